@@ -1,0 +1,1 @@
+"""From frames and rough masks to shape, texture and poses."""

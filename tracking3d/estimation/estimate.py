@@ -1,0 +1,79 @@
+"""What travels out of the estimator: one estimate a frame, and the object at the end.
+
+Conventions: OpenCV camera axes (x right, y down, z forward), ``T_cam_obj`` maps object to camera coordinates,
+``x_cam = R x_obj + t``; the scale of the object is arbitrary.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Status(StrEnum):
+    """The estimator's own judgement of one frame."""
+
+    TRACKED = "tracked"
+    UNCERTAIN = "uncertain"
+    LOST = "lost"
+
+
+@dataclass(frozen=True, eq=False)
+class FrameEstimate:
+    """The answer for one frame.
+
+    Attributes:
+        index: The frame's index in the source.
+        time: Seconds since the start of the video, where known.
+        T_cam_obj: ``(4, 4)`` float64 rigid transform from object to camera.
+        mask: ``(H, W)`` bool, full resolution: the answer. The rendered silhouette, or the initial mask where
+            the frame is lost.
+        initial_mask: ``(H, W)`` bool as the mask tracker gave it, or None where it gave none.
+        status: See `Status`.
+        reason: Why the frame has that status, in words.
+        confidence: In [0, 1].
+        losses: Each loss term at the answer, unweighted, by name.
+        iterations: Optimizer iterations spent.
+        keyframe: Whether the frame became a keyframe.
+        seconds: Wall time spent on the frame.
+        revised: Better answers for earlier frames that this frame made possible; they replace those given before.
+    """
+
+    index: int
+    time: float | None
+    T_cam_obj: NDArray[np.float64]
+    mask: NDArray[np.bool_]
+    initial_mask: NDArray[np.bool_] | None
+    status: Status
+    reason: str
+    confidence: float
+    losses: dict[str, float] = field(default_factory=dict)
+    iterations: int = 0
+    keyframe: bool = False
+    seconds: float = 0.0
+    revised: tuple[FrameEstimate, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectModel:
+    """The estimated object: one textured mesh in object coordinates.
+
+    Attributes:
+        vertices: ``(V, 3)`` float64.
+        faces: ``(F, 3)`` int64, counter-clockwise seen from outside.
+        face_uvs: ``(F, 3, 2)`` float64, one per face corner, so that the seam of the atlas is exact. u runs to
+            the right, v *down* the texture image; u may pass 1 at the seam and wraps.
+        texture: ``(T, T, 3)`` uint8 RGB, back-projected from the video.
+        texture_weight: ``(T, T)`` float32, how much each texel was seen; 0 = never.
+        features: ``(T, T, C)`` float32 feature texture the poses were estimated with.
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+    face_uvs: NDArray[np.float64]
+    texture: NDArray[np.uint8]
+    texture_weight: NDArray[np.float32]
+    features: NDArray[np.float32]

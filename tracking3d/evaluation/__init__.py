@@ -1,0 +1,1 @@
+"""Measures, clips with known truth, and benchmarks."""

@@ -1,0 +1,1 @@
+"""Feature encoders: what the appearance loss compares."""

@@ -1,0 +1,80 @@
+"""What travels from the video into the estimator: frames, prompts and masks.
+
+Images are ``(H, W, 3)`` uint8 RGB arrays; pixel (0, 0) is the *centre* of the top-left pixel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.uint8]
+"""``(H, W, 3)`` uint8 RGB."""
+
+Box = tuple[float, float, float, float]
+"""``(x, y, width, height)`` in pixels; x and y are the left and upper edge of the box."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One decoded frame.
+
+    Attributes:
+        index: Position in the source, counted from 0; it keeps its value when frames are skipped.
+        image: ``(H, W, 3)`` uint8 RGB.
+        time: Seconds since the start of the video, where known.
+        name: What messages call it: a file name, or ``"frame 12"``.
+    """
+
+    index: int
+    image: Image
+    time: float | None = None
+    name: str = ""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """``(height, width)`` in pixels."""
+        return self.image.shape[0], self.image.shape[1]
+
+
+@dataclass(frozen=True)
+class SkippedFrame:
+    """A frame that the source could not decode; the run goes on without it and records why."""
+
+    index: int
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Prompt:
+    """The object in the first frame.
+
+    Attributes:
+        box: ``(x, y, width, height)`` in pixels. Always present; the mask's bounding box where a mask was given.
+        mask: ``(H, W)`` bool, or None where only a box was given.
+    """
+
+    box: Box
+    mask: NDArray[np.bool_] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class MaskEstimate:
+    """A mask tracker's answer for one frame.
+
+    Attributes:
+        mask: ``(H, W)`` float32 in [0, 1], full resolution; None where the tracker has no answer for this frame.
+        score: The tracker's own confidence in [0, 1].
+        reason: Why there is no mask, or why the score is low; one short clause.
+    """
+
+    mask: NDArray[np.float32] | None
+    score: float = 1.0
+    reason: str = ""
+
+    @property
+    def binary(self) -> NDArray[np.bool_] | None:
+        """The mask thresholded at one half, or None."""
+        return None if self.mask is None else self.mask >= 0.5

@@ -1,0 +1,92 @@
+"""The one camera of a video, and windows of it.
+
+OpenCV axes: x right, y down, z forward. Pixel (0, 0) is the centre of the top-left pixel. A crop is a *window*
+of the one camera (shifted principal point, scaled focal length), never a camera of its own, so that poses stay
+comparable from frame to frame.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+DEFAULT_FIELD_OF_VIEW = 45.0
+"""Vertical field of view in degrees when nothing better is known (paper section 3.2)."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera of the full frame.
+
+    Attributes:
+        fx, fy: Focal lengths in pixels.
+        cx, cy: Principal point in pixels.
+        width, height: Frame size in pixels.
+        origin: Where the intrinsics came from, in words; recorded in the run.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    origin: str = "given"
+
+    @classmethod
+    def from_fov(
+        cls, width: int, height: int, fov: float = DEFAULT_FIELD_OF_VIEW, origin: str = "default field of view"
+    ) -> Camera:
+        """A centred camera with square pixels and a vertical field of view of ``fov`` degrees."""
+        focal = 0.5 * height / math.tan(math.radians(fov) / 2)
+        return cls(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height, origin)
+
+    @property
+    def K(self) -> NDArray[np.float64]:
+        """``(3, 3)`` intrinsic matrix of the full frame."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True)
+class Window:
+    """A square region of the frame seen at ``size`` x ``size`` pixels; it may reach beyond the frame.
+
+    Attributes:
+        left, top: Outer edge of the region: the column and row of its first pixel in the frame.
+        side: Side of the region in frame pixels.
+        size: Side in window pixels.
+    """
+
+    left: int
+    top: int
+    side: int
+    size: int
+
+    @classmethod
+    def around(cls, box: tuple[float, float, float, float], margin: float, size: int) -> Window:
+        """The square window centred on ``box`` ``(x, y, w, h)``, ``1 + 2 margin`` times its longer side."""
+        x, y, width, height = box
+        side = max(round(max(width, height) * (1.0 + 2.0 * margin)), 4)
+        return cls(round(x + width / 2 - side / 2), round(y + height / 2 - side / 2), side, size)
+
+    @property
+    def scale(self) -> float:
+        """Window pixels per frame pixel."""
+        return self.size / self.side
+
+    def K(self, camera: Camera) -> NDArray[np.float64]:
+        """``(3, 3)`` intrinsics of ``camera`` in this window's pixels.
+
+        Pixel centres are at integers in both grids, so ``u_window = (u + 0.5 - left) * scale - 0.5``.
+        """
+        s = self.scale
+        return np.array(
+            [
+                [s * camera.fx, 0.0, (camera.cx + 0.5 - self.left) * s - 0.5],
+                [0.0, s * camera.fy, (camera.cy + 0.5 - self.top) * s - 0.5],
+                [0.0, 0.0, 1.0],
+            ]
+        )

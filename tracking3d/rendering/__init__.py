@@ -1,0 +1,1 @@
+"""The differentiable renderer (DIB-R). Knows nothing of video or tracking."""

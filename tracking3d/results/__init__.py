@@ -1,0 +1,1 @@
+"""The run folder: writing, reading, and everything drawn or exported from it."""

@@ -1,0 +1,52 @@
+"""The protocol of mask trackers: 2D trackers that give a rough mask of the object in every frame.
+
+A plug-in is a class registered under the entry-point group ``tracking3d.trackers``. It knows frames and
+masks, never the pipeline.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol, Self, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict
+
+from tracking3d.frames import Frame, MaskEstimate, Prompt
+
+
+class Options(BaseModel):
+    """Base of every plug-in's options: frozen, and unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+@runtime_checkable
+class MaskTracker(Protocol):
+    """Gives a mask of the object in every frame, causally.
+
+    A class that implements it has a nested pydantic model ``Options`` and a classmethod
+    ``from_options(options)``; YAML and ``--set`` are checked by that model.
+    """
+
+    @classmethod
+    def from_options(cls, options: BaseModel) -> Self:
+        """Build a tracker from its validated ``Options``."""
+        ...
+
+    def init(self, frame: Frame, prompt: Prompt) -> MaskEstimate:
+        """Start on the first frame from a box or a mask, and answer for that frame."""
+        ...
+
+    def step(self, frame: Frame) -> MaskEstimate:
+        """Answer for the next frame."""
+        ...
+
+
+@runtime_checkable
+class CorrectableTracker(Protocol):
+    """A mask tracker that can be re-anchored on a better mask."""
+
+    def correct(self, frame: Frame, mask: NDArray[np.bool_]) -> None:
+        """Take ``mask`` ``(H, W)`` as the object's place in ``frame``."""
+        ...
