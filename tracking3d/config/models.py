@@ -1,0 +1,132 @@
+"""What can be configured, as pydantic models: every key, its default, its range and what it means.
+
+The defaults are the paper's (preset ``paper``); ``tracking3d/config/presets`` holds what other presets change.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+
+class Section(BaseModel):
+    """Base of all sections: frozen, and unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class PluginChoice(BaseModel):
+    """A plug-in by name; every other key is an option of the plug-in and checked by its own ``Options``."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    name: str = Field(description="Name of the plug-in, as `tracking3d plugins` lists it.")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _name_alone(cls, value: Any) -> Any:
+        return {"name": value} if isinstance(value, str) else value
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """The plug-in's own options."""
+        return dict(self.model_extra or {})
+
+
+class CameraConfig(Section):
+    """The camera of the full frame."""
+
+    fov: float | None = Field(
+        None, gt=1, lt=170, description="Vertical field of view in degrees; 45 when nothing better is known."
+    )
+    intrinsics: tuple[float, float, float, float] | None = Field(
+        None, description="fx, fy, cx, cy in pixels of the full frame; wins over fov."
+    )
+
+
+class ObjectConfig(Section):
+    """How the object is represented (paper section 3.1)."""
+
+    prototype: str = Field("sphere", description="sphere, ellipsoid (fitted to the first mask) or a mesh file.")
+    frequency: int = Field(11, ge=1, le=40, description="Icosphere frequency f: 10 f^2 + 2 vertices.")
+    texture_size: int = Field(300, ge=16, le=2048, description="Side of the feature texture in texels.")
+    flat: bool = Field(False, description="Flat prior: project all vertices onto one plane after each iteration.")
+
+
+class WindowConfig(Section):
+    """The window of the frame that is rendered."""
+
+    size: int = Field(128, ge=32, le=1024, description="Working resolution: side of the window in pixels.")
+    margin: float = Field(0.3, ge=0.05, le=2, description="Free space on each side, relative to the longer side of the mask's box.")
+
+
+class Weights(Section):
+    """Weights of the loss terms; 0 switches a term off (paper section 3.3)."""
+
+    features: float = Field(1.0, ge=0, description="Appearance loss, eq. 1.")
+    silhouette: float = Field(1.0, ge=0, description="Silhouette loss, IoU term of eq. 2.")
+    distance: float = Field(1.0, ge=0, description="Silhouette loss, distance-transform term of eq. 2, times `silhouette`.")
+    motion: float = Field(1.0, ge=0, description="Motion regularization, eq. 3.")
+    laplacian: float = Field(1000.0, ge=0, description="Laplacian shape regularization.")
+    total_variation: float = Field(0.001, ge=0, description="Total variation of the texture.")
+
+
+class LearningRates(Section):
+    """Adam's learning rate for each group of parameters (paper: 0.1 for all)."""
+
+    translation: float = Field(0.1, ge=0)
+    rotation: float = Field(0.1, ge=0)
+    vertices: float = Field(0.1, ge=0)
+    texture: float = Field(0.1, ge=0)
+
+
+class KeyframeConfig(Section):
+    """Which frames stay in the optimization (paper section 3.4)."""
+
+    maximum: int = Field(6, ge=1, le=64, description="Number of most recent keyframes that are kept.")
+    silhouette: float = Field(0.3, gt=0, description="A keyframe's silhouette loss is below this.")
+    features: float | None = Field(None, gt=0, description="A keyframe's appearance loss is below this; the encoder's tau if empty.")
+    translation: float = Field(0.5, ge=0, description="New view: moved more than this times the object's size, or ...")
+    rotation: float = Field(45.0, ge=0, description="... turned more than this many degrees since the latest keyframe.")
+    keep_first: bool = Field(False, description="Frame 0 stays a keyframe whatever happens.")
+
+
+class SolverConfig(Section):
+    """The estimator. Defaults are the paper's recipe."""
+
+    name: str = Field("paper", description="Which solver.")
+    iterations: int = Field(500, ge=1, le=100_000, description="Most iterations a frame.")
+    tau: float | None = Field(None, gt=0, description="Converged when the appearance loss is below this; the encoder's own if empty.")
+    cauchy_scale: float = Field(0.25, gt=0, description="Scale of the Cauchy loss.")
+    sigma: float = Field(7000.0, gt=0, description="Sharpness of the soft silhouette, per squared NDC unit.")
+    boxlen: float = Field(0.02, gt=0, lt=1, description="Reach of the soft silhouette beyond a face's box, NDC.")
+    knum: int = Field(30, ge=1, description="Most faces that a soft-silhouette pixel counts.")
+    band: Literal["erode", "soften", "none"] = Field(
+        "erode", description="How the bias of the soft band is removed: erode the silhouette 3x3, soften the target by the same kernel, or not."
+    )
+    motion_translation: float = Field(0.1, ge=0, description="Free translation a frame since the last keyframe, eq. 3.")
+    motion_rotation: float = Field(30.0, ge=0, description="Free rotation in degrees a frame since the last keyframe, eq. 3.")
+    weights: Weights = Weights()
+    learning_rates: LearningRates = LearningRates()
+    keyframes: KeyframeConfig = KeyframeConfig()
+
+
+class RuntimeConfig(Section):
+    """Where and how it runs."""
+
+    device: str = Field("cpu", description="cpu, cuda, or cuda:N.")
+    seed: int = Field(0, ge=0, description="Seed of everything random.")
+    threads: int | None = Field(None, ge=1, description="CPU threads; torch's own choice if empty.")
+
+
+class PipelineConfig(Section):
+    """The whole pipeline."""
+
+    tracker: PluginChoice = PluginChoice(name="csrt")
+    features: PluginChoice = PluginChoice(name="rgb")
+    camera: CameraConfig = CameraConfig()
+    object: ObjectConfig = ObjectConfig()
+    window: WindowConfig = WindowConfig()
+    solver: SolverConfig = SolverConfig()
+    runtime: RuntimeConfig = RuntimeConfig()
