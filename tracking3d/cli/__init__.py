@@ -1,1 +1,51 @@
-"""The command line: parse, call, print."""
+"""The command line: parse, call, print.
+
+Each command has a file and imports what it needs when it is called, so that ``--help`` is quick.
+"""
+
+from __future__ import annotations
+
+import typer
+
+from tracking3d.cli import bench, config, demo, evaluate, plugins, points, run
+from tracking3d.cli.options import Debug
+from tracking3d.cli.program import Program
+
+app = typer.Typer(
+    name="tracking3d",
+    cls=Program,
+    help="Track a rigid object in an ordinary RGB video: masks, poses and a textured mesh.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+app.command(name="run")(run.run)
+app.command(name="demo")(demo.demo)
+app.command(name="evaluate")(evaluate.evaluate)
+app.command(name="points")(points.points)
+app.command(name="plugins")(plugins.plugins)
+app.add_typer(config.app, name="config")
+app.add_typer(bench.app, name="bench")
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib import metadata
+
+        typer.echo(f"tracking3d {metadata.version('tracking3d')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: bool = typer.Option(
+        False, "--version", is_eager=True, callback=_print_version, help="Print the version and exit."
+    ),
+    debug: Debug = False,
+) -> None:
+    pass
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    app()

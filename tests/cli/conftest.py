@@ -1,0 +1,109 @@
+"""A clip on disk, a session that answers at once, and the program to call."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from typer.testing import CliRunner, Result
+
+from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
+from tracking3d.geometry.camera import Camera
+from tracking3d.plugins import TRACKERS, build_plugin
+
+HEIGHT, WIDTH, FRAMES = 48, 64, 5
+
+
+@dataclass
+class Script:
+    """What the fake session is to raise in which frame, and what it was built with."""
+
+    faults: dict[int, BaseException] = field(default_factory=dict)
+    built: list[tuple] = field(default_factory=list)
+
+
+@pytest.fixture
+def script(monkeypatch) -> Script:
+    """Replace the estimator by one that answers with the prompt's box at once."""
+    script = Script()
+
+    class FakeSession:
+        def __init__(self, config, prompt, intrinsics=None, intrinsics_origin=""):
+            script.built.append((config, prompt))
+            build_plugin(TRACKERS, config.tracker)
+
+        def step(self, frame):
+            if fault := script.faults.get(frame.index):
+                raise fault
+            self.camera = Camera.from_fov(frame.size[1], frame.size[0])
+            mask = np.zeros(frame.size, dtype=bool)
+            mask[10:30, 20:40] = True
+            T = np.eye(4)
+            T[2, 3] = 3
+            return FrameEstimate(frame.index, frame.time, T, mask, mask, Status.TRACKED, "", 1.0, seconds=0.1)
+
+        def result(self):
+            sphere = trimesh.creation.icosphere(1)
+            uvs = np.full((*sphere.faces.shape, 2), 0.5)
+            texture = np.zeros((4, 4, 3))
+            return ObjectModel(
+                sphere.vertices, sphere.faces, uvs, texture.astype(np.uint8), texture[..., 0], texture
+            )
+
+    monkeypatch.setattr("tracking3d.recording.Session", FakeSession)
+    return script
+
+
+@pytest.fixture
+def clip(tmp_path: Path) -> Path:
+    """A folder of five images of noise."""
+    folder = tmp_path / "clip"
+    folder.mkdir()
+    rng = np.random.default_rng(0)
+    for index in range(FRAMES):
+        pixels = rng.integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(folder / f"{index:03d}.png")
+    return folder
+
+
+@pytest.fixture
+def mask_file(tmp_path: Path):
+    """Write a mask image and return its path."""
+
+    def write(mask: np.ndarray, name: str = "mask.png") -> Path:
+        Image.fromarray((mask * 255).astype(np.uint8)).save(tmp_path / name)
+        return tmp_path / name
+
+    return write
+
+
+@pytest.fixture
+def call(tmp_path: Path, monkeypatch):
+    """Call the program in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments: object) -> Result:
+        from tracking3d.cli import app
+
+        return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+    return call
+
+
+@pytest.fixture
+def refused(call):
+    """Call the program with something it cannot use, and return the one line it prints."""
+
+    def refused(*arguments: object) -> str:
+        result = call(*arguments)
+        assert result.exit_code == 2, result.output
+        [line] = result.stderr.splitlines()
+        assert line.startswith("error: ")
+        assert result.stdout == ""
+        return line
+
+    return refused

@@ -1,0 +1,225 @@
+"""The commands beside ``run``: what they print, as text and as JSON, and how they refuse bad input."""
+
+from __future__ import annotations
+
+import csv
+import functools
+import io
+import json
+import shutil
+import subprocess
+import sys
+import types
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from tracking3d.config.loading import load_config
+from tracking3d.evaluation import synthetic
+
+BOX = ("--box", "20,10,20,20")
+COMMANDS = ["run", "demo", "evaluate", "points", "plugins", "config show", "config schema", "config validate"]
+
+
+@pytest.fixture
+def finished(call, clip, script) -> Path:
+    """A finished run of the fake session, which answers with one mask in every frame."""
+    assert call("run", clip, *BOX, "--out", "run").exit_code == 0
+    return Path("run")
+
+
+@pytest.mark.parametrize("command", ["", *COMMANDS, "config", "bench", "bench render"])
+def test_every_command_has_help(call, command):
+    result = call(*command.split(), "--help")
+    assert result.exit_code == 0
+    assert "Usage:" in result.stdout
+    assert command not in COMMANDS or "--debug" in result.stdout
+
+
+def test_version(call):
+    result = call("--version")
+    assert result.exit_code == 0
+    assert result.stdout.startswith("tracking3d 0.")
+
+
+def test_no_command_prints_the_help(call):
+    assert "Usage:" in call().stdout
+    assert "Usage:" in call("config").stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [("rnu", "did you mean 'run'"), ("config shwo", "did you mean 'show'"), ("--nonsense", "no such option")],
+)
+def test_unknown_command_is_one_sentence(refused, arguments, words):
+    assert words in refused(*arguments.split()).lower()
+
+
+def test_importing_the_command_line_loads_nothing_heavy():
+    heavy = "{'torch', 'cv2', 'kornia', 'numba', 'numpy', 'rich.progress', 'trimesh'}"
+    code = f"import sys, tracking3d.cli; print({heavy} & set(sys.modules))"
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert answer.stdout == "set()\n"
+
+
+def test_broken_pipe_ends_quietly():
+    code = "from tracking3d.cli import main; main()"
+    program = subprocess.Popen(
+        [sys.executable, "-c", code, "config", "schema"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    program.stdout.close()
+    assert program.stderr.read() == b""
+    program.stderr.close()
+    program.wait()
+
+
+def test_plugins_are_listed_with_status_and_reason(call, monkeypatch):
+    monkeypatch.setenv("TRACKING3D_PLUGINS", "tracking3d.trackers:bad=no_such_module_at_all:Bad")
+    result = call("plugins")
+    assert result.exit_code == 0
+    [csrt] = [line for line in result.stdout.splitlines() if "csrt" in line]
+    assert [cell.strip() for cell in csrt.strip("│").split("│")][:3] == [
+        "csrt",
+        "tracking3d.trackers",
+        "tracking3d",
+    ]
+    [bad] = [line for line in result.stdout.splitlines() if "bad" in line]
+    assert "broken" in bad
+    assert "No module named 'no_such_module_at_all'" in bad
+
+
+def test_plugins_as_json(call):
+    infos = {info["name"]: info for info in json.loads(call("plugins", "--json").stdout)}
+    assert set(infos["csrt"]) == {"name", "group", "package", "version", "status", "reason", "options"}
+    assert "path" in infos["precomputed"]["options"]["properties"]
+
+
+def test_config_show_is_a_configuration_file_with_every_default(call, tmp_path):
+    result = call("config", "show", "--preset", "paper", "--set", "window.size=64")
+    shown = yaml.safe_load(result.stdout)
+    assert shown["window"]["size"] == 64
+    assert shown["tracker"]["padding"] > 0
+    (tmp_path / "shown.yaml").write_text(result.stdout)
+    assert load_config(tmp_path / "shown.yaml").window.size == 64
+    assert call("config", "show", "--config", "shown.yaml").stdout == result.stdout
+
+
+def test_config_show_refuses_what_run_would_refuse(refused):
+    assert "did you mean 'padding'?" in refused("config", "show", "--set", "tracker.paddin=1")
+    assert "option 'path' is missing" in refused("config", "show", "--set", "tracker=precomputed")
+
+
+def test_config_schema_is_json(call):
+    schema = json.loads(call("config", "schema").stdout)
+    assert {"tracker", "solver", "preset"} <= set(schema["properties"])
+
+
+def test_config_validate_checks_the_plugins_own_options(call, refused, tmp_path):
+    good, bad = tmp_path / "good.yaml", tmp_path / "bad.yaml"
+    good.write_text("tracker: {name: csrt, padding: 2}")
+    result = call("config", "validate", good)
+    assert (result.exit_code, result.stdout) == (0, f"{good} is valid\n")
+    for text, words in [
+        ("tracker: {name: csrt, paddin: 2}", "did you mean 'padding'?"),
+        ("tracker: {name: csrt, padding: wide}", "'padding' must be a valid number"),
+        ("tracker: crst", "did you mean 'csrt'?"),
+        ("- tracker", "holds a list"),
+        ("solver: !!python/name:os.system", "never run code"),
+    ]:
+        bad.write_text(text)
+        assert words in refused("config", "validate", bad)
+
+
+@pytest.fixture
+def truth(clip, tmp_path, mask_file) -> Path:
+    """A clip whose true masks are what the fake session answers."""
+    folder = tmp_path / "truth"
+    shutil.copytree(clip, folder / "frames")
+    (folder / "masks").mkdir()
+    mask = np.zeros((48, 64), dtype=bool)
+    mask[10:30, 20:40] = True
+    for index in range(5):
+        mask_file(mask, f"truth/masks/{index:03d}.png")
+    return folder
+
+
+def test_evaluate_prints_a_table_or_json_only(call, finished, truth):
+    scores = json.loads(call("evaluate", finished, "--truth", truth, "--json").stdout)
+    assert scores["iou_mean"] == scores["iou_initial_mean"] == 1
+    assert scores["frames"] == 5
+    assert {"rotation_error_mean_deg", "rotation_error_median_deg", "share_under_5_deg"} <= set(scores)
+    assert {"rotation_error_anchored_median_deg", "share_worse_than_initial"} <= set(scores)
+    result = call("evaluate", finished, "--truth", truth)
+    assert result.exit_code == 0
+    assert "IoU" in result.stdout
+
+
+def test_evaluate_names_the_folder_that_is_none(refused, finished, truth):
+    assert "absent" in refused("evaluate", "absent", "--truth", truth)
+    assert "absent" in refused("evaluate", finished, "--truth", "absent")
+    assert "--truth" in refused("evaluate", finished)
+
+
+def test_points_are_followed_as_csv_and_json(call, finished):
+    pixels = ("--xy", "31.5,23.5", "--xy", "0,0")
+    rows = list(csv.DictReader(io.StringIO(call("points", finished, "--frame", 0, *pixels).stdout)))
+    assert len(rows) == 10
+    assert float(rows[0]["x"]) == pytest.approx(31.5, abs=0.01)
+    assert (rows[0]["on_object"], rows[1]["on_object"]) == ("1", "0")
+    tracks = json.loads(call("points", finished, *pixels, "--json").stdout)
+    assert tracks["frames"] == [0, 1, 2, 3, 4]
+    result = call("points", finished, *pixels, "--csv", "points.csv")
+    assert (result.exit_code, result.stdout) == (0, "")
+    assert list(csv.DictReader(io.StringIO(Path("points.csv").read_text()))) == rows
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("points absent --xy 1,1", "absent"),
+        ("points run", "--xy"),
+        ("points run --xy 1", "--xy '1' is not 2 numbers"),
+        ("points run --xy a,b", "--xy 'a,b' is not 2 numbers"),
+        ("points run --xy nan,1", "--xy 'nan,1' is not 2 numbers"),
+        ("points run --xy 1,1 --frame 9", "9"),
+        ("points run --xy 1,1 --frame x", "--frame"),
+        ("points run --xy 1,1 --csv run/no/points.csv", "run/no/points.csv"),
+    ],
+)
+def test_bad_question_for_points_is_refused(refused, finished, arguments, words):
+    assert words in refused(*arguments.split())
+
+
+def test_bench_render_prints_the_benchmark(call, refused, monkeypatch):
+    module = types.ModuleType("bench_render")
+    module.benchmark = lambda size, frames, channels, repeats: {"given": [size, frames, channels, repeats]}
+    monkeypatch.setitem(sys.modules, "tracking3d.evaluation.bench_render", module)
+    options = ["--size", 64, "--frames", 2, "--channels", 8, "--repeats", 3]
+    result = call("bench", "render", *options, "--json")
+    assert json.loads(result.stdout) == {"given": [64, 2, 8, 3]}
+    assert "--frames" in refused("bench", "render", "--frames", "0")
+
+
+def test_demo_writes_clip_run_and_summary(call, script, monkeypatch):
+    quick = functools.partial(synthetic.make_demo_clip, frames=3, size=(64, 48))
+    monkeypatch.setattr(synthetic, "make_demo_clip", quick)
+    for _ in range(2):  # a second call replaces the first's files
+        result = call("demo", "--out", "shown", "--seed", 3)
+        assert result.exit_code == 0, result.output
+    summary = json.loads(Path("shown/summary.json").read_text())
+    names = [
+        "iou_initial",
+        "iou",
+        "rotation_error_mean_deg",
+        "rotation_error_median_deg",
+        "seconds_per_frame",
+    ]
+    assert list(summary) == names
+    assert all(name in result.stdout for name in names)
+    assert Path("shown/run/run.json").exists()
+    assert Path("shown/clip/poses.json").exists()
+    config, prompt = script.built[-1]
+    assert (config.tracker.name, config.features.name, config.runtime.seed) == ("csrt", "rgb", 3)
+    assert prompt.mask is None

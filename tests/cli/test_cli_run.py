@@ -1,0 +1,264 @@
+"""``tracking3d run``: what it hands to the pipeline, how it ends, and what it says about bad input."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tracking3d.cli.run import default_folder
+from tracking3d.errors import PluginError
+from tracking3d.results.run_reader import RunReader
+
+BOX = ("--box", "20,10,20,20")
+
+
+@pytest.fixture(autouse=True)
+def usual_log_level():
+    yield
+    logging.getLogger("tracking3d").setLevel(logging.NOTSET)
+
+
+def test_run_writes_the_folder_and_prints_the_closing_table(call, clip, script):
+    result = call("run", clip, *BOX, "--tracker", "csrt", "--features", "rgb", "--out", "run")
+    assert result.exit_code == 0, result.output
+    for word in ["frames", "tracked", "IoU", "seconds per frame", "run/masks", "run/overlay.mp4"]:
+        assert word in result.stdout
+    run = RunReader(Path("run"))
+    assert run.state == "finished"
+    assert [frame.index for frame in run.frames] == [0, 1, 2, 3, 4]
+    assert run.config["tracker"]["name"] == "csrt"
+    assert run.description["command"]
+
+
+def test_options_reach_the_configuration(call, clip, script, tmp_path):
+    (tmp_path / "mine.yaml").write_text("preset: paper\nsolver: {knum: 7, iterations: 9}")
+    options = (
+        "--flat --prototype ellipsoid --size 64 --device cpu --seed 5 --set solver.iterations=3 --fov 30"
+    )
+    result = call(
+        "run", clip, *BOX, *options.split(), "--config", "mine.yaml", "--intrinsics", "70,70,32,24", "--quiet"
+    )
+    assert result.exit_code == 0, result.output
+    [(config, prompt)] = script.built
+    assert (config.solver.knum, config.solver.iterations) == (7, 3)
+    assert (config.object.flat, config.object.prototype) == (True, "ellipsoid")
+    assert (config.window.size, config.runtime.device, config.runtime.seed) == (64, "cpu", 5)
+    assert (config.camera.fov, config.camera.intrinsics) == (30, (70, 70, 32, 24))
+    assert prompt.box == (20, 10, 20, 20)
+    assert RunReader(Path("runs/clip")).description["seed"] == 5
+
+
+def test_absent_flag_does_not_undo_the_files(call, clip, script, tmp_path):
+    (tmp_path / "mine.yaml").write_text("object: {flat: true}")
+    call("run", clip, *BOX, "--config", "mine.yaml")
+    assert script.built[0][0].object.flat is True
+
+
+def test_quiet_prints_nothing_and_a_pipe_gets_no_bar(call, clip, script):
+    assert call("run", clip, *BOX, "--quiet").output == ""
+    result = call("run", clip, "--box", "-5,10,20,20", "--quiet", "--out", "other")
+    assert (result.exit_code, result.output) == (0, "")
+    assert "━" not in call("run", clip, *BOX, "--overwrite").stderr
+
+
+def test_frames_are_selected_and_keep_their_index(call, clip, script):
+    assert call("run", clip, *BOX, "--frames", "1:5:2", "--out", "run").exit_code == 0
+    assert [frame.index for frame in RunReader(Path("run")).frames] == [1, 3]
+
+
+def test_mask_is_the_prompt(call, clip, script, mask_file):
+    mask = np.zeros((48, 64), dtype=bool)
+    mask[10:20, 30:50] = True
+    assert call("run", clip, "--mask", mask_file(mask)).exit_code == 0
+    [(_, prompt)] = script.built
+    assert prompt.box == (30, 10, 20, 10)
+
+
+def test_masks_choose_the_tracker_and_need_no_prompt(call, clip, script, mask_file, tmp_path):
+    (tmp_path / "masks").mkdir()
+    mask = np.zeros((48, 64), dtype=bool)
+    mask[10:20, 30:50] = True
+    mask_file(mask, "masks/000.png")
+    assert call("run", clip, "--masks", "masks").exit_code == 0
+    assert (
+        call("run", clip, "--tracker", "precomputed", "--set", "tracker.path=masks", "--out", "b").exit_code
+        == 0
+    )
+    assert call("run", clip, "--masks", "masks", *BOX, "--out", "c").exit_code == 0
+    assert [prompt and prompt.box for _, prompt in script.built] == [None, None, (20, 10, 20, 20)]
+    assert all(config.tracker.options == {"path": "masks"} for config, _ in script.built)
+
+
+def test_undecodable_frame_is_skipped_and_recorded(call, clip, script):
+    (clip / "002.png").write_bytes(b"no image")
+    result = call("run", clip, *BOX, "--out", "run")
+    assert result.exit_code == 0, result.output
+    assert "skipped" in result.stdout
+    run = RunReader(Path("run"))
+    assert [frame.index for frame in run.frames] == [0, 1, 3, 4]
+    assert [skipped["index"] for skipped in run.description["skipped"]] == [2]
+
+
+def test_first_frame_may_be_undecodable(call, clip, script):
+    (clip / "000.png").write_bytes(b"no image")
+    assert call("run", clip, *BOX, "--out", "run").exit_code == 0
+    run = RunReader(Path("run"))
+    assert [frame.index for frame in run.frames] == [1, 2, 3, 4]
+    assert [skipped["index"] for skipped in run.description["skipped"]] == [0]
+
+
+def test_box_partly_outside_is_clipped_and_the_run_goes_on(call, clip, script, caplog):
+    assert call("run", clip, "--box", "-5,10,20,20").exit_code == 0
+    assert script.built[0][1].box == (0, 10, 15, 20)
+    assert "reaches beyond the frame" in caplog.text
+
+
+def test_interrupted_run_keeps_what_was_finished(call, clip, script):
+    script.faults[3] = KeyboardInterrupt()
+    result = call("run", clip, *BOX, "--out", "run")
+    assert result.exit_code == 130
+    assert result.stderr.splitlines() == ["interrupted", "What was finished until then is kept in run."]
+    run = RunReader(Path("run"))
+    assert run.state == "interrupted"
+    assert [frame.index for frame in run.frames] == [0, 1, 2]
+    assert Path("run/overlay.mp4").stat().st_size
+
+
+def test_interrupt_before_the_first_answer_leaves_no_folder(call, clip, script):
+    script.faults[0] = KeyboardInterrupt()
+    result = call("run", clip, *BOX, "--out", "run")
+    assert (result.exit_code, result.stderr) == (130, "interrupted\n")
+    assert not Path("run").exists()
+
+
+def test_failing_plugin_ends_the_run_with_a_sentence_and_keeps_what_was_finished(call, clip, script):
+    script.faults[2] = PluginError("The tracker gave up.")
+    result = call("run", clip, *BOX, "--out", "run")
+    assert result.exit_code == 2
+    assert result.stderr.splitlines() == [
+        "error: The tracker gave up.",
+        "What was finished until then is kept in run.",
+    ]
+    description = json.loads(Path("run/run.json").read_text())
+    assert (description["state"], description["error"]) == ("failed", "The tracker gave up.")
+    assert len(RunReader(Path("run")).frames) == 2
+
+
+def test_fault_of_the_program_is_no_traceback_unless_asked_for(call, clip, script):
+    script.faults[0] = ZeroDivisionError("division by zero")
+    result = call("run", clip, *BOX)
+    assert result.exit_code == 1
+    assert "Traceback" not in result.output
+    assert "ZeroDivisionError: division by zero" in result.stderr
+    assert "Traceback" in call("run", clip, *BOX, "--debug").stderr
+    assert "Traceback" in call("--debug", "run", clip, *BOX).stderr
+
+
+def test_folder_with_a_run_is_refused_unless_it_may_be_overwritten(call, refused, clip, script):
+    assert call("run", clip, *BOX, "--out", "run").exit_code == 0
+    before = Path("run/frames.jsonl").read_bytes()
+    assert "already holds a run" in refused("run", clip, *BOX, "--out", "run", "--frames", "0:2")
+    assert Path("run/frames.jsonl").read_bytes() == before
+    assert call("run", clip, *BOX, "--out", "run", "--frames", "0:2", "--overwrite").exit_code == 0
+    assert len(RunReader(Path("run")).frames) == 2
+
+
+def test_folder_that_cannot_be_written_is_named(refused, clip, script, tmp_path):
+    (tmp_path / "file").write_text("")
+    assert "file" in refused("run", clip, *BOX, "--out", "file")
+    assert "file/inner" in refused("run", clip, *BOX, "--out", "file/inner")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("", "--box X,Y,W,H, --mask FILE, or --masks DIR"),
+        ("--box 1,2,3", "'1,2,3' has 3 numbers"),
+        ("--box here", "'here' has 1 numbers"),
+        ("--box a,b,c,d", "'a,b,c,d' is not four numbers"),
+        ("--box 1,2,nan,4", "no finite number"),
+        ("--box 1,2,0,4", "has no size"),
+        ("--box 1,2,3,-4", "has no size"),
+        ("--box 100,100,9,9", "outside 000.png, which is 64 x 48"),
+        ("--mask absent.png", "absent.png does not exist"),
+        ("--box 1,1,9,9 --mask m.png", "either --box or --mask"),
+        ("--masks absent", "absent"),
+        ("--masks m --tracker csrt", "leave out --tracker csrt"),
+        ("--box 1,1,9,9 --tracker crst", "did you mean 'csrt'?"),
+        ("--box 1,1,9,9 --features rbg", "did you mean 'rgb'?"),
+        ("--box 1,1,9,9 --preset papr", "did you mean 'paper'?"),
+        ("--box 1,1,9,9 --set solver.sigmaa=1", "did you mean 'solver.sigma'?"),
+        ("--box 1,1,9,9 --set tracker.paddin=1", "did you mean 'padding'?"),
+        ("--box 1,1,9,9 --set window", "section.key=value"),
+        ("--box 1,1,9,9 --config absent.yaml", "absent.yaml does not exist"),
+        ("--box 1,1,9,9 --size 3", "'window.size' must be greater than or equal to 32, not 3"),
+        ("--box 1,1,9,9 --size big", "--size"),
+        ("--box 1,1,9,9 --fov 200", "'camera.fov'"),
+        ("--box 1,1,9,9 --fov wide", "--fov"),
+        ("--box 1,1,9,9 --intrinsics 1,2,3", "--intrinsics '1,2,3' is not 4 numbers"),
+        ("--box 1,1,9,9 --intrinsics a,b,c,d", "FX,FY,CX,CY"),
+        ("--box 1,1,9,9 --intrinsics 1,2,nan,4", "is not 4 numbers"),
+        ("--box 1,1,9,9 --seed -1", "'runtime.seed'"),
+        ("--box 1,1,9,9 --frames 3:1", "selects no frame"),
+        ("--box 1,1,9,9 --frames x", "START:STOP:STEP"),
+        ("--box 1,1,9,9 --frames 90:99", "no"),
+        ("--boxx 1,1,9,9", "No such option"),
+        ("--box", "requires an argument"),
+        ("extra --box 1,1,9,9", "unexpected extra argument"),
+    ],
+)
+def test_bad_option_is_refused_in_one_sentence(refused, clip, script, options, words):
+    assert words in refused("run", clip, *options.split())
+    assert not Path("runs").exists()
+
+
+def test_bad_sources_are_refused_in_one_sentence(refused, script, tmp_path):
+    (tmp_path / "empty.mp4").touch()
+    (tmp_path / "text.mp4").write_text("no video")
+    (tmp_path / "folder").mkdir()
+    for source in ["absent.mp4", "empty.mp4", "text.mp4", "folder", "none/*.png", ""]:
+        assert source in refused("run", source, *BOX)
+    assert "SOURCE" in refused("run")
+
+
+@pytest.mark.parametrize(
+    ("mask", "words"),
+    [
+        (np.zeros((48, 64)), "is empty"),
+        (np.ones((48, 64)), "covers the whole"),
+        (np.eye(20), "is 20 x 20 pixels but 000.png is 64 x 48"),
+    ],
+)
+def test_bad_mask_is_refused_in_one_sentence(refused, clip, script, mask_file, mask, words):
+    assert words in refused("run", clip, "--mask", mask_file(mask))
+
+
+def test_images_of_different_sizes_are_skipped(call, clip, script):
+    Image.new("RGB", (20, 20)).save(clip / "003.png")
+    assert call("run", clip, *BOX, "--out", "run").exit_code == 0
+    assert [s["index"] for s in RunReader(Path("run")).description["skipped"]] == [3]
+
+
+def test_broken_plugin_stops_only_the_run_that_selects_it(call, refused, clip, script, monkeypatch):
+    monkeypatch.setenv("TRACKING3D_PLUGINS", "tracking3d.trackers:bad=no_such_module_at_all:Bad")
+    assert call("run", clip, *BOX).exit_code == 0
+    line = refused("run", clip, *BOX, "--tracker", "bad")
+    assert "'bad'" in line
+    assert "No module named 'no_such_module_at_all'" in line
+
+
+def test_default_folder_is_named_after_the_source(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "shots" / "frames").mkdir(parents=True)
+    (tmp_path / "film.one.mp4").touch()
+    assert default_folder("film.one.mp4") == Path("runs/film.one")
+    assert default_folder("shots/") == Path("runs/shots")
+    assert default_folder("shots/frames") == Path("runs/shots")
+    assert default_folder("shots/*.png") == Path("runs/shots")
+    assert default_folder(".") == Path("runs") / tmp_path.name
+    assert default_folder("0") == Path("runs/camera_0")

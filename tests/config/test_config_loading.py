@@ -1,0 +1,210 @@
+"""A configuration is built from layers, and whatever is wrong with one is said in a sentence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from tracking3d.config.loading import config_schema, list_presets, load_config
+from tracking3d.config.models import PipelineConfig
+from tracking3d.config.yaml_files import parse_yaml
+from tracking3d.errors import InputError
+
+
+@pytest.fixture
+def yaml_file(tmp_path: Path):
+    def write(text: str | bytes, name: str = "mine.yaml") -> Path:
+        file = tmp_path / name
+        file.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return file
+
+    return write
+
+
+def test_preset_paper_is_the_models_defaults():
+    assert load_config(preset="paper") == PipelineConfig()
+
+
+def test_presets_are_listed_and_each_is_valid():
+    assert {"default", "paper"} <= set(list_presets())
+    for name in list_presets():
+        load_config(preset=name)
+
+
+def test_default_preset_is_used_when_none_is_named():
+    assert load_config() == load_config(preset="default")
+
+
+def test_later_layers_win_key_by_key(yaml_file):
+    file = yaml_file("preset: paper\nsolver: {iterations: 7, sigma: 10, knum: 5}\nwindow: {size: 64}")
+    config = load_config(
+        file,
+        overrides=["solver.sigma=20", "solver.weights.motion=2"],
+        solver={"knum": 9},
+        tracker="precomputed",
+    )
+    assert (config.solver.iterations, config.solver.sigma, config.solver.knum) == (7, 20, 9)
+    assert config.solver.weights.motion == 2
+    assert config.solver.weights.laplacian == 1000
+    assert config.window.size == 64
+    assert config.tracker.name == "precomputed"
+
+
+def test_named_preset_wins_over_the_files(yaml_file):
+    file = yaml_file("preset: does_not_exist\nwindow: {size: 64}")
+    assert load_config(file, preset="paper").window.size == 64
+    with pytest.raises(InputError, match="no preset 'does_not_exist'"):
+        load_config(file)
+
+
+def test_plugin_may_be_a_string_in_yaml_and_on_the_command_line(yaml_file):
+    file = yaml_file("tracker: csrt\nfeatures: {name: rgb, x: 1}")
+    config = load_config(file, overrides=["features=rgb"])
+    assert config.tracker.name == "csrt"
+    assert config.features.options == {"x": 1}
+
+
+def test_another_plugin_drops_the_options_of_the_one_below(yaml_file):
+    file = yaml_file("tracker: {name: csrt, padding: 3}")
+    assert load_config(file).tracker.options == {"padding": 3}
+    assert load_config(file, tracker="csrt").tracker.options == {"padding": 3}
+    assert load_config(file, tracker={"name": "precomputed", "path": "m"}).tracker.options == {"path": "m"}
+    assert load_config(file, overrides=["tracker.name=precomputed"]).tracker.options == {}
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_options_set_beside_a_plugin_belong_to_it_in_any_order(first):
+    items = ["tracker.name=precomputed", "tracker.path=masks"]
+    config = load_config(overrides=items if first else items[::-1])
+    assert config.tracker.options == {"path": "masks"}
+    config = load_config(overrides=["tracker.path=masks"], tracker="precomputed")
+    assert config.tracker.options == {"path": "masks"}
+
+
+@pytest.mark.parametrize("text", ["", "# only a comment\n", "{}", "solver:\n  # sigma: 3\n", "---\n...\n"])
+def test_empty_file_and_empty_sections_change_nothing(yaml_file, text):
+    assert load_config(yaml_file(text)) == load_config()
+
+
+def test_override_values_are_yaml():
+    config = load_config(
+        overrides=[
+            "camera.intrinsics=[500, 500, 320, 240]",
+            "object.flat=true",
+            "solver.tau=null",
+            "solver.sigma=1e3",
+        ]
+    )
+    assert config.camera.intrinsics == (500, 500, 320, 240)
+    assert config.object.flat is True
+    assert config.solver.tau is None
+    assert config.solver.sigma == 1000
+
+
+def test_yaml_merge_keys_are_plain_data():
+    text = "x: &x {a: 1, b: 2}\ny:\n  <<: *x\n  a: 3"
+    assert parse_yaml(text, "text")["y"] == {"a": 3, "b": 2}
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("- tracker: csrt", "holds a list at its top level"),
+        ("just words", "holds a single value at its top level"),
+        ("42", "holds a single value"),
+        ("tracker: [1", "not valid YAML"),
+        ("a: b: c", "not valid YAML"),
+        ("\tsolver: 1", "not valid YAML"),
+        ("a: 1\n---\nb: 2", "another document"),
+        ("[" * 3000, "nested too deeply"),
+        ("solver: &s {sigma: *s}", "recursive"),
+        ("solver: !!python/object/apply:os.system ['touch {marker}']", "never run code"),
+        ("solver: !!python/name:os.system", "never run code"),
+        ("solver: !mine {sigma: 3}", "'!mine' is refused"),
+        ("window: {size: 64}\nwindow: {margin: 1}", r"'window' is given twice \(line 2"),
+        ("solver: {sigma: 1, sigma: 2}", "'sigma' is given twice"),
+        ("1: 2", "key 1 is not text"),
+        ("? [a, b]\n: 1", "is not text"),
+        ("solver: {sigmaa: 3}", r"no setting 'solver.sigmaa'; did you mean 'solver.sigma'\?"),
+        ("solvr: {sigma: 3}", r"no setting 'solvr'; did you mean 'solver'\?"),
+        ("fov: 30", r"no setting 'fov'; did you mean 'camera.fov'\?"),
+        ("solver: {weights: {featurs: 3}}", r"did you mean 'solver.weights.features'\?"),
+        ("zzz: 30", "no setting 'zzz'; valid are camera, features"),
+        ("solver: {sigma: lots}", "'solver.sigma' must be a valid number, not 'lots'"),
+        ("window: {size: 4}", "'window.size' must be greater than or equal to 32, not 4"),
+        ("solver: {band: erod}", "'solver.band' must be 'erode', 'soften' or 'none', not 'erod'"),
+        ("solver: {sigma: .nan}", "must be greater than 0, not nan"),
+        ("solver: 3", "'solver' must be a mapping of settings, not 3"),
+        ("solver: [1, 2]", "'solver' must be a mapping"),
+        ("tracker: [csrt]", "'tracker' must be a mapping"),
+        ("tracker: {name: 5}", "'tracker.name' must be a valid string, not 5"),
+        ("camera: {intrinsics: [1, 2, 3]}", "camera.intrinsics"),
+        ("camera: {intrinsics: 500}", "'camera.intrinsics' must be"),
+        ("preset: [paper]", "'preset' must be the name"),
+        (b"\xff\xfe\x00binary", "not a text file"),
+        (b"a: \x00", "not valid YAML"),
+    ],
+)
+def test_bad_yaml_is_one_sentence_with_the_file_and_the_place(yaml_file, tmp_path, text, sentence):
+    marker = tmp_path / "ran"
+    if isinstance(text, str):
+        text = text.replace("{marker}", str(marker))
+    with pytest.raises(InputError, match=sentence) as caught:
+        load_config(yaml_file(text))
+    assert "mine.yaml" in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert not marker.exists()
+
+
+def test_absent_file_and_folder_are_named(tmp_path):
+    with pytest.raises(InputError, match=r"absent\.yaml does not exist"):
+        load_config(tmp_path / "absent.yaml")
+    with pytest.raises(InputError, match="cannot be read"):
+        load_config(tmp_path)
+
+
+@pytest.mark.parametrize("item", ["solver", "=3", "a..b=3", ".a=3", "solver.=3", ""])
+def test_malformed_override_says_how_to_write_it(item):
+    with pytest.raises(InputError, match=r"section\.key=value"):
+        load_config(overrides=[item])
+
+
+@pytest.mark.parametrize("item", ["window.size=4", "solver.sigmaa=4", "solver.sigma=!!python/name:os.system"])
+def test_bad_override_is_quoted(item):
+    with pytest.raises(InputError) as caught:
+        load_config(overrides=["window.size=64", item])
+    assert f"--set {item}" in str(caught.value)
+
+
+def test_unknown_preset_is_answered_with_the_nearest():
+    with pytest.raises(InputError, match=r"no preset 'papr' .*did you mean 'paper'\?"):
+        load_config(preset="papr")
+    with pytest.raises(InputError, match="no preset"):
+        load_config(preset="../presets/paper")
+
+
+def test_huge_value_is_shown_short(yaml_file):
+    with pytest.raises(InputError) as caught:
+        load_config(yaml_file("solver: {sigma: " + "x" * 10_000 + "}"))
+    assert len(str(caught.value)) < 400
+
+
+def test_schema_covers_presets_and_the_short_form_of_plugins():
+    schema = config_schema()
+    assert "paper" in schema["properties"]["preset"]["enum"]
+    assert {"type": "string"} in schema["$defs"]["PluginChoice"]["anyOf"]
+    assert schema["$defs"]["WindowConfig"]["properties"]["size"]["minimum"] == 32
+
+
+def test_configuration_is_frozen():
+    with pytest.raises(ValidationError):
+        load_config(preset="paper").window.size = 64
+
+
+def test_configs_of_the_repository_are_valid():
+    files = sorted((Path(__file__).resolve().parents[2] / "configs").glob("*.yaml"))
+    assert len(files) >= 3
+    for file in files:
+        load_config(file)

@@ -1,0 +1,356 @@
+"""Scores of run folders written by hand, against a clip whose truth is simple enough to score by hand."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import asdict
+
+import cv2
+import numpy as np
+import pytest
+from rich.console import Console
+from scipy.spatial.transform import Rotation
+
+from tracking3d.errors import InputError
+from tracking3d.evaluation.clip import write_clip
+from tracking3d.evaluation.score import Scores, format_scores, score_run
+from tracking3d.geometry.camera import Camera
+
+FRAMES, WIDTH, HEIGHT = 10, 60, 40
+CAMERA = Camera.from_fov(WIDTH, HEIGHT)
+
+REQUIRED = {
+    "iou_initial_mean",
+    "iou_mean",
+    "rotation_error_mean_deg",
+    "rotation_error_median_deg",
+    "rotation_error_anchored_median_deg",
+    "share_under_5_deg",
+    "share_worse_than_initial",
+    "frames",
+}
+
+
+def square(shift):
+    """A 10 x 10 square; shifted by s it overlaps the unshifted one with IoU (10 - s) / (10 + s)."""
+    mask = np.zeros((HEIGHT, WIDTH), bool)
+    mask[10:20, 20 + shift : 30 + shift] = True
+    return mask
+
+
+def pose(degrees):
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec([0, np.radians(degrees), 0]).as_matrix()
+    T[2, 3] = 4
+    return T
+
+
+TRUE_POSES = np.stack([pose(3 * n) for n in range(FRAMES)])
+
+
+@pytest.fixture
+def clip(tmp_path):
+    images = np.zeros((FRAMES, HEIGHT, WIDTH, 3), np.uint8)
+    masks = np.stack([square(0)] * FRAMES)
+    write_clip(tmp_path / "clip", images, masks, TRUE_POSES, CAMERA, source="hand", note="")
+    return tmp_path / "clip"
+
+
+def line(index, T, **changes):
+    fields = {
+        "index": index,
+        "time": None,
+        "name": f"{index:06d}.png",
+        "T_cam_obj": T.tolist(),
+        "status": "tracked",
+        "reason": "",
+        "confidence": 1.0,
+        "losses": {},
+        "iterations": 5,
+        "keyframe": False,
+        "seconds": 0.5,
+        "iou_initial": None,
+        "area": 100,
+        "revision": False,
+    }
+    return json.dumps(fields | changes) + "\n"
+
+
+def write_masks(run, folder, masks):
+    (run / folder).mkdir(exist_ok=True)
+    for index, mask in masks.items():
+        cv2.imwrite(str(run / folder / f"{index:06d}.png"), mask.astype(np.uint8) * 255)
+
+
+@pytest.fixture
+def write_run(tmp_path):
+    """Write a run folder; without arguments a perfect one, but for initial masks that are 2 pixels off."""
+
+    def write(indices=range(FRAMES), poses=TRUE_POSES, masks=None, initial=None, changes=None, **description):
+        run = tmp_path / "run"
+        run.mkdir()
+        document = {
+            "format": "tracking3d-run",
+            "format_version": 1,
+            "state": "finished",
+            "config": {},
+            "camera": asdict(CAMERA),
+            "counts": {},
+            "timings": {},
+            "skipped": [],
+        }
+        (run / "run.json").write_text(json.dumps(document | description))
+        lines = [line(n, poses[n], **(changes or {}).get(n, {})) for n in indices]
+        (run / "frames.jsonl").write_text("".join(lines))
+        write_masks(run, "masks", {n: square(0) for n in indices} | (masks or {}))
+        write_masks(run, "initial_masks", {n: square(2) for n in indices} if initial is None else initial)
+        return run
+
+    return write
+
+
+def test_a_perfect_run_has_full_marks(write_run, clip):
+    scores = score_run(write_run(), clip)
+    assert scores.iou_mean == 1.0
+    assert scores.iou_initial_mean == pytest.approx(8 / 12)
+    assert scores.iou_gain_percent == pytest.approx(50)
+    assert scores.rotation_error_mean_deg == pytest.approx(0, abs=1e-9)
+    assert scores.rotation_error_anchored_median_deg == pytest.approx(0, abs=1e-9)
+    assert scores.share_under_5_deg == 1.0
+    assert scores.share_worse_than_initial == 0.0
+    assert (scores.frames, scores.frames_missing, scores.frames_lost) == (10, 0, 0)
+    assert (scores.frames_with_mask, scores.frames_with_pose) == (9, 10)
+    assert scores.seconds_per_frame == 0.5
+
+
+def test_the_scores_are_json_with_the_promised_keys(write_run, clip):
+    document = json.loads(json.dumps(asdict(score_run(write_run(), clip)), allow_nan=False))
+    assert document.keys() >= REQUIRED
+
+
+def test_another_object_frame_and_scale_are_no_error(write_run, clip):
+    poses = TRUE_POSES @ pose(77)
+    poses[:, :3, 3] *= 5
+    assert score_run(write_run(poses=poses), clip).rotation_error_max_deg == pytest.approx(0, abs=1e-9)
+
+
+def test_mask_means_leave_out_the_first_frame_and_count_every_other(write_run, clip):
+    run = write_run(masks={0: square(9), 1: square(5), 2: square(3), 3: square(2)})
+    scores = score_run(run, clip)
+    assert scores.iou_mean == pytest.approx((5 / 15 + 7 / 13 + 8 / 12 + 6) / 9)
+    # Frames 1 and 2 are worse than their initial mask, frame 3 equals it.
+    assert scores.share_worse_than_initial == pytest.approx(2 / 9)
+
+
+def test_a_frame_without_initial_mask_has_an_initial_iou_of_zero(write_run, clip):
+    scores = score_run(write_run(initial={n: square(0) for n in range(4)}), clip)
+    assert scores.iou_initial_mean == pytest.approx(3 / 9)
+    assert scores.share_worse_than_initial == 0.0
+
+
+def test_no_initial_mask_at_all_leaves_the_gain_unknown(write_run, clip):
+    scores = score_run(write_run(initial={}), clip)
+    assert scores.iou_initial_mean == 0.0
+    assert scores.iou_gain_percent is None
+
+
+def test_one_wrong_rotation_shows_in_mean_maximum_and_share_but_not_in_the_median(write_run, clip):
+    poses = TRUE_POSES.copy()
+    poses[4] = pose(12 + 30)
+    scores = score_run(write_run(poses=poses), clip)
+    assert scores.rotation_error_mean_deg == pytest.approx(3)
+    assert scores.rotation_error_max_deg == pytest.approx(30)
+    assert scores.rotation_error_median_deg == pytest.approx(0, abs=1e-9)
+    assert scores.share_under_5_deg == pytest.approx(0.9)
+
+
+def test_anchored_errors_inherit_the_first_frames_error_and_aligned_ones_do_not(write_run, clip):
+    poses = TRUE_POSES.copy()
+    poses[0] = pose(20)
+    scores = score_run(write_run(poses=poses), clip)
+    assert scores.rotation_error_anchored_median_deg == pytest.approx(20)
+    assert scores.rotation_error_median_deg == pytest.approx(0, abs=1e-9)
+    assert scores.rotation_error_consecutive_median_deg == pytest.approx(0, abs=1e-9)
+
+
+def test_a_lost_frame_is_not_under_five_degrees_though_its_pose_is_right(write_run, clip):
+    scores = score_run(write_run(changes={3: {"status": "lost"}, 4: {"status": "uncertain"}}), clip)
+    assert scores.share_under_5_deg == pytest.approx(0.9)
+    assert scores.rotation_error_mean_deg == pytest.approx(0, abs=1e-9)
+    assert scores.frames_lost == 1
+
+
+@pytest.mark.parametrize("what", ["missing", "nan", "mirrored"])
+def test_a_frame_without_a_usable_pose_is_half_a_turn_off(write_run, clip, what):
+    poses = TRUE_POSES.copy()
+    poses[4] = {"missing": poses[4], "nan": np.full((4, 4), np.nan), "mirrored": np.diag([1, 1, -1, 1])}[what]
+    indices = [n for n in range(FRAMES) if what != "missing" or n != 4]
+    scores = score_run(write_run(indices, poses), clip)
+    assert scores.rotation_error_mean_deg == pytest.approx(18)
+    assert scores.rotation_error_median_deg == pytest.approx(0, abs=1e-9)
+    assert scores.share_under_5_deg == pytest.approx(0.9)
+    assert scores.rotation_error_consecutive_median_deg == pytest.approx(0, abs=1e-9)
+
+
+def test_a_run_without_any_usable_pose_is_half_a_turn_off_throughout(write_run, clip):
+    scores = score_run(write_run(poses=np.full((FRAMES, 4, 4), np.nan)), clip)
+    assert scores.rotation_error_median_deg == scores.rotation_error_anchored_median_deg == 180
+    assert scores.rotation_error_consecutive_median_deg is None
+    assert scores.share_under_5_deg == 0
+
+
+def test_frames_that_an_interrupted_run_never_came_to_count_as_wrong(write_run, clip):
+    scores = score_run(write_run(range(4), state="interrupted"), clip)
+    assert scores.iou_mean == pytest.approx(3 / 9)
+    assert scores.iou_initial_mean == pytest.approx(3 / 9 * 8 / 12)
+    assert scores.share_under_5_deg == pytest.approx(0.4)
+    assert (scores.frames, scores.frames_missing) == (10, 6)
+
+
+def test_a_frame_that_was_skipped_counts_as_wrong(write_run, clip):
+    skipped = [{"index": 5, "reason": "damaged"}]
+    scores = score_run(write_run([n for n in range(FRAMES) if n != 5], skipped=skipped), clip)
+    assert scores.iou_mean == pytest.approx(8 / 9)
+    assert scores.share_worse_than_initial == 0.0
+    assert scores.share_under_5_deg == pytest.approx(0.9)
+
+
+def test_only_the_frames_a_run_was_asked_for_count(write_run, clip):
+    scores = score_run(write_run(range(2, 9, 3), masks={2: square(9)}, selection="2:9:3"), clip)
+    assert (scores.frames, scores.frames_missing) == (3, 0)
+    assert scores.iou_mean == 1.0  # frame 2 is the first of this run: its mask was given
+    assert scores.frames_with_mask == 2
+    assert scores.share_under_5_deg == 1.0
+
+
+def test_a_later_line_replaces_an_earlier_one(write_run, clip):
+    wrong = TRUE_POSES.copy()
+    wrong[7] = pose(150)
+    run = write_run(poses=wrong)
+    with (run / "frames.jsonl").open("a") as file:
+        file.write(line(7, TRUE_POSES[7], revision=True))
+    assert score_run(run, clip).rotation_error_max_deg == pytest.approx(0, abs=1e-9)
+
+
+def test_a_line_that_was_cut_off_is_a_missing_frame(write_run, clip):
+    run = write_run()
+    lines = (run / "frames.jsonl").read_text()
+    (run / "frames.jsonl").write_text(lines[:-40])
+    assert score_run(run, clip).frames_missing == 1
+
+
+def test_only_trusted_poses_are_scored(write_run, clip):
+    document = json.loads((clip / "poses.json").read_text())
+    for name in ("000004", "000005"):
+        document["frames"][name]["trusted"] = False
+    (clip / "poses.json").write_text(json.dumps(document))
+    poses = TRUE_POSES.copy()
+    poses[4:6] = pose(100)
+    scores = score_run(write_run(poses=poses), clip)
+    assert scores.frames_with_pose == 8
+    assert scores.rotation_error_max_deg == pytest.approx(0, abs=1e-9)
+
+
+def test_without_true_poses_the_rotation_figures_are_unknown(write_run, clip):
+    (clip / "poses.json").unlink()
+    scores = asdict(score_run(write_run(), clip))
+    assert {key for key, value in scores.items() if value is None} == {
+        "rotation_error_mean_deg",
+        "rotation_error_median_deg",
+        "rotation_error_max_deg",
+        "rotation_error_anchored_median_deg",
+        "rotation_error_consecutive_median_deg",
+        "share_under_5_deg",
+    }
+
+
+def test_without_true_masks_the_mask_figures_are_unknown(write_run, clip):
+    for mask in (clip / "masks").iterdir():
+        mask.unlink()
+    scores = asdict(score_run(write_run(), clip))
+    assert {key for key, value in scores.items() if value is None} == {
+        "iou_initial_mean",
+        "iou_mean",
+        "iou_gain_percent",
+        "share_worse_than_initial",
+    }
+
+
+def test_frames_without_a_true_mask_do_not_count_for_the_masks(write_run, clip):
+    (clip / "masks" / "000003.png").unlink()
+    scores = score_run(write_run(masks={3: square(9)}), clip)
+    assert (scores.iou_mean, scores.frames_with_mask) == (1.0, 8)
+
+
+def test_an_object_that_is_truly_out_of_sight_is_matched_by_an_empty_mask(write_run, clip):
+    empty = np.zeros((HEIGHT, WIDTH), bool)
+    cv2.imwrite(str(clip / "masks" / "000006.png"), empty.astype(np.uint8))
+    assert score_run(write_run(masks={6: empty}), clip).iou_mean == 1.0
+
+
+def test_a_folder_that_is_not_a_run_or_not_a_clip_is_named(write_run, clip, tmp_path):
+    with pytest.raises(InputError, match="nowhere"):
+        score_run(tmp_path / "nowhere", clip)
+    with pytest.raises(InputError, match="clip"):
+        score_run(clip, clip)
+    with pytest.raises(InputError, match="nowhere"):
+        score_run(write_run(), tmp_path / "nowhere")
+
+
+def test_broken_files_are_named(write_run, clip):
+    run = write_run()
+    lines = (run / "frames.jsonl").read_text()
+    (run / "frames.jsonl").write_text(lines.replace('"index": 3', '"index": ', 1))
+    with pytest.raises(InputError, match=r"(?i)line 4 of .*frames\.jsonl"):
+        score_run(run, clip)
+    (run / "run.json").write_text("{")
+    with pytest.raises(InputError, match=r"run\.json"):
+        score_run(run, clip)
+
+
+def test_a_run_of_something_else_has_no_frame_in_common(write_run, clip):
+    with pytest.raises(InputError, match="has no frame of the clip"):
+        score_run(write_run(range(100, 102), poses={100: pose(0), 101: pose(0)}), clip)
+
+
+def test_masks_of_another_size_are_named_with_their_frame(write_run, clip):
+    with pytest.raises(InputError, match="Frame 2: the run's mask is 8 x 6 pixels"):
+        score_run(write_run(masks={2: np.ones((6, 8), bool)}), clip)
+
+
+def test_a_mask_that_is_missing_from_the_run_is_named(write_run, clip):
+    run = write_run()
+    (run / "masks" / "000003.png").unlink()
+    with pytest.raises(InputError, match="frame 3"):
+        score_run(run, clip)
+
+
+@pytest.mark.parametrize("selection", ["5:2", "all", 7])
+def test_a_selection_that_makes_no_sense_is_named(write_run, clip, selection):
+    with pytest.raises(InputError, match="Frames"):
+        score_run(write_run(selection=selection), clip)
+
+
+def test_the_table_shows_the_figures_and_names_what_is_unknown(write_run, clip):
+    (clip / "poses.json").unlink()
+    scores = score_run(write_run(), clip)
+    console = Console(record=True, width=100, file=io.StringIO())
+    console.print(format_scores(scores))
+    text = console.export_text()
+    assert isinstance(scores, Scores)
+    assert "IoU of the answers, mean" in text and "1.000" in text and "50.0 %" in text
+    assert "unknown" in text
+
+
+def test_a_real_clip_scores_its_own_truth_perfectly(write_run, shared_data, tmp_path):
+    from tracking3d.evaluation.clip import read_truth
+
+    truth = read_truth(shared_data / "cube_in_hand")
+    wanted = range(0, 164, 20)
+    poses = {n: truth.T_cam_obj.get(n, np.full((4, 4), np.nan)) for n in wanted}
+    masks = {n: truth.mask(n) for n in wanted if n in truth.masks}
+    run = write_run(wanted, poses, masks=masks, initial=masks, selection="0:164:20")
+    scores = score_run(run, shared_data / "cube_in_hand")
+    assert scores.iou_mean == scores.iou_initial_mean == 1.0
+    assert scores.rotation_error_max_deg == pytest.approx(0, abs=1e-6)

@@ -1,0 +1,143 @@
+"""Exported meshes say what the model says, in the conventions of their formats."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import struct
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from tracking3d.errors import InputError
+from tracking3d.results.mesh_export import export_mesh, load_mesh, load_model
+from tracking3d.results.mesh_view import render_view, turned_views
+
+
+def parse_glb(data: bytes) -> tuple[dict, bytes]:
+    """JSON and binary chunk, read by the specification's byte layout."""
+    magic, version, length, json_length, json_kind = struct.unpack("<4sII I4s", data[:20])
+    assert (magic, version, length, json_kind) == (b"glTF", 2, len(data), b"JSON")
+    return json.loads(data[20 : 20 + json_length]), data[28 + json_length :]
+
+
+def accessor(tree: dict, binary: bytes, number: int) -> np.ndarray:
+    entry = tree["accessors"][number]
+    view = tree["bufferViews"][entry["bufferView"]]
+    start = view.get("byteOffset", 0) + entry.get("byteOffset", 0)
+    kind = {5126: np.float32, 5125: np.uint32, 5123: np.uint16}[entry["componentType"]]
+    columns = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}[entry["type"]]
+    return np.frombuffer(binary, kind, entry["count"] * columns, start).reshape(-1, columns)
+
+
+def test_the_glb_holds_positions_texture_coordinates_and_image_as_gltf_defines_them(tmp_path, turning_sphere):
+    model = turning_sphere.model
+    export_mesh(tmp_path, model)
+    tree, binary = parse_glb((tmp_path / "mesh.glb").read_bytes())
+    (primitive,) = [p for mesh in tree["meshes"] for p in mesh["primitives"]]
+    position = accessor(tree, binary, primitive["attributes"]["POSITION"])
+    uv = accessor(tree, binary, primitive["attributes"]["TEXCOORD_0"])
+    normal = accessor(tree, binary, primitive["attributes"]["NORMAL"])
+    index = accessor(tree, binary, primitive["indices"]).reshape(-1, 3)
+    assert np.allclose(position[index], model.vertices[model.faces], atol=1e-6)
+    # glTF's v runs down the image, as the model's does; the seam goes past 1 and the sampler repeats.
+    assert np.allclose(uv[index], model.face_uvs, atol=1e-6)
+    assert uv[:, 0].max() > 1
+    assert [(s["wrapS"], s["wrapT"]) for s in tree["samplers"]] == [(10497, 33071)]
+    assert all(texture["sampler"] == 0 for texture in tree["textures"])
+    assert np.allclose(normal, position / np.linalg.norm(position, axis=1, keepdims=True), atol=0.05)
+    view = tree["bufferViews"][tree["images"][0]["bufferView"]]
+    start = view.get("byteOffset", 0)
+    image = Image.open(io.BytesIO(binary[start : start + view["byteLength"]]))
+    assert np.array_equal(np.asarray(image.convert("RGB")), model.texture)
+    # Object coordinates as they are: nothing turns the mesh on the way.
+    assert all(
+        np.allclose(node.get("matrix", np.eye(4).ravel()), np.eye(4).ravel()) for node in tree["nodes"]
+    )
+
+
+def test_the_obj_refers_to_its_material_and_texture_with_v_upwards(tmp_path, turning_sphere):
+    model = turning_sphere.model
+    export_mesh(tmp_path, model)
+    rows: dict[str, list[list[str]]] = {}
+    for line in (tmp_path / "mesh.obj").read_text().splitlines():
+        key, *values = line.split() or ["#"]
+        rows.setdefault(key, []).append(values)
+    assert rows["mtllib"] == [["mesh.mtl"]]
+    material = (tmp_path / "mesh.mtl").read_text()
+    assert f"newmtl {rows['usemtl'][0][0]}" in material
+    assert "map_Kd texture.png" in material
+    assert "Kd 1.00000000 1.00000000 1.00000000" in material  # the texture is not darkened
+    corners = np.array([[corner.split("/")[:2] for corner in face] for face in rows["f"]]).astype(int) - 1
+    vertices, uvs = np.array(rows["v"], dtype=float), np.array(rows["vt"], dtype=float)
+    assert np.allclose(vertices[corners[..., 0]], model.vertices[model.faces], atol=1e-8)
+    assert np.allclose(uvs[corners[..., 1]] * [1, -1] + [0, 1], model.face_uvs, atol=1e-8)
+    assert np.array_equal(np.asarray(Image.open(tmp_path / "texture.png")), model.texture)
+
+
+def test_vertices_are_doubled_at_the_seam_only(tmp_path, turning_sphere):
+    model = turning_sphere.model
+    export_mesh(tmp_path, model)
+    mesh = load_mesh(tmp_path)
+    distinct = {
+        (vertex, *uv)
+        for vertex, uv in zip(model.faces.ravel(), model.face_uvs.reshape(-1, 2).tolist(), strict=True)
+    }
+    assert len(mesh.vertices) == len(distinct)
+    assert len(model.vertices) < len(mesh.vertices) < 1.2 * len(model.vertices)
+
+
+def test_a_mesh_makes_the_round_trip(tmp_path, turning_sphere):
+    model = turning_sphere.model
+    export_mesh(tmp_path, model)
+    for mesh in (load_mesh(tmp_path), trimesh.load_mesh(tmp_path / "mesh.glb", process=False)):
+        assert np.allclose(mesh.vertices[mesh.faces], model.vertices[model.faces], atol=1e-6)
+        uv = mesh.visual.uv[mesh.faces] * [1, -1] + [0, 1]
+        assert np.allclose(uv, model.face_uvs, atol=1e-6)
+    texture = load_mesh(tmp_path).visual.material.image
+    assert np.array_equal(np.asarray(texture.convert("RGB")), model.texture)
+
+
+def test_the_exact_model_makes_the_round_trip(tmp_path, turning_sphere):
+    export_mesh(tmp_path, turning_sphere.model)
+    model = load_model(tmp_path)
+    for field in dataclasses.fields(model):
+        written, read = getattr(turning_sphere.model, field.name), getattr(model, field.name)
+        assert np.array_equal(written, read), field.name
+        assert written.dtype == read.dtype, field.name
+
+
+@pytest.mark.parametrize(("load", "name"), [(load_mesh, "mesh.obj"), (load_model, "features.npz")])
+def test_an_absent_or_damaged_mesh_is_said_in_one_sentence(tmp_path, turning_sphere, load, name):
+    with pytest.raises(InputError, match=f"holds no {name}"):
+        load(tmp_path)
+    export_mesh(tmp_path, turning_sphere.model)
+    (tmp_path / name).write_bytes(b"v 1 nonsense\nf 1 2 3\n")
+    with pytest.raises(InputError, match="cannot be read"):
+        load(tmp_path)
+
+
+def test_a_view_of_the_mesh_shows_the_texture_where_it_was_seen(turning_sphere):
+    model = dataclasses.replace(
+        turning_sphere.model,
+        texture=np.full((64, 64, 3), (200, 40, 90), dtype=np.uint8),
+        texture_weight=np.concatenate([np.ones((32, 64)), np.zeros((32, 64))]).astype(np.float32),
+    )
+    picture = render_view(model, np.eye(3), 101).astype(int)
+    assert np.array_equal(picture[0, 0], [40, 40, 40])
+    upper, lower = picture[40, 50], picture[60, 50]  # the texture's upper half is up in the picture
+    assert np.abs(upper - [200, 40, 90]).max() < 10
+    assert np.ptp(lower) == 0
+    assert np.abs(lower - 128).max() < 8
+
+
+def test_new_views_look_down_on_sides_the_first_view_did_not_show():
+    first = np.eye(3)
+    views = turned_views(first, 4)
+    towards = np.array([view.T @ [0, 0, -1] for view in views])  # to the camera, in object coordinates
+    assert np.allclose(towards[:, 1], -np.sin(np.radians(20)))  # above: y points down
+    angles = np.degrees(np.arctan2(towards[:, 0], -towards[:, 2]))
+    assert np.allclose(np.sort(angles), [-135, -45, 45, 135])

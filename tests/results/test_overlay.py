@@ -1,0 +1,152 @@
+"""The overlay and the contact sheet show what they say."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from tracking3d.estimation.estimate import Status
+from tracking3d.frames import Frame
+from tracking3d.geometry.camera import Camera
+from tracking3d.results import drawing
+from tracking3d.results.contact_sheet import COLUMNS, CROPS, MOST, TILE, Thumbnails, draw_contact_sheet
+from tracking3d.results.description import summary
+from tracking3d.results.overlay import ObjectAxes, OverlaySize, draw_overlay
+from tracking3d.results.records import FrameRecord
+
+
+def overlay_of(clip, number, axes=None, **changes):
+    estimate = dataclasses.replace(clip.estimates[number], **changes)
+    record = FrameRecord.of(estimate, "", estimate.initial_mask)
+    return draw_overlay(clip.frames[number], estimate, record, clip.camera, axes)
+
+
+@pytest.mark.parametrize(
+    ("size", "picture"),
+    [
+        ((160, 120), (320, 240)),
+        ((320, 241), (320, 241)),
+        ((641, 480), (640, 480)),
+        ((3840, 2160), (1920, 1080)),
+    ],
+)
+def test_overlays_are_readable_and_of_even_size(size, picture):
+    layout = OverlaySize.of(Camera.from_fov(*size))
+    assert (layout.width, layout.picture) == picture
+    assert layout.width % 2 == layout.height % 2 == 0
+    assert layout.bar >= 22
+
+
+@pytest.mark.parametrize("size", [(160, 120), (333, 251), (640, 480)])
+def test_an_overlay_has_its_size_and_leaves_the_frame_alone(make_turning_sphere, size):
+    clip = make_turning_sphere(1, *size)
+    before = clip.frames[0].image.copy()
+    image = overlay_of(clip, 0)
+    layout = OverlaySize.of(clip.camera)
+    assert image.shape == (layout.height, layout.width, 3)
+    assert image.dtype == np.uint8
+    assert np.array_equal(clip.frames[0].image, before)
+
+
+def test_outlines_lie_on_the_edges_of_the_masks(make_turning_sphere):
+    clip = make_turning_sphere(1, 640, 480)
+    answer, initial = np.zeros((480, 640), dtype=bool), np.zeros((480, 640), dtype=bool)
+    answer[100:200, 100:200] = True
+    answer[140:160, 140:160] = False  # a hole has an edge too
+    initial[300:400, 300:400] = True
+    image = overlay_of(clip, 0, mask=answer, initial_mask=initial)
+    for y, x in [(100, 150), (199, 150), (150, 100), (140, 150)]:
+        assert tuple(image[y, x]) == drawing.REFINED
+    assert tuple(image[300, 350]) == drawing.INITIAL
+    assert np.array_equal(image[120, 120], clip.frames[0].image[120, 120])
+
+
+def test_axes_start_at_the_objects_middle_and_have_its_length(make_turning_sphere):
+    clip = make_turning_sphere(8, 640, 480)
+    axes = ObjectAxes.of(clip.estimates[0], clip.camera)
+    assert np.abs(axes.origin).max() < 0.05
+    assert axes.length == pytest.approx(1.0, abs=0.05)
+    image = overlay_of(clip, 0, axes)
+    x = round(clip.camera.cx - 0.6 / 4 * clip.camera.fx)
+    y = round(clip.camera.cy + 0.1 / 4 * clip.camera.fx)
+    assert (image[y - 4 : y + 5, x + 60] == (255, 60, 60)).all(1).any()  # x to the right
+    assert (image[y + 60, x - 4 : x + 5] == (60, 220, 60)).all(1).any()  # y down
+    assert not (image[y, x - 60 : x - 10] == (255, 60, 60)).all(1).any()
+
+
+@pytest.mark.parametrize("T", [np.full((4, 4), np.nan), np.diag([1.0, 1, 1, 1]), -np.eye(4)])
+def test_a_pose_that_cannot_be_drawn_is_left_out(turning_sphere, T):
+    axes = ObjectAxes(np.zeros(3), 1.0)
+    assert (
+        ObjectAxes.of(dataclasses.replace(turning_sphere.estimates[0], T_cam_obj=T), turning_sphere.camera)
+        is None
+    )
+    assert np.array_equal(overlay_of(turning_sphere, 0, axes, T_cam_obj=T), overlay_of(turning_sphere, 0))
+
+
+@pytest.mark.parametrize("status", list(Status))
+def test_the_status_bar_shows_status_by_colour_and_survives_any_reason(turning_sphere, status):
+    bar = overlay_of(turning_sphere, 0, status=status, reason="ünsehr lang " * 60, confidence=float("nan"))[
+        240:
+    ]
+    assert (np.abs(bar.astype(int) - drawing.STATUS[status]).max(2) < 40).any()
+    assert (bar[:, -3:] == drawing.PAPER).all()  # nothing runs out of the picture
+
+
+def test_thumbnails_are_few_and_spread_over_a_clip_of_any_length(turning_sphere):
+    picture = np.zeros((240, 320, 3), dtype=np.uint8)
+    small = dataclasses.replace(turning_sphere.estimates[0], mask=np.zeros((4, 4), dtype=bool))
+    thumbnails = Thumbnails()
+    for index in range(1000):
+        thumbnails.add(picture, 2.0, dataclasses.replace(small, index=index))
+        assert len(thumbnails.kept) <= MOST
+        steps = np.diff([thumbnail.index for thumbnail in thumbnails.kept])
+        assert len(set(steps)) <= 1
+    chosen = [thumbnail.index for thumbnail in thumbnails.spread(CROPS)]
+    assert len(chosen) == CROPS
+    assert chosen[0] == 0
+    assert chosen[-1] >= 900
+    assert Thumbnails().spread(CROPS) == []
+
+
+def test_a_thumbnail_is_centred_on_the_object(turning_sphere):
+    mask = np.zeros((120, 160), dtype=bool)
+    mask[40:60, 100:120] = True
+    picture = np.repeat(np.repeat(mask, 2, 0), 2, 1)[..., None] * np.full(3, 255, dtype=np.uint8)
+    thumbnails = Thumbnails()
+    thumbnails.add(picture, 2.0, dataclasses.replace(turning_sphere.estimates[0], mask=mask))
+    rows, columns = np.nonzero(thumbnails.kept[0].image[..., 0] > 128)
+    assert rows.mean() == pytest.approx(TILE / 2, abs=3)
+    assert columns.mean() == pytest.approx(TILE / 2, abs=3)
+    assert 0.5 < np.ptp(rows) / TILE < 0.7
+
+
+@pytest.mark.parametrize(("count", "rows"), [(0, 1), (5, 2), (12, 3)])
+def test_the_sheet_has_crops_texture_mesh_and_figures(turning_sphere, count, rows):
+    thumbnails = Thumbnails()
+    for index in range(count):
+        estimate = dataclasses.replace(turning_sphere.estimates[0], index=index, keyframe=index == 1)
+        thumbnails.add(overlay_of(turning_sphere, 0)[:240], 2.0, estimate)
+    figures = summary([], 0, 0.0)
+    sheet = draw_contact_sheet(thumbnails.spread(CROPS), turning_sphere.model, np.eye(3), figures)
+    assert sheet.shape == (rows * TILE, COLUMNS * TILE, 3)
+    framed = [tuple(sheet[1, column * TILE + 1]) == drawing.KEYFRAME for column in range(COLUMNS)]
+    assert framed == [count > 1 and column == 1 for column in range(COLUMNS)]
+
+
+def test_the_sheet_of_a_run_without_a_mesh_has_no_mesh(turning_sphere):
+    thumbnails = Thumbnails()
+    thumbnails.add(overlay_of(turning_sphere, 0)[:240], 2.0, turning_sphere.estimates[0])
+    sheet = draw_contact_sheet(thumbnails.spread(CROPS), None, np.eye(3), summary([], 0, 0.0))
+    assert sheet.shape[0] == 2 * TILE
+    assert (sheet[TILE:, TILE:] == drawing.PAPER).all()
+
+
+def test_a_frame_of_another_size_than_the_cameras_is_scaled(turning_sphere):
+    camera = turning_sphere.camera
+    frame = Frame(0, np.zeros((60, 80, 3), dtype=np.uint8))
+    estimate = turning_sphere.estimates[0]
+    record = FrameRecord.of(estimate)
+    assert draw_overlay(frame, estimate, record, camera, None).shape[1] == OverlaySize.of(camera).width

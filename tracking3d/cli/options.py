@@ -1,0 +1,70 @@
+"""Options that several commands share, and what their texts mean."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tracking3d.errors import InputError
+
+if TYPE_CHECKING:
+    from tracking3d.config.models import PipelineConfig
+
+_SETTINGS = "Settings"
+
+Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
+ConfigFile = Annotated[
+    Path | None,
+    typer.Option("--config", metavar="FILE.yaml", help="Configuration file.", rich_help_panel=_SETTINGS),
+]
+Preset = Annotated[
+    str | None,
+    typer.Option(metavar="NAME", help="Settings to start from, such as paper.", rich_help_panel=_SETTINGS),
+]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="SECTION.KEY=VALUE",
+        help="Change one setting; may be repeated.",
+        rich_help_panel=_SETTINGS,
+    ),
+]
+
+
+def configure(
+    file: Path | None, preset: str | None, overrides: list[str] | None, **direct: Any
+) -> PipelineConfig:
+    """The configuration, the options of its plug-ins checked too; None in ``direct`` is no setting."""
+    from tracking3d.config.loading import load_config
+    from tracking3d.plugins import FEATURES, TRACKERS, check_options
+
+    config = load_config(file, preset, overrides or (), **_given(direct))
+    check_options(TRACKERS, config.tracker)
+    check_options(FEATURES, config.features)
+    return config
+
+
+def _given(values: dict[str, Any]) -> dict[str, Any]:
+    """``values`` without those that are None, section by section."""
+    sections = {key: _given(value) if isinstance(value, dict) else value for key, value in values.items()}
+    return {key: value for key, value in sections.items() if value is not None and value != {}}
+
+
+def numbers(text: str, count: int, option: str, form: str) -> tuple[float, ...]:
+    """Read ``count`` finite numbers with commas between them.
+
+    Raises:
+        InputError: Anything else, naming the ``option`` and its ``form``.
+    """
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != count or not all(map(math.isfinite, values)):
+        raise InputError(f"{option} '{text}' is not {count} numbers; write it as {form}.")
+    return values

@@ -1,0 +1,82 @@
+"""What a run shows while it goes on, and at its end."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from tracking3d.cli.tables import print_table, shown
+from tracking3d.frames import SkippedFrame
+from tracking3d.recording import Listener
+from tracking3d.results import layout
+from tracking3d.results.records import FrameRecord
+from tracking3d.results.run_reader import RunReader
+
+_COLOURS = {"tracked": "green", "uncertain": "yellow", "lost": "red", "skipped": "red"}
+
+
+@contextmanager
+def progress(count: int | None, quiet: bool) -> Iterator[Listener]:
+    """A progress bar on the standard error: frame, status, IoU against the initial mask, speed, time left.
+
+    Args:
+        count: Number of frames, where known.
+        quiet: Show nothing, as where the standard error is no terminal.
+
+    Yields:
+        The listener to tell of every frame.
+    """
+    console = Console(stderr=True)
+    bar = Progress(
+        BarColumn(bar_width=24),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[frame]}"),
+        TimeRemainingColumn(compact=True),
+        console=console,
+        disable=quiet or not console.is_terminal,
+        transient=True,
+    )
+    task = bar.add_task("", total=count, frame="first frame")
+    with bar:
+        yield lambda frame: bar.update(task, advance=1, frame=_line(frame))
+
+
+def print_summary(folder: Path) -> None:
+    """Print the closing table of the run in ``folder``."""
+    run = RunReader(folder).description
+    counts, seconds = run["counts"], run["timings"]["seconds_per_frame_mean"]
+    table = Table(title=f"{escape(str(folder))} ({run['state']})", show_header=False, title_justify="left")
+    table.add_row("frames", str(counts["frames"]))
+    for status in ("tracked", "uncertain", "lost", "skipped"):
+        if counts[status] or status == "tracked":
+            table.add_row(f"  {status}", f"[{_COLOURS[status]}]{counts[status]}[/]")
+    table.add_row("mean IoU with the initial masks", shown(run["iou_initial_mean"]))
+    table.add_row("seconds per frame", shown(seconds))
+    for what, names in _OUTPUTS.items():
+        if files := [escape(str(folder / name)) for name in names if (folder / name).exists()]:
+            table.add_row(what, "\n".join(files))
+    print_table(table)
+
+
+_OUTPUTS = {
+    "poses": (layout.FRAMES,),
+    "masks": (layout.MASKS,),
+    "mesh": (layout.OBJ, layout.GLB),
+    "video": (layout.OVERLAY,),
+    "contact sheet": (layout.CONTACT_SHEET,),
+}
+
+
+def _line(frame: FrameRecord | SkippedFrame) -> str:
+    if isinstance(frame, SkippedFrame):
+        return f"[{_COLOURS['skipped']}]frame {frame.index} skipped[/]"
+    return (
+        f"frame {frame.index} [{_COLOURS[frame.status]}]{frame.status}[/] "
+        f"IoU {shown(frame.iou_initial)} {frame.seconds:.2f} s"
+    )

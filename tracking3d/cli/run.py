@@ -1,0 +1,154 @@
+"""``tracking3d run``: track an object through a video and write a run folder."""
+
+from __future__ import annotations
+
+import logging
+import shlex
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quiet, configure, numbers
+from tracking3d.errors import InputError
+
+_TRACKING, _CAMERA, _RUNNING = "The object and how to track it", "The camera", "Running"
+
+
+def run(
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="SOURCE", help="Video file, folder or pattern of images, or the number of a camera."
+        ),
+    ],
+    box: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y,W,H", help="Object in the first frame, in pixels.", rich_help_panel=_TRACKING
+        ),
+    ] = None,
+    mask: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Mask of the object in the first frame.", rich_help_panel=_TRACKING
+        ),
+    ] = None,
+    masks: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Masks of all frames, as a folder, video or .npz; the first is also the object.",
+            rich_help_panel=_TRACKING,
+        ),
+    ] = None,
+    tracker: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Mask tracker.", rich_help_panel=_TRACKING)
+    ] = None,
+    features: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Feature encoder.", rich_help_panel=_TRACKING)
+    ] = None,
+    flat: Annotated[
+        bool, typer.Option("--flat", help="The object is flat, like a card.", rich_help_panel=_TRACKING)
+    ] = False,
+    prototype: Annotated[
+        str | None,
+        typer.Option(help="First shape: sphere, ellipsoid or a mesh file.", rich_help_panel=_TRACKING),
+    ] = None,
+    fov: Annotated[
+        float | None, typer.Option(help="Vertical field of view in degrees.", rich_help_panel=_CAMERA)
+    ] = None,
+    intrinsics: Annotated[
+        str | None,
+        typer.Option(metavar="FX,FY,CX,CY", help="In pixels of the full frame.", rich_help_panel=_CAMERA),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Run folder; default runs/<source>.", rich_help_panel=_RUNNING),
+    ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace a run in that folder.", rich_help_panel=_RUNNING)
+    ] = False,
+    frames: Annotated[
+        str | None,
+        typer.Option(
+            metavar="START:STOP:STEP", help="Which frames, counted from 0.", rich_help_panel=_RUNNING
+        ),
+    ] = None,
+    config: ConfigFile = None,
+    preset: Preset = None,
+    overrides: Overrides = None,
+    size: Annotated[
+        int | None, typer.Option(help="Working resolution in pixels.", rich_help_panel=_RUNNING)
+    ] = None,
+    device: Annotated[str | None, typer.Option(help="cpu, cuda or cuda:N.", rich_help_panel=_RUNNING)] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="Seed of everything random.", rich_help_panel=_RUNNING)
+    ] = None,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Track the object through SOURCE: masks, poses and a textured mesh in a run folder.
+
+    Say what the object is by --box, --mask or --masks.
+    """
+    if box is not None and mask is not None:
+        raise InputError("Give either --box or --mask, not both.")
+    chosen: dict[str, str | None] = {"name": tracker}
+    if masks is not None:
+        if tracker not in (None, "precomputed"):
+            raise InputError(f"--masks is for the tracker precomputed; leave out --tracker {tracker}.")
+        chosen = {"name": "precomputed", "path": str(masks)}
+    camera = intrinsics and numbers(intrinsics, 4, "--intrinsics", "FX,FY,CX,CY in pixels")
+    settings = configure(
+        config,
+        preset,
+        overrides,
+        tracker=chosen,
+        features=features,
+        camera={"fov": fov, "intrinsics": camera or None},
+        object={"flat": flat or None, "prototype": prototype},
+        window={"size": size},
+        runtime={"device": device, "seed": seed},
+    )
+    if box is None and mask is None and settings.tracker.name != "precomputed":
+        raise InputError(
+            "Say what the object is in the first frame: --box X,Y,W,H, --mask FILE, or --masks DIR."
+        )
+
+    from tracking3d.cli.progress import print_summary, progress
+    from tracking3d.prompts import parse_box
+    from tracking3d.recording import record
+    from tracking3d.video import open_source
+
+    given = None if box is None else parse_box(box)
+    opened = open_source(source, frames)
+    folder = out or default_folder(source)
+    if quiet:
+        logging.getLogger("tracking3d").setLevel(logging.ERROR)
+    with progress(opened.count, quiet) as listener:
+        record(
+            opened,
+            settings,
+            folder,
+            box=given,
+            mask=mask,
+            command=shlex.join(sys.argv),
+            overwrite=overwrite,
+            listener=listener,
+        )
+    if not quiet:
+        print_summary(folder)
+
+
+def default_folder(source: str) -> Path:
+    """``runs/<name>`` after the file, the folder of images, or the camera."""
+    if source.isdigit() and not Path(source).exists():
+        return Path("runs", f"camera_{source}")
+    path = Path(source).expanduser().absolute()
+    if any(sign in path.name for sign in "*?["):
+        path = path.parent
+    if path.name in ("frames", "images"):
+        path = path.parent
+    return Path("runs", path.stem if path.is_file() else path.name)

@@ -1,0 +1,153 @@
+"""One configuration from its layers: model defaults, preset, file, ``--set``, and options given directly.
+
+A later layer wins key by key. Where a layer names another plug-in, the options that lower layers gave to the
+old one are dropped; options without a name belong to whatever plug-in is chosen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from tracking3d.config.explain import describe, hint
+from tracking3d.config.models import PipelineConfig, PluginChoice
+from tracking3d.config.yaml_files import parse_yaml, read_mapping
+from tracking3d.errors import InputError
+
+DEFAULT_PRESET = "default"
+"""The preset that is used when none is named."""
+
+_PLUGIN_SECTIONS = [
+    name for name, field in PipelineConfig.model_fields.items() if field.annotation is PluginChoice
+]
+
+Layer = tuple[str, Mapping[str, Any]]
+"""Where settings come from, as messages call it, and the settings."""
+
+
+def load_config(
+    file: Path | None = None, preset: str | None = None, overrides: Sequence[str] = (), **direct: Any
+) -> PipelineConfig:
+    """Build the configuration of a run.
+
+    Args:
+        file: A YAML file; it may choose its preset by a top-level ``preset: name``.
+        preset: Name of a preset; wins over the file's.
+        overrides: ``section.key=value`` items as ``--set`` takes them; the value is YAML.
+        direct: Settings by section, such as ``camera={"fov": 60}`` or ``tracker="csrt"``; they win over all.
+
+    Returns:
+        The validated configuration. The options of plug-ins are not checked here but by the plug-ins
+        themselves, see `tracking3d.plugins.check_options`.
+
+    Raises:
+        InputError: A file, preset, key or value that cannot be used.
+    """
+    from_file = dict(read_mapping(Path(file))) if file is not None else {}
+    file_preset = from_file.pop("preset", None)
+    if not isinstance(file_preset, str | None):
+        raise InputError(f"{file}: 'preset' must be the name of a preset, not {file_preset!r}.")
+
+    settings: dict[str, Any] = PipelineConfig().model_dump()
+    layers: list[Layer] = [_preset_layer(preset or file_preset or DEFAULT_PRESET)]
+    if file is not None:
+        layers.append((str(file), from_file))
+    spoken = [(f"--set {item}", _parse_override(item)) for item in overrides]
+    spoken.append(("", direct))
+    # The plug-ins chosen on the command line come first, so that the options of a `--set tracker.path=...`
+    # beside a `--tracker precomputed` are those of the latter.
+    chosen = ("", _plugin_names(layer for _, layer in spoken))
+
+    for origin, layer in [*layers, chosen, *spoken]:
+        settings = _merged(settings, _without_shorthand(layer), _PLUGIN_SECTIONS)
+        config = _validated(settings, origin)
+    return config
+
+
+def list_presets() -> list[str]:
+    """The names of the presets that come with the package."""
+    folder = resources.files("tracking3d.config") / "presets"
+    return sorted(Path(item.name).stem for item in folder.iterdir() if item.name.endswith(".yaml"))
+
+
+def config_schema() -> dict[str, Any]:
+    """The JSON schema of a configuration file, for editors and other tools."""
+    schema = PipelineConfig.model_json_schema()
+    schema["properties"]["preset"] = {
+        "type": "string",
+        "enum": list_presets(),
+        "default": DEFAULT_PRESET,
+        "description": "The preset that the settings of this file change.",
+    }
+    choice = schema["$defs"]["PluginChoice"]
+    schema["$defs"]["PluginChoice"] = {"anyOf": [{"type": "string"}, choice]}
+    return schema
+
+
+def _preset_layer(name: str) -> Layer:
+    names = list_presets()
+    if name not in names:
+        raise InputError(f"There is no preset '{name}' (available: {', '.join(names)}); {hint(name, names)}")
+    with resources.as_file(resources.files("tracking3d.config") / "presets" / f"{name}.yaml") as path:
+        return f"preset {name}", read_mapping(path)
+
+
+def _parse_override(item: str) -> dict[str, Any]:
+    """Turn ``a.b.c=value`` into ``{"a": {"b": {"c": value}}}``."""
+    path, equals, text = item.partition("=")
+    keys = [key.strip() for key in path.split(".")]
+    if not equals or not all(keys):
+        raise InputError(f"--set {item} cannot be read; write it as section.key=value.")
+    value: Any = parse_yaml(text, f"--set {item}")
+    for key in reversed(keys[1:]):
+        value = {key: value}
+    return {keys[0]: value}
+
+
+def _without_shorthand(layer: Mapping[str, Any]) -> dict[str, Any]:
+    """Write ``tracker: csrt`` as ``tracker: {name: csrt}``."""
+    return {
+        key: {"name": value} if key in _PLUGIN_SECTIONS and isinstance(value, str) else value
+        for key, value in layer.items()
+    }
+
+
+def _plugin_names(layers: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    names: dict[str, Any] = {}
+    for layer in layers:
+        for section, value in _without_shorthand(layer).items():
+            if section in _PLUGIN_SECTIONS and isinstance(value, dict) and isinstance(value.get("name"), str):
+                names[section] = {"name": value["name"]}
+    return names
+
+
+def _merged(
+    lower: Mapping[str, Any], upper: Mapping[str, Any], plugins: Sequence[str] = ()
+) -> dict[str, Any]:
+    """``lower`` with the values of ``upper``, mapping by mapping.
+
+    The keys in ``plugins`` hold plug-in choices: under another name, nothing of ``lower`` is kept.
+    """
+    result = dict(lower)
+    for key, value in upper.items():
+        below = result.get(key)
+        if isinstance(below, dict) and value is None:
+            continue  # a section whose every line is commented out changes nothing
+        if isinstance(below, dict) and isinstance(value, dict):
+            if key in plugins and value.get("name", below["name"]) != below["name"]:
+                below = {}
+            value = _merged(below, value)
+        result[key] = value
+    return result
+
+
+def _validated(settings: Mapping[str, Any], origin: str) -> PipelineConfig:
+    try:
+        return PipelineConfig.model_validate(settings)
+    except ValidationError as error:
+        prefix = f"{origin}: " if origin else ""
+        raise InputError(prefix + describe(error, PipelineConfig)) from error

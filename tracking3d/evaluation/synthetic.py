@@ -1,0 +1,186 @@
+"""Short clips with exact truth: a textured convex object turns and drifts before a cluttered background.
+
+OpenCV axes; pixel (0, 0) is the centre of the top-left pixel; ``x_cam = R x_obj + t``. A pixel belongs to the
+mask if the ray through its centre meets the object. One `SyntheticSpec` always gives the same clip.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from tracking3d.evaluation.clip import write_clip
+from tracking3d.evaluation.image_formation import draw
+from tracking3d.evaluation.procedural_texture import paint_background, paint_panel
+from tracking3d.evaluation.raycast import Ellipsoid, Polyhedron, Surface
+from tracking3d.frames import Box
+from tracking3d.geometry.camera import DEFAULT_FIELD_OF_VIEW, Camera
+from tracking3d.results.files import write_mask, writing
+
+SURFACES: dict[str, Surface] = {
+    "box": Polyhedron.box((0.62, 0.48, 0.56)),
+    "chamfered_box": Polyhedron.box((0.62, 0.48, 0.56), chamfer=0.25),
+    "ellipsoid": Ellipsoid(np.array([0.95, 0.7, 0.6])),
+}
+"""The objects by name, 0.95 in radius; their axes differ, so that fewer turns map one to itself."""
+
+
+@dataclass(frozen=True)
+class SyntheticSpec:
+    """What to synthesize.
+
+    Attributes:
+        shape: ``box``; ``chamfered_box``, whose corners are cut off; or ``ellipsoid``.
+        frames: Number of frames.
+        size: ``(width, height)`` in pixels.
+        degrees_per_frame: Rotation from each frame to the next.
+        axis: Axis of that rotation in camera axes, of any length.
+        drift: Movement in x, y and z from the first frame to the last, in object radii.
+        fill: Diameter of the object's enclosing sphere in the first frame relative to the image height.
+        fov: Vertical field of view in degrees.
+        clutter: 0 for a plain background to 1 for a full one.
+        noise: Standard deviation of the image noise in grey levels.
+        supersample: Rays per pixel and axis; odd, so that one goes through the pixel's centre.
+        seed: Seed of textures, background and noise.
+    """
+
+    shape: Literal["box", "chamfered_box", "ellipsoid"] = "chamfered_box"
+    frames: int = 20
+    size: tuple[int, int] = (200, 160)
+    degrees_per_frame: float = 2.0
+    axis: tuple[float, float, float] = (-0.3, 1.0, -0.15)
+    drift: tuple[float, float, float] = (0.4, -0.2, 0.4)
+    fill: float = 0.6
+    fov: float = DEFAULT_FIELD_OF_VIEW
+    clutter: float = 1.0
+    noise: float = 2.0
+    supersample: int = 3
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class SyntheticClip:
+    """Images and their truth.
+
+    Attributes:
+        images: ``(N, H, W, 3)`` uint8 RGB.
+        masks: ``(N, H, W)`` bool.
+        T_cam_obj: ``(N, 4, 4)`` float64.
+        camera: The camera of all frames.
+        surface: The object, in object coordinates.
+    """
+
+    images: NDArray[np.uint8]
+    masks: NDArray[np.bool_]
+    T_cam_obj: NDArray[np.float64]
+    camera: Camera
+    surface: Surface
+
+    @property
+    def K(self) -> NDArray[np.float64]:
+        """``(3, 3)`` intrinsic matrix."""
+        return self.camera.K
+
+    @property
+    def box(self) -> Box:
+        """Bounding box ``(x, y, width, height)`` of the first mask."""
+        x, y, width, height = (float(side) for side in cv2.boundingRect(self.masks[0].astype(np.uint8)))
+        return x, y, width, height
+
+
+def synthesize(spec: SyntheticSpec) -> SyntheticClip:
+    """Make a clip in memory.
+
+    Raises:
+        ValueError: If ``spec.supersample`` is even or there are no frames.
+    """
+    if spec.supersample % 2 == 0 or spec.frames < 1:
+        raise ValueError("supersample must be odd and frames at least 1")
+    width, height = spec.size
+    rng = np.random.default_rng(spec.seed)
+    camera = Camera.from_fov(width, height, spec.fov, origin="synthetic")
+    surface = SURFACES[spec.shape]
+    panels = np.stack([paint_panel(rng) for _ in range(surface.panels)])
+    background = paint_background(rng, width, height, spec.clutter)
+    poses = _poses(spec, camera, surface.radius)
+    images = np.empty((spec.frames, height, width, 3), np.uint8)
+    masks = np.empty((spec.frames, height, width), bool)
+    for n, pose in enumerate(poses):
+        image, masks[n] = draw(pose, camera, surface, panels, background, spec.supersample)
+        noisy = image + spec.noise * rng.standard_normal(image.shape, dtype=np.float32)
+        images[n] = np.clip(noisy.round(), 0, 255).astype(np.uint8)
+    return SyntheticClip(images, masks, poses, camera, surface)
+
+
+def degrade_masks(masks: NDArray[np.bool_], seed: int, pixels: float = 1.5) -> NDArray[np.bool_]:
+    """Move the boundaries of ``masks`` ``(N, H, W)`` in and out at random, independently in every frame.
+
+    The displacement is zero on average, has a standard deviation of ``pixels`` and varies smoothly along the
+    boundary, over about four times as far. Empty and full masks stay as they are.
+    """
+    rng = np.random.default_rng(seed)
+    degraded = masks.copy()
+    for n, mask in enumerate(masks):
+        if mask.all() or not mask.any() or pixels == 0:
+            continue
+        inside = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)
+        outside = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5)
+        # Pixel centres next to the boundary are half a pixel away from it, not one.
+        signed = np.where(mask, inside - 0.5, 0.5 - outside)
+        shift = cv2.GaussianBlur(rng.standard_normal(mask.shape), (0, 0), 4 * pixels)
+        degraded[n] = signed + pixels * shift / shift.std() > 0
+    return degraded
+
+
+def make_demo_clip(
+    folder: Path, *, seed: int = 0, frames: int = 36, size: tuple[int, int] = (320, 240)
+) -> Path:
+    """Write the clip of ``tracking3d demo`` in the layout of `tracking3d.evaluation.clip`.
+
+    Beside the exact ``masks/`` it holds ``rough_masks/``, the same with noise on their boundaries.
+
+    Args:
+        folder: Where to write; made if absent.
+        seed: Seed of textures, background and noise.
+        frames: Number of frames; the object turns by 2 degrees a frame, 70 degrees with the default.
+        size: ``(width, height)`` in pixels.
+
+    Returns:
+        The folder.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
+    spec = SyntheticSpec(frames=frames, size=size, seed=seed, degrees_per_frame=2.0)
+    clip = synthesize(spec)
+    note = f"{spec.shape}, {spec.degrees_per_frame:g} degrees a frame, seed {seed}; the truth is exact"
+    write_clip(folder, clip.images, clip.masks, clip.T_cam_obj, clip.camera, source="synthetic", note=note)
+    rough = folder / "rough_masks"
+    with writing(rough):
+        rough.mkdir(exist_ok=True)
+    for n, mask in enumerate(degrade_masks(clip.masks, seed)):
+        write_mask(rough / f"{n:06d}.png", mask)
+    return folder
+
+
+def _poses(spec: SyntheticSpec, camera: Camera, radius: float) -> NDArray[np.float64]:
+    """``(N, 4, 4)``: a steady turn about a fixed axis, along a slightly curved path centred on the image."""
+    start = Rotation.from_euler("yxz", [-30, -25, 10], degrees=True)  # shows three faces
+    axis = np.asarray(spec.axis, dtype=np.float64) / np.linalg.norm(spec.axis)
+    n = np.arange(spec.frames)
+    turn = Rotation.from_rotvec(np.radians(spec.degrees_per_frame) * n[:, None] * axis)
+    progress = n / max(spec.frames - 1, 1)
+    path = progress[:, None] * np.asarray(spec.drift)
+    path[:, :2] -= 0.5 * np.asarray(spec.drift[:2])
+    path[:, 1] += 0.15 * abs(spec.drift[0]) * np.sin(2 * np.pi * progress)
+    poses = np.tile(np.eye(4), (spec.frames, 1, 1))
+    poses[:, :3, :3] = (turn * start).as_matrix()
+    poses[:, :3, 3] = radius * path
+    poses[:, 2, 3] += 2 * radius * camera.fy / (spec.fill * camera.height)
+    return poses

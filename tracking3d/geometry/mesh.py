@@ -1,0 +1,41 @@
+"""A triangle mesh with texture coordinates, and its uniform Laplacian."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Fixed topology and atlas; the vertices are the rest shape.
+
+    Attributes:
+        vertices: ``(V, 3)`` float64 in object coordinates.
+        faces: ``(F, 3)`` int64, counter-clockwise seen from outside.
+        face_uvs: ``(F, 3, 2)`` float64, one per face corner; v runs down the texture, u wraps at 1.
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+    face_uvs: NDArray[np.float64]
+
+
+def uniform_laplacian(faces: Tensor, vertices: int) -> Tensor:
+    """Sparse ``(V, V)`` matrix L with ``(L x)_i = x_i - mean of the neighbours of i`` (SoftRas).
+
+    Args:
+        faces: ``(F, 3)`` int64.
+        vertices: Number of vertices V.
+    """
+    directed = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    edges = torch.unique(torch.cat([directed, directed.flip(1)]), dim=0)
+    degree = torch.bincount(edges[:, 0], minlength=vertices).clamp_min(1)
+    diagonal = torch.arange(vertices, device=faces.device)
+    index = torch.cat([edges.T, torch.stack([diagonal, diagonal])], 1)
+    value = torch.cat([-1.0 / degree[edges[:, 0]], torch.ones(vertices, device=faces.device)])
+    return torch.sparse_coo_tensor(index, value, (vertices, vertices), check_invariants=False).coalesce()

@@ -1,0 +1,94 @@
+"""Prototype meshes that the shape is deformed from, and the equirectangular atlas of their texture.
+
+The sphere is an icosahedron whose faces are divided into f x f triangles (frequency f): ``10 f^2 + 2`` vertices,
+1212 for f = 11 (paper section 3.4, "Initialization").
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from tracking3d.errors import InputError
+from tracking3d.geometry.mesh import Mesh
+
+
+def icosphere(frequency: int = 11) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Unit sphere of ``10 f^2 + 2`` vertices ``(V, 3)`` and ``20 f^2`` faces ``(F, 3)``, outward oriented."""
+    solid = trimesh.creation.icosahedron()
+    corners, faces = [], []
+    steps = [(i, j) for i in range(frequency + 1) for j in range(frequency + 1 - i)]
+    row = {step: k for k, step in enumerate(steps)}
+    weights = np.array([(frequency - i - j, i, j) for i, j in steps]) / frequency
+    cells = [(row[i, j], row[i + 1, j], row[i, j + 1]) for i, j in steps if i + j < frequency]
+    cells += [(row[i + 1, j], row[i + 1, j + 1], row[i, j + 1]) for i, j in steps if i + j < frequency - 1]
+    for face in solid.faces:
+        faces.append(np.array(cells) + sum(map(len, corners)))
+        corners.append(weights @ solid.vertices[face])
+    # Vertices on shared edges are computed from both sides: merge them.
+    points = np.concatenate(corners)
+    _, first, inverse = np.unique(np.round(points, 6), axis=0, return_index=True, return_inverse=True)
+    vertices = points[first] / np.linalg.norm(points[first], axis=1, keepdims=True)
+    return vertices, inverse.reshape(-1)[np.concatenate(faces)]
+
+
+def equirectangular_uvs(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Texture coordinates ``(F, 3, 2)`` of every face corner by longitude and latitude.
+
+    The poles are on the y axis; u = 0.5 looks towards the camera (-z), u grows with x and v with y, so that the
+    texture is seen upright. Faces across the seam get u beyond 1 (the texture wraps); a corner on a pole takes
+    the mean u of the other two.
+    """
+    corner = vertices[faces]
+    radius = np.linalg.norm(corner, axis=2).clip(1e-12)
+    u = np.arctan2(corner[..., 0], -corner[..., 2]) / (2 * math.pi) + 0.5
+    v = np.arccos((-corner[..., 1] / radius).clip(-1, 1)) / math.pi
+    pole = np.hypot(corner[..., 0], corner[..., 2]) < 1e-9 * radius + 1e-12
+    reference = np.where(pole, np.nan, u)
+    across = np.nanmax(reference, 1) - np.nanmin(reference, 1) > 0.5
+    reference = np.where(across[:, None] & (reference < 0.5), reference + 1, reference)
+    u = np.where(pole, np.nanmean(reference, 1, keepdims=True), reference)
+    return np.stack([u, v], 2)
+
+
+def sphere(frequency: int = 11) -> Mesh:
+    """The paper's prototype: a unit sphere around the origin."""
+    vertices, faces = icosphere(frequency)
+    return Mesh(vertices, faces, equirectangular_uvs(vertices, faces))
+
+
+def ellipsoid(axes: NDArray[np.float64], rotation: NDArray[np.float64], frequency: int = 11) -> Mesh:
+    """A sphere stretched by ``axes`` ``(3,)`` and turned by ``rotation`` ``(3, 3)``; its atlas is the sphere's."""
+    unit = sphere(frequency)
+    return Mesh((unit.vertices * axes) @ rotation.T, unit.faces, unit.face_uvs)
+
+
+def from_file(path: Path) -> Mesh:
+    """A user's mesh, centred and scaled to unit radius, with an atlas by longitude and latitude.
+
+    Raises:
+        InputError: If the file is missing or holds no triangle mesh.
+    """
+    if not path.is_file():
+        raise InputError(f"the prototype '{path}' does not exist: give sphere, ellipsoid or a mesh file")
+    try:
+        loaded = trimesh.load_mesh(path, process=False)
+    except Exception as error:  # trimesh raises whatever its loaders raise
+        raise InputError(f"the prototype '{path}' cannot be read as a mesh ({error}): give an OBJ, PLY, STL or GLB file") from error
+    if not isinstance(loaded, trimesh.Trimesh) or len(loaded.faces) == 0:
+        raise InputError(f"the prototype '{path}' holds no triangles: give an OBJ, PLY, STL or GLB file")
+    # Duplicated vertices at texture seams would tear when the shape deforms.
+    solid = trimesh.Trimesh(loaded.vertices, loaded.faces, process=False)
+    solid.merge_vertices(merge_tex=True, merge_norm=True)
+    solid.update_faces(solid.nondegenerate_faces())
+    solid.remove_unreferenced_vertices()
+    if solid.is_watertight:
+        solid.fix_normals()
+    vertices = solid.vertices - solid.bounds.mean(0)
+    vertices = vertices / np.linalg.norm(vertices, axis=1).max()
+    faces = np.asarray(solid.faces, dtype=np.int64)
+    return Mesh(np.asarray(vertices, dtype=np.float64), faces, equirectangular_uvs(vertices, faces))

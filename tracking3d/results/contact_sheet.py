@@ -1,0 +1,146 @@
+"""One picture of a whole run: crops spread over the clip, the texture and the mesh from new sides."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
+from tracking3d.frames import Image
+from tracking3d.results import drawing
+from tracking3d.results.mesh_view import render_view, turned_views
+
+TILE = 240
+COLUMNS = 6
+CROPS = 12
+MOST = 2 * CROPS
+_MARGIN = 0.35  # of the object's longer side, around it
+_LETTERS = 11
+
+
+@dataclass(frozen=True, eq=False)
+class Thumbnail:
+    """One crop of the overlay, ``(TILE, TILE, 3)``, and what is written on it."""
+
+    index: int
+    image: Image
+    status: Status
+    keyframe: bool
+
+
+class Thumbnails:
+    """At most `MOST` crops, evenly spread over a clip whose length is not known beforehand.
+
+    Every ``step``-th frame is kept; when there are too many, every other one goes and the step doubles.
+    """
+
+    def __init__(self) -> None:
+        self.kept: list[Thumbnail] = []
+        self._step = 1
+        self._frames = 0
+
+    def add(self, picture: Image, scale: float, estimate: FrameEstimate) -> None:
+        """Offer the next frame's overlay.
+
+        Args:
+            picture: ``(H, W, 3)`` overlay without its bar.
+            scale: Overlay pixels per frame pixel.
+            estimate: The answer that it shows.
+        """
+        if self._frames % self._step == 0:
+            crop = drawing.fit(_around(picture, estimate.mask, scale), TILE)
+            self.kept.append(Thumbnail(estimate.index, crop, estimate.status, estimate.keyframe))
+        self._frames += 1
+        if len(self.kept) > MOST:
+            self.kept = self.kept[::2]
+            self._step *= 2
+
+    def spread(self, count: int) -> list[Thumbnail]:
+        """``count`` of them, evenly spread, the first and the last among them."""
+        chosen = np.unique(np.linspace(0, len(self.kept) - 1, min(count, len(self.kept))).round().astype(int))
+        return [self.kept[i] for i in chosen]
+
+
+def draw_contact_sheet(
+    thumbnails: Sequence[Thumbnail],
+    model: ObjectModel | None,
+    first_rotation: NDArray[np.float64],
+    summary: dict[str, Any],
+) -> Image:
+    """Draw the sheet.
+
+    Args:
+        thumbnails: Crops in the order of the clip.
+        model: The object; None leaves texture and mesh out.
+        first_rotation: ``(3, 3)`` object to camera in the first frame; the mesh is turned away from it.
+        summary: As `tracking3d.results.description.summary` gives it.
+
+    Returns:
+        ``(H, COLUMNS * TILE, 3)``.
+    """
+    tiles = [_labelled(thumbnail) for thumbnail in thumbnails]
+    tiles += [_blank() for _ in range(-len(tiles) % COLUMNS)]
+    if model is not None:
+        texture = np.where((model.texture_weight > 0)[..., None], model.texture, model.texture // 3 + 40)
+        tiles.append(_titled(drawing.fit(texture.astype(np.uint8), TILE), "texture (pale: never seen)"))
+        for view, rotation in enumerate(turned_views(first_rotation, COLUMNS - 2)):
+            yaw = round((view + 0.5) * 360 / (COLUMNS - 2))
+            tiles.append(_titled(render_view(model, rotation, TILE), f"mesh, turned {yaw} degrees"))
+    tiles.append(_legend(summary))
+    tiles += [_blank() for _ in range(-len(tiles) % COLUMNS)]
+    return np.concatenate(
+        [np.concatenate(tiles[i : i + COLUMNS], 1) for i in range(0, len(tiles), COLUMNS)], 0
+    )
+
+
+def _around(picture: Image, mask: NDArray[np.bool_], scale: float) -> Image:
+    """The part of ``picture`` around the mask, as square as the frame allows; all of it for an empty mask."""
+    x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    if not width:
+        return picture
+    half = scale * max(width, height) * (0.5 + _MARGIN)
+    middle = scale * (x + width / 2), scale * (y + height / 2)
+    left, right = (int(np.clip(middle[0] + d, 0, picture.shape[1])) for d in (-half, half))
+    top, bottom = (int(np.clip(middle[1] + d, 0, picture.shape[0])) for d in (-half, half))
+    return picture[top:bottom, left:right] if bottom > top and right > left else picture
+
+
+def _labelled(thumbnail: Thumbnail) -> Image:
+    title = f"#{thumbnail.index} {thumbnail.status.value}" + (", keyframe" if thumbnail.keyframe else "")
+    tile = _titled(thumbnail.image, title, drawing.STATUS[thumbnail.status])
+    if thumbnail.keyframe:
+        cv2.rectangle(tile, (1, 1), (TILE - 2, TILE - 2), drawing.KEYFRAME, 3)
+    return tile
+
+
+def _titled(tile: Image, title: str, colour: drawing.Colour = drawing.INK) -> Image:
+    tile = tile.copy()
+    tile[: 2 * _LETTERS + 2] = tile[: 2 * _LETTERS + 2] // 4
+    drawing.draw_text(tile, title, _LETTERS // 2 + 3, _LETTERS * 3 // 2 + 2, _LETTERS, colour)
+    return tile
+
+
+def _legend(summary: dict[str, Any]) -> Image:
+    tile, counts = _blank(), summary["counts"]
+    per_frame, iou = summary["timings"]["seconds_per_frame_mean"], summary["iou_initial_mean"]
+    lines = [
+        (f"{counts['frames']} frames", drawing.INK),
+        *((f"{counts[status.value]} {status.value}", drawing.STATUS[status]) for status in Status),
+        (f"{counts['keyframes']} keyframes", drawing.KEYFRAME),
+        ("initial outline", drawing.INITIAL),
+        ("refined outline", drawing.REFINED),
+        (f"IoU with initial {iou:.3f}" if iou is not None else "no initial masks", drawing.INK),
+        (f"{per_frame:.2f} s a frame" if per_frame is not None else "", drawing.INK),
+    ]
+    for row, (text, colour) in enumerate(lines):
+        drawing.draw_text(tile, text, 16, 30 + row * 23, _LETTERS, colour)
+    return tile
+
+
+def _blank() -> Image:
+    return np.full((TILE, TILE, 3), drawing.PAPER, dtype=np.uint8)

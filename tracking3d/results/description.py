@@ -1,0 +1,91 @@
+"""The contents of ``run.json``: how a run was made and what came of it."""
+
+from __future__ import annotations
+
+import platform
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict
+from datetime import UTC, datetime
+from importlib import metadata
+from typing import Any
+
+import cv2
+import numpy as np
+
+from tracking3d.estimation.estimate import Status
+from tracking3d.geometry.camera import Camera
+from tracking3d.results.layout import CONVENTIONS, FORMAT, FORMAT_VERSION
+from tracking3d.results.records import FrameRecord
+
+
+def description_at_start(
+    *, config: dict[str, Any], camera: Camera, source: str, seed: int, fps: float | None, command: str | None
+) -> dict[str, Any]:
+    """What is known of a run before its first frame."""
+    return {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "state": "running",
+        "error": None,
+        "created": now(),
+        "finished": None,
+        "source": source,
+        "fps": fps,
+        "command": command,
+        "seed": seed,
+        "config": config,
+        "camera": asdict(camera),
+        "versions": versions(),
+        "conventions": CONVENTIONS,
+        "skipped": [],
+    }
+
+
+def summary(records: Sequence[FrameRecord], skipped: int, seconds: float) -> dict[str, Any]:
+    """Counts, timings and mean IoU of a run.
+
+    Args:
+        records: The answer for every frame.
+        skipped: Number of frames that could not be decoded.
+        seconds: Wall time of the whole run.
+    """
+    by_status = Counter(record.status for record in records)
+    per_frame = [record.seconds for record in records]
+    ious = [record.iou_initial for record in records if record.iou_initial is not None]
+    return {
+        "counts": {
+            "frames": len(records),
+            **{status.value: by_status[status] for status in Status},
+            "keyframes": sum(record.keyframe for record in records),
+            "skipped": skipped,
+        },
+        "timings": {
+            "seconds_total": seconds,
+            "seconds_per_frame_mean": float(np.mean(per_frame)) if per_frame else None,
+            "seconds_per_frame_median": float(np.median(per_frame)) if per_frame else None,
+        },
+        "iou_initial_mean": float(np.mean(ious)) if ious else None,
+    }
+
+
+def versions() -> dict[str, str | None]:
+    """Versions of what a result depends on."""
+    packages = {name: _version(name) for name in ("tracking3d", "torch", "kornia", "numpy")}
+    return packages | {
+        "opencv": cv2.__version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+    }
+
+
+def now() -> str:
+    """The time in UTC, ISO 8601."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None

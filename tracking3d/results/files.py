@@ -1,0 +1,75 @@
+"""Writing files so that a kill leaves either the old one or the new one, and errors in one sentence."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.errors import OutputError
+from tracking3d.results.layout import partial_path
+
+_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+_FORBIDDEN = {errno.EACCES, errno.EPERM, errno.EROFS}
+_NOT_A_FOLDER = {errno.ENOTDIR, errno.EEXIST}
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn the operating system's errors about ``path`` into one sentence.
+
+    Raises:
+        OutputError: On any `OSError` inside the block.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno in _FULL:
+            what = f"The disk is full at {path}; free some space (what was finished is kept)."
+        elif error.errno in _FORBIDDEN:
+            what = f"{path} is not writable; choose another --out."
+        elif error.errno in _NOT_A_FOLDER:
+            what = f"{path} is not a folder, or lies inside a file; choose another --out."
+        else:
+            what = f"{path} cannot be written: {error.strerror or error}; choose another --out."
+        raise OutputError(what) from error
+
+
+def write_atomic(path: Path, data: bytes) -> None:
+    """Write ``data`` beside ``path`` and rename it into place.
+
+    Raises:
+        OutputError: If it cannot be written; ``path`` is then as it was.
+    """
+    partial = partial_path(path)
+    with writing(path):
+        try:
+            partial.write_bytes(data)
+            partial.replace(path)
+        except OSError:
+            partial.unlink(missing_ok=True)
+            raise
+
+
+def write_image(path: Path, image: NDArray[np.uint8]) -> None:
+    """Write ``(H, W)`` grey or ``(H, W, 3)`` RGB uint8 as PNG, atomically."""
+    ordered = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
+    write_atomic(path, cv2.imencode(".png", ordered)[1].tobytes())
+
+
+def write_mask(path: Path, mask: NDArray[np.bool_]) -> None:
+    """Write ``(H, W)`` bool as a 0/255 PNG, atomically."""
+    write_image(path, mask.astype(np.uint8) * np.uint8(255))
+
+
+def read_mask(path: Path) -> NDArray[np.bool_] | None:
+    """Read a mask written by `write_mask`: ``(H, W)`` bool, or None if there is no such image."""
+    if not path.is_file():
+        return None
+    image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE) if path.stat().st_size else None
+    return None if image is None else image >= 128

@@ -1,0 +1,69 @@
+"""What lies where in a run folder.
+
+::
+
+    run.json            configuration as used, camera, versions, seed, counts, timings, state
+    frames.jsonl        one line a frame, flushed; a better answer for an earlier frame is a further line
+    masks/              the answers, 0/255 PNG at full resolution, named by frame index
+    initial_masks/      what the mask tracker gave
+    overlay.mp4         the video with outlines and axes
+    contact_sheet.png   the run at a glance
+    mesh.obj, mesh.mtl, texture.png, mesh.glb, features.npz
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+FORMAT = "tracking3d-run"
+FORMAT_VERSION = 1
+
+RUN = "run.json"
+FRAMES = "frames.jsonl"
+MASKS = "masks"
+INITIAL_MASKS = "initial_masks"
+OVERLAY = "overlay.mp4"
+CONTACT_SHEET = "contact_sheet.png"
+OBJ = "mesh.obj"
+MTL = "mesh.mtl"
+TEXTURE = "texture.png"
+GLB = "mesh.glb"
+FEATURES = "features.npz"
+
+CONVENTIONS = {
+    "axes": "OpenCV camera axes: x right, y down, z forward.",
+    "pixels": "Pixel (0, 0) is the centre of the top-left pixel; K is that of the full frame.",
+    "T_cam_obj": "Object to camera: x_cam = R x_obj + t, a row-major 4 x 4 matrix.",
+    "scale": "The unit of length is arbitrary unless the user gave one; only ratios mean anything.",
+    "mesh": "mesh.obj and mesh.glb are in object coordinates as they are: no axis is swapped or turned.",
+    "revisions": "The last line for an index in frames.jsonl is the answer.",
+}
+
+_FILES = (RUN, FRAMES, OVERLAY, CONTACT_SHEET, OBJ, MTL, TEXTURE, GLB, FEATURES)
+_MASK_NAME = re.compile(r"\d{6,}\.png")
+
+
+def mask_path(folder: Path, index: int) -> Path:
+    """Where the answer's mask of frame ``index`` lies."""
+    return folder / MASKS / f"{index:06d}.png"
+
+
+def initial_mask_path(folder: Path, index: int) -> Path:
+    """Where the mask tracker's mask of frame ``index`` lies."""
+    return folder / INITIAL_MASKS / f"{index:06d}.png"
+
+
+def partial_path(path: Path) -> Path:
+    """Where ``path`` is written before it is renamed into place."""
+    return path.with_name(f".{path.name}.part")
+
+
+def run_files(folder: Path) -> list[Path]:
+    """The files in ``folder`` that bear the names a run writes, unfinished ones included."""
+    named = [folder / name for name in _FILES]
+    for masks in (folder / MASKS, folder / INITIAL_MASKS):
+        if masks.is_dir():
+            names = {path.name.removeprefix(".").removesuffix(".part") for path in masks.iterdir()}
+            named += [masks / name for name in sorted(names) if _MASK_NAME.fullmatch(name)]
+    return [path for file in named for path in (file, partial_path(file)) if path.is_file()]

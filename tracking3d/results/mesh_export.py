@@ -1,0 +1,131 @@
+"""The object as OBJ with MTL and texture.png, as GLB, and exactly as features.npz; and back.
+
+Coordinates are the object's own, unchanged, in an arbitrary unit. Viewers that take y as up show an object
+that stood upright in the video upside down until it is turned.
+
+The atlas wraps in u and is clamped in v. OBJ viewers and glTF repeat a texture beyond its edge, which is
+exactly the wrap; for glTF the clamp in v is written as well. OBJ cannot say that: there the outermost half
+texel at the two poles mixes with the opposite edge.
+"""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from PIL import Image as PillowImage
+from trimesh.exchange.gltf import export_glb
+from trimesh.exchange.obj import export_obj
+
+from tracking3d.errors import InputError
+from tracking3d.estimation.estimate import ObjectModel
+from tracking3d.results.files import write_atomic
+from tracking3d.results.layout import FEATURES, GLB, MTL, OBJ, TEXTURE
+
+_REPEAT, _CLAMP, _LINEAR, _MIPMAP = 10497, 33071, 9729, 9987  # glTF's constants
+
+
+def export_mesh(folder: Path, model: ObjectModel) -> None:
+    """Write the mesh files of a run.
+
+    Raises:
+        OutputError: If one cannot be written.
+    """
+    image = PillowImage.fromarray(model.texture)
+    simple = trimesh.visual.material.SimpleMaterial(
+        image, diffuse=(255, 255, 255), ambient=(255, 255, 255), specular=(0, 0, 0), name=Path(TEXTURE).stem
+    )
+    text, files = export_obj(
+        split_mesh(model, simple),
+        include_normals=True,
+        return_texture=True,
+        digits=9,
+        mtl_name=MTL,
+        header="tracking3d: object coordinates, OpenCV axes, arbitrary unit",
+    )
+    write_atomic(folder / OBJ, text.encode())
+    for name, data in files.items():
+        write_atomic(folder / name, data)
+    pbr = trimesh.visual.material.PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0)
+    glb = export_glb(split_mesh(model, pbr), include_normals=True, tree_postprocessor=_wrap_u_clamp_v)
+    write_atomic(folder / GLB, glb)
+    exact = io.BytesIO()
+    np.savez_compressed(
+        exact,
+        vertices=model.vertices,
+        faces=model.faces,
+        face_uvs=model.face_uvs,
+        texture_weight=model.texture_weight,
+        features=model.features,
+    )
+    write_atomic(folder / FEATURES, exact.getvalue())
+
+
+def split_mesh(model: ObjectModel, material: trimesh.visual.material.Material) -> trimesh.Trimesh:
+    """The model with one texture coordinate a vertex: vertices are doubled only where the atlas has its seam.
+
+    Faces keep their order. Texture coordinates have trimesh's origin, the lower left. Normals are those of
+    the unsplit mesh, so that the seam does not show.
+    """
+    corners = np.concatenate([model.faces.reshape(-1, 1), model.face_uvs.reshape(-1, 2)], axis=1)
+    unique, inverse = np.unique(corners, axis=0, return_inverse=True)
+    vertex = unique[:, 0].astype(np.int64)
+    whole = trimesh.Trimesh(model.vertices, model.faces, process=False)
+    uv = np.stack([unique[:, 1], 1.0 - unique[:, 2]], axis=1)
+    return trimesh.Trimesh(
+        model.vertices[vertex],
+        inverse.reshape(-1, 3),
+        vertex_normals=whole.vertex_normals[vertex],
+        visual=trimesh.visual.TextureVisuals(uv, material=material),
+        process=False,
+    )
+
+
+def load_mesh(folder: Path) -> trimesh.Trimesh:
+    """Read the OBJ of a run: vertices, faces in the model's order, and the texture as its visual.
+
+    Raises:
+        InputError: If the run has no mesh, or it cannot be read.
+    """
+    path = _existing(folder / OBJ)
+    try:
+        return trimesh.load_mesh(path, process=False, maintain_order=True)
+    except Exception as error:  # trimesh raises whatever its loaders raise
+        raise InputError(
+            f"The mesh {path} cannot be read ({error}); track again with another --out."
+        ) from error
+
+
+def load_model(folder: Path) -> ObjectModel:
+    """Read the exact model of a run.
+
+    Raises:
+        InputError: If the run has no mesh, or it cannot be read.
+    """
+    path = _existing(folder / FEATURES)
+    try:
+        with np.load(path) as arrays, PillowImage.open(folder / TEXTURE) as image:
+            texture: NDArray[np.uint8] = np.asarray(image.convert("RGB"))
+            return ObjectModel(texture=texture, **{name: arrays[name] for name in arrays.files})
+    except Exception as error:  # a damaged archive raises almost anything
+        raise InputError(
+            f"The model {path} cannot be read ({error}); track again with another --out."
+        ) from error
+
+
+def _existing(path: Path) -> Path:
+    if not path.is_file():
+        raise InputError(
+            f"{path.parent} holds no {path.name}; the run has not ended, or ended without a mesh."
+        )
+    return path
+
+
+def _wrap_u_clamp_v(tree: dict[str, Any]) -> None:
+    tree["samplers"] = [{"wrapS": _REPEAT, "wrapT": _CLAMP, "magFilter": _LINEAR, "minFilter": _MIPMAP}]
+    for texture in tree.get("textures", []):
+        texture["sampler"] = 0

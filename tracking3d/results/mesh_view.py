@@ -1,0 +1,74 @@
+"""Pictures of the textured mesh from any side."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from tracking3d.estimation.estimate import ObjectModel
+from tracking3d.frames import Image
+from tracking3d.rendering.interpolation import interpolate
+from tracking3d.rendering.texture import sample_texture
+from tracking3d.rendering.visibility import rasterize
+
+_BACKGROUND = 40.0
+_UNSEEN = 128.0
+_AMBIENT = 0.45
+_DISTANCE = 4.0  # of the camera, in radii of the object
+_FILL = 0.8  # of the picture's side
+
+
+def turned_views(rotation: NDArray[np.float64], count: int, pitch: float = 20.0) -> list[NDArray[np.float64]]:
+    """Rotations ``(3, 3)`` that show the object from ``count`` sides a first view did not.
+
+    Args:
+        rotation: ``(3, 3)`` object to camera of the first view; its upright stays upright.
+        count: Number of views, evenly spread around the vertical, the first half a step off the first view.
+        pitch: Degrees by which each view looks down on the object.
+    """
+    steps = (np.arange(count) + 0.5) * 360.0 / count
+    return [Rotation.from_euler("yx", [yaw, pitch], degrees=True).as_matrix() @ rotation for yaw in steps]
+
+
+def render_view(model: ObjectModel, rotation: NDArray[np.float64], size: int) -> Image:
+    """Draw the whole object, lit from the camera, into a square picture ``(size, size, 3)``.
+
+    Texels that were never seen are grey.
+
+    Args:
+        model: The object.
+        rotation: ``(3, 3)`` object to camera.
+        size: Side in pixels.
+    """
+    low, high = model.vertices.min(0), model.vertices.max(0)
+    centred = (model.vertices - (low + high) / 2) @ rotation.T
+    radius = max(float(np.linalg.norm(centred, axis=1).max()), 1e-12)
+    points = centred / radius + (0.0, 0.0, _DISTANCE)
+    focal = 0.5 * _FILL * size * math.sqrt(_DISTANCE**2 - 1)
+    screen = torch.tensor(focal * points[:, :2] / points[:, 2:] + (size - 1) / 2)[None]
+    depth = torch.tensor(points[:, 2])[None]
+    faces = torch.tensor(model.faces)
+    face_index = rasterize(screen, depth, faces, (size, size)).face_index
+
+    normals = trimesh.Trimesh(centred, model.faces, process=False).vertex_normals
+    corners = np.concatenate([model.face_uvs, normals[model.faces], centred[model.faces] / radius], axis=2)
+    uv, normal, at = interpolate(screen, depth, faces, torch.tensor(corners), face_index).split(
+        [2, 3, 3], dim=1
+    )
+    seen = (model.texture_weight > 0)[..., None]
+    texture = torch.tensor(np.concatenate([model.texture * seen, seen], axis=2, dtype=np.float64))
+    colour, weight = sample_texture(texture, uv).split([3, 1], dim=1)
+    colour = colour + (1 - weight) * _UNSEEN
+    to_camera = torch.nn.functional.normalize(
+        torch.tensor([0.0, 0.0, -_DISTANCE], dtype=at.dtype) - at, dim=1
+    )
+    facing = (torch.nn.functional.normalize(normal, dim=1) * to_camera).sum(1, keepdim=True).clamp(0, 1)
+    picture = torch.full((size, size, 3), _BACKGROUND, dtype=colour.dtype)
+    picture[face_index[0] >= 0] = colour * (_AMBIENT + (1 - _AMBIENT) * facing)
+    result: Image = picture.round().clamp(0, 255).to(torch.uint8).numpy()
+    return result

@@ -1,0 +1,158 @@
+"""One frame with everything the tracker said about it drawn in.
+
+The picture has the outline of the initial mask (thin, orange) and of the answer (thicker, cyan), the object's
+axes (x red, y green, z blue) and below it a status bar.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.estimation.estimate import FrameEstimate
+from tracking3d.frames import Frame, Image
+from tracking3d.geometry.camera import Camera
+from tracking3d.results import drawing
+from tracking3d.results.records import FrameRecord
+
+NARROWEST, WIDEST = 320, 1920
+_AXIS_COLOURS: tuple[drawing.Colour, ...] = ((255, 60, 60), (60, 220, 60), (80, 120, 255))
+
+
+@dataclass(frozen=True)
+class OverlaySize:
+    """Layout of the overlay of one camera.
+
+    Attributes:
+        scale: Overlay pixels per frame pixel.
+        width: Width of picture and bar, even.
+        picture: Height of the picture.
+        bar: Height of the status bar below it; the sum is even.
+    """
+
+    scale: float
+    width: int
+    picture: int
+    bar: int
+
+    @classmethod
+    def of(cls, camera: Camera) -> OverlaySize:
+        """The frame's own size, unless its text could not be read or the video would be needlessly large."""
+        scale = min(max(1.0, NARROWEST / camera.width), WIDEST / camera.width)
+        width, picture = 2 * round(camera.width * scale / 2), max(round(camera.height * scale), 1)
+        bar = max(22, round(width / 30))
+        return cls(scale, width, picture, bar + (picture + bar) % 2)
+
+    @property
+    def height(self) -> int:
+        """Height of picture and bar together."""
+        return self.picture + self.bar
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectAxes:
+    """Where the axes are drawn, in object coordinates.
+
+    Attributes:
+        origin: ``(3,)``.
+        length: About the object's radius.
+    """
+
+    origin: NDArray[np.float64]
+    length: float
+
+    @classmethod
+    def of(cls, estimate: FrameEstimate, camera: Camera) -> ObjectAxes | None:
+        """The object's middle and radius as one mask and pose show them; None if they show nothing.
+
+        The mesh is known at the end only, so the mask's middle is taken at the depth of the object's origin.
+        """
+        depth = float(estimate.T_cam_obj[2, 3])
+        rows, columns = np.nonzero(estimate.mask)
+        if not len(rows) or not np.isfinite(estimate.T_cam_obj).all() or depth <= 0:
+            return None
+        middle = depth * np.linalg.solve(camera.K, np.array([columns.mean(), rows.mean(), 1.0]))
+        rotation, translation = estimate.T_cam_obj[:3, :3], estimate.T_cam_obj[:3, 3]
+        return cls(rotation.T @ (middle - translation), math.sqrt(len(rows) / math.pi) * depth / camera.fx)
+
+
+def draw_overlay(
+    frame: Frame, estimate: FrameEstimate, record: FrameRecord, camera: Camera, axes: ObjectAxes | None
+) -> Image:
+    """Draw one overlay.
+
+    Args:
+        frame: The input.
+        estimate: The answer for it.
+        record: The same answer as it is recorded.
+        camera: The camera of the full frame.
+        axes: The object's axes; None leaves them out.
+
+    Returns:
+        ``(height, width, 3)`` as `OverlaySize.of` gives them.
+    """
+    size = OverlaySize.of(camera)
+    shape = (size.width, size.picture)
+    canvas = np.full((size.height, size.width, 3), drawing.PAPER, dtype=np.uint8)
+    way = cv2.INTER_AREA if size.scale < 1 else cv2.INTER_LINEAR
+    picture = canvas[: size.picture]
+    picture[:] = cv2.resize(frame.image, shape, interpolation=way)
+    thin = max(round(size.width / 400), 1)
+    drawing.draw_outline(picture, _scaled(estimate.mask, shape), drawing.REFINED, thin + 1)
+    if estimate.initial_mask is not None:
+        drawing.draw_outline(picture, _scaled(estimate.initial_mask, shape), drawing.INITIAL, thin)
+    if axes is not None:
+        _draw_axes(picture, estimate.T_cam_obj, camera, axes, size.scale, thin + 1)
+    _draw_bar(canvas[size.picture :], record)
+    return canvas
+
+
+def _scaled(mask: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np.bool_]:
+    return cv2.resize(mask.astype(np.uint8), shape, interpolation=cv2.INTER_NEAREST).astype(bool)
+
+
+def _draw_axes(
+    picture: Image,
+    T_cam_obj: NDArray[np.float64],
+    camera: Camera,
+    axes: ObjectAxes,
+    scale: float,
+    thickness: int,
+) -> None:
+    ends = np.concatenate([axes.origin[None], axes.origin + axes.length * np.eye(3)])
+    points = ends @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3]
+    if not np.isfinite(points).all() or points[:, 2].min() <= 0:
+        return
+    pixels = (points @ camera.K.T)[:, :2] / points[:, 2:]
+    pixels = np.clip((pixels + 0.5) * scale - 0.5, -1e5, 1e5).round().astype(int)
+    for axis in np.argsort(-points[1:, 2]):  # the nearest last, on top
+        cv2.line(picture, pixels[0], pixels[axis + 1], _AXIS_COLOURS[axis], thickness, cv2.LINE_AA)
+
+
+def _draw_bar(bar: Image, record: FrameRecord) -> None:
+    height, width = bar.shape[:2]
+    letters = round(height * 0.42)
+    gap, base = letters, round((height + letters) / 2)
+    left = drawing.draw_text(bar, f"#{record.index}", gap // 2, base, letters, drawing.INK)
+    left = drawing.draw_text(
+        bar, record.status.value, left + gap, base, letters, drawing.STATUS[record.status]
+    )
+    figures = [f"conf {record.confidence:.2f}"]
+    if record.iou_initial is not None:
+        figures.append(f"IoU {record.iou_initial:.2f}")
+    for text in figures:
+        left = drawing.draw_text(bar, text, left + gap, base, letters, drawing.INK)
+    if record.keyframe:
+        left = drawing.draw_text(bar, "key", left + gap, base, letters, drawing.KEYFRAME)
+    legend = width - drawing.text_width("initial refined", letters) - gap
+    if legend > left + gap:
+        after = drawing.draw_text(bar, "initial ", legend, base, letters, drawing.INITIAL)
+        drawing.draw_text(bar, "refined", after, base, letters, drawing.REFINED)
+    reason = drawing.shorten(
+        record.reason, letters, (legend if legend > left + gap else width) - left - 2 * gap
+    )
+    drawing.draw_text(bar, reason, left + gap, base, letters, (170, 170, 175))

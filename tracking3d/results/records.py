@@ -1,0 +1,134 @@
+"""One frame as a line of ``frames.jsonl``, and back."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.estimation.estimate import FrameEstimate, Status
+
+
+@dataclass(frozen=True, eq=False)
+class FrameRecord:
+    """What the run folder keeps of one frame, its masks aside.
+
+    Attributes:
+        index: The frame's index in the source.
+        time: Seconds since the start of the video, where known.
+        name: What messages call the frame.
+        T_cam_obj: ``(4, 4)`` float64 from object to camera; NaN where the estimate had no number.
+        status: The estimator's judgement.
+        reason: Why, in words.
+        confidence: In [0, 1].
+        losses: Each loss term at the answer, unweighted, by name; NaN where it was not a number.
+        iterations: Optimizer iterations spent.
+        keyframe: Whether the frame became a keyframe.
+        seconds: Wall time spent on the frame.
+        iou_initial: IoU of the answer and the initial mask; None without an initial mask.
+        area: Pixels of the answer's mask.
+        revision: Whether this replaces an earlier answer.
+    """
+
+    index: int
+    time: float | None
+    name: str
+    T_cam_obj: NDArray[np.float64]
+    status: Status
+    reason: str
+    confidence: float
+    losses: dict[str, float]
+    iterations: int
+    keyframe: bool
+    seconds: float
+    iou_initial: float | None
+    area: int
+    revision: bool = False
+
+    @classmethod
+    def of(
+        cls,
+        estimate: FrameEstimate,
+        name: str = "",
+        initial_mask: NDArray[np.bool_] | None = None,
+        revision: bool = False,
+    ) -> Self:
+        """The record of ``estimate``, whose initial mask was ``initial_mask``."""
+        return cls(
+            index=estimate.index,
+            time=estimate.time,
+            name=name,
+            T_cam_obj=np.asarray(estimate.T_cam_obj, dtype=np.float64),
+            status=Status(estimate.status),
+            reason=estimate.reason,
+            confidence=float(estimate.confidence),
+            losses={term: float(value) for term, value in estimate.losses.items()},
+            iterations=int(estimate.iterations),
+            keyframe=bool(estimate.keyframe),
+            seconds=float(estimate.seconds),
+            iou_initial=mask_iou(estimate.mask, initial_mask),
+            area=int(np.count_nonzero(estimate.mask)),
+            revision=revision,
+        )
+
+    @classmethod
+    def from_json(cls, line: str | bytes) -> Self:
+        """Read one line.
+
+        Raises:
+            ValueError: If it is not a whole and valid record.
+        """
+        try:
+            fields = json.loads(line)
+            fields["T_cam_obj"] = np.array(fields["T_cam_obj"], dtype=np.float64).reshape(4, 4)
+            fields["status"] = Status(fields["status"])
+            fields["confidence"] = _number(fields["confidence"])
+            fields["seconds"] = _number(fields["seconds"])
+            fields["losses"] = {term: _number(value) for term, value in fields["losses"].items()}
+            return cls(**{key: value for key, value in fields.items() if key in cls.__dataclass_fields__})
+        except (KeyError, TypeError, AttributeError) as error:
+            raise ValueError(f"not a frame record: {error}") from error
+
+    def to_json(self) -> str:
+        """The record as one line of valid JSON; what is not a number is null."""
+        return json.dumps(jsonable(vars(self)), allow_nan=False)
+
+
+def latest(records: Iterable[FrameRecord]) -> list[FrameRecord]:
+    """The answer for every frame: the last record of each index, sorted by index."""
+    answers: dict[int, FrameRecord] = {}
+    for record in records:
+        before = answers.get(record.index)
+        # A revision is made long after the frame was seen and no longer knows its name.
+        answers[record.index] = replace(record, name=before.name) if before and not record.name else record
+    return [answers[index] for index in sorted(answers)]
+
+
+def mask_iou(a: NDArray[np.bool_], b: NDArray[np.bool_] | None) -> float | None:
+    """Intersection over union of two ``(H, W)`` masks; None if one is absent or both are empty."""
+    if b is None or not (union := np.count_nonzero(a | b)):
+        return None
+    return float(np.count_nonzero(a & b) / union)
+
+
+def jsonable(value: Any) -> Any:
+    """``value`` in JSON's own types: arrays as lists, paths as text, what is not a finite number as None."""
+    if isinstance(value, Mapping):
+        return {str(key): jsonable(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return jsonable(value.tolist())
+    if isinstance(value, list | tuple):
+        return [jsonable(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return str(value) if isinstance(value, Path) else value
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)

@@ -1,0 +1,143 @@
+"""Colour models of an object and its surroundings: a global one that remembers, and a local one."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+_BINS = (16, 12, 12)  # L, a, b
+_LOG_LIMIT = 3.0
+_LUT_BITS = 5  # bits a channel of the table that maps a colour to its palette entry
+
+
+def lab(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """``(H, W, 3)`` RGB to 8-bit CIE Lab."""
+    return cv2.cvtColor(image, cv2.COLOR_RGB2LAB)
+
+
+class GlobalColours:
+    """Lab histograms of object and background: those of the first mask, and running ones.
+
+    Args:
+        colours: ``(S, S, 3)`` Lab crop with the first mask.
+        mask: ``(S, S)`` bool, the object.
+        background: ``(S, S)`` bool, what is surely not the object.
+        memory: Share of the first mask's histograms in the mixture.
+        rate: How fast the running histograms follow.
+    """
+
+    def __init__(
+        self,
+        colours: NDArray[np.uint8],
+        mask: NDArray[np.bool_],
+        background: NDArray[np.bool_],
+        memory: float = 0.5,
+        rate: float = 0.1,
+    ) -> None:
+        self._memory, self._rate = memory, rate
+        self._first = _histograms(colours, mask, background)
+        self._running = self._first
+
+    def update(
+        self, colours: NDArray[np.uint8], mask: NDArray[np.bool_], background: NDArray[np.bool_]
+    ) -> None:
+        """Let the running histograms follow a mask that is trusted."""
+        self._running = (1 - self._rate) * self._running + self._rate * _histograms(colours, mask, background)
+
+    def log_ratio(self, colours: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """``(S, S)``: log of object over background likelihood of each pixel, clipped at 3."""
+        return _log_ratio(self._memory * self._first + (1 - self._memory) * self._running, colours)
+
+    def separation(
+        self, colours: NDArray[np.uint8], mask: NDArray[np.bool_], background: NDArray[np.bool_]
+    ) -> float:
+        """How much more the mask looks like the first frame's object than its surroundings do, in [-1, 1]."""
+        if not mask.any() or not background.any():
+            return 0.0
+        likeness = np.tanh(_log_ratio(self._first, colours))
+        return float(likeness[mask].mean() - likeness[background].mean()) / 2
+
+
+def _bin(colours: NDArray[np.uint8]) -> NDArray[np.int32]:
+    index = np.zeros(colours.shape[:2], np.int32)
+    for channel, bins in enumerate(_BINS):
+        index = index * bins + colours[..., channel].astype(np.int32) * bins // 256
+    return index
+
+
+def _histograms(
+    colours: NDArray[np.uint8], mask: NDArray[np.bool_], background: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    index, size = _bin(colours), int(np.prod(_BINS))
+    counts = np.stack([np.bincount(index[where], minlength=size) for where in (mask, background)]).astype(
+        float
+    )
+    # Neighbouring bins share counts: a shade seen once should not make its neighbour impossible.
+    smooth = np.stack([_smooth(c.reshape(_BINS)).ravel() for c in counts])
+    return smooth / np.maximum(smooth.sum(1, keepdims=True), 1.0)
+
+
+def _smooth(cube: NDArray[np.float64]) -> NDArray[np.float64]:
+    for axis in range(cube.ndim):
+        padded = np.pad(cube, [(int(a == axis),) * 2 for a in range(cube.ndim)], mode="edge")
+        below, above = (np.take(padded, np.arange(s, s + cube.shape[axis]), axis) for s in (0, 2))
+        cube = 0.25 * below + 0.5 * cube + 0.25 * above
+    return cube
+
+
+def _log_ratio(histograms: NDArray[np.float64], colours: NDArray[np.uint8]) -> NDArray[np.float32]:
+    floor = 1e-4  # about five pixels of a crop: rarer colours are evidence for neither side
+    table = np.log((histograms[0] + floor) / (histograms[1] + floor))
+    return np.clip(table, -_LOG_LIMIT, _LOG_LIMIT).astype(np.float32)[_bin(colours)]
+
+
+class Palette:
+    """A few colours that stand for all (k-means in Lab), to compare where each of them lay.
+
+    Args:
+        colours: ``(S, S, 3)`` Lab crop to take the colours from.
+        size: Number of colours.
+    """
+
+    def __init__(self, colours: NDArray[np.uint8], size: int = 40) -> None:
+        samples = colours[::3, ::3].reshape(-1, 3).astype(np.float32)
+        size = min(size, len(np.unique(samples, axis=0)))
+        cv2.setRNGSeed(0)  # k-means++ draws from OpenCV's generator
+        criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 10, 1.0)
+        _, _, centres = cv2.kmeans(samples, size, None, criteria, 1, cv2.KMEANS_PP_CENTERS)
+        steps = (np.arange(1 << _LUT_BITS, dtype=np.float32) + 0.5) * (256 >> _LUT_BITS)
+        grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 1, 3)
+        self._table = np.argmin(((grid - centres) ** 2).sum(-1), axis=1).astype(np.uint8)
+        self.size = size
+
+    def label(self, colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """``(S, S)``: the palette entry nearest to each pixel."""
+        short = colours.astype(np.int32) >> (8 - _LUT_BITS)
+        return self._table[(short[..., 0] << 2 * _LUT_BITS) + (short[..., 1] << _LUT_BITS) + short[..., 2]]
+
+    def local_log_ratio(
+        self,
+        labels: NDArray[np.uint8],
+        last_labels: NDArray[np.uint8],
+        last_mask: NDArray[np.float32],
+        radius: int,
+    ) -> NDArray[np.float32]:
+        """``(S, S)``: was a pixel's colour object or background within ``radius`` pixels, one frame ago?
+
+        Args:
+            labels: ``(S, S)`` palette entries of the present crop.
+            last_labels: ``(S, S)`` those of the last crop, warped onto the present one.
+            last_mask: ``(S, S)`` in [0, 1], the last mask, warped alike.
+            radius: Half the side of the neighbourhood in pixels.
+        """
+        side = (2 * radius + 1,) * 2
+        ratio = np.zeros(labels.shape, np.float32)
+        floor = 0.002
+        total = np.maximum(np.stack([cv2.blur(m, side) for m in (last_mask, 1 - last_mask)]), 0.02)
+        for entry in np.unique(labels):
+            here, where = last_labels == entry, labels == entry
+            object_ = cv2.blur(here * last_mask, side)[where] / total[0][where]
+            rest = cv2.blur(here * (1 - last_mask), side)[where] / total[1][where]
+            ratio[where] = np.log((object_ + floor) / (rest + floor))
+        return np.clip(ratio, -_LOG_LIMIT, _LOG_LIMIT)

@@ -1,0 +1,72 @@
+"""How much a mask can be trusted, without knowing the truth.
+
+Agreement with one's own prediction says nothing, since a stuck mask agrees with itself; what tells is an
+independent box, and whether colours and motion support the outline.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+_BAND = 0.08  # width of the bands along the outline, relative to the square root of the area
+_LOST_SEPARATION = 0.1
+_LOST_AGREEMENT = 0.3
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What tells a good mask from a bad one.
+
+    Attributes:
+        separation: How much better than its surroundings the mask fits the first frame's colours, in [-1, 1].
+        margin: The same just inside and outside the outline, by all the evidence but the prior, in [-1, 1].
+        agreement: IoU of the mask's box and the witness's; None without a witness.
+        believed: False where the moved last mask stands in for a segmentation that changed too much.
+    """
+
+    separation: float
+    margin: float
+    agreement: float | None = None
+    believed: bool = True
+
+    @property
+    def score(self) -> float:
+        """Confidence in [0, 1]."""
+        agreement = 1.0 if self.agreement is None else self.agreement
+        return float(np.clip(agreement * (0.5 + self.margin / 2), 0.0, 1.0))
+
+    @property
+    def doubt(self) -> str:
+        """Why the mask may be lost, or empty."""
+        if self.agreement is not None and self.agreement < _LOST_AGREEMENT:
+            return "the mask and the box tracker disagree"
+        if self.separation < _LOST_SEPARATION:
+            return "the mask's colours are not the object's"
+        return "" if self.believed else "the segmentation changed too much, the last mask was moved along"
+
+
+def outline_margin(evidence: NDArray[np.float32], mask: NDArray[np.bool_]) -> float:
+    """How much more the evidence speaks for the object just inside the outline than just outside, in [-1, 1].
+
+    Args:
+        evidence: ``(S, S)`` log-odds of the object.
+        mask: ``(S, S)``.
+    """
+    distance = signed_distance(mask)
+    band = np.abs(distance) <= max(_BAND * math.sqrt(np.count_nonzero(mask)), 1.0)
+    inner, outer = band & mask, band & ~mask
+    if not inner.any() or not outer.any():
+        return 0.0
+    likeness = np.tanh(evidence / 3)
+    return float(likeness[inner].mean() - likeness[outer].mean()) / 2
+
+
+def signed_distance(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """``(S, S)`` pixels to the outline: positive inside, negative outside."""
+    inside = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 3)
+    return inside - cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 3)

@@ -1,0 +1,63 @@
+"""Square crops of a frame at a fixed working size, and back."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.frames import Box
+from tracking3d.geometry.camera import Window
+
+
+def cut(image: NDArray, window: Window) -> NDArray:
+    """What ``window`` sees of ``image`` ``(H, W)`` or ``(H, W, C)``, resampled to ``(size, size[, C])``.
+
+    The part of the window beyond the frame repeats the frame's border.
+    """
+    rows = np.clip(np.arange(window.top, window.top + window.side), 0, image.shape[0] - 1)
+    columns = np.clip(np.arange(window.left, window.left + window.side), 0, image.shape[1] - 1)
+    region = image.take(rows, axis=0).take(columns, axis=1)
+    method = cv2.INTER_AREA if window.size < window.side else cv2.INTER_LINEAR
+    return cv2.resize(region, (window.size, window.size), interpolation=method)
+
+
+def inside_frame(shape: tuple[int, ...], window: Window) -> NDArray[np.bool_]:
+    """``(size, size)``: which pixels of ``window`` lie inside a frame of ``shape`` ``(H, W, ...)``."""
+    centres = (np.arange(window.size) + 0.5) / window.scale
+    rows, columns = window.top + centres, window.left + centres
+    return ((rows > 0) & (rows < shape[0]))[:, None] & ((columns > 0) & (columns < shape[1]))
+
+
+def paste(mask: NDArray[np.bool_], window: Window, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """A full-frame mask ``(H, W)`` in [0, 1] from a window's ``(size, size)`` mask, smooth at its outline."""
+    height, width = shape[:2]
+    soft = cv2.GaussianBlur(mask.astype(np.float32), (3, 3), 0)
+    region = cv2.resize(soft, (window.side, window.side), interpolation=cv2.INTER_LINEAR)
+    full = np.zeros((height, width), np.float32)
+    x0, y0 = max(window.left, 0), max(window.top, 0)
+    x1, y1 = min(window.left + window.side, width), min(window.top + window.side, height)
+    if x1 > x0 and y1 > y0:
+        full[y0:y1, x0:x1] = region[y0 - window.top : y1 - window.top, x0 - window.left : x1 - window.left]
+    return full
+
+
+def box_of(mask: NDArray) -> Box | None:
+    """The bounding box of ``mask > 0.5``, or None where it is empty."""
+    x, y, width, height = cv2.boundingRect((mask > 0.5).astype(np.uint8))
+    return (float(x), float(y), float(width), float(height)) if width and height else None
+
+
+def clip_box(box: Box, shape: tuple[int, ...]) -> Box | None:
+    """The part of ``box`` inside a frame of ``shape`` ``(H, W, ...)``, or None where under a pixel is left."""
+    x0, y0 = max(box[0], 0.0), max(box[1], 0.0)
+    x1, y1 = min(box[0] + box[2], float(shape[1])), min(box[1] + box[3], float(shape[0]))
+    return (x0, y0, x1 - x0, y1 - y0) if x1 - x0 >= 1 and y1 - y0 >= 1 else None
+
+
+def box_iou(a: Box, b: Box) -> float:
+    """Intersection over union of two boxes."""
+    width = min(a[0] + a[2], b[0] + b[2]) - max(a[0], b[0])
+    height = min(a[1] + a[3], b[1] + b[3]) - max(a[1], b[1])
+    common = max(width, 0.0) * max(height, 0.0)
+    return common / max(a[2] * a[3] + b[2] * b[3] - common, 1e-9)

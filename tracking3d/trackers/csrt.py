@@ -1,0 +1,137 @@
+"""CSR-DCF with a mask: OpenCV's discriminative correlation filter (Lukezic et al. 2017) finds the box, a
+temporally consistent colour segmentation finds the object in it.
+"""
+
+from __future__ import annotations
+
+from typing import Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, Field
+
+from tracking3d.errors import InputError, PluginError
+from tracking3d.frames import Box, Frame, Image, MaskEstimate, Prompt
+from tracking3d.trackers.crops import box_of, clip_box
+from tracking3d.trackers.protocol import Options
+from tracking3d.trackers.segmentation import ColourSegmentation
+
+
+class CsrtTracker:
+    """Mask tracker ``csrt``: CSR-DCF proposes the box, the colour segmentation answers with the mask.
+
+    The two correct each other: the segmentation begins anew from the box when it has lost the object. The answer
+    is deterministic. See `CsrtTracker.Options` for what can be set.
+    """
+
+    class Options(Options):
+        """Options of ``csrt``; the names are those of ``cv2.TrackerCSRT.Params``."""
+
+        segmentation_size: int = Field(
+            224, ge=64, le=1024, description="Side of the segmentation's crop in pixels."
+        )
+        resolution: float = Field(1.0, gt=0, le=1, description="Scale of the image the box tracker sees.")
+        use_rgb: bool = Field(True, description="Raw colour as features of the filter.")
+        use_hog: bool = Field(True, description="Histograms of gradients as features of the filter.")
+        use_color_names: bool = Field(True, description="Colour names as features of the filter.")
+        use_gray: bool = Field(True, description="Grey value as a feature of the filter.")
+        use_channel_weights: bool = Field(True, description="Weigh features by how well they discriminate.")
+        use_segmentation: bool = Field(False, description="CSR-DCF's own spatial reliability map.")
+        template_size: float = Field(200.0, ge=16, le=1000, description="Side of the filter in pixels.")
+        padding: float = Field(3.0, ge=1, le=10, description="Search region relative to the box.")
+        filter_lr: float = Field(0.02, ge=0, le=1, description="Learning rate of the filter.")
+        weights_lr: float = Field(0.02, ge=0, le=1, description="Learning rate of the channel weights.")
+        psr_threshold: float = Field(0.035, ge=0, description="Peak below which the filter says it is lost.")
+        number_of_scales: int = Field(33, ge=1, le=101, description="Scales tried in every frame.")
+        scale_step: float = Field(1.02, gt=1, le=2, description="Factor from one scale to the next.")
+        scale_lr: float = Field(0.025, ge=0, le=1, description="Learning rate of the scale filter.")
+
+    def __init__(self, options: CsrtTracker.Options) -> None:
+        self._options = options
+        self._boxes: BoxTracker | None = None
+        self._segmentation: ColourSegmentation | None = None
+
+    @classmethod
+    def from_options(cls, options: BaseModel) -> Self:
+        """Build the tracker from its validated options."""
+        if not isinstance(options, CsrtTracker.Options):
+            raise PluginError("The tracker csrt was built with options that are not its own.")
+        return cls(options)
+
+    def init(self, frame: Frame, prompt: Prompt) -> MaskEstimate:
+        """Start from a box or a mask; the prompt's mask is the first answer, else the box's segmentation."""
+        if clip_box(prompt.box, frame.image.shape) is None:
+            raise InputError(
+                f"The box {prompt.box} lies outside {frame.name or 'the first frame'}; give a box inside it."
+            )
+        self._segmentation = ColourSegmentation(
+            frame.image, prompt.box, prompt.mask, size=self._options.segmentation_size
+        )
+        self._boxes = BoxTracker(self._options, frame.image, prompt.box)
+        return self._segmentation.estimate
+
+    def step(self, frame: Frame) -> MaskEstimate:
+        """Answer for the next frame."""
+        if self._segmentation is None or self._boxes is None:
+            raise PluginError("The tracker csrt was asked for a frame before it was started with init.")
+        box = self._boxes.update(frame.image)
+        estimate = self._segmentation.step(frame.image, box)
+        if box is None and estimate.mask is not None:
+            return MaskEstimate(estimate.mask, estimate.score / 2, "CSR-DCF has lost the object")
+        return estimate
+
+    def correct(self, frame: Frame, mask: NDArray[np.bool_]) -> None:
+        """Re-anchor the box tracker and the segmentation on ``mask`` ``(H, W)`` in ``frame``."""
+        box = box_of(mask)
+        if box is None or self._segmentation is None:
+            return
+        self._segmentation.correct(frame.image, mask)
+        self._boxes = BoxTracker(self._options, frame.image, box)
+
+
+class BoxTracker:
+    """OpenCV's CSR-DCF, deterministic, on RGB images at a chosen resolution.
+
+    Args:
+        options: The options of ``csrt``.
+        image: ``(H, W, 3)`` RGB, the first frame.
+        box: ``(x, y, w, h)`` in it, in pixels; the part inside the image is tracked.
+    """
+
+    def __init__(self, options: CsrtTracker.Options, image: Image, box: Box) -> None:
+        params = cv2.TrackerCSRT.Params()
+        for name in CsrtTracker.Options.model_fields.keys() & set(dir(params)):
+            setattr(params, name, getattr(options, name))
+        self._scale = options.resolution
+        self._filter = cv2.TrackerCSRT.create(params)
+        view = self._view(image)
+        visible = clip_box(box, image.shape) or (0.0, 0.0, 1.0, 1.0)
+        x, y, width, height = (value * self._scale for value in visible)
+        # A filter needs a few pixels: a smaller box is grown about its corner.
+        rectangle = [int(x), int(y), max(round(width), 4), max(round(height), 4)]
+        rectangle[0] = max(min(rectangle[0], view.shape[1] - rectangle[2]), 0)
+        rectangle[1] = max(min(rectangle[1], view.shape[0] - rectangle[3]), 0)
+        cv2.setRNGSeed(0)
+        try:
+            self._filter.init(view, rectangle)
+        except cv2.error:  # an image too small or a box too slender for a filter
+            self._filter = None
+
+    def update(self, image: Image) -> Box | None:
+        """The box in the next image, or None where the filter has lost the object."""
+        if self._filter is None:
+            return None
+        cv2.setRNGSeed(0)
+        try:
+            found, box = self._filter.update(self._view(image))
+        except cv2.error:  # the object has shrunk to nothing
+            return None
+        x, y, width, height = (value / self._scale for value in box)
+        return (x, y, width, height) if found else None
+
+    def _view(self, image: Image) -> NDArray[np.uint8]:
+        bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+        if self._scale == 1:
+            return bgr
+        return cv2.resize(bgr, None, fx=self._scale, fy=self._scale, interpolation=cv2.INTER_AREA)

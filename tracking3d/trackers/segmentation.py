@@ -1,0 +1,206 @@
+"""Temporally consistent colour segmentation of one object: the last mask moved along, colours kept.
+
+Each frame, every pixel of a crop around the object collects log-odds from where the last mask has moved to, from
+global and local colours, from how the pixel moves, and from a box tracker's box where there is one; an
+edge-aware smoother turns them into a mask. The box is a *witness*, not the master: the object is segmented anew
+from it only when the mask looks lost. Any box tracker will do. Everything is deterministic and causal.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.frames import Box, Image, MaskEstimate
+from tracking3d.geometry.camera import Window
+from tracking3d.trackers.colour_models import GlobalColours, Palette, lab
+from tracking3d.trackers.confidence import Judgement, outline_margin, signed_distance
+from tracking3d.trackers.crops import box_iou, box_of, clip_box, cut, inside_frame, paste
+from tracking3d.trackers.first_mask import mask_in_box
+from tracking3d.trackers.mask_motion import MaskMotion, follow_mask
+
+_MARGIN = 0.45  # free space around the last box: how far the mask may move or grow in one frame
+_AREA_CHANGE = 0.35  # a larger relative change against the moved mask is not believed
+_PATIENCE = 3  # doubtful frames in a row before the mask is begun anew
+
+# Weights of the log-odds, against global and local colours with weight 1.
+_PRIOR, _MOTION, _WITNESS = 1.5, 2.0, 1.0
+
+
+class ColourSegmentation:
+    """Follows one object's mask through a video.
+
+    Args:
+        image: ``(H, W, 3)`` uint8 RGB, the first frame.
+        box: ``(x, y, w, h)`` in pixels, the object in it.
+        mask: ``(H, W)`` bool, the object's first mask; segmented from the box if None.
+        size: Side of the working crop in pixels.
+    """
+
+    def __init__(
+        self, image: Image, box: Box, mask: NDArray[np.bool_] | None = None, size: int = 224
+    ) -> None:
+        self._size = size
+        self._image = image
+        self._mask = mask_in_box(image, box) if mask is None else mask.astype(np.float32)
+        self._velocity = (0, 0)
+        self._doubtful_frames = 0
+        window = Window.around(box_of(self._mask) or box, _MARGIN, size)
+        colours = lab(cut(image, window))
+        inside, around = _sides(cut(self._mask, window))
+        self._colours = GlobalColours(colours, inside, around)
+        self._palette = Palette(colours)
+        self._judgement = Judgement(self._colours.separation(colours, inside, around), 1.0)
+
+    @property
+    def estimate(self) -> MaskEstimate:
+        """The latest frame's mask and score, or no mask and the reason where the object is out of sight."""
+        if box_of(self._mask) is None:
+            return MaskEstimate(None, 0.0, "the object is out of sight")
+        return MaskEstimate(self._mask, self._judgement.score, self._judgement.doubt)
+
+    def correct(self, image: Image, mask: NDArray[np.bool_]) -> None:
+        """Go on from ``mask`` ``(H, W)`` in ``image``, the latest frame; the colour models stay."""
+        self._image, self._mask = image, mask.astype(np.float32)
+        self._velocity, self._doubtful_frames = (0, 0), 0
+
+    def step(self, image: Image, witness: Box | None = None) -> MaskEstimate:
+        """Segment the next frame.
+
+        Args:
+            image: ``(H, W, 3)`` uint8 RGB.
+            witness: ``(x, y, w, h)``, a box tracker's opinion, or None where there is none.
+        """
+        witness = None if witness is None else clip_box(witness, image.shape)
+        mask, judgement = self._follow(image, witness)
+        self._doubtful_frames = self._doubtful_frames + 1 if judgement.doubt else 0
+        if witness is not None and self._doubtful_frames >= _PATIENCE:
+            mask, judgement = self._begin_anew(image, witness, mask, judgement)
+        self._velocity = _shift(box_of(self._mask), box_of(mask))
+        self._image, self._mask, self._judgement = image, mask, judgement
+        return self.estimate
+
+    def _follow(self, image: Image, witness: Box | None) -> tuple[NDArray[np.float32], Judgement]:
+        out_of_sight = np.zeros(image.shape[:2], np.float32), Judgement(0.0, 0.0, believed=False)
+        box = box_of(self._mask)
+        if box is None:
+            return out_of_sight
+        before = Window.around(box, _MARGIN, self._size)
+        right, down = self._velocity
+        window = Window(before.left + right, before.top + down, before.side, self._size)
+        last, present = cut(self._image, before), cut(image, window)
+        in_frame = inside_frame(image.shape, window)
+        motion = follow_mask(_grey(last), _grey(present), cut(self._mask, before))
+        moved = (motion.by_flow + motion.by_similarity > 1.0) & in_frame
+        area = np.count_nonzero(moved)
+        if area < 9:
+            return out_of_sight
+
+        colours = lab(present)
+        evidence = self._evidence(colours, lab(last), motion, area)
+        if witness is not None:
+            evidence -= _WITNESS * _distance_beyond(witness, window)
+        support = np.tanh((evidence + _PRIOR * _prior(motion, area)) / 3)
+        smooth = cv2.ximgproc.fastGlobalSmootherFilter(present, support, 100.0, 12.0)
+        mask = _clean((smooth > 0) & in_frame, moved)
+        believed = abs(np.count_nonzero(mask) / area - 1) <= _AREA_CHANGE
+        if not believed:
+            mask = moved
+        inside, around = _sides(mask)
+        around &= in_frame
+        separation = self._colours.separation(colours, inside, around)
+        if believed:
+            self._colours.update(colours, inside, around)
+        full = paste(mask, window, image.shape)
+        agreement = None if witness is None else box_iou(box_of(full) or (0.0, 0.0, 0.0, 0.0), witness)
+        return full, Judgement(separation, outline_margin(evidence, mask), agreement, believed)
+
+    def _evidence(
+        self, colours: NDArray[np.uint8], last_colours: NDArray[np.uint8], motion: MaskMotion, area: int
+    ) -> NDArray[np.float32]:
+        last_labels = cv2.remap(
+            self._palette.label(last_colours), motion.source, None, cv2.INTER_NEAREST,
+            borderMode=cv2.BORDER_REPLICATE,
+        )  # fmt: skip
+        radius = max(round(0.22 * math.sqrt(area)), 1)
+        local = self._palette.local_log_ratio(
+            self._palette.label(colours), last_labels, motion.by_flow, radius
+        )
+        return self._colours.log_ratio(colours) + local + _MOTION * motion.cue
+
+    def _begin_anew(
+        self, image: Image, witness: Box, mask: NDArray[np.float32], judgement: Judgement
+    ) -> tuple[NDArray[np.float32], Judgement]:
+        """Segment from the witness's box; keep the old mask unless the new one looks more like the object."""
+        fresh = mask_in_box(image, witness)
+        window = Window.around(witness, _MARGIN, self._size)
+        inside, around = _sides(cut(fresh, window))
+        around &= inside_frame(image.shape, window)
+        fresh_judgement = Judgement(
+            self._colours.separation(lab(cut(image, window)), inside, around), 0.0, judgement.agreement
+        )
+        if fresh_judgement.separation <= judgement.separation:
+            return mask, judgement
+        return fresh, fresh_judgement
+
+
+def _grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+
+
+def _disc(radius: float) -> NDArray[np.uint8]:
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * max(round(radius), 1) + 1,) * 2)
+
+
+def _sides(mask: NDArray) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """The object's pixels, and those surely beyond its outline."""
+    inside = mask > 0.5
+    grown = cv2.dilate(inside.astype(np.uint8), _disc(0.05 * math.sqrt(np.count_nonzero(inside))))
+    return inside, grown == 0
+
+
+def _prior(motion: MaskMotion, area: int) -> NDArray[np.float32]:
+    distance = signed_distance(motion.by_flow > 0.5) + signed_distance(motion.by_similarity > 0.5)
+    return np.clip(distance / np.float32(0.24 * math.sqrt(area)), -4.0, 4.0)
+
+
+def _distance_beyond(box: Box, window: Window) -> NDArray[np.float32]:
+    """``(S, S)``: distance outside ``box``, 1 at 15 % of its sides, at most 2."""
+    centres = (np.arange(window.size, dtype=np.float32) + 0.5) / window.scale
+    across, down = (
+        np.maximum(np.maximum(start - at, at - start - length), 0) / (0.15 * length)
+        for at, start, length in (
+            (window.left + centres, box[0], box[2]),
+            (window.top + centres, box[1], box[3]),
+        )
+    )
+    return np.minimum(np.hypot(across, down[:, None]), 2.0).astype(np.float32)
+
+
+def _clean(mask: NDArray[np.bool_], moved: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Drop specks, components that the moved mask does not support, and pinholes."""
+    area = np.count_nonzero(moved)
+    disc = _disc(0.02 * math.sqrt(area))
+    tidy = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, disc)
+    tidy = cv2.morphologyEx(tidy, cv2.MORPH_CLOSE, disc)
+    count, labels = cv2.connectedComponents(tidy)
+    sizes = np.bincount(labels.ravel(), minlength=count)
+    supported = np.bincount(labels[moved], minlength=count) > 0.3 * sizes
+    supported[0] = False
+    kept = supported[labels]
+    _, labels = cv2.connectedComponents((~kept).astype(np.uint8), connectivity=4)
+    pinhole = np.bincount(labels.ravel()) < 0.02 * area
+    pinhole[0] = False
+    return kept | pinhole[labels]
+
+
+def _shift(last: Box | None, present: Box | None) -> tuple[int, int]:
+    """Pixels the box's centre moved, at most the box's longer side."""
+    if last is None or present is None:
+        return 0, 0
+    limit = max(last[2:])
+    right, down = (present[i] + present[i + 2] / 2 - last[i] - last[i + 2] / 2 for i in (0, 1))
+    return round(max(min(right, limit), -limit)), round(max(min(down, limit), -limit))

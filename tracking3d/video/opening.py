@@ -1,0 +1,70 @@
+"""From what the user names to a frame source."""
+
+from __future__ import annotations
+
+import glob
+from collections.abc import Iterable
+from pathlib import Path
+
+from tracking3d.errors import InputError
+from tracking3d.frames import Image
+from tracking3d.video.array_source import ArraySource
+from tracking3d.video.image_file import is_still_image
+from tracking3d.video.image_sequence import ImageSequence
+from tracking3d.video.live_camera import LiveCamera
+from tracking3d.video.selection import parse_selection
+from tracking3d.video.source import FrameSource
+from tracking3d.video.video_file import VideoFile
+
+
+def open_source(source: str | Path | Iterable[Image], frames: str | None = None) -> FrameSource:
+    """Open a video file, a folder or glob pattern of images, a camera, or any iterable of arrays.
+
+    Args:
+        source: A path; a pattern such as ``"shots/*.png"`` (``**`` for all subfolders); the number of a
+            camera, such as ``"0"``; or an iterable of ``(H, W, 3)`` uint8 RGB arrays. A text that exists as a
+            path is taken as a path.
+        frames: ``START:STOP:STEP`` to select frames (see `parse_selection`); frames keep the source's index.
+
+    Raises:
+        InputError: If there is nothing that can be read as frames, or the selection is bad or empty.
+    """
+    selection = parse_selection(frames)
+    if isinstance(source, str | Path):
+        return _open_path(str(source), selection)
+    if isinstance(source, Iterable):
+        return ArraySource(source, selection)
+    raise InputError(
+        f"A {type(source).__name__} is no source of frames; give a path or an iterable of RGB arrays."
+    )
+
+
+def _open_path(name: str, selection: range) -> FrameSource:
+    if not name.strip():
+        raise InputError(
+            "The source has no name; give a video file, a folder or pattern of images, or a camera number."
+        )
+    path = Path(name).expanduser()
+    try:
+        if path.is_dir():
+            return ImageSequence.open(name, list(path.iterdir()), selection)
+        if path.exists():
+            return _open_file(name, path, selection)
+    except (OSError, ValueError) as error:  # no permission; a name that no file can have
+        raise InputError(f"{name} cannot be opened: {getattr(error, 'strerror', None) or error}.") from error
+    if name.isascii() and name.isdigit():
+        return LiveCamera.open(int(name), selection)
+    if glob.has_magic(name):
+        found = glob.iglob(str(path), recursive=True)  # noqa: PTH207 (Path.glob takes no absolute pattern)
+        return ImageSequence.open(name, map(Path, found), selection)
+    raise InputError(
+        f"{name} does not exist; give a video file, a folder or pattern of images, or a camera number."
+    )
+
+
+def _open_file(name: str, path: Path, selection: range) -> VideoFile:
+    if path.stat().st_size == 0:
+        raise InputError(f"{name} is empty; give a video file or a folder of images.")
+    if is_still_image(path):
+        raise InputError(f"{name} is a single image; give the folder that it is in, or a video.")
+    return VideoFile.open(name, path, selection)

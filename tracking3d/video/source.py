@@ -1,0 +1,88 @@
+"""What every frame source offers, and what holds for all of them: one frame size, at least one frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Protocol, runtime_checkable
+
+from tracking3d.errors import InputError
+from tracking3d.frames import Frame, SkippedFrame
+
+Intrinsics = tuple[float, float, float, float]
+"""``(fx, fy, cx, cy)`` in pixels of the full frame; pixel (0, 0) is the centre of the top-left pixel."""
+
+
+@runtime_checkable
+class FrameSource(Protocol):
+    """Gives frames one at a time, in order; never holds more than one of them.
+
+    Every `Frame` has the size of the first one. What cannot be used is given as a `SkippedFrame` in its
+    place. Files can be iterated again from the start; cameras and one-shot iterables go on where they are.
+
+    Attributes:
+        name: What messages call the source: the path as given, or ``"camera 0"``.
+        count: Number of selected frames where it is cheaply known (of videos, as the header has it), or None.
+        fps: Selected frames per second (the source's rate over the step), or None where it has no rate.
+        intrinsics: ``(fx, fy, cx, cy)`` in pixels where the source knows its lens, else None.
+        intrinsics_origin: Where the intrinsics came from, in words; empty where there are none.
+    """
+
+    @property
+    def name(self) -> str: ...  # noqa: D102
+
+    @property
+    def count(self) -> int | None: ...  # noqa: D102
+
+    @property
+    def fps(self) -> float | None: ...  # noqa: D102
+
+    @property
+    def intrinsics(self) -> Intrinsics | None: ...  # noqa: D102
+
+    @property
+    def intrinsics_origin(self) -> str: ...  # noqa: D102
+
+    def __iter__(self) -> Iterator[Frame | SkippedFrame]:
+        """Decode the selected frames.
+
+        Raises:
+            InputError: At the end, if not one frame could be used.
+        """
+        ...
+
+
+def checked(frames: Iterable[Frame | SkippedFrame], name: str) -> Iterator[Frame | SkippedFrame]:
+    """Pass ``frames`` on; skip those of another size than the first, and insist on at least one.
+
+    Args:
+        frames: The frames of one source, with those it could not decode.
+        name: The source's name, for messages.
+
+    Raises:
+        InputError: After the last frame, if there was none to use.
+    """
+    first: tuple[str, tuple[int, int]] | None = None
+    reason: str | None = None
+    for frame in frames:
+        if isinstance(frame, SkippedFrame):
+            reason = reason or frame.reason
+            yield frame
+        elif first is None or frame.size == first[1]:
+            first = first or (frame.name, frame.size)
+            yield frame
+        else:
+            yield SkippedFrame(
+                frame.index,
+                f"{frame.name} has {_pixels(frame.size)} pixels but {first[0]}, the first, "
+                f"has {_pixels(first[1])}; all frames must have one size",
+            )
+    if first is None:
+        raise InputError(
+            f"{name} has no frame in the selected range; choose other frames."
+            if reason is None
+            else f"{name} has no frame that can be decoded ({reason})."
+        )
+
+
+def _pixels(size: tuple[int, int]) -> str:
+    return f"{size[1]} x {size[0]}"

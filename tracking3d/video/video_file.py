@@ -1,0 +1,127 @@
+"""Frames from a video file of any codec that FFmpeg knows (through PyAV)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import av
+from av.container import InputContainer
+from av.error import FFmpegError
+from av.video.stream import VideoStream
+
+from tracking3d.errors import InputError
+from tracking3d.frames import Frame, Image, SkippedFrame
+from tracking3d.video.orientation import UPRIGHT, orientation_from_display_matrix, turn_upright
+from tracking3d.video.selection import EVERY_FRAME, within
+from tracking3d.video.source import Intrinsics, checked
+from tracking3d.video.video_decoding import decode_pictures
+
+
+@dataclass(frozen=True, eq=False)
+class VideoFile:
+    """A video file, decoded frame by frame.
+
+    See `tracking3d.video.source.FrameSource` for the attributes. Frames are turned upright as the file asks
+    for, and their times are the file's own, so that a variable frame rate is kept.
+    """
+
+    name: str
+    path: Path
+    selection: range
+    count: int | None
+    fps: float | None
+    intrinsics: Intrinsics | None = None
+    intrinsics_origin: str = ""
+
+    @classmethod
+    def open(cls, name: str, path: Path, selection: range = EVERY_FRAME) -> VideoFile:
+        """Read the file's header.
+
+        Args:
+            name: What messages call the video.
+            path: The file.
+            selection: Wanted frame indices.
+
+        Raises:
+            InputError: If it is no video, or truncated beyond use.
+        """
+        with _open(name, path) as container:
+            if container.format.name in ("tty", "image2") or container.format.name.endswith("_pipe"):
+                raise InputError(f"{name} is not a video; give a video file or a folder of images.")
+            stream = _video_stream(container)
+            if stream is None:
+                raise InputError(f"{name} has no video in it; give a file with a video stream.")
+            if stream.codec_context is None:
+                raise InputError(
+                    f"{name} uses a video codec that is not known here; convert it to H.264 first."
+                )
+            frames = _announced_frames(container, stream)
+            rate = stream.average_rate or stream.guessed_rate
+        return cls(
+            name,
+            path,
+            selection,
+            len(within(selection, frames)) if frames else None,
+            float(rate) / selection.step if rate else None,
+        )
+
+    def __iter__(self) -> Iterator[Frame | SkippedFrame]:
+        """Decode the selected frames; those that cannot be decoded are given as skipped."""
+        return checked(self._frames(), self.name)
+
+    def _frames(self) -> Iterator[Frame | SkippedFrame]:
+        with _open(self.name, self.path) as container:
+            stream = _video_stream(container)
+            assert stream is not None
+            start = stream.start_time
+            for index, picture in enumerate(decode_pictures(container, stream)):
+                seconds = None
+                if isinstance(picture, av.VideoFrame) and picture.pts is not None and stream.time_base:
+                    start = picture.pts if start is None else min(start, picture.pts)
+                    seconds = float((picture.pts - start) * stream.time_base)
+                if index in self.selection:
+                    yield _frame(index, picture, seconds)
+                if index + 1 >= self.selection.stop:
+                    return
+
+
+def _open(name: str, path: Path) -> InputContainer:
+    try:
+        # "file:" keeps FFmpeg from taking a colon in the name for a protocol.
+        return av.open(f"file:{path}", metadata_errors="ignore")
+    except (FFmpegError, OSError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{name} cannot be read as a video; is it complete? ({reason})") from error
+
+
+def _video_stream(container: InputContainer) -> VideoStream | None:
+    """The first video stream that is not the cover picture of a song."""
+    cover = av.stream.Disposition.attached_pic
+    return next((stream for stream in container.streams.video if not stream.disposition & cover), None)
+
+
+def _announced_frames(container: InputContainer, stream: VideoStream) -> int | None:
+    """How many frames the header tells of, or the rate makes likely; None where neither is known."""
+    if stream.frames:
+        return stream.frames
+    if stream.duration and stream.time_base:
+        duration = float(stream.duration * stream.time_base)
+    else:
+        duration = (container.duration or 0) / av.time_base
+    return round(duration * stream.average_rate) if duration > 0 and stream.average_rate else None
+
+
+def _frame(index: int, picture: av.VideoFrame | str, seconds: float | None) -> Frame | SkippedFrame:
+    name = f"frame {index}"
+    if isinstance(picture, str):
+        return SkippedFrame(index, f"{name}: {picture}")
+    try:
+        image = cast(Image, picture.to_ndarray(format="rgb24"))
+    except (FFmpegError, ValueError) as error:
+        return SkippedFrame(index, f"{name}: its pixels cannot be converted to RGB: {error}")
+    matrix: Any = picture.side_data.get("DISPLAYMATRIX")
+    orientation = UPRIGHT if matrix is None else orientation_from_display_matrix(bytes(matrix))
+    return Frame(index, turn_upright(image, orientation), seconds, name)
