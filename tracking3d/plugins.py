@@ -129,9 +129,9 @@ def check_options(group: str, choice: PluginChoice) -> BaseModel:
     """
     plugin = _find(group, choice.name)
     model: type[BaseModel] = _load(plugin).Options
-    if model.model_config.get("extra", "ignore") == "ignore":  # pydantic would ignore a misspelt option
-        for key in choice.options.keys() - model.model_fields.keys():
-            raise PluginError(f"{plugin.label}: {unknown_key([key], model, 'option')}")
+    unknown = [key for key in choice.options if key not in model.model_fields]
+    if unknown and model.model_config.get("extra", "ignore") == "ignore":  # in silence, as pydantic would
+        raise PluginError(f"{plugin.label}: {unknown_key(unknown[:1], model, 'option')}")
     try:
         return model.model_validate(choice.options)
     except ValidationError as error:
@@ -175,7 +175,7 @@ def _distribution(point: metadata.EntryPoint) -> tuple[str, str]:
     """Package and version behind an entry point; its metadata may be damaged or absent."""
     try:
         dist = point.dist
-        return (dist.name, dist.version) if dist else ("unknown", "")
+        return (dist.name or "unknown", dist.version or "") if dist else ("unknown", "")
     except Exception:
         return "unknown", ""
 

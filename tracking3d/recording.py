@@ -76,13 +76,14 @@ def record(
                 listener(frame)
             else:
                 listener(writer.write(session.step(frame), frame))
+        model = session.result()
     except BaseException as error:
         failed = isinstance(error, Exception)
         error.add_note(f"What was finished until then is kept in {folder}.")
         with suppress(OutputError):  # the first error is the one to tell
             writer.finish(_model(session), "failed" if failed else "interrupted", str(error) or None)
         raise
-    writer.finish(session.result(), "finished")
+    writer.finish(model, "finished")
 
 
 def _first_frame(frames: Iterator[Frame | SkippedFrame], name: str) -> tuple[list[SkippedFrame], Frame]:

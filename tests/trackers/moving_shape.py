@@ -10,7 +10,9 @@ from tracking3d.frames import Box, Frame
 SIZE = (180, 240)
 
 
-def clutter(seed: int, size: tuple[int, int], low: tuple[int, int, int], high: tuple[int, int, int]) -> np.ndarray:
+def clutter(
+    seed: int, size: tuple[int, int], low: tuple[int, int, int], high: tuple[int, int, int]
+) -> np.ndarray:
     """Smooth random colours between ``low`` and ``high``, ``(H, W, 3)`` float."""
     noise = np.random.default_rng(seed).random((*size, 3)).astype(np.float32)
     noise = cv2.GaussianBlur(noise, (0, 0), 2.0)
@@ -18,7 +20,9 @@ def clutter(seed: int, size: tuple[int, int], low: tuple[int, int, int], high: t
     return np.asarray(low) + noise * (np.asarray(high) - np.asarray(low))
 
 
-def moving_shape(count: int, step: float = 3.0, turn: float = 2.0, start: float = 60.0) -> tuple[list[Frame], np.ndarray]:
+def moving_shape(
+    count: int, step: float = 3.0, turn: float = 2.0, start: float = 60.0
+) -> tuple[list[Frame], np.ndarray]:
     """A warm hexagon with a dent that drifts and turns over a cool background.
 
     Returns:
@@ -27,7 +31,14 @@ def moving_shape(count: int, step: float = 3.0, turn: float = 2.0, start: float 
     background = clutter(1, SIZE, (0, 40, 60), (90, 160, 255))
     texture = clutter(2, (160, 160), (120, 30, 0), (255, 200, 90))
     angles = np.radians([0, 60, 120, 180, 240, 300])
-    outline = 80 + 45 * np.stack([np.cos(angles), np.sin(angles)], 1) * [[1.0], [1.0], [0.7], [1.0], [1.0], [1.0]]
+    outline = 80 + 45 * np.stack([np.cos(angles), np.sin(angles)], 1) * [
+        [1.0],
+        [1.0],
+        [0.7],
+        [1.0],
+        [1.0],
+        [1.0],
+    ]
     stencil = np.zeros((160, 160), np.float32)
     cv2.fillPoly(stencil, [outline.round().astype(np.int32)], 1.0)
     frames, masks = [], []

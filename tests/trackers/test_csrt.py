@@ -135,7 +135,8 @@ def test_a_box_outside_the_frame_is_an_input_error(box: tuple[float, float, floa
 
 
 @pytest.mark.parametrize(
-    "box", [(100.0, 80.0, 1.0, 1.0), (0.0, 0.0, 2.5, 60.0), (239.0, 179.0, 1.0, 1.0), (0.0, 0.0, 240.0, 180.0)]
+    "box",
+    [(100.0, 80.0, 1.0, 1.0), (0.0, 0.0, 2.5, 60.0), (239.0, 179.0, 1.0, 1.0), (0.0, 0.0, 240.0, 180.0)],
 )
 @pytest.mark.parametrize("picture", ["shape", "black", "white", "noise"])
 def test_any_box_in_any_image_is_answered(box: tuple[float, float, float, float], picture: str) -> None:
@@ -184,7 +185,11 @@ def test_options_are_checked() -> None:
 def test_options_reach_the_filter() -> None:
     frames, truth = moving_shape(6)
     prompt = Prompt(box_around(truth[0]))
-    for options in ({"resolution": 0.5}, {"template_size": 64.0, "use_hog": False}, {"segmentation_size": 96}):
+    for options in (
+        {"resolution": 0.5},
+        {"template_size": 64.0, "use_hog": False},
+        {"segmentation_size": 96},
+    ):
         csrt = tracker(**options)
         csrt.init(frames[0], prompt)
         estimates = [csrt.step(frame) for frame in frames[1:]]

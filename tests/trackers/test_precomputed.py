@@ -97,19 +97,21 @@ def test_without_numbers_the_order_counts(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("names", "first", "then", "expected"),
+    ("masks", "frames", "expected"),
     [
-        (["mask_0001", "mask_0002"], Frame(0, None, name="img_0001.jpg"), Frame(1, None, name="img_0002.jpg"), [0, 1]),
-        (["mask_0000", "mask_0001"], Frame(0, None, name="img_0001.jpg"), Frame(1, None, name="img_0002.jpg"), [0, 1]),
-        (["mask_0002"], Frame(0, None, name="img_0001.jpg"), Frame(1, None, name="img_0002.jpg"), [None, 0]),
-        (["000001"], Frame(0, None, name="000000.jpg"), Frame(1, None, name="000001.jpg"), [None, 0]),
-        (["1_2023", "2_2023"], Frame(1, None, name=""), Frame(2, None, name=""), [0, 1]),
-        ((), Frame(5, None, name="000000.jpg"), Frame(6, None, name="000001.jpg"), [5, 6]),
+        (["mask_0001", "mask_0002"], ["img_0001.jpg", "img_0002.jpg"], [0, 1]),
+        (["mask_0000", "mask_0001"], ["img_0001.jpg", "img_0002.jpg"], [0, 1]),
+        (["mask_0002"], ["img_0001.jpg", "img_0002.jpg"], [None, 0]),
+        (["000001"], ["000000.jpg", "000001.jpg"], [None, 0]),
+        (["a_2023", "b_2023"], ["", ""], [0, 1]),
+        (["1_2023", "0_2023"], ["", ""], [1, 0]),
+        ([], ["000007.jpg", "000008.jpg"], [0, 1]),
     ],
-)  # fmt: skip
-def test_matching(names: list[str], first: Frame, then: Frame, expected: list[int | None]) -> None:
-    find = match_masks(names, first)
-    assert [find(first), find(then)] == expected
+)
+def test_matching(masks: list[str], frames: list[str], expected: list[int | None]) -> None:
+    sequence = [frame(index, name) for index, name in enumerate(frames)]
+    find = match_masks(masks, sequence[0])
+    assert [find(f) for f in sequence] == expected
 
 
 def test_the_first_mask_falls_back_to_the_prompt(tmp_path: Path) -> None:
@@ -142,7 +144,9 @@ KINDS = {
     "colour.png": lambda m: Pillow.fromarray((m[..., None] * [200, 0, 20]).astype(np.uint8)),
     "opaque.png": lambda m: Pillow.fromarray(np.dstack([m * 255] * 3 + [m * 0 + 255]).astype(np.uint8)),
     "cut-out.png": lambda m: Pillow.fromarray(np.dstack([m * 0 + 90] * 3 + [m * 255]).astype(np.uint8)),
-    "grey and alpha.png": lambda m: Pillow.fromarray(np.dstack([m * 0 + 255, m * 255]).astype(np.uint8), "LA"),
+    "grey and alpha.png": lambda m: Pillow.fromarray(
+        np.dstack([m * 0 + 255, m * 255]).astype(np.uint8), "LA"
+    ),
     "cmyk.tif": lambda m: Pillow.fromarray(m.astype(np.uint8) * 255).convert("RGB").convert("CMYK"),
 }
 
@@ -174,6 +178,8 @@ def test_arrays_by_frame_name(tmp_path: Path) -> None:
     np.savez(tmp_path / "m.npz", **{f"{index:06d}": truth(index) for index in (10, 2, 3)})
     frames = [frame(index, f"{index + 2:06d}.jpg") for index in range(3)]
     assert_truth(track(tmp_path / "m.npz", frames), [2, 3, None])
+    np.savez(tmp_path / "one.npz", **{"000003": truth(3)})
+    assert_truth(track(tmp_path / "one.npz", frames), [None, 3, None])
 
 
 def test_a_video(tmp_path: Path) -> None:
@@ -223,7 +229,9 @@ def test_a_truncated_video_ends_in_gaps(tmp_path: Path) -> None:
     assert estimates[-1].mask is None
 
 
-@pytest.mark.parametrize("name", ["absent", "folder", "notes", "text.png", "text.npz", "text.mp4", "pickle.npy"])
+@pytest.mark.parametrize(
+    "name", ["absent", "folder", "notes", "text.png", "text.npz", "text.mp4", "pickle.npy"]
+)
 def test_unusable_paths_are_refused_at_once(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     if name == "folder":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import struct
 import wave
 from collections.abc import Callable
@@ -123,6 +124,17 @@ def test_selected_frames_keep_index_and_time(clip: Clip, frames: str) -> None:
     assert [frame.index for frame in selected] == shown_numbers(selected) == wanted
     assert source.count == len(wanted)
     assert [frame.time for frame in selected] == pytest.approx([index / 10 for index in wanted])
+
+
+def test_pictures_are_let_go_as_soon_as_they_are_read(clip: Clip) -> None:
+    path = clip("clip.avi", codec="mjpeg", pix_fmt="yuvj420p")  # no picture waits for another
+    gc.collect()
+    gc.disable()  # otherwise pictures in reference cycles would pile up only until the next collection
+    try:
+        held = [sum(isinstance(item, av.VideoFrame) for item in gc.get_objects()) for _ in open_source(path)]
+    finally:
+        gc.enable()
+    assert held[-1] == held[1]
 
 
 def test_a_step_lowers_the_frame_rate(clip: Clip) -> None:

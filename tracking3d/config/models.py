@@ -107,6 +107,30 @@ class SolverConfig(Section):
     )
     motion_translation: float = Field(0.1, ge=0, description="Free translation a frame since the last keyframe, eq. 3.")
     motion_rotation: float = Field(30.0, ge=0, description="Free rotation in degrees a frame since the last keyframe, eq. 3.")
+    laplacian_of: Literal["vertices", "offsets"] = Field(
+        "vertices", description="Smooth the vertices themselves (SoftRas), or their offsets from the prototype."
+    )
+    stop: Literal["threshold", "plateau"] = Field(
+        "threshold",
+        description="End a frame as soon as the appearance loss is below tau (paper), or when the total loss, having beaten that of the start, no longer falls; the best state is kept.",
+    )
+    patience: int = Field(10, ge=1, description="With plateau: iterations without progress before the end.")
+    prediction: Literal["last", "velocity"] = Field(
+        "last", description="A frame starts from the last pose (paper), or from the best of last pose, constant velocity and the mask's own shift."
+    )
+    pose_iterations: int = Field(
+        0, ge=0, description="Iterations on the new frame's pose alone before the joint ones; 0 for none (paper)."
+    )
+    texture_start: Literal["zero", "backprojected"] = Field(
+        "zero", description="Texels not seen before start at zero (paper), or at what the new frame shows there."
+    )
+    unseen_charge: float | None = Field(
+        None, ge=0, description="What a pixel of never seen texture costs instead of its appearance loss; empty: no difference is made (paper)."
+    )
+    start_frames: int = Field(
+        1, ge=1, le=32, description="Solve this many first frames together from several hypotheses of rotation; 1 for none (paper)."
+    )
+    start_iterations: int = Field(60, ge=1, description="Iterations of each hypothesis of that joint start.")
     weights: Weights = Weights()
     learning_rates: LearningRates = LearningRates()
     keyframes: KeyframeConfig = KeyframeConfig()

@@ -26,9 +26,9 @@ def paint_panel(rng: np.random.Generator, size: int = 256) -> FloatImage:
     palette = [_colour(hue + shift, 0.55 + 0.4 * rng.random(), value) for shift, value in PALETTE]
     panel = np.full((fine, fine, 3), palette[0], np.uint8)
     _draw_stripes(panel, palette[1], rng)
-    for _ in range(40):
+    for _ in range(80):
         centre = rng.integers(0, fine, 2)
-        _draw_mark(panel, centre, int(rng.integers(fine // 35, fine // 10)), palette[rng.integers(1, 5)], rng)
+        _draw_mark(panel, centre, int(rng.integers(fine // 40, fine // 11)), palette[rng.integers(1, 5)], rng)
     panel_float = cv2.resize(panel, (size, size), interpolation=cv2.INTER_AREA).astype(np.float32)
     return np.clip(panel_float + 7 * _smooth_noise(rng, (size, size), 1.5)[..., None], 0, 255)
 

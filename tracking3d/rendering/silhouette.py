@@ -133,9 +133,15 @@ def _pairs_near_uncovered(
 def _first_per_pixel(pixel: Tensor, knum: int, pixels: int) -> Tensor | None:
     """Positions of the first ``knum`` entries of every pixel, in order; None if that is all of them."""
     count = torch.bincount(pixel, minlength=pixels)
-    if len(pixel) == 0 or int(count.max()) <= knum:
+    crowded = torch.nonzero((count > knum)[pixel])[:, 0]
+    if len(crowded) == 0:
         return None
-    order = torch.argsort(pixel, stable=True)
-    first = torch.cumsum(count, 0) - count
-    rank = torch.arange(len(pixel), device=pixel.device) - first[pixel[order]]
-    return order[rank < knum].sort().values
+    order = crowded[torch.argsort(pixel[crowded], stable=True)]
+    ordered = pixel[order]
+    position = torch.arange(len(order), device=pixel.device)
+    starts = torch.ones_like(ordered, dtype=torch.bool)
+    starts[1:] = ordered[1:] != ordered[:-1]
+    rank = position - torch.where(starts, position, 0).cummax(0).values
+    kept = torch.ones_like(pixel, dtype=torch.bool)
+    kept[order[rank >= knum]] = False
+    return torch.nonzero(kept)[:, 0]

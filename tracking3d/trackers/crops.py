@@ -49,7 +49,7 @@ def box_of(mask: NDArray) -> Box | None:
 
 
 def clip_box(box: Box, shape: tuple[int, ...]) -> Box | None:
-    """The part of ``box`` inside a frame of ``shape`` ``(H, W, ...)``, or None where under a pixel is left."""
+    """The part of ``box`` inside a frame of ``shape`` ``(H, W, ...)``; None where under a pixel is left."""
     x0, y0 = max(box[0], 0.0), max(box[1], 0.0)
     x1, y1 = min(box[0] + box[2], float(shape[1])), min(box[1] + box[3], float(shape[0]))
     return (x0, y0, x1 - x0, y1 - y0) if x1 - x0 >= 1 and y1 - y0 >= 1 else None

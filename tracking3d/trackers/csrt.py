@@ -21,8 +21,11 @@ from tracking3d.trackers.segmentation import ColourSegmentation
 class CsrtTracker:
     """Mask tracker ``csrt``: CSR-DCF proposes the box, the colour segmentation answers with the mask.
 
-    The two correct each other: the segmentation begins anew from the box when it has lost the object. The answer
-    is deterministic. See `CsrtTracker.Options` for what can be set.
+    The box is a witness: it holds the mask back from spilling, judges it, and lets it begin anew when it has
+    lost the object. Answers are deterministic: OpenCV's random generator is seeded before each use.
+
+    Defaults were chosen by the mean IoU of the box over four real clips: colour features save a car in shadow
+    (0.16 to 0.78), and CSR-DCF's own spatial reliability map costs half the time and gains nothing.
     """
 
     class Options(Options):
@@ -104,7 +107,7 @@ class BoxTracker:
         for name in CsrtTracker.Options.model_fields.keys() & set(dir(params)):
             setattr(params, name, getattr(options, name))
         self._scale = options.resolution
-        self._filter = cv2.TrackerCSRT.create(params)
+        self._filter: cv2.TrackerCSRT | None = cv2.TrackerCSRT.create(params)
         view = self._view(image)
         visible = clip_box(box, image.shape) or (0.0, 0.0, 1.0, 1.0)
         x, y, width, height = (value * self._scale for value in visible)

@@ -14,7 +14,9 @@ from tracking3d.trackers.crops import clip_box, cut, inside_frame, paste
 _SIZE = 288
 _MARGIN = 0.35
 _LEAST_SHARE = 0.15  # of the box; less is taken for a failure
-_LEAST_CONTRAST = 2.0  # standard deviation in grey levels; below, the graph cut takes minutes and means nothing
+_LEAST_CONTRAST = (
+    2.0  # standard deviation in grey levels; below, the graph cut takes minutes and means nothing
+)
 
 
 def mask_in_box(image: Image, box: Box, iterations: int = 5) -> NDArray[np.float32]:
@@ -39,9 +41,7 @@ def mask_in_box(image: Image, box: Box, iterations: int = 5) -> NDArray[np.float
     return paste(mask, window, image.shape)
 
 
-def _grab_cut(
-    colours: NDArray[np.uint8], candidate: NDArray[np.bool_], iterations: int
-) -> NDArray[np.bool_]:
+def _grab_cut(colours: NDArray[np.uint8], candidate: NDArray[np.bool_], iterations: int) -> NDArray[np.bool_]:
     """The object among the candidate pixels; none where the colours cannot tell it from the rest."""
     if candidate.all() or not candidate.any() or colours.std(axis=(0, 1)).max() < _LEAST_CONTRAST:
         return np.zeros_like(candidate)

@@ -25,8 +25,8 @@ class MaskMotion:
         source: ``(S, S, 2)`` float32, where each present pixel was in the last crop, (x, y).
         by_flow: ``(S, S)`` float32 in [0, 1], the last mask warped by the flow.
         by_similarity: ``(S, S)`` float32 in [0, 1], the last mask moved by one similarity.
-        cue: ``(S, S)`` float32 pixels: how much better a pixel's motion fits the object's affine motion than the
-            background's similarity; 0 where it cannot be told.
+        cue: ``(S, S)`` float32 pixels: how much better a pixel's motion fits the object's affine motion than
+            the background's similarity; 0 where it cannot be told.
     """
 
     source: NDArray[np.float32]

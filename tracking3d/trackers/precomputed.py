@@ -14,7 +14,13 @@ from pydantic import BaseModel, Field
 
 from tracking3d.errors import InputError, PluginError
 from tracking3d.frames import Frame, MaskEstimate, Prompt
-from tracking3d.trackers.mask_files import ImageMasks, MaskFiles, UnreadableMaskError, natural_key, open_masks
+from tracking3d.trackers.mask_files import (
+    ImageMasks,
+    MaskFiles,
+    UnreadableMaskError,
+    natural_key,
+    open_masks,
+)
 from tracking3d.trackers.protocol import Options
 
 _ASPECT_TOLERANCE = 0.02
@@ -30,7 +36,7 @@ class PrecomputedMasks:
         """Options of ``precomputed``."""
 
         path: str = Field(
-            description="Folder of images, video, .npz or .npy file of masks; object where above half, or above 0."
+            description="Folder of images, video, .npz or .npy file; object where above half or above 0."
         )
 
     def __init__(self, masks: MaskFiles) -> None:
@@ -97,10 +103,10 @@ class PrecomputedMasks:
 def match_masks(names: Sequence[str], first: Frame) -> Callable[[Frame], int | None]:
     """Decide on the first frame how masks belong to frames.
 
-    1. By name without suffix, where the first frame has a mask of its name: ``000012.png`` or ``12.png`` is the
-       mask of ``000012.jpg``.
-    2. Else by the number in the mask's name: the frame's index counted from 0; or, where no mask is numbered 0,
-       the number in the frame's own name.
+    1. By name without suffix, where the first frame has a mask of its name: ``000012.png`` or ``12.png`` is
+       the mask of ``000012.jpg``.
+    2. Else by the number in the mask's name: the frame's index counted from 0; or, where no mask is numbered
+       0, the number in the frame's own name.
     3. Else by order: mask n belongs to frame n of the source.
 
     Args:

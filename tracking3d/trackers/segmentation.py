@@ -1,9 +1,10 @@
 """Temporally consistent colour segmentation of one object: the last mask moved along, colours kept.
 
-Each frame, every pixel of a crop around the object collects log-odds from where the last mask has moved to, from
-global and local colours, from how the pixel moves, and from a box tracker's box where there is one; an
-edge-aware smoother turns them into a mask. The box is a *witness*, not the master: the object is segmented anew
-from it only when the mask looks lost. Any box tracker will do. Everything is deterministic and causal.
+GrabCut gives the first mask. From then on every pixel of a crop around the object collects log-odds from
+where the last mask has moved to, from global and local colours that are kept, from how the pixel moves, and
+from a box tracker's box where there is one; an edge-aware smoother, far cheaper than a graph cut, turns them
+into a mask. The box is a *witness*, not the master: the object is segmented anew from it only when the mask
+looks lost. Any box tracker will do. Everything is deterministic and causal.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from tracking3d.trackers.mask_motion import MaskMotion, follow_mask
 
 _MARGIN = 0.45  # free space around the last box: how far the mask may move or grow in one frame
 _AREA_CHANGE = 0.35  # a larger relative change against the moved mask is not believed
-_PATIENCE = 3  # doubtful frames in a row before the mask is begun anew
+_PATIENCE = 3  # doubtful frames in a row before each attempt to begin anew
 
 # Weights of the log-odds, against global and local colours with weight 1.
 _PRIOR, _MOTION, _WITNESS = 1.5, 2.0, 1.0
@@ -53,7 +54,8 @@ class ColourSegmentation:
         inside, around = _sides(cut(self._mask, window))
         self._colours = GlobalColours(colours, inside, around)
         self._palette = Palette(colours)
-        self._judgement = Judgement(self._colours.separation(colours, inside, around), 1.0)
+        separation = self._colours.separation(colours, inside, around)
+        self._judgement = Judgement(separation, margin=separation)
 
     @property
     def estimate(self) -> MaskEstimate:
@@ -63,9 +65,12 @@ class ColourSegmentation:
         return MaskEstimate(self._mask, self._judgement.score, self._judgement.doubt)
 
     def correct(self, image: Image, mask: NDArray[np.bool_]) -> None:
-        """Go on from ``mask`` ``(H, W)`` in ``image``, the latest frame; the colour models stay."""
+        """Go on from ``mask`` ``(H, W)`` in ``image``, the latest frame, and learn from its colours."""
         self._image, self._mask = image, mask.astype(np.float32)
         self._velocity, self._doubtful_frames = (0, 0), 0
+        if (box := box_of(mask)) is not None:
+            window = Window.around(box, _MARGIN, self._size)
+            self._colours.update(lab(cut(image, window)), *_sides(cut(self._mask, window)))
 
     def step(self, image: Image, witness: Box | None = None) -> MaskEstimate:
         """Segment the next frame.
@@ -79,6 +84,7 @@ class ColourSegmentation:
         self._doubtful_frames = self._doubtful_frames + 1 if judgement.doubt else 0
         if witness is not None and self._doubtful_frames >= _PATIENCE:
             mask, judgement = self._begin_anew(image, witness, mask, judgement)
+            self._doubtful_frames = 0
         self._velocity = _shift(box_of(self._mask), box_of(mask))
         self._image, self._mask, self._judgement = image, mask, judgement
         return self.estimate
@@ -95,7 +101,7 @@ class ColourSegmentation:
         in_frame = inside_frame(image.shape, window)
         motion = follow_mask(_grey(last), _grey(present), cut(self._mask, before))
         moved = (motion.by_flow + motion.by_similarity > 1.0) & in_frame
-        area = np.count_nonzero(moved)
+        area = int(np.count_nonzero(moved))
         if area < 9:
             return out_of_sight
 
@@ -106,7 +112,7 @@ class ColourSegmentation:
         support = np.tanh((evidence + _PRIOR * _prior(motion, area)) / 3)
         smooth = cv2.ximgproc.fastGlobalSmootherFilter(present, support, 100.0, 12.0)
         mask = _clean((smooth > 0) & in_frame, moved)
-        believed = abs(np.count_nonzero(mask) / area - 1) <= _AREA_CHANGE
+        believed = bool(abs(np.count_nonzero(mask) / area - 1) <= _AREA_CHANGE)
         if not believed:
             mask = moved
         inside, around = _sides(mask)
@@ -182,7 +188,7 @@ def _distance_beyond(box: Box, window: Window) -> NDArray[np.float32]:
 
 def _clean(mask: NDArray[np.bool_], moved: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Drop specks, components that the moved mask does not support, and pinholes."""
-    area = np.count_nonzero(moved)
+    area = int(np.count_nonzero(moved))
     disc = _disc(0.02 * math.sqrt(area))
     tidy = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, disc)
     tidy = cv2.morphologyEx(tidy, cv2.MORPH_CLOSE, disc)

@@ -77,13 +77,20 @@ class VideoFile:
             stream = _video_stream(container)
             assert stream is not None
             start = stream.start_time
+            orientation: int | None = None
             for index, picture in enumerate(decode_pictures(container, stream)):
                 seconds = None
                 if isinstance(picture, av.VideoFrame) and picture.pts is not None and stream.time_base:
                     start = picture.pts if start is None else min(start, picture.pts)
                     seconds = float((picture.pts - start) * stream.time_base)
-                if index in self.selection:
-                    yield _frame(index, picture, seconds)
+                if index not in self.selection:
+                    continue
+                if isinstance(picture, str):
+                    yield SkippedFrame(index, f"frame {index}: {picture}")
+                else:
+                    # Once, because asking PyAV for side data keeps the picture until Python collects cycles.
+                    orientation = orientation or _orientation(picture)
+                    yield _frame(index, picture, seconds, orientation)
                 if index + 1 >= self.selection.stop:
                     return
 
@@ -114,14 +121,17 @@ def _announced_frames(container: InputContainer, stream: VideoStream) -> int | N
     return round(duration * stream.average_rate) if duration > 0 and stream.average_rate else None
 
 
-def _frame(index: int, picture: av.VideoFrame | str, seconds: float | None) -> Frame | SkippedFrame:
+def _orientation(picture: av.VideoFrame) -> int:
+    matrix: Any = picture.side_data.get("DISPLAYMATRIX")
+    return UPRIGHT if matrix is None else orientation_from_display_matrix(bytes(matrix))
+
+
+def _frame(
+    index: int, picture: av.VideoFrame, seconds: float | None, orientation: int
+) -> Frame | SkippedFrame:
     name = f"frame {index}"
-    if isinstance(picture, str):
-        return SkippedFrame(index, f"{name}: {picture}")
     try:
         image = cast(Image, picture.to_ndarray(format="rgb24"))
     except (FFmpegError, ValueError) as error:
         return SkippedFrame(index, f"{name}: its pixels cannot be converted to RGB: {error}")
-    matrix: Any = picture.side_data.get("DISPLAYMATRIX")
-    orientation = UPRIGHT if matrix is None else orientation_from_display_matrix(bytes(matrix))
     return Frame(index, turn_upright(image, orientation), seconds, name)

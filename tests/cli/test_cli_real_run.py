@@ -1,0 +1,94 @@
+"""The whole program in a process of its own: a real run, one that is interrupted, and one that is killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tracking3d.evaluation.synthetic import make_demo_clip
+from tracking3d.results.run_reader import RunReader
+
+QUICK = ["--size", "32", "--set", "solver.iterations=2", "--set", "object.frequency=2"]
+
+STOPPING_TRACKER = """
+import os
+import signal
+from tracking3d.trackers.csrt import CsrtTracker
+
+class Stopping(CsrtTracker):
+    def step(self, frame):
+        if frame.index == 2:
+            os.kill(os.getpid(), getattr(signal, os.environ["STOP_BY"]))
+        return super().step(frame)
+"""
+
+
+@pytest.fixture(scope="module")
+def real_clip(tmp_path_factory) -> Path:
+    return make_demo_clip(tmp_path_factory.mktemp("real") / "clip", frames=4, size=(96, 72))
+
+
+@pytest.fixture
+def box(real_clip: Path) -> str:
+    return ",".join(str(value) for value in json.loads((real_clip / "init.json").read_text())["bbox_xywh"])
+
+
+def program(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", "from tracking3d.cli import main; main()", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1", **environment},
+    )
+
+
+def test_real_run_from_a_box(real_clip, box, tmp_path):
+    result = program("run", real_clip / "frames", "--box", box, *QUICK, "--out", tmp_path / "run")
+    assert result.returncode == 0, result.stderr
+    run = RunReader(tmp_path / "run")
+    assert run.state == "finished"
+    assert [frame.index for frame in run.frames] == [0, 1, 2, 3]
+    scores = program("evaluate", tmp_path / "run", "--truth", real_clip, "--json")
+    assert json.loads(scores.stdout)["iou_initial_mean"] > 0.5
+
+
+def test_real_run_from_masks_alone(real_clip, tmp_path):
+    masks = ("--masks", real_clip / "masks")
+    result = program("run", real_clip / "frames", *masks, *QUICK, "--out", tmp_path / "run", "--quiet")
+    assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
+    frames = RunReader(tmp_path / "run").frames
+    assert len(frames) == 4
+    assert all(frame.iou_initial is not None for frame in frames)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+@pytest.mark.parametrize(("stop", "code"), [("SIGINT", 130), ("SIGKILL", -signal.SIGKILL)])
+def test_stopped_run_keeps_every_finished_frame(real_clip, box, tmp_path, stop, code):
+    (tmp_path / "stopping.py").write_text(STOPPING_TRACKER)
+    result = program(
+        *(
+            "run",
+            real_clip / "frames",
+            "--box",
+            box,
+            *QUICK,
+            "--tracker",
+            "stopping",
+            "--out",
+            tmp_path / "run",
+        ),
+        TRACKING3D_PLUGINS=f"tracking3d.trackers:stopping={tmp_path / 'stopping.py'}:Stopping",
+        STOP_BY=stop,
+    )
+    assert result.returncode == code, result.stderr
+    assert "Traceback" not in result.stderr
+    run = RunReader(tmp_path / "run")
+    assert run.state == "interrupted"
+    assert [frame.index for frame in run.frames] == [0, 1]
+    assert all(run.mask(index).any() for index in (0, 1))

@@ -1,0 +1,52 @@
+"""Track a rigid object in an ordinary RGB video: masks, 6DoF poses, a textured mesh, point correspondences.
+
+Conventions: OpenCV camera axes (x right, y down, z forward); pixel (0, 0) is the centre of the top-left pixel;
+``T_cam_obj`` maps object to camera coordinates; the scale is arbitrary.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Frame",
+    "FrameEstimate",
+    "ObjectModel",
+    "PipelineConfig",
+    "Prompt",
+    "Session",
+    "Status",
+    "__version__",
+    "load_config",
+    "track",
+]
+
+if TYPE_CHECKING:
+    from tracking3d.config.loading import load_config
+    from tracking3d.config.models import PipelineConfig
+    from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
+    from tracking3d.frames import Frame, Prompt
+    from tracking3d.pipeline import Session, track
+
+_HOME = {
+    "Frame": "tracking3d.frames",
+    "FrameEstimate": "tracking3d.estimation.estimate",
+    "ObjectModel": "tracking3d.estimation.estimate",
+    "PipelineConfig": "tracking3d.config.models",
+    "Prompt": "tracking3d.frames",
+    "Session": "tracking3d.pipeline",
+    "Status": "tracking3d.estimation.estimate",
+    "load_config": "tracking3d.config.loading",
+    "track": "tracking3d.pipeline",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import the public names on first use, so that `tracking3d --help` need not wait for torch."""
+    if name not in _HOME:
+        raise AttributeError(f"module 'tracking3d' has no attribute '{name}'")
+    from importlib import import_module
+
+    return getattr(import_module(_HOME[name]), name)

@@ -1,0 +1,113 @@
+"""The loss terms of the paper (section 3.3), each for itself and for every frame where it has frames.
+
+Silhouettes, masks and distances are ``(B, H, W)``; ``valid`` is 0 beyond the frame's border, where nothing is
+known and nothing is charged.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from kornia.losses import cauchy_loss
+from torch import Tensor
+from torch.nn import functional
+
+from tracking3d.geometry.pose import Pose, rotation_angle
+
+_SMALL = 1e-10
+
+
+def cauchy(a: Tensor, b: Tensor, scale: float) -> Tensor:
+    """Cauchy loss ``log(1 + ((a - b) / scale)^2)``, element by element."""
+    factor = math.sqrt(2.0) / scale  # kornia's is log(1 + (a - b)^2 / 2)
+    return cauchy_loss(a * factor, b * factor, reduction="none")
+
+
+def appearance_loss(
+    rendered: Tensor, observed: Tensor, pixels: Tensor, valid: Tensor, scale: float, seen: Tensor | None = None,
+    unseen_charge: float = 0.0,
+) -> Tensor:
+    """Appearance loss, eq. 1, for each frame: the mean Cauchy loss over the object's visible pixels.
+
+    Only covered pixels take part: there the soft silhouette is 1, so the factor ``R_S`` of eq. 1 is exact, and
+    an empty texture beyond the outline is not compared with the background.
+
+    Args:
+        rendered: ``(P, C)`` features at the covered pixels.
+        observed: ``(B, C, H, W)`` features of the frames.
+        pixels: ``(P,)`` flat indices of the covered pixels in ``(B, H, W)``.
+        valid: ``(B, H, W)``.
+        scale: Scale of the Cauchy loss (0.25).
+        seen: ``(P,)`` how far the texture at each covered pixel is known, in [0, 1]; all known if None.
+        unseen_charge: What an unknown pixel costs instead.
+
+    Returns:
+        ``(B,)``; zero where nothing is covered.
+    """
+    batch, channels, height, width = observed.shape
+    view = torch.div(pixels, height * width, rounding_mode="floor")
+    target = observed.permute(0, 2, 3, 1).reshape(-1, channels)[pixels]
+    loss = cauchy(rendered, target, scale).mean(1)
+    if seen is not None:
+        loss = seen * loss + (1 - seen) * unseen_charge
+    weight = valid.reshape(-1)[pixels]
+    total = loss.new_zeros(batch).index_add(0, view, loss * weight)
+    count = loss.new_zeros(batch).index_add(0, view, weight)
+    return total / count.clamp_min(1.0)
+
+
+def iou_loss(silhouette: Tensor, mask: Tensor, valid: Tensor) -> Tensor:
+    """First term of the silhouette loss, eq. 2: one minus the soft intersection over union, ``(B,)``."""
+    silhouette, mask = silhouette * valid, mask * valid
+    intersection = (silhouette * mask).sum((1, 2))
+    union = (silhouette + mask).sum((1, 2)) - intersection
+    return 1 - intersection / (union + _SMALL)
+
+
+def distance_loss(silhouette: Tensor, distance: Tensor, valid: Tensor) -> Tensor:
+    """Second term of the silhouette loss, eq. 2: mean distance of silhouette pixels to the mask, ``(B,)``."""
+    silhouette = silhouette * valid
+    return (silhouette * distance).sum((1, 2)) / silhouette.sum((1, 2)).clamp_min(1.0)
+
+
+def erode(silhouette: Tensor) -> Tensor:
+    """3 x 3 erosion, as the reference applies it to the soft silhouette ``(B, H, W)``."""
+    # A minimum filter; kornia's morphology unfolds the image, ten times slower in the inner loop.
+    return -functional.max_pool2d(-silhouette[:, None], 3, 1, 1)[:, 0]
+
+
+def soften(mask: Tensor, distance: Tensor, sigma: float) -> Tensor:
+    """The target ``(B, H, W)`` with the same soft band as the silhouette: ``exp(-sigma d^2)`` outside."""
+    return torch.maximum(mask, torch.exp(-sigma * distance.square()) * (distance > 0))
+
+
+def motion_loss(
+    keyframe: Pose, current: Pose, frames: int, free_translation: float, free_rotation: float
+) -> Tensor:
+    """Motion regularization, eq. 3: motion a frame since the last keyframe beyond what is free.
+
+    Args:
+        keyframe: Pose of the most recent keyframe.
+        current: Pose of the current frame.
+        frames: Number of frames between them (the paper's sign of this difference is a slip).
+        free_translation: Object units a frame (0.1).
+        free_rotation: Degrees a frame (30).
+    """
+    translation = torch.linalg.vector_norm(current.translation - keyframe.translation) / frames
+    rotation = rotation_angle(keyframe.quaternion, current.quaternion) / frames
+    return functional.relu(translation - free_translation) + functional.relu(
+        rotation - math.radians(free_rotation)
+    )
+
+
+def laplacian_loss(laplacian: Tensor, vertices: Tensor) -> Tensor:
+    """Laplacian shape regularization (SoftRas): mean squared length of ``L v``."""
+    return torch.sparse.mm(laplacian, vertices).square().sum(1).mean()
+
+
+def total_variation_loss(texture: Tensor, scale: float) -> Tensor:
+    """Mean Cauchy loss between neighbouring texels of ``(C, T, T)``; neighbours wrap around in u."""
+    right = cauchy(texture, texture.roll(-1, 2), scale).mean()
+    below = cauchy(texture[:, 1:], texture[:, :-1], scale).mean()
+    return right + below

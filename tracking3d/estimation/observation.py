@@ -1,0 +1,147 @@
+"""One frame as the solvers see it: features and mask in a window of the one camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from tracking3d.features.protocol import FeatureEncoder
+from tracking3d.frames import Frame
+from tracking3d.geometry.camera import Camera, Window
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """A window of one frame, ``S`` x ``S`` pixels.
+
+    Attributes:
+        index: The frame's index in the source.
+        window: Where in the frame.
+        K: ``(3, 3)`` the camera's intrinsics in the window.
+        image: ``(3, 2 S, 2 S)`` RGB in [0, 1], finer than the rest: it becomes the visible texture.
+        features: ``(C, S, S)``.
+        valid: ``(S, S)`` 1 inside the frame, 0 beyond its border, where nothing is known.
+        mask: ``(S, S)`` rough mask in [0, 1]; all zero where there is none.
+        distance: ``(S, S)`` distance to the mask in NDC, zero inside it.
+        has_mask: Whether the mask tracker gave a mask.
+    """
+
+    index: int
+    window: Window
+    K: Tensor
+    image: Tensor
+    features: Tensor
+    valid: Tensor
+    mask: Tensor
+    distance: Tensor
+    has_mask: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """Several observations stacked: the same fields with a leading ``(B,)``, see `Observation`."""
+
+    index: Tensor
+    K: Tensor
+    features: Tensor
+    valid: Tensor
+    mask: Tensor
+    distance: Tensor
+    has_mask: Tensor
+
+    @classmethod
+    def of(cls, observations: list[Observation]) -> Batch:
+        """Stack observations."""
+        device = observations[0].features.device
+        return cls(
+            torch.tensor([o.index for o in observations], device=device),
+            torch.stack([o.K for o in observations]),
+            torch.stack([o.features for o in observations]),
+            torch.stack([o.valid for o in observations]),
+            torch.stack([o.mask for o in observations]),
+            torch.stack([o.distance for o in observations]),
+            torch.tensor([float(o.has_mask) for o in observations], device=device),
+        )
+
+
+def observe(
+    frame: Frame,
+    mask: NDArray[np.bool_] | None,
+    window: Window,
+    camera: Camera,
+    encoder: FeatureEncoder,
+    device: torch.device,
+) -> Observation:
+    """Cut the window out of a frame and encode it."""
+    pixels = torch.from_numpy(np.ascontiguousarray(frame.image)).to(device)
+    pixels = pixels.permute(2, 0, 1).float() / 255
+    image = crop(pixels, window)
+    detail = crop(pixels, replace(window, size=2 * window.size))
+    valid = crop(torch.ones(1, *frame.size, device=device), window)[0].ge(0.5).float()
+    features = encoder.encode(image[None])
+    if features.shape[-1] != window.size:
+        features = functional.interpolate(features, size=(window.size, window.size), mode="bilinear")
+    if mask is None or not mask.any():
+        soft = distance = torch.zeros_like(valid)
+    else:
+        soft = crop(torch.from_numpy(mask).to(device).float()[None], window)[0]
+        distance = mask_distance(soft)
+    K = torch.tensor(window.K(camera), dtype=torch.float32, device=device)
+    known = mask is not None and bool(soft.any())
+    return Observation(frame.index, window, K, detail, features[0].float(), valid, soft, distance, known)
+
+
+def halved(observation: Observation) -> Observation:
+    """The same observation at half the working resolution."""
+    half = replace(observation.window, size=observation.window.size // 2)
+    scale = observation.K.new_tensor([0.5, 0.5, 1.0])
+    K = observation.K * scale[:, None]
+    K[:2, 2] -= 0.25  # pixel centres stay at integers
+
+    def pool(image: Tensor) -> Tensor:
+        return functional.avg_pool2d(image.reshape(1, -1, *image.shape[-2:]), 2)[0].reshape(
+            *image.shape[:-2], half.size, half.size
+        )
+
+    return replace(
+        observation,
+        window=half,
+        K=K,
+        features=pool(observation.features),
+        valid=pool(observation.valid).ge(0.75).float(),
+        mask=pool(observation.mask),
+        distance=pool(observation.distance),
+    )
+
+
+def crop(image: Tensor, window: Window) -> Tensor:
+    """Resample ``(C, H, W)`` into the window: ``(C, S, S)``, antialiased, zero beyond the border."""
+    height, width = image.shape[-2:]
+    right, bottom = window.left + window.side, window.top + window.side
+    inner = image[:, max(window.top, 0) : max(bottom, 0), max(window.left, 0) : max(right, 0)]
+    if inner.numel() == 0:
+        return image.new_zeros(image.shape[0], window.size, window.size)
+    left, top = max(-window.left, 0), max(-window.top, 0)
+    border = (left, max(right - width, 0), top, max(bottom - height, 0))
+    inner = functional.pad(inner, border)
+    size = (window.size, window.size)
+    return functional.interpolate(inner[None], size=size, mode="bilinear", antialias=True)[0]
+
+
+def mask_distance(mask: Tensor) -> Tensor:
+    """Distance of every pixel of ``(S, S)`` to the mask, in NDC (half the window's side is 1).
+
+    OpenCV's exact transform: the target is constant, so nothing is differentiated through it, and kornia's
+    differentiable one is an approximation.
+    """
+    outside = (mask < 0.5).cpu().numpy().astype(np.uint8)
+    if outside.all():
+        return torch.zeros_like(mask)
+    pixels = cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return torch.from_numpy(pixels).to(mask) * (2.0 / mask.shape[-1])

@@ -1,0 +1,85 @@
+"""A start that solves the first few frames together, from several hypotheses of how the object turns.
+
+Frame by frame against a wrong first shape the estimate locks into depth reversal or too little rotation while
+its silhouette still fits. The hypothesis that re-renders all first frames best wins.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from tracking3d.config.models import SolverConfig
+from tracking3d.estimation.observation import Batch, halved
+from tracking3d.estimation.paper.belief import Belief, Keyframe
+from tracking3d.estimation.paper.optimize import Optimum, optimize
+from tracking3d.estimation.paper.problem import Parameters, Problem
+from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
+
+RATES = (3.0, 8.0)
+"""Degrees a frame that the hypotheses turn."""
+DIRECTIONS = 8
+_FINALISTS = 2
+
+
+def joint_start(belief: Belief, frames: list[Keyframe], config: SolverConfig, tau: float) -> Optimum:
+    """Solve shape, texture and all poses of ``frames``; the first pose is fixed.
+
+    Args:
+        belief: Its shape and texture are what every hypothesis starts from.
+        frames: The first frames, with the poses found one by one: one of the hypotheses.
+        config: The solver's constants; ``stop`` is taken as ``plateau``.
+        tau: The encoder's convergence threshold.
+    """
+    config = config.model_copy(update={"stop": "plateau", "patience": config.start_iterations})
+    coarse = Problem(belief.shape, Batch.of([halved(frame.observation) for frame in frames]), config)
+    fine = Problem(belief.shape, Batch.of([frame.observation for frame in frames]), config)
+    starts = [belief.parameters(frames)] + hypotheses(belief, frames)
+    coarse_optima = [
+        optimize(coarse, start, iterations=config.start_iterations, tau=tau, fixed=1) for start in starts
+    ]
+    usable = [optimum for optimum in coarse_optima if not optimum.reason] or coarse_optima[:1]
+    usable.sort(key=lambda optimum: optimum.total)
+    finals = [
+        optimize(fine, optimum.parameters, iterations=config.start_iterations, tau=tau, fixed=1)
+        for optimum in usable[:_FINALISTS]
+    ]
+    best = min(finals, key=lambda optimum: math.inf if optimum.reason else optimum.total)
+    spent = sum(optimum.iterations for optimum in coarse_optima + finals)
+    return replace(best, iterations=spent)
+
+
+def hypotheses(belief: Belief, frames: list[Keyframe]) -> list[Parameters]:
+    """No rotation; the rotations found so far mirrored in depth; turning in eight directions at two rates.
+
+    Translations are those found so far: they are seen directly.
+    """
+    first = frames[0].pose
+    found = [frame.pose for frame in frames]
+    still = [Pose(pose.translation, first.quaternion) for pose in found]
+    variants = [still, [_mirrored(first, pose) for pose in found]]
+    for direction in range(DIRECTIONS):
+        angle = 2 * math.pi * direction / DIRECTIONS
+        axis = first.translation.new_tensor([math.cos(angle), math.sin(angle), 0.0])
+        for rate in RATES:
+            variants.append([_turned(first, frame, axis, rate, frames[0]) for frame in frames])
+    return [
+        belief.parameters([Keyframe(frame.observation, pose) for frame, pose in zip(frames, poses, strict=True)])
+        for poses in variants
+    ]
+
+
+def _turned(first: Pose, frame: Keyframe, axis: Tensor, rate: float, start: Keyframe) -> Pose:
+    degrees = rate * (frame.observation.index - start.observation.index)
+    degrees = max(min(degrees, 60.0), -60.0)
+    return from_matrix(rotation_about(axis, degrees) @ first.R, frame.pose.translation)
+
+
+def _mirrored(first: Pose, pose: Pose) -> Pose:
+    """The rotation since the first frame with its tilt out of the image plane reversed (Necker)."""
+    delta = pose.R @ first.R.T
+    flip = torch.diag(delta.new_tensor([1.0, 1.0, -1.0]))
+    return from_matrix(flip @ delta @ flip @ first.R, pose.translation)

@@ -1,0 +1,65 @@
+"""Where a new frame's pose starts."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from tracking3d.estimation.paper.belief import Belief
+from tracking3d.frames import Box
+from tracking3d.geometry.pose import Pose, extrapolate
+
+
+def candidate_poses(belief: Belief, index: int, mask: NDArray[np.bool_] | None) -> list[Pose]:
+    """The last pose, constant velocity, and the last rotation moved to where the mask is."""
+    last, last_index = belief.last
+    candidates = [last]
+    if belief.before is not None:
+        before, before_index = belief.before
+        steps = (index - last_index) / max(last_index - before_index, 1)
+        candidates.append(extrapolate(before, last, min(steps, 3.0)))
+    if mask is not None and mask.any():
+        candidates += [moved_to_mask(belief, pose, mask) for pose in list(candidates)]
+    return candidates
+
+
+def moved_to_mask(belief: Belief, pose: Pose, mask: NDArray[np.bool_]) -> Pose:
+    """Shift a pose so that its silhouette has the mask's centroid and area."""
+    silhouette = belief.silhouette(pose)
+    if not silhouette.any():
+        silhouette = mask
+    camera = belief.camera
+    (x0, y0), (x1, y1) = _centroid(silhouette), _centroid(mask)
+    ratio = float(np.clip(np.sqrt(silhouette.sum() / mask.sum()), 0.8, 1.25))
+    depth = float(pose.translation[2])
+    shift = pose.translation.new_tensor(
+        [(x1 - x0) / camera.fx * depth, (y1 - y0) / camera.fy * depth, 0.0]
+    )
+    return Pose((pose.translation + shift) * ratio, pose.quaternion)
+
+
+def projected_box(belief: Belief, pose: Pose) -> Box | None:
+    """Box ``(x, y, w, h)`` of the projected vertices in the full frame; None where they are behind the camera."""
+    x_cam = belief.vertices @ pose.R.T + pose.translation
+    if bool((x_cam[:, 2] <= 1e-3).any()):
+        return None
+    camera = belief.camera
+    focal = x_cam.new_tensor([camera.fx, camera.fy])
+    pixel = x_cam[:, :2] / x_cam[:, 2:] * focal + x_cam.new_tensor([camera.cx, camera.cy])
+    low, high = pixel.amin(0), pixel.amax(0)
+    size = high - low
+    if not bool(torch.isfinite(size).all()):
+        return None
+    return float(low[0]), float(low[1]), float(size[0]), float(size[1])
+
+
+def mask_box(mask: NDArray[np.bool_]) -> Box:
+    """Box ``(x, y, w, h)`` of a non-empty mask."""
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    left, top = float(columns[0]), float(rows[0])
+    return left, top, float(columns[-1] + 1) - left, float(rows[-1] + 1) - top
+
+
+def _centroid(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+    return np.argwhere(mask)[:, ::-1].mean(0)

@@ -1,0 +1,290 @@
+"""The solver of Rozumnyi et al., ICCV 2023, sections 3.1 to 3.4, and what the presets add to it.
+
+In every frame one Adam optimizes the poses of the keyframes and of the new frame, the shape and the texture.
+The gauge is fixed: the oldest frame in the window does not move. Where a config key is not the paper's, its
+default is, so that preset ``paper`` is the pure recipe.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from tracking3d.config.models import PipelineConfig
+from tracking3d.errors import InputError
+from tracking3d.estimation.appearance import visible_texture
+from tracking3d.estimation.assessment import Assessment, assess
+from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
+from tracking3d.estimation.keyframes import Candidate, select_keyframes
+from tracking3d.estimation.observation import Batch, Observation, observe
+from tracking3d.estimation.paper.belief import Belief, Keyframe
+from tracking3d.estimation.paper.joint_start import joint_start
+from tracking3d.estimation.paper.optimize import Optimum, optimize
+from tracking3d.estimation.paper.prediction import candidate_poses, mask_box, projected_box
+from tracking3d.estimation.paper.problem import Problem, Shape, flatten
+from tracking3d.estimation.start import first_translation, mask_ellipse, prototype_mesh
+from tracking3d.features.protocol import FeatureEncoder
+from tracking3d.frames import Frame, MaskEstimate
+from tracking3d.geometry.camera import Camera, Window
+from tracking3d.geometry.pose import Pose
+from tracking3d.rendering import BackProjection, TexelMap
+
+
+@dataclass(frozen=True)
+class PaperSolver:
+    """See the module; implements `tracking3d.estimation.solver.Solver`.
+
+    Attributes:
+        config: The pipeline's configuration.
+        camera: The camera of the full frame.
+        encoder: The feature encoder.
+    """
+
+    config: PipelineConfig
+    camera: Camera
+    encoder: FeatureEncoder
+
+    @property
+    def tau(self) -> float:
+        """Convergence threshold of the appearance loss."""
+        return self.config.solver.tau or self.encoder.tau
+
+    @property
+    def device(self) -> torch.device:
+        """Where tensors live."""
+        return torch.device(self.config.runtime.device)
+
+    def init(self, frame: Frame, mask: MaskEstimate) -> tuple[Belief, FrameEstimate]:
+        """Fit prototype, shape and texture to the first frame.
+
+        Raises:
+            InputError: If the first frame's mask is missing or empty, or the prototype cannot be used.
+        """
+        started = time.perf_counter()
+        binary = mask.binary
+        if binary is None or not binary.any():
+            raise InputError(
+                f"{frame.name or 'the first frame'} has no object: its mask is empty, give another --box or --mask"
+            )
+        ellipse = mask_ellipse(binary)
+        translation = torch.tensor(first_translation(ellipse, self.camera), dtype=torch.float32)
+        pose = Pose.identity(translation.to(self.device))
+        shape = Shape.of(prototype_mesh(self.config.object, ellipse), self.config.object.flat, self.device)
+        size = self.config.object.texture_size
+        offsets = torch.zeros_like(shape.rest)
+        if shape.flat:
+            offsets = flatten(shape.rest) - shape.rest
+        belief = Belief(
+            self.camera,
+            shape,
+            TexelMap.of(shape.face_uvs, size),
+            offsets,
+            torch.zeros(self.encoder.channels, size, size, device=self.device),
+            (),
+            BackProjection(
+                torch.zeros(3, size, size, device=self.device), torch.zeros(size, size, device=self.device)
+            ),
+            (pose, frame.index),
+            waiting=() if self.config.solver.start_frames > 1 else None,
+        )
+        observation = self._observe(belief, frame, binary, pose)
+        return self._solve(belief, frame, binary, Keyframe(observation, pose), started)
+
+    def step(self, state: Belief, frame: Frame, mask: MaskEstimate) -> tuple[Belief, FrameEstimate]:
+        """Track one more frame."""
+        started = time.perf_counter()
+        binary = mask.binary
+        if binary is not None and not binary.any():
+            binary = None
+        candidates = [state.last[0]]
+        if self.config.solver.prediction == "velocity":
+            candidates = candidate_poses(state, frame.index, binary)
+        observation = self._observe(state, frame, binary, candidates[0])
+        pose = self._best_candidate(state, observation, candidates)
+        return self._solve(state, frame, binary, Keyframe(observation, pose), started)
+
+    def result(self, state: Belief) -> ObjectModel:
+        """The object with its visible texture back-projected from the keyframes (section 3.4)."""
+        texture, weight = visible_texture(state.seen_with_keyframes())
+        return ObjectModel(
+            state.vertices.double().cpu().numpy(),
+            state.shape.faces.cpu().numpy(),
+            state.shape.face_uvs.double().cpu().numpy(),
+            texture,
+            weight,
+            state.texture.permute(1, 2, 0).cpu().numpy(),
+        )
+
+    def _observe(
+        self, belief: Belief, frame: Frame, mask: NDArray[np.bool_] | None, pose: Pose
+    ) -> Observation:
+        box = mask_box(mask) if mask is not None else projected_box(belief, pose)
+        if box is None:
+            box = (0.0, 0.0, float(self.camera.width), float(self.camera.height))
+        window = Window.around(box, self.config.window.margin, self.config.window.size)
+        return observe(frame, mask, window, self.camera, self.encoder, self.device)
+
+    def _best_candidate(self, belief: Belief, observation: Observation, candidates: list[Pose]) -> Pose:
+        """The pose with the least loss as it stands."""
+        if len(candidates) == 1:
+            return candidates[0]
+        problem = self._problem_of_pose(belief, observation)
+        totals = []
+        for pose in candidates:
+            with torch.no_grad():
+                losses = problem.losses(belief.parameters([Keyframe(observation, pose)]))
+            totals.append(float(losses.total(self.config.solver.weights)))
+        return candidates[int(np.argmin(np.nan_to_num(totals, nan=np.inf)))]
+
+    def _problem_of_pose(self, belief: Belief, observation: Observation) -> Problem:
+        """One frame against the shape and texture known so far."""
+        seen = previous = None
+        if self.config.solver.unseen_charge is not None:
+            seen = (belief.seen_with_keyframes().weight > 0).float()[None]
+        if belief.keyframes:
+            keyframe = belief.keyframes[-1]
+            previous = keyframe.pose, keyframe.observation.index
+        return Problem(belief.shape, Batch.of([observation]), self.config.solver, seen, previous)
+
+    def _solve(
+        self, belief: Belief, frame: Frame, mask: NDArray[np.bool_] | None, current: Keyframe, started: float
+    ) -> tuple[Belief, FrameEstimate]:
+        """Optimize, judge, choose keyframes, answer."""
+        first, iterations = not belief.started, 0
+        if self.config.solver.pose_iterations and not first:
+            current, iterations = self._refine_pose(belief, current)
+        belief = self._with_new_texture(belief, current)
+        frames, optimum = self._optimize(belief, current)
+        losses = optimum.losses.of_frame(-1)
+        answer = FrameEstimate(
+            index=frame.index,
+            time=frame.time,
+            T_cam_obj=optimum.parameters.poses[-1].matrix().numpy(),
+            mask=mask if mask is not None else np.zeros(frame.size, dtype=np.bool_),
+            initial_mask=mask,
+            status=Status.LOST,
+            reason="",
+            confidence=0.0,
+            losses=losses,
+            iterations=iterations + optimum.iterations,
+        )
+        judgement = self._judge(optimum, -1, mask is not None)
+        if judgement.status is Status.LOST and not first:
+            # What was known before stays; only the pose goes on from where the optimization left it.
+            if not optimum.reason:
+                belief = replace(belief, last=(optimum.parameters.poses[-1], frame.index))
+            return belief, self._answered(answer, judgement, started)
+        known = self._updated(belief, frames, optimum)
+        if judgement.status is not Status.LOST:
+            answer = replace(answer, mask=known.silhouette(known.last[0]))
+        answer = replace(answer, keyframe=any(k.observation.index == frame.index for k in known.keyframes))
+        return self._with_waiting(belief, known, frames, optimum, self._answered(answer, judgement, started))
+
+    def _refine_pose(self, belief: Belief, current: Keyframe) -> tuple[Keyframe, int]:
+        """The new frame's pose alone, against what is known."""
+        optimum = optimize(
+            self._problem_of_pose(belief, current.observation),
+            belief.parameters([current]),
+            iterations=self.config.solver.pose_iterations,
+            tau=self.tau,
+            free="pose",
+        )
+        pose = current.pose if optimum.reason else optimum.parameters.poses[0]
+        return Keyframe(current.observation, pose), optimum.iterations
+
+    def _with_new_texture(self, belief: Belief, current: Keyframe) -> Belief:
+        """Start texels that no keyframe has seen at what the new frame shows."""
+        if self.config.solver.texture_start == "zero":
+            return belief
+        shown = belief.back_project(current.observation.features, current)
+        new = (belief.seen_with_keyframes().weight <= 0) & (shown.weight > 0)
+        return replace(belief, texture=torch.where(new, shown.mean(), belief.texture))
+
+    def _optimize(self, belief: Belief, current: Keyframe) -> tuple[list[Keyframe], Optimum]:
+        """Everything over the keyframes and the new frame; over all first frames when the joint start is due."""
+        config = self.config.solver
+        waiting = belief.waiting or ()
+        if waiting and len(waiting) + 1 == config.start_frames:
+            frames = [keyframe for keyframe, _ in waiting] + [current]
+            return frames, joint_start(belief, frames, config, self.tau)
+        frames = [*belief.keyframes, current]
+        # The gauge: the oldest frame does not move, so that poses stored at different times compare.
+        fixed = 1 if belief.keyframes or not belief.started else 0
+        problem = Problem(belief.shape, Batch.of([frame.observation for frame in frames]), config)
+        start = belief.parameters(frames)
+        return frames, optimize(problem, start, iterations=config.iterations, tau=self.tau, fixed=fixed)
+
+    def _judge(self, optimum: Optimum, position: int, has_mask: bool) -> Assessment:
+        losses = optimum.losses.of_frame(position)
+        silhouette = losses["silhouette"] + losses["distance"]
+        limit = self.config.solver.keyframes.silhouette
+        return assess(losses["features"], silhouette, has_mask, self.tau, limit, optimum.reason)
+
+    def _updated(self, belief: Belief, frames: list[Keyframe], optimum: Optimum) -> Belief:
+        """Take over what was found, and choose the keyframes anew."""
+        parameters = optimum.parameters
+        moved = [Keyframe(frame.observation, parameters.poses[i]) for i, frame in enumerate(frames)]
+        found = replace(belief, offsets=parameters.offsets, texture=parameters.texture)
+        silhouette = (optimum.losses.silhouette + optimum.losses.distance).tolist()
+        appearance = optimum.losses.features.tolist()
+        candidates = [
+            Candidate(keyframe.pose, silhouette[i], appearance[i]) for i, keyframe in enumerate(moved)
+        ]
+        criteria = self.config.solver.keyframes
+        kept = select_keyframes(candidates, found.object_size, self.tau, criteria)
+        seen = belief.seen
+        for i, keyframe in enumerate(moved[:-1]):
+            if i not in kept and appearance[i] < self.tau:
+                seen = seen + found.back_project(keyframe.observation.image, keyframe)
+        return replace(
+            found,
+            keyframes=tuple(moved[i] for i in kept),
+            seen=seen,
+            last=(moved[-1].pose, moved[-1].observation.index),
+            before=belief.last if belief.started else None,
+            started=True,
+        )
+
+    def _with_waiting(
+        self, belief: Belief, known: Belief, frames: list[Keyframe], optimum: Optimum, answer: FrameEstimate
+    ) -> tuple[Belief, FrameEstimate]:
+        """Keep the first frames until they are solved together, then answer them anew."""
+        if belief.waiting is None:
+            return known, answer
+        count = len(belief.waiting) + 1
+        if count < self.config.solver.start_frames:
+            waiting = (*belief.waiting, (Keyframe(frames[-1].observation, known.last[0]), answer))
+            if answer.status is Status.TRACKED and len(waiting) > 1:
+                reason = "the first frames are not yet solved together"
+                answer = replace(answer, status=Status.UNCERTAIN, reason=reason, confidence=answer.confidence / 2)
+            return replace(known, waiting=waiting), answer
+        revised = []
+        for position, (keyframe, earlier) in enumerate(belief.waiting):
+            judgement = self._judge(optimum, position, keyframe.observation.has_mask)
+            pose = optimum.parameters.poses[position]
+            lost = judgement.status is Status.LOST
+            revised.append(
+                replace(
+                    earlier,
+                    T_cam_obj=pose.matrix().numpy(),
+                    mask=earlier.mask if lost else known.silhouette(pose),
+                    status=judgement.status,
+                    reason=judgement.reason,
+                    confidence=judgement.confidence,
+                    losses=optimum.losses.of_frame(position),
+                )
+            )
+        return replace(known, waiting=None), replace(answer, revised=tuple(revised))
+
+    @staticmethod
+    def _answered(answer: FrameEstimate, judgement: Assessment, started: float) -> FrameEstimate:
+        return replace(
+            answer,
+            status=judgement.status,
+            reason=judgement.reason,
+            confidence=judgement.confidence,
+            seconds=time.perf_counter() - started,
+        )

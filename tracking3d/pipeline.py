@@ -1,0 +1,182 @@
+"""The pipeline: builds the parts that a configuration names and sends frames through them.
+
+>>> for estimate in track(frames, box=(x, y, w, h)):  # doctest: +SKIP
+...     print(estimate.index, estimate.status, estimate.T_cam_obj)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from tracking3d.config.loading import load_config
+from tracking3d.config.models import CameraConfig, PipelineConfig
+from tracking3d.errors import InputError
+from tracking3d.estimation.estimate import FrameEstimate, ObjectModel
+from tracking3d.estimation.paper.solver import PaperSolver
+from tracking3d.estimation.solver import Solver
+from tracking3d.features.protocol import FeatureEncoder
+from tracking3d.frames import Box, Frame, Image, Prompt, SkippedFrame
+from tracking3d.geometry.camera import DEFAULT_FIELD_OF_VIEW, Camera
+from tracking3d.plugins import FEATURES, TRACKERS, build_plugin
+from tracking3d.prompts import make_prompt
+from tracking3d.trackers.protocol import MaskTracker
+
+SOLVERS: dict[str, type[PaperSolver]] = {"paper": PaperSolver}
+"""Solvers by the name that `solver.name` selects."""
+
+
+class Session:
+    """One object tracked through one video: ``step`` takes each frame, ``result`` gives the object.
+
+    Args:
+        config: The pipeline.
+        prompt: The object in the first frame; None takes the mask tracker's own first mask.
+        intrinsics: fx, fy, cx, cy that the source knows of, in pixels; the configuration wins over them.
+        intrinsics_origin: Where they come from, in words.
+
+    Raises:
+        PluginError: If a plug-in is unknown or broken.
+        InputError: If an option cannot be used on this machine.
+    """
+
+    def __init__(
+        self,
+        config: PipelineConfig,
+        prompt: Prompt | None,
+        intrinsics: tuple[float, float, float, float] | None = None,
+        intrinsics_origin: str = "",
+    ) -> None:
+        check_device(config.runtime.device)
+        if config.solver.name not in SOLVERS:
+            raise InputError(f"Unknown solver '{config.solver.name}'; choose one of {', '.join(SOLVERS)}.")
+        if config.runtime.threads is not None:
+            torch.set_num_threads(config.runtime.threads)
+        self.config = config
+        self._prompt = prompt
+        self._intrinsics = intrinsics, intrinsics_origin
+        self._tracker = cast(MaskTracker, build_plugin(TRACKERS, config.tracker))
+        self._encoder = cast(FeatureEncoder, build_plugin(FEATURES, config.features))
+        self._solver: Solver[Any] | None = None
+        self._state: Any = None
+        self._camera: Camera | None = None
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of the full frame, known from the first frame on."""
+        if self._camera is None:
+            raise RuntimeError("the camera is known after the first step")
+        return self._camera
+
+    def step(self, frame: Frame) -> FrameEstimate:
+        """Track the object in the next frame; the first call starts on it.
+
+        Raises:
+            InputError: If the first frame has no object.
+        """
+        if self._solver is None:
+            height, width = frame.size
+            self._camera = choose_camera(self.config.camera, width, height, *self._intrinsics)
+            torch.manual_seed(self.config.runtime.seed)
+            prompt = self._prompt or Prompt((0.0, 0.0, float(width), float(height)))
+            mask = self._tracker.init(frame, prompt)
+            solver = SOLVERS[self.config.solver.name](self.config, self._camera, self._encoder)
+            self._state, estimate = solver.init(frame, mask)
+            self._solver = solver
+        else:
+            self._state, estimate = self._solver.step(self._state, frame, self._tracker.step(frame))
+        return estimate
+
+    def result(self) -> ObjectModel:
+        """The object as it is known now: one textured mesh."""
+        if self._solver is None:
+            raise RuntimeError("there is no object before the first step")
+        return self._solver.result(self._state)
+
+
+def track(
+    frames: Iterable[Image | Frame | SkippedFrame],
+    *,
+    box: Box | None = None,
+    mask: NDArray[np.bool_] | None = None,
+    config: PipelineConfig | Path | str | None = None,
+) -> Iterator[FrameEstimate]:
+    """Track an object through frames; answers come as the frames do, memory is bounded by the keyframes.
+
+    Args:
+        frames: ``(H, W, 3)`` uint8 RGB arrays, or `Frame` objects; frames that could not be read are passed over.
+        box: The object in the first frame, ``(x, y, width, height)`` in pixels.
+        mask: The object in the first frame, ``(H, W)`` bool. Either a box or a mask is given, or neither where
+            the tracker knows its masks (``precomputed``).
+        config: The pipeline, or a YAML file of one; the default preset if None.
+
+    Yields:
+        One estimate a frame.
+
+    Raises:
+        Tracking3dError: If the input or the configuration cannot be used.
+    """
+    if not isinstance(config, PipelineConfig):
+        config = load_config(Path(config) if config is not None else None)
+    session: Session | None = None
+    for position, item in enumerate(frames):
+        if isinstance(item, SkippedFrame):
+            continue
+        frame = item if isinstance(item, Frame) else Frame(position, checked_image(item, position))
+        if session is None:
+            prompt = None if box is None and mask is None else make_prompt(frame, box, mask)
+            session = Session(config, prompt)
+        yield session.step(frame)
+
+
+def checked_image(image: Image, position: int) -> Image:
+    """Give back an image that is ``(H, W, 3)`` uint8.
+
+    Raises:
+        InputError: If it is not.
+    """
+    image = np.asarray(image)
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+        raise InputError(
+            f"Frame {position} has shape {image.shape} and type {image.dtype}; give (H, W, 3) arrays of uint8."
+        )
+    return image
+
+
+def choose_camera(
+    config: CameraConfig,
+    width: int,
+    height: int,
+    known: tuple[float, float, float, float] | None = None,
+    known_origin: str = "",
+) -> Camera:
+    """The camera by what is known best: given intrinsics, given field of view, the source's own, 45 degrees."""
+    if config.intrinsics is not None:
+        return Camera(*config.intrinsics, width, height, "given intrinsics")
+    if config.fov is not None:
+        return Camera.from_fov(width, height, config.fov, f"given field of view of {config.fov:g} degrees")
+    if known is not None:
+        return Camera(*known, width, height, known_origin)
+    return Camera.from_fov(
+        width, height, DEFAULT_FIELD_OF_VIEW, f"default field of view of {DEFAULT_FIELD_OF_VIEW:g} degrees"
+    )
+
+
+def check_device(name: str) -> None:
+    """Make sure that a device is there.
+
+    Raises:
+        InputError: If it is not.
+    """
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise InputError(
+            f"The device '{name}' is not available on this machine; use --device cpu."
+        ) from error

@@ -1,0 +1,120 @@
+"""Texture in closed form: what a frame shows of every texel.
+
+Each texel of the atlas is a point of the surface. It is projected into the frame, kept where it is visible
+(depth test, front-facing), and takes the frame's value there, weighted by the squared cosine of the viewing
+angle.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from tracking3d.rendering.interpolation import barycentrics
+from tracking3d.rendering.renderer import project
+from tracking3d.rendering.visibility import rasterize
+
+_DEPTH_TOLERANCE = 0.02
+"""A texel is hidden if something is nearer by more than this share of the mesh's radius."""
+_GRAZING = 0.15
+"""Texels seen at a smaller cosine are not believed: the outline is uncertain by a pixel or so."""
+
+
+@dataclass(frozen=True, eq=False)
+class TexelMap:
+    """Where each texel of an atlas lies on the surface; fixed as long as faces and texture coordinates are.
+
+    Attributes:
+        size: Side T of the texture.
+        texel: ``(N,)`` flat indices of the texels that lie on a face.
+        face: ``(N,)`` that face.
+        barycentric: ``(N, 3)`` place on that face.
+    """
+
+    size: int
+    texel: Tensor
+    face: Tensor
+    barycentric: Tensor
+
+    @classmethod
+    def of(cls, face_uvs: Tensor, size: int) -> TexelMap:
+        """Rasterize the atlas ``(F, 3, 2)``; faces across the seam are drawn on both sides."""
+        count = len(face_uvs)
+        corner = face_uvs * size - 0.5
+        both = torch.cat([corner, corner - corner.new_tensor([float(size), 0.0])])
+        triangles = torch.arange(6 * count, device=corner.device).reshape(-1, 3)
+        flat = both.reshape(1, -1, 2)
+        index = rasterize(flat, torch.ones_like(flat[..., 0]), triangles, (size, size)).face_index.reshape(-1)
+        texel = torch.nonzero(index >= 0)[:, 0]
+        drawn = index[texel]
+        x, y = (texel % size).to(corner), torch.div(texel, size, rounding_mode="floor").to(corner)
+        weights, _ = barycentrics(both[drawn], x, y)
+        return cls(size, texel, drawn % count, weights)
+
+
+@dataclass(frozen=True, eq=False)
+class BackProjection:
+    """Weighted sums of what was seen of each texel; sums over frames add up.
+
+    Attributes:
+        total: ``(C, T, T)`` weighted sum of values.
+        weight: ``(T, T)`` sum of weights.
+    """
+
+    total: Tensor
+    weight: Tensor
+
+    def __add__(self, other: BackProjection) -> BackProjection:
+        """What both have seen."""
+        return BackProjection(self.total + other.total, self.weight + other.weight)
+
+    def mean(self) -> Tensor:
+        """``(C, T, T)`` weighted mean, zero where nothing was seen."""
+        return self.total / self.weight.clamp_min(1e-8)
+
+
+@torch.no_grad()
+def back_project(
+    values: Tensor, valid: Tensor, vertices: Tensor, faces: Tensor, texels: TexelMap, R: Tensor, t: Tensor, K: Tensor
+) -> BackProjection:
+    """What one frame shows of the texture.
+
+    Args:
+        values: ``(C, H, W)`` colours or features of the frame.
+        valid: ``(H, W)`` in [0, 1], how far each pixel may be believed.
+        vertices: ``(V, 3)`` in object coordinates.
+        faces: ``(F, 3)``.
+        texels: The atlas.
+        R: ``(3, 3)``; t: ``(3,)``: ``T_cam_obj``.
+        K: ``(3, 3)`` of the window.
+    """
+    height, width = values.shape[1:]
+    screen, depth = project(vertices, R[None], t[None], K[None])
+    drawn = rasterize(screen, depth, faces, (height, width)).depth
+    x_cam = vertices @ R.T + t
+    corner = x_cam[faces]
+    normal = functional.normalize(torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), dim=1)
+    point = (x_cam[faces[texels.face]] * texels.barycentric[..., None]).sum(1)
+    cosine = -(normal[texels.face] * functional.normalize(point, dim=1)).sum(1)
+    front = torch.nonzero((cosine > _GRAZING) & (point[:, 2] > 0))[:, 0]
+    point, cosine, texel = point[front], cosine[front], texels.texel[front]
+
+    pixel = torch.stack([K[0, 0], K[1, 1]]) * point[:, :2] / point[:, 2:] + K[:2, 2]
+    grid = ((2 * pixel + 1) / pixel.new_tensor([width, height]) - 1)[None, None]
+    nearest = functional.grid_sample(
+        torch.where(drawn.isinf(), 0.0, drawn)[None], grid, mode="nearest", align_corners=False
+    )[0, 0, 0]
+    radius = (vertices - vertices.mean(0)).norm(dim=1).max()
+    visible = (nearest > 0) & (point[:, 2] < nearest + _DEPTH_TOLERANCE * radius / cosine)
+    layers = torch.cat([values, valid[None]])
+    sampled = functional.grid_sample(layers[None], grid, mode="bilinear", align_corners=False)[0, :, 0]
+    weight = cosine.square() * visible * sampled[-1]
+    size = texels.size
+    total = values.new_zeros(values.shape[0], size * size)
+    total[:, texel] = sampled[:-1] * weight
+    count = values.new_zeros(size * size)
+    count[texel] = weight
+    return BackProjection(total.reshape(-1, size, size), count.reshape(size, size))
