@@ -121,6 +121,10 @@ class SolverConfig(Section):
     pose_iterations: int = Field(
         0, ge=0, description="Iterations on the new frame's pose alone before the joint ones; 0 for none (paper)."
     )
+    joint: Literal["always", "new_view"] = Field(
+        "always",
+        description="Optimize shape, texture and all poses in every frame (paper), or only in frames that show a new view or that their pose alone cannot explain; needs pose_iterations.",
+    )
     texture_start: Literal["zero", "backprojected"] = Field(
         "zero", description="Texels not seen before start at zero (paper), or at what the new frame shows there."
     )

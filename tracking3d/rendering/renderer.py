@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from tracking3d.rendering.interpolation import interpolate
+from tracking3d.rendering.shapes import check_shapes
 from tracking3d.rendering.silhouette import BOXLEN, KNUM, SIGMA, soft_silhouette
 from tracking3d.rendering.texture import sample_texture
 from tracking3d.rendering.visibility import NEAR, rasterize
@@ -99,7 +100,15 @@ def render(
     Raises:
         ValueError: If a shape does not fit; it names the actual and the expected shape.
     """
-    _check_shapes(vertices, faces, face_uvs, texture, R, t, K)
+    check_shapes(
+        R=(R, "B 3 3"),
+        t=(t, "B 3"),
+        K=(K, "B 3 3"),
+        vertices=(vertices, "B V 3" if vertices.dim() == 3 else "V 3"),
+        faces=(faces, "F 3"),
+        face_uvs=(face_uvs, "F 3 2"),
+        texture=(texture, "C T T"),
+    )
     band = band or SoftBand()
     screen, depth = project(vertices, R, t, K)
     visibility = rasterize(screen.detach(), depth.detach(), faces, size)
@@ -108,21 +117,3 @@ def render(
     uv = interpolate(screen, depth, faces, face_uvs, index)
     pixels = torch.nonzero(index.reshape(-1) >= 0)[:, 0]
     return Rendering(index, visibility.depth, silhouette, pixels, uv, sample_texture(texture, uv))
-
-
-def _check_shapes(
-    vertices: Tensor, faces: Tensor, face_uvs: Tensor, texture: Tensor, R: Tensor, t: Tensor, K: Tensor
-) -> None:
-    batch = R.shape[0]
-    expected = {
-        "R": (R, (batch, 3, 3)),
-        "t": (t, (batch, 3)),
-        "K": (K, (batch, 3, 3)),
-        "faces": (faces, (len(faces), 3)),
-        "face_uvs": (face_uvs, (len(faces), 3, 2)),
-        "vertices": (vertices, (*((batch,) if vertices.dim() == 3 else ()), vertices.shape[-2], 3)),
-        "texture": (texture, (texture.shape[0], *texture.shape[1:3])),
-    }
-    for name, (value, shape) in expected.items():
-        if tuple(value.shape) != shape:
-            raise ValueError(f"{name} has shape {tuple(value.shape)}, expected {shape}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -66,6 +66,10 @@ class Belief:
         """Diameter of the object in object units."""
         centred = self.vertices - self.vertices.mean(0)
         return 2 * float(centred.norm(dim=1).max())
+
+    def moved(self, pose: Pose, index: int) -> Belief:
+        """The same belief one frame later."""
+        return replace(self, last=(pose, index), before=self.last if self.started else None, started=True)
 
     def back_project(self, values: Tensor, keyframe: Keyframe) -> BackProjection:
         """What a frame shows of the texture; ``values`` is ``(C, H, W)`` over the frame's window."""

@@ -73,11 +73,11 @@ def optimize(
         )
         losses = problem.losses(parameters)
         total = losses.total(config.weights)
-        value = float(total)
+        value = float(total.detach())
         if not torch.isfinite(total):
             return _numerical_failure(best, start, losses, value, iteration)
         if config.stop == "threshold":
-            converged = float(losses.features.mean()) < tau
+            converged = float(losses.features.detach().mean()) < tau
             if converged or iteration == iterations:
                 return Optimum(parameters.detach(), losses.detach(), value, iteration)
         elif best is None or value < best.total:

@@ -38,11 +38,12 @@ class Shape:
     def of(cls, mesh: Mesh, flat: bool, device: torch.device) -> Shape:
         """Take a prototype mesh to a device."""
         faces = torch.from_numpy(mesh.faces).to(device)
+        laplacian = uniform_laplacian(faces, len(mesh.vertices)).to(device)
         return cls(
             torch.from_numpy(mesh.vertices).float().to(device),
             faces,
             torch.from_numpy(mesh.face_uvs).float().to(device),
-            uniform_laplacian(faces, len(mesh.vertices)).to(device),
+            laplacian,
             flat,
         )
 

@@ -18,7 +18,7 @@ from tracking3d.errors import InputError
 from tracking3d.estimation.appearance import visible_texture
 from tracking3d.estimation.assessment import Assessment, assess
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
-from tracking3d.estimation.keyframes import Candidate, select_keyframes
+from tracking3d.estimation.keyframes import Candidate, is_new_view, select_keyframes
 from tracking3d.estimation.observation import Batch, Observation, observe
 from tracking3d.estimation.paper.belief import Belief, Keyframe
 from tracking3d.estimation.paper.joint_start import joint_start
@@ -72,7 +72,8 @@ class PaperSolver:
         ellipse = mask_ellipse(binary)
         translation = torch.tensor(first_translation(ellipse, self.camera), dtype=torch.float32)
         pose = Pose.identity(translation.to(self.device))
-        shape = Shape.of(prototype_mesh(self.config.object, ellipse), self.config.object.flat, self.device)
+        prototype = prototype_mesh(self.config.object, ellipse)
+        shape = Shape.of(prototype, self.config.object.flat, self.device)
         size = self.config.object.texture_size
         offsets = torch.zeros_like(shape.rest)
         if shape.flat:
@@ -154,10 +155,17 @@ class PaperSolver:
     ) -> tuple[Belief, FrameEstimate]:
         """Optimize, judge, choose keyframes, answer."""
         first, iterations = not belief.started, 0
+        optimum = None
         if self.config.solver.pose_iterations and not first:
-            current, iterations = self._refine_pose(belief, current)
-        belief = self._with_new_texture(belief, current)
-        frames, optimum = self._optimize(belief, current)
+            optimum = self._refine_pose(belief, current)
+            iterations = optimum.iterations
+            if not optimum.reason:
+                current = Keyframe(current.observation, optimum.parameters.poses[0])
+        frames = [current]
+        if optimum is None or self._needs_joint(belief, current, optimum):
+            belief = self._with_new_texture(belief, current)
+            frames, optimum = self._optimize(belief, current)
+            iterations += optimum.iterations
         losses = optimum.losses.of_frame(-1)
         answer = FrameEstimate(
             index=frame.index,
@@ -169,7 +177,7 @@ class PaperSolver:
             reason="",
             confidence=0.0,
             losses=losses,
-            iterations=iterations + optimum.iterations,
+            iterations=iterations,
         )
         judgement = self._judge(optimum, -1, mask is not None)
         if judgement.status is Status.LOST and not first:
@@ -177,23 +185,31 @@ class PaperSolver:
             if not optimum.reason:
                 belief = replace(belief, last=(optimum.parameters.poses[-1], frame.index))
             return belief, self._answered(answer, judgement, started)
-        known = self._updated(belief, frames, optimum)
+        joint = len(frames) > 1 or first or not belief.keyframes
+        known = self._updated(belief, frames, optimum) if joint else belief.moved(frames[-1].pose, frame.index)
         if judgement.status is not Status.LOST:
             answer = replace(answer, mask=known.silhouette(known.last[0]))
         answer = replace(answer, keyframe=any(k.observation.index == frame.index for k in known.keyframes))
         return self._with_waiting(belief, known, frames, optimum, self._answered(answer, judgement, started))
 
-    def _refine_pose(self, belief: Belief, current: Keyframe) -> tuple[Keyframe, int]:
+    def _refine_pose(self, belief: Belief, current: Keyframe) -> Optimum:
         """The new frame's pose alone, against what is known."""
-        optimum = optimize(
+        return optimize(
             self._problem_of_pose(belief, current.observation),
             belief.parameters([current]),
             iterations=self.config.solver.pose_iterations,
             tau=self.tau,
             free="pose",
         )
-        pose = current.pose if optimum.reason else optimum.parameters.poses[0]
-        return Keyframe(current.observation, pose), optimum.iterations
+
+    def _needs_joint(self, belief: Belief, current: Keyframe, optimum: Optimum) -> bool:
+        """Whether shape and texture have something to learn from this frame."""
+        if self.config.solver.joint == "always" or belief.waiting is not None or not belief.keyframes:
+            return True
+        if self._judge(optimum, -1, current.observation.has_mask).status is Status.LOST:
+            return True
+        latest = belief.keyframes[-1].pose
+        return is_new_view(latest, current.pose, belief.object_size, self.config.solver.keyframes)
 
     def _with_new_texture(self, belief: Belief, current: Keyframe) -> Belief:
         """Start texels that no keyframe has seen at what the new frame shows."""
@@ -239,14 +255,8 @@ class PaperSolver:
         for i, keyframe in enumerate(moved[:-1]):
             if i not in kept and appearance[i] < self.tau:
                 seen = seen + found.back_project(keyframe.observation.image, keyframe)
-        return replace(
-            found,
-            keyframes=tuple(moved[i] for i in kept),
-            seen=seen,
-            last=(moved[-1].pose, moved[-1].observation.index),
-            before=belief.last if belief.started else None,
-            started=True,
-        )
+        found = found.moved(moved[-1].pose, moved[-1].observation.index)
+        return replace(found, keyframes=tuple(moved[i] for i in kept), seen=seen)
 
     def _with_waiting(
         self, belief: Belief, known: Belief, frames: list[Keyframe], optimum: Optimum, answer: FrameEstimate

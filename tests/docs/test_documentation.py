@@ -1,0 +1,91 @@
+"""What the documentation names exists: files, headings, settings, keys of the files that are written."""
+
+from __future__ import annotations
+
+import re
+from functools import reduce
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from documentation_pages import PAGES, ROOT, label
+from pydantic import BaseModel
+
+from tracking3d.config.loading import load_config
+from tracking3d.config.models import PipelineConfig
+from tracking3d.evaluation.score import Scores
+from tracking3d.geometry.camera import Camera
+from tracking3d.results import layout
+from tracking3d.results.description import description_at_start, summary
+from tracking3d.results.records import FrameRecord
+
+
+def anchor(heading: str) -> str:
+    """The anchor that Markdown viewers give a heading."""
+    return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=label)
+def test_links_lead_somewhere(page: Path):
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
+        if re.match(r"https?:", target):
+            continue
+        name, _, fragment = target.partition("#")
+        file = (page.parent / name).resolve() if name else page
+        assert file.exists(), target
+        if fragment:
+            headings = re.findall(r"^#+ (.*)$", file.read_text(encoding="utf-8"), re.M)
+            assert fragment in map(anchor, headings), target
+
+
+def test_every_page_is_in_the_index():
+    index = (ROOT / "docs/index.md").read_text(encoding="utf-8")
+    for page in ROOT.glob("docs/*.md"):
+        assert page.name == "index.md" or f"({page.name})" in index
+
+
+@pytest.mark.parametrize("page", PAGES, ids=label)
+def test_settings_that_are_named_exist(page: Path):
+    sections = "|".join(PipelineConfig.model_fields)
+    named = re.findall(rf"`((?:{sections})\.[a-z_.]+)`", page.read_text(encoding="utf-8"))
+    for path in set(named) - {layout.FEATURES}:
+        reduce(field_named, path.split("."), PipelineConfig)
+
+
+def field_named(model: type[BaseModel], key: str) -> Any:
+    assert key in model.model_fields, f"{model.__name__} has no {key}"
+    return model.model_fields[key].annotation
+
+
+def test_method_lists_exactly_what_the_default_preset_changes():
+    page = (ROOT / "docs/method.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `([a-z_.]+)` \| ([^|]*) \| ([^|]*) \|[^|]*\|$", page, re.M)
+    documented = {key: (yaml.safe_load(paper), yaml.safe_load(default)) for key, paper, default in rows}
+    paper, default = (dict(flat(load_config(preset=name).model_dump())) for name in ("paper", "default"))
+    assert documented == {key: (paper[key], default[key]) for key in paper if paper[key] != default[key]}
+
+
+def flat(settings: dict[str, Any], prefix: str = ""):
+    for key, value in settings.items():
+        if isinstance(value, dict):
+            yield from flat(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, value
+
+
+def test_run_folder_page_names_every_file_and_key():
+    page = (ROOT / "docs/run-folder.md").read_text(encoding="utf-8")
+    files = [value for name, value in vars(layout).items() if name.isupper() and isinstance(value, str)]
+    start = description_at_start(
+        config={}, camera=Camera.from_fov(4, 4), source="", seed=0, fps=None, command=None
+    )
+    end = summary([], 0, 0.0)
+    keys = {*start, *start["versions"], *start["camera"], *end, *end["counts"], *end["timings"]}
+    for name in {*files, *keys, *FrameRecord.__dataclass_fields__} - {layout.FORMAT}:
+        assert name in page, name
+
+
+def test_measures_page_names_every_key():
+    page = (ROOT / "docs/measures.md").read_text(encoding="utf-8")
+    assert [key for key in Scores.__dataclass_fields__ if f"`{key}`" not in page] == []
