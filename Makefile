@@ -27,8 +27,8 @@ clean:
 
 # Editable, so that what runs is what lies here, without installing again after a change.
 $(VENV)/installed: pyproject.toml constraints.txt
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "tracking3d needs \
-	Python 3.11 or newer and $(PYTHON) is not: name one that is, as in make demo PYTHON=python3.12" >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { echo \
+	"$(PYTHON) is not Python 3.11 or newer; name one that is, such as: make demo PYTHON=python3.12" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	@echo "Installing into $(VENV); the first time this downloads torch and takes a minute or more."
 	$(INSTALL) -e .

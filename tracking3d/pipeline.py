@@ -55,8 +55,7 @@ class Session:
         check_device(config.runtime.device)
         if config.solver.name not in SOLVERS:
             raise InputError(f"Unknown solver '{config.solver.name}'; choose one of {', '.join(SOLVERS)}.")
-        if config.runtime.threads is not None:
-            torch.set_num_threads(config.runtime.threads)
+        torch.set_num_threads(config.runtime.threads)
         self.config = config
         self._prompt = prompt
         self._intrinsics = intrinsics, intrinsics_origin

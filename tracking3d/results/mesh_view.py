@@ -61,7 +61,8 @@ def render_view(model: ObjectModel, rotation: NDArray[np.float64], size: int) ->
         [2, 3, 3], dim=1
     )
     seen = (model.texture_weight > 0)[..., None]
-    texture = torch.tensor(np.concatenate([model.texture * seen, seen], axis=2, dtype=np.float64))
+    layers = np.concatenate([model.texture * seen, seen], axis=2, dtype=np.float64)
+    texture = torch.tensor(layers.transpose(2, 0, 1))
     colour, weight = sample_texture(texture, uv).split([3, 1], dim=1)
     colour = colour + (1 - weight) * _UNSEEN
     to_camera = torch.nn.functional.normalize(

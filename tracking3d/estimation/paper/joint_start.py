@@ -22,6 +22,7 @@ from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
 RATES = (3.0, 8.0)
 """Degrees a frame that the hypotheses turn."""
 DIRECTIONS = 8
+_SEMIFINALISTS = 6
 _FINALISTS = 2
 
 
@@ -37,19 +38,17 @@ def joint_start(belief: Belief, frames: list[Keyframe], config: SolverConfig, ta
     config = config.model_copy(update={"stop": "plateau", "patience": config.start_iterations})
     coarse = Problem(belief.shape, Batch.of([halved(frame.observation) for frame in frames]), config)
     fine = Problem(belief.shape, Batch.of([frame.observation for frame in frames]), config)
-    starts = [belief.parameters(frames)] + hypotheses(belief, frames)
-    coarse_optima = [
-        optimize(coarse, start, iterations=config.start_iterations, tau=tau, fixed=1) for start in starts
-    ]
-    usable = [optimum for optimum in coarse_optima if not optimum.reason] or coarse_optima[:1]
-    usable.sort(key=lambda optimum: optimum.total)
-    finals = [
-        optimize(fine, optimum.parameters, iterations=config.start_iterations, tau=tau, fixed=1)
-        for optimum in usable[:_FINALISTS]
-    ]
-    best = min(finals, key=lambda optimum: math.inf if optimum.reason else optimum.total)
-    spent = sum(optimum.iterations for optimum in coarse_optima + finals)
-    return replace(best, iterations=spent)
+    spent = 0
+    optima: list[Optimum] = []
+    starts = [belief.parameters(frames), *hypotheses(belief, frames)]
+    for problem, survivors, share in ((coarse, len(starts), 3), (coarse, _SEMIFINALISTS, 1), (fine, _FINALISTS, 1)):
+        starts = starts[:survivors]
+        iterations = max(config.start_iterations // share, 1)
+        optima = [optimize(problem, start, iterations=iterations, tau=tau, fixed=1) for start in starts]
+        spent += sum(optimum.iterations for optimum in optima)
+        optima.sort(key=lambda optimum: math.inf if optimum.reason else optimum.total)
+        starts = [optimum.parameters for optimum in optima]
+    return replace(optima[0], iterations=spent)
 
 
 def hypotheses(belief: Belief, frames: list[Keyframe]) -> list[Parameters]:
