@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import pytest
+import torch
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
@@ -26,3 +28,10 @@ def shared_data() -> Path:
 def shared_models() -> Path:
     """Folder of real ONNX networks; the test is skipped where it is absent."""
     return _shared("models")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_thread() -> None:
+    """Tests that run side by side on few cores wait for each other's threads far longer than they compute."""
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)

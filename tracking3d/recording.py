@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError, OutputError
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.frames import Box, Frame, SkippedFrame
-from tracking3d.pipeline import Session
+from tracking3d.pipeline import Session, choose_camera
 from tracking3d.prompts import make_prompt
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_writer import RunWriter
@@ -31,6 +32,7 @@ def record(
     box: Box | None = None,
     mask: NDArray[np.bool_] | Path | None = None,
     command: str | None = None,
+    selection: str | None = None,
     overwrite: bool = False,
     listener: Listener = lambda frame: None,
 ) -> None:
@@ -44,6 +46,7 @@ def record(
         mask: The object in the first frame, as a mask or the image file of one. Without a box and a mask the
             tracker's own first mask is the prompt.
         command: The command line, for the record.
+        selection: The ``START:STOP:STEP`` that the source was opened with, for the record.
         overwrite: Replace a run that is in the folder.
         listener: Is told of every frame.
 
@@ -52,38 +55,38 @@ def record(
     """
     frames = iter(source)
     skipped, first = _first_frame(frames, source.name)
+    height, width = first.size
+    camera = choose_camera(config.camera, width, height, source.intrinsics, source.intrinsics_origin)
     prompt = None if box is None and mask is None else make_prompt(first, box, mask)
     session = Session(config, prompt, source.intrinsics, source.intrinsics_origin)
-    estimate = session.step(first)
-    writer = RunWriter(
+    with RunWriter(
         folder,
         config=config.model_dump(mode="json"),
-        camera=session.camera,
+        camera=camera,
         source=source.name,
         seed=config.runtime.seed,
         fps=source.fps,
         command=command,
+        selection=selection,
         overwrite=overwrite,
-    )
-    try:
-        for item in skipped:
-            writer.skip(item)
-            listener(item)
-        listener(writer.write(estimate, first))
-        for frame in frames:
-            if isinstance(frame, SkippedFrame):
-                writer.skip(frame)
-                listener(frame)
-            else:
-                listener(writer.write(session.step(frame), frame))
-        model = session.result()
-    except BaseException as error:
-        failed = isinstance(error, Exception)
-        error.add_note(f"What was finished until then is kept in {folder}.")
-        with suppress(OutputError):  # the first error is the one to tell
-            writer.finish(_model(session), "failed" if failed else "interrupted", str(error) or None)
-        raise
-    writer.finish(model, "finished")
+    ) as writer:
+        try:
+            for item in skipped:
+                writer.skip(item)
+                listener(item)
+            for frame in chain([first], frames):
+                if isinstance(frame, SkippedFrame):
+                    writer.skip(frame)
+                    listener(frame)
+                else:
+                    listener(writer.write(session.step(frame), frame))
+        except BaseException as error:
+            failed = isinstance(error, Exception)
+            error.add_note(f"What was finished until then is kept in {folder}.")
+            with suppress(OutputError):  # the first error is the one to tell
+                writer.finish(_model(session), "failed" if failed else "interrupted", str(error) or None)
+            raise
+        writer.finish(session.result(), "finished")
 
 
 def _first_frame(frames: Iterator[Frame | SkippedFrame], name: str) -> tuple[list[SkippedFrame], Frame]:

@@ -78,7 +78,7 @@ def test_run_folder_page_names_every_file_and_key():
     page = (ROOT / "docs/run-folder.md").read_text(encoding="utf-8")
     files = [value for name, value in vars(layout).items() if name.isupper() and isinstance(value, str)]
     start = description_at_start(
-        config={}, camera=Camera.from_fov(4, 4), source="", seed=0, fps=None, command=None
+        config={}, camera=Camera.from_fov(4, 4), source="", selection=None, seed=0, fps=None, command=None
     )
     end = summary([], 0, 0.0)
     keys = {*start, *start["versions"], *start["camera"], *end, *end["counts"], *end["timings"]}

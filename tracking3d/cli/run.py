@@ -135,6 +135,7 @@ def run(
             box=given,
             mask=mask,
             command=shlex.join(sys.argv),
+            selection=frames,
             overwrite=overwrite,
             listener=listener,
         )

@@ -30,6 +30,9 @@ def appearance_loss(
 ) -> Tensor:
     """Appearance loss, eq. 1, for each frame: the mean Cauchy loss over the object's visible pixels.
 
+    The mean over the object makes the threshold tau independent of the window; over the whole window, where most
+    pixels are zero, 0.2 would be reached before anything has moved.
+
     Only covered pixels take part: there the soft silhouette is 1, so the factor ``R_S`` of eq. 1 is exact, and
     an empty texture beyond the outline is not compared with the background.
 

@@ -17,9 +17,20 @@ from tracking3d.errors import InputError
 from tracking3d.geometry.mesh import Mesh
 
 
+LONGEST_EDGE = 0.25
+"""A user's mesh is refined until its edges are shorter than this, in units of its radius."""
+MOST_FACES = 10_000
+"""But not beyond this number of faces."""
+
+
 def icosphere(frequency: int = 11) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Unit sphere of ``10 f^2 + 2`` vertices ``(V, 3)`` and ``20 f^2`` faces ``(F, 3)``, outward oriented."""
+    """Unit sphere of ``10 f^2 + 2`` vertices ``(V, 3)`` and ``20 f^2`` faces ``(F, 3)``, outward oriented.
+
+    There is a vertex at each end of the y axis, where the atlas has its poles.
+    """
     solid = trimesh.creation.icosahedron()
+    sine, cosine, _ = solid.vertices[1]  # lies in the plane z = 0
+    upright = solid.vertices @ np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
     corners, faces = [], []
     steps = [(i, j) for i in range(frequency + 1) for j in range(frequency + 1 - i)]
     row = {step: k for k, step in enumerate(steps)}
@@ -28,7 +39,7 @@ def icosphere(frequency: int = 11) -> tuple[NDArray[np.float64], NDArray[np.int6
     cells += [(row[i + 1, j], row[i + 1, j + 1], row[i, j + 1]) for i, j in steps if i + j < frequency - 1]
     for face in solid.faces:
         faces.append(np.array(cells) + sum(map(len, corners)))
-        corners.append(weights @ solid.vertices[face])
+        corners.append(weights @ upright[face])
     # Vertices on shared edges are computed from both sides: merge them.
     points = np.concatenate(corners)
     _, first, inverse = np.unique(np.round(points, 6), axis=0, return_index=True, return_inverse=True)
@@ -70,25 +81,35 @@ def ellipsoid(axes: NDArray[np.float64], rotation: NDArray[np.float64], frequenc
 def from_file(path: Path) -> Mesh:
     """A user's mesh, centred and scaled to unit radius, with an atlas by longitude and latitude.
 
+    Coarse meshes are divided into smaller faces: a face cannot bend, and a large one would fold the atlas.
+
     Raises:
         InputError: If the file is missing or holds no triangle mesh.
     """
+    advice = "give an OBJ, PLY, STL or GLB file"
     if not path.is_file():
         raise InputError(f"the prototype '{path}' does not exist: give sphere, ellipsoid or a mesh file")
     try:
         loaded = trimesh.load_mesh(path, process=False)
     except Exception as error:  # trimesh raises whatever its loaders raise
-        raise InputError(f"the prototype '{path}' cannot be read as a mesh ({error}): give an OBJ, PLY, STL or GLB file") from error
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"the prototype '{path}' cannot be read as a mesh ({reason}): {advice}") from error
     if not isinstance(loaded, trimesh.Trimesh) or len(loaded.faces) == 0:
-        raise InputError(f"the prototype '{path}' holds no triangles: give an OBJ, PLY, STL or GLB file")
+        raise InputError(f"the prototype '{path}' holds no triangles: {advice}")
+    if not np.isfinite(loaded.vertices).all():
+        raise InputError(f"the prototype '{path}' has vertices that are not finite: {advice}")
     # Duplicated vertices at texture seams would tear when the shape deforms.
     solid = trimesh.Trimesh(loaded.vertices, loaded.faces, process=False)
     solid.merge_vertices(merge_tex=True, merge_norm=True)
     solid.update_faces(solid.nondegenerate_faces())
     solid.remove_unreferenced_vertices()
+    if len(solid.faces) == 0:
+        raise InputError(f"the prototype '{path}' holds only triangles without area: {advice}")
     if solid.is_watertight:
         solid.fix_normals()
-    vertices = solid.vertices - solid.bounds.mean(0)
-    vertices = vertices / np.linalg.norm(vertices, axis=1).max()
-    faces = np.asarray(solid.faces, dtype=np.int64)
-    return Mesh(np.asarray(vertices, dtype=np.float64), faces, equirectangular_uvs(vertices, faces))
+    solid.vertices -= solid.bounds.mean(0)
+    solid.vertices /= np.linalg.norm(solid.vertices, axis=1).max()
+    while solid.edges_unique_length.max() > LONGEST_EDGE and 4 * len(solid.faces) <= MOST_FACES:
+        solid = solid.subdivide()
+    vertices, faces = np.array(solid.vertices, dtype=np.float64), np.array(solid.faces, dtype=np.int64)
+    return Mesh(vertices, faces, equirectangular_uvs(vertices, faces))

@@ -51,8 +51,9 @@ class TexelMap:
         texel = torch.nonzero(index >= 0)[:, 0]
         drawn = index[texel]
         x, y = (texel % size).to(corner), torch.div(texel, size, rounding_mode="floor").to(corner)
-        weights, _ = barycentrics(both[drawn], x, y)
-        return cls(size, texel, drawn % count, weights)
+        corner_x, corner_y = both[drawn].permute(2, 1, 0)
+        weights, _, _ = barycentrics(corner_x, corner_y, x, y)
+        return cls(size, texel, drawn % count, weights.T)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,7 @@
 """Perspective-correct interpolation of face attributes at covered pixels, with its closed-form gradient.
 
 With screen barycentrics w_i and depths z_i: ``l_i = (w_i / z_i) / sum_j (w_j / z_j)`` and ``u = sum_i l_i u_i``.
+Everything is computed in planes ``(3, P)``, one for each corner of the faces.
 """
 
 from __future__ import annotations
@@ -10,6 +11,9 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+
+from tracking3d.rendering.shapes import check_shapes
+from tracking3d.rendering.visibility import gather
 
 
 def interpolate(screen: Tensor, depth: Tensor, faces: Tensor, attributes: Tensor, face_index: Tensor) -> Tensor:
@@ -26,27 +30,36 @@ def interpolate(screen: Tensor, depth: Tensor, faces: Tensor, attributes: Tensor
 
     Returns:
         ``(P, D)``, one row for each covered pixel in the order of ``(face_index >= 0).nonzero()``.
+
+    Raises:
+        ValueError: If a shape does not fit.
     """
+    check_shapes(
+        screen=(screen, "B V 2"),
+        depth=(depth, "B V"),
+        faces=(faces, "F 3"),
+        attributes=(attributes, "F 3 D"),
+        face_index=(face_index, "B H W"),
+    )
     result: Tensor = _Interpolate.apply(screen, depth, faces, attributes, face_index)
     return result
 
 
-def barycentrics(corner: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+def barycentrics(corner_x: Tensor, corner_y: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Screen barycentrics of points in triangles, and their gradient in the point.
 
     Args:
-        corner: ``(P, 3, 2)`` triangle corners.
+        corner_x, corner_y: ``(3, P)`` triangle corners.
         x, y: ``(P,)`` points.
 
     Returns:
-        ``(P, 3)`` weights that sum to 1, and ``(P, 3, 2)`` their derivative by the point.
+        ``(3, P)`` weights that sum to 1, and their derivatives ``(3, P)`` by x and by y.
     """
-    following, last = corner.roll(-1, 1), corner.roll(-2, 1)
-    edge = last - following  # opposite corner i
-    area = (edge[:, 2, 0] * -edge[:, 1, 1] + edge[:, 2, 1] * edge[:, 1, 0])[:, None]
-    slope = torch.stack([-edge[..., 1], edge[..., 0]], 2) / area[..., None]
-    to_point = torch.stack([x, y], 1)[:, None] - following
-    return (to_point * slope).sum(2), slope
+    following_x, following_y = corner_x.roll(-1, 0), corner_y.roll(-1, 0)
+    edge_x, edge_y = corner_x.roll(-2, 0) - following_x, corner_y.roll(-2, 0) - following_y  # opposite corner i
+    area = edge_x[1] * edge_y[2] - edge_y[1] * edge_x[2]
+    by_x, by_y = -edge_y / area, edge_x / area
+    return (x - following_x) * by_x + (y - following_y) * by_y, by_x, by_y
 
 
 class _Interpolate(torch.autograd.Function):
@@ -54,33 +67,40 @@ class _Interpolate(torch.autograd.Function):
     def forward(
         ctx: Any, screen: Tensor, depth: Tensor, faces: Tensor, attributes: Tensor, face_index: Tensor
     ) -> Tensor:
-        view, y, x = torch.nonzero(face_index >= 0, as_tuple=True)
-        face = face_index[view, y, x]
-        vertex = view[:, None] * screen.shape[1] + faces[face]  # (P, 3)
-        z = depth.reshape(-1)[vertex]
-        w, slope = barycentrics(screen.reshape(-1, 2)[vertex], x.to(screen.dtype), y.to(screen.dtype))
+        _, height, width = face_index.shape
+        pixel = torch.nonzero(face_index.reshape(-1) >= 0)[:, 0]
+        face = gather(face_index, pixel)
+        row = torch.div(pixel, width, rounding_mode="floor")
+        view = torch.div(row, height, rounding_mode="floor")
+        x, y = (pixel - row * width).to(screen.dtype), (row - view * height).to(screen.dtype)
+        vertex = faces.T.contiguous().index_select(1, face) + view * screen.shape[1]  # (3, P) in depth.flatten()
+        z = gather(depth, vertex)
+        w, by_x, by_y = barycentrics(gather(screen[..., 0], vertex), gather(screen[..., 1], vertex), x, y)
         weight = w / z
-        s = 1 / weight.sum(1, keepdim=True)
+        s = 1 / weight.sum(0)
         share = weight * s
-        corner_values = attributes[face]  # (P, 3, D)
-        values = (share[..., None] * corner_values).sum(1)
-        ctx.save_for_backward(vertex, face, w, slope, z, s, share, corner_values, values)
+        planes = attributes.permute(2, 1, 0).reshape(-1, len(faces))
+        corner_values = planes.index_select(1, face).reshape(attributes.shape[2], 3, len(face))  # (D, 3, P)
+        values = (share * corner_values).sum(1)  # (D, P)
+        ctx.save_for_backward(vertex, face, w, by_x, by_y, z, s, share, corner_values, values)
         ctx.shapes = screen.shape, attributes.shape
-        return values
+        return values.T
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None, Tensor | None, None]:  # type: ignore[override]
-        vertex, face, w, slope, z, s, share, corner_values, values = ctx.saved_tensors
+        vertex, face, w, by_x, by_y, z, s, share, corner_values, values = ctx.saved_tensors
         screen_shape, attributes_shape = ctx.shapes
-        g = ((corner_values - values[:, None]) * grad[:, None]).sum(2)  # (P, 3)
-        by_point = (g * s / z)[:, None] @ slope  # (P, 1, 2)
-        grad_screen = grad.new_zeros(screen_shape)
-        grad_screen.reshape(-1, 2).index_add_(0, vertex.reshape(-1), (-w[..., None] * by_point).reshape(-1, 2))
-        grad_depth = grad.new_zeros(screen_shape[:2])
-        grad_depth.reshape(-1).index_add_(0, vertex.reshape(-1), (-g * share / z).reshape(-1))
+        rows = vertex.reshape(-1)
+        g = ((corner_values - values[:, None]) * grad.T[:, None]).sum(0) / z  # (3, P)
+        by_weight = g * s
+        planes = [-w * (by_weight * slope).sum(0) for slope in (by_x, by_y)] + [-g * share]
+        grad_x, grad_y, grad_depth = (
+            grad.new_zeros(screen_shape[:2]).reshape(-1).index_add_(0, rows, plane.reshape(-1)) for plane in planes
+        )
         grad_attributes = None
         if ctx.needs_input_grad[3]:
             grad_attributes = grad.new_zeros(attributes_shape)
-            grad_attributes.index_add_(0, face, share[..., None] * grad[:, None])
-        return grad_screen, grad_depth, None, grad_attributes, None
+            grad_attributes.index_add_(0, face, share.T[..., None] * grad[:, None])
+        grad_screen = torch.stack([grad_x, grad_y], 1).reshape(screen_shape)
+        return grad_screen, grad_depth.reshape(screen_shape[:2]), None, grad_attributes, None

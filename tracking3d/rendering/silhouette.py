@@ -8,18 +8,22 @@ faces in index order only.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.nn import functional
 
-from tracking3d.rendering.visibility import NEAR, PixelPairs, expand_boxes
+from tracking3d.rendering.shapes import check_shapes
+from tracking3d.rendering.visibility import NEAR, expand_ranges, face_corners, gather
 
 SIGMA = 7000.0
 BOXLEN = 0.02
 KNUM = 30
 _CLAMP = 1e-7  # keeps 1 / (1 - e) finite where a pixel lies on an edge
+_LEAST = -60.0  # exp of less changes no sum, but denormal numbers are slow
 
 
 def soft_silhouette(
@@ -33,6 +37,8 @@ def soft_silhouette(
 ) -> Tensor:
     """Soft silhouette ``(B, H, W)`` in [0, 1], differentiable in ``screen``.
 
+    A view with a vertex that is not finite is NaN where it is uncovered, so that a loss on it shows.
+
     Args:
         screen: ``(B, V, 2)`` vertices in pixels.
         depth: ``(B, V)`` z in camera coordinates; faces too near are left out.
@@ -41,7 +47,13 @@ def soft_silhouette(
         sigma: Sharpness per squared NDC unit.
         boxlen: Reach beyond a face's box in NDC.
         knum: Most faces that count at a pixel.
+
+    Raises:
+        ValueError: If a shape does not fit.
     """
+    check_shapes(
+        screen=(screen, "B V 2"), depth=(depth, "B V"), faces=(faces, "F 3"), face_index=(face_index, "B H W")
+    )
     result: Tensor = _SoftSilhouette.apply(screen, depth, faces, face_index, sigma, boxlen, knum)
     return result
 
@@ -59,85 +71,130 @@ class _SoftSilhouette(torch.autograd.Function):
         knum: int,
     ) -> Tensor:
         batch, height, width = face_index.shape
-        uncovered = face_index < 0
-        to_ndc = screen.new_tensor([2.0 / width, 2.0 / height])
-        ndc = screen * to_ndc + (to_ndc * 0.5 - 1.0)
-        view, face, pairs = _pairs_near_uncovered(ndc, depth, faces, uncovered, boxlen)
-        pixel = (view[pairs.box] * height + pairs.y) * width + pairs.x
-        kept = _first_per_pixel(pixel, knum, batch * height * width)
+        x, y = _ndc(screen[..., 0], width), _ndc(screen[..., 1], height)
+        pairs = _pairs_near_uncovered(x, y, depth, faces, face_index < 0, boxlen)
+        kept = _first_per_pixel(pairs.pixel, knum, face_index.numel())
         if kept is not None:
-            pixel = pixel[kept]
-            pairs = PixelPairs(pairs.box[kept], pairs.x[kept], pairs.y[kept])
+            box, column, row, pixel = (gather(part, kept) for part in (pairs.box, pairs.x, pairs.y, pairs.pixel))
+            pairs = _Pairs(pairs.vertex, box, column, row, pixel)
 
-        vertex = view[:, None] * screen.shape[1] + faces[face]  # (M, 3) rows of ndc.flatten(0, 1)
-        corner = ndc.reshape(-1, 2)[vertex]  # (M, 3, 2)
-        start = corner.permute(1, 2, 0)[:, :, pairs.box]  # (3, 2, N)
-        edge = start.roll(-1, 0) - start
-        point = torch.stack([pairs.x, pairs.y]).to(screen.dtype) * to_ndc[:, None] + (to_ndc[:, None] * 0.5 - 1.0)
-        to_point = point - start
-        length2 = edge.square().sum(1).clamp_min(torch.finfo(screen.dtype).tiny)
-        t = ((to_point * edge).sum(1) / length2).clamp(0, 1)  # (3, N)
-        residual = to_point - t[:, None] * edge
-        d2, side = residual.square().sum(1).min(0)
-        column = torch.arange(len(side), device=side.device)
-        e = torch.exp(-sigma * d2).clamp_max(1 - _CLAMP)
-        log_rest = torch.zeros(batch * height * width, dtype=screen.dtype, device=screen.device)
-        log_rest.index_add_(0, pixel, torch.log1p(-e))
-        rest = log_rest.exp()
-        silhouette = torch.where(uncovered, 1 - rest.reshape(batch, height, width), 1.0)
+        # Planes (3, M) and then (3, N), one for the edge from each corner to the next.
+        following = pairs.vertex.roll(-1, 0)
+        ax, ay = gather(x, pairs.vertex), gather(y, pairs.vertex)
+        ex, ey = gather(x, following) - ax, gather(y, following) - ay
+        length2 = (ex.square() + ey.square()).clamp_min(torch.finfo(screen.dtype).tiny)
+        ax, ay, ex, ey, length2 = (plane.index_select(1, pairs.box) for plane in (ax, ay, ex, ey, length2))
+        dx = gather(_ndc(torch.arange(width).to(x), width), pairs.x) - ax
+        dy = gather(_ndc(torch.arange(height).to(y), height), pairs.y) - ay
+        t = ((dx * ex + dy * ey) / length2).clamp(0, 1)
+        rx, ry = dx - t * ex, dy - t * ey
+        d2 = rx.square() + ry.square()
+        nearest = d2.amin(0)
+        e = torch.exp((-sigma * nearest).clamp_min(_LEAST)).clamp_max(1 - _CLAMP)
+        sound = screen.isfinite().flatten(1).all(1)[:, None, None]
+        log_rest = torch.where(face_index < 0, torch.where(sound, 0.0, torch.nan).to(x), -torch.inf).reshape(-1)
+        rest = log_rest.index_add_(0, pairs.pixel, torch.log1p(-e)).exp_()
 
-        near = vertex[pairs.box, side]
-        far = vertex[pairs.box, (side + 1) % 3]
-        slope = 2 * sigma * e * rest[pixel] / (1 - e)  # dS/d(d2) = -slope / 2
-        ctx.save_for_backward(pixel, near, far, residual[side, :, column] * slope[:, None], t[side, column], to_ndc)
-        ctx.screen_shape = screen.shape
-        return silhouette
+        slope = 2 * sigma * e * gather(rest, pairs.pixel) / (1 - e)  # dS/d(nearest) = -slope / 2
+        side = (d2[0] > nearest).long() * (1 + (d2[1] > nearest).long())
+        at_side = side * len(side) + torch.arange(len(side), device=side.device)
+        box = side * len(pairs.vertex[0]) + pairs.box
+        ctx.save_for_backward(
+            pairs.pixel,
+            gather(pairs.vertex, box),
+            gather(following, box),
+            gather(t, at_side),
+            slope * gather(rx, at_side),
+            slope * gather(ry, at_side),
+        )
+        ctx.shapes = screen.shape, (width, height)
+        return 1 - rest.reshape(batch, height, width)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None, None, None, None]:  # type: ignore[override]
-        pixel, near, far, direction, t, to_ndc = ctx.saved_tensors
+        pixel, near, far, t, *directions = ctx.saved_tensors
+        shape, sides = ctx.shapes
         # d(d2)/da = -2 (1 - t) r and d(d2)/db = -2 t r for the nearest point a + t (b - a).
-        pull = grad.reshape(-1)[pixel, None] * direction
-        result = torch.zeros(ctx.screen_shape, dtype=grad.dtype, device=grad.device).reshape(-1, 2)
-        result.index_add_(0, near, (1 - t)[:, None] * pull)
-        result.index_add_(0, far, t[:, None] * pull)
-        return (result * to_ndc).reshape(ctx.screen_shape), None, None, None, None, None, None
+        at_pixel = gather(grad, pixel)
+        by_far = at_pixel * t
+        by_near = at_pixel - by_far
+        planes = []
+        for direction, side in zip(directions, sides, strict=True):
+            plane = grad.new_zeros(shape[:2]).reshape(-1)
+            plane.index_add_(0, near, by_near * direction).index_add_(0, far, by_far * direction)
+            planes.append(plane * (2 / side))
+        return torch.stack(planes, 1).reshape(shape), None, None, None, None, None, None
+
+
+def _ndc(position: Tensor, side: int) -> Tensor:
+    """From pixels to [-1, 1] across ``side`` pixels: pixel i lies at (2 i + 1 - side) / side."""
+    return (2 * position + (1 - side)) / side
+
+
+@dataclass(frozen=True, eq=False)
+class _Pairs:
+    """M boxes of faces with uncovered pixels in them, and the N pairs of a face and a pixel, in index order.
+
+    Attributes:
+        vertex: ``(3, M)`` corners of each face, as rows of ``screen.flatten(0, 1)``.
+        box: ``(N,)`` which box.
+        x, y, pixel: ``(N,)`` column and row of the pixel, and its index in ``(B, H, W)`` flattened.
+    """
+
+    vertex: Tensor
+    box: Tensor
+    x: Tensor
+    y: Tensor
+    pixel: Tensor
 
 
 def _pairs_near_uncovered(
-    ndc: Tensor, depth: Tensor, faces: Tensor, uncovered: Tensor, boxlen: float
-) -> tuple[Tensor, Tensor, PixelPairs]:
-    """Uncovered pixels in the grown box of each face: ``(view, face)`` of each box, and the pairs."""
-    batch, height, width = uncovered.shape
-    size = ndc.new_tensor([width, height])
-    corner = ndc[:, faces]
-    # Pixel i lies at (2 i + 1 - W) / W; a box takes low <= pixel < high.
-    low = (((corner.amin(2) - boxlen + 1) * size - 1) / 2).ceil()
-    high = (((corner.amax(2) + boxlen + 1) * size - 1) / 2).ceil() - 1
-    x0, y0 = low[..., 0].clamp(0, width).long(), low[..., 1].clamp(0, height).long()
-    x1, y1 = high[..., 0].clamp(-1, width - 1).long(), high[..., 1].clamp(-1, height - 1).long()
-    drawn = (depth[:, faces].amin(2) > NEAR) & (x0 <= x1) & (y0 <= y1)
+    x: Tensor, y: Tensor, depth: Tensor, faces: Tensor, uncovered: Tensor, boxlen: float
+) -> _Pairs:
+    """Uncovered pixels in the grown box of each face; x and y are ``(B, V)`` in NDC."""
+    _, height, width = uncovered.shape
+    bounds = []
+    for plane, side in ((x, width), (y, height)):
+        corner = face_corners(plane, faces)
+        # A box takes the pixels low <= pixel < high.
+        for limit in (corner.amin(1) - boxlen, corner.amax(1) + boxlen):
+            bounds.append((((limit + 1) * side - 1) / 2).ceil().clamp(0, side))
+    x0, x1, y0, y1 = bounds
+    drawn = (face_corners(depth, faces).amin(1) > NEAR) & (x0 < x1) & (y0 < y1)
+    view, face = torch.nonzero(drawn, as_tuple=True)
+    at = view * len(faces) + face
+    x0, x1, y0, y1 = (gather(bound, at).long() for bound in bounds)
+
     # Most boxes hold no uncovered pixel: an integral image tells at once.
-    integral = torch.nn.functional.pad(uncovered.cumsum(1).cumsum(2), (1, 0, 1, 0)).reshape(-1)
-    base = torch.arange(batch, device=ndc.device)[:, None] * ((height + 1) * (width + 1))
-    x2, y2 = (x1 + 1).clamp_min(0), (y1 + 1).clamp_min(0)
-    top, bottom = base + y0 * (width + 1), base + y2 * (width + 1)
-    count = integral[bottom + x2] - integral[bottom + x0] - integral[top + x2] + integral[top + x0]
-    view, face = torch.nonzero(drawn & (count > 0), as_tuple=True)
-    pairs = expand_boxes(*(bound[view, face] for bound in (x0, x1, y0, y1)))
-    open_pixel = torch.nonzero(uncovered[view[pairs.box], pairs.y, pairs.x])[:, 0]
-    return view, face, PixelPairs(pairs.box[open_pixel], pairs.x[open_pixel], pairs.y[open_pixel])
+    sums = uncovered.cumsum(1, dtype=torch.int32).cumsum(2, dtype=torch.int32)
+    integral = functional.pad(sums, (1, 0, 1, 0))
+    top, bottom = ((view * (height + 1) + row) * (width + 1) for row in (y0, y1))
+    count = gather(integral, bottom + x1) - gather(integral, bottom + x0)
+    count = count - gather(integral, top + x1) + gather(integral, top + x0)
+    some = torch.nonzero(count)[:, 0]
+    view, face, x0, x1, y0, y1 = (gather(part, some) for part in (view, face, x0, x1, y0, y1))
+
+    # Those in one row of a box are neighbours in the list of all uncovered pixels.
+    pixels = torch.nonzero(uncovered.reshape(-1))[:, 0]
+    before = functional.pad(uncovered.reshape(-1).cumsum(0), (1, 0))
+    box, row = expand_ranges(y0, y1 - y0)
+    start = (gather(view, box) * height + row) * width
+    first, end = (gather(before, start + gather(bound, box)) for bound in (x0, x1))
+    line, listed = expand_ranges(first, end - first)
+    pixel = gather(pixels, listed)
+    vertex = faces.index_select(0, face).T + view * x.shape[1]
+    return _Pairs(vertex, gather(box, line), pixel - gather(start, line), gather(row, line), pixel)
 
 
 def _first_per_pixel(pixel: Tensor, knum: int, pixels: int) -> Tensor | None:
     """Positions of the first ``knum`` entries of every pixel, in order; None if that is all of them."""
-    count = torch.bincount(pixel, minlength=pixels)
-    crowded = torch.nonzero((count > knum)[pixel])[:, 0]
+    full = torch.bincount(pixel, minlength=pixels) > knum
+    crowded = torch.nonzero(gather(full, pixel))[:, 0]
     if len(crowded) == 0:
         return None
-    order = crowded[torch.argsort(pixel[crowded], stable=True)]
-    ordered = pixel[order]
+    order = gather(crowded, torch.argsort(gather(pixel, crowded), stable=True))
+    ordered = gather(pixel, order)
     position = torch.arange(len(order), device=pixel.device)
     starts = torch.ones_like(ordered, dtype=torch.bool)
     starts[1:] = ordered[1:] != ordered[:-1]

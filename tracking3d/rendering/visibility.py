@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from tracking3d.rendering.shapes import check_shapes
+
 NEAR = 1e-3
 """Faces with a vertex nearer than this (object units, along z) are not drawn."""
 
@@ -29,34 +31,30 @@ class Visibility:
     depth: Tensor
 
 
-@dataclass(frozen=True, eq=False)
-class PixelPairs:
-    """A ragged list of candidate (face, pixel) pairs, in the order of the boxes they come from.
-
-    Attributes:
-        box: ``(N,)`` index of the pair's box.
-        x, y: ``(N,)`` int64 column and row of the pair's pixel.
-    """
-
-    box: Tensor
-    x: Tensor
-    y: Tensor
-
-
-def expand_boxes(x0: Tensor, x1: Tensor, y0: Tensor, y1: Tensor) -> PixelPairs:
-    """List all pixels of integer boxes, row by row.
+def expand_ranges(first: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
+    """List the integers of all ranges ``first, first + 1, ...``, one range after the other.
 
     Args:
-        x0, x1, y0, y1: ``(M,)`` int64, inclusive bounds, ``x0 <= x1`` and ``y0 <= y1``.
+        first: ``(M,)`` int64.
+        count: ``(M,)`` int64, how many integers each range has.
+
+    Returns:
+        ``(N,)`` which range each integer belongs to, and ``(N,)`` the integers.
     """
-    width = x1 - x0 + 1
-    count = width * (y1 - y0 + 1)
-    total = int(count.sum())
-    box = torch.repeat_interleave(torch.arange(len(count), device=count.device), count, output_size=total)
-    first = torch.cumsum(count, 0) - count
-    offset = torch.arange(total, device=count.device) - first[box]
-    row = torch.div(offset, width[box], rounding_mode="floor")
-    return PixelPairs(box, x0[box] + offset - row * width[box], y0[box] + row)
+    owner = torch.repeat_interleave(count)
+    before = count.cumsum(0) - count
+    return owner, torch.arange(len(owner), device=count.device) + (first - before).index_select(0, owner)
+
+
+def face_corners(plane: Tensor, faces: Tensor) -> Tensor:
+    """``(B, 3, F)`` values at the corners of every face, from ``(B, V)`` values at the vertices."""
+    return plane.contiguous().index_select(1, faces.T.reshape(-1)).reshape(len(plane), 3, -1)
+
+
+def gather(plane: Tensor, index: Tensor) -> Tensor:
+    """``plane.flatten()[index]``, for an index of any shape."""
+    # index_select on one dimension is several times faster than indexing with a tensor.
+    return plane.reshape(-1).index_select(0, index.reshape(-1)).reshape(index.shape)
 
 
 @torch.no_grad()
@@ -64,44 +62,72 @@ def rasterize(screen: Tensor, depth: Tensor, faces: Tensor, size: tuple[int, int
     """Find the nearest front-facing face at every pixel centre.
 
     Args:
-        screen: ``(B, V, 2)`` vertices in pixels; pixel (0, 0) is the centre of the top-left pixel.
+        screen: ``(B, V, 2)`` vertices in pixels; pixel (0, 0) is the centre of the top-left pixel. Faces with a
+            vertex that is not finite are not drawn.
         depth: ``(B, V)`` z in camera coordinates.
         faces: ``(F, 3)`` int64, counter-clockwise seen from outside; faces seen from behind are culled.
         size: ``(H, W)``.
+
+    Raises:
+        ValueError: If a shape does not fit.
     """
-    batch, height, width = screen.shape[0], *size
-    device, dtype = screen.device, screen.dtype
-    corner = screen[:, faces]  # (B, F, 3, 2)
-    z = depth[:, faces]  # (B, F, 3)
-    ab, ac = corner[:, :, 1] - corner[:, :, 0], corner[:, :, 2] - corner[:, :, 0]
-    area = ab[..., 1] * ac[..., 0] - ab[..., 0] * ac[..., 1]  # positive in front: y points down
-    low, high = corner.amin(2), corner.amax(2)
-    x0, y0 = low[..., 0].ceil().clamp(0, width), low[..., 1].ceil().clamp(0, height)
-    x1, y1 = high[..., 0].floor().clamp(-1, width - 1), high[..., 1].floor().clamp(-1, height - 1)
-    drawn = (area > 0) & (z.amin(2) > NEAR) & (x0 <= x1) & (y0 <= y1)
-    view, face = torch.nonzero(drawn, as_tuple=True)
-    pairs = expand_boxes(*(bound[view, face].long() for bound in (x0, x1, y0, y1)))
+    check_shapes(screen=(screen, "B V 2"), depth=(depth, "B V"), faces=(faces, "F 3"))
+    batch, (height, width) = len(screen), size
+    view, face, (x0, x1, y0, y1) = _boxes_in_front(screen, depth, faces, size)
+    vertex = faces.index_select(0, face).T + view * screen.shape[1]  # (3, M) in screen.flatten(0, 1)
+    box, y = expand_ranges(y0, y1 - y0 + 1)  # rows of the boxes
+    row, x = expand_ranges(gather(x0, box), gather(x1 - x0 + 1, box))
+    row_start = (gather(view, box) * height + y) * width
 
-    # Edge i lies opposite corner i and is evaluated from its end with the lower vertex index.
-    start, end = faces[:, [1, 2, 0]], faces[:, [2, 0, 1]]
-    swapped = start > end
-    first, second = torch.where(swapped, end, start), torch.where(swapped, start, end)
-    origin = screen[:, first][view, face]  # (M, 3, 2)
-    edge = screen[:, second][view, face] - origin
-    edge = edge * torch.where(swapped, 1.0, -1.0).to(dtype)[face][..., None]
-    coefficients = torch.cat([origin[..., 0], origin[..., 1], edge[..., 0], edge[..., 1]], 1)[pairs.box]
-    ox, oy, ex, ey = coefficients.T.reshape(4, 3, -1)
-    w = ex * (pairs.y.to(dtype) - oy) - ey * (pairs.x.to(dtype) - ox)  # (3, N)
-    inside = torch.nonzero((w >= 0).all(0))[:, 0]
-    w, box = w[:, inside], pairs.box[inside]
-    inverse_depth = (w / z[view, face].T[:, box]).sum(0) / w.sum(0).clamp_min(torch.finfo(dtype).tiny)
-    pixel = (view[box] * height + pairs.y[inside]) * width + pairs.x[inside]
+    # The edge functions of a pixel; what depends on its row only is computed once for the row.
+    ox, oy, ex, ey = (plane.index_select(1, box) for plane in _directed_edges(screen, vertex))
+    along, ox, ey = (plane.index_select(1, row) for plane in (ex * (y - oy), ox, ey))
+    w = along - ey * (x - ox)  # (3, N)
+    area = w.sum(0)
+    inside = torch.nonzero((w.amin(0) >= 0) & (area > 0))[:, 0]
+    row = gather(row, inside)
+    owner = gather(box, row)
+    z = gather(depth, vertex).index_select(1, owner)
+    inverse_depth = (w.index_select(1, inside) / z).sum(0) / gather(area, inside)
+    pixel = gather(row_start, row) + gather(x, inside)
 
-    nearest = torch.zeros(batch * height * width, dtype=dtype, device=device)
+    nearest = screen.new_zeros(batch * height * width)
     nearest.scatter_reduce_(0, pixel, inverse_depth, "amax")
-    wins = torch.nonzero(inverse_depth == nearest[pixel])[:, 0]
-    face_index = torch.full((batch * height * width,), len(faces), dtype=torch.int64, device=device)
-    face_index.scatter_reduce_(0, pixel[wins], face[box[wins]], "amin")
-    face_index[face_index == len(faces)] = -1
+    claimant = torch.where(inverse_depth == gather(nearest, pixel), gather(face, owner), len(faces))
+    face_index = torch.full((batch * height * width,), -1, device=screen.device)
+    face_index.scatter_reduce_(0, pixel, claimant, "amin", include_self=False)
     shape = (batch, height, width)
     return Visibility(face_index.reshape(shape), nearest.reciprocal().reshape(shape))
+
+
+def _boxes_in_front(
+    screen: Tensor, depth: Tensor, faces: Tensor, size: tuple[int, int]
+) -> tuple[Tensor, Tensor, list[Tensor]]:
+    """Faces that may be seen: ``(M,)`` view, face, and inclusive bounds x0, x1, y0, y1 of their pixels."""
+    height, width = size
+    x, y, z = (face_corners(plane, faces) for plane in (*screen.unbind(2), depth))
+    # Twice the area on the screen; positive in front, for y points down.
+    area = (y[:, 1] - y[:, 0]) * (x[:, 2] - x[:, 0]) - (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0])
+    x0, y0 = x.amin(1).ceil().clamp(0, width), y.amin(1).ceil().clamp(0, height)
+    x1, y1 = x.amax(1).floor().clamp(-1, width - 1), y.amax(1).floor().clamp(-1, height - 1)
+    drawn = (area > 0) & (z.amin(1) > NEAR) & (x0 <= x1) & (y0 <= y1)
+    view, face = torch.nonzero(drawn, as_tuple=True)
+    return view, face, [bound[view, face].long() for bound in (x0, x1, y0, y1)]
+
+
+def _directed_edges(screen: Tensor, vertex: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Edges of M faces as ``(3, M)`` planes: x and y of where each begins, and of its direction.
+
+    Edge i lies opposite corner i. It begins at its end with the lower vertex index, whichever face it is seen
+    from, and its direction changes sign with the face.
+
+    Args:
+        screen: ``(B, V, 2)``.
+        vertex: ``(3, M)`` corners of the faces, as rows of ``screen.flatten(0, 1)``.
+    """
+    start, end = vertex.roll(-1, 0), vertex.roll(-2, 0)
+    first, second = torch.minimum(start, end), torch.maximum(start, end)
+    sign = torch.where(start > end, 1.0, -1.0).to(screen.dtype)
+    x, y = screen.unbind(2)
+    ox, oy = gather(x, first), gather(y, first)
+    return ox, oy, (gather(x, second) - ox) * sign, (gather(y, second) - oy) * sign

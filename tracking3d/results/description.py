@@ -20,7 +20,14 @@ from tracking3d.results.records import FrameRecord
 
 
 def description_at_start(
-    *, config: dict[str, Any], camera: Camera, source: str, seed: int, fps: float | None, command: str | None
+    *,
+    config: dict[str, Any],
+    camera: Camera,
+    source: str,
+    seed: int,
+    fps: float | None,
+    command: str | None,
+    selection: str | None,
 ) -> dict[str, Any]:
     """What is known of a run before its first frame."""
     return {
@@ -31,6 +38,7 @@ def description_at_start(
         "created": now(),
         "finished": None,
         "source": source,
+        "selection": selection,
         "fps": fps,
         "command": command,
         "seed": seed,

@@ -119,9 +119,12 @@ def _read_description(folder: Path) -> dict[str, Any]:
         raise InputError(f"{path} is damaged: it cannot be read ({error}).") from error
     if not isinstance(description, dict) or description.get("format") != layout.FORMAT:
         raise InputError(f"{folder} is not a run folder: its run.json is not one of tracking3d.")
-    if description["format_version"] > layout.FORMAT_VERSION:
+    version = description.get("format_version")
+    if not isinstance(version, int):
+        raise InputError(f"{path} is damaged: it holds no format version.")
+    if version > layout.FORMAT_VERSION:
         raise InputError(
-            f"The run {folder} has format version {description['format_version']}, newer than the "
+            f"The run {folder} has format version {version}, newer than the "
             f"{layout.FORMAT_VERSION} that this tracking3d reads; update tracking3d."
         )
     return description

@@ -64,6 +64,7 @@ class RunWriter:
         seed: int,
         fps: float | None,
         command: str | None,
+        selection: str | None = None,
         overwrite: bool = False,
     ) -> None:
         self.folder = Path(folder)
@@ -76,7 +77,13 @@ class RunWriter:
         self._video: VideoWriter | None = None
         self._over = False
         self._description = description.description_at_start(
-            config=config, camera=camera, source=source, seed=seed, fps=fps, command=command
+            config=config,
+            camera=camera,
+            source=source,
+            seed=seed,
+            fps=fps,
+            command=command,
+            selection=selection,
         )
         frames = self.folder / layout.FRAMES
         with writing(self.folder):
@@ -238,13 +245,13 @@ def _make_room(folder: Path, overwrite: bool) -> None:
     if not there:
         return
     try:
-        RunReader(folder)
+        earlier = RunReader(folder)
     except InputError as error:
         raise OutputError(
             f"{folder} is not a readable run folder but holds {there[0].relative_to(folder)}, "
             "which a run would replace; choose another --out."
         ) from error
-    if not overwrite:
+    if earlier.frames and not overwrite:
         raise OutputError(f"{folder} already holds a run; choose another --out or pass --overwrite.")
     with writing(folder):
         for path in there:

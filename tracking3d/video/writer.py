@@ -21,7 +21,16 @@ from tracking3d.frames import Image
 ENCODERS = ("libx264", "libopenh264", "h264_videotoolbox", "h264_mf", "mpeg4")
 """Encoders by preference: x264, other H.264 encoders, and MPEG-4 part 2, which every FFmpeg has."""
 
-_OPTIONS = {"libx264": {"crf": "20", "preset": "veryfast"}, "mpeg4": {"qscale": "3"}}
+_OPTIONS = {"libx264": {"crf": "20", "preset": "veryfast", "g": "30"}, "mpeg4": {"qscale": "3", "g": "30"}}
+
+
+def _movflags() -> str:
+    """Fragments while writing, so that a killed process leaves a video that plays up to its last keyframe.
+
+    From FFmpeg 7.1 on (libavformat 61.7) the fragments become an ordinary MP4 when the file is closed.
+    """
+    hybrid = av.library_versions["libavformat"] >= (61, 7, 0)
+    return "+hybrid_fragmented" if hybrid else "+frag_keyframe+empty_moov"
 
 
 class VideoWriter:
@@ -54,7 +63,7 @@ class VideoWriter:
             # Opened here once, because FFmpeg says less clearly why it cannot.
             self.path.open("wb").close()
             self._container = av.open(
-                f"file:{self.path}", "w", format="mp4", options={"movflags": "+faststart"}
+                f"file:{self.path}", "w", format="mp4", options={"movflags": _movflags()}
             )
             rate = max(Fraction(fps).limit_denominator(1001), Fraction(1, 1001))
             self._stream = self._add_stream(rate)

@@ -1,0 +1,81 @@
+"""A small textured object whose every observation is known exactly, because it is rendered."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tracking3d.config.models import SolverConfig
+from tracking3d.estimation.observation import Batch, Observation, mask_distance
+from tracking3d.estimation.paper.problem import Parameters, Problem, Shape
+from tracking3d.geometry.camera import Camera, Window
+from tracking3d.geometry.mesh import Mesh
+from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
+from tracking3d.geometry.prototypes import ellipsoid
+from tracking3d.rendering import render
+
+SIZE = 48
+CAMERA = Camera.from_fov(SIZE, SIZE)
+WINDOW = Window(0, 0, SIZE, SIZE)
+AXES = np.array([0.9, 0.7, 0.6])
+
+
+def pose_of(degrees: float = 0.0, x: float = 0.0, z: float = 3.0, axis: tuple[float, ...] = (0, 1, 0)) -> Pose:
+    """Turned by ``degrees`` about ``axis``, at ``(x, 0, z)``."""
+    R = rotation_about(torch.tensor(axis, dtype=torch.float32), degrees)
+    return from_matrix(R, torch.tensor([x, 0.0, z]))
+
+
+def small_shape(flat: bool = False) -> Shape:
+    """An ellipsoid of 92 vertices."""
+    return Shape.of(small_mesh(), flat, torch.device("cpu"))
+
+
+def small_mesh() -> Mesh:
+    """The mesh of `small_shape`."""
+    return ellipsoid(AXES, np.eye(3), 3)
+
+
+def painted(size: int = 24) -> Tensor:
+    """A smooth texture ``(3, T, T)`` without repetition."""
+    v, u = torch.meshgrid(*[(torch.arange(size) + 0.5) / size] * 2, indexing="ij")
+    turn = 2 * math.pi * u
+    layers = [torch.sin(turn) * torch.sin(3 * v), torch.cos(2 * turn + 4 * v), torch.cos(turn) * v]
+    return 0.5 + 0.4 * torch.stack(layers)
+
+
+def observed(pose: Pose, index: int = 0, shape: Shape | None = None, has_mask: bool = True) -> Observation:
+    """What a perfect camera sees of the painted object."""
+    shape = shape or small_shape()
+    K = torch.tensor(WINDOW.K(CAMERA), dtype=torch.float32)
+    drawn = render(
+        shape.rest, shape.faces, shape.face_uvs, painted(), pose.R[None], pose.translation[None], K[None], (SIZE, SIZE)
+    )
+    mask = (drawn.face_index[0] >= 0).float() * has_mask
+    image = drawn.image()[0]
+    return Observation(
+        index,
+        WINDOW,
+        K,
+        torch.nn.functional.interpolate(image[None], scale_factor=2.0)[0],
+        image,
+        torch.ones(SIZE, SIZE),
+        mask,
+        mask_distance(mask),
+        has_mask,
+    )
+
+
+def parameters_of(poses: list[Pose], texture: Tensor | None = None) -> Parameters:
+    """The undeformed object in the given poses."""
+    stacked = Pose.stack(poses)
+    texture = painted() if texture is None else texture
+    return Parameters(stacked.translation, stacked.quaternion, torch.zeros_like(small_shape().rest), texture)
+
+
+def problem_of(observations: list[Observation], flat: bool = False, **solver: object) -> Problem:
+    """The problem of explaining observations, with settings of the section ``solver``."""
+    return Problem(small_shape(flat), Batch.of(observations), SolverConfig.model_validate(solver))
