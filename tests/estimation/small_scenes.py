@@ -23,7 +23,9 @@ WINDOW = Window(0, 0, SIZE, SIZE)
 AXES = np.array([0.9, 0.7, 0.6])
 
 
-def pose_of(degrees: float = 0.0, x: float = 0.0, z: float = 3.0, axis: tuple[float, ...] = (0, 1, 0)) -> Pose:
+def pose_of(
+    degrees: float = 0.0, x: float = 0.0, z: float = 3.0, axis: tuple[float, ...] = (0, 1, 0)
+) -> Pose:
     """Turned by ``degrees`` about ``axis``, at ``(x, 0, z)``."""
     R = rotation_about(torch.tensor(axis, dtype=torch.float32), degrees)
     return from_matrix(R, torch.tensor([x, 0.0, z]))
@@ -52,7 +54,14 @@ def observed(pose: Pose, index: int = 0, shape: Shape | None = None, has_mask: b
     shape = shape or small_shape()
     K = torch.tensor(WINDOW.K(CAMERA), dtype=torch.float32)
     drawn = render(
-        shape.rest, shape.faces, shape.face_uvs, painted(), pose.R[None], pose.translation[None], K[None], (SIZE, SIZE)
+        shape.rest,
+        shape.faces,
+        shape.face_uvs,
+        painted(),
+        pose.R[None],
+        pose.translation[None],
+        K[None],
+        (SIZE, SIZE),
     )
     mask = (drawn.face_index[0] >= 0).float() * has_mask
     image = drawn.image()[0]

@@ -8,7 +8,9 @@ from tracking3d.estimation.assessment import Assessment, assess
 from tracking3d.estimation.estimate import Status
 
 
-def judged(appearance: float = 0.1, silhouette: float = 0.1, has_mask: bool = True, failure: str = "") -> Assessment:
+def judged(
+    appearance: float = 0.1, silhouette: float = 0.1, has_mask: bool = True, failure: str = ""
+) -> Assessment:
     return assess(appearance, silhouette, has_mask, tau=0.2, silhouette_limit=0.3, failure=failure)
 
 

@@ -13,7 +13,9 @@ TAU = 0.2
 OBJECT_SIZE = 1.8
 
 
-def frame(degrees: float = 0.0, x: float = 0.0, silhouette: float = 0.1, appearance: float = 0.1) -> Candidate:
+def frame(
+    degrees: float = 0.0, x: float = 0.0, silhouette: float = 0.1, appearance: float = 0.1
+) -> Candidate:
     axis = torch.tensor([0.0, 1.0, 0.0])
     pose = from_matrix(rotation_about(axis, degrees), torch.tensor([x, 0.0, 3.0]))
     return Candidate(pose, silhouette, appearance)

@@ -80,7 +80,9 @@ def test_iou_loss_is_one_minus_the_soft_intersection_over_union():
 def test_distance_loss_is_the_mean_distance_of_silhouette_pixels():
     silhouette = torch.tensor([[[1.0, 1.0], [0.5, 0.0]]])
     distance = torch.tensor([[[0.0, 0.1], [0.2, 7.0]]])
-    assert distance_loss(silhouette, distance, torch.ones(1, 2, 2)).item() == pytest.approx((0.1 + 0.5 * 0.2) / 2.5)
+    assert distance_loss(silhouette, distance, torch.ones(1, 2, 2)).item() == pytest.approx(
+        (0.1 + 0.5 * 0.2) / 2.5
+    )
     upper_row = torch.tensor([[[1.0, 1.0], [0.0, 0.0]]])
     assert distance_loss(silhouette, distance, upper_row).item() == pytest.approx(0.1 / 2)
     assert distance_loss(torch.zeros(1, 2, 2), distance, torch.ones(1, 2, 2)).item() == 0
@@ -129,12 +131,17 @@ def test_slower_motion_is_free():
 
 def test_motion_does_not_depend_on_the_sign_of_a_quaternion():
     turned = posed(degrees=90)
-    assert motion(Pose(turned.translation, -turned.quaternion), 2) == pytest.approx(motion(turned, 2), abs=1e-6)
+    assert motion(Pose(turned.translation, -turned.quaternion), 2) == pytest.approx(
+        motion(turned, 2), abs=1e-6
+    )
 
 
 def test_motion_has_a_finite_gradient_where_nothing_moved():
     pose = posed()
-    translation, quaternion = pose.translation.clone().requires_grad_(), pose.quaternion.clone().requires_grad_()
+    translation, quaternion = (
+        pose.translation.clone().requires_grad_(),
+        pose.quaternion.clone().requires_grad_(),
+    )
     motion_loss(pose, Pose(translation, quaternion), 1, 0.1, 30.0).backward()
     assert translation.grad.isfinite().all()
     assert quaternion.grad.isfinite().all()

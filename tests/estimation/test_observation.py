@@ -88,7 +88,6 @@ def test_rendering_into_a_window_of_another_scale_covers_the_same_part_of_the_fr
         assert abs(offset) < 0.1 * max(window.scale, 1)
 
 
-
 @pytest.fixture
 def frame() -> Frame:
     rng = np.random.default_rng(0)

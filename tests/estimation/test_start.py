@@ -101,7 +101,9 @@ def test_start_knows_oblong_pixels_and_a_shifted_principal_point():
 
 def test_a_sphere_that_is_seen_is_put_back_where_it_is():
     mesh = prototype_mesh(ObjectConfig(), mask_ellipse(drawn_ellipse()))
-    mesh = Mesh(mesh.vertices / np.linalg.norm(mesh.vertices, axis=1).max() * RADIUS, mesh.faces, mesh.face_uvs)
+    mesh = Mesh(
+        mesh.vertices / np.linalg.norm(mesh.vertices, axis=1).max() * RADIUS, mesh.faces, mesh.face_uvs
+    )
     truth = np.array([0.1, 0.05, 3.0])
     found = first_translation(mask_ellipse(projected(mesh, truth, CAMERA)), CAMERA)
     np.testing.assert_allclose(found, truth, rtol=0.02, atol=0.02)

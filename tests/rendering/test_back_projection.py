@@ -60,7 +60,9 @@ def test_the_far_side_is_not_painted_through():
     scene = bumpy_sphere((96, 96), views=1, frequency=8)
     texels = TexelMap.of(scene.face_uvs, 32)
     ones = torch.ones(1, 96, 96, dtype=torch.float64)
-    seen = back_project(ones, ones[0], scene.vertices, scene.faces, texels, scene.R[0], scene.t[0], scene.K[0])
+    seen = back_project(
+        ones, ones[0], scene.vertices, scene.faces, texels, scene.R[0], scene.t[0], scene.K[0]
+    )
     point = (scene.vertices[scene.faces[texels.face]] * texels.barycentric[..., None]).sum(1) @ scene.R[0].T
     far = texels.texel[point[:, 2] > 0.25]
     assert (seen.weight.flatten()[far] == 0).all()

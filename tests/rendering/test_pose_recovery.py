@@ -30,13 +30,23 @@ class Object:
 
     def render(self, pose: Pose, band: SoftBand) -> Rendering:
         return render(
-            self.vertices, self.faces, self.face_uvs, self.texture, pose.R, pose.translation, self.K, SIZE, band
+            self.vertices,
+            self.faces,
+            self.face_uvs,
+            self.texture,
+            pose.R,
+            pose.translation,
+            self.K,
+            SIZE,
+            band,
         )
 
 
 def recover(thing: Object, truth: Pose, start: Pose) -> Pose:
     """Minimize the difference of features and silhouettes, from a wide band to a narrow one."""
-    translation, quaternion = (part.clone().requires_grad_() for part in (start.translation, start.quaternion))
+    translation, quaternion = (
+        part.clone().requires_grad_() for part in (start.translation, start.quaternion)
+    )
     optimizer = torch.optim.Adam([translation, quaternion], lr=0.02)
     for band in (SoftBand(300.0, 0.12), SoftBand(2000.0, 0.05)):
         target = thing.render(truth, band)

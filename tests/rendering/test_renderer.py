@@ -41,7 +41,9 @@ def test_the_image_is_the_texture_where_the_rays_meet_the_surface():
     result = drawn(scene)
     screen, depth = project(scene.vertices, scene.R, scene.t, scene.K)
     faces, uvs = scene.faces.numpy(), scene.face_uvs.numpy()
-    pictures = [cast_rays(s.numpy(), d.numpy(), faces, scene.size) for s, d in zip(screen, depth, strict=True)]
+    pictures = [
+        cast_rays(s.numpy(), d.numpy(), faces, scene.size) for s, d in zip(screen, depth, strict=True)
+    ]
     uv = np.concatenate([picture.interpolate(uvs) for picture in pictures])
     np.testing.assert_allclose(result.uv.detach(), uv, atol=1e-9)
     np.testing.assert_allclose(

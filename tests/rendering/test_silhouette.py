@@ -87,7 +87,10 @@ def test_a_face_counts_from_the_lower_end_of_its_box_up_to_but_not_at_the_upper(
 
 def test_faces_seen_from_behind_count():
     scene = Scene(
-        torch.tensor([[[4.0, 4.0], [9.0, 4.0], [4.0, 9.0]]]), torch.ones(1, 3), torch.tensor([[0, 1, 2]]), (16, 16)
+        torch.tensor([[[4.0, 4.0], [9.0, 4.0], [4.0, 9.0]]]),
+        torch.ones(1, 3),
+        torch.tensor([[0, 1, 2]]),
+        (16, 16),
     )
     assert (covered(scene) == -1).all()
     assert drawn(scene, SoftBand()).max() > 0.9

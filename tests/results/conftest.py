@@ -64,7 +64,9 @@ def draw(
     uv = interpolate(screen, depth, faces, torch.tensor(model.face_uvs), face_index)
     image = np.repeat(np.linspace(60, 160, camera.width)[None, :, None], camera.height, 0).repeat(3, 2)
     mask = (face_index[0] >= 0).numpy()
-    image[mask] = sample_texture(torch.tensor(model.texture, dtype=torch.float64), uv).numpy()
+    image[mask] = sample_texture(
+        torch.tensor(model.texture, dtype=torch.float64).permute(2, 0, 1), uv
+    ).numpy()
     return image.astype(np.uint8), mask
 
 

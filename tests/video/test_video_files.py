@@ -131,7 +131,9 @@ def test_pictures_are_let_go_as_soon_as_they_are_read(clip: Clip) -> None:
     gc.collect()
     gc.disable()  # otherwise pictures in reference cycles would pile up only until the next collection
     try:
-        held = [sum(issubclass(type(item), av.VideoFrame) for item in gc.get_objects()) for _ in open_source(path)]
+        held = [
+            sum(issubclass(type(item), av.VideoFrame) for item in gc.get_objects()) for _ in open_source(path)
+        ]
     finally:
         gc.enable()
     assert held[-1] == held[1]

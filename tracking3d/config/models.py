@@ -48,17 +48,26 @@ class CameraConfig(Section):
 class ObjectConfig(Section):
     """How the object is represented (paper section 3.1)."""
 
-    prototype: str = Field("sphere", description="sphere, ellipsoid (fitted to the first mask) or a mesh file.")
+    prototype: str = Field(
+        "sphere", description="sphere, ellipsoid (fitted to the first mask) or a mesh file."
+    )
     frequency: int = Field(11, ge=1, le=40, description="Icosphere frequency f: 10 f^2 + 2 vertices.")
     texture_size: int = Field(300, ge=16, le=2048, description="Side of the feature texture in texels.")
-    flat: bool = Field(False, description="Flat prior: project all vertices onto one plane after each iteration.")
+    flat: bool = Field(
+        False, description="Flat prior: project all vertices onto one plane after each iteration."
+    )
 
 
 class WindowConfig(Section):
     """The window of the frame that is rendered."""
 
     size: int = Field(128, ge=32, le=1024, description="Working resolution: side of the window in pixels.")
-    margin: float = Field(0.3, ge=0.05, le=2, description="Free space on each side, relative to the longer side of the mask's box.")
+    margin: float = Field(
+        0.3,
+        ge=0.05,
+        le=2,
+        description="Free space on each side, relative to the longer side of the mask's box.",
+    )
 
 
 class Weights(Section):
@@ -66,7 +75,9 @@ class Weights(Section):
 
     features: float = Field(1.0, ge=0, description="Appearance loss, eq. 1.")
     silhouette: float = Field(1.0, ge=0, description="Silhouette loss, IoU term of eq. 2.")
-    distance: float = Field(1.0, ge=0, description="Silhouette loss, distance-transform term of eq. 2, times `silhouette`.")
+    distance: float = Field(
+        1.0, ge=0, description="Silhouette loss, distance-transform term of eq. 2, times `silhouette`."
+    )
     motion: float = Field(1.0, ge=0, description="Motion regularization, eq. 3.")
     laplacian: float = Field(1000.0, ge=0, description="Laplacian shape regularization.")
     total_variation: float = Field(0.001, ge=0, description="Total variation of the texture.")
@@ -86,9 +97,15 @@ class KeyframeConfig(Section):
 
     maximum: int = Field(6, ge=1, le=64, description="Number of most recent keyframes that are kept.")
     silhouette: float = Field(0.3, gt=0, description="A keyframe's silhouette loss is below this.")
-    features: float | None = Field(None, gt=0, description="A keyframe's appearance loss is below this; the encoder's tau if empty.")
-    translation: float = Field(0.5, ge=0, description="New view: moved more than this times the object's size, or ...")
-    rotation: float = Field(45.0, ge=0, description="... turned more than this many degrees since the latest keyframe.")
+    features: float | None = Field(
+        None, gt=0, description="A keyframe's appearance loss is below this; the encoder's tau if empty."
+    )
+    translation: float = Field(
+        0.5, ge=0, description="New view: moved more than this times the object's size, or ..."
+    )
+    rotation: float = Field(
+        45.0, ge=0, description="... turned more than this many degrees since the latest keyframe."
+    )
     keep_first: bool = Field(False, description="Frame 0 stays a keyframe whatever happens.")
 
 
@@ -97,42 +114,80 @@ class SolverConfig(Section):
 
     name: str = Field("paper", description="Which solver.")
     iterations: int = Field(500, ge=1, le=100_000, description="Most iterations a frame.")
-    tau: float | None = Field(None, gt=0, description="Converged when the appearance loss is below this; the encoder's own if empty.")
+    tau: float | None = Field(
+        None,
+        gt=0,
+        description="Converged when the appearance loss is below this; the encoder's own if empty.",
+    )
     cauchy_scale: float = Field(0.25, gt=0, description="Scale of the Cauchy loss.")
     sigma: float = Field(7000.0, gt=0, description="Sharpness of the soft silhouette, per squared NDC unit.")
-    boxlen: float = Field(0.02, gt=0, lt=1, description="Reach of the soft silhouette beyond a face's box, NDC.")
+    boxlen: float = Field(
+        0.02, gt=0, lt=1, description="Reach of the soft silhouette beyond a face's box, NDC."
+    )
     knum: int = Field(30, ge=1, description="Most faces that a soft-silhouette pixel counts.")
     band: Literal["erode", "soften", "none"] = Field(
-        "erode", description="How the bias of the soft band is removed: erode the silhouette 3x3, soften the target by the same kernel, or not."
+        "erode",
+        description=(
+            "How the bias of the soft band is removed: erode the silhouette 3x3, soften the target by the "
+            "same kernel, or not."
+        ),
     )
-    motion_translation: float = Field(0.1, ge=0, description="Free translation a frame since the last keyframe, eq. 3.")
-    motion_rotation: float = Field(30.0, ge=0, description="Free rotation in degrees a frame since the last keyframe, eq. 3.")
+    motion_translation: float = Field(
+        0.1, ge=0, description="Free translation a frame since the last keyframe, eq. 3."
+    )
+    motion_rotation: float = Field(
+        30.0, ge=0, description="Free rotation in degrees a frame since the last keyframe, eq. 3."
+    )
     laplacian_of: Literal["vertices", "offsets"] = Field(
-        "vertices", description="Smooth the vertices themselves (SoftRas), or their offsets from the prototype."
+        "vertices",
+        description="Smooth the vertices themselves (SoftRas), or their offsets from the prototype.",
     )
     stop: Literal["threshold", "plateau"] = Field(
         "threshold",
-        description="End a frame as soon as the appearance loss is below tau (paper), or when the total loss, having beaten that of the start, no longer falls; the best state is kept.",
+        description=(
+            "End a frame as soon as the appearance loss is below tau (paper), or when the total loss, "
+            "having beaten that of the start, no longer falls; the best state is kept."
+        ),
     )
     patience: int = Field(10, ge=1, description="With plateau: iterations without progress before the end.")
     prediction: Literal["last", "velocity"] = Field(
-        "last", description="A frame starts from the last pose (paper), or from the best of last pose, constant velocity and the mask's own shift."
+        "last",
+        description=(
+            "A frame starts from the last pose (paper), or from the best of last pose, constant velocity "
+            "and the mask's own shift."
+        ),
     )
     pose_iterations: int = Field(
-        0, ge=0, description="Iterations on the new frame's pose alone before the joint ones; 0 for none (paper)."
+        0,
+        ge=0,
+        description="Iterations on the new frame's pose alone before the joint ones; 0 for none (paper).",
     )
     joint: Literal["always", "new_view"] = Field(
         "always",
-        description="Optimize shape, texture and all poses in every frame (paper), or only in frames that show a new view or that their pose alone cannot explain; needs pose_iterations.",
+        description=(
+            "Optimize shape, texture and all poses in every frame (paper), or only in frames that show a "
+            "new view or that their pose alone cannot explain; needs pose_iterations."
+        ),
     )
     texture_start: Literal["zero", "backprojected"] = Field(
-        "zero", description="Texels not seen before start at zero (paper), or at what the new frame shows there."
+        "zero",
+        description="Texels not seen before start at zero (paper), or at what the new frame shows there.",
     )
     unseen_charge: float | None = Field(
-        None, ge=0, description="What a pixel of never seen texture costs instead of its appearance loss; empty: no difference is made (paper)."
+        None,
+        ge=0,
+        description=(
+            "What a pixel of never seen texture costs instead of its appearance loss; empty: no difference "
+            "is made (paper)."
+        ),
     )
     start_frames: int = Field(
-        1, ge=1, le=32, description="Solve this many first frames together from several hypotheses of rotation; 1 for none (paper)."
+        1,
+        ge=1,
+        le=32,
+        description=(
+            "Solve this many first frames together from several hypotheses of rotation; 1 for none (paper)."
+        ),
     )
     start_iterations: int = Field(60, ge=1, description="Iterations of each hypothesis of that joint start.")
     weights: Weights = Weights()
@@ -146,7 +201,9 @@ class RuntimeConfig(Section):
     device: str = Field("cpu", description="cpu, cuda, or cuda:N.")
     seed: int = Field(0, ge=0, description="Seed of everything random.")
     threads: int = Field(
-        1, ge=1, description="CPU threads of torch. One is never much slower here, and far faster on a busy machine."
+        1,
+        ge=1,
+        description="CPU threads of torch. One is never much slower here, and far faster on a busy machine.",
     )
 
 

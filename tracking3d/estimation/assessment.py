@@ -18,7 +18,12 @@ class Assessment:
 
 
 def assess(
-    appearance: float, silhouette: float, has_mask: bool, tau: float, silhouette_limit: float, failure: str = ""
+    appearance: float,
+    silhouette: float,
+    has_mask: bool,
+    tau: float,
+    silhouette_limit: float,
+    failure: str = "",
 ) -> Assessment:
     """Judge one frame by its losses (paper section 3.4: failure is an appearance loss not below tau).
 
@@ -33,7 +38,9 @@ def assess(
     if failure:
         return Assessment(Status.LOST, failure, 0.0)
     if not math.isfinite(appearance) or appearance >= tau:
-        return Assessment(Status.LOST, f"the appearance loss {appearance:.3f} did not fall below {tau:g}", 0.0)
+        return Assessment(
+            Status.LOST, f"the appearance loss {appearance:.3f} did not fall below {tau:g}", 0.0
+        )
     agreement = max(0.0, 1.0 - silhouette) if has_mask else 0.5
     confidence = agreement * (1.0 - 0.5 * appearance / tau)
     if not has_mask:

@@ -47,7 +47,9 @@ def select_keyframes(
         anchor = config.keep_first and position == 0
         consistent = candidate.silhouette_loss < config.silhouette and candidate.appearance_loss < limit
         latest = candidates[kept[-1]].pose if kept else None
-        if anchor or (consistent and (latest is None or is_new_view(latest, candidate.pose, object_size, config))):
+        if anchor or (
+            consistent and (latest is None or is_new_view(latest, candidate.pose, object_size, config))
+        ):
             kept.append(position)
     if config.keep_first and len(kept) > config.maximum:
         return thin_out(kept, config.maximum)

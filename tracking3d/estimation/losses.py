@@ -25,7 +25,12 @@ def cauchy(a: Tensor, b: Tensor, scale: float) -> Tensor:
 
 
 def appearance_loss(
-    rendered: Tensor, observed: Tensor, pixels: Tensor, valid: Tensor, scale: float, seen: Tensor | None = None,
+    rendered: Tensor,
+    observed: Tensor,
+    pixels: Tensor,
+    valid: Tensor,
+    scale: float,
+    seen: Tensor | None = None,
     unseen_charge: float = 0.0,
 ) -> Tensor:
     """Appearance loss, eq. 1, for each frame: the mean Cauchy loss over the object's visible pixels.

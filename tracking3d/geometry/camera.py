@@ -38,7 +38,11 @@ class Camera:
 
     @classmethod
     def from_fov(
-        cls, width: int, height: int, fov: float = DEFAULT_FIELD_OF_VIEW, origin: str = "default field of view"
+        cls,
+        width: int,
+        height: int,
+        fov: float = DEFAULT_FIELD_OF_VIEW,
+        origin: str = "default field of view",
     ) -> Camera:
         """A centred camera with square pixels and a vertical field of view of ``fov`` degrees."""
         focal = 0.5 * height / math.tan(math.radians(fov) / 2)

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from tracking3d.errors import InputError
 from tracking3d.geometry.mesh import Mesh
 
-
 LONGEST_EDGE = 0.25
 """A user's mesh is refined until its edges are shorter than this, in units of its radius."""
 MOST_FACES = 10_000
@@ -31,14 +30,15 @@ def icosphere(frequency: int = 11) -> tuple[NDArray[np.float64], NDArray[np.int6
     solid = trimesh.creation.icosahedron()
     sine, cosine, _ = solid.vertices[1]  # lies in the plane z = 0
     upright = solid.vertices @ np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
-    corners, faces = [], []
+    corners: list[NDArray[np.float64]] = []
+    faces: list[NDArray[np.int64]] = []
     steps = [(i, j) for i in range(frequency + 1) for j in range(frequency + 1 - i)]
     row = {step: k for k, step in enumerate(steps)}
     weights = np.array([(frequency - i - j, i, j) for i, j in steps]) / frequency
     cells = [(row[i, j], row[i + 1, j], row[i, j + 1]) for i, j in steps if i + j < frequency]
     cells += [(row[i + 1, j], row[i + 1, j + 1], row[i, j + 1]) for i, j in steps if i + j < frequency - 1]
     for face in solid.faces:
-        faces.append(np.array(cells) + sum(map(len, corners)))
+        faces.append(np.array(cells) + len(steps) * len(corners))
         corners.append(weights @ upright[face])
     # Vertices on shared edges are computed from both sides: merge them.
     points = np.concatenate(corners)

@@ -79,7 +79,14 @@ class BackProjection:
 
 @torch.no_grad()
 def back_project(
-    values: Tensor, valid: Tensor, vertices: Tensor, faces: Tensor, texels: TexelMap, R: Tensor, t: Tensor, K: Tensor
+    values: Tensor,
+    valid: Tensor,
+    vertices: Tensor,
+    faces: Tensor,
+    texels: TexelMap,
+    R: Tensor,
+    t: Tensor,
+    K: Tensor,
 ) -> BackProjection:
     """What one frame shows of the texture.
 
@@ -97,7 +104,9 @@ def back_project(
     drawn = rasterize(screen, depth, faces, (height, width)).depth
     x_cam = vertices @ R.T + t
     corner = x_cam[faces]
-    normal = functional.normalize(torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), dim=1)
+    normal = functional.normalize(
+        torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), dim=1
+    )
     point = (x_cam[faces[texels.face]] * texels.barycentric[..., None]).sum(1)
     cosine = -(normal[texels.face] * functional.normalize(point, dim=1)).sum(1)
     front = torch.nonzero((cosine > _GRAZING) & (point[:, 2] > 0))[:, 0]

@@ -16,7 +16,9 @@ from tracking3d.rendering.shapes import check_shapes
 from tracking3d.rendering.visibility import gather
 
 
-def interpolate(screen: Tensor, depth: Tensor, faces: Tensor, attributes: Tensor, face_index: Tensor) -> Tensor:
+def interpolate(
+    screen: Tensor, depth: Tensor, faces: Tensor, attributes: Tensor, face_index: Tensor
+) -> Tensor:
     """Interpolate per-corner attributes at every covered pixel.
 
     Differentiable in ``screen``, ``depth`` and ``attributes``; visibility is held fixed.
@@ -56,7 +58,10 @@ def barycentrics(corner_x: Tensor, corner_y: Tensor, x: Tensor, y: Tensor) -> tu
         ``(3, P)`` weights that sum to 1, and their derivatives ``(3, P)`` by x and by y.
     """
     following_x, following_y = corner_x.roll(-1, 0), corner_y.roll(-1, 0)
-    edge_x, edge_y = corner_x.roll(-2, 0) - following_x, corner_y.roll(-2, 0) - following_y  # opposite corner i
+    edge_x, edge_y = (
+        corner_x.roll(-2, 0) - following_x,
+        corner_y.roll(-2, 0) - following_y,
+    )  # opposite corner i
     area = edge_x[1] * edge_y[2] - edge_y[1] * edge_x[2]
     by_x, by_y = -edge_y / area, edge_x / area
     return (x - following_x) * by_x + (y - following_y) * by_y, by_x, by_y
@@ -73,7 +78,9 @@ class _Interpolate(torch.autograd.Function):
         row = torch.div(pixel, width, rounding_mode="floor")
         view = torch.div(row, height, rounding_mode="floor")
         x, y = (pixel - row * width).to(screen.dtype), (row - view * height).to(screen.dtype)
-        vertex = faces.T.contiguous().index_select(1, face) + view * screen.shape[1]  # (3, P) in depth.flatten()
+        vertex = (
+            faces.T.contiguous().index_select(1, face) + view * screen.shape[1]
+        )  # (3, P) in depth.flatten()
         z = gather(depth, vertex)
         w, by_x, by_y = barycentrics(gather(screen[..., 0], vertex), gather(screen[..., 1], vertex), x, y)
         weight = w / z
@@ -88,7 +95,7 @@ class _Interpolate(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None, Tensor | None, None]:  # type: ignore[override]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None, Tensor | None, None]:
         vertex, face, w, by_x, by_y, z, s, share, corner_values, values = ctx.saved_tensors
         screen_shape, attributes_shape = ctx.shapes
         rows = vertex.reshape(-1)
@@ -96,7 +103,8 @@ class _Interpolate(torch.autograd.Function):
         by_weight = g * s
         planes = [-w * (by_weight * slope).sum(0) for slope in (by_x, by_y)] + [-g * share]
         grad_x, grad_y, grad_depth = (
-            grad.new_zeros(screen_shape[:2]).reshape(-1).index_add_(0, rows, plane.reshape(-1)) for plane in planes
+            grad.new_zeros(screen_shape[:2]).reshape(-1).index_add_(0, rows, plane.reshape(-1))
+            for plane in planes
         )
         grad_attributes = None
         if ctx.needs_input_grad[3]:

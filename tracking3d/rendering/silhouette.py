@@ -75,7 +75,9 @@ class _SoftSilhouette(torch.autograd.Function):
         pairs = _pairs_near_uncovered(x, y, depth, faces, face_index < 0, boxlen)
         kept = _first_per_pixel(pairs.pixel, knum, face_index.numel())
         if kept is not None:
-            box, column, row, pixel = (gather(part, kept) for part in (pairs.box, pairs.x, pairs.y, pairs.pixel))
+            box, column, row, pixel = (
+                gather(part, kept) for part in (pairs.box, pairs.x, pairs.y, pairs.pixel)
+            )
             pairs = _Pairs(pairs.vertex, box, column, row, pixel)
 
         # Planes (3, M) and then (3, N), one for the edge from each corner to the next.
@@ -92,7 +94,9 @@ class _SoftSilhouette(torch.autograd.Function):
         nearest = d2.amin(0)
         e = torch.exp((-sigma * nearest).clamp_min(_LEAST)).clamp_max(1 - _CLAMP)
         sound = screen.isfinite().flatten(1).all(1)[:, None, None]
-        log_rest = torch.where(face_index < 0, torch.where(sound, 0.0, torch.nan).to(x), -torch.inf).reshape(-1)
+        log_rest = torch.where(face_index < 0, torch.where(sound, 0.0, torch.nan).to(x), -torch.inf).reshape(
+            -1
+        )
         rest = log_rest.index_add_(0, pairs.pixel, torch.log1p(-e)).exp_()
 
         slope = 2 * sigma * e * gather(rest, pairs.pixel) / (1 - e)  # dS/d(nearest) = -slope / 2
@@ -112,7 +116,7 @@ class _SoftSilhouette(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None, None, None, None]:  # type: ignore[override]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None, None, None, None]:
         pixel, near, far, t, *directions = ctx.saved_tensors
         shape, sides = ctx.shapes
         # d(d2)/da = -2 (1 - t) r and d(d2)/db = -2 t r for the nearest point a + t (b - a).

@@ -20,4 +20,3 @@ def sample_texture(texture: Tensor, uv: Tensor) -> Tensor:
     grid = torch.stack([x, uv[:, 1] * 2 - 1], 1)[None, None]
     sampled = functional.grid_sample(wrapped[None], grid, padding_mode="border", align_corners=False)
     return sampled[0, :, 0].T
-

@@ -79,7 +79,9 @@ class Belief:
         K[:2] *= scale
         K[:2, 2] += (scale - 1) / 2  # pixel centres stay at integers
         valid = observation.valid * (observation.mask if observation.has_mask else 1.0)
-        valid = torch.nn.functional.interpolate(valid[None, None], size=values.shape[-2:], mode="bilinear")[0, 0]
+        valid = torch.nn.functional.interpolate(valid[None, None], size=values.shape[-2:], mode="bilinear")[
+            0, 0
+        ]
         return back_project(
             values, valid, self.vertices, self.shape.faces, self.texels, keyframe.pose.R,
             keyframe.pose.translation, K,

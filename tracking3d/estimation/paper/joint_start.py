@@ -41,7 +41,11 @@ def joint_start(belief: Belief, frames: list[Keyframe], config: SolverConfig, ta
     spent = 0
     optima: list[Optimum] = []
     starts = [belief.parameters(frames), *hypotheses(belief, frames)]
-    for problem, survivors, share in ((coarse, len(starts), 3), (coarse, _SEMIFINALISTS, 1), (fine, _FINALISTS, 1)):
+    for problem, survivors, share in (
+        (coarse, len(starts), 3),
+        (coarse, _SEMIFINALISTS, 1),
+        (fine, _FINALISTS, 1),
+    ):
         starts = starts[:survivors]
         iterations = max(config.start_iterations // share, 1)
         optima = [optimize(problem, start, iterations=iterations, tau=tau, fixed=1) for start in starts]
@@ -66,7 +70,9 @@ def hypotheses(belief: Belief, frames: list[Keyframe]) -> list[Parameters]:
         for rate in RATES:
             variants.append([_turned(first, frame, axis, rate, frames[0]) for frame in frames])
     return [
-        belief.parameters([Keyframe(frame.observation, pose) for frame, pose in zip(frames, poses, strict=True)])
+        belief.parameters(
+            [Keyframe(frame.observation, pose) for frame, pose in zip(frames, poses, strict=True)]
+        )
         for poses in variants
     ]
 

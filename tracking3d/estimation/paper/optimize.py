@@ -7,7 +7,6 @@ from typing import Literal
 
 import torch
 
-
 from tracking3d.estimation.paper.problem import Losses, Parameters, Problem, flatten
 
 Free = Literal["all", "pose"]
@@ -104,5 +103,3 @@ def _numerical_failure(
     if best is not None:
         return replace(best, iterations=iteration, reason=reason)
     return Optimum(start, losses.detach(), value, iteration, reason)
-
-

@@ -33,9 +33,7 @@ def moved_to_mask(belief: Belief, pose: Pose, mask: NDArray[np.bool_]) -> Pose:
     (x0, y0), (x1, y1) = _centroid(silhouette), _centroid(mask)
     ratio = float(np.clip(np.sqrt(silhouette.sum() / mask.sum()), 0.8, 1.25))
     depth = float(pose.translation[2])
-    shift = pose.translation.new_tensor(
-        [(x1 - x0) / camera.fx * depth, (y1 - y0) / camera.fy * depth, 0.0]
-    )
+    shift = pose.translation.new_tensor([(x1 - x0) / camera.fx * depth, (y1 - y0) / camera.fy * depth, 0.0])
     return Pose((pose.translation + shift) * ratio, pose.quaternion)
 
 

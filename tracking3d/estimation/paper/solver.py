@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -186,7 +187,9 @@ class PaperSolver:
                 belief = replace(belief, last=(optimum.parameters.poses[-1], frame.index))
             return belief, self._answered(answer, judgement, started)
         joint = len(frames) > 1 or first or not belief.keyframes
-        known = self._updated(belief, frames, optimum) if joint else belief.moved(frames[-1].pose, frame.index)
+        known = (
+            self._updated(belief, frames, optimum) if joint else belief.moved(frames[-1].pose, frame.index)
+        )
         if judgement.status is not Status.LOST:
             answer = replace(answer, mask=known.silhouette(known.last[0]))
         answer = replace(answer, keyframe=any(k.observation.index == frame.index for k in known.keyframes))
@@ -272,7 +275,9 @@ class PaperSolver:
             waiting = (*belief.waiting, (Keyframe(frames[-1].observation, known.last[0]), answer))
             if answer.status is Status.TRACKED and len(waiting) > 1:
                 reason = "the first frames are not yet solved together"
-                answer = replace(answer, status=Status.UNCERTAIN, reason=reason, confidence=answer.confidence / 2)
+                answer = replace(
+                    answer, status=Status.UNCERTAIN, reason=reason, confidence=answer.confidence / 2
+                )
             return replace(known, waiting=waiting), answer
         revised = []
         for position, (keyframe, earlier) in enumerate(belief.waiting):
