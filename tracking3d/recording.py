@@ -70,6 +70,7 @@ def record(
         selection=selection,
         overwrite=overwrite,
     ) as writer:
+        answer: FrameRecord | None = None
         try:
             for item in skipped:
                 writer.skip(item)
@@ -79,10 +80,12 @@ def record(
                     writer.skip(frame)
                     listener(frame)
                 else:
-                    listener(writer.write(session.step(frame), frame))
+                    answer = writer.write(session.step(frame), frame)
+                    listener(answer)
         except BaseException as error:
             failed = isinstance(error, Exception)
-            error.add_note(f"What was finished until then is kept in {folder}.")
+            if answer is not None:
+                error.add_note(f"What was finished until then is kept in {folder}.")
             with suppress(OutputError):  # the first error is the one to tell
                 writer.finish(_model(session), "failed" if failed else "interrupted", str(error) or None)
             raise

@@ -129,11 +129,13 @@ def test_interrupted_run_keeps_what_was_finished(call, clip, script):
     assert Path("run/overlay.mp4").stat().st_size
 
 
-def test_interrupt_before_the_first_answer_leaves_no_folder(call, clip, script):
+def test_interrupt_before_the_first_answer_leaves_nothing_in_the_way(call, clip, script):
     script.faults[0] = KeyboardInterrupt()
     result = call("run", clip, *BOX, "--out", "run")
     assert (result.exit_code, result.stderr) == (130, "interrupted\n")
-    assert not Path("run").exists()
+    assert RunReader("run").frames == []
+    script.faults.clear()
+    assert call("run", clip, *BOX, "--out", "run").exit_code == 0
 
 
 def test_failing_plugin_ends_the_run_with_a_sentence_and_keeps_what_was_finished(call, clip, script):

@@ -135,7 +135,7 @@ def test_yaml_merge_keys_are_plain_data():
         ("solver: {sigma: lots}", "'solver.sigma' must be a valid number, not 'lots'"),
         ("window: {size: 4}", "'window.size' must be greater than or equal to 32, not 4"),
         ("solver: {band: erod}", "'solver.band' must be 'erode', 'soften' or 'none', not 'erod'"),
-        ("solver: {sigma: .nan}", "must be greater than 0, not nan"),
+        ("solver: {sigma: .nan}", "must be a finite number, not nan"),
         ("solver: 3", "'solver' must be a mapping of settings, not 3"),
         ("solver: [1, 2]", "'solver' must be a mapping"),
         ("tracker: [csrt]", "'tracker' must be a mapping"),

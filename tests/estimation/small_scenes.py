@@ -18,8 +18,6 @@ from tracking3d.geometry.prototypes import ellipsoid
 from tracking3d.rendering import render
 
 SIZE = 48
-CAMERA = Camera.from_fov(SIZE, SIZE)
-WINDOW = Window(0, 0, SIZE, SIZE)
 AXES = np.array([0.9, 0.7, 0.6])
 
 
@@ -49,29 +47,21 @@ def painted(size: int = 24) -> Tensor:
     return 0.5 + 0.4 * torch.stack(layers)
 
 
-def observed(pose: Pose, index: int = 0, shape: Shape | None = None, has_mask: bool = True) -> Observation:
-    """What a perfect camera sees of the painted object."""
-    shape = shape or small_shape()
-    K = torch.tensor(WINDOW.K(CAMERA), dtype=torch.float32)
-    drawn = render(
-        shape.rest,
-        shape.faces,
-        shape.face_uvs,
-        painted(),
-        pose.R[None],
-        pose.translation[None],
-        K[None],
-        (SIZE, SIZE),
-    )
+def observed(pose: Pose, index: int = 0, has_mask: bool = True, size: int = SIZE) -> Observation:
+    """What a perfect camera sees of the painted object in black surroundings."""
+    shape, window = small_shape(), Window(0, 0, size, size)
+    K = torch.tensor(window.K(Camera.from_fov(size, size)), dtype=torch.float32)
+    R, t = pose.R[None], pose.translation[None]
+    drawn = render(shape.rest, shape.faces, shape.face_uvs, painted(), R, t, K[None], (size, size))
     mask = (drawn.face_index[0] >= 0).float() * has_mask
     image = drawn.image()[0]
     return Observation(
         index,
-        WINDOW,
+        window,
         K,
         torch.nn.functional.interpolate(image[None], scale_factor=2.0)[0],
         image,
-        torch.ones(SIZE, SIZE),
+        torch.ones(size, size),
         mask,
         mask_distance(mask),
         has_mask,

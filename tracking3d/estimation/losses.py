@@ -87,7 +87,9 @@ def erode(silhouette: Tensor) -> Tensor:
 
 def soften(mask: Tensor, distance: Tensor, sigma: float) -> Tensor:
     """The target ``(B, H, W)`` with the same soft band as the silhouette: ``exp(-sigma d^2)`` outside."""
-    return torch.maximum(mask, torch.exp(-sigma * distance.square()) * (distance > 0))
+    # The silhouette's d ends at the outline, on average half a pixel short of the mask's nearest pixel centre.
+    to_outline = (distance - 1.0 / mask.shape[-1]).clamp_min(0.0)
+    return torch.maximum(mask, torch.exp(-sigma * to_outline.square()) * (distance > 0))
 
 
 def motion_loss(

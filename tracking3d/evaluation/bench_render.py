@@ -88,7 +88,12 @@ class Scene:
 
 
 def benchmark(
-    size: int = 128, frames: int = 7, channels: int = 3, repeats: int = 5, device: str = "cpu"
+    size: int = 128,
+    frames: int = 7,
+    channels: int = 3,
+    repeats: int = 5,
+    device: str = "cpu",
+    threads: int = 1,
 ) -> dict[str, Any]:
     """Time forward and backward passes of every backend on one problem.
 
@@ -99,11 +104,14 @@ def benchmark(
         repeats: Measurements of each backend after a first one that does not count; the dense one takes part in
             every tenth.
         device: ``cpu``, ``cuda`` or ``cuda:N``.
+        threads: CPU threads of all backends. Several gain little at these sizes and, on a machine that has other
+            work to do, lose much by waiting for each other.
 
     Returns:
         The problem, where it ran (``threads``, ``device``), for each of ``backends`` and ``dense`` the median
-        milliseconds ``forward_ms``, ``backward_ms`` and ``total_ms`` with the number of ``measurements`` and of
-        ``measured_frames``, and ``speedup_over_dense``: how many times longer ``dense`` takes than ``torch``.
+        milliseconds ``forward_ms``, ``backward_ms`` and ``total_ms`` for all frames, with the number of
+        ``measurements`` and of ``measured_frames``, from which they are scaled up, and ``speedup_over_dense``: how
+        many times longer ``dense`` takes than ``torch``.
 
     Raises:
         InputError: If the device is not there.
@@ -111,29 +119,43 @@ def benchmark(
     place = torch.device(device)
     if place.type == "cuda" and not torch.cuda.is_available():
         raise InputError(f"the device '{device}' is not available: no CUDA GPU was found; use cpu")
+    threads_before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        times = _measure_all(size, frames, channels, repeats, place)
+    finally:
+        torch.set_num_threads(threads_before)
+    results = {
+        name: _summary(measured, frames, frames) for name, measured in times.items() if name != "dense"
+    }
+    results["dense"] = _summary(times["dense"], frames, 1)
+    return {
+        "size": size,
+        "frames": frames,
+        "channels": channels,
+        "faces": 20 * FREQUENCY**2,
+        "texture": TEXTURE,
+        "device": torch.cuda.get_device_name(place) if place.type == "cuda" else "cpu",
+        "threads": threads,
+        "backends": results,
+        "speedup_over_dense": round(results["dense"]["total_ms"] / results["torch"]["total_ms"], 1),
+    }
+
+
+def _measure_all(
+    size: int, frames: int, channels: int, repeats: int, place: torch.device
+) -> dict[str, list[tuple[float, float]]]:
+    """Milliseconds of forward and backward passes by name, the dense one's for a single frame."""
     scene, first = (Scene.make(size, count, channels, place) for count in (frames, 1))
-    times: dict[str, list[tuple[float, float]]] = {name: [] for name in BACKENDS}
-    dense: list[tuple[float, float]] = []
+    times: dict[str, list[tuple[float, float]]] = {name: [] for name in (*BACKENDS, "dense")}
     for backend in BACKENDS.values():
         _measure(scene, backend)
     for turn in range(repeats):
         for name, backend in BACKENDS.items():
             times[name].append(_measure(scene, backend))
         if turn % _DENSE_EVERY == 0:
-            dense.append(_measure(first, render_dense))
-    results = {name: _summary(measured, frames, frames) for name, measured in times.items()}
-    results["dense"] = _summary(dense, frames, 1)
-    return {
-        "size": size,
-        "frames": frames,
-        "channels": channels,
-        "faces": len(scene.constants["faces"]),
-        "texture": TEXTURE,
-        "device": torch.cuda.get_device_name(place) if place.type == "cuda" else "cpu",
-        "threads": torch.get_num_threads(),
-        "backends": results,
-        "speedup_over_dense": round(results["dense"]["total_ms"] / results["torch"]["total_ms"], 1),
-    }
+            times["dense"].append(_measure(first, render_dense))
+    return times
 
 
 def _measure(scene: Scene, backend: Callable[..., Rendering]) -> tuple[float, float]:

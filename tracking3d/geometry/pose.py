@@ -28,8 +28,9 @@ class Pose:
 
     @classmethod
     def identity(cls, translation: Tensor) -> Pose:
-        """No rotation."""
-        return cls(translation, translation.new_tensor([1.0, 0.0, 0.0, 0.0]))
+        """No rotation, at one translation or a batch of them."""
+        quaternion = translation.new_tensor([1.0, 0.0, 0.0, 0.0])
+        return cls(translation, quaternion.expand(*translation.shape[:-1], 4))
 
     @classmethod
     def stack(cls, poses: list[Pose]) -> Pose:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import BinaryIO, Self
 
 import av
 import numpy as np
@@ -23,14 +23,8 @@ ENCODERS = ("libx264", "libopenh264", "h264_videotoolbox", "h264_mf", "mpeg4")
 
 _OPTIONS = {"libx264": {"crf": "20", "preset": "veryfast", "g": "30"}, "mpeg4": {"qscale": "3", "g": "30"}}
 
-
-def _movflags() -> str:
-    """Fragments while writing, so that a killed process leaves a video that plays up to its last keyframe.
-
-    From FFmpeg 7.1 on (libavformat 61.7) the fragments become an ordinary MP4 when the file is closed.
-    """
-    hybrid = av.library_versions["libavformat"] >= (61, 7, 0)
-    return "+hybrid_fragmented" if hybrid else "+frag_keyframe+empty_moov"
+_FRAGMENTED = {"movflags": "+frag_keyframe+empty_moov+default_base_moof"}
+"""The index goes into every fragment, so that a killed process leaves a video up to its last keyframe."""
 
 
 class VideoWriter:
@@ -59,12 +53,11 @@ class VideoWriter:
         self._frames = 0
         self._closed = False
         self._failed = False
+        self._file: BinaryIO | None = None
         with self._output_errors():
-            # Opened here once, because FFmpeg says less clearly why it cannot.
-            self.path.open("wb").close()
-            self._container = av.open(
-                f"file:{self.path}", "w", format="mp4", options={"movflags": _movflags()}
-            )
+            # Python's file: FFmpeg forgets a failed write of a fragment, Python does not.
+            self._file = self.path.open("wb")
+            self._container = av.open(self._file, "w", format="mp4", options=_FRAGMENTED)
             rate = max(Fraction(fps).limit_denominator(1001), Fraction(1, 1001))
             self._stream = self._add_stream(rate)
             # The header now: FFmpeg crashes if it is asked for it again after it could not be written.
@@ -117,7 +110,11 @@ class VideoWriter:
                 if self._frames and not self._failed:
                     self._container.mux(self._stream.encode(None))
             finally:
-                self._container.close()
+                try:
+                    self._container.close()
+                finally:
+                    if self._file is not None:
+                        self._file.close()
         if not self._frames and self.path.is_file():
             self.path.unlink()
 
@@ -139,5 +136,8 @@ class VideoWriter:
             yield
         except (FFmpegError, OSError) as error:
             self._failed = True
+            if self._file is not None:
+                with suppress(OSError):
+                    self._file.close()
             reason = getattr(error, "strerror", None) or error
             raise OutputError(f"{self.path} cannot be written: {reason}.") from error

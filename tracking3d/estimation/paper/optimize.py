@@ -56,7 +56,7 @@ def optimize(
     groups = [(translation, rates.translation), (quaternion, rates.rotation)]
     if free == "all":
         groups += [(offsets, rates.vertices), (texture, rates.texture)]
-    groups = [(tensor, rate) for tensor, rate in groups if tensor.numel() and rate > 0]
+    groups = [(tensor, rate) for tensor, rate in groups if tensor.numel()]
     for tensor, _ in groups:
         tensor.requires_grad_()
     adam = torch.optim.Adam([{"params": [tensor], "lr": rate} for tensor, rate in groups])

@@ -25,7 +25,7 @@ from tracking3d.estimation.paper.belief import Belief, Keyframe
 from tracking3d.estimation.paper.joint_start import joint_start
 from tracking3d.estimation.paper.optimize import Optimum, optimize
 from tracking3d.estimation.paper.prediction import candidate_poses, mask_box, projected_box
-from tracking3d.estimation.paper.problem import Problem, Shape, flatten
+from tracking3d.estimation.paper.problem import Problem, Shape
 from tracking3d.estimation.start import first_translation, mask_ellipse, prototype_mesh
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame, MaskEstimate
@@ -78,7 +78,8 @@ class PaperSolver:
         size = self.config.object.texture_size
         offsets = torch.zeros_like(shape.rest)
         if shape.flat:
-            offsets = flatten(shape.rest) - shape.rest
+            # Facing the camera: any plane fits a ball, and the one that fits an ellipsoid best is seen edge-on.
+            offsets[:, 2] = -shape.rest[:, 2]
         belief = Belief(
             self.camera,
             shape,
@@ -164,8 +165,7 @@ class PaperSolver:
                 current = Keyframe(current.observation, optimum.parameters.poses[0])
         frames = [current]
         if optimum is None or self._needs_joint(belief, current, optimum):
-            belief = self._with_new_texture(belief, current)
-            frames, optimum = self._optimize(belief, current)
+            frames, optimum = self._optimize(self._with_new_texture(belief, current), current)
             iterations += optimum.iterations
         losses = optimum.losses.of_frame(-1)
         answer = FrameEstimate(
@@ -181,11 +181,11 @@ class PaperSolver:
             iterations=iterations,
         )
         judgement = self._judge(optimum, -1, mask is not None)
-        if judgement.status is Status.LOST and not first:
+        if judgement.status is Status.LOST and (optimum.reason or not first):
             # What was known before stays; only the pose goes on from where the optimization left it.
             if not optimum.reason:
                 belief = replace(belief, last=(optimum.parameters.poses[-1], frame.index))
-            return belief, self._answered(answer, judgement, started)
+            return replace(belief, started=True), self._answered(answer, judgement, started)
         joint = len(frames) > 1 or first or not belief.keyframes
         known = (
             self._updated(belief, frames, optimum) if joint else belief.moved(frames[-1].pose, frame.index)

@@ -1,0 +1,95 @@
+"""The solver on a short synthetic clip, with settings that are quick rather than good."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import cache
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from tracking3d.config.loading import load_config
+from tracking3d.estimation.estimate import FrameEstimate
+from tracking3d.estimation.paper.belief import Belief
+from tracking3d.estimation.paper.solver import PaperSolver
+from tracking3d.evaluation.synthetic import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.features.protocol import FeatureEncoder
+from tracking3d.features.rgb import RgbEncoder
+from tracking3d.frames import Frame, MaskEstimate
+
+QUICK: dict[str, Any] = {
+    "window": {"size": 32},
+    "object": {"frequency": 4, "texture_size": 32},
+    "solver": {"iterations": 8, "tau": 0.5},
+}
+QUICK_DEFAULT: dict[str, Any] = {
+    **QUICK,
+    "solver": {**QUICK["solver"], "pose_iterations": 8, "start_frames": 3, "start_iterations": 4},
+}
+
+Mask = NDArray[np.bool_] | None
+
+
+@cache
+def short_clip() -> SyntheticClip:
+    """Ten frames of 100 x 80 pixels, 4 degrees apart."""
+    return synthesize(SyntheticSpec(frames=10, size=(100, 80), degrees_per_frame=4.0))
+
+
+def quick_solver(
+    preset: str = "default", encoder: FeatureEncoder | None = None, **sections: Any
+) -> PaperSolver:
+    """A solver of a preset; ``sections`` change settings of a section on top of the quick ones."""
+    quick = QUICK_DEFAULT if preset == "default" else QUICK
+    names = {*quick, *sections}
+    merged = {name: {**quick.get(name, {}), **sections.get(name, {})} for name in names}
+    return PaperSolver(load_config(preset=preset, **merged), short_clip().camera, encoder or RgbEncoder())
+
+
+def frame(index: int) -> Frame:
+    """A frame of the clip; beyond its end it runs backwards, and so on."""
+    count = len(short_clip().images)
+    place = index % (2 * count - 2)
+    return Frame(index, short_clip().images[min(place, 2 * count - 2 - place)], name=f"frame {index}")
+
+
+def true_mask(index: int) -> NDArray[np.bool_]:
+    """The exact mask of `frame`."""
+    count = len(short_clip().images)
+    place = index % (2 * count - 2)
+    return short_clip().masks[min(place, 2 * count - 2 - place)]
+
+
+def estimate_of(mask: Mask) -> MaskEstimate:
+    """What a mask tracker answers."""
+    return MaskEstimate(None if mask is None else mask.astype(np.float32))
+
+
+def run(
+    solver: PaperSolver, frames: Iterable[int] = range(6), masks: dict[int, Mask] | None = None
+) -> tuple[list[FrameEstimate], Belief]:
+    """All answers as they came, and the state at the end; ``masks`` replaces the exact ones."""
+    torch.manual_seed(0)
+    given = masks or {}
+    answers: list[FrameEstimate] = []
+    state: Belief | None = None
+    for index in frames:
+        mask = estimate_of(given.get(index, true_mask(index)))
+        if state is None:
+            state, answer = solver.init(frame(index), mask)
+        else:
+            state, answer = solver.step(state, frame(index), mask)
+        answers.append(answer)
+    assert state is not None
+    return answers, state
+
+
+def revised(answers: Iterable[FrameEstimate]) -> list[FrameEstimate]:
+    """The final answer of every frame."""
+    final: dict[int, FrameEstimate] = {}
+    for answer in answers:
+        final |= {better.index: better for better in answer.revised}
+        final[answer.index] = answer
+    return list(final.values())

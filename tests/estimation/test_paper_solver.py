@@ -1,0 +1,396 @@
+"""The solver as a state machine: what it answers, what it keeps, and how a frame fails without harm."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from short_runs import estimate_of, frame, quick_solver, revised, run, short_clip, true_mask
+
+from tracking3d.errors import InputError
+from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
+from tracking3d.estimation.observation import Observation
+from tracking3d.estimation.paper.problem import Losses, Problem
+from tracking3d.evaluation.metrics import mask_iou
+from tracking3d.features.rgb import RgbEncoder
+from tracking3d.frames import MaskEstimate
+from tracking3d.rendering import render
+
+PRESETS = pytest.mark.parametrize("preset", ["paper", "default"])
+FAILS = {"tau": 1e-6}
+
+
+@PRESETS
+def test_every_frame_is_answered(preset):
+    answers, _ = run(quick_solver(preset), range(10))
+    assert [answer.index for answer in answers] == list(range(10))
+    for answer in answers:
+        T_cam_obj = answer.T_cam_obj
+        assert T_cam_obj.shape == (4, 4)
+        assert T_cam_obj.dtype == np.float64
+        np.testing.assert_allclose(T_cam_obj[:3, :3] @ T_cam_obj[:3, :3].T, np.eye(3), atol=1e-5)
+        assert np.linalg.det(T_cam_obj[:3, :3]) == pytest.approx(1, abs=1e-5)
+        assert T_cam_obj[3].tolist() == [0, 0, 0, 1]
+        assert T_cam_obj[2, 3] > 0
+        assert answer.mask.shape == (80, 100)
+        assert answer.mask.dtype == bool
+        np.testing.assert_array_equal(answer.initial_mask, true_mask(answer.index))
+        assert set(answer.losses) == {field.name for field in fields(Losses)}
+        assert all(math.isfinite(value) for value in answer.losses.values())
+        assert 0 <= answer.confidence <= 1
+        assert answer.iterations >= 1
+        assert answer.seconds > 0
+        assert (answer.reason == "") == (answer.status is Status.TRACKED)
+    assert sum(answer.keyframe for answer in answers) >= 1
+
+
+@PRESETS
+def test_times_of_frames_are_passed_on(preset):
+    solver = quick_solver(preset)
+    state, first = solver.init(replace(frame(0), time=0.5), estimate_of(true_mask(0)))
+    _, second = solver.step(state, frame(1), estimate_of(true_mask(1)))
+    assert (first.time, second.time) == (0.5, None)
+
+
+def test_the_paper_recipe_as_it_is_published():
+    full = {"frequency": 11, "texture_size": 300}
+    recipe = quick_solver("paper", window={"size": 64}, object=full, solver={"iterations": 500, "tau": 0.2})
+    answers, state = run(recipe, range(4))
+    assert all(answer.status is not Status.LOST for answer in answers)
+    assert all(answer.iterations < 500 for answer in answers)
+    assert all(answer.losses["features"] < 0.25 for answer in answers)
+    assert len(state.vertices) == 1212
+    assert state.texture.shape == (3, 300, 300)
+    assert np.mean([mask_iou(answer.mask, true_mask(answer.index)) for answer in answers]) > 0.75
+
+
+@PRESETS
+def test_the_same_input_gives_the_same_answers(preset):
+    (once, model), (again, other) = (
+        (revised(answers), solver.result(state))
+        for solver in (quick_solver(preset), quick_solver(preset))
+        for answers, state in [run(solver)]
+    )
+    for a, b in zip(once, again, strict=True):
+        assert np.array_equal(a.T_cam_obj, b.T_cam_obj)
+        assert np.array_equal(a.mask, b.mask)
+        assert replace(a, T_cam_obj=0, mask=0, initial_mask=0, seconds=0, revised=()).__dict__ == (
+            replace(b, T_cam_obj=0, mask=0, initial_mask=0, seconds=0, revised=()).__dict__
+        )
+    assert np.array_equal(model.vertices, other.vertices)
+    assert np.array_equal(model.texture, other.texture)
+
+
+# The gauge
+
+
+def test_the_first_frame_does_not_move():
+    answers, state = run(quick_solver("default"), range(8))
+    first = state.keyframes[0]
+    assert first.observation.index == 0
+    np.testing.assert_array_equal(first.pose.matrix().numpy(), answers[0].T_cam_obj)
+    np.testing.assert_array_equal(revised(answers)[0].T_cam_obj, answers[0].T_cam_obj)
+    np.testing.assert_allclose(answers[0].T_cam_obj[:3, :3], np.eye(3), atol=1e-7)
+
+
+def test_the_oldest_keyframe_does_not_move_in_the_paper_recipe():
+    solver = quick_solver("paper")
+    answers, state = run(solver, range(4))
+    [keyframe] = state.keyframes
+    np.testing.assert_array_equal(keyframe.pose.matrix().numpy(), answers[0].T_cam_obj)
+
+
+# The joint start
+
+
+def test_first_frames_are_uncertain_until_they_are_solved_together_and_then_answered_anew():
+    answers, state = run(quick_solver("default", solver={"start_frames": 4}), range(6))
+    assert [len(answer.revised) for answer in answers] == [0, 0, 0, 3, 0, 0]
+    assert [better.index for better in answers[3].revised] == [0, 1, 2]
+    assert all(answer.status is Status.UNCERTAIN for answer in answers[1:3])
+    assert all("together" in answer.reason for answer in answers[1:3])
+    for better in answers[3].revised:
+        assert better.status is Status.TRACKED
+        assert better.reason == ""
+        assert better.revised == ()
+        assert mask_iou(better.mask, true_mask(better.index)) > 0.7
+    assert not np.array_equal(answers[2].T_cam_obj, answers[3].revised[2].T_cam_obj)
+    assert state.waiting is None
+
+
+def test_revised_answers_and_the_one_that_carries_them_are_one_solution():
+    answers, _ = run(quick_solver("default"), range(3))
+    together = {better.losses["laplacian"] for better in answers[2].revised} | {
+        answers[2].losses["laplacian"]
+    }
+    assert len(together) == 1
+
+
+def test_a_video_that_ends_before_the_joint_start_has_a_result():
+    solver = quick_solver("default", solver={"start_frames": 8})
+    answers, state = run(solver, range(3))
+    assert all(answer.revised == () for answer in answers)
+    assert (solver.result(state).texture_weight > 0).any()
+
+
+# Frames without a mask
+
+
+@pytest.mark.parametrize("absent", [None, np.zeros((80, 100), bool)], ids=["none", "empty"])
+@PRESETS
+def test_a_frame_without_a_mask_is_tracked(preset, absent):
+    answers, _ = run(quick_solver(preset), range(8), {5: absent})
+    answer = answers[5]
+    assert answer.status is Status.UNCERTAIN
+    assert "no initial mask" in answer.reason
+    assert answer.initial_mask is None
+    assert answer.confidence > 0
+    assert mask_iou(answer.mask, answers[4].mask) > 0.6
+    assert answers[6].initial_mask is not None
+
+
+def test_a_gap_of_several_frames_is_tracked_through():
+    final = run(quick_solver("default"), range(9), dict.fromkeys((4, 5, 6, 7)))[0]
+    assert all(mask_iou(answer.mask, true_mask(answer.index)) > 0.6 for answer in final[4:])
+    assert final[8].status is Status.TRACKED
+
+
+def test_a_gap_within_the_first_frames_is_tracked_through():
+    answers, _ = run(quick_solver("default", solver={"start_frames": 4}), range(5), {1: None, 2: None})
+    final = revised(answers)
+    assert all(mask_iou(answer.mask, true_mask(answer.index)) > 0.6 for answer in final)
+    assert [answer.initial_mask is None for answer in final] == [False, True, True, False, False]
+
+
+def test_frames_that_are_missing_altogether_are_passed_over():
+    answers, _ = run(quick_solver("default"), (0, 1, 3, 4, 7, 8))
+    assert [answer.index for answer in answers] == [0, 1, 3, 4, 7, 8]
+    assert all(mask_iou(answer.mask, true_mask(answer.index)) > 0.6 for answer in answers)
+
+
+# Failure is data
+
+
+@pytest.mark.parametrize("mask", [None, np.zeros((80, 100), bool)], ids=["none", "empty"])
+def test_the_first_frame_must_have_a_mask(mask):
+    with pytest.raises(InputError, match=r"^frame 0 .*--box or --mask"):
+        quick_solver().init(frame(0), estimate_of(mask))
+
+
+@PRESETS
+def test_a_frame_that_is_not_explained_is_lost_and_answered_with_its_initial_mask(preset):
+    answers, state = run(quick_solver(preset, solver=FAILS), range(3))
+    for answer in answers[1:]:
+        assert (answer.status, answer.confidence) == (Status.LOST, 0.0)
+        assert "appearance loss" in answer.reason
+        np.testing.assert_array_equal(answer.mask, true_mask(answer.index))
+        assert not answer.keyframe
+    assert len(state.keyframes) <= 1
+
+
+def test_a_lost_frame_without_a_mask_has_an_empty_answer():
+    answers, _ = run(quick_solver("paper", solver=FAILS), range(3), {2: None})
+    assert answers[2].status is Status.LOST
+    assert answers[2].initial_mask is None
+    assert not answers[2].mask.any()
+
+
+class BrokenEncoder(RgbEncoder):
+    """The colours, but not a number in chosen calls."""
+
+    def __init__(self, *broken: int) -> None:
+        self.broken, self.calls = broken, 0
+
+    def encode(self, images: torch.Tensor) -> torch.Tensor:
+        self.calls += 1
+        return images * math.nan if self.calls - 1 in self.broken else images
+
+
+@PRESETS
+def test_a_frame_whose_loss_is_no_number_is_lost_and_the_run_goes_on(preset):
+    answers, state = run(quick_solver(preset, BrokenEncoder(4)), range(8))
+    assert (answers[4].status, answers[4].confidence) == (Status.LOST, 0.0)
+    assert "nan" in answers[4].reason
+    np.testing.assert_array_equal(answers[4].mask, true_mask(4))
+    assert np.isfinite(answers[4].T_cam_obj).all()
+    for answer in answers[5:]:
+        assert answer.status is Status.TRACKED, answer.reason
+        assert math.isfinite(answer.losses["features"])
+    assert state.texture.isfinite().all()
+    assert all(keyframe.observation.index != 4 for keyframe in state.keyframes)
+
+
+def test_a_broken_frame_leaves_shape_and_texture_as_they_were():
+    solver = quick_solver("default", BrokenEncoder(5))
+    _, before = run(solver, range(5))
+    after, answer = solver.step(before, frame(5), estimate_of(true_mask(5)))
+    assert answer.status is Status.LOST
+    assert torch.equal(after.offsets, before.offsets)
+    assert torch.equal(after.texture, before.texture)
+    assert after.keyframes == before.keyframes
+
+
+def test_a_lost_frame_leaves_shape_and_texture_as_they_were():
+    _, before = run(quick_solver("default"), range(5))
+    solver = quick_solver("default", solver=FAILS)
+    after, answer = solver.step(before, frame(9), estimate_of(true_mask(9)))
+    assert answer.status is Status.LOST
+    assert torch.equal(after.offsets, before.offsets)
+    assert torch.equal(after.texture, before.texture)
+
+
+@pytest.mark.parametrize("broken", [0, 1, 2])
+@PRESETS
+def test_a_broken_frame_among_the_first_does_not_spoil_the_others(preset, broken):
+    answers, state = run(quick_solver(preset, BrokenEncoder(broken)), range(8))
+    final = revised(answers)
+    assert final[broken].status is Status.LOST
+    assert "nan" in final[broken].reason
+    np.testing.assert_array_equal(final[broken].mask, true_mask(broken))
+    for answer in final[5:]:
+        assert answer.status is not Status.LOST, answer.reason
+        assert mask_iou(answer.mask, true_mask(answer.index)) > 0.6
+    assert state.waiting is None
+
+
+def test_an_infinite_loss_in_the_middle_of_a_frame_loses_that_frame_only(monkeypatch):
+    healthy = Problem.losses
+
+    def failing(self: Problem, parameters) -> Losses:
+        losses = healthy(self, parameters)
+        return replace(losses, features=losses.features + (math.inf if 4 in self.batch.index else 0.0))
+
+    monkeypatch.setattr(Problem, "losses", failing)
+    answers, _ = run(quick_solver("default"), range(7))
+    assert [answer.status is Status.LOST for answer in answers] == [index == 4 for index in range(7)]
+    assert "inf" in answers[4].reason
+
+
+def test_an_object_that_leaves_the_picture_stops_nothing():
+    away = MaskEstimate(None)
+    solver = quick_solver("default")
+    _, state = run(solver, range(4))
+    far = state.last[0]
+    for shift in ([50.0, 0.0, 0.0], [0.0, 0.0, -2.0], [0.0, 0.0, -20.0]):
+        moved = replace(far, translation=far.translation + torch.tensor(shift))
+        _, answer = solver.step(replace(state, last=(moved, 3), before=None), frame(4), away)
+        assert answer.status is not Status.TRACKED
+        assert np.isfinite(answer.T_cam_obj).all()
+
+
+# Memory
+
+
+def observations_in(value: object, seen: set[int] | None = None) -> Iterator[Observation]:
+    """Every observation that can be reached from a value."""
+    seen = set() if seen is None else seen
+    if id(value) in seen:
+        return
+    seen.add(id(value))
+    if isinstance(value, Observation):
+        yield value
+    elif is_dataclass(value) and not isinstance(value, type):
+        for field in fields(value):
+            yield from observations_in(getattr(value, field.name), seen)
+    elif isinstance(value, (tuple, list, set)):
+        for item in value:
+            yield from observations_in(item, seen)
+    elif isinstance(value, dict):
+        for item in value.values():
+            yield from observations_in(item, seen)
+
+
+@PRESETS
+def test_memory_is_bounded_by_keyframes(preset):
+    every_frame = {"keyframes": {"maximum": 3, "rotation": 0, "silhouette": 2.0}, "iterations": 3}
+    solver = quick_solver(preset, solver={**every_frame, "start_frames": 1})
+    answers, state = run(solver, range(25))
+    held = list(observations_in(state))
+    assert len(held) == len(state.keyframes) == 3
+    assert sum(answer.keyframe for answer in answers) > 20
+    assert not list(observations_in(answers))
+
+
+def test_memory_during_the_joint_start_is_bounded_by_its_frames():
+    solver = quick_solver("default", solver={"start_frames": 5, "keyframes": {"maximum": 2, "rotation": 0}})
+    state = None
+    for index in range(12):
+        mask = estimate_of(true_mask(index))
+        state, _ = (
+            solver.init(frame(index), mask) if state is None else solver.step(state, frame(index), mask)
+        )
+        waiting = index + 1 if index < 4 else 0
+        assert len(list(observations_in(state))) <= waiting + 2
+    assert len(list(observations_in(state))) <= 2
+
+
+def test_frames_that_stay_lost_do_not_pile_up():
+    _, state = run(quick_solver("default", solver=FAILS), range(12))
+    assert len(list(observations_in(state))) <= 3
+
+
+# The object
+
+
+@PRESETS
+def test_the_object_is_a_closed_textured_mesh(preset):
+    solver = quick_solver(preset)
+    _, state = run(solver)
+    model = solver.result(state)
+    assert isinstance(model, ObjectModel)
+    assert model.vertices.shape == (162, 3)
+    assert model.faces.shape == (320, 3)
+    assert model.face_uvs.shape == (320, 3, 2)
+    assert (model.texture.shape, model.texture.dtype) == ((32, 32, 3), np.uint8)
+    assert (model.texture_weight.shape, model.texture_weight.dtype) == ((32, 32), np.float32)
+    assert (model.features.shape, model.features.dtype) == ((32, 32, 3), np.float32)
+    assert trimesh.Trimesh(model.vertices, model.faces, process=False).is_watertight
+    assert np.isfinite(model.vertices).all()
+
+
+def test_the_visible_texture_is_that_of_the_video():
+    sharp = {"frequency": 8, "texture_size": 100}
+    solver = quick_solver("default", window={"size": 64}, object=sharp)
+    answers, state = run(solver, range(4))
+    model = solver.result(state)
+    camera = short_clip().camera
+    T_cam_obj = torch.tensor(revised(answers)[0].T_cam_obj).float()
+    drawn = render(
+        torch.tensor(model.vertices).float(),
+        torch.tensor(model.faces),
+        torch.tensor(model.face_uvs).float(),
+        torch.tensor(model.texture).permute(2, 0, 1) / 255,
+        T_cam_obj[None, :3, :3],
+        T_cam_obj[None, :3, 3],
+        torch.tensor(camera.K).float()[None],
+        (camera.height, camera.width),
+    )
+    inside = (drawn.face_index[0] >= 0).numpy() & true_mask(0)
+    shown = drawn.image()[0].permute(1, 2, 0).numpy()
+    difference = np.abs(shown - frame(0).image / 255)[inside].mean()
+    assert difference < 0.06
+    assert 0.2 < (model.texture_weight > 0).mean() < 0.8  # one side was seen
+
+
+def test_flat_prior_answers_with_a_flat_object():
+    for preset in ("paper", "default"):
+        solver = quick_solver(preset, object={"flat": True})
+        answers, state = run(solver, range(5))
+        vertices = solver.result(state).vertices
+        spread = np.linalg.svd(vertices - vertices.mean(0), compute_uv=False)
+        assert spread[2] < 1e-4 * spread[1]
+        assert all(answer.status is not Status.LOST for answer in answers)
+
+
+def test_answers_do_not_share_memory_with_what_was_given():
+    solver = quick_solver()
+    given = estimate_of(true_mask(0))
+    _, answer = solver.init(frame(0), given)
+    assert isinstance(answer, FrameEstimate)
+    given.mask[:] = 0
+    assert answer.initial_mask.any()

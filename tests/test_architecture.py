@@ -1,0 +1,104 @@
+"""The house: imports point down only, and rooms stay small."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[1] / "tracking3d"
+LONGEST_MODULE = 400
+
+# Who lives on which floor; a module may import from lower floors and from its own room only.
+# Rooms of one floor may use each other, but never in circles.
+FLOORS = [
+    {"errors", "frames", "geometry", "config", "features"},
+    {"rendering", "trackers", "video"},
+    {"estimation", "plugins", "prompts"},
+    {"pipeline", "recording", "results"},
+    {"evaluation", "viewer"},
+    {"cli"},
+]
+"""``tracking3d/__init__.py`` is the front door: it imports from anywhere, and nobody imports from it."""
+
+
+def floor(room: str) -> int:
+    for height, rooms in enumerate(FLOORS):
+        if room in rooms:
+            return height
+    raise AssertionError(f"tracking3d.{room} has no floor yet: give it one in {Path(__file__).name}")
+
+
+def modules() -> list[Path]:
+    return sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
+
+
+def room_of(path: Path) -> str:
+    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def imported_modules(path: Path) -> set[str]:
+    """Full names of what a module imports from the package, within functions too."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: imports are absolute"
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return {name for name in names if name.split(".")[0] == "tracking3d"}
+
+
+@pytest.mark.parametrize("path", modules(), ids=lambda path: path.relative_to(PACKAGE).as_posix())
+def test_a_module_imports_from_below_only(path):
+    own = room_of(path)
+    for name in imported_modules(path):
+        room = name.split(".")[1] if "." in name else ""
+        if not (PACKAGE / room).is_dir() and not (PACKAGE / f"{room}.py").is_file():
+            continue  # a name of the front door, such as the version
+        if room != own:
+            assert floor(room) <= floor(own), f"{own} (floor {floor(own) + 1}) imports {name} from above"
+
+
+def test_rooms_of_one_floor_do_not_import_each_other_in_circles():
+    uses: dict[str, set[str]] = {}
+    for path in modules():
+        rooms = {name.split(".")[1] for name in imported_modules(path) if "." in name}
+        uses.setdefault(room_of(path), set()).update(rooms & set().union(*FLOORS) - {room_of(path)})
+    reached = {room: set(used) for room, used in uses.items()}
+    for _ in reached:
+        reached = {
+            room: used.union(*(reached.get(other, set()) for other in used)) for room, used in reached.items()
+        }
+    assert not [room for room, used in reached.items() if room in used]
+
+
+@pytest.mark.parametrize("room", ["geometry", "rendering"])
+def test_geometry_and_rendering_know_nothing_of_video_or_tracking(room):
+    allowed = {"geometry", "rendering", "errors"}
+    for path in (PACKAGE / room).rglob("*.py"):
+        assert {name.split(".")[1] for name in imported_modules(path)} <= allowed, path
+
+
+def test_the_solvers_are_tenants_that_never_import_each_other():
+    tenants = [
+        folder.name for folder in (PACKAGE / "estimation").iterdir() if (folder / "__init__.py").is_file()
+    ]
+    for tenant in tenants:
+        for path in (PACKAGE / "estimation" / tenant).rglob("*.py"):
+            for name in imported_modules(path):
+                parts = name.split(".")
+                assert parts[:2] != ["tracking3d", "estimation"] or parts[2] not in set(tenants) - {tenant}, (
+                    path
+                )
+
+
+@pytest.mark.parametrize("path", modules(), ids=lambda path: path.relative_to(PACKAGE).as_posix())
+def test_no_module_is_longer_than_a_reader_keeps_in_mind(path):
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= LONGEST_MODULE
+
+
+def test_half_of_the_modules_are_short():
+    lengths = sorted(len(path.read_text(encoding="utf-8").splitlines()) for path in modules())
+    assert lengths[len(lengths) // 2] <= 150
