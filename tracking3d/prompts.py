@@ -23,16 +23,11 @@ def parse_box(text: str) -> Box:
     Raises:
         InputError: Other than four numbers, or no positive size.
     """
-    parts = text.split(",")
-    if len(parts) != 4:
-        raise InputError(
-            f"The box '{text}' has {len(parts)} numbers; write it as X,Y,WIDTH,HEIGHT in pixels."
-        )
     try:
-        x, y, width, height = (float(part) for part in parts)
+        x, y, width, height = (float(part) for part in text.split(","))
     except ValueError as error:
         raise InputError(
-            f"The box '{text}' is not four numbers; write X,Y,WIDTH,HEIGHT in pixels."
+            f"The box '{text}' is not four numbers; write it as X,Y,WIDTH,HEIGHT in pixels."
         ) from error
     return _checked((x, y, width, height))
 

@@ -180,8 +180,8 @@ def test_folder_that_cannot_be_written_is_named(refused, clip, script, tmp_path)
     ("options", "words"),
     [
         ("", "--box X,Y,W,H, --mask FILE, or --masks DIR"),
-        ("--box 1,2,3", "'1,2,3' has 3 numbers"),
-        ("--box here", "'here' has 1 numbers"),
+        ("--box 1,2,3", "'1,2,3' is not four numbers"),
+        ("--box here", "'here' is not four numbers"),
         ("--box a,b,c,d", "'a,b,c,d' is not four numbers"),
         ("--box 1,2,nan,4", "no finite number"),
         ("--box 1,2,0,4", "has no size"),

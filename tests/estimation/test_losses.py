@@ -53,9 +53,13 @@ def test_appearance_leaves_out_what_lies_beyond_the_border_of_the_frame():
     assert appearance(valid) == pytest.approx([math.log(2) / 2, 0.0])
 
 
-def test_appearance_of_a_frame_without_the_object_is_zero():
+def test_an_object_out_of_sight_explains_nothing():
+    nothing = math.log(1 + 1 / 0.5**2)  # a residual of 1
     loss = appearance_loss(RENDERED[:2], OBSERVED, PIXELS[:2], torch.ones(2, 1, 3), 0.5)
-    assert loss[1] == 0
+    assert loss[1].item() == pytest.approx(nothing)
+    outside = torch.ones(2, 1, 3)
+    outside[1] = 0
+    assert appearance(outside)[1] == pytest.approx(nothing)
 
 
 def test_unknown_texture_costs_the_charge_in_place_of_its_residual():

@@ -51,7 +51,7 @@ def appearance_loss(
         unseen_charge: What an unknown pixel costs instead.
 
     Returns:
-        ``(B,)``; zero where nothing is covered.
+        ``(B,)``; where nothing is covered, the cost of a residual of 1.
     """
     batch, channels, height, width = observed.shape
     view = torch.div(pixels, height * width, rounding_mode="floor")
@@ -62,7 +62,9 @@ def appearance_loss(
     weight = valid.reshape(-1)[pixels]
     total = loss.new_zeros(batch).index_add(0, view, loss * weight)
     count = loss.new_zeros(batch).index_add(0, view, weight)
-    return total / count.clamp_min(1.0)
+    # Were it zero, the cheapest pose would be out of sight, and the stopping rule satisfied there.
+    nothing = math.log1p(1 / scale**2)
+    return torch.where(count > 0, total / count.clamp_min(1.0), nothing)
 
 
 def iou_loss(silhouette: Tensor, mask: Tensor, valid: Tensor) -> Tensor:
