@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -16,12 +17,12 @@ from numpy.typing import NDArray
 
 from tracking3d.config.loading import load_config
 from tracking3d.config.models import CameraConfig, PipelineConfig
-from tracking3d.errors import InputError
+from tracking3d.errors import InputError, PluginError, Tracking3dError
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel
 from tracking3d.estimation.paper.solver import PaperSolver
 from tracking3d.estimation.solver import Solver
 from tracking3d.features.protocol import FeatureEncoder
-from tracking3d.frames import Box, Frame, Image, Prompt, SkippedFrame
+from tracking3d.frames import Box, Frame, Image, MaskEstimate, Prompt, SkippedFrame
 from tracking3d.geometry.camera import DEFAULT_FIELD_OF_VIEW, Camera
 from tracking3d.plugins import FEATURES, TRACKERS, build_plugin
 from tracking3d.prompts import make_prompt
@@ -55,6 +56,8 @@ class Session:
         check_device(config.runtime.device)
         if config.solver.name not in SOLVERS:
             raise InputError(f"Unknown solver '{config.solver.name}'; choose one of {', '.join(SOLVERS)}.")
+        if prompt is None and config.tracker.name != "precomputed":
+            raise InputError("Say what the object is by either a box or a mask of the first frame.")
         torch.set_num_threads(config.runtime.threads)
         self.config = config
         self._prompt = prompt
@@ -76,20 +79,43 @@ class Session:
         """Track the object in the next frame; the first call starts on it.
 
         Raises:
-            InputError: If the first frame has no object.
+            InputError: If the first frame has no object, or the frame has another size than the first.
+            PluginError: If the mask tracker fails.
         """
         if self._solver is None:
             height, width = frame.size
             self._camera = choose_camera(self.config.camera, width, height, *self._intrinsics)
             torch.manual_seed(self.config.runtime.seed)
-            prompt = self._prompt or Prompt((0.0, 0.0, float(width), float(height)))
-            mask = self._tracker.init(frame, prompt)
+            mask = self._mask(frame, self._prompt or Prompt((0.0, 0.0, float(width), float(height))))
             solver = SOLVERS[self.config.solver.name](self.config, self._camera, self._encoder)
             self._state, estimate = solver.init(frame, mask)
             self._solver = solver
-        else:
-            self._state, estimate = self._solver.step(self._state, frame, self._tracker.step(frame))
+            return estimate
+        if frame.size != (self.camera.height, self.camera.width):
+            raise InputError(
+                f"{_label(frame)} has {_pixels(frame.size)} pixels but the first frame "
+                f"{_pixels((self.camera.height, self.camera.width))}; all frames must have one size."
+            )
+        self._state, estimate = self._solver.step(self._state, frame, self._mask(frame))
         return estimate
+
+    def _mask(self, frame: Frame, prompt: Prompt | None = None) -> MaskEstimate:
+        """Ask the mask tracker; whatever goes wrong in it is told as its own fault."""
+        name = f"The mask tracker '{self.config.tracker.name}'"
+        try:
+            answer = self._tracker.step(frame) if prompt is None else self._tracker.init(frame, prompt)
+        except Tracking3dError:
+            raise
+        except Exception as error:
+            raise PluginError(
+                f"{name} failed at {_label(frame)}: {type(error).__name__}: {error}."
+            ) from error
+        if answer.mask is not None and answer.mask.shape != frame.size:
+            raise PluginError(
+                f"{name} gave a mask of shape {answer.mask.shape} for {_label(frame)} of {_pixels(frame.size)} "
+                "pixels; it must have the size of the frame."
+            )
+        return answer
 
     def result(self) -> ObjectModel:
         """The object as it is known now: one textured mesh."""
@@ -126,7 +152,8 @@ def track(
     for position, item in enumerate(frames):
         if isinstance(item, SkippedFrame):
             continue
-        frame = item if isinstance(item, Frame) else Frame(position, checked_image(item, position))
+        frame = item if isinstance(item, Frame) else Frame(position, item)
+        frame = replace(frame, image=checked_image(frame.image, frame.index))
         if session is None:
             prompt = None if box is None and mask is None else make_prompt(frame, box, mask)
             session = Session(config, prompt)
@@ -134,13 +161,13 @@ def track(
 
 
 def checked_image(image: Image, position: int) -> Image:
-    """Give back an image that is ``(H, W, 3)`` uint8.
+    """A copy of an image that is ``(H, W, 3)`` uint8; callers like to decode every frame into one buffer.
 
     Raises:
         InputError: If it is not.
     """
-    image = np.asarray(image)
-    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+    image = np.array(image, order="C")
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or not image.size:
         raise InputError(
             f"Frame {position} has shape {image.shape} and type {image.dtype}; give (H, W, 3) arrays of uint8."
         )
@@ -174,8 +201,16 @@ def check_device(name: str) -> None:
     """
     try:
         device = torch.device(name)
-        torch.zeros(1, device=device)
+        torch.zeros(1, device=device).item()
     except (RuntimeError, AssertionError) as error:
         raise InputError(
             f"The device '{name}' is not available on this machine; use --device cpu."
         ) from error
+
+
+def _label(frame: Frame) -> str:
+    return frame.name or f"frame {frame.index}"
+
+
+def _pixels(size: tuple[int, int]) -> str:
+    return f"{size[1]} x {size[0]}"

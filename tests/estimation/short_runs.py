@@ -19,14 +19,26 @@ from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.features.rgb import RgbEncoder
 from tracking3d.frames import Frame, MaskEstimate
 
-QUICK: dict[str, Any] = {
-    "window": {"size": 32},
-    "object": {"frequency": 4, "texture_size": 32},
-    "solver": {"iterations": 8, "tau": 0.5},
-}
-QUICK_DEFAULT: dict[str, Any] = {
-    **QUICK,
-    "solver": {**QUICK["solver"], "pose_iterations": 8, "start_frames": 3, "start_iterations": 4},
+_COARSE: dict[str, Any] = {"window": {"size": 32}, "object": {"frequency": 4, "texture_size": 32}}
+QUICK: dict[str, dict[str, Any]] = {
+    "paper": {
+        **_COARSE,
+        "solver": {
+            "iterations": 30,
+            "tau": 0.3,
+            "learning_rates": dict.fromkeys(("translation", "rotation", "vertices", "texture"), 0.03),
+        },
+    },
+    "default": {
+        **_COARSE,
+        "solver": {
+            "iterations": 8,
+            "tau": 0.5,
+            "pose_iterations": 8,
+            "start_frames": 3,
+            "start_iterations": 4,
+        },
+    },
 }
 
 Mask = NDArray[np.bool_] | None
@@ -42,7 +54,7 @@ def quick_solver(
     preset: str = "default", encoder: FeatureEncoder | None = None, **sections: Any
 ) -> PaperSolver:
     """A solver of a preset; ``sections`` change settings of a section on top of the quick ones."""
-    quick = QUICK_DEFAULT if preset == "default" else QUICK
+    quick = QUICK[preset]
     names = {*quick, *sections}
     merged = {name: {**quick.get(name, {}), **sections.get(name, {})} for name in names}
     return PaperSolver(load_config(preset=preset, **merged), short_clip().camera, encoder or RgbEncoder())

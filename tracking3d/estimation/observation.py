@@ -79,7 +79,7 @@ def observe(
     device: torch.device,
 ) -> Observation:
     """Cut the window out of a frame and encode it."""
-    pixels = torch.tensor(frame.image, device=device)
+    pixels = torch.tensor(np.ascontiguousarray(frame.image), device=device)
     pixels = pixels.permute(2, 0, 1).float() / 255
     image = crop(pixels, window)
     detail = crop(pixels, replace(window, size=2 * window.size))

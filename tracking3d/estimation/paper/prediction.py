@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from tracking3d.estimation.paper.belief import Belief
@@ -38,18 +37,19 @@ def moved_to_mask(belief: Belief, pose: Pose, mask: NDArray[np.bool_]) -> Pose:
 
 
 def projected_box(belief: Belief, pose: Pose) -> Box | None:
-    """Box ``(x, y, w, h)`` of the projected vertices in the full frame; None where they are behind the camera."""
+    """Box ``(x, y, w, h)`` of the projected vertices inside the frame; None where none is or one is behind."""
     x_cam = belief.vertices @ pose.R.T + pose.translation
-    if bool((x_cam[:, 2] <= 1e-3).any()):
+    if not bool((x_cam[:, 2] > 1e-3).all()):
         return None
     camera = belief.camera
     focal = x_cam.new_tensor([camera.fx, camera.fy])
     pixel = x_cam[:, :2] / x_cam[:, 2:] * focal + x_cam.new_tensor([camera.cx, camera.cy])
-    low, high = pixel.amin(0), pixel.amax(0)
-    size = high - low
-    if not bool(torch.isfinite(size).all()):
+    # Of an object right before the camera all but a little lies outside, and could be any number of pixels.
+    size = x_cam.new_tensor([camera.width, camera.height])
+    low, high = (bound.clamp_min(0.0).minimum(size) for bound in (pixel.amin(0), pixel.amax(0)))
+    if not bool((low < high).all()):
         return None
-    return float(low[0]), float(low[1]), float(size[0]), float(size[1])
+    return float(low[0]), float(low[1]), float(high[0] - low[0]), float(high[1] - low[1])
 
 
 def mask_box(mask: NDArray[np.bool_]) -> Box:

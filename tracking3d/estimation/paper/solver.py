@@ -295,7 +295,9 @@ class PaperSolver:
                     losses=optimum.losses.of_frame(position),
                 )
             )
-        return replace(known, waiting=None), replace(answer, revised=tuple(revised))
+        # The motion so far was found before; that of the joint solution is what goes on.
+        before = optimum.parameters.poses[-2], frames[-2].observation.index
+        return replace(known, before=before, waiting=None), replace(answer, revised=tuple(revised))
 
     @staticmethod
     def _answered(answer: FrameEstimate, judgement: Assessment, started: float) -> FrameEstimate:
