@@ -1,0 +1,132 @@
+"""What users of the library rely on: removing or renaming any of it fails here, and needs a new major version."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import subprocess
+import sys
+from importlib import import_module
+
+import pytest
+
+import tracking3d
+from tracking3d.evaluation.score import Scores
+
+EXACT = {
+    "tracking3d": """Frame FrameEstimate ObjectModel PipelineConfig Prompt Session Status __version__ load_config
+        track""",
+    "tracking3d.rendering": """BackProjection Rendering SoftBand TexelMap Visibility back_project project
+        rasterize render sample_texture soft_silhouette""",
+    "tracking3d.video": """FrameSource Intrinsics VideoWriter natural_order open_source parse_selection
+        read_image""",
+}
+"""Packages that say in ``__all__`` what is public: exactly this."""
+
+AT_LEAST = {
+    "tracking3d.config.loading": "config_schema list_presets load_config",
+    "tracking3d.config.models": """CameraConfig KeyframeConfig LearningRates ObjectConfig PipelineConfig
+        PluginChoice RuntimeConfig SolverConfig Weights WindowConfig""",
+    "tracking3d.errors": "InputError OutputError PluginError Tracking3dError",
+    "tracking3d.estimation.estimate": "FrameEstimate ObjectModel Status",
+    "tracking3d.estimation.solver": "Solver",
+    "tracking3d.evaluation.clip": "Truth read_truth write_clip",
+    "tracking3d.evaluation.metrics": """aligned_rotation_errors anchored_rotation_errors
+        consecutive_rotation_errors mask_iou rotation_alignment share_under""",
+    "tracking3d.evaluation.score": "Scores score_run",
+    "tracking3d.evaluation.synthetic": """SyntheticClip SyntheticSpec degrade_masks make_demo_clip
+        synthesize""",
+    "tracking3d.features.protocol": "FeatureEncoder",
+    "tracking3d.features.rgb": "RgbEncoder",
+    "tracking3d.frames": "Box Frame Image MaskEstimate Prompt SkippedFrame",
+    "tracking3d.geometry.camera": "Camera Window",
+    "tracking3d.geometry.mesh": "Mesh",
+    "tracking3d.geometry.pose": "Pose",
+    "tracking3d.geometry.prototypes": "ellipsoid from_file icosphere sphere",
+    "tracking3d.pipeline": "Session track",
+    "tracking3d.plugins": "FEATURES TRACKERS PluginInfo build_plugin check_options list_plugins load_plugin",
+    "tracking3d.prompts": "make_prompt parse_box",
+    "tracking3d.recording": "record",
+    "tracking3d.results.correspondences": "PointTracks track_points",
+    "tracking3d.results.mesh_export": "export_mesh load_mesh",
+    "tracking3d.results.records": "FrameRecord",
+    "tracking3d.results.run_reader": "RunReader",
+    "tracking3d.results.run_writer": "RunWriter",
+    "tracking3d.trackers.csrt": "CsrtTracker",
+    "tracking3d.trackers.precomputed": "PrecomputedMasks",
+    "tracking3d.trackers.protocol": "CorrectableTracker MaskTracker Options",
+    "tracking3d.trackers.segmentation": "ColourSegmentation",
+}
+"""Modules that the documentation sends users to, or that hold what the above take and give."""
+
+FIELDS = {
+    tracking3d.Frame: "index image time name",
+    tracking3d.Prompt: "box mask",
+    tracking3d.FrameEstimate: """index time T_cam_obj mask initial_mask status reason confidence losses
+        iterations keyframe seconds revised""",
+    tracking3d.ObjectModel: "vertices faces face_uvs texture texture_weight features",
+    Scores: """iou_initial_mean iou_mean rotation_error_mean_deg rotation_error_median_deg
+        rotation_error_anchored_median_deg share_under_5_deg share_worse_than_initial frames""",
+}
+SETTINGS = "tracker features camera object window solver runtime"
+
+
+@pytest.mark.parametrize(("module", "names"), EXACT.items())
+def test_a_package_exports_what_it_says(module, names):
+    package = import_module(module)
+    assert sorted(package.__all__) == sorted(names.split())
+    for name in names.split():
+        assert getattr(package, name) is not None
+
+
+@pytest.mark.parametrize(("module", "names"), AT_LEAST.items())
+def test_a_module_has_its_public_names(module, names):
+    absent = [name for name in names.split() if not hasattr(import_module(module), name)]
+    assert absent == []
+
+
+@pytest.mark.parametrize(
+    ("record", "names"), FIELDS.items(), ids=lambda value: getattr(value, "__name__", "")
+)
+def test_a_record_has_its_fields(record, names):
+    assert set(names.split()) <= {field.name for field in dataclasses.fields(record)}
+
+
+def test_settings_keep_their_sections():
+    assert set(SETTINGS.split()) <= set(tracking3d.PipelineConfig.model_fields)
+
+
+def test_track_is_called_as_documented():
+    parameters = inspect.signature(tracking3d.track).parameters
+    assert list(parameters)[:1] == ["frames"]
+    for name in ("box", "mask", "config"):
+        assert parameters[name].kind is inspect.Parameter.KEYWORD_ONLY
+        assert parameters[name].default is None
+
+
+def test_statuses_are_their_names():
+    assert [str(status) for status in tracking3d.Status] == ["tracked", "uncertain", "lost"]
+
+
+def test_public_names_are_documented():
+    for name in set(tracking3d.__all__) - {"__version__"}:
+        assert getattr(tracking3d, name).__doc__, name
+
+
+def test_an_unknown_name_is_told():
+    with pytest.raises(AttributeError, match="no attribute 'trakc'"):
+        tracking3d.trakc  # noqa: B018
+
+
+def test_the_package_itself_imports_nothing_heavy():
+    code = (
+        "import sys, tracking3d; tracking3d.__version__; print(sorted({'torch', 'cv2'} & set(sys.modules)))"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
+
+
+def test_the_package_is_typed():
+    from importlib.resources import files
+
+    assert (files("tracking3d") / "py.typed").is_file()
