@@ -146,6 +146,10 @@ def track(
     Raises:
         Tracking3dError: If the input or the configuration cannot be used.
     """
+    if config is not None and not isinstance(config, PipelineConfig | str | Path):
+        raise InputError(
+            f"config is a {type(config).__name__}; give a PipelineConfig (see load_config) or a YAML file."
+        )
     if not isinstance(config, PipelineConfig):
         config = load_config(Path(config) if config is not None else None)
     session: Session | None = None

@@ -48,7 +48,11 @@ def make_prompt(frame: Frame, box: Box | None = None, mask: NDArray[np.bool_] | 
     if (box is None) == (mask is None):
         raise InputError("Say what the object is by either a box or a mask of the first frame.")
     if box is not None:
-        return Prompt(_inside(_checked(box), frame))
+        try:
+            x, y, width, height = (float(value) for value in box)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"The box {box!r} is not four numbers x, y, width, height.") from error
+        return Prompt(_inside(_checked((x, y, width, height)), frame))
     label = f"The mask {mask}" if isinstance(mask, Path) else "The mask"
     binary = _read(mask) if isinstance(mask, Path) else np.asarray(mask) != 0
     height, width = frame.size

@@ -141,6 +141,7 @@ def test_yaml_merge_keys_are_plain_data():
         ("tracker: [csrt]", "'tracker' must be a mapping"),
         ("tracker: {name: 5}", "'tracker.name' must be a valid string, not 5"),
         ("camera: {intrinsics: [1, 2, 3]}", "camera.intrinsics"),
+        ("camera: {intrinsics: [0, 0, 1, 1]}", "positive focal lengths"),
         ("camera: {intrinsics: 500}", "'camera.intrinsics' must be"),
         ("preset: [paper]", "'preset' must be the name"),
         (b"\xff\xfe\x00binary", "not a text file"),

@@ -248,6 +248,9 @@ def test_a_killed_run_loses_at_most_the_current_frame(tmp_path, turning_sphere, 
     for record in run.frames:
         assert np.count_nonzero(run.mask(record.index)) == record.area > 0
         assert run.initial_mask(record.index) is not None
+    if kept > 1:  # the muxer holds the last frame back
+        with av.open(str(folder / "overlay.mp4")) as video:
+            assert kept - 2 <= sum(1 for _ in video.decode(video=0)) <= kept
     # The dead process holds nothing: the folder can be used again, and nothing of the old run stays.
     with pytest.raises(OutputError, match="already holds a run"):
         start_run(folder, turning_sphere)

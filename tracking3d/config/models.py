@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 
 class Section(BaseModel):
@@ -43,6 +43,15 @@ class CameraConfig(Section):
     intrinsics: tuple[float, float, float, float] | None = Field(
         None, description="fx, fy, cx, cy in pixels of the full frame; wins over fov."
     )
+
+    @field_validator("intrinsics")
+    @classmethod
+    def _focal_lengths_are_positive(
+        cls, value: tuple[float, float, float, float] | None
+    ) -> tuple[float, float, float, float] | None:
+        if value is not None and min(value[:2]) <= 0:
+            raise ValueError("fx, fy, cx, cy with positive focal lengths fx and fy")
+        return value
 
 
 class ObjectConfig(Section):

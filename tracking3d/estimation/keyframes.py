@@ -1,6 +1,7 @@
 """Which frames stay in the optimization (paper section 3.4, "Keyframe selection criteria").
 
-All criteria are judged anew after every frame, so a keyframe can fall out.
+All criteria are judged anew after every joint optimization (in preset ``paper`` that is every frame), so a
+keyframe can fall out.
 """
 
 from __future__ import annotations

@@ -21,10 +21,10 @@ from tracking3d.frames import Image
 ENCODERS = ("libx264", "libopenh264", "h264_videotoolbox", "h264_mf", "mpeg4")
 """Encoders by preference: x264, other H.264 encoders, and MPEG-4 part 2, which every FFmpeg has."""
 
-_OPTIONS = {"libx264": {"crf": "20", "preset": "veryfast", "g": "30"}, "mpeg4": {"qscale": "3", "g": "30"}}
+_OPTIONS = {"libx264": {"crf": "20", "preset": "veryfast", "tune": "zerolatency"}, "mpeg4": {"qscale": "3"}}
 
-_FRAGMENTED = {"movflags": "+frag_keyframe+empty_moov+default_base_moof"}
-"""The index goes into every fragment, so that a killed process leaves a video up to its last keyframe."""
+_FRAGMENTED = {"movflags": "+frag_every_frame+empty_moov+default_base_moof", "flush_packets": "1"}
+"""Every frame is a fragment of its own, so that a killed process leaves all but the last of them."""
 
 
 class VideoWriter:
@@ -94,6 +94,8 @@ class VideoWriter:
         frame.pts = self._frames
         with self._output_errors():
             self._container.mux(self._stream.encode(frame))
+            assert self._file is not None  # opened in the constructor
+            self._file.flush()
         self._frames += 1
 
     def close(self) -> None:

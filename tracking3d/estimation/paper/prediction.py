@@ -8,16 +8,22 @@ from numpy.typing import NDArray
 from tracking3d.estimation.paper.belief import Belief
 from tracking3d.frames import Box
 from tracking3d.geometry.pose import Pose, extrapolate
+from tracking3d.rendering.visibility import NEAR
 
 
 def candidate_poses(belief: Belief, index: int, mask: NDArray[np.bool_] | None) -> list[Pose]:
-    """The last pose, constant velocity, and the last rotation moved to where the mask is."""
+    """The last pose, constant velocity, and their rotations moved to where the mask is.
+
+    After a lost frame there is no velocity to go on with; the keyframes' poses are tried instead.
+    """
     last, last_index = belief.last
     candidates = [last]
     if belief.before is not None:
         before, before_index = belief.before
         steps = (index - last_index) / max(last_index - before_index, 1)
         candidates.append(extrapolate(before, last, min(steps, 3.0)))
+    else:
+        candidates += [keyframe.pose for keyframe in belief.keyframes]
     if mask is not None and mask.any():
         candidates += [moved_to_mask(belief, pose, mask) for pose in list(candidates)]
     return candidates
@@ -26,11 +32,15 @@ def candidate_poses(belief: Belief, index: int, mask: NDArray[np.bool_] | None) 
 def moved_to_mask(belief: Belief, pose: Pose, mask: NDArray[np.bool_]) -> Pose:
     """Shift a pose so that its silhouette has the mask's centroid and area."""
     silhouette = belief.silhouette(pose)
-    if not silhouette.any():
-        silhouette = mask
     camera = belief.camera
-    (x0, y0), (x1, y1) = _centroid(silhouette), _centroid(mask)
-    ratio = float(np.clip(np.sqrt(silhouette.sum() / mask.sum()), 0.8, 1.25))
+    x1, y1 = _centroid(mask)
+    if silhouette.any():
+        x0, y0 = _centroid(silhouette)
+        ratio = float(np.clip(np.sqrt(silhouette.sum() / mask.sum()), 0.8, 1.25))
+    else:  # the pose has left the view: bring its centre back
+        x, y, z = pose.translation.tolist()
+        x0, y0 = camera.cx + camera.fx * x / max(z, NEAR), camera.cy + camera.fy * y / max(z, NEAR)
+        ratio = 1.0
     depth = float(pose.translation[2])
     shift = pose.translation.new_tensor([(x1 - x0) / camera.fx * depth, (y1 - y0) / camera.fy * depth, 0.0])
     return Pose((pose.translation + shift) * ratio, pose.quaternion)

@@ -68,7 +68,7 @@ class PaperSolver:
         binary = mask.binary
         if binary is None or not binary.any():
             raise InputError(
-                f"{frame.name or 'the first frame'} has no object: its mask is empty, give another --box or --mask"
+                f"{frame.name or 'The first frame'} has no object: its mask is empty; give another box or mask."
             )
         ellipse = mask_ellipse(binary)
         translation = torch.tensor(first_translation(ellipse, self.camera), dtype=torch.float32)
@@ -184,7 +184,7 @@ class PaperSolver:
         if judgement.status is Status.LOST and (optimum.reason or not first):
             # What was known before stays; only the pose goes on from where the optimization left it.
             if not optimum.reason:
-                belief = replace(belief, last=(optimum.parameters.poses[-1], frame.index))
+                belief = replace(belief, last=(optimum.parameters.poses[-1], frame.index), before=None)
             return replace(belief, started=True), self._answered(answer, judgement, started)
         joint = len(frames) > 1 or first or not belief.keyframes
         known = (
