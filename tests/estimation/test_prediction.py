@@ -30,8 +30,15 @@ def centroid(mask: np.ndarray) -> np.ndarray:
     return np.argwhere(mask).mean(0)[::-1]
 
 
-def test_after_one_frame_there_is_only_the_last_pose(belief):
-    assert candidate_poses(belief, 1, None) == [belief.last[0]]
+def test_without_a_motion_to_go_on_with_the_views_of_the_keyframes_are_tried(belief):
+    [keyframe] = belief.keyframes
+    away = turned(belief.last[0], 40)
+    lost = replace(belief, last=(away, 5), before=None)
+    assert candidate_poses(lost, 6, None) == [away, keyframe.pose]
+
+
+def test_where_nothing_is_known_there_is_only_the_last_pose(belief):
+    assert candidate_poses(replace(belief, keyframes=()), 1, None) == [belief.last[0]]
 
 
 def test_the_last_motion_goes_on(belief):
@@ -77,9 +84,15 @@ def test_a_pose_moved_to_a_mask_has_its_centroid_and_area(belief, shift, scale):
     assert torch.equal(moved_to_mask(belief, pose, mask).quaternion, pose.quaternion)
 
 
-def test_a_pose_out_of_sight_can_be_moved_to_a_mask(belief):
-    away = Pose(belief.last[0].translation + torch.tensor([100.0, 0.0, 0.0]), belief.last[0].quaternion)
-    assert torch.isfinite(moved_to_mask(belief, away, true_mask(0)).translation).all()
+def test_a_pose_out_of_sight_is_brought_back_to_the_mask(belief):
+    away = Pose(belief.last[0].translation + torch.tensor([100.0, 30.0, 0.0]), belief.last[0].quaternion)
+    found = belief.silhouette(moved_to_mask(belief, away, true_mask(0)))
+    assert np.linalg.norm(centroid(found) - centroid(true_mask(0))) < 3
+
+
+def test_a_pose_behind_the_camera_stays_a_number(belief):
+    behind = Pose(-belief.last[0].translation, belief.last[0].quaternion)
+    assert torch.isfinite(moved_to_mask(belief, behind, true_mask(0)).translation).all()
 
 
 def test_depth_changes_by_a_quarter_at_most(belief):
