@@ -17,7 +17,7 @@ class Optimum:
     """Where the optimization ended.
 
     Attributes:
-        parameters: The answer; what the optimization started from if it failed numerically.
+        parameters: The answer; the best state so far, or the start, if it failed numerically.
         losses: The terms at the answer.
         total: Their weighted sum.
         iterations: Number of evaluations.
