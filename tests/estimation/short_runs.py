@@ -55,6 +55,8 @@ def quick_solver(
 ) -> PaperSolver:
     """A solver of a preset; ``sections`` change settings of a section on top of the quick ones."""
     quick = QUICK[preset]
+    # So few iterations fit the mask roughly; the rendered mask is what these tests look at.
+    quick = {**quick, "solver": {"agreement": 0.0, **quick.get("solver", {})}}
     names = {*quick, *sections}
     merged = {name: {**quick.get(name, {}), **sections.get(name, {})} for name in names}
     return PaperSolver(load_config(preset=preset, **merged), short_clip().camera, encoder or RgbEncoder())

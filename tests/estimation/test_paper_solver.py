@@ -13,6 +13,7 @@ import trimesh
 from short_runs import estimate_of, frame, quick_solver, revised, run, short_clip, true_mask
 
 from tracking3d.config.loading import load_config
+from tracking3d.estimation.assessment import Assessment
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.estimation.observation import Observation
 from tracking3d.estimation.paper.problem import Losses
@@ -263,3 +264,20 @@ def test_answers_do_not_share_memory_with_what_was_given():
     assert isinstance(answer, FrameEstimate)
     given.mask[:] = 0
     assert answer.initial_mask.any()
+
+
+def test_a_rendered_mask_that_differs_too_much_yields_to_the_initial_one():
+    solver = quick_solver("default", solver={"agreement": 0.8})
+    initial = np.zeros((20, 20), dtype=bool)
+    initial[5:15, 5:15] = True
+    judgement = Assessment(Status.TRACKED, "", 0.9)
+    near = initial.copy()
+    near[5, 5:15] = False  # IoU 0.9
+    kept, same = solver._supported(near, initial, judgement)
+    assert kept is near and same is judgement
+    far = np.roll(initial, 3, axis=1)  # IoU 70 / 130
+    answer, doubtful = solver._supported(far, initial, judgement)
+    assert answer is initial
+    assert doubtful.status is Status.UNCERTAIN and "0.54" in doubtful.reason
+    alone, _ = solver._supported(far, None, judgement)
+    assert alone is far  # there is nothing to fall back on

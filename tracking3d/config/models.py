@@ -151,6 +151,15 @@ class SolverConfig(Section):
         "vertices",
         description="Smooth the vertices themselves (SoftRas), or their offsets from the prototype.",
     )
+    agreement: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description=(
+            "Answer with the initial mask where the rendered one overlaps it by less than this IoU; 0 never does "
+            "(paper)."
+        ),
+    )
     stop: Literal["threshold", "plateau"] = Field(
         "threshold",
         description=(

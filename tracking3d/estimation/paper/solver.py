@@ -191,9 +191,22 @@ class PaperSolver:
             self._updated(belief, frames, optimum) if joint else belief.moved(frames[-1].pose, frame.index)
         )
         if judgement.status is not Status.LOST:
-            answer = replace(answer, mask=known.silhouette(known.last[0]))
+            rendered, judgement = self._supported(known.silhouette(known.last[0]), mask, judgement)
+            answer = replace(answer, mask=rendered)
         answer = replace(answer, keyframe=any(k.observation.index == frame.index for k in known.keyframes))
         return self._with_waiting(belief, known, frames, optimum, self._answered(answer, judgement, started))
+
+    def _supported(
+        self, rendered: NDArray[np.bool_], initial: NDArray[np.bool_] | None, judgement: Assessment
+    ) -> tuple[NDArray[np.bool_], Assessment]:
+        """The rendered mask, or the initial one where the two differ too much (`solver.agreement`)."""
+        if initial is None:
+            return rendered, judgement
+        iou = float(np.sum(rendered & initial)) / max(float(np.sum(rendered | initial)), 1.0)
+        if iou >= self.config.solver.agreement:
+            return rendered, judgement
+        reason = f"the rendered mask overlaps the initial one by an IoU of {iou:.2f} only, so that one is the answer"
+        return initial, replace(judgement, status=Status.UNCERTAIN, reason=reason)
 
     def _refine_pose(self, belief: Belief, current: Keyframe) -> Optimum:
         """The new frame's pose alone, against what is known."""
@@ -283,12 +296,15 @@ class PaperSolver:
         for position, (keyframe, earlier) in enumerate(belief.waiting):
             judgement = self._judge(optimum, position, keyframe.observation.has_mask)
             pose = optimum.parameters.poses[position]
-            lost = judgement.status is Status.LOST
+            answered = earlier.mask
+            if judgement.status is not Status.LOST:
+                rendered = known.silhouette(pose)
+                answered, judgement = self._supported(rendered, earlier.initial_mask, judgement)
             revised.append(
                 replace(
                     earlier,
                     T_cam_obj=pose.matrix().numpy(),
-                    mask=earlier.mask if lost else known.silhouette(pose),
+                    mask=answered,
                     status=judgement.status,
                     reason=judgement.reason,
                     confidence=judgement.confidence,
