@@ -26,6 +26,7 @@ from tracking3d.frames import Box, Frame, Image, MaskEstimate, Prompt, SkippedFr
 from tracking3d.geometry.camera import DEFAULT_FIELD_OF_VIEW, Camera
 from tracking3d.plugins import FEATURES, TRACKERS, build_plugin
 from tracking3d.prompts import make_prompt
+from tracking3d.rendering import describe_backend
 from tracking3d.trackers.protocol import MaskTracker
 
 SOLVERS: dict[str, type[PaperSolver]] = {"paper": PaperSolver}
@@ -40,6 +41,10 @@ class Session:
         prompt: The object in the first frame; None takes the mask tracker's own first mask.
         intrinsics: fx, fy, cx, cy that the source knows of, in pixels; the configuration wins over them.
         intrinsics_origin: Where they come from, in words.
+
+    Attributes:
+        config: The pipeline.
+        renderer: What renders, and why, see `tracking3d.rendering.describe_backend`.
 
     Raises:
         PluginError: If a plug-in is unknown or broken.
@@ -59,6 +64,10 @@ class Session:
         if prompt is None and config.tracker.name != "precomputed":
             raise InputError("Say what the object is by either a box or a mask of the first frame.")
         torch.set_num_threads(config.runtime.threads)
+        try:
+            self.renderer = describe_backend(config.runtime.renderer, config.runtime.device)
+        except ValueError as error:
+            raise InputError(f"runtime.renderer: {error}.") from error
         self.config = config
         self._prompt = prompt
         self._intrinsics = intrinsics, intrinsics_origin

@@ -65,6 +65,7 @@ def record(
         camera=camera,
         source=source.name,
         seed=config.runtime.seed,
+        renderer=session.renderer,
         fps=source.fps,
         command=command,
         selection=selection,

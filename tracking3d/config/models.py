@@ -221,7 +221,14 @@ class RuntimeConfig(Section):
     threads: int = Field(
         1,
         ge=1,
-        description="CPU threads of torch. One is never much slower here, and far faster on a busy machine.",
+        description=(
+            "CPU threads of torch and of the renderer. One is never much slower here, and far faster on a busy "
+            "machine or when several runs share one."
+        ),
+    )
+    renderer: Literal["auto", "torch", "numba"] = Field(
+        "auto",
+        description="What renders: torch everywhere, numba on the CPU, or the fastest that can be used here.",
     )
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 
 import torch
-from kornia.losses import cauchy_loss
 from torch import Tensor
 from torch.nn import functional
 
@@ -18,15 +17,8 @@ from tracking3d.geometry.pose import Pose, rotation_angle
 _SMALL = 1e-10
 
 
-def cauchy(a: Tensor, b: Tensor, scale: float) -> Tensor:
-    """Cauchy loss ``log(1 + ((a - b) / scale)^2)``, element by element."""
-    factor = math.sqrt(2.0) / scale  # kornia's is log(1 + (a - b)^2 / 2)
-    return cauchy_loss(a * factor, b * factor, reduction="none")
-
-
 def appearance_loss(
-    rendered: Tensor,
-    observed: Tensor,
+    pixel_loss: Tensor,
     pixels: Tensor,
     valid: Tensor,
     scale: float,
@@ -42,8 +34,7 @@ def appearance_loss(
     an empty texture beyond the outline is not compared with the background.
 
     Args:
-        rendered: ``(P, C)`` features at the covered pixels.
-        observed: ``(B, C, H, W)`` features of the frames.
+        pixel_loss: ``(P,)`` Cauchy loss at the covered pixels, from `tracking3d.rendering.texture_losses`.
         pixels: ``(P,)`` flat indices of the covered pixels in ``(B, H, W)``.
         valid: ``(B, H, W)``.
         scale: Scale of the Cauchy loss (0.25).
@@ -53,13 +44,12 @@ def appearance_loss(
     Returns:
         ``(B,)``; where nothing is covered, the cost of a residual of 1.
     """
-    batch, channels, height, width = observed.shape
+    batch, height, width = valid.shape
     view = torch.div(pixels, height * width, rounding_mode="floor")
-    target = observed.permute(0, 2, 3, 1).reshape(-1, channels)[pixels]
-    loss = cauchy(rendered, target, scale).mean(1)
+    loss = pixel_loss
     if seen is not None:
         loss = seen * loss + (1 - seen) * unseen_charge
-    weight = valid.reshape(-1)[pixels]
+    weight = valid.reshape(-1).index_select(0, pixels)
     total = loss.new_zeros(batch).index_add(0, view, loss * weight)
     count = loss.new_zeros(batch).index_add(0, view, weight)
     # Were it zero, the cheapest pose would be out of sight, and the stopping rule satisfied there.
@@ -69,16 +59,20 @@ def appearance_loss(
 
 def iou_loss(silhouette: Tensor, mask: Tensor, valid: Tensor) -> Tensor:
     """First term of the silhouette loss, eq. 2: one minus the soft intersection over union, ``(B,)``."""
-    silhouette, mask = silhouette * valid, mask * valid
-    intersection = (silhouette * mask).sum((1, 2))
-    union = (silhouette + mask).sum((1, 2)) - intersection
+    mask = mask * valid
+    intersection = _inner(silhouette, mask)
+    union = _inner(silhouette, valid) + mask.sum((1, 2)) - intersection
     return 1 - intersection / (union + _SMALL)
 
 
 def distance_loss(silhouette: Tensor, distance: Tensor, valid: Tensor) -> Tensor:
     """Second term of the silhouette loss, eq. 2: mean distance of silhouette pixels to the mask, ``(B,)``."""
-    silhouette = silhouette * valid
-    return (silhouette * distance).sum((1, 2)) / silhouette.sum((1, 2)).clamp_min(1.0)
+    return _inner(silhouette, distance * valid) / _inner(silhouette, valid).clamp_min(1.0)
+
+
+def _inner(a: Tensor, b: Tensor) -> Tensor:
+    """Inner product of images ``(B, H, W)`` for each frame."""
+    return (a * b).sum((1, 2))
 
 
 def erode(silhouette: Tensor) -> Tensor:
@@ -116,10 +110,3 @@ def motion_loss(
 def laplacian_loss(laplacian: Tensor, vertices: Tensor) -> Tensor:
     """Laplacian shape regularization (SoftRas): mean squared length of ``L v``."""
     return torch.sparse.mm(laplacian, vertices).square().sum(1).mean()
-
-
-def total_variation_loss(texture: Tensor, scale: float) -> Tensor:
-    """Mean Cauchy loss between neighbouring texels of ``(C, T, T)``; neighbours wrap around in u."""
-    right = cauchy(texture, texture.roll(-1, 2), scale).mean()
-    below = cauchy(texture[:, 1:], texture[:, :-1], scale).mean()
-    return right + below

@@ -14,6 +14,7 @@ from torch.nn import functional
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera, Window
+from tracking3d.rendering import channels_last
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +63,7 @@ class Batch:
         return cls(
             torch.tensor([o.index for o in observations], device=device),
             torch.stack([o.K for o in observations]),
-            torch.stack([o.features for o in observations]),
+            channels_last(torch.stack([o.features for o in observations])),
             torch.stack([o.valid for o in observations]),
             torch.stack([o.mask for o in observations]),
             torch.stack([o.distance for o in observations]),

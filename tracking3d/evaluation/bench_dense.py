@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from tracking3d.rendering import Rendering, SoftBand, project, sample_texture
+from tracking3d.rendering import Rendering, SoftBand
+from tracking3d.rendering.renderer import to_camera, to_screen
 from tracking3d.rendering.visibility import NEAR
 
 CHUNK = 200_000
@@ -32,7 +33,8 @@ def render_dense(
     """The same as `tracking3d.rendering.render`, densely; its depth has a gradient."""
     band = band or SoftBand()
     height, width = size
-    screen, depth = project(vertices, R, t, K)
+    x_cam = to_camera(vertices, R, t)
+    screen, depth = to_screen(x_cam, K), x_cam[..., 2]
     extent = screen.new_tensor([width, height])
     y, x = torch.meshgrid(*(torch.arange(side, device=screen.device) for side in size), indexing="ij")
     points = (2 * torch.stack([x, y], 2).reshape(-1, 2) + 1 - extent) / extent
@@ -52,7 +54,12 @@ def render_dense(
         silhouette.reshape(shape),
         pixels,
         uv,
-        sample_texture(texture, uv),
+        texture,
+        x_cam,
+        screen,
+        faces,
+        K,
+        "torch",
     )
 
 

@@ -13,6 +13,7 @@ import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -23,11 +24,14 @@ from tracking3d.errors import InputError
 from tracking3d.estimation import losses
 from tracking3d.evaluation.bench_dense import render_dense
 from tracking3d.geometry.prototypes import sphere
-from tracking3d.rendering import Rendering, render
+from tracking3d.rendering import Rendering, channels_last, render, texture_losses
 
 TEXTURE = 300
 FREQUENCY = 11
-BACKENDS: dict[str, Callable[..., Rendering]] = {"torch": render}
+BACKENDS: dict[str, Callable[..., Rendering]] = {
+    "torch": partial(render, backend="torch"),
+    "numba": partial(render, backend="numba"),
+}
 _CAUCHY_SCALE, _TOTAL_VARIATION_WEIGHT = 0.25, 0.001
 _DENSE_EVERY = 10  # rounds in which the dense one takes part
 
@@ -59,7 +63,7 @@ class Scene:
         K = torch.tensor([[1.25 * size, 0, (size - 1) / 2], [0, 1.25 * size, (size - 1) / 2], [0, 0, 1]])
         parameters = {
             "vertices": vertices,
-            "texture": torch.rand(channels, TEXTURE, TEXTURE, generator=generator),
+            "texture": channels_last(torch.rand(channels, TEXTURE, TEXTURE, generator=generator)),
             "R": axis_angle_to_rotation_matrix(turns),
             "t": torch.tensor([[0.0, 0.0, 4.0]]).repeat(frames, 1),
         }
@@ -73,17 +77,17 @@ class Scene:
         mask = (x**2 + y**2 < 0.3).float().expand(frames, size, size)
         features = torch.rand(frames, channels, size, size, generator=generator)
         leaves = {name: value.to(device).requires_grad_() for name, value in parameters.items()}
-        return cls(leaves, constants, features.to(device), mask.to(device))
+        return cls(leaves, constants, channels_last(features).to(device), mask.to(device))
 
     def loss(self, backend: Callable[..., Rendering]) -> Tensor:
         """The paper's losses of the rendering by ``backend``."""
         drawn = backend(**self.parameters, **self.constants)
         valid = torch.ones_like(self.mask)
-        appearance = losses.appearance_loss(
-            drawn.features, self.features, drawn.pixels, valid, _CAUCHY_SCALE
-        ).mean()
+        pixel_loss, smooth = texture_losses(
+            drawn.texture, drawn.uv, self.features, drawn.pixels, _CAUCHY_SCALE, backend=drawn.backend
+        )
+        appearance = losses.appearance_loss(pixel_loss, drawn.pixels, valid, _CAUCHY_SCALE).mean()
         silhouette = losses.iou_loss(drawn.silhouette, self.mask, valid).mean()
-        smooth = losses.total_variation_loss(self.parameters["texture"], _CAUCHY_SCALE)
         return appearance + silhouette + _TOTAL_VARIATION_WEIGHT * smooth
 
 

@@ -1,4 +1,4 @@
-"""A triangle mesh with texture coordinates, and its uniform Laplacian."""
+"""A triangle mesh with texture coordinates, its uniform Laplacian and its normals."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import functional
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,3 +40,20 @@ def uniform_laplacian(faces: Tensor, vertices: int) -> Tensor:
     index = torch.cat([edges.T, torch.stack([diagonal, diagonal])], 1)
     value = torch.cat([-1.0 / degree[edges[:, 0]], torch.ones(vertices, device=faces.device)])
     return torch.sparse_coo_tensor(index, value, (vertices, vertices), check_invariants=False).coalesce()
+
+
+def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
+    """Unit normals ``(..., V, 3)`` of ``(..., V, 3)``: the faces' normals, averaged by area; differentiable.
+
+    A vertex without a face of positive area has a zero normal.
+
+    Args:
+        vertices: ``(..., V, 3)``.
+        faces: ``(F, 3)`` int64, counter-clockwise seen from outside.
+    """
+    a, b, c = (vertices.index_select(-2, corner) for corner in faces.unbind(1))
+    weighted = torch.linalg.cross(b - a, c - a)  # twice the area long
+    total = torch.zeros_like(vertices)
+    for corner in faces.unbind(1):
+        total = total.index_add(-2, corner, weighted)
+    return functional.normalize(total, dim=-1)

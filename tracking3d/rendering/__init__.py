@@ -1,21 +1,29 @@
 """The differentiable renderer (DIB-R). Knows nothing of video or tracking."""
 
+from tracking3d.rendering.backend import BackendName, describe_backend
 from tracking3d.rendering.backprojection import BackProjection, TexelMap, back_project
+from tracking3d.rendering.interpolation import interpolate
 from tracking3d.rendering.renderer import Rendering, SoftBand, project, render
 from tracking3d.rendering.silhouette import soft_silhouette
 from tracking3d.rendering.texture import sample_texture
+from tracking3d.rendering.texture_losses import channels_last, texture_losses
 from tracking3d.rendering.visibility import Visibility, rasterize
 
 __all__ = [
     "BackProjection",
+    "BackendName",
     "Rendering",
     "SoftBand",
     "TexelMap",
     "Visibility",
     "back_project",
+    "channels_last",
+    "describe_backend",
+    "interpolate",
     "project",
     "rasterize",
     "render",
     "sample_texture",
     "soft_silhouette",
+    "texture_losses",
 ]

@@ -87,6 +87,7 @@ def back_project(
     R: Tensor,
     t: Tensor,
     K: Tensor,
+    backend: str = "auto",
 ) -> BackProjection:
     """What one frame shows of the texture.
 
@@ -98,10 +99,11 @@ def back_project(
         texels: The atlas.
         R: ``(3, 3)``; t: ``(3,)``: ``T_cam_obj``.
         K: ``(3, 3)`` of the window.
+        backend: See `tracking3d.rendering.backend`.
     """
     height, width = values.shape[1:]
     screen, depth = project(vertices, R[None], t[None], K[None])
-    drawn = rasterize(screen, depth, faces, (height, width)).depth
+    drawn = rasterize(screen, depth, faces, (height, width), backend).depth
     x_cam = vertices @ R.T + t
     corner = x_cam[faces]
     normal = functional.normalize(

@@ -12,12 +12,18 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from tracking3d.rendering.backend import use_numba
 from tracking3d.rendering.shapes import check_shapes
 from tracking3d.rendering.visibility import gather
 
 
 def interpolate(
-    screen: Tensor, depth: Tensor, faces: Tensor, attributes: Tensor, face_index: Tensor
+    screen: Tensor,
+    depth: Tensor,
+    faces: Tensor,
+    attributes: Tensor,
+    face_index: Tensor,
+    backend: str = "auto",
 ) -> Tensor:
     """Interpolate per-corner attributes at every covered pixel.
 
@@ -27,8 +33,9 @@ def interpolate(
         screen: ``(B, V, 2)`` vertices in pixels.
         depth: ``(B, V)`` z in camera coordinates.
         faces: ``(F, 3)`` int64.
-        attributes: ``(F, 3, D)``, one row a face corner.
+        attributes: ``(F, 3, D)``, one row a face corner, or ``(B, F, 3, D)`` with other ones in each view.
         face_index: ``(B, H, W)`` int64 from `rasterize`.
+        backend: See `tracking3d.rendering.backend`.
 
     Returns:
         ``(P, D)``, one row for each covered pixel in the order of ``(face_index >= 0).nonzero()``.
@@ -40,10 +47,15 @@ def interpolate(
         screen=(screen, "B V 2"),
         depth=(depth, "B V"),
         faces=(faces, "F 3"),
-        attributes=(attributes, "F 3 D"),
+        attributes=(attributes, "B F 3 D" if attributes.dim() == 4 else "F 3 D"),
         face_index=(face_index, "B H W"),
     )
-    result: Tensor = _Interpolate.apply(screen, depth, faces, attributes, face_index)
+    if attributes.dim() == 3:
+        attributes = attributes[None]
+    function: Any = _Interpolate
+    if use_numba(backend, screen, depth, attributes):
+        from tracking3d.rendering.kernels.interpolation import Interpolate as function
+    result: Tensor = function.apply(screen, depth, faces, attributes, face_index)
     return result
 
 
@@ -86,8 +98,11 @@ class _Interpolate(torch.autograd.Function):
         weight = w / z
         s = 1 / weight.sum(0)
         share = weight * s
-        planes = attributes.permute(2, 1, 0).reshape(-1, len(faces))
-        corner_values = planes.index_select(1, face).reshape(attributes.shape[2], 3, len(face))  # (D, 3, P)
+        if len(attributes) > 1:
+            face = face + view * len(faces)
+        table = attributes.flatten(0, 1)
+        planes = table.permute(2, 1, 0).reshape(-1, len(table))
+        corner_values = planes.index_select(1, face).reshape(table.shape[2], 3, len(face))  # (D, 3, P)
         values = (share * corner_values).sum(1)  # (D, P)
         ctx.save_for_backward(vertex, face, w, by_x, by_y, z, s, share, corner_values, values)
         ctx.shapes = screen.shape, attributes.shape
@@ -109,6 +124,6 @@ class _Interpolate(torch.autograd.Function):
         grad_attributes = None
         if ctx.needs_input_grad[3]:
             grad_attributes = grad.new_zeros(attributes_shape)
-            grad_attributes.index_add_(0, face, share.T[..., None] * grad[:, None])
+            grad_attributes.flatten(0, 1).index_add_(0, face, share.T[..., None] * grad[:, None])
         grad_screen = torch.stack([grad_x, grad_y], 1).reshape(screen_shape)
         return grad_screen, grad_depth.reshape(screen_shape[:2]), None, grad_attributes, None

@@ -1,15 +1,19 @@
 """The differentiable renderer: shape, texture and poses in; features, silhouette and visibility out.
 
-All frames are one batch, each with its own pose and window, over one mesh or one mesh a frame.
+All frames are one batch, each with its own pose and window, over one mesh or one mesh a frame. What is not asked
+of a `Rendering` is not computed.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
+from tracking3d.geometry.mesh import vertex_normals
 from tracking3d.rendering.interpolation import interpolate
 from tracking3d.rendering.shapes import check_shapes
 from tracking3d.rendering.silhouette import BOXLEN, KNUM, SIGMA, soft_silhouette
@@ -28,15 +32,20 @@ class SoftBand:
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """What the renderer answers.
+    """What the renderer answers. P pixels are covered, in the order of ``(face_index >= 0).nonzero()``.
 
     Attributes:
         face_index: ``(B, H, W)`` int64, -1 where uncovered.
-        depth: ``(B, H, W)`` z in camera coordinates, infinite where uncovered; no gradient.
+        depth: ``(B, H, W)`` z in camera coordinates, infinite where uncovered; no gradient, see `points`.
         silhouette: ``(B, H, W)`` soft, in [0, 1].
         pixels: ``(P,)`` int64, flat indices of the covered pixels in ``(B, H, W)``.
         uv: ``(P, 2)`` texture coordinates at the covered pixels.
-        features: ``(P, C)`` texture at the covered pixels.
+        texture: ``(C, T, T)`` as given.
+        x_cam: ``(B, V, 3)`` vertices in camera coordinates.
+        screen: ``(B, V, 2)`` vertices in pixels.
+        faces: ``(F, 3)`` as given.
+        K: ``(B, 3, 3)`` as given.
+        backend: Which implementation was asked for.
     """
 
     face_index: Tensor
@@ -44,14 +53,54 @@ class Rendering:
     silhouette: Tensor
     pixels: Tensor
     uv: Tensor
-    features: Tensor
+    texture: Tensor
+    x_cam: Tensor
+    screen: Tensor
+    faces: Tensor
+    K: Tensor
+    backend: str = "auto"
 
-    def image(self) -> Tensor:
-        """The features as ``(B, C, H, W)``, zero where uncovered."""
+    @cached_property
+    def features(self) -> Tensor:
+        """``(P, C)`` texture at the covered pixels."""
+        return sample_texture(self.texture, self.uv)
+
+    @cached_property
+    def points(self) -> Tensor:
+        """``(P, 3)`` surface points seen at the covered pixels, in camera coordinates; z is the depth."""
+        return self._interpolate(self.x_cam)
+
+    @cached_property
+    def normals(self) -> Tensor:
+        """``(P, 3)`` unit normals of the smooth surface at the covered pixels, outward, in camera coordinates."""
+        return functional.normalize(self._interpolate(vertex_normals(self.x_cam, self.faces)), dim=1)
+
+    def image(self, values: Tensor | None = None) -> Tensor:
+        """``(P, C)`` values, the features if None, as ``(B, C, H, W)``, zero where uncovered."""
+        values = self.features if values is None else values
         batch, height, width = self.face_index.shape
-        flat = self.features.new_zeros(batch * height * width, self.features.shape[1])
-        flat = flat.index_copy(0, self.pixels, self.features)
+        flat = values.new_zeros(batch * height * width, values.shape[1])
+        flat = flat.index_copy(0, self.pixels, values)
         return flat.reshape(batch, height, width, -1).permute(0, 3, 1, 2)
+
+    def _interpolate(self, of_vertices: Tensor) -> Tensor:
+        """``(P, D)`` at the covered pixels of ``(B, V, D)``."""
+        corners = of_vertices[:, self.faces]
+        return interpolate(
+            self.screen, self.x_cam[..., 2], self.faces, corners, self.face_index, self.backend
+        )
+
+
+def to_camera(vertices: Tensor, R: Tensor, t: Tensor) -> Tensor:
+    """``(B, V, 3)`` camera coordinates of ``(V, 3)`` or ``(B, V, 3)`` object coordinates, see `project`."""
+    return vertices @ R.transpose(1, 2) + t[:, None]
+
+
+def to_screen(x_cam: Tensor, K: Tensor) -> Tensor:
+    """``(B, V, 2)`` pixels of ``(B, V, 3)`` camera coordinates, see `project`."""
+    ray = x_cam[..., :2] / x_cam[..., 2:].clamp_min(NEAR)
+    focal = torch.stack([K[:, 0, 0], K[:, 1, 1]], 1)
+    return ray * focal[:, None] + K[:, None, :2, 2]
 
 
 def project(vertices: Tensor, R: Tensor, t: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
@@ -66,11 +115,8 @@ def project(vertices: Tensor, R: Tensor, t: Tensor, K: Tensor) -> tuple[Tensor, 
     Returns:
         ``(B, V, 2)`` pixels and ``(B, V)`` depths z in camera coordinates.
     """
-    x_cam = vertices @ R.transpose(1, 2) + t[:, None]
-    depth = x_cam[..., 2]
-    ray = x_cam[..., :2] / depth.clamp_min(NEAR)[..., None]
-    focal = torch.stack([K[:, 0, 0], K[:, 1, 1]], 1)
-    return ray * focal[:, None] + K[:, None, :2, 2], depth
+    x_cam = to_camera(vertices, R, t)
+    return to_screen(x_cam, K), x_cam[..., 2]
 
 
 def render(
@@ -83,6 +129,7 @@ def render(
     K: Tensor,
     size: tuple[int, int],
     band: SoftBand | None = None,
+    backend: str = "auto",
 ) -> Rendering:
     """Render a textured mesh in every frame.
 
@@ -96,9 +143,11 @@ def render(
         R: ``(B, 3, 3)``; t: ``(B, 3)``; K: ``(B, 3, 3)``, see `project`.
         size: ``(H, W)`` of every window.
         band: Kernel of the soft silhouette; DIB-R's constants if None.
+        backend: ``auto``, ``torch`` or ``numba``, see `tracking3d.rendering.backend`.
 
     Raises:
-        ValueError: If a shape does not fit; it names the actual and the expected shape.
+        ValueError: If a shape does not fit; it names the actual and the expected shape. If the backend cannot
+            render these tensors.
     """
     check_shapes(
         R=(R, "B 3 3"),
@@ -110,10 +159,15 @@ def render(
         texture=(texture, "C T T"),
     )
     band = band or SoftBand()
-    screen, depth = project(vertices, R, t, K)
-    visibility = rasterize(screen.detach(), depth.detach(), faces, size)
+    x_cam = to_camera(vertices, R, t)
+    screen, depth = to_screen(x_cam, K), x_cam[..., 2]
+    visibility = rasterize(screen, depth, faces, size, backend)
     index = visibility.face_index
-    silhouette = soft_silhouette(screen, depth, faces, index, band.sigma, band.boxlen, band.knum)
-    uv = interpolate(screen, depth, faces, face_uvs, index)
+    silhouette = soft_silhouette(
+        screen, depth, faces, index, band.sigma, band.boxlen, band.knum, backend
+    )
+    uv = interpolate(screen, depth, faces, face_uvs, index, backend)
     pixels = torch.nonzero(index.reshape(-1) >= 0)[:, 0]
-    return Rendering(index, visibility.depth, silhouette, pixels, uv, sample_texture(texture, uv))
+    return Rendering(
+        index, visibility.depth, silhouette, pixels, uv, texture, x_cam, screen, faces, K, backend
+    )

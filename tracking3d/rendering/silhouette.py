@@ -16,13 +16,14 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
+from tracking3d.rendering.backend import use_numba
 from tracking3d.rendering.shapes import check_shapes
 from tracking3d.rendering.visibility import NEAR, expand_ranges, face_corners, gather
 
 SIGMA = 7000.0
 BOXLEN = 0.02
 KNUM = 30
-_CLAMP = 1e-7  # keeps 1 / (1 - e) finite where a pixel lies on an edge
+_EPSILON = 1e-7  # the reference's: keeps 1 / (1 - e) finite where a pixel lies on an edge
 _LEAST = -60.0  # exp of less changes no sum, but denormal numbers are slow
 
 
@@ -34,6 +35,7 @@ def soft_silhouette(
     sigma: float = SIGMA,
     boxlen: float = BOXLEN,
     knum: int = KNUM,
+    backend: str = "auto",
 ) -> Tensor:
     """Soft silhouette ``(B, H, W)`` in [0, 1], differentiable in ``screen``.
 
@@ -47,6 +49,7 @@ def soft_silhouette(
         sigma: Sharpness per squared NDC unit.
         boxlen: Reach beyond a face's box in NDC.
         knum: Most faces that count at a pixel.
+        backend: See `tracking3d.rendering.backend`.
 
     Raises:
         ValueError: If a shape does not fit.
@@ -54,6 +57,13 @@ def soft_silhouette(
     check_shapes(
         screen=(screen, "B V 2"), depth=(depth, "B V"), faces=(faces, "F 3"), face_index=(face_index, "B H W")
     )
+    if use_numba(backend, screen, depth):
+        from tracking3d.rendering.kernels.silhouette import SoftSilhouette
+
+        drawn: Tensor = SoftSilhouette.apply(
+            screen, depth, faces, face_index, NEAR, sigma, boxlen, knum, _EPSILON
+        )
+        return drawn
     result: Tensor = _SoftSilhouette.apply(screen, depth, faces, face_index, sigma, boxlen, knum)
     return result
 
@@ -92,14 +102,14 @@ class _SoftSilhouette(torch.autograd.Function):
         rx, ry = dx - t * ex, dy - t * ey
         d2 = rx.square() + ry.square()
         nearest = d2.amin(0)
-        e = torch.exp((-sigma * nearest).clamp_min(_LEAST)).clamp_max(1 - _CLAMP)
+        e = torch.exp((-sigma * nearest).clamp_min(_LEAST))
         sound = screen.isfinite().flatten(1).all(1)[:, None, None]
         log_rest = torch.where(face_index < 0, torch.where(sound, 0.0, torch.nan).to(x), -torch.inf).reshape(
             -1
         )
         rest = log_rest.index_add_(0, pairs.pixel, torch.log1p(-e)).exp_()
 
-        slope = 2 * sigma * e * gather(rest, pairs.pixel) / (1 - e)  # dS/d(nearest) = -slope / 2
+        slope = 2 * sigma * e * gather(rest, pairs.pixel) / (1 - e + _EPSILON)  # dS/d(nearest) = -slope / 2
         side = (d2[0] > nearest).long() * (1 + (d2[1] > nearest).long())
         at_side = side * len(side) + torch.arange(len(side), device=side.device)
         box = side * len(pairs.vertex[0]) + pairs.box

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from tracking3d.rendering.backend import use_numba
 from tracking3d.rendering.shapes import check_shapes
 
 NEAR = 1e-3
@@ -58,7 +59,9 @@ def gather(plane: Tensor, index: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def rasterize(screen: Tensor, depth: Tensor, faces: Tensor, size: tuple[int, int]) -> Visibility:
+def rasterize(
+    screen: Tensor, depth: Tensor, faces: Tensor, size: tuple[int, int], backend: str = "auto"
+) -> Visibility:
     """Find the nearest front-facing face at every pixel centre.
 
     Args:
@@ -67,11 +70,16 @@ def rasterize(screen: Tensor, depth: Tensor, faces: Tensor, size: tuple[int, int
         depth: ``(B, V)`` z in camera coordinates.
         faces: ``(F, 3)`` int64, counter-clockwise seen from outside; faces seen from behind are culled.
         size: ``(H, W)``.
+        backend: See `tracking3d.rendering.backend`.
 
     Raises:
         ValueError: If a shape does not fit.
     """
     check_shapes(screen=(screen, "B V 2"), depth=(depth, "B V"), faces=(faces, "F 3"))
+    if use_numba(backend, screen, depth):
+        from tracking3d.rendering.kernels import visibility
+
+        return Visibility(*visibility.rasterize(screen, depth, faces, size, NEAR))
     batch, (height, width) = len(screen), size
     view, face, (x0, x1, y0, y1) = _boxes_in_front(screen, depth, faces, size)
     vertex = faces.index_select(0, face).T + view * screen.shape[1]  # (3, M) in screen.flatten(0, 1)

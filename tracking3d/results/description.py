@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from importlib import metadata
@@ -28,6 +28,7 @@ def description_at_start(
     fps: float | None,
     command: str | None,
     selection: str | None,
+    renderer: Mapping[str, str | int] | None,
 ) -> dict[str, Any]:
     """What is known of a run before its first frame."""
     return {
@@ -44,6 +45,7 @@ def description_at_start(
         "seed": seed,
         "config": config,
         "camera": asdict(camera),
+        "renderer": renderer,
         "versions": versions(),
         "conventions": CONVENTIONS,
         "skipped": [],
@@ -79,7 +81,7 @@ def summary(records: Sequence[FrameRecord], skipped: int, seconds: float) -> dic
 
 def versions() -> dict[str, str | None]:
     """Versions of what a result depends on."""
-    packages = {name: _version(name) for name in ("tracking3d", "torch", "kornia", "numpy")}
+    packages = {name: _version(name) for name in ("tracking3d", "torch", "kornia", "numba", "numpy")}
     return packages | {
         "opencv": cv2.__version__,
         "python": platform.python_version(),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -46,6 +46,7 @@ class RunWriter:
         camera: The camera of the full frame.
         source: What was tracked, in words.
         seed: Seed of everything random.
+        renderer: What renders, and why.
         fps: Frames per second of the source, where known.
         command: The command line, where there was one.
         overwrite: Replace a run that is there. Only files a run writes are removed, only from a run folder.
@@ -65,6 +66,7 @@ class RunWriter:
         fps: float | None,
         command: str | None,
         selection: str | None = None,
+        renderer: Mapping[str, str | int] | None = None,
         overwrite: bool = False,
     ) -> None:
         self.folder = Path(folder)
@@ -84,6 +86,7 @@ class RunWriter:
             fps=fps,
             command=command,
             selection=selection,
+            renderer=renderer,
         )
         frames = self.folder / layout.FRAMES
         with writing(self.folder):

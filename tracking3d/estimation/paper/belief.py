@@ -42,6 +42,7 @@ class Belief:
         waiting: First frames that wait for the joint start, with their answers so far; None when none waits
             any more.
         started: Whether the first frame is done.
+        renderer: Which renderer, see `tracking3d.rendering.backend`.
     """
 
     camera: Camera
@@ -55,6 +56,7 @@ class Belief:
     before: tuple[Pose, int] | None = None
     waiting: tuple[tuple[Keyframe, FrameEstimate], ...] | None = None
     started: bool = False
+    renderer: str = "auto"
 
     @property
     def vertices(self) -> Tensor:
@@ -84,7 +86,7 @@ class Belief:
         ]
         return back_project(
             values, valid, self.vertices, self.shape.faces, self.texels, keyframe.pose.R,
-            keyframe.pose.translation, K,
+            keyframe.pose.translation, K, self.renderer,
         )  # fmt: skip
 
     def seen_with_keyframes(self) -> BackProjection:
@@ -99,7 +101,7 @@ class Belief:
         size = (self.camera.height, self.camera.width)
         K = torch.tensor(self.camera.K, dtype=torch.float32, device=self.offsets.device)
         screen, depth = project(self.vertices, pose.R[None], pose.translation[None], K[None])
-        covered = rasterize(screen, depth, self.shape.faces, size).face_index[0] >= 0
+        covered = rasterize(screen, depth, self.shape.faces, size, self.renderer).face_index[0] >= 0
         return np.asarray(covered.cpu().numpy(), dtype=np.bool_)
 
     def parameters(self, frames: list[Keyframe]) -> Parameters:

@@ -36,8 +36,13 @@ def joint_start(belief: Belief, frames: list[Keyframe], config: SolverConfig, ta
         tau: The encoder's convergence threshold.
     """
     config = config.model_copy(update={"stop": "plateau", "patience": config.start_iterations})
-    coarse = Problem(belief.shape, Batch.of([halved(frame.observation) for frame in frames]), config)
-    fine = Problem(belief.shape, Batch.of([frame.observation for frame in frames]), config)
+    coarse, fine = (
+        Problem(belief.shape, Batch.of(observations), config, backend=belief.renderer)
+        for observations in (
+            [halved(frame.observation) for frame in frames],
+            [frame.observation for frame in frames],
+        )
+    )
     spent = 0
     optima: list[Optimum] = []
     starts = [belief.parameters(frames), *hypotheses(belief, frames)]

@@ -8,6 +8,7 @@ from typing import Literal
 import torch
 
 from tracking3d.estimation.paper.problem import Losses, Parameters, Problem, flatten
+from tracking3d.rendering import channels_last
 
 Free = Literal["all", "pose"]
 
@@ -52,7 +53,7 @@ def optimize(
     """
     config, rates = problem.config, problem.config.learning_rates
     translation, quaternion = start.translation[fixed:].clone(), start.quaternion[fixed:].clone()
-    offsets, texture = start.offsets.clone(), start.texture.clone()
+    offsets, texture = start.offsets.clone(), channels_last(start.texture).clone()
     groups = [(translation, rates.translation), (quaternion, rates.rotation)]
     if free == "all":
         groups += [(offsets, rates.vertices), (texture, rates.texture)]

@@ -13,7 +13,7 @@ from tracking3d.estimation import losses
 from tracking3d.estimation.observation import Batch
 from tracking3d.geometry.mesh import Mesh, uniform_laplacian
 from tracking3d.geometry.pose import Pose
-from tracking3d.rendering import Rendering, SoftBand, render, sample_texture
+from tracking3d.rendering import Rendering, SoftBand, render, sample_texture, texture_losses
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class Parameters:
         translation: ``(B, 3)`` of each frame's ``T_cam_obj``.
         quaternion: ``(B, 4)`` of each frame's ``T_cam_obj``, w first.
         offsets: ``(V, 3)`` from the prototype.
-        texture: ``(C, T, T)`` feature texture.
+        texture: ``(C, T, T)`` feature texture; fastest with its channels side by side in memory.
     """
 
     translation: Tensor
@@ -121,6 +121,7 @@ class Problem:
         seen: ``(1, T, T)`` how far each texel is known, in [0, 1]; None if that makes no difference.
         previous: Where eq. 3 measures motion from: pose and frame index of the last keyframe. None takes it
             from the batch's last but one frame; there is no motion term if there is none.
+        backend: Which renderer, see `tracking3d.rendering.backend`.
     """
 
     shape: Shape
@@ -128,6 +129,7 @@ class Problem:
     config: SolverConfig
     seen: Tensor | None = None
     previous: tuple[Pose, int] | None = None
+    backend: str = "auto"
 
     def rendering(self, parameters: Parameters) -> Rendering:
         """Render all frames."""
@@ -142,6 +144,7 @@ class Problem:
             self.batch.K,
             (self.batch.mask.shape[1], self.batch.mask.shape[2]),
             SoftBand(config.sigma, config.boxlen, config.knum),
+            self.backend,
         )
 
     def losses(self, parameters: Parameters) -> Losses:
@@ -152,10 +155,18 @@ class Problem:
         seen = None
         if self.seen is not None and config.unseen_charge is not None:
             seen = sample_texture(self.seen, drawn.uv.detach())[:, 0]
+        pixel_loss, total_variation = texture_losses(
+            parameters.texture,
+            drawn.uv,
+            batch.features,
+            drawn.pixels,
+            config.cauchy_scale,
+            total_variation=bool(weights.total_variation and parameters.texture.requires_grad),
+            backend=self.backend,
+        )
         appearance = losses.appearance_loss(
-            drawn.features, batch.features, drawn.pixels, batch.valid, config.cauchy_scale, seen,
-            config.unseen_charge or 0.0,
-        )  # fmt: skip
+            pixel_loss, drawn.pixels, batch.valid, config.cauchy_scale, seen, config.unseen_charge or 0.0
+        )
         silhouette, target = drawn.silhouette, batch.mask
         if config.band == "erode":
             silhouette = losses.erode(silhouette)
@@ -170,9 +181,7 @@ class Problem:
             losses.distance_loss(silhouette, batch.distance, batch.valid) * batch.has_mask,
             self._motion(parameters) if weights.motion else zero,
             losses.laplacian_loss(self.shape.laplacian, smoothed) if weights.laplacian else zero,
-            losses.total_variation_loss(parameters.texture, config.cauchy_scale)
-            if weights.total_variation and parameters.texture.requires_grad
-            else zero,
+            total_variation,
         )
 
     def _motion(self, parameters: Parameters) -> Tensor:

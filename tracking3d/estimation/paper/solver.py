@@ -92,6 +92,7 @@ class PaperSolver:
             ),
             (pose, frame.index),
             waiting=() if self.config.solver.start_frames > 1 else None,
+            renderer=self.config.runtime.renderer,
         )
         observation = self._observe(belief, frame, binary, pose)
         return self._solve(belief, frame, binary, Keyframe(observation, pose), started)
@@ -150,7 +151,9 @@ class PaperSolver:
         if belief.keyframes:
             keyframe = belief.keyframes[-1]
             previous = keyframe.pose, keyframe.observation.index
-        return Problem(belief.shape, Batch.of([observation]), self.config.solver, seen, previous)
+        return Problem(
+            belief.shape, Batch.of([observation]), self.config.solver, seen, previous, belief.renderer
+        )
 
     def _solve(
         self, belief: Belief, frame: Frame, mask: NDArray[np.bool_] | None, current: Keyframe, started: float
@@ -245,7 +248,8 @@ class PaperSolver:
         frames = [*belief.keyframes, current]
         # The gauge: the oldest frame does not move, so that poses stored at different times compare.
         fixed = 1 if belief.keyframes or not belief.started else 0
-        problem = Problem(belief.shape, Batch.of([frame.observation for frame in frames]), config)
+        batch = Batch.of([frame.observation for frame in frames])
+        problem = Problem(belief.shape, batch, config, backend=belief.renderer)
         start = belief.parameters(frames)
         return frames, optimize(problem, start, iterations=config.iterations, tau=self.tau, fixed=fixed)
 

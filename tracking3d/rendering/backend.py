@@ -1,0 +1,69 @@
+"""Which implementation renders: torch, which runs everywhere, or the Numba kernels for float32 on the CPU."""
+
+from __future__ import annotations
+
+import functools
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+BackendName = Literal["auto", "torch", "numba"]
+"""``auto`` takes the Numba kernels wherever they can run."""
+
+
+def use_numba(backend: str, *tensors: Tensor) -> bool:
+    """Whether tensors are to be rendered by the Numba kernels, and not by torch.
+
+    Args:
+        backend: See `BackendName`.
+        *tensors: All that is to be rendered.
+
+    Raises:
+        ValueError: If Numba is asked for but cannot render these tensors, or there is no such backend.
+    """
+    if backend == "torch":
+        return False
+    dtypes = {(tensor.dtype, tensor.device.type) for tensor in tensors if tensor.is_floating_point()}
+    fits = dtypes == {(torch.float32, "cpu")}
+    if backend == "auto":
+        return fits and not why_no_numba()
+    if backend != "numba":
+        raise ValueError(f"there is no backend '{backend}'; choose auto, torch or numba")
+    if why_no_numba():
+        raise ValueError(f"the backend 'numba' cannot be used: {why_no_numba()}; choose auto or torch")
+    if not fits:
+        found = ", ".join(sorted(f"{dtype} on {device}" for dtype, device in dtypes))
+        raise ValueError(
+            f"the backend 'numba' renders torch.float32 on cpu, not {found}; choose auto or torch"
+        )
+    return True
+
+
+def describe_backend(backend: str, device: str) -> dict[str, str | int]:
+    """What renders float32 on a device, why, and with how many threads; for the record of a run.
+
+    Raises:
+        ValueError: If Numba is asked for but cannot be used.
+    """
+    place = torch.device(device).type
+    if place == "cpu":
+        chosen = "numba" if use_numba(backend, torch.empty(0)) else "torch"
+    elif backend == "numba":
+        raise ValueError(f"the backend 'numba' renders on the cpu, not on {device}; choose auto or torch")
+    else:
+        chosen = "torch"
+    reason = "asked for"
+    if backend == "auto":
+        reason = why_no_numba() or f"{chosen} is the fastest on {place}"
+    return {"backend": chosen, "reason": reason, "threads": torch.get_num_threads()}
+
+
+@functools.cache
+def why_no_numba() -> str:
+    """Why the kernels cannot be used on this machine; empty if they can."""
+    try:
+        import numba  # noqa: F401
+    except Exception as error:  # an installation that does not fit fails in many ways
+        return f"numba cannot be imported ({type(error).__name__}: {error})"
+    return ""

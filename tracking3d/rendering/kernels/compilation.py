@@ -1,0 +1,108 @@
+"""Compiling kernels once and keeping them on disk.
+
+Numba's cache replaces files atomically and every kernel has one signature, so that several processes that start
+at once do the same work at worst. Where no folder can be written, each process compiles for itself.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import numba
+from numba.core import event
+from numpy.typing import NDArray
+from torch import Tensor
+
+OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+"""Of every kernel: several may run at once, and dividing by zero gives infinity as it does in torch."""
+REORDER = {"reassoc", "contract", "arcp", "nsz"}
+"""Freedoms of sums and products that let them use vector instructions; NaN and infinity stay what they are."""
+
+_log = logging.getLogger("tracking3d.rendering")
+_compiling = threading.RLock()
+
+
+class Kernel:
+    """A function that is compiled for one signature when it is called for the first time.
+
+    Args:
+        function: What to compile.
+        signature: Numba types of its arguments, such as ``void(float32[::1], int64)``.
+        fastmath: Freedoms of floating-point arithmetic; none by default.
+    """
+
+    def __init__(
+        self, function: Callable[..., Any], signature: str, fastmath: set[str] | None = None
+    ) -> None:
+        self._function, self._signature = function, signature
+        self._options = {**OPTIONS, "fastmath": fastmath or False}
+        self._compiled: Callable[..., Any] | None = None
+        functools.update_wrapper(self, function)
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Run it."""
+        if self._compiled is None:
+            with _compiling:
+                self._compiled = self._compiled or self._compile()
+        return self._compiled(*arguments)
+
+    def _compile(self) -> Callable[..., Any]:
+        try:
+            dispatcher = numba.njit(cache=True, **self._options)(self._function)
+            with event.install_listener("numba:compile", _Announcer(dispatcher.stats.cache_path)):
+                dispatcher.compile(self._signature)
+        except Exception:
+            # No folder can be written, or what is there cannot be read. A fault of the kernel itself comes again.
+            dispatcher = numba.njit(**self._options)(self._function)
+            with event.install_listener("numba:compile", _Announcer(None)):
+                dispatcher.compile(self._signature)
+        dispatcher.disable_compile()
+        compiled: Callable[..., Any] = dispatcher
+        return compiled
+
+
+def kernel(signature: str, fastmath: set[str] | None = None) -> Callable[[Callable[..., Any]], Kernel]:
+    """Decorator that makes a `Kernel`."""
+    return lambda function: Kernel(function, signature, fastmath)
+
+
+def array(tensor: Tensor) -> NDArray[Any]:
+    """The tensor's memory, or a contiguous copy of it."""
+    result: NDArray[Any] = tensor.detach().contiguous().numpy()
+    return result
+
+
+def check_corners(faces: Tensor, screen: Tensor) -> None:
+    """Make sure that faces have vertices: kernels do not look where they read.
+
+    Raises:
+        IndexError: If they have not.
+    """
+    count = screen.shape[1]
+    if faces.numel() and not (0 <= int(faces.min()) and int(faces.max()) < count):
+        raise IndexError(
+            f"faces name vertices {int(faces.min())} to {int(faces.max())}, but there are {count} vertices"
+        )
+
+
+class _Announcer(event.Listener):  # type: ignore[misc]
+    """Tells the user of the first compilation in this process."""
+
+    def __init__(self, folder: str | None) -> None:
+        self._folder = folder
+
+    def on_start(self, event: event.Event) -> None:
+        _announce(self._folder)
+
+    def on_end(self, event: event.Event) -> None:
+        pass
+
+
+@functools.cache
+def _announce(folder: str | None) -> None:
+    kept = f"the result is kept in {folder}" if folder else "no folder can be written to keep the result in"
+    _log.warning("Compiling the renderer's kernels for this processor takes some seconds; %s.", kept)

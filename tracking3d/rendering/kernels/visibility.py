@@ -1,0 +1,92 @@
+"""Kernel of `tracking3d.rendering.visibility`: the same arithmetic, bit for bit."""
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor
+
+from tracking3d.rendering.kernels.compilation import OPTIONS, array, check_corners, kernel
+from tracking3d.rendering.kernels.threads import share
+
+
+def rasterize(
+    screen: Tensor, depth: Tensor, faces: Tensor, size: tuple[int, int], near: float
+) -> tuple[Tensor, Tensor]:
+    """Face index and depth ``(B, H, W)`` of the nearest front faces.
+
+    Args:
+        screen: ``(B, V, 2)``; depth: ``(B, V)``; faces: ``(F, 3)``; size: ``(H, W)``, see
+            `tracking3d.rendering.rasterize`.
+        near: Faces with a vertex nearer than this are not drawn.
+    """
+    check_corners(faces, screen)
+    shape = (len(screen), *size)
+    face_index = torch.full(shape, -1)
+    drawn = torch.zeros(shape)
+    arrays = array(screen), array(depth), array(faces)
+    share(_rasterize, len(screen), 2, *arrays, near, face_index.numpy(), drawn.numpy())
+    return face_index, drawn
+
+
+@numba.njit(inline="always", **OPTIONS)
+def _edge(corners, start, end):
+    """Where an edge begins, and its direction; it begins at its end of lower index, whichever face asks."""
+    first = min(start, end)
+    return (
+        corners[first, 0],
+        corners[first, 1],
+        corners[start, 0] - corners[end, 0],
+        corners[start, 1] - corners[end, 1],
+    )
+
+
+@kernel(
+    "void(float32[:,:,::1], float32[:,::1], int64[:,::1], float64,"
+    " int64[:,:,::1], float32[:,:,::1], int64, int64)"
+)
+def _rasterize(screen, depth, faces, near, face_index, drawn, first, last):
+    height, width = face_index.shape[1:]
+    for view in range(first, last):
+        corners, z = screen[view], depth[view]
+        nearest, winner = drawn[view], face_index[view]  # inverse depths until the end
+        for face in range(len(faces)):
+            a, b, c = faces[face]
+            za, zb, zc = z[a], z[b], z[c]
+            if not (za > near and zb > near and zc > near):
+                continue
+            ax, ay, bx, by, cx, cy = (
+                corners[a, 0], corners[a, 1], corners[b, 0], corners[b, 1], corners[c, 0], corners[c, 1]
+            )  # fmt: skip
+            if not (by - ay) * (cx - ax) - (bx - ax) * (cy - ay) > 0:
+                continue
+            x0 = math.ceil(max(min(ax, bx, cx), np.float32(0)))
+            y0 = math.ceil(max(min(ay, by, cy), np.float32(0)))
+            x1 = math.floor(min(max(ax, bx, cx), np.float32(width - 1)))
+            y1 = math.floor(min(max(ay, by, cy), np.float32(height - 1)))
+            if x0 > x1 or y0 > y1:
+                continue
+            oxa, oya, exa, eya = _edge(corners, b, c)
+            oxb, oyb, exb, eyb = _edge(corners, c, a)
+            oxc, oyc, exc, eyc = _edge(corners, a, b)
+            for y in range(y0, y1 + 1):
+                fy = np.float32(y)
+                along_a, along_b, along_c = exa * (fy - oya), exb * (fy - oyb), exc * (fy - oyc)
+                for x in range(x0, x1 + 1):
+                    fx = np.float32(x)
+                    wa = along_a - eya * (fx - oxa)
+                    wb = along_b - eyb * (fx - oxb)
+                    wc = along_c - eyc * (fx - oxc)
+                    area = wa + wb + wc
+                    if wa >= 0 and wb >= 0 and wc >= 0 and area > 0:
+                        inverse_depth = (wa / za + wb / zb + wc / zc) / area
+                        if inverse_depth > nearest[y, x]:
+                            nearest[y, x] = inverse_depth
+                            winner[y, x] = face
+        for y in range(height):
+            for x in range(width):
+                nearest[y, x] = 1 / nearest[y, x]
