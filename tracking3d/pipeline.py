@@ -26,7 +26,7 @@ from tracking3d.frames import Box, Frame, Image, MaskEstimate, Prompt, SkippedFr
 from tracking3d.geometry.camera import DEFAULT_FIELD_OF_VIEW, Camera
 from tracking3d.plugins import FEATURES, TRACKERS, build_plugin
 from tracking3d.prompts import make_prompt
-from tracking3d.rendering import describe_backend
+from tracking3d.rendering import prepare_backend
 from tracking3d.trackers.protocol import MaskTracker
 
 SOLVERS: dict[str, type[PaperSolver]] = {"paper": PaperSolver}
@@ -44,7 +44,7 @@ class Session:
 
     Attributes:
         config: The pipeline.
-        renderer: What renders, and why, see `tracking3d.rendering.describe_backend`.
+        renderer: What renders, and why, see `tracking3d.rendering.prepare_backend`.
 
     Raises:
         PluginError: If a plug-in is unknown or broken.
@@ -63,9 +63,9 @@ class Session:
             raise InputError(f"Unknown solver '{config.solver.name}'; choose one of {', '.join(SOLVERS)}.")
         if prompt is None and config.tracker.name != "precomputed":
             raise InputError("Say what the object is by either a box or a mask of the first frame.")
-        torch.set_num_threads(config.runtime.threads)
+        runtime = config.runtime
         try:
-            self.renderer = describe_backend(config.runtime.renderer, config.runtime.device)
+            self.renderer = prepare_backend(runtime.renderer, runtime.device, runtime.threads)
         except ValueError as error:
             raise InputError(f"runtime.renderer: {error}.") from error
         self.config = config

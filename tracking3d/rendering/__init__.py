@@ -1,6 +1,6 @@
 """The differentiable renderer (DIB-R). Knows nothing of video or tracking."""
 
-from tracking3d.rendering.backend import BackendName, describe_backend
+from tracking3d.rendering.backend import BackendName, prepare_backend
 from tracking3d.rendering.backprojection import BackProjection, TexelMap, back_project
 from tracking3d.rendering.interpolation import interpolate
 from tracking3d.rendering.renderer import Rendering, SoftBand, project, render
@@ -18,8 +18,8 @@ __all__ = [
     "Visibility",
     "back_project",
     "channels_last",
-    "describe_backend",
     "interpolate",
+    "prepare_backend",
     "project",
     "rasterize",
     "render",

@@ -40,8 +40,19 @@ def use_numba(backend: str, *tensors: Tensor) -> bool:
     return True
 
 
-def describe_backend(backend: str, device: str) -> dict[str, str | int]:
-    """What renders float32 on a device, why, and with how many threads; for the record of a run.
+def prepare_backend(backend: str, device: str, threads: int = 1) -> dict[str, str | int]:
+    """Choose what renders float32 on a device, and give it its threads.
+
+    With the Numba kernels torch itself gets one thread: its threads keep their cores busy while they wait for work,
+    which costs the kernels more than torch gains.
+
+    Args:
+        backend: See `BackendName`.
+        device: As torch writes it.
+        threads: CPU threads. One is the best choice for several processes on one machine.
+
+    Returns:
+        ``backend`` that will render, the ``reason`` why, and its ``threads``, for the record of a run.
 
     Raises:
         ValueError: If Numba is asked for but cannot be used.
@@ -56,7 +67,12 @@ def describe_backend(backend: str, device: str) -> dict[str, str | int]:
     reason = "asked for"
     if backend == "auto":
         reason = why_no_numba() or f"{chosen} is the fastest on {place}"
-    return {"backend": chosen, "reason": reason, "threads": torch.get_num_threads()}
+    torch.set_num_threads(1 if chosen == "numba" else threads)
+    if chosen == "numba":
+        from tracking3d.rendering.kernels.threads import set_num_threads
+
+        set_num_threads(threads)
+    return {"backend": chosen, "reason": reason, "threads": threads}
 
 
 @functools.cache

@@ -163,11 +163,8 @@ def render(
     screen, depth = to_screen(x_cam, K), x_cam[..., 2]
     visibility = rasterize(screen, depth, faces, size, backend)
     index = visibility.face_index
-    silhouette = soft_silhouette(
-        screen, depth, faces, index, band.sigma, band.boxlen, band.knum, backend
-    )
+    silhouette = soft_silhouette(screen, depth, faces, index, band.sigma, band.boxlen, band.knum, backend)
     uv = interpolate(screen, depth, faces, face_uvs, index, backend)
-    pixels = torch.nonzero(index.reshape(-1) >= 0)[:, 0]
     return Rendering(
-        index, visibility.depth, silhouette, pixels, uv, texture, x_cam, screen, faces, K, backend
+        index, visibility.depth, silhouette, visibility.pixels, uv, texture, x_cam, screen, faces, K, backend
     )

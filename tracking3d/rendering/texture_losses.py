@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 
-import torch
 from kornia.losses import cauchy_loss
 from torch import Tensor
 

@@ -26,10 +26,12 @@ class Visibility:
     Attributes:
         face_index: ``(B, H, W)`` int64, -1 where no face is.
         depth: ``(B, H, W)`` z in camera coordinates, infinite where no face is.
+        pixels: ``(P,)`` int64, flat indices of the covered pixels in ``(B, H, W)``, rising.
     """
 
     face_index: Tensor
     depth: Tensor
+    pixels: Tensor
 
 
 def expand_ranges(first: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
@@ -81,7 +83,7 @@ def rasterize(
 
         return Visibility(*visibility.rasterize(screen, depth, faces, size, NEAR))
     batch, (height, width) = len(screen), size
-    view, face, (x0, x1, y0, y1) = _boxes_in_front(screen, depth, faces, size)
+    view, face, area, (x0, x1, y0, y1) = _boxes_in_front(screen, depth, faces, size)
     vertex = faces.index_select(0, face).T + view * screen.shape[1]  # (3, M) in screen.flatten(0, 1)
     box, y = expand_ranges(y0, y1 - y0 + 1)  # rows of the boxes
     row, x = expand_ranges(gather(x0, box), gather(x1 - x0 + 1, box))
@@ -91,12 +93,11 @@ def rasterize(
     ox, oy, ex, ey = (plane.index_select(1, box) for plane in _directed_edges(screen, vertex))
     along, ox, ey = (plane.index_select(1, row) for plane in (ex * (y - oy), ox, ey))
     w = along - ey * (x - ox)  # (3, N)
-    area = w.sum(0)
-    inside = torch.nonzero((w.amin(0) >= 0) & (area > 0))[:, 0]
+    inside = torch.nonzero(w.amin(0) >= 0)[:, 0]
     row = gather(row, inside)
     owner = gather(box, row)
-    z = gather(depth, vertex).index_select(1, owner)
-    inverse_depth = (w.index_select(1, inside) / z).sum(0) / gather(area, inside)
+    by_weight = (gather(depth, vertex).reciprocal() * area.reciprocal()).index_select(1, owner)
+    inverse_depth = (w.index_select(1, inside) * by_weight).sum(0)
     pixel = gather(row_start, row) + gather(x, inside)
 
     nearest = screen.new_zeros(batch * height * width)
@@ -105,13 +106,14 @@ def rasterize(
     face_index = torch.full((batch * height * width,), -1, device=screen.device)
     face_index.scatter_reduce_(0, pixel, claimant, "amin", include_self=False)
     shape = (batch, height, width)
-    return Visibility(face_index.reshape(shape), nearest.reciprocal().reshape(shape))
+    covered = torch.nonzero(face_index >= 0)[:, 0]
+    return Visibility(face_index.reshape(shape), nearest.reciprocal().reshape(shape), covered)
 
 
 def _boxes_in_front(
     screen: Tensor, depth: Tensor, faces: Tensor, size: tuple[int, int]
-) -> tuple[Tensor, Tensor, list[Tensor]]:
-    """Faces that may be seen: ``(M,)`` view, face, and inclusive bounds x0, x1, y0, y1 of their pixels."""
+) -> tuple[Tensor, Tensor, Tensor, list[Tensor]]:
+    """Faces that may be seen: ``(M,)`` view, face, twice the area, and bounds x0, x1, y0, y1, all inclusive."""
     height, width = size
     x, y, z = (face_corners(plane, faces) for plane in (*screen.unbind(2), depth))
     # Twice the area on the screen; positive in front, for y points down.
@@ -120,7 +122,7 @@ def _boxes_in_front(
     x1, y1 = x.amax(1).floor().clamp(-1, width - 1), y.amax(1).floor().clamp(-1, height - 1)
     drawn = (area > 0) & (z.amin(1) > NEAR) & (x0 <= x1) & (y0 <= y1)
     view, face = torch.nonzero(drawn, as_tuple=True)
-    return view, face, [bound[view, face].long() for bound in (x0, x1, y0, y1)]
+    return view, face, area[view, face], [bound[view, face].long() for bound in (x0, x1, y0, y1)]
 
 
 def _directed_edges(screen: Tensor, vertex: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

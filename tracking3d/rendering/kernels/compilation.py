@@ -89,7 +89,7 @@ def check_corners(faces: Tensor, screen: Tensor) -> None:
         )
 
 
-class _Announcer(event.Listener):  # type: ignore[misc]
+class _Announcer(event.Listener):
     """Tells the user of the first compilation in this process."""
 
     def __init__(self, folder: str | None) -> None:

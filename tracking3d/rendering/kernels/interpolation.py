@@ -1,4 +1,8 @@
-"""Kernels of `tracking3d.rendering.interpolation`; the backward pass computes the barycentrics again."""
+"""Kernels of `tracking3d.rendering.interpolation`; the backward pass computes the barycentrics again.
+
+Neighbours in a row mostly show the same face: what depends on the face only is computed once for such a run, and
+its gradients are summed up before they are added to the vertices.
+"""
 # mypy: disable-error-code="no-untyped-def"
 
 from __future__ import annotations
@@ -25,11 +29,11 @@ class Interpolate(torch.autograd.Function):
     def forward(
         ctx: Any, screen: Tensor, depth: Tensor, faces: Tensor, attributes: Tensor, face_index: Tensor
     ) -> Tensor:
+        check_corners(faces, screen)
         index = array(face_index)
         ends = np.empty(len(index) + 1, dtype=np.int64)
         if _count(index, ends) >= len(faces):
             raise IndexError(f"face_index names face {int(index.max())}, but there are {len(faces)} faces")
-        check_corners(faces, screen)
         values = torch.empty(int(ends[-1]), attributes.shape[3])
         arrays = array(screen), array(depth), array(faces), array(attributes), index, ends
         share(_forward, len(index), 2, *arrays, values.numpy())
@@ -68,17 +72,37 @@ def _count(face_index, ends):
 
 
 @numba.njit(inline="always", **OPTIONS)
-def _barycentrics(ax, ay, bx, by, cx, cy, x, y):
-    """Screen barycentrics of a point, and their slopes by x and by y, as three triples."""
-    # Edge i lies opposite corner i.
-    ex0, ey0, ex1, ey1, ex2, ey2 = cx - bx, cy - by, ax - cx, ay - cy, bx - ax, by - ay
-    scale = np.float32(1) / (ex1 * ey2 - ey1 * ex2)
-    x0, x1, x2 = -ey0 * scale, -ey1 * scale, -ey2 * scale
-    y0, y1, y2 = ex0 * scale, ex1 * scale, ex2 * scale
-    w0 = (x - bx) * x0 + (y - by) * y0
-    w1 = (x - cx) * x1 + (y - cy) * y1
-    w2 = (x - ax) * x2 + (y - ay) * y2
-    return (w0, w1, w2), (x0, x1, x2), (y0, y1, y2)
+def _slopes(corners, z, a, b, c):
+    """Slopes of the screen barycentrics by x and by y, and of their sums over the depths; inverse depths."""
+    ax, ay, bx, by, cx, cy = (
+        corners[a, 0], corners[a, 1], corners[b, 0], corners[b, 1], corners[c, 0], corners[c, 1]
+    )  # fmt: skip
+    one = np.float32(1)
+    scale = one / ((ax - cx) * (by - ay) - (ay - cy) * (bx - ax))
+    by_x = (by - cy) * scale, (cy - ay) * scale, (ay - by) * scale
+    by_y = (cx - bx) * scale, (ax - cx) * scale, (bx - ax) * scale
+    return (ax, ay, bx, by, cx, cy), by_x, by_y, (one / z[a], one / z[b], one / z[c])
+
+
+@numba.njit(inline="always", **OPTIONS)
+def _barycentrics(place, by_x, by_y, x, y):
+    """Screen barycentrics of a pixel, each measured from the corner that follows."""
+    ax, ay, bx, by, cx, cy = place
+    return (
+        (x - bx) * by_x[0] + (y - by) * by_y[0],
+        (x - cx) * by_x[1] + (y - cy) * by_y[1],
+        (x - ax) * by_x[2] + (y - ay) * by_y[2],
+    )
+
+
+@numba.njit(inline="always", **OPTIONS)
+def _mix(attributes, mesh, face, wa, wb, wc, values, row, channels):
+    for k in range(channels):
+        values[row, k] = (
+            wa * attributes[mesh, face, 0, k]
+            + wb * attributes[mesh, face, 1, k]
+            + wc * attributes[mesh, face, 2, k]
+        )
 
 
 @kernel(
@@ -89,27 +113,40 @@ def _forward(screen, depth, faces, attributes, face_index, ends, values, first, 
     height, width = face_index.shape[1:]
     channels = attributes.shape[3]
     for view in range(first, last):
-        corners, z = screen[view], depth[view]
-        per_face = attributes[view if len(attributes) > 1 else 0]
+        mesh = view if len(attributes) > 1 else 0
         row = ends[view]
         for y in range(height):
-            for x in range(width):
+            x = 0
+            while x < width:
                 face = face_index[view, y, x]
                 if face < 0:
+                    x += 1
                     continue
-                a, b, c = faces[face]
-                w, _, _ = _barycentrics(
-                    corners[a, 0], corners[a, 1], corners[b, 0], corners[b, 1], corners[c, 0], corners[c, 1],
-                    np.float32(x), np.float32(y),
-                )  # fmt: skip
-                wa, wb, wc = w[0] / z[a], w[1] / z[b], w[2] / z[c]
-                s = np.float32(1) / (wa + wb + wc)
-                wa, wb, wc = wa * s, wb * s, wc * s
-                for k in range(channels):
-                    values[row, k] = (
-                        wa * per_face[face, 0, k] + wb * per_face[face, 1, k] + wc * per_face[face, 2, k]
-                    )
-                row += 1
+                place, by_x, by_y, inverse = _slopes(
+                    screen[view], depth[view], faces[face, 0], faces[face, 1], faces[face, 2]
+                )
+                while x < width and face_index[view, y, x] == face:
+                    w = _barycentrics(place, by_x, by_y, np.float32(x), np.float32(y))
+                    wa, wb, wc = w[0] * inverse[0], w[1] * inverse[1], w[2] * inverse[2]
+                    s = np.float32(1) / (wa + wb + wc)
+                    if channels == 2:  # texture coordinates: a loop of known length is not a loop any more
+                        _mix(attributes, mesh, face, wa * s, wb * s, wc * s, values, row, 2)
+                    else:
+                        _mix(attributes, mesh, face, wa * s, wb * s, wc * s, values, row, channels)
+                    row += 1
+                    x += 1
+
+
+@numba.njit(inline="always", **OPTIONS)
+def _differences(attributes, mesh, face, values, grad, row, channels):
+    """For each corner ``sum_k dL/du_k (u_k of the corner - u_k)``."""
+    ga, gb, gc = np.float32(0), np.float32(0), np.float32(0)
+    for k in range(channels):
+        value, slope = values[row, k], grad[row, k]
+        ga += slope * (attributes[mesh, face, 0, k] - value)
+        gb += slope * (attributes[mesh, face, 1, k] - value)
+        gc += slope * (attributes[mesh, face, 2, k] - value)
+    return ga, gb, gc
 
 
 @kernel(
@@ -123,45 +160,54 @@ def _backward(
     height, width = face_index.shape[1:]
     channels = attributes.shape[3]
     for view in range(first, last):
-        corners, z = screen[view], depth[view]
         mesh = view if len(attributes) > 1 else 0
-        row = ends[view] - 1
+        by_corner, by_z = grad_screen[view], grad_depth[view]
+        row = ends[view]
         for y in range(height):
-            for x in range(width):
+            x = 0
+            while x < width:
                 face = face_index[view, y, x]
                 if face < 0:
+                    x += 1
                     continue
-                row += 1
                 a, b, c = faces[face]
-                w, by_x, by_y = _barycentrics(
-                    corners[a, 0], corners[a, 1], corners[b, 0], corners[b, 1], corners[c, 0], corners[c, 1],
-                    np.float32(x), np.float32(y),
-                )  # fmt: skip
-                one = np.float32(1)
-                ia, ib, ic = one / z[a], one / z[b], one / z[c]
-                s = one / (w[0] * ia + w[1] * ib + w[2] * ic)
-                ga, gb, gc = np.float32(0), np.float32(0), np.float32(0)
-                for k in range(channels):
-                    value, slope = values[row, k], grad[row, k]
-                    ga += slope * (attributes[mesh, face, 0, k] - value)
-                    gb += slope * (attributes[mesh, face, 1, k] - value)
-                    gc += slope * (attributes[mesh, face, 2, k] - value)
-                ga, gb, gc = ga * s * ia, gb * s * ib, gc * s * ic  # by the screen barycentrics
-                gx = ga * by_x[0] + gb * by_x[1] + gc * by_x[2]
-                gy = ga * by_y[0] + gb * by_y[1] + gc * by_y[2]
-                grad_screen[view, a, 0] -= w[0] * gx
-                grad_screen[view, a, 1] -= w[0] * gy
-                grad_screen[view, b, 0] -= w[1] * gx
-                grad_screen[view, b, 1] -= w[1] * gy
-                grad_screen[view, c, 0] -= w[2] * gx
-                grad_screen[view, c, 1] -= w[2] * gy
-                grad_depth[view, a] -= ga * w[0] * ia
-                grad_depth[view, b] -= gb * w[1] * ib
-                grad_depth[view, c] -= gc * w[2] * ic
-                if len(grad_attributes):
-                    la, lb, lc = w[0] * ia * s, w[1] * ib * s, w[2] * ic * s
-                    for k in range(channels):
-                        slope = grad[row, k]
-                        grad_attributes[mesh, face, 0, k] += slope * la
-                        grad_attributes[mesh, face, 1, k] += slope * lb
-                        grad_attributes[mesh, face, 2, k] += slope * lc
+                place, by_x, by_y, inverse = _slopes(screen[view], depth[view], a, b, c)
+                ax = ay = bx = by = cx = cy = az = bz = cz = np.float32(0)
+                while x < width and face_index[view, y, x] == face:
+                    w = _barycentrics(place, by_x, by_y, np.float32(x), np.float32(y))
+                    wa, wb, wc = w[0] * inverse[0], w[1] * inverse[1], w[2] * inverse[2]
+                    s = np.float32(1) / (wa + wb + wc)
+                    if channels == 2:
+                        ga, gb, gc = _differences(attributes, mesh, face, values, grad, row, 2)
+                    else:
+                        ga, gb, gc = _differences(attributes, mesh, face, values, grad, row, channels)
+                    ga, gb, gc = ga * s, gb * s, gc * s
+                    az += ga * wa
+                    bz += gb * wb
+                    cz += gc * wc
+                    ga, gb, gc = ga * inverse[0], gb * inverse[1], gc * inverse[2]  # by the barycentrics
+                    gx = ga * by_x[0] + gb * by_x[1] + gc * by_x[2]
+                    gy = ga * by_y[0] + gb * by_y[1] + gc * by_y[2]
+                    ax += w[0] * gx
+                    ay += w[0] * gy
+                    bx += w[1] * gx
+                    by += w[1] * gy
+                    cx += w[2] * gx
+                    cy += w[2] * gy
+                    if len(grad_attributes):
+                        for k in range(channels):
+                            slope = grad[row, k] * s
+                            grad_attributes[mesh, face, 0, k] += slope * wa
+                            grad_attributes[mesh, face, 1, k] += slope * wb
+                            grad_attributes[mesh, face, 2, k] += slope * wc
+                    row += 1
+                    x += 1
+                by_corner[a, 0] -= ax
+                by_corner[a, 1] -= ay
+                by_corner[b, 0] -= bx
+                by_corner[b, 1] -= by
+                by_corner[c, 0] -= cx
+                by_corner[c, 1] -= cy
+                by_z[a] -= az * inverse[0]
+                by_z[b] -= bz * inverse[1]
+                by_z[c] -= cz * inverse[2]

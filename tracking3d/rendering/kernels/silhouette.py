@@ -43,16 +43,17 @@ class SoftSilhouette(torch.autograd.Function):
         corners, index = array(screen), array(face_index)
         boxes = np.empty((views, len(faces), 5), np.int32)
         most = np.empty((views, 2), np.int64)  # boxes and pairs of each view
-        share(_boxes, views, 2, corners, array(depth), array(faces), index, near, boxlen, boxes, most)
+        rest, silhouette = torch.empty(face_index.shape), torch.empty(face_index.shape)
+        arrays = corners, array(depth), array(faces)
+        share(_boxes, views, 2, *arrays, index, near, boxlen, rest.numpy(), boxes, most)
         ends = np.concatenate([np.zeros(1, np.int64), most[:, 1].cumsum()])
         places = np.empty((int(ends[-1]), 3), np.int32)
         slopes = np.empty((int(ends[-1]), 3), np.float32)
-        rest = torch.empty(face_index.shape)
         band = sigma, knum, epsilon
-        outputs = rest.numpy(), places, slopes
-        share(_pairs, views, 2, corners, array(faces), index, boxes, most, ends, *band, *outputs)
+        outputs = rest.numpy(), silhouette.numpy(), places, slopes
+        share(_pairs, views, 2, corners, array(faces), boxes, most, ends, *band, *outputs)
         ctx.shape, ctx.pairs = screen.shape, (most, ends, places, slopes, rest.numpy())
-        return 1 - rest
+        return silhouette
 
     @staticmethod
     @once_differentiable
@@ -86,21 +87,31 @@ def _corners_of(screen, faces, face, width, height):
 
 
 @kernel(
-    "void(float32[:,:,::1], float32[:,::1], int64[:,::1], int64[:,:,::1], float64, float64, int32[:,:,::1],"
-    " int64[:,::1], int64, int64)"
+    "void(float32[:,:,::1], float32[:,::1], int64[:,::1], int64[:,:,::1], float64, float64,"
+    " float32[:,:,::1], int32[:,:,::1], int64[:,::1], int64, int64)"
 )
-def _boxes(screen, depth, faces, face_index, near, boxlen, boxes, most, first, last):
-    """Faces whose grown box holds an uncovered pixel, with the box: x0, x1, y0, y1, in order."""
+def _boxes(screen, depth, faces, face_index, near, boxlen, rest, boxes, most, first, last):
+    """Faces whose grown box holds an uncovered pixel, with the box: x0, x1, y0, y1, in order.
+
+    ``rest`` becomes 1 at uncovered pixels and 0 at covered ones.
+    """
     height, width = face_index.shape[1:]
     grown = np.float32(boxlen)
     before = np.zeros((height + 1, width + 1), np.int32)
     for view in range(first, last):
-        z, index = depth[view], face_index[view]
+        z, index, product = depth[view], face_index[view], rest[view]
+        # A vertex that is not finite shows: its view is NaN where it is uncovered.
+        start = np.float32(1)
+        for vertex in range(screen.shape[1]):
+            if not (math.isfinite(screen[view, vertex, 0]) and math.isfinite(screen[view, vertex, 1])):
+                start = np.float32(np.nan)
         for y in range(height):
             line = 0
             for x in range(width):
-                line += index[y, x] < 0
+                uncovered = index[y, x] < 0
+                line += uncovered
                 before[y + 1, x + 1] = before[y, x + 1] + line
+                product[y, x] = start if uncovered else np.float32(0)
         found, pairs = 0, 0
         for face in range(len(faces)):
             if not (z[faces[face, 0]] > near and z[faces[face, 1]] > near and z[faces[face, 2]] > near):
@@ -131,31 +142,23 @@ def _nearest(px, py, ax, ay, ex, ey, inverse_length2):
 
 
 @kernel(
-    "void(float32[:,:,::1], int64[:,::1], int64[:,:,::1], int32[:,:,::1], int64[:,::1], int64[::1], float64, int64,"
-    " float64, float32[:,:,::1], int32[:,::1], float32[:,::1], int64, int64)"
+    "void(float32[:,:,::1], int64[:,::1], int32[:,:,::1], int64[:,::1], int64[::1], float64, int64,"
+    " float64, float32[:,:,::1], float32[:,:,::1], int32[:,::1], float32[:,::1], int64, int64)"
 )
 def _pairs(
-    screen, faces, face_index, boxes, most, ends, sigma, knum, epsilon, rest, places, slopes, first, last
+    screen, faces, boxes, most, ends, sigma, knum, epsilon, rest, silhouette, places, slopes, first, last
 ):
-    """``1 - S``; and for each pair its pixel, the nearest edge's two corners, t, the way r there, and a factor.
+    """``1 - S``; and for each pair its pixel, the nearest edge's two corners, t, and ``factor r``.
 
-    The factor times ``r (1 - S) dL/dS`` is the gradient by the nearest point of the edge.
+    The factor is such that ``factor r (1 - S) dL/dS`` is the gradient by the nearest point of the edge.
     """
-    height, width = face_index.shape[1:]
+    height, width = rest.shape[1:]
     sharpness, small = np.float32(sigma), np.float32(epsilon)
     one, two = np.float32(1), np.float32(2)
-    count = np.empty((height, width), np.int32)
+    count = np.empty(height * width, np.int32)
     for view in range(first, last):
-        index, product = face_index[view], rest[view]
-        # A vertex that is not finite shows: its view is NaN where it is uncovered.
-        start = one
-        for vertex in range(screen.shape[1]):
-            if not (math.isfinite(screen[view, vertex, 0]) and math.isfinite(screen[view, vertex, 1])):
-                start = np.float32(np.nan)
-        for y in range(height):
-            for x in range(width):
-                product[y, x] = start if index[y, x] < 0 else np.float32(0)
-                count[y, x] = 0
+        product, drawn = rest[view].reshape(-1), silhouette[view].reshape(-1)
+        count[:] = 0
         pair = ends[view]
         for position in range(most[view, 0]):
             face, x0, x1, y0, y1 = boxes[view, position]
@@ -168,9 +171,10 @@ def _pairs(
             for y in range(y0, y1):
                 py = _ndc(np.float32(y), height)
                 for x in range(x0, x1):
-                    if index[y, x] >= 0 or count[y, x] >= knum:
+                    pixel = y * width + x
+                    if product[pixel] == 0 or count[pixel] >= knum:
                         continue
-                    count[y, x] += 1
+                    count[pixel] += 1
                     px = _ndc(np.float32(x), width)
                     begin, end = a, b
                     t, rx, ry, d2 = _nearest(px, py, ax, ay, abx, aby, ab)
@@ -181,13 +185,14 @@ def _pairs(
                     if other_d2 < d2:
                         begin, end, t, rx, ry, d2 = c, a, other_t, other_x, other_y, other_d2
                     e = np.float32(math.exp(-sharpness * d2))
-                    product[y, x] *= one - e
+                    product[pixel] *= one - e
                     factor = two * sharpness * e / (one - e + small)
-                    places[pair, 0], places[pair, 1], places[pair, 2] = y * width + x, begin, end
-                    slopes[pair, 0], slopes[pair, 1] = t, factor * rx
-                    slopes[pair, 2] = factor * ry
+                    places[pair, 0], places[pair, 1], places[pair, 2] = pixel, begin, end
+                    slopes[pair, 0], slopes[pair, 1], slopes[pair, 2] = t, factor * rx, factor * ry
                     pair += 1
         most[view, 1] = pair - ends[view]
+        for pixel in range(height * width):
+            drawn[pixel] = one - product[pixel]
 
 
 @kernel(

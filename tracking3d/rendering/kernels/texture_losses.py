@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from tracking3d.rendering.kernels.compilation import OPTIONS, REORDER, array, kernel
-from tracking3d.rendering.kernels.threads import share
+from tracking3d.rendering.kernels.threads import get_num_threads, share
 
 _PIXELS, _ROWS, _WORK = 4000, 64, 400_000  # worth another thread: pixels, rows, values of pixels
 
@@ -57,7 +57,7 @@ class TextureLosses(torch.autograd.Function):
         texture, uv = arrays[:2]
         for_texture = ctx.needs_input_grad[0]
         work = len(uv) * texture.shape[2]
-        parts = max(1, min(torch.get_num_threads(), work // _WORK)) if for_texture else 1
+        parts = max(1, min(get_num_threads(), work // _WORK)) if for_texture else 1
         # Each thread adds to a texture of its own; the first one's starts with the total variation's gradient.
         grad_textures = torch.zeros(parts, *texture.shape) if for_texture else torch.zeros(1, 0, 0, 0)
         if for_texture and ctx.smooth:
@@ -90,10 +90,9 @@ def _factor(residual, i, sharpness):
     return np.float32(1) + residual[i] * residual[i] * sharpness
 
 
-@numba.njit(fastmath=REORDER, **OPTIONS)
-def _sum_of_cauchy(residual, sharpness):
-    """Sum of ``log(1 + sharpness r^2)``."""
-    count = len(residual)
+@numba.njit(inline="always", **OPTIONS)
+def _sum_of_cauchy(residual, count, sharpness):
+    """Sum of ``log(1 + sharpness r^2)`` of the first ``count`` values."""
     whole = count - count % 64
     total = 0.0
     for start in range(0, whole, 64):
@@ -117,6 +116,65 @@ def _sum_of_cauchy(residual, sharpness):
     return total
 
 
+@numba.njit(inline="always", **OPTIONS)
+def _compare(texture, taps, target, residual, channels, sharpness):
+    """Sum of the losses of one pixel."""
+    top, bottom, left, right, fx, fy, _ = taps
+    w00, w01, w10, w11 = _weights(fx, fy)
+    t00, t01, t10, t11 = (
+        texture[top, left],
+        texture[top, right],
+        texture[bottom, left],
+        texture[bottom, right],
+    )
+    for c in range(channels):
+        residual[c] = w00 * t00[c] + w01 * t01[c] + w10 * t10[c] + w11 * t11[c] - target[c]
+    return _sum_of_cauchy(residual, channels, sharpness)
+
+
+@numba.njit(inline="always", **OPTIONS)
+def _compare_slope(texture, taps, target, slope, channels, sharpness, weight, out):
+    """Slopes of ``weight`` times the loss of one pixel by x and y in texels; adds those by texels to ``out``."""
+    one = np.float32(1)
+    top, bottom, left, right, fx, fy, _ = taps
+    w00, w01, w10, w11 = _weights(fx, fy)
+    t00, t01, t10, t11 = (
+        texture[top, left],
+        texture[top, right],
+        texture[bottom, left],
+        texture[bottom, right],
+    )
+    by_x, by_y = np.float32(0), np.float32(0)
+    for c in range(channels):
+        d = w00 * t00[c] + w01 * t01[c] + w10 * t10[c] + w11 * t11[c] - target[c]
+        g = weight * d / (one + d * d * sharpness)
+        slope[c] = g
+        by_x += g * ((one - fy) * (t01[c] - t00[c]) + fy * (t11[c] - t10[c]))
+        by_y += g * ((one - fx) * (t10[c] - t00[c]) + fx * (t11[c] - t01[c]))
+    if out.size:
+        _add(out[top, left], w00, slope, channels)
+        _add(out[top, right], w01, slope, channels)
+        _add(out[bottom, left], w10, slope, channels)
+        _add(out[bottom, right], w11, slope, channels)
+    return by_x, by_y
+
+
+@numba.njit(inline="always", **OPTIONS)
+def _weights(fx, fy):
+    one = np.float32(1)
+    return (one - fy) * (one - fx), (one - fy) * fx, fy * (one - fx), fy * fx
+
+
+@numba.njit(inline="always", **OPTIONS)
+def _add(target, factor, values, count):
+    """``target += factor * values``."""
+    for c in range(count):
+        target[c] += factor * values[c]
+
+
+# RGB has a path of its own in both kernels: a loop of known length is not a loop any more.
+
+
 @kernel(
     "void(float32[:,:,::1], float32[:,::1], float32[:,::1], int64[::1], float64, float32[::1], int64, int64)",
     fastmath=REORDER,
@@ -124,32 +182,17 @@ def _sum_of_cauchy(residual, sharpness):
 def _appearance(texture, uv, observed, pixels, scale, loss, first, last):
     height, width, channels = texture.shape
     sharpness = np.float32(1 / scale**2)
-    one = np.float32(1)
     residual = np.empty(channels, np.float32)
     for place in range(first, last):
         u, v = uv[place]
         if not (math.isfinite(u) and math.isfinite(v)):
             loss[place] = np.nan
             continue
-        top, bottom, left, right, fx, fy, _ = _taps(u, v, height, width)
-        w00, w01, w10, w11 = (one - fy) * (one - fx), (one - fy) * fx, fy * (one - fx), fy * fx
-        t00, t01, t10, t11 = texture[top, left], texture[top, right], texture[bottom, left], texture[bottom, right]
-        target = observed[pixels[place]]
-        for c in range(channels):
-            residual[c] = w00 * t00[c] + w01 * t01[c] + w10 * t10[c] + w11 * t11[c] - target[c]
-        loss[place] = _sum_of_cauchy(residual, sharpness) / channels
-
-
-@numba.njit(inline="always", **OPTIONS)
-def _add(target, factor, values):
-    """``target += factor * values``."""
-    if len(values) == 3:  # RGB: three additions are sooner done than a loop is set up
-        target[0] += factor * values[0]
-        target[1] += factor * values[1]
-        target[2] += factor * values[2]
-    else:
-        for c in range(len(values)):
-            target[c] += factor * values[c]
+        taps, target = _taps(u, v, height, width), observed[pixels[place]]
+        if channels == 3:
+            loss[place] = _compare(texture, taps, target, residual, 3, sharpness) / 3
+        else:
+            loss[place] = _compare(texture, taps, target, residual, channels, sharpness) / channels
 
 
 @kernel(
@@ -161,34 +204,21 @@ def _appearance_slope(texture, uv, observed, pixels, scale, grad, grad_textures,
     """Of the pixels in parts ``first`` to ``last`` of ``len(grad_textures)``."""
     height, width, channels = texture.shape
     sharpness = np.float32(1 / scale**2)
-    one = np.float32(1)
     parts = len(grad_textures)
-    slope = np.empty(channels, np.float32)
+    slope, out = np.empty(channels, np.float32), grad_textures[first]
     for place in range(len(uv) * first // parts, len(uv) * last // parts):
         weight = np.float32(2) * sharpness * grad[place] / np.float32(channels)
         u, v = uv[place]
         if weight == 0 or not (math.isfinite(u) and math.isfinite(v)):
             continue
-        top, bottom, left, right, fx, fy, free = _taps(u, v, height, width)
-        w00, w01, w10, w11 = (one - fy) * (one - fx), (one - fy) * fx, fy * (one - fx), fy * fx
-        t00, t01, t10, t11 = texture[top, left], texture[top, right], texture[bottom, left], texture[bottom, right]
-        target = observed[pixels[place]]
-        by_x, by_y = np.float32(0), np.float32(0)
-        for c in range(channels):
-            d = w00 * t00[c] + w01 * t01[c] + w10 * t10[c] + w11 * t11[c] - target[c]
-            g = weight * d / (one + d * d * sharpness)
-            slope[c] = g
-            by_x += g * ((one - fy) * (t01[c] - t00[c]) + fy * (t11[c] - t10[c]))
-            by_y += g * ((one - fx) * (t10[c] - t00[c]) + fx * (t11[c] - t01[c]))
+        taps, target = _taps(u, v, height, width), observed[pixels[place]]
+        if channels == 3:
+            by_x, by_y = _compare_slope(texture, taps, target, slope, 3, sharpness, weight, out)
+        else:
+            by_x, by_y = _compare_slope(texture, taps, target, slope, channels, sharpness, weight, out)
         grad_uv[place, 0] = by_x * np.float32(width)
-        if free:
+        if taps[6]:  # v is free to move
             grad_uv[place, 1] = by_y * np.float32(height)
-        if grad_textures.size:
-            out = grad_textures[first]
-            _add(out[top, left], w00, slope)
-            _add(out[top, right], w01, slope)
-            _add(out[bottom, left], w10, slope)
-            _add(out[bottom, right], w11, slope)
 
 
 @numba.njit(inline="always", **OPTIONS)
@@ -208,10 +238,10 @@ def _variation(texture, scale, sums, first, last):
         row = rows[y]
         _subtract(row[:-channels], row[channels:], residual[:-channels])
         _subtract(row[-channels:], row[:channels], residual[-channels:])
-        sums[0, y] = _sum_of_cauchy(residual, sharpness)
+        sums[0, y] = _sum_of_cauchy(residual, len(residual), sharpness)
         if y + 1 < height:
             _subtract(row, rows[y + 1], residual)
-            sums[1, y] = _sum_of_cauchy(residual, sharpness)
+            sums[1, y] = _sum_of_cauchy(residual, len(residual), sharpness)
 
 
 @numba.njit(fastmath=REORDER, **OPTIONS)

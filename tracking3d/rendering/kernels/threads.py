@@ -1,15 +1,37 @@
-"""Sharing a kernel's work among as many threads as torch uses (`torch.set_num_threads`)."""
+"""Sharing a kernel's work among threads.
+
+Their number is a setting of the process, as torch's is, and independent of it: threads of torch that wait for
+work keep their cores busy, so that both together are slower than either.
+"""
 
 from __future__ import annotations
 
 import functools
+import itertools
 import os
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-import torch
-
 from tracking3d.rendering.kernels.compilation import Kernel
+
+_threads = 1
+
+
+def set_num_threads(threads: int) -> None:
+    """Let kernels use this many threads; the default is one.
+
+    Raises:
+        ValueError: If it is less than one.
+    """
+    global _threads
+    if threads < 1:
+        raise ValueError(f"the number of threads is {threads}; give one or more")
+    _threads = threads
+
+
+def get_num_threads() -> int:
+    """How many threads kernels may use."""
+    return _threads
 
 
 def share(kernel: Kernel, count: int, least: int, *arguments: Any) -> None:
@@ -21,14 +43,14 @@ def share(kernel: Kernel, count: int, least: int, *arguments: Any) -> None:
         least: Fewest items for which waking another thread pays.
         *arguments: Come before the range.
     """
-    threads = min(torch.get_num_threads(), count // least)
+    threads = min(_threads, count // least)
     if threads <= 1:
         kernel(*arguments, 0, count)
         return
     bounds = [count * part // threads for part in range(threads + 1)]
     others = [
         _pool(threads - 1).submit(kernel, *arguments, first, last)
-        for first, last in zip(bounds[1:-1], bounds[2:], strict=True)
+        for first, last in itertools.pairwise(bounds[1:])
     ]
     kernel(*arguments, bounds[0], bounds[1])
     for other in others:

@@ -16,8 +16,8 @@ from tracking3d.rendering.kernels.threads import share
 
 def rasterize(
     screen: Tensor, depth: Tensor, faces: Tensor, size: tuple[int, int], near: float
-) -> tuple[Tensor, Tensor]:
-    """Face index and depth ``(B, H, W)`` of the nearest front faces.
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Face index and depth ``(B, H, W)`` of the nearest front faces, and the covered pixels.
 
     Args:
         screen: ``(B, V, 2)``; depth: ``(B, V)``; faces: ``(F, 3)``; size: ``(H, W)``, see
@@ -29,8 +29,11 @@ def rasterize(
     face_index = torch.full(shape, -1)
     drawn = torch.zeros(shape)
     arrays = array(screen), array(depth), array(faces)
-    share(_rasterize, len(screen), 2, *arrays, near, face_index.numpy(), drawn.numpy())
-    return face_index, drawn
+    counts = np.zeros(len(screen), np.int64)
+    share(_rasterize, len(screen), 2, *arrays, near, face_index.numpy(), drawn.numpy(), counts)
+    pixels = torch.empty(int(counts.sum()), dtype=torch.int64)
+    _list(face_index.numpy().reshape(-1), pixels.numpy())
+    return face_index, drawn, pixels
 
 
 @numba.njit(inline="always", **OPTIONS)
@@ -47,10 +50,11 @@ def _edge(corners, start, end):
 
 @kernel(
     "void(float32[:,:,::1], float32[:,::1], int64[:,::1], float64,"
-    " int64[:,:,::1], float32[:,:,::1], int64, int64)"
+    " int64[:,:,::1], float32[:,:,::1], int64[::1], int64, int64)"
 )
-def _rasterize(screen, depth, faces, near, face_index, drawn, first, last):
+def _rasterize(screen, depth, faces, near, face_index, drawn, counts, first, last):
     height, width = face_index.shape[1:]
+    one = np.float32(1)
     for view in range(first, last):
         corners, z = screen[view], depth[view]
         nearest, winner = drawn[view], face_index[view]  # inverse depths until the end
@@ -62,7 +66,8 @@ def _rasterize(screen, depth, faces, near, face_index, drawn, first, last):
             ax, ay, bx, by, cx, cy = (
                 corners[a, 0], corners[a, 1], corners[b, 0], corners[b, 1], corners[c, 0], corners[c, 1]
             )  # fmt: skip
-            if not (by - ay) * (cx - ax) - (bx - ax) * (cy - ay) > 0:
+            area = (by - ay) * (cx - ax) - (bx - ax) * (cy - ay)
+            if not area > 0:
                 continue
             x0 = math.ceil(max(min(ax, bx, cx), np.float32(0)))
             y0 = math.ceil(max(min(ay, by, cy), np.float32(0)))
@@ -70,6 +75,9 @@ def _rasterize(screen, depth, faces, near, face_index, drawn, first, last):
             y1 = math.floor(min(max(ay, by, cy), np.float32(height - 1)))
             if x0 > x1 or y0 > y1:
                 continue
+            by_a, by_b, by_c = (
+                (one / za) * (one / area), (one / zb) * (one / area), (one / zc) * (one / area)
+            )  # fmt: skip
             oxa, oya, exa, eya = _edge(corners, b, c)
             oxb, oyb, exb, eyb = _edge(corners, c, a)
             oxc, oyc, exc, eyc = _edge(corners, a, b)
@@ -81,12 +89,24 @@ def _rasterize(screen, depth, faces, near, face_index, drawn, first, last):
                     wa = along_a - eya * (fx - oxa)
                     wb = along_b - eyb * (fx - oxb)
                     wc = along_c - eyc * (fx - oxc)
-                    area = wa + wb + wc
-                    if wa >= 0 and wb >= 0 and wc >= 0 and area > 0:
-                        inverse_depth = (wa / za + wb / zb + wc / zc) / area
+                    if wa >= 0 and wb >= 0 and wc >= 0:
+                        inverse_depth = wa * by_a + wb * by_b + wc * by_c
                         if inverse_depth > nearest[y, x]:
                             nearest[y, x] = inverse_depth
                             winner[y, x] = face
+        covered = 0
         for y in range(height):
             for x in range(width):
-                nearest[y, x] = 1 / nearest[y, x]
+                covered += nearest[y, x] > 0
+                nearest[y, x] = one / nearest[y, x]
+        counts[view] = covered
+
+
+@kernel("void(int64[::1], int64[::1])")
+def _list(face_index, pixels):
+    """Where ``face_index`` is not negative."""
+    place = 0
+    for pixel in range(len(face_index)):
+        if face_index[pixel] >= 0:
+            pixels[place] = pixel
+            place += 1
