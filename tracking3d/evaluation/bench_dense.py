@@ -58,6 +58,7 @@ def render_dense(
         x_cam,
         screen,
         faces,
+        face_uvs,
         K,
         "torch",
     )

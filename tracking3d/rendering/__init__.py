@@ -3,8 +3,10 @@
 from tracking3d.rendering.backend import BackendName, prepare_backend
 from tracking3d.rendering.backprojection import BackProjection, TexelMap, back_project
 from tracking3d.rendering.interpolation import interpolate
+from tracking3d.rendering.normal_equations import NormalEquations, pose_normal_equations
 from tracking3d.rendering.renderer import Rendering, SoftBand, project, render
 from tracking3d.rendering.silhouette import soft_silhouette
+from tracking3d.rendering.surface_visibility import visible_texels, visible_vertices
 from tracking3d.rendering.texture import sample_texture
 from tracking3d.rendering.texture_losses import channels_last, texture_losses
 from tracking3d.rendering.visibility import Visibility, rasterize
@@ -12,6 +14,7 @@ from tracking3d.rendering.visibility import Visibility, rasterize
 __all__ = [
     "BackProjection",
     "BackendName",
+    "NormalEquations",
     "Rendering",
     "SoftBand",
     "TexelMap",
@@ -19,6 +22,7 @@ __all__ = [
     "back_project",
     "channels_last",
     "interpolate",
+    "pose_normal_equations",
     "prepare_backend",
     "project",
     "rasterize",
@@ -26,4 +30,6 @@ __all__ = [
     "sample_texture",
     "soft_silhouette",
     "texture_losses",
+    "visible_texels",
+    "visible_vertices",
 ]

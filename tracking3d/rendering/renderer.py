@@ -43,7 +43,7 @@ class Rendering:
         texture: ``(C, T, T)`` as given.
         x_cam: ``(B, V, 3)`` vertices in camera coordinates.
         screen: ``(B, V, 2)`` vertices in pixels.
-        faces: ``(F, 3)`` as given.
+        faces: ``(F, 3)``; face_uvs: ``(F, 3, 2)``; as given.
         K: ``(B, 3, 3)`` as given.
         backend: Which implementation was asked for.
     """
@@ -57,6 +57,7 @@ class Rendering:
     x_cam: Tensor
     screen: Tensor
     faces: Tensor
+    face_uvs: Tensor
     K: Tensor
     backend: str = "auto"
 
@@ -166,5 +167,6 @@ def render(
     silhouette = soft_silhouette(screen, depth, faces, index, band.sigma, band.boxlen, band.knum, backend)
     uv = interpolate(screen, depth, faces, face_uvs, index, backend)
     return Rendering(
-        index, visibility.depth, silhouette, visibility.pixels, uv, texture, x_cam, screen, faces, K, backend
-    )
+        index, visibility.depth, silhouette, visibility.pixels, uv, texture, x_cam, screen, faces, face_uvs, K,
+        backend,
+    )  # fmt: skip

@@ -1,5 +1,4 @@
 """Numba kernels of the renderer: float32 on the CPU, with gradients written by hand.
 
-Each file is the fast twin of the module of the same name one folder up, which is its specification. A file holds
-everything that its kernels call: Numba's cache on disk watches one file for each kernel.
+Each file is the fast twin of the module of the same name one folder up, which is its specification.
 """

@@ -10,6 +10,7 @@ import functools
 import logging
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numba
@@ -53,6 +54,7 @@ class Kernel:
     def _compile(self) -> Callable[..., Any]:
         try:
             dispatcher = numba.njit(cache=True, **self._options)(self._function)
+            _drop_stale(dispatcher.stats.cache_path, self._function.__name__)
             with event.install_listener("numba:compile", _Announcer(dispatcher.stats.cache_path)):
                 dispatcher.compile(self._signature)
         except Exception:
@@ -87,6 +89,14 @@ def check_corners(faces: Tensor, screen: Tensor) -> None:
         raise IndexError(
             f"faces name vertices {int(faces.min())} to {int(faces.max())}, but there are {count} vertices"
         )
+
+
+def _drop_stale(folder: str, name: str) -> None:
+    """Forget a compiled kernel that is older than any kernel's source: Numba looks at its own file only."""
+    newest = max(source.stat().st_mtime for source in Path(__file__).parent.glob("*.py"))
+    for index in Path(folder).glob(f"*.{name}-*.nbi"):
+        if index.stat().st_mtime < newest:
+            index.unlink(missing_ok=True)
 
 
 class _Announcer(event.Listener):

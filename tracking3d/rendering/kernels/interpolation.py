@@ -72,7 +72,7 @@ def _count(face_index, ends):
 
 
 @numba.njit(inline="always", **OPTIONS)
-def _slopes(corners, z, a, b, c):
+def slopes_of_face(corners, z, a, b, c):
     """Slopes of the screen barycentrics by x and by y, and of their sums over the depths; inverse depths."""
     ax, ay, bx, by, cx, cy = (
         corners[a, 0], corners[a, 1], corners[b, 0], corners[b, 1], corners[c, 0], corners[c, 1]
@@ -122,7 +122,7 @@ def _forward(screen, depth, faces, attributes, face_index, ends, values, first, 
                 if face < 0:
                     x += 1
                     continue
-                place, by_x, by_y, inverse = _slopes(
+                place, by_x, by_y, inverse = slopes_of_face(
                     screen[view], depth[view], faces[face, 0], faces[face, 1], faces[face, 2]
                 )
                 while x < width and face_index[view, y, x] == face:
@@ -171,7 +171,7 @@ def _backward(
                     x += 1
                     continue
                 a, b, c = faces[face]
-                place, by_x, by_y, inverse = _slopes(screen[view], depth[view], a, b, c)
+                place, by_x, by_y, inverse = slopes_of_face(screen[view], depth[view], a, b, c)
                 ax = ay = bx = by = cx = cy = az = bz = cz = np.float32(0)
                 while x < width and face_index[view, y, x] == face:
                     w = _barycentrics(place, by_x, by_y, np.float32(x), np.float32(y))

@@ -71,7 +71,7 @@ class TextureLosses(torch.autograd.Function):
 
 
 @numba.njit(inline="always", **OPTIONS)
-def _taps(u, v, height, width):
+def taps_of(u, v, height, width):
     """Two rows, two columns, the place between them, and whether v is free to move."""
     x = (u - np.floor(u)) * np.float32(width) - np.float32(0.5)
     y = v * np.float32(height) - np.float32(0.5)
@@ -120,7 +120,7 @@ def _sum_of_cauchy(residual, count, sharpness):
 def _compare(texture, taps, target, residual, channels, sharpness):
     """Sum of the losses of one pixel."""
     top, bottom, left, right, fx, fy, _ = taps
-    w00, w01, w10, w11 = _weights(fx, fy)
+    w00, w01, w10, w11 = bilinear_weights(fx, fy)
     t00, t01, t10, t11 = (
         texture[top, left],
         texture[top, right],
@@ -137,7 +137,7 @@ def _compare_slope(texture, taps, target, slope, channels, sharpness, weight, ou
     """Slopes of ``weight`` times the loss of one pixel by x and y in texels; adds those by texels to ``out``."""
     one = np.float32(1)
     top, bottom, left, right, fx, fy, _ = taps
-    w00, w01, w10, w11 = _weights(fx, fy)
+    w00, w01, w10, w11 = bilinear_weights(fx, fy)
     t00, t01, t10, t11 = (
         texture[top, left],
         texture[top, right],
@@ -160,7 +160,7 @@ def _compare_slope(texture, taps, target, slope, channels, sharpness, weight, ou
 
 
 @numba.njit(inline="always", **OPTIONS)
-def _weights(fx, fy):
+def bilinear_weights(fx, fy):
     one = np.float32(1)
     return (one - fy) * (one - fx), (one - fy) * fx, fy * (one - fx), fy * fx
 
@@ -188,7 +188,7 @@ def _appearance(texture, uv, observed, pixels, scale, loss, first, last):
         if not (math.isfinite(u) and math.isfinite(v)):
             loss[place] = np.nan
             continue
-        taps, target = _taps(u, v, height, width), observed[pixels[place]]
+        taps, target = taps_of(u, v, height, width), observed[pixels[place]]
         if channels == 3:
             loss[place] = _compare(texture, taps, target, residual, 3, sharpness) / 3
         else:
@@ -211,7 +211,7 @@ def _appearance_slope(texture, uv, observed, pixels, scale, grad, grad_textures,
         u, v = uv[place]
         if weight == 0 or not (math.isfinite(u) and math.isfinite(v)):
             continue
-        taps, target = _taps(u, v, height, width), observed[pixels[place]]
+        taps, target = taps_of(u, v, height, width), observed[pixels[place]]
         if channels == 3:
             by_x, by_y = _compare_slope(texture, taps, target, slope, 3, sharpness, weight, out)
         else:

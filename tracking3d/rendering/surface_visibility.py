@@ -1,0 +1,63 @@
+"""Which vertices and texels of a rendered mesh are seen in each frame.
+
+A surface point is seen if it lies in the window, on a face that is seen from its front, and not behind what is
+drawn around it.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from tracking3d.rendering.backprojection import TexelMap
+from tracking3d.rendering.renderer import Rendering, to_screen
+from tracking3d.rendering.visibility import NEAR
+
+DEPTH_TOLERANCE = 0.01
+"""How far behind the drawn surface a point may lie and still be seen, in radii of the mesh."""
+
+
+@torch.no_grad()
+def visible_vertices(drawn: Rendering) -> Tensor:
+    """``(B, V)`` bool: the vertices that are seen; one front face at a vertex suffices."""
+    front = front_faces(drawn.screen, drawn.faces)
+    corners = drawn.faces.reshape(-1).expand(len(front), -1)
+    facing = torch.zeros(drawn.screen.shape[:2], dtype=torch.bool, device=front.device)
+    facing = facing.scatter_reduce(1, corners, front.repeat_interleave(3, 1), "amax")
+    return facing & _unhidden(drawn, drawn.x_cam)
+
+
+@torch.no_grad()
+def visible_texels(drawn: Rendering, texels: TexelMap) -> Tensor:
+    """``(B, N)`` bool: the texels of the atlas that are seen, in the order of ``texels.texel``."""
+    corners = drawn.x_cam[:, drawn.faces[texels.face]]  # (B, N, 3, 3)
+    points = (corners * texels.barycentric[..., None]).sum(2)
+    front = front_faces(drawn.screen, drawn.faces).index_select(1, texels.face)
+    return front & _unhidden(drawn, points)
+
+
+def front_faces(screen: Tensor, faces: Tensor) -> Tensor:
+    """``(B, F)`` bool: the faces that turn their front to the camera, from ``(B, V, 2)`` pixels."""
+    a, b, c = (screen.index_select(1, corner) for corner in faces.unbind(1))
+    ab, ac = b - a, c - a
+    return ab[..., 1] * ac[..., 0] > ab[..., 0] * ac[..., 1]
+
+
+def _unhidden(drawn: Rendering, points: Tensor) -> Tensor:
+    """``(B, N)``: points ``(B, N, 3)`` in camera coordinates that lie in the window and behind nothing.
+
+    A point's depth is compared with the deepest of the four pixel centres around it: on a plane it lies between
+    those four, however steep the plane is.
+    """
+    _, height, width = drawn.depth.shape
+    pixel = to_screen(points, drawn.K)
+    inside = (pixel > -0.5).all(2) & (pixel < pixel.new_tensor([width - 0.5, height - 0.5])).all(2)
+    low = torch.where(inside[..., None], pixel, 0.0).floor().long()
+    x = [(low[..., 0] + step).clamp(0, width - 1) for step in (0, 1)]
+    y = [(low[..., 1] + step).clamp(0, height - 1) for step in (0, 1)]
+    flat = drawn.depth.flatten(1)
+    around = torch.stack([flat.gather(1, row * width + column) for row in y for column in x])
+    centre = drawn.x_cam.mean(1, keepdim=True)
+    radius = (drawn.x_cam - centre).norm(dim=2).amax(1, keepdim=True)
+    depth = points[..., 2]
+    return inside & (depth > NEAR) & (depth < around.amax(0) + DEPTH_TOLERANCE * radius)
