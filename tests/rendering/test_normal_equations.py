@@ -22,7 +22,9 @@ def exponential(w: Tensor) -> Tensor:
     return torch.linalg.matrix_exp(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], 1).reshape(-1, 3, 3))
 
 
-def moved(scene: Textured, step: Tensor, backend: str = "torch", dtype: torch.dtype = torch.float64) -> Rendering:
+def moved(
+    scene: Textured, step: Tensor, backend: str = "torch", dtype: torch.dtype = torch.float64
+) -> Rendering:
     """The scene, rotated about the objects' origins and shifted in the camera's axes by (v, w)."""
     step = step.to(torch.float64)
     return render(
@@ -54,7 +56,9 @@ def problem(channels: int = 3) -> tuple[Textured, Tensor, Tensor]:
     generator = torch.Generator().manual_seed(5)
     still = torch.zeros(2, 6, dtype=torch.float64)
     drawn = moved(scene, still)
-    observed = drawn.image() + 0.2 * torch.randn(drawn.image().shape, generator=generator, dtype=torch.float64)
+    observed = drawn.image() + 0.2 * torch.randn(
+        drawn.image().shape, generator=generator, dtype=torch.float64
+    )
     weight = torch.rand(len(drawn.pixels), generator=generator, dtype=torch.float64)
     return scene, observed, weight * (weight > 0.2)
 
@@ -122,12 +126,16 @@ def test_steps_lead_to_the_true_pose_in_a_few_iterations(backend):
     step = torch.tensor([[0.03, -0.02, 0.05, 0.05, -0.04, 0.03]]).repeat(3, 1)
     R, t = exponential(step[:, 3:].double()) @ scene.R, scene.t + step[:, :3]
     for _ in range(12):
-        there = Textured(scene.vertices, scene.faces, scene.face_uvs, scene.texture, R, t, scene.K, scene.size)
+        there = Textured(
+            scene.vertices, scene.faces, scene.face_uvs, scene.texture, R, t, scene.K, scene.size
+        )
         drawn = moved(there, torch.zeros(3, 6), backend, torch.float32)
         inside = (truth.face_index.reshape(-1)[drawn.pixels] >= 0).float()
         update = pose_normal_equations(drawn, observed, t.float(), SCALE, inside).step().double()
         R, t = exponential(update[:, 3:]) @ R, t + update[:, :3]
-    turned = torch.rad2deg(torch.arccos(((R @ scene.R.mT).diagonal(dim1=1, dim2=2).sum(1) - 1).div(2).clamp(-1, 1)))
+    turned = torch.rad2deg(
+        torch.arccos(((R @ scene.R.mT).diagonal(dim1=1, dim2=2).sum(1) - 1).div(2).clamp(-1, 1))
+    )
     assert turned.max() < 0.1
     assert (t - scene.t).abs().max() < 0.005
 

@@ -2,6 +2,13 @@
 
 from tracking3d.rendering.backend import BackendName, prepare_backend
 from tracking3d.rendering.backprojection import BackProjection, TexelMap, back_project
+from tracking3d.rendering.contour import (
+    Contour,
+    contour_loss,
+    contour_normal_equations,
+    find_contour,
+    signed_distance,
+)
 from tracking3d.rendering.interpolation import interpolate
 from tracking3d.rendering.normal_equations import NormalEquations, pose_normal_equations
 from tracking3d.rendering.renderer import Rendering, SoftBand, project, render
@@ -14,6 +21,7 @@ from tracking3d.rendering.visibility import Visibility, rasterize
 __all__ = [
     "BackProjection",
     "BackendName",
+    "Contour",
     "NormalEquations",
     "Rendering",
     "SoftBand",
@@ -21,6 +29,9 @@ __all__ = [
     "Visibility",
     "back_project",
     "channels_last",
+    "contour_loss",
+    "contour_normal_equations",
+    "find_contour",
     "interpolate",
     "pose_normal_equations",
     "prepare_backend",
@@ -28,6 +39,7 @@ __all__ = [
     "rasterize",
     "render",
     "sample_texture",
+    "signed_distance",
     "soft_silhouette",
     "texture_losses",
     "visible_texels",

@@ -116,7 +116,10 @@ def pose_normal_equations(
     gradient = -torch.einsum("pia,pi->pa", motion, pull)
     cost = share * torch.log1p((residual / scale).square()).sum(1)
     return NormalEquations(
-        *(part.new_zeros(batch, *part.shape[1:]).index_add(0, view, part) for part in (matrix, gradient, cost))
+        *(
+            part.new_zeros(batch, *part.shape[1:]).index_add(0, view, part)
+            for part in (matrix, gradient, cost)
+        )
     )
 
 

@@ -48,7 +48,12 @@ def _of_channels(texture, taps, target, channels, sharpness, by_x, by_y):
     one = np.float32(1)
     top, bottom, left, right, fx, fy, free = taps
     w00, w01, w10, w11 = bilinear_weights(fx, fy)
-    t00, t01, t10, t11 = texture[top, left], texture[top, right], texture[bottom, left], texture[bottom, right]
+    t00, t01, t10, t11 = (
+        texture[top, left],
+        texture[top, right],
+        texture[bottom, left],
+        texture[bottom, right],
+    )
     down = one if free else np.float32(0)
     xx = xy = yy = x = y = np.float32(0)
     loss, product = 0.0, 1.0

@@ -161,6 +161,7 @@ def _compare_slope(texture, taps, target, slope, channels, sharpness, weight, ou
 
 @numba.njit(inline="always", **OPTIONS)
 def bilinear_weights(fx, fy):
+    """Weights of the four taps, row by row."""
     one = np.float32(1)
     return (one - fy) * (one - fx), (one - fy) * fx, fy * (one - fx), fy * fx
 
