@@ -16,8 +16,10 @@ from tracking3d.evaluation.score import Scores
 EXACT = {
     "tracking3d": """Frame FrameEstimate ObjectModel PipelineConfig Prompt Session Status __version__ load_config
         track""",
-    "tracking3d.rendering": """BackProjection Rendering SoftBand TexelMap Visibility back_project project
-        rasterize render sample_texture soft_silhouette""",
+    "tracking3d.rendering": """BackProjection BackendName Contour NormalEquations Rendering SoftBand TexelMap Visibility
+        back_project channels_last contour_loss contour_normal_equations find_contour interpolate
+        pose_normal_equations prepare_backend project rasterize render sample_texture signed_distance
+        soft_silhouette texture_losses visible_texels visible_vertices""",
     "tracking3d.video": """FrameSource Intrinsics VideoWriter natural_order open_source parse_selection
         read_image""",
 }

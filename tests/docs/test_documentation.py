@@ -16,6 +16,7 @@ from tracking3d.config.loading import load_config
 from tracking3d.config.models import PipelineConfig
 from tracking3d.evaluation.score import Scores
 from tracking3d.geometry.camera import Camera
+from tracking3d.rendering import prepare_backend
 from tracking3d.results import layout
 from tracking3d.results.description import description_at_start, summary
 from tracking3d.results.records import FrameRecord
@@ -78,10 +79,25 @@ def test_run_folder_page_names_every_file_and_key():
     page = (ROOT / "docs/run-folder.md").read_text(encoding="utf-8")
     files = [value for name, value in vars(layout).items() if name.isupper() and isinstance(value, str)]
     start = description_at_start(
-        config={}, camera=Camera.from_fov(4, 4), source="", selection=None, seed=0, fps=None, command=None
+        config={},
+        camera=Camera.from_fov(4, 4),
+        source="",
+        selection=None,
+        seed=0,
+        fps=None,
+        command=None,
+        renderer=prepare_backend("auto", "cpu"),
     )
     end = summary([], 0, 0.0)
-    keys = {*start, *start["versions"], *start["camera"], *end, *end["counts"], *end["timings"]}
+    keys = {
+        *start,
+        *start["versions"],
+        *start["camera"],
+        *start["renderer"],
+        *end,
+        *end["counts"],
+        *end["timings"],
+    }
     for name in {*files, *keys, *FrameRecord.__dataclass_fields__} - {layout.FORMAT}:
         assert name in page, name
 

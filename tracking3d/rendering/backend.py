@@ -17,15 +17,14 @@ def use_numba(backend: str, *tensors: Tensor) -> bool:
 
     Args:
         backend: See `BackendName`.
-        *tensors: All that is to be rendered.
+        *tensors: All that is to be rendered, of floating-point types.
 
     Raises:
         ValueError: If Numba is asked for but cannot render these tensors, or there is no such backend.
     """
     if backend == "torch":
         return False
-    dtypes = {(tensor.dtype, tensor.device.type) for tensor in tensors if tensor.is_floating_point()}
-    fits = dtypes == {(torch.float32, "cpu")}
+    fits = all(tensor.dtype is torch.float32 and tensor.is_cpu for tensor in tensors)
     if backend == "auto":
         return fits and not why_no_numba()
     if backend != "numba":
@@ -33,7 +32,7 @@ def use_numba(backend: str, *tensors: Tensor) -> bool:
     if why_no_numba():
         raise ValueError(f"the backend 'numba' cannot be used: {why_no_numba()}; choose auto or torch")
     if not fits:
-        found = ", ".join(sorted(f"{dtype} on {device}" for dtype, device in dtypes))
+        found = ", ".join(sorted({f"{tensor.dtype} on {tensor.device.type}" for tensor in tensors}))
         raise ValueError(
             f"the backend 'numba' renders torch.float32 on cpu, not {found}; choose auto or torch"
         )
