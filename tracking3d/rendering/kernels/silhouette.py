@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from tracking3d.rendering.kernels.compilation import OPTIONS, array, check_corners, kernel
+from tracking3d.rendering.kernels.compilation import OPTIONS, REORDER, array, check_corners, kernel
 from tracking3d.rendering.kernels.threads import share
 
 _TINY = np.finfo(np.float32).tiny
@@ -143,7 +143,8 @@ def _nearest(px, py, ax, ay, ex, ey, inverse_length2):
 
 @kernel(
     "void(float32[:,:,::1], int64[:,::1], int32[:,:,::1], int64[:,::1], int64[::1], float64, int64,"
-    " float64, float32[:,:,::1], float32[:,:,::1], int32[:,::1], float32[:,::1], int64, int64)"
+    " float64, float32[:,:,::1], float32[:,:,::1], int32[:,::1], float32[:,::1], int64, int64)",
+    fastmath=REORDER,
 )
 def _pairs(
     screen, faces, boxes, most, ends, sigma, knum, epsilon, rest, silhouette, places, slopes, first, last
@@ -176,14 +177,18 @@ def _pairs(
                         continue
                     count[pixel] += 1
                     px = _ndc(np.float32(x), width)
-                    begin, end = a, b
+                    # Selections instead of branches, which nobody can predict here.
                     t, rx, ry, d2 = _nearest(px, py, ax, ay, abx, aby, ab)
-                    other_t, other_x, other_y, other_d2 = _nearest(px, py, bx, by, bcx, bcy, bc)
-                    if other_d2 < d2:
-                        begin, end, t, rx, ry, d2 = b, c, other_t, other_x, other_y, other_d2
-                    other_t, other_x, other_y, other_d2 = _nearest(px, py, cx, cy, cax, cay, ca)
-                    if other_d2 < d2:
-                        begin, end, t, rx, ry, d2 = c, a, other_t, other_x, other_y, other_d2
+                    t1, rx1, ry1, d21 = _nearest(px, py, bx, by, bcx, bcy, bc)
+                    t2, rx2, ry2, d22 = _nearest(px, py, cx, cy, cax, cay, ca)
+                    second = d21 < d2
+                    t, rx, ry = t1 if second else t, rx1 if second else rx, ry1 if second else ry
+                    d2 = d21 if second else d2
+                    third = d22 < d2
+                    t, rx, ry = t2 if third else t, rx2 if third else rx, ry2 if third else ry
+                    d2 = d22 if third else d2
+                    begin = c if third else (b if second else a)
+                    end = a if third else (c if second else b)
                     e = np.float32(math.exp(-sharpness * d2))
                     product[pixel] *= one - e
                     factor = two * sharpness * e / (one - e + small)

@@ -29,10 +29,11 @@ def rasterize(
     face_index = torch.full(shape, -1)
     drawn = torch.zeros(shape)
     arrays = array(screen), array(depth), array(faces)
-    counts = np.zeros(len(screen), np.int64)
-    share(_rasterize, len(screen), 2, *arrays, near, face_index.numpy(), drawn.numpy(), counts)
-    pixels = torch.empty(int(counts.sum()), dtype=torch.int64)
-    _list(face_index.numpy().reshape(-1), pixels.numpy())
+    listed, counts = np.empty((shape[0], size[0] * size[1] + 1), np.int64), np.zeros(shape[0], np.int64)
+    outputs = face_index.numpy(), drawn.numpy(), listed, counts
+    share(_rasterize, len(screen), 2, *arrays, near, *outputs)
+    covered = [line[:count] for line, count in zip(listed, counts, strict=True)]
+    pixels = torch.from_numpy(np.concatenate(covered)) if covered else torch.empty(0, dtype=torch.int64)
     return face_index, drawn, pixels
 
 
@@ -50,9 +51,9 @@ def _edge(corners, start, end):
 
 @kernel(
     "void(float32[:,:,::1], float32[:,::1], int64[:,::1], float64,"
-    " int64[:,:,::1], float32[:,:,::1], int64[::1], int64, int64)"
+    " int64[:,:,::1], float32[:,:,::1], int64[:,::1], int64[::1], int64, int64)"
 )
-def _rasterize(screen, depth, faces, near, face_index, drawn, counts, first, last):
+def _rasterize(screen, depth, faces, near, face_index, drawn, listed, counts, first, last):
     height, width = face_index.shape[1:]
     one = np.float32(1)
     for view in range(first, last):
@@ -94,19 +95,12 @@ def _rasterize(screen, depth, faces, near, face_index, drawn, counts, first, las
                         if inverse_depth > nearest[y, x]:
                             nearest[y, x] = inverse_depth
                             winner[y, x] = face
+        # Without branches: the place after the last one is written again and again.
+        flat, line = nearest.reshape(-1), listed[view]
         covered = 0
-        for y in range(height):
-            for x in range(width):
-                covered += nearest[y, x] > 0
-                nearest[y, x] = one / nearest[y, x]
+        for pixel in range(height * width):
+            line[covered] = view * height * width + pixel
+            covered += flat[pixel] > 0
         counts[view] = covered
-
-
-@kernel("void(int64[::1], int64[::1])")
-def _list(face_index, pixels):
-    """Where ``face_index`` is not negative."""
-    place = 0
-    for pixel in range(len(face_index)):
-        if face_index[pixel] >= 0:
-            pixels[place] = pixel
-            place += 1
+        for pixel in range(height * width):
+            flat[pixel] = one / flat[pixel]
