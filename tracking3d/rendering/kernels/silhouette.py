@@ -42,17 +42,17 @@ class SoftSilhouette(torch.autograd.Function):
         views = len(screen)
         corners, index = array(screen), array(face_index)
         boxes = np.empty((views, len(faces), 5), np.int32)
-        most = np.empty((views, 2), np.int64)  # boxes and pairs of each view
+        counts = np.empty((views, 2), np.int64)  # of boxes and of pairs in each view, at most
         rest, silhouette = torch.empty(face_index.shape), torch.empty(face_index.shape)
         arrays = corners, array(depth), array(faces)
-        share(_boxes, views, 2, *arrays, index, near, boxlen, rest.numpy(), boxes, most)
-        ends = np.concatenate([np.zeros(1, np.int64), most[:, 1].cumsum()])
+        share(_boxes, views, 2, *arrays, index, near, boxlen, knum, rest.numpy(), boxes, counts)
+        ends = np.concatenate([np.zeros(1, np.int64), counts[:, 1].cumsum()])
         places = np.empty((int(ends[-1]), 3), np.int32)
         slopes = np.empty((int(ends[-1]), 3), np.float32)
         band = sigma, knum, epsilon
         outputs = rest.numpy(), silhouette.numpy(), places, slopes
-        share(_pairs, views, 2, corners, array(faces), boxes, most, ends, *band, *outputs)
-        ctx.shape, ctx.pairs = screen.shape, (most, ends, places, slopes, rest.numpy())
+        share(_pairs, views, 2, corners, array(faces), boxes, counts, ends, *band, *outputs)
+        ctx.shape, ctx.pairs = screen.shape, (counts, ends, places, slopes, rest.numpy())
         return silhouette
 
     @staticmethod
@@ -87,10 +87,10 @@ def _corners_of(screen, faces, face, width, height):
 
 
 @kernel(
-    "void(float32[:,:,::1], float32[:,::1], int64[:,::1], int64[:,:,::1], float64, float64,"
+    "void(float32[:,:,::1], float32[:,::1], int64[:,::1], int64[:,:,::1], float64, float64, int64,"
     " float32[:,:,::1], int32[:,:,::1], int64[:,::1], int64, int64)"
 )
-def _boxes(screen, depth, faces, face_index, near, boxlen, rest, boxes, most, first, last):
+def _boxes(screen, depth, faces, face_index, near, boxlen, knum, rest, boxes, counts, first, last):
     """Faces whose grown box holds an uncovered pixel, with the box: x0, x1, y0, y1, in order.
 
     ``rest`` becomes 1 at uncovered pixels and 0 at covered ones.
@@ -129,7 +129,7 @@ def _boxes(screen, depth, faces, face_index, near, boxlen, rest, boxes, most, fi
                 box[0], box[1], box[2], box[3], box[4] = face, x0, x1, y0, y1
                 found += 1
                 pairs += uncovered
-        most[view, 0], most[view, 1] = found, pairs
+        counts[view, 0], counts[view, 1] = found, min(pairs, knum * before[height, width])
 
 
 @numba.njit(inline="always", **OPTIONS)
@@ -147,7 +147,7 @@ def _nearest(px, py, ax, ay, ex, ey, inverse_length2):
     fastmath=REORDER,
 )
 def _pairs(
-    screen, faces, boxes, most, ends, sigma, knum, epsilon, rest, silhouette, places, slopes, first, last
+    screen, faces, boxes, counts, ends, sigma, knum, epsilon, rest, silhouette, places, slopes, first, last
 ):
     """``1 - S``; and for each pair its pixel, the nearest edge's two corners, t, and ``factor r``.
 
@@ -161,7 +161,7 @@ def _pairs(
         product, drawn = rest[view].reshape(-1), silhouette[view].reshape(-1)
         count[:] = 0
         pair = ends[view]
-        for position in range(most[view, 0]):
+        for position in range(counts[view, 0]):
             face, x0, x1, y0, y1 = boxes[view, position]
             a, b, c = faces[face]
             ax, ay, bx, by, cx, cy = _corners_of(screen[view], faces, face, width, height)
@@ -195,7 +195,7 @@ def _pairs(
                     places[pair, 0], places[pair, 1], places[pair, 2] = pixel, begin, end
                     slopes[pair, 0], slopes[pair, 1], slopes[pair, 2] = t, factor * rx, factor * ry
                     pair += 1
-        most[view, 1] = pair - ends[view]
+        counts[view, 1] = pair - ends[view]
         for pixel in range(height * width):
             drawn[pixel] = one - product[pixel]
 
@@ -204,12 +204,12 @@ def _pairs(
     "void(float32[:,:,::1], int64[:,::1], int64[::1], int32[:,::1], float32[:,::1], float32[:,:,::1],"
     " float32[:,:,::1], int64, int64)"
 )
-def _backward(grad, most, ends, places, slopes, rest, grad_screen, first, last):
+def _backward(grad, counts, ends, places, slopes, rest, grad_screen, first, last):
     height, width = grad.shape[1:]
     scale_x, scale_y = np.float32(2) / np.float32(width), np.float32(2) / np.float32(height)
     for view in range(first, last):
         grads, product, out = grad[view].reshape(-1), rest[view].reshape(-1), grad_screen[view]
-        for pair in range(ends[view], ends[view] + most[view, 1]):
+        for pair in range(ends[view], ends[view] + counts[view, 1]):
             pixel, begin, end = places[pair]
             weight = grads[pixel] * product[pixel]
             # d(d2)/da = -2 (1 - t) r and d(d2)/db = -2 t r for the nearest point a + t (b - a).
