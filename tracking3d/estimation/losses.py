@@ -35,7 +35,7 @@ def appearance_loss(
 
     Args:
         pixel_loss: ``(P,)`` Cauchy loss at the covered pixels, from `tracking3d.rendering.texture_losses`.
-        pixels: ``(P,)`` flat indices of the covered pixels in ``(B, H, W)``.
+        pixels: ``(P,)`` flat indices of the covered pixels in ``(B, H, W)``, rising.
         valid: ``(B, H, W)``.
         scale: Scale of the Cauchy loss (0.25).
         seen: ``(P,)`` how far the texture at each covered pixel is known, in [0, 1]; all known if None.
@@ -45,13 +45,13 @@ def appearance_loss(
         ``(B,)``; where nothing is covered, the cost of a residual of 1.
     """
     batch, height, width = valid.shape
-    view = torch.div(pixels, height * width, rounding_mode="floor")
+    firsts = torch.arange(batch + 1, device=pixels.device) * (height * width)
+    lengths = torch.searchsorted(pixels, firsts).diff()  # pixels of each frame
     loss = pixel_loss
     if seen is not None:
         loss = seen * loss + (1 - seen) * unseen_charge
     weight = valid.reshape(-1).index_select(0, pixels)
-    total = loss.new_zeros(batch).index_add(0, view, loss * weight)
-    count = loss.new_zeros(batch).index_add(0, view, weight)
+    total, count = (torch.segment_reduce(part, "sum", lengths=lengths) for part in (loss * weight, weight))
     # Were it zero, the cheapest pose would be out of sight, and the stopping rule satisfied there.
     nothing = math.log1p(1 / scale**2)
     return torch.where(count > 0, total / count.clamp_min(1.0), nothing)
