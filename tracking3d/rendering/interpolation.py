@@ -101,7 +101,7 @@ class _Interpolate(torch.autograd.Function):
         if len(attributes) > 1:
             face = face + view * len(faces)
         table = attributes.flatten(0, 1)
-        planes = table.permute(2, 1, 0).reshape(-1, len(table))
+        planes = table.permute(2, 1, 0).reshape(3 * table.shape[2], len(table))
         corner_values = planes.index_select(1, face).reshape(table.shape[2], 3, len(face))  # (D, 3, P)
         values = (share * corner_values).sum(1)  # (D, P)
         ctx.save_for_backward(vertex, face, w, by_x, by_y, z, s, share, corner_values, values)

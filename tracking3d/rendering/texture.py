@@ -12,14 +12,20 @@ from torch.nn import functional
 
 
 def sample_texture(texture: Tensor, uv: Tensor) -> Tensor:
-    """Sample ``texture`` ``(C, H, W)`` at ``uv`` ``(P, 2)``: ``(P, C)``, differentiable in both."""
+    """Sample ``texture`` ``(C, H, W)`` at ``uv`` ``(P, 2)``: ``(P, C)``, differentiable in both.
+
+    A place that is not finite gives NaN.
+    """
+    # grid_sample takes such a place for one on the border, and its gradient reads beyond the texture there.
+    sound = uv.isfinite().all(1)
+    uv = torch.where(sound[:, None], uv, 0.5)
     width = texture.shape[2]
     # One column on each side makes the bilinear taps wrap; u itself may pass 1 on faces across the seam.
     wrapped = torch.cat([texture[:, :, -1:], texture, texture[:, :, :1]], 2)
     x = (uv[:, 0].remainder(1.0) * width + 1.0) / (width + 2) * 2 - 1
     grid = torch.stack([x, uv[:, 1] * 2 - 1], 1)[None, None]
     sampled = functional.grid_sample(wrapped[None], grid, padding_mode="border", align_corners=False)
-    return sampled[0, :, 0].T
+    return torch.where(sound, sampled[0, :, 0], torch.nan).T
 
 
 def bilinear_taps(texture: Tensor, uv: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -76,5 +76,5 @@ def cauchy(a: Tensor, b: Tensor, scale: float) -> Tensor:
 def total_variation_loss(texture: Tensor, scale: float) -> Tensor:
     """Mean Cauchy loss between neighbouring texels of ``(C, T, T)``; neighbours wrap around in u."""
     right = cauchy(texture, texture.roll(-1, 2), scale).mean()
-    below = cauchy(texture[:, 1:], texture[:, :-1], scale).mean()
+    below = cauchy(texture[:, 1:], texture[:, :-1], scale).sum() / max(texture[:, 1:].numel(), 1)
     return right + below

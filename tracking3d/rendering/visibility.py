@@ -51,7 +51,7 @@ def expand_ranges(first: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
 
 def face_corners(plane: Tensor, faces: Tensor) -> Tensor:
     """``(B, 3, F)`` values at the corners of every face, from ``(B, V)`` values at the vertices."""
-    return plane.contiguous().index_select(1, faces.T.reshape(-1)).reshape(len(plane), 3, -1)
+    return plane.contiguous().index_select(1, faces.T.reshape(-1)).reshape(len(plane), 3, len(faces))
 
 
 def gather(plane: Tensor, index: Tensor) -> Tensor:
@@ -120,7 +120,7 @@ def _boxes_in_front(
     area = (y[:, 1] - y[:, 0]) * (x[:, 2] - x[:, 0]) - (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0])
     x0, y0 = x.amin(1).ceil().clamp(0, width), y.amin(1).ceil().clamp(0, height)
     x1, y1 = x.amax(1).floor().clamp(-1, width - 1), y.amax(1).floor().clamp(-1, height - 1)
-    drawn = (area > 0) & (z.amin(1) > NEAR) & (x0 <= x1) & (y0 <= y1)
+    drawn = (area > 0) & area.isfinite() & (z.amin(1) > NEAR) & (x0 <= x1) & (y0 <= y1)
     view, face = torch.nonzero(drawn, as_tuple=True)
     return view, face, area[view, face], [bound[view, face].long() for bound in (x0, x1, y0, y1)]
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from tracking3d.rendering.kernels.compilation import OPTIONS, array, check_corners, kernel
+from tracking3d.rendering.kernels.compilation import OPTIONS, REORDER, array, check_corners, kernel
 from tracking3d.rendering.kernels.threads import share
 
 
@@ -34,7 +34,7 @@ class Interpolate(torch.autograd.Function):
         ends = np.empty(len(index) + 1, dtype=np.int64)
         if _count(index, ends) >= len(faces):
             raise IndexError(f"face_index names face {int(index.max())}, but there are {len(faces)} faces")
-        values = torch.empty(int(ends[-1]), attributes.shape[3])
+        values = torch.empty(int(ends[-1]), attributes.shape[3], dtype=torch.float32)
         arrays = array(screen), array(depth), array(faces), array(attributes), index, ends
         share(_forward, len(index), 2, *arrays, values.numpy())
         ctx.save_for_backward(screen, depth, faces, attributes, face_index, values)
@@ -46,9 +46,9 @@ class Interpolate(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         *inputs, values = ctx.saved_tensors
         screen, depth, _, attributes, _ = inputs
-        grads = [torch.zeros(part.shape) for part in (screen, depth)]
+        grads = [torch.zeros(part.shape, dtype=torch.float32) for part in (screen, depth)]
         wanted = ctx.needs_input_grad[3]
-        grad_attributes = torch.zeros(attributes.shape if wanted else (0, 0, 0, 0))
+        grad_attributes = torch.zeros(attributes.shape if wanted else (0, 0, 0, 0), dtype=torch.float32)
         arrays = (*map(array, inputs), ctx.ends, array(values), array(grad))
         # Views that share their attributes would add to the same places.
         views, least = len(screen), 10**9 if wanted and len(attributes) == 1 else 2
@@ -107,7 +107,8 @@ def _mix(attributes, mesh, face, wa, wb, wc, values, row, channels):
 
 @kernel(
     "void(float32[:,:,::1], float32[:,::1], int64[:,::1], float32[:,:,:,::1], int64[:,:,::1], int64[::1],"
-    " float32[:,::1], int64, int64)"
+    " float32[:,::1], int64, int64)",
+    fastmath=REORDER,
 )
 def _forward(screen, depth, faces, attributes, face_index, ends, values, first, last):
     height, width = face_index.shape[1:]
@@ -151,7 +152,8 @@ def _differences(attributes, mesh, face, values, grad, row, channels):
 
 @kernel(
     "void(float32[:,:,::1], float32[:,::1], int64[:,::1], float32[:,:,:,::1], int64[:,:,::1], int64[::1],"
-    " float32[:,::1], float32[:,::1], float32[:,:,::1], float32[:,::1], float32[:,:,:,::1], int64, int64)"
+    " float32[:,::1], float32[:,::1], float32[:,:,::1], float32[:,::1], float32[:,:,:,::1], int64, int64)",
+    fastmath=REORDER,
 )
 def _backward(
     screen, depth, faces, attributes, face_index, ends, values, grad,

@@ -43,7 +43,10 @@ class SoftSilhouette(torch.autograd.Function):
         corners, index = array(screen), array(face_index)
         boxes = np.empty((views, len(faces), 5), np.int32)
         counts = np.empty((views, 2), np.int64)  # of boxes and of pairs in each view, at most
-        rest, silhouette = torch.empty(face_index.shape), torch.empty(face_index.shape)
+        rest, silhouette = (
+            torch.empty(face_index.shape, dtype=torch.float32),
+            torch.empty(face_index.shape, dtype=torch.float32),
+        )
         arrays = corners, array(depth), array(faces)
         share(_boxes, views, 2, *arrays, index, near, boxlen, knum, rest.numpy(), boxes, counts)
         ends = np.concatenate([np.zeros(1, np.int64), counts[:, 1].cumsum()])
@@ -58,7 +61,7 @@ class SoftSilhouette(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        grad_screen = torch.zeros(ctx.shape)
+        grad_screen = torch.zeros(ctx.shape, dtype=torch.float32)
         share(_backward, len(grad_screen), 2, array(grad), *ctx.pairs, grad_screen.numpy())
         return (grad_screen, *[None] * 8)
 

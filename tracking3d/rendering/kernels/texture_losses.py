@@ -37,7 +37,7 @@ class TextureLosses(torch.autograd.Function):
             raise IndexError(
                 f"pixels go from {int(pixels.min())} to {int(pixels.max())}, but there are {len(observed)}"
             )
-        loss = torch.empty(len(uv))
+        loss = torch.empty(len(uv), dtype=torch.float32)
         arrays = [array(part) for part in (texture, uv, observed, pixels)]
         share(_appearance, len(uv), _PIXELS, *arrays, scale, loss.numpy())
         variation = 0.0
@@ -59,11 +59,15 @@ class TextureLosses(torch.autograd.Function):
         work = len(uv) * texture.shape[2]
         parts = max(1, min(get_num_threads(), work // _WORK)) if for_texture else 1
         # Each thread adds to a texture of its own; the first one's starts with the total variation's gradient.
-        grad_textures = torch.zeros(parts, *texture.shape) if for_texture else torch.zeros(1, 0, 0, 0)
+        grad_textures = (
+            torch.zeros(parts, *texture.shape, dtype=torch.float32)
+            if for_texture
+            else torch.zeros(1, 0, 0, 0, dtype=torch.float32)
+        )
         if for_texture and ctx.smooth:
             first = grad_textures[0].numpy()
             share(_variation_slope, len(texture), _ROWS, texture, ctx.scale, float(grad_variation), first)
-        grad_uv = torch.zeros(uv.shape)
+        grad_uv = torch.zeros(uv.shape, dtype=torch.float32)
         outputs = array(grad_loss), grad_textures.numpy(), grad_uv.numpy()
         share(_appearance_slope, parts, 1, *arrays, ctx.scale, *outputs)
         grad_texture = grad_textures[0] if parts == 1 else grad_textures.sum(0)

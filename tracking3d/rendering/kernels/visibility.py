@@ -27,7 +27,7 @@ def rasterize(
     check_corners(faces, screen)
     shape = (len(screen), *size)
     face_index = torch.full(shape, -1)
-    drawn = torch.zeros(shape)
+    drawn = torch.zeros(shape, dtype=torch.float32)
     arrays = array(screen), array(depth), array(faces)
     listed, counts = np.empty((shape[0], size[0] * size[1] + 1), np.int64), np.zeros(shape[0], np.int64)
     outputs = face_index.numpy(), drawn.numpy(), listed, counts
@@ -68,7 +68,7 @@ def _rasterize(screen, depth, faces, near, face_index, drawn, listed, counts, fi
                 corners[a, 0], corners[a, 1], corners[b, 0], corners[b, 1], corners[c, 0], corners[c, 1]
             )  # fmt: skip
             area = (by - ay) * (cx - ax) - (bx - ax) * (cy - ay)
-            if not area > 0:
+            if not 0 < area < np.inf:
                 continue
             x0 = math.ceil(max(min(ax, bx, cx), np.float32(0)))
             y0 = math.ceil(max(min(ay, by, cy), np.float32(0)))
@@ -85,16 +85,20 @@ def _rasterize(screen, depth, faces, near, face_index, drawn, listed, counts, fi
             for y in range(y0, y1 + 1):
                 fy = np.float32(y)
                 along_a, along_b, along_c = exa * (fy - oya), exb * (fy - oyb), exc * (fy - oyc)
+                entered = False
                 for x in range(x0, x1 + 1):
                     fx = np.float32(x)
                     wa = along_a - eya * (fx - oxa)
                     wb = along_b - eyb * (fx - oxb)
                     wc = along_c - eyc * (fx - oxc)
-                    if wa >= 0 and wb >= 0 and wc >= 0:
+                    if min(wa, wb, wc) >= 0:
                         inverse_depth = wa * by_a + wb * by_b + wc * by_c
                         if inverse_depth > nearest[y, x]:
                             nearest[y, x] = inverse_depth
                             winner[y, x] = face
+                        entered = True
+                    elif entered:
+                        break  # a triangle is left once only
         # Without branches: the place after the last one is written again and again.
         flat, line = nearest.reshape(-1), listed[view]
         covered = 0
