@@ -91,6 +91,7 @@ def pose_normal_equations(
         pivot=(pivot, "B 3"),
         texture=(drawn.texture, "C T T"),
         pixels=(drawn.pixels, "P"),
+        weight=(drawn.pixels if weight is None else weight, "P"),
     )
     if weight is None:
         weight = torch.ones_like(drawn.uv[:, 0])

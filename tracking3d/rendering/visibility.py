@@ -98,13 +98,16 @@ def rasterize(
     owner = gather(box, row)
     by_weight = (gather(depth, vertex).reciprocal() * area.reciprocal()).index_select(1, owner)
     inverse_depth = (w.index_select(1, inside) * by_weight).sum(0)
+    inverse_depth = torch.where(inverse_depth > 0, inverse_depth, 0.0)  # nor NaN: not seen
     pixel = gather(row_start, row) + gather(x, inside)
 
     nearest = screen.new_zeros(batch * height * width)
     nearest.scatter_reduce_(0, pixel, inverse_depth, "amax")
-    claimant = torch.where(inverse_depth == gather(nearest, pixel), gather(face, owner), len(faces))
+    wins = (inverse_depth > 0) & (inverse_depth == gather(nearest, pixel))
+    claimant = torch.where(wins, gather(face, owner), len(faces))
     face_index = torch.full((batch * height * width,), -1, device=screen.device)
     face_index.scatter_reduce_(0, pixel, claimant, "amin", include_self=False)
+    face_index.masked_fill_(face_index == len(faces), -1)
     shape = (batch, height, width)
     covered = torch.nonzero(face_index >= 0)[:, 0]
     return Visibility(face_index.reshape(shape), nearest.reciprocal().reshape(shape), covered)

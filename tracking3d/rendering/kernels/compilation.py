@@ -6,6 +6,7 @@ at once do the same work at worst. Where no folder can be written, each process 
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import logging
 import threading
@@ -52,19 +53,33 @@ class Kernel:
         return self._compiled(*arguments)
 
     def _compile(self) -> Callable[..., Any]:
-        try:
-            dispatcher = numba.njit(cache=True, **self._options)(self._function)
-            _drop_stale(dispatcher.stats.cache_path, self._function.__name__)
-            with event.install_listener("numba:compile", _Announcer(dispatcher.stats.cache_path)):
-                dispatcher.compile(self._signature)
-        except Exception:
-            # No folder can be written, or what is there cannot be read. A fault of the kernel itself comes again.
+        dispatcher = self._with_cache()
+        if dispatcher is None:
             dispatcher = numba.njit(**self._options)(self._function)
             with event.install_listener("numba:compile", _Announcer(None)):
                 dispatcher.compile(self._signature)
         dispatcher.disable_compile()
         compiled: Callable[..., Any] = dispatcher
         return compiled
+
+    def _with_cache(self) -> Any:
+        """Load or compile and keep; None where no folder can be written, or the kernel is at fault."""
+        try:
+            dispatcher = numba.njit(cache=True, **self._options)(self._function)
+        except RuntimeError:
+            return None
+        folder = dispatcher.stats.cache_path
+        for _ in range(2):
+            try:
+                _drop_stale(folder, self._function.__name__)
+                with event.install_listener("numba:compile", _Announcer(folder)):
+                    dispatcher.compile(self._signature)
+                return dispatcher
+            except Exception:  # what a damaged file raises can be anything
+                if dispatcher.signatures:
+                    return dispatcher  # it is compiled, but cannot be kept
+                _forget(folder, self._function.__name__)
+        return None
 
 
 def kernel(signature: str, fastmath: set[str] | None = None) -> Callable[[Callable[..., Any]], Kernel]:
@@ -94,9 +109,15 @@ def check_corners(faces: Tensor, screen: Tensor) -> None:
 def _drop_stale(folder: str, name: str) -> None:
     """Forget a compiled kernel that is older than any kernel's source: Numba looks at its own file only."""
     newest = max(source.stat().st_mtime for source in Path(__file__).parent.glob("*.py"))
+    if any(index.stat().st_mtime < newest for index in Path(folder).glob(f"*.{name}-*.nbi")):
+        _forget(folder, name)
+
+
+def _forget(folder: str, name: str) -> None:
+    """Remove what says where a compiled kernel is kept."""
     for index in Path(folder).glob(f"*.{name}-*.nbi"):
-        if index.stat().st_mtime < newest:
-            index.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            index.unlink()
 
 
 class _Announcer(event.Listener):

@@ -99,7 +99,7 @@ def _boxes(screen, depth, faces, face_index, near, boxlen, knum, rest, boxes, co
     ``rest`` becomes 1 at uncovered pixels and 0 at covered ones.
     """
     height, width = face_index.shape[1:]
-    grown = np.float32(boxlen)
+    grown, plane = np.float32(boxlen), np.float32(near)
     before = np.zeros((height + 1, width + 1), np.int32)
     for view in range(first, last):
         z, index, product = depth[view], face_index[view], rest[view]
@@ -117,7 +117,7 @@ def _boxes(screen, depth, faces, face_index, near, boxlen, knum, rest, boxes, co
                 product[y, x] = start if uncovered else np.float32(0)
         found, pairs = 0, 0
         for face in range(len(faces)):
-            if not (z[faces[face, 0]] > near and z[faces[face, 1]] > near and z[faces[face, 2]] > near):
+            if not (z[faces[face, 0]] > plane and z[faces[face, 1]] > plane and z[faces[face, 2]] > plane):
                 continue
             ax, ay, bx, by, cx, cy = _corners_of(screen[view], faces, face, width, height)
             left, right = _bounds(min(ax, bx, cx), max(ax, bx, cx), grown, width)
@@ -132,7 +132,7 @@ def _boxes(screen, depth, faces, face_index, near, boxlen, knum, rest, boxes, co
                 box[0], box[1], box[2], box[3], box[4] = face, x0, x1, y0, y1
                 found += 1
                 pairs += uncovered
-        counts[view, 0], counts[view, 1] = found, min(pairs, knum * before[height, width])
+        counts[view, 0], counts[view, 1] = found, min(pairs, min(knum, pairs) * before[height, width])
 
 
 @numba.njit(inline="always", **OPTIONS)

@@ -55,14 +55,14 @@ def _edge(corners, start, end):
 )
 def _rasterize(screen, depth, faces, near, face_index, drawn, listed, counts, first, last):
     height, width = face_index.shape[1:]
-    one = np.float32(1)
+    one, plane = np.float32(1), np.float32(near)
     for view in range(first, last):
         corners, z = screen[view], depth[view]
         nearest, winner = drawn[view], face_index[view]  # inverse depths until the end
         for face in range(len(faces)):
             a, b, c = faces[face]
             za, zb, zc = z[a], z[b], z[c]
-            if not (za > near and zb > near and zc > near):
+            if not (za > plane and zb > plane and zc > plane):
                 continue
             ax, ay, bx, by, cx, cy = (
                 corners[a, 0], corners[a, 1], corners[b, 0], corners[b, 1], corners[c, 0], corners[c, 1]
