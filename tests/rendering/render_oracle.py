@@ -2,19 +2,37 @@
 
 Visibility is ray casting: the ray of pixel (x, y) is ``p = (x, y, 1)``, a vertex seen at ``(sx, sy)`` and depth
 z lies at ``(sx z, sy z, z)``, and the ray meets a triangle with corners X where ``[X_0 X_1 X_2] c = p`` has no
-negative entry: at barycentrics ``c / sum(c)`` and depth ``1 / sum(c)``. The soft mask is a loop over pixels and
-faces, written from the definition of DIB-R's kernel.
+negative entry: at barycentrics ``c / sum(c)`` and depth ``1 / sum(c)``. The soft mask is a loop over faces, written
+from the definition of DIB-R's kernel.
 """
 
 from __future__ import annotations
 
+import functools
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 NEAR = 1e-3
+
+
+def remembered(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Answers once for all implementations that are asked about the same scene."""
+    known: dict[tuple[Any, ...], Any] = {}
+
+    @functools.wraps(function)
+    def answer(*arguments: Any) -> Any:
+        key = tuple(part.tobytes() if isinstance(part, np.ndarray) else part for part in arguments)
+        if key not in known:
+            known[key] = function(*arguments)
+        return known[key]
+
+    return answer
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +55,7 @@ class Picture:
         return np.einsum("pk,pkd->pd", self.barycentrics[covered], attributes[self.face_index[covered]])
 
 
+@remembered
 def cast_rays(screen: Array, depth: Array, faces: NDArray[np.int64], size: tuple[int, int]) -> Picture:
     """The nearest front-facing face at every pixel of one view.
 
@@ -68,6 +87,17 @@ def cast_rays(screen: Array, depth: Array, faces: NDArray[np.int64], size: tuple
     return Picture(face_index.reshape(size), barycentrics.reshape(*size, 3), depths)
 
 
+def certain(
+    screen: Array, depth: Array, faces: NDArray[np.int64], size: tuple[int, int], reach: float = 1e-3
+) -> NDArray[np.bool_]:
+    """``(H, W)``: pixels around which all rays within ``reach`` pixels meet the same face."""
+    steps = [(reach, 0), (-reach, 0), (0, reach), (0, -reach)]
+    around = [cast_rays(screen + np.array(step), depth, faces, size).face_index for step in steps]
+    here = cast_rays(screen, depth, faces, size).face_index
+    return np.all([index == here for index in around], axis=0)
+
+
+@remembered
 def soft_mask(
     screen: Array,
     depth: Array,
@@ -85,32 +115,42 @@ def soft_mask(
         sigma, boxlen, knum: The kernel.
     """
     height, width = covered.shape
-    ndc = np.column_stack([(2 * screen[:, 0] + 1 - width) / width, (2 * screen[:, 1] + 1 - height) / height])
+    sides = np.array([width, height])
+    ndc = (2 * screen + 1 - sides) / sides
+    row, column = np.nonzero(~covered)
+    pixel = (2 * np.stack([column, row], 1) + 1 - sides) / sides
+    rest, taken = np.ones(len(pixel)), np.zeros(len(pixel), int)
+    for face in faces[depth[faces].min(1) > NEAR]:
+        low, high = ndc[face].min(0) - boxlen, ndc[face].max(0) + boxlen
+        counts = (pixel >= low).all(1) & (pixel < high).all(1) & (taken < knum)
+        rest[counts] *= 1 - np.exp(-sigma * squared_distance(pixel[counts], ndc[face]))
+        taken += counts
     mask = np.ones(covered.shape)
-    for row, column in np.argwhere(~covered):
-        pixel = np.array([(2 * column + 1 - width) / width, (2 * row + 1 - height) / height])
-        rest, taken = 1.0, 0
-        for face in faces:
-            corner = ndc[face]
-            low, high = corner.min(0) - boxlen, corner.max(0) + boxlen
-            if depth[face].min() <= NEAR or (pixel < low).any() or (pixel >= high).any():
-                continue
-            if taken == knum:
-                break
-            taken += 1
-            rest *= 1 - np.exp(-sigma * squared_distance(pixel, corner))
-        mask[row, column] = 1 - rest
+    mask[row, column] = 1 - rest
     return mask
 
 
-def squared_distance(point: Array, corner: Array) -> float:
-    """From ``point`` ``(2,)`` to the outline of the triangle ``corner`` ``(3, 2)``: its corners and its edges."""
-    best = float(((point - corner) ** 2).sum(1).min())
+def squared_distance(points: Array, corner: Array) -> Array:
+    """From ``points`` ``(N, 2)`` to the outline of the triangle ``corner`` ``(3, 2)``: its corners and its edges."""
+    best = ((points[:, None] - corner) ** 2).sum(2).min(1)
     for a, b in ((0, 1), (1, 2), (2, 0)):
         along = corner[b] - corner[a]
         length2 = along @ along
-        foot = (point - corner[a]) @ along
-        if 0 < foot < length2:
-            normal = np.array([-along[1], along[0]])
-            best = min(best, float((normal @ (point - corner[a])) ** 2 / length2))
+        foot = (points - corner[a]) @ along
+        beside = (foot > 0) & (foot < length2)
+        normal = np.array([-along[1], along[0]])
+        best[beside] = np.minimum(best[beside], ((points[beside] - corner[a]) @ normal) ** 2 / length2)
     return best
+
+
+def bilinear(texture: Array, u: float, v: float) -> Array:
+    """``(C,)``: the four texels of ``(C, H, W)`` around (u, v), columns taken round, rows held at the ends."""
+    _, height, width = texture.shape
+    x, y = u * width - 0.5, min(max(v * height - 0.5, 0.0), height - 1.0)
+    left, top = math.floor(x), min(math.floor(y), height - 1)
+    below = min(top + 1, height - 1)
+    rows = [
+        (1 - (x - left)) * texture[:, row, left % width] + (x - left) * texture[:, row, (left + 1) % width]
+        for row in (top, below)
+    ]
+    return (1 - (y - top)) * rows[0] + (y - top) * rows[1]

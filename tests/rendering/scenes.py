@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
+from implementations import Implementation
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -14,18 +15,18 @@ from tracking3d.rendering import project
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What is drawn, in float64, and into which ``(H, W)``."""
+    """What is drawn, and into which ``(H, W)``: numbers of float32 in float64, the same for all implementations."""
 
     screen: Tensor
     depth: Tensor
     faces: Tensor
     size: tuple[int, int]
+    backend: str = "torch"
 
-    def to(self, dtype: torch.dtype, device: str = "cpu") -> Scene:
-        """The same in another precision or place."""
-        return Scene(
-            self.screen.to(device, dtype), self.depth.to(device, dtype), self.faces.to(device), self.size
-        )
+    def by(self, implementation: Implementation) -> Scene:
+        """The same for another implementation."""
+        screen, depth = self.screen.to(implementation.dtype), self.depth.to(implementation.dtype)
+        return replace(self, screen=screen, depth=depth, backend=implementation.backend)
 
 
 def triangles(
@@ -46,7 +47,12 @@ def triangles(
     corner = centre + spread * torch.randn(views, faces, 3, 2, generator=generator, dtype=torch.float64)
     depth = 1 + torch.rand(views, 3 * faces, generator=generator, dtype=torch.float64)
     index = torch.arange(3 * faces).reshape(faces, 3)
-    return Scene((corner * extent).reshape(views, -1, 2), depth, index, size)
+    return Scene(rounded((corner * extent).reshape(views, -1, 2)), rounded(depth), index, size)
+
+
+def rounded(values: Tensor) -> Tensor:
+    """The nearest numbers of float32, in float64."""
+    return values.float().double()
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +71,8 @@ class Textured:
     @property
     def scene(self) -> Scene:
         """Its projection."""
-        return Scene(*project(self.vertices, self.R, self.t, self.K), self.faces, self.size)
+        screen, depth = project(self.vertices, self.R, self.t, self.K)
+        return Scene(rounded(screen), rounded(depth), self.faces, self.size)
 
     def arguments(self, dtype: torch.dtype = torch.float64, device: str = "cpu") -> dict[str, Tensor]:
         """The tensors by name, fresh leaves of an autograd graph."""

@@ -7,22 +7,11 @@ import math
 import numpy as np
 import pytest
 import torch
+from render_oracle import bilinear
 from torch.autograd import gradcheck
 
 from tracking3d.rendering import sample_texture
-
-
-def bilinear(texture: np.ndarray, u: float, v: float) -> np.ndarray:
-    """``(C,)``: the four texels around (u, v), columns taken round, rows held at the ends."""
-    _, height, width = texture.shape
-    x, y = u * width - 0.5, min(max(v * height - 0.5, 0.0), height - 1.0)
-    left, top = math.floor(x), min(math.floor(y), height - 1)
-    below = min(top + 1, height - 1)
-    rows = [
-        (1 - (x - left)) * texture[:, row, left % width] + (x - left) * texture[:, row, (left + 1) % width]
-        for row in (top, below)
-    ]
-    return (1 - (y - top)) * rows[0] + (y - top) * rows[1]
+from tracking3d.rendering.texture import bilinear_taps
 
 
 @pytest.fixture
@@ -89,3 +78,27 @@ def test_float32_agrees_with_float64(texture):
     uv = torch.rand(200, 2, generator=torch.Generator().manual_seed(3), dtype=torch.float64) * 1.2 - 0.1
     low = sample_texture(texture.float(), uv.float())
     torch.testing.assert_close(low.double(), sample_texture(texture, uv), rtol=0, atol=1e-5)
+
+
+def test_taps_are_the_samples_and_their_slopes(texture):
+    uv = torch.rand(60, 2, generator=torch.Generator().manual_seed(4), dtype=torch.float64) * 1.4 - 0.2
+    uv.requires_grad_()
+    sampled = sample_texture(texture, uv)
+    values, by_u, by_v = bilinear_taps(texture, uv.detach())
+    torch.testing.assert_close(values, sampled.detach())
+    for channel in range(3):
+        (slope,) = torch.autograd.grad(sampled[:, channel].sum(), uv, retain_graph=True)
+        torch.testing.assert_close(torch.stack([by_u[:, channel], by_v[:, channel]], 1), slope)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_a_place_that_is_not_finite_gives_nothing_and_pulls_at_nothing(texture, bad):
+    uv = torch.rand(6, 2, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    expected = sample_texture(texture, uv)
+    uv[0, 0] = uv[3, 1] = bad
+    uv.requires_grad_()
+    sampled = sample_texture(texture.requires_grad_(), uv)
+    assert sampled[[0, 3]].isnan().all()
+    torch.testing.assert_close(sampled[[1, 2, 4, 5]], expected[[1, 2, 4, 5]])
+    sampled[[1, 2, 4, 5]].sum().backward()
+    assert uv.grad.isfinite().all() and texture.grad.isfinite().all()

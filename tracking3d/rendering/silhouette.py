@@ -52,11 +52,13 @@ def soft_silhouette(
         backend: See `tracking3d.rendering.backend`.
 
     Raises:
-        ValueError: If a shape does not fit.
+        ValueError: If a shape does not fit, or no face is to count.
     """
     check_shapes(
         screen=(screen, "B V 2"), depth=(depth, "B V"), faces=(faces, "F 3"), face_index=(face_index, "B H W")
     )
+    if knum < 1:
+        raise ValueError(f"knum is {knum}; give the number of faces that count at a pixel, one or more")
     if use_numba(backend, screen, depth):
         from tracking3d.rendering.kernels.silhouette import SoftSilhouette
 

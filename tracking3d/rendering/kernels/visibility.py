@@ -70,10 +70,10 @@ def _rasterize(screen, depth, faces, near, face_index, drawn, listed, counts, fi
             area = (by - ay) * (cx - ax) - (bx - ax) * (cy - ay)
             if not 0 < area < np.inf:
                 continue
-            x0 = math.ceil(max(min(ax, bx, cx), np.float32(0)))
-            y0 = math.ceil(max(min(ay, by, cy), np.float32(0)))
-            x1 = math.floor(min(max(ax, bx, cx), np.float32(width - 1)))
-            y1 = math.floor(min(max(ay, by, cy), np.float32(height - 1)))
+            x0 = math.ceil(min(max(min(ax, bx, cx), np.float32(0)), np.float32(width)))
+            y0 = math.ceil(min(max(min(ay, by, cy), np.float32(0)), np.float32(height)))
+            x1 = math.floor(max(min(max(ax, bx, cx), np.float32(width - 1)), np.float32(-1)))
+            y1 = math.floor(max(min(max(ay, by, cy), np.float32(height - 1)), np.float32(-1)))
             if x0 > x1 or y0 > y1:
                 continue
             by_a, by_b, by_c = (
