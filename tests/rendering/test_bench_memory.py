@@ -1,0 +1,54 @@
+"""Memory is measured in a process of its own, and only what the iterations need."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tracking3d.evaluation import bench_memory
+from tracking3d.evaluation.bench_memory import forget_peak, peak_memory, resident_memory
+from tracking3d.evaluation.bench_scene import Problem
+
+CPU = torch.device("cpu")
+needs_proc = pytest.mark.skipif(
+    not Path("/proc/self/clear_refs").exists(), reason="this system has no /proc/self/clear_refs"
+)
+
+
+@needs_proc
+def test_the_peak_is_that_since_it_was_forgotten():
+    forget_peak()
+    now, _ = resident_memory()
+    block = np.ones(8_000_000)  # 64 MB
+    del block
+    assert 60 < resident_memory()[1] - now < 80
+    forget_peak()
+    assert resident_memory()[1] - now < 20
+
+
+def test_without_proc_the_operating_system_is_asked_in_its_unit(monkeypatch):
+    resource = pytest.importorskip("resource", reason="this system has no module resource")
+    monkeypatch.setattr(bench_memory, "_STATUS", Path("no such file"))
+    monkeypatch.setattr(resource, "getrusage", lambda who: type("usage", (), {"ru_maxrss": 3_000_000}))
+    monkeypatch.setattr(sys, "platform", "linux")
+    assert resident_memory() == pytest.approx((3072.0, 3072.0))
+    monkeypatch.setattr(sys, "platform", "darwin")
+    assert resident_memory() == pytest.approx((3.0, 3.0))
+
+
+def test_where_nobody_tells_there_is_no_answer(monkeypatch):
+    monkeypatch.setattr(bench_memory, "_STATUS", Path("no such file"))
+    monkeypatch.setitem(sys.modules, "resource", None)
+    assert resident_memory() is None
+    assert peak_memory("torch", Problem(), CPU) is None
+
+
+@needs_proc
+def test_a_backend_needs_at_least_the_gradient_of_the_texture():
+    problem = Problem(size=32, frames=1, channels=32, texture=256)
+    gradient = 4e-6 * problem.channels * problem.texture**2  # 8.4 MB
+    assert gradient <= peak_memory("numba", problem, CPU) < 10 * gradient

@@ -1,0 +1,99 @@
+"""How much memory the iterations of a backend need.
+
+On the CPU a process of its own imports everything, compiles the kernels on a tiny scene, builds the scene that is
+asked for, and notes its resident set size. Then it runs a few iterations. The answer is the highest resident set size
+during these, less the noted one: what forward and backward passes and the gradients take, without libraries and data.
+The allocator of glibc is told to give everything back that is large; what it would keep depends on what ran before.
+
+On a GPU it is the same difference in what torch's allocator has handed out.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+
+from tracking3d.evaluation.bench_scene import Problem, Scene
+from tracking3d.evaluation.bench_timing import backends, give_threads
+
+ITERATIONS = 3
+_TINY = Problem(size=16, frames=1, channels=1, texture=8, frequency=2)
+_GIVE_BACK = 128 * 1024  # bytes; blocks of at least this size go back to the system at once
+_STATUS = Path("/proc/self/status")
+_CLEAR_PEAK = Path("/proc/self/clear_refs")
+
+
+def peak_memory(name: str, problem: Problem, device: torch.device, threads: int = 1) -> float | None:
+    """Megabytes (10^6 bytes) that a backend needs to solve a problem; None where they cannot be measured."""
+    if device.type == "cuda":
+        return _on_gpu(name, problem, device)
+    if resident_memory() is None:
+        return None
+    asked = json.dumps({"name": name, "problem": asdict(problem), "threads": threads})
+    command = [sys.executable, "-m", "tracking3d.evaluation.bench_memory", asked]
+    environment = {**os.environ, "MALLOC_MMAP_THRESHOLD_": str(_GIVE_BACK)}
+    answer = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True).stdout
+    return float(answer)
+
+
+def resident_memory() -> tuple[float, float] | None:
+    """Megabytes of this process in memory: now, and at most since `forget_peak`; None where nobody tells.
+
+    Where there is no ``/proc``, both are the most since the process began.
+    """
+    if _STATUS.exists():
+        # Not getrusage: on Linux its maximum includes that of the process which started this one.
+        lines = (line.split() for line in _STATUS.read_text(encoding="ascii").splitlines())
+        kilobytes = {line[0]: int(line[1]) for line in lines if line and line[0] in ("VmRSS:", "VmHWM:")}
+        if len(kilobytes) == 2:
+            return 1.024e-3 * kilobytes["VmRSS:"], 1.024e-3 * kilobytes["VmHWM:"]
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # bytes on macOS, kilobytes elsewhere
+    peak = 1e-6 * most * (1 if sys.platform == "darwin" else 1024)
+    return peak, peak
+
+
+def forget_peak() -> None:
+    """Let the highest resident set size be that of now, where the system can do that (Linux)."""
+    with contextlib.suppress(OSError):
+        _CLEAR_PEAK.write_text("5", encoding="ascii")
+
+
+def _in_this_process(name: str, problem: Problem, threads: int) -> float | None:
+    device = torch.device("cpu")
+    give_threads(name, device, threads)
+    backend = backends(device)[name]
+    Scene.make(_TINY, device).loss(backend).backward()
+    scene = Scene.make(problem, device)
+    forget_peak()
+    before = resident_memory()
+    for _ in range(ITERATIONS):
+        scene.forget_gradients()
+        scene.loss(backend).backward()
+    after = resident_memory()
+    return None if before is None or after is None else max(after[1] - before[0], 0.0)
+
+
+def _on_gpu(name: str, problem: Problem, device: torch.device) -> float:
+    backend, scene = backends(device)[name], Scene.make(problem, device)
+    before = torch.cuda.memory_allocated(device)
+    torch.cuda.reset_peak_memory_stats(device)
+    for _ in range(ITERATIONS):
+        scene.forget_gradients()
+        scene.loss(backend).backward()
+    return 1e-6 * (torch.cuda.max_memory_allocated(device) - before)
+
+
+if __name__ == "__main__":
+    asked = json.loads(sys.argv[1])
+    print(json.dumps(_in_this_process(asked["name"], Problem(**asked["problem"]), asked["threads"])))

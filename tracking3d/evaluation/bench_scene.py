@@ -1,0 +1,116 @@
+"""What the benchmark of the renderer renders, and the loss that every backend evaluates of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+from torch import Tensor
+
+from tracking3d.estimation import losses
+from tracking3d.geometry.prototypes import sphere
+from tracking3d.rendering import Rendering, channels_last, texture_losses
+
+Backend = Callable[..., Rendering]
+"""Called with the arguments of `tracking3d.rendering.render`, by name."""
+
+_CAUCHY_SCALE, _TOTAL_VARIATION_WEIGHT = 0.25, 0.001
+
+
+def default_texture(channels: int) -> int:
+    """Side of the texture that solvers give to RGB, or to that many feature channels."""
+    return 300 if channels <= 16 else 150
+
+
+@dataclass(frozen=True)
+class Problem:
+    """How much there is to render.
+
+    Attributes:
+        size: Side of the windows in pixels.
+        frames: Frames in the batch.
+        channels: Channels of the texture and of the frames.
+        texture: Side of the texture in texels.
+        frequency: Of the icosphere.
+    """
+
+    size: int = 128
+    frames: int = 7
+    channels: int = 3
+    texture: int = 300
+    frequency: int = 11
+
+    @property
+    def pixels(self) -> int:
+        """Pixels of one window."""
+        return self.size**2
+
+    @property
+    def faces(self) -> int:
+        """Faces of the mesh."""
+        return 20 * self.frequency**2
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """One problem: what is rendered, and what it is compared with.
+
+    Attributes:
+        parameters: What gets gradients: vertices, texture, R and t of `render`.
+        constants: Its other arguments.
+        features: ``(B, C, H, W)`` observed.
+        mask: ``(B, H, W)`` observed.
+    """
+
+    parameters: dict[str, Tensor]
+    constants: dict[str, Any]
+    features: Tensor
+    mask: Tensor
+
+    @classmethod
+    def make(cls, problem: Problem, device: torch.device) -> Scene:
+        """An ellipsoid that turns by 10 degrees a frame and covers a quarter of the pixels."""
+        size, frames, channels = problem.size, problem.frames, problem.channels
+        generator = torch.Generator().manual_seed(0)
+        mesh = sphere(problem.frequency)
+        vertices = torch.from_numpy(mesh.vertices).float() * torch.tensor([1.0, 0.8, 0.6])
+        vertices += 0.01 * torch.randn(vertices.shape, generator=generator)
+        turns = torch.deg2rad(torch.tensor([[3.0, 10.0, 1.0]]) * torch.arange(frames)[:, None])
+        K = torch.tensor([[1.25 * size, 0, (size - 1) / 2], [0, 1.25 * size, (size - 1) / 2], [0, 0, 1]])
+        texture = torch.rand(channels, problem.texture, problem.texture, generator=generator)
+        parameters = {
+            "vertices": vertices,
+            "texture": channels_last(texture),
+            "R": axis_angle_to_rotation_matrix(turns),
+            "t": torch.tensor([[0.0, 0.0, 4.0]]).repeat(frames, 1),
+        }
+        constants = {
+            "faces": torch.from_numpy(mesh.faces).to(device),
+            "face_uvs": torch.from_numpy(mesh.face_uvs).float().to(device),
+            "K": K.repeat(frames, 1, 1).to(device),
+            "size": (size, size),
+        }
+        y, x = torch.meshgrid(*[torch.linspace(-1, 1, size)] * 2, indexing="ij")
+        mask = (x**2 + y**2 < 0.3).float().expand(frames, size, size)
+        features = torch.rand(frames, channels, size, size, generator=generator)
+        leaves = {name: value.to(device).requires_grad_() for name, value in parameters.items()}
+        return cls(leaves, constants, channels_last(features).to(device), mask.to(device))
+
+    def loss(self, backend: Backend) -> Tensor:
+        """The paper's losses of the rendering by ``backend``."""
+        drawn = backend(**self.parameters, **self.constants)
+        valid = torch.ones_like(self.mask)
+        pixel_loss, smooth = texture_losses(
+            drawn.texture, drawn.uv, self.features, drawn.pixels, _CAUCHY_SCALE, backend=drawn.backend
+        )
+        appearance = losses.appearance_loss(pixel_loss, drawn.pixels, valid, _CAUCHY_SCALE).mean()
+        silhouette = losses.iou_loss(drawn.silhouette, self.mask, valid).mean()
+        return appearance + silhouette + _TOTAL_VARIATION_WEIGHT * smooth
+
+    def forget_gradients(self) -> None:
+        """Make ready for the next backward pass."""
+        for parameter in self.parameters.values():
+            parameter.grad = None
