@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -32,6 +33,8 @@ def script(monkeypatch) -> Script:
     script = Script()
 
     class FakeSession:
+        renderer: ClassVar = {"backend": "none", "reason": "a test", "threads": 1}
+
         def __init__(self, config, prompt, intrinsics=None, intrinsics_origin=""):
             script.built.append((config, prompt))
             build_plugin(TRACKERS, config.tracker)

@@ -194,11 +194,12 @@ def test_bad_question_for_points_is_refused(refused, finished, arguments, words)
 
 def test_bench_render_prints_the_benchmark(call, refused, monkeypatch):
     module = types.ModuleType("bench_render")
-    module.benchmark = lambda size, frames, channels, repeats: {"given": [size, frames, channels, repeats]}
+    module.benchmark = lambda *given, **named: {"given": given, **named}
     monkeypatch.setitem(sys.modules, "tracking3d.evaluation.bench_render", module)
-    options = ["--size", 64, "--frames", 2, "--channels", 8, "--repeats", 3]
+    options = ["--size", 64, "--frames", 2, "--channels", 8, "--repeats", 3, "--no-dense"]
     result = call("bench", "render", *options, "--json")
-    assert json.loads(result.stdout) == {"given": [64, 2, 8, 3]}
+    given = [64, 2, 8, None, 3, 1, "cpu"]
+    assert json.loads(result.stdout) == {"given": given, "dense": False, "growth": False}
     assert "--frames" in refused("bench", "render", "--frames", "0")
 
 
