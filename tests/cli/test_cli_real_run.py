@@ -24,6 +24,8 @@ from tracking3d.trackers.csrt import CsrtTracker
 class Stopping(CsrtTracker):
     def step(self, frame):
         if frame.index == 2:
+            # A shell's background job starts with Ctrl-C ignored; here it is to arrive.
+            signal.signal(signal.SIGINT, signal.default_int_handler)
             os.kill(os.getpid(), getattr(signal, os.environ["STOP_BY"]))
         return super().step(frame)
 """
