@@ -60,7 +60,7 @@ def prepare_backend(backend: str, device: str, threads: int = 1) -> dict[str, st
     if threads < 1:
         raise ValueError(f"the number of threads is {threads}; give one or more")
     if place == "cpu" or backend not in ("auto", "torch", "numba"):
-        chosen = "numba" if use_numba(backend, torch.empty(0)) else "torch"
+        chosen = "numba" if use_numba(backend, torch.empty(0, dtype=torch.float32)) else "torch"
     elif backend == "numba":
         raise ValueError(f"the backend 'numba' renders on the cpu, not on {device}; choose auto or torch")
     else:

@@ -19,6 +19,7 @@ from tracking3d.rendering.normal_equations import NormalEquations, screen_motion
 from tracking3d.rendering.renderer import Rendering
 from tracking3d.rendering.shapes import check_shapes
 from tracking3d.rendering.surface_visibility import front_faces
+from tracking3d.rendering.texture_losses import cauchy
 from tracking3d.rendering.visibility import NEAR, expand_ranges
 
 _MOST = 256  # points on one edge, however large it seems
@@ -86,7 +87,7 @@ def contour_loss(contour: Contour, distance: Tensor, scale: float) -> Tensor:
         0 for a frame without contour.
     """
     residual = contour_distance(contour, distance)
-    loss = torch.log1p((residual / scale).square()) * contour.length
+    loss = cauchy(residual, torch.zeros_like(residual), scale) * contour.length
     return _per_frame(contour, loss) / _per_frame(contour, contour.length).clamp_min(1.0)
 
 
@@ -117,7 +118,7 @@ def contour_normal_equations(
         weight = share * 2 / (scale**2 + residual.square())
         matrix = torch.einsum("na,n,nb->nab", jacobian, weight, jacobian)
         gradient = (weight * residual)[:, None] * jacobian
-        cost = share * torch.log1p((residual / scale).square())
+        cost = share * cauchy(residual, torch.zeros_like(residual), scale)
         return NormalEquations(*(_per_frame(contour, part) for part in (matrix, gradient, cost)))
 
 

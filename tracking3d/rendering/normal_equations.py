@@ -18,6 +18,7 @@ from tracking3d.rendering.interpolation import barycentrics
 from tracking3d.rendering.renderer import Rendering
 from tracking3d.rendering.shapes import check_shapes
 from tracking3d.rendering.texture import bilinear_taps
+from tracking3d.rendering.texture_losses import cauchy
 from tracking3d.rendering.visibility import gather
 
 
@@ -104,7 +105,8 @@ def pose_normal_equations(
     view = torch.div(drawn.pixels, height * width, rounding_mode="floor")
     uv_by_x, uv_by_y, depth = _surface_at_pixels(drawn, view)
     value, by_u, by_v = bilinear_taps(drawn.texture, drawn.uv)
-    residual = value - rows.index_select(0, drawn.pixels)
+    target = rows.index_select(0, drawn.pixels)
+    residual = value - target
     # Of the rendered image by x and y, (2, P, C); the Jacobian has the opposite sign.
     slopes = torch.stack([uv[:, :1] * by_u + uv[:, 1:] * by_v for uv in (uv_by_x, uv_by_y)])
     total = weight.new_zeros(batch).index_add(0, view, weight).clamp_min(1.0)
@@ -115,7 +117,7 @@ def pose_normal_equations(
     motion = screen_motion(_unprojected(drawn, view, depth), drawn.K[view], pivot[view])  # (P, 2, 6)
     matrix = torch.einsum("pia,pij,pjb->pab", motion, inner, motion)
     gradient = -torch.einsum("pia,pi->pa", motion, pull)
-    cost = share * torch.log1p((residual / scale).square()).sum(1)
+    cost = share * cauchy(value, target, scale).sum(1)
     return NormalEquations(
         *(
             part.new_zeros(batch, *part.shape[1:]).index_add(0, view, part)

@@ -14,7 +14,7 @@ from tracking3d.rendering.renderer import Rendering, to_screen
 from tracking3d.rendering.visibility import NEAR
 
 DEPTH_TOLERANCE = 0.01
-"""How far behind the drawn surface a point may lie and still be seen, in radii of the mesh."""
+"""How far behind the drawn surface a point may lie and still be seen, in radii of the object."""
 
 
 @torch.no_grad()
@@ -43,21 +43,30 @@ def front_faces(screen: Tensor, faces: Tensor) -> Tensor:
     return ab[..., 1] * ac[..., 0] > ab[..., 0] * ac[..., 1]
 
 
-def _unhidden(drawn: Rendering, points: Tensor) -> Tensor:
-    """``(B, N)``: points ``(B, N, 3)`` in camera coordinates that lie in the window and behind nothing.
+def deepest_around(depth: Tensor, pixel: Tensor) -> Tensor:
+    """``(B, N)`` largest depth at the four pixel centres around each point; -inf off the window.
 
-    A point's depth is compared with the deepest of the four pixel centres around it: on a plane it lies between
-    those four, however steep the plane is.
+    On a plane a point's own depth lies between those four, however steep the plane is; with the nearest pixel
+    alone, points of steep surfaces would seem hidden by the surface they are on.
+
+    Args:
+        depth: ``(B, H, W)`` as drawn.
+        pixel: ``(B, N, 2)`` points in pixels; NaN is off the window.
     """
-    _, height, width = drawn.depth.shape
-    pixel = to_screen(points, drawn.K)
+    _, height, width = depth.shape
     inside = (pixel > -0.5).all(2) & (pixel < pixel.new_tensor([width - 0.5, height - 0.5])).all(2)
     low = torch.where(inside[..., None], pixel, 0.0).floor().long()
     x = [(low[..., 0] + step).clamp(0, width - 1) for step in (0, 1)]
     y = [(low[..., 1] + step).clamp(0, height - 1) for step in (0, 1)]
-    flat = drawn.depth.flatten(1)
+    flat = depth.flatten(1)
     around = torch.stack([flat.gather(1, row * width + column) for row in y for column in x])
+    return torch.where(inside, around.amax(0), -torch.inf)
+
+
+def _unhidden(drawn: Rendering, points: Tensor) -> Tensor:
+    """``(B, N)``: points ``(B, N, 3)`` in camera coordinates that lie in the window and behind nothing."""
+    around = deepest_around(drawn.depth, to_screen(points, drawn.K))
     centre = drawn.x_cam.mean(1, keepdim=True)
     radius = (drawn.x_cam - centre).norm(dim=2).amax(1, keepdim=True)
     depth = points[..., 2]
-    return inside & (depth > NEAR) & (depth < around.amax(0) + DEPTH_TOLERANCE * radius)
+    return (depth > NEAR) & (depth < around + DEPTH_TOLERANCE * radius)

@@ -17,12 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import Status
 from tracking3d.geometry.camera import Camera
+from tracking3d.rendering.surface_visibility import DEPTH_TOLERANCE, deepest_around
 from tracking3d.rendering.visibility import NEAR, rasterize
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
-
-DEPTH_TOLERANCE = 0.01
-"""How far behind the drawn surface a point may lie and still be seen, in radii of the object."""
 
 _EDGE = 1e-9  # barycentric slack, so that a ray through an edge does not slip between two faces
 _CHUNK = 256  # points met with all faces at once
@@ -153,20 +151,12 @@ def _deepest_around(
     faces: NDArray[np.int64],
     xy: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Largest depth drawn at the four pixel centres around each point ``xy`` ``(N, 2)``; -inf off the frame.
-
-    On a plane the point's own depth lies between those four, however steep the plane is; with the nearest
-    pixel alone, points of steep surfaces would seem hidden by the surface they are on.
-    """
+    """``(N,)`` largest depth drawn around each point ``xy`` ``(N, 2)``, see `deepest_around`."""
     vertices = torch.tensor(np.nan_to_num(screen), dtype=torch.float32)[None]
     z = torch.tensor(depth, dtype=torch.float32)[None]
-    drawn = rasterize(vertices, z, torch.tensor(faces), (camera.height, camera.width)).depth[0]
-    inside = _in_frame(camera, xy)
-    low = np.floor(np.where(inside[:, None], xy, 0)).astype(int)
-    limits = (camera.width - 1, camera.height - 1)
-    (x0, y0), (x1, y1) = np.clip(low, 0, limits).T, np.clip(low + 1, 0, limits).T
-    around = drawn.numpy()[[y0, y0, y1, y1], [x0, x1, x0, x1]].max(0)
-    return np.where(inside, around, -np.inf)
+    drawn = rasterize(vertices, z, torch.tensor(faces), (camera.height, camera.width)).depth
+    around: NDArray[np.float64] = deepest_around(drawn, torch.tensor(xy)[None])[0].double().numpy()
+    return around
 
 
 def _in_frame(camera: Camera, xy: NDArray[np.float64]) -> NDArray[np.bool_]:

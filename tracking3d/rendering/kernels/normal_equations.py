@@ -12,7 +12,7 @@ from torch import Tensor
 
 from tracking3d.rendering.kernels.compilation import OPTIONS, REORDER, array, check_corners, kernel
 from tracking3d.rendering.kernels.interpolation import slopes_of_face
-from tracking3d.rendering.kernels.texture_losses import bilinear_weights, taps_of
+from tracking3d.rendering.kernels.texture_losses import bilinear_weights, taps_of, texels_at
 from tracking3d.rendering.kernels.threads import share
 from tracking3d.rendering.renderer import Rendering
 
@@ -46,14 +46,9 @@ def _of_channels(texture, taps, target, channels, sharpness, by_x, by_y):
     ``by_x`` and ``by_y`` are the derivatives of the place in the texture, in texels, by the pixel's x and y.
     """
     one = np.float32(1)
-    top, bottom, left, right, fx, fy, free = taps
-    w00, w01, w10, w11 = bilinear_weights(fx, fy)
-    t00, t01, t10, t11 = (
-        texture[top, left],
-        texture[top, right],
-        texture[bottom, left],
-        texture[bottom, right],
-    )
+    _, _, _, _, fx, fy, free = taps
+    w00, w01, w10, w11 = bilinear_weights(taps)
+    t00, t01, t10, t11 = texels_at(texture, taps)
     down = one if free else np.float32(0)
     xx = xy = yy = x = y = np.float32(0)
     loss, product = 0.0, 1.0

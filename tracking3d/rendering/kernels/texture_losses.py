@@ -123,14 +123,8 @@ def _sum_of_cauchy(residual, count, sharpness):
 @numba.njit(inline="always", **OPTIONS)
 def _compare(texture, taps, target, residual, channels, sharpness):
     """Sum of the losses of one pixel."""
-    top, bottom, left, right, fx, fy, _ = taps
-    w00, w01, w10, w11 = bilinear_weights(fx, fy)
-    t00, t01, t10, t11 = (
-        texture[top, left],
-        texture[top, right],
-        texture[bottom, left],
-        texture[bottom, right],
-    )
+    w00, w01, w10, w11 = bilinear_weights(taps)
+    t00, t01, t10, t11 = texels_at(texture, taps)
     for c in range(channels):
         residual[c] = w00 * t00[c] + w01 * t01[c] + w10 * t10[c] + w11 * t11[c] - target[c]
     return _sum_of_cauchy(residual, channels, sharpness)
@@ -141,13 +135,8 @@ def _compare_slope(texture, taps, target, slope, channels, sharpness, weight, ou
     """Slopes of ``weight`` times the loss of one pixel by x and y in texels; adds those by texels to ``out``."""
     one = np.float32(1)
     top, bottom, left, right, fx, fy, _ = taps
-    w00, w01, w10, w11 = bilinear_weights(fx, fy)
-    t00, t01, t10, t11 = (
-        texture[top, left],
-        texture[top, right],
-        texture[bottom, left],
-        texture[bottom, right],
-    )
+    w00, w01, w10, w11 = bilinear_weights(taps)
+    t00, t01, t10, t11 = texels_at(texture, taps)
     by_x, by_y = np.float32(0), np.float32(0)
     for c in range(channels):
         d = w00 * t00[c] + w01 * t01[c] + w10 * t10[c] + w11 * t11[c] - target[c]
@@ -164,8 +153,16 @@ def _compare_slope(texture, taps, target, slope, channels, sharpness, weight, ou
 
 
 @numba.njit(inline="always", **OPTIONS)
-def bilinear_weights(fx, fy):
-    """Weights of the four taps, row by row."""
+def texels_at(texture, taps):
+    """The four texels ``(C,)``, row by row."""
+    top, bottom, left, right, _, _, _ = taps
+    return texture[top, left], texture[top, right], texture[bottom, left], texture[bottom, right]
+
+
+@numba.njit(inline="always", **OPTIONS)
+def bilinear_weights(taps):
+    """Weights of the four texels, row by row."""
+    _, _, _, _, fx, fy, _ = taps
     one = np.float32(1)
     return (one - fy) * (one - fx), (one - fy) * fx, fy * (one - fx), fy * fx
 
