@@ -32,11 +32,11 @@ AT_LEAST = {
     "tracking3d.errors": "InputError OutputError PluginError Tracking3dError",
     "tracking3d.estimation.estimate": "FrameEstimate ObjectModel Status",
     "tracking3d.estimation.solver": "Solver",
-    "tracking3d.evaluation.clip": "Truth read_truth write_clip",
+    "tracking3d.datasets.clip": "Truth read_truth write_clip",
     "tracking3d.evaluation.metrics": """aligned_rotation_errors anchored_rotation_errors
         consecutive_rotation_errors mask_iou rotation_alignment share_under""",
     "tracking3d.evaluation.score": "Scores score_run",
-    "tracking3d.evaluation.synthetic": """SyntheticClip SyntheticSpec degrade_masks make_demo_clip
+    "tracking3d.synthesis.convex_clips": """SyntheticClip SyntheticSpec degrade_masks make_demo_clip
         synthesize""",
     "tracking3d.features.protocol": "FeatureEncoder",
     "tracking3d.features.rgb": "RgbEncoder",

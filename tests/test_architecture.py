@@ -17,7 +17,9 @@ FLOORS = [
     {"rendering", "trackers", "video"},
     {"estimation", "plugins", "prompts"},
     {"pipeline", "recording", "results"},
-    {"evaluation", "viewer"},
+    {"datasets"},
+    {"synthesis", "evaluation", "speed", "viewer"},
+    {"benchmark"},
     {"cli"},
 ]
 """``tracking3d/__init__.py`` is the front door: it imports from anywhere, and nobody imports from it."""

@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 from tracking3d.config.loading import load_config
-from tracking3d.evaluation import synthetic
+from tracking3d.synthesis import convex_clips
 
 BOX = ("--box", "20,10,20,20")
 COMMANDS = ["run", "demo", "evaluate", "points", "plugins", "config show", "config schema", "config validate"]
@@ -195,7 +195,7 @@ def test_bad_question_for_points_is_refused(refused, finished, arguments, words)
 def test_bench_render_prints_the_benchmark(call, refused, monkeypatch):
     module = types.ModuleType("bench_render")
     module.benchmark = lambda *given, **named: {"given": given, **named}
-    monkeypatch.setitem(sys.modules, "tracking3d.evaluation.bench_render", module)
+    monkeypatch.setitem(sys.modules, "tracking3d.speed.benchmark", module)
     options = ["--size", 64, "--frames", 2, "--channels", 8, "--repeats", 3, "--no-dense"]
     result = call("bench", "render", *options, "--json")
     given = [64, 2, 8, None, 3, 1, "cpu"]
@@ -204,8 +204,8 @@ def test_bench_render_prints_the_benchmark(call, refused, monkeypatch):
 
 
 def test_demo_writes_clip_run_and_summary(call, script, monkeypatch):
-    quick = functools.partial(synthetic.make_demo_clip, frames=3, size=(64, 48))
-    monkeypatch.setattr(synthetic, "make_demo_clip", quick)
+    quick = functools.partial(convex_clips.make_demo_clip, frames=3, size=(64, 48))
+    monkeypatch.setattr(convex_clips, "make_demo_clip", quick)
     for _ in range(2):  # a second call replaces the first's files
         result = call("demo", "--out", "shown", "--seed", 3)
         assert result.exit_code == 0, result.output

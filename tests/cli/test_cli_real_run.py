@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from tracking3d.evaluation.synthetic import make_demo_clip
 from tracking3d.results.run_reader import RunReader
+from tracking3d.synthesis.convex_clips import make_demo_clip
 
 QUICK = ["--size", "32", "--set", "solver.iterations=2", "--set", "object.frequency=2"]
 

@@ -14,10 +14,10 @@ from tracking3d.config.loading import load_config
 from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.estimation.paper.belief import Belief
 from tracking3d.estimation.paper.solver import PaperSolver
-from tracking3d.evaluation.synthetic import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.features.rgb import RgbEncoder
 from tracking3d.frames import Frame, MaskEstimate
+from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 
 _COARSE: dict[str, Any] = {"window": {"size": 32}, "object": {"frequency": 4, "texture_size": 32}}
 QUICK: dict[str, dict[str, Any]] = {

@@ -11,9 +11,9 @@ from tracking3d.config.loading import load_config
 from tracking3d.estimation.estimate import FrameEstimate, Status
 from tracking3d.estimation.paper.solver import PaperSolver
 from tracking3d.evaluation.metrics import Angles, aligned_rotation_errors, mask_iou
-from tracking3d.evaluation.synthetic import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.features.rgb import RgbEncoder
 from tracking3d.frames import Frame, MaskEstimate
+from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 
 
 @dataclass(frozen=True, eq=False)

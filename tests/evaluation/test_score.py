@@ -12,8 +12,8 @@ import pytest
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
+from tracking3d.datasets.clip import write_clip
 from tracking3d.errors import InputError
-from tracking3d.evaluation.clip import write_clip
 from tracking3d.evaluation.score import Scores, format_scores, score_run
 from tracking3d.geometry.camera import Camera
 
@@ -344,7 +344,7 @@ def test_the_table_shows_the_figures_and_names_what_is_unknown(write_run, clip):
 
 
 def test_a_real_clip_scores_its_own_truth_perfectly(write_run, shared_data, tmp_path):
-    from tracking3d.evaluation.clip import read_truth
+    from tracking3d.datasets.clip import read_truth
 
     truth = read_truth(shared_data / "cube_in_hand")
     wanted = range(0, 164, 20)

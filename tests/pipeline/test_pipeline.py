@@ -15,11 +15,11 @@ import tracking3d
 from tracking3d import Frame, FrameEstimate, PipelineConfig, Session, Status, load_config, track
 from tracking3d.config.models import CameraConfig
 from tracking3d.errors import InputError, PluginError
-from tracking3d.evaluation.synthetic import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.frames import SkippedFrame
 from tracking3d.pipeline import choose_camera
 from tracking3d.plugins import VARIABLE
 from tracking3d.prompts import make_prompt
+from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 
 QUICK = [
     "window.size=32",

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from tracking3d.evaluation.synthetic import make_demo_clip
 from tracking3d.results.run_reader import RunReader
+from tracking3d.synthesis.convex_clips import make_demo_clip
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -12,12 +12,13 @@ from typer.testing import CliRunner
 
 from tracking3d.cli import app
 from tracking3d.errors import InputError, OutputError
-from tracking3d.evaluation import bench_growth, bench_render
-from tracking3d.evaluation.bench_growth import exponent, measure_growth
-from tracking3d.evaluation.bench_plot import check_plot, plot_growth
-from tracking3d.evaluation.bench_scene import Problem
-from tracking3d.evaluation.bench_table import format_growth
-from tracking3d.evaluation.bench_timing import Duration
+from tracking3d.speed import benchmark as bench_render
+from tracking3d.speed import growth as bench_growth
+from tracking3d.speed.growth import exponent, measure_growth
+from tracking3d.speed.plot import check_plot, plot_growth
+from tracking3d.speed.scene import Problem
+from tracking3d.speed.table import format_growth
+from tracking3d.speed.timing import Duration
 
 FEW = {
     "pixels": [{"size": size} for size in (16, 20, 24)],

@@ -11,10 +11,10 @@ import pytorch3d_stand_in
 import torch
 from scenes import bumpy_sphere
 
-from tracking3d.evaluation.bench_pytorch3d import can_render, render_pytorch3d, to_pytorch3d
-from tracking3d.evaluation.bench_scene import Problem, Scene
-from tracking3d.evaluation.bench_timing import backends
 from tracking3d.rendering import SoftBand, render
+from tracking3d.speed.pytorch3d import can_render, render_pytorch3d, to_pytorch3d
+from tracking3d.speed.scene import Problem, Scene
+from tracking3d.speed.timing import backends
 
 CPU = torch.device("cpu")
 BAND = SoftBand(sigma=7000.0, boxlen=0.06)

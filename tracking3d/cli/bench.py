@@ -52,8 +52,8 @@ def render(
     """Time one forward and backward pass of the renderer's backends and of a dense implementation."""
     import json
 
-    from tracking3d.evaluation.bench_plot import check_plot, plot_growth
-    from tracking3d.evaluation.bench_render import benchmark
+    from tracking3d.speed.benchmark import benchmark
+    from tracking3d.speed.plot import check_plot, plot_growth
 
     if plot:
         check_plot(plot)
@@ -74,7 +74,7 @@ def render(
         typer.echo(json.dumps(report))
         return
     from tracking3d.cli.tables import print_table
-    from tracking3d.evaluation.bench_table import format_growth, format_problem, format_times
+    from tracking3d.speed.table import format_growth, format_problem, format_times
 
     print_table(format_times(report))
     typer.echo(format_problem(report))

@@ -26,11 +26,11 @@ def demo(
 
     from tracking3d.cli.progress import print_summary, progress
     from tracking3d.cli.tables import print_figures
-    from tracking3d.evaluation.clip import read_truth
+    from tracking3d.datasets.clip import read_truth
     from tracking3d.evaluation.score import score_run
-    from tracking3d.evaluation.synthetic import make_demo_clip
     from tracking3d.recording import record
     from tracking3d.results.files import write_atomic
+    from tracking3d.synthesis.convex_clips import make_demo_clip
     from tracking3d.trackers.crops import box_of
     from tracking3d.video import open_source
 

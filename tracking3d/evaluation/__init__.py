@@ -1,1 +1,1 @@
-"""Measures, clips with known truth, and benchmarks."""
+"""Measures of estimates against the truth."""

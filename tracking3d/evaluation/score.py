@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
+from tracking3d.datasets.clip import Truth, is_rigid, read_truth
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import Status
-from tracking3d.evaluation.clip import Truth, is_rigid, read_truth
 from tracking3d.evaluation.metrics import (
     aligned_rotation_errors,
     anchored_rotation_errors,
@@ -94,7 +94,7 @@ class Scores(MaskScores, RotationScores):
 
 
 def score_run(run_folder: Path, clip: Path) -> Scores:
-    """Score a run folder against a clip in the layout of `tracking3d.evaluation.clip`.
+    """Score a run folder against a clip in the layout of `tracking3d.datasets.clip`.
 
     A run's frame index is the position of the frame in the clip. If ``run.json`` holds a ``selection``
     ``START:STOP:STEP``, only those frames count.

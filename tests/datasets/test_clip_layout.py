@@ -8,11 +8,11 @@ import shutil
 import numpy as np
 import pytest
 
+from tracking3d.datasets.clip import is_rigid, read_truth
 from tracking3d.errors import InputError, OutputError
-from tracking3d.evaluation.clip import is_rigid, read_truth
 from tracking3d.evaluation.metrics import mask_iou
-from tracking3d.evaluation.synthetic import SyntheticSpec, make_demo_clip, synthesize
 from tracking3d.results.files import read_mask
+from tracking3d.synthesis.convex_clips import SyntheticSpec, make_demo_clip, synthesize
 from tracking3d.video import read_image
 
 

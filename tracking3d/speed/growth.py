@@ -12,8 +12,8 @@ from typing import Any
 
 import torch
 
-from tracking3d.evaluation.bench_scene import Problem
-from tracking3d.evaluation.bench_timing import Duration, median, time_backends
+from tracking3d.speed.scene import Problem
+from tracking3d.speed.timing import Duration, median, time_backends
 
 RANGES: dict[str, list[dict[str, int]]] = {
     "pixels": [{"size": side} for side in (64, 96, 128, 192, 256, 384)],

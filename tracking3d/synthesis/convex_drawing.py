@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.evaluation.procedural_texture import FloatImage, sample_panels
-from tracking3d.evaluation.raycast import Surface
 from tracking3d.geometry.camera import Camera
+from tracking3d.synthesis.convex_raycast import Surface
+from tracking3d.synthesis.procedural_texture import FloatImage, sample_panels
 
 LIGHT = np.array([-0.45, -0.7, -0.55]) / np.linalg.norm([-0.45, -0.7, -0.55])
 """Unit direction towards the light in camera axes: from the upper left, behind the camera."""

@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from tracking3d.evaluation.clip import write_clip
-from tracking3d.evaluation.image_formation import draw
-from tracking3d.evaluation.procedural_texture import paint_background, paint_panel
-from tracking3d.evaluation.raycast import Ellipsoid, Polyhedron, Surface
+from tracking3d.datasets.clip import write_clip
 from tracking3d.frames import Box
 from tracking3d.geometry.camera import DEFAULT_FIELD_OF_VIEW, Camera
 from tracking3d.results.files import write_mask, writing
+from tracking3d.synthesis.convex_drawing import draw
+from tracking3d.synthesis.convex_raycast import Ellipsoid, Polyhedron, Surface
+from tracking3d.synthesis.procedural_texture import paint_background, paint_panel
 
 SURFACES: dict[str, Surface] = {
     "box": Polyhedron.box((0.62, 0.48, 0.56)),
@@ -141,7 +141,7 @@ def degrade_masks(masks: NDArray[np.bool_], seed: int, pixels: float = 1.5) -> N
 def make_demo_clip(
     folder: Path, *, seed: int = 0, frames: int = 36, size: tuple[int, int] = (320, 240)
 ) -> Path:
-    """Write the clip of ``tracking3d demo`` in the layout of `tracking3d.evaluation.clip`.
+    """Write the clip of ``tracking3d demo`` in the layout of `tracking3d.datasets.clip`.
 
     Beside the exact ``masks/`` it holds ``rough_masks/``, the same with noise on their boundaries.
 

@@ -20,8 +20,8 @@ from pathlib import Path
 
 import torch
 
-from tracking3d.evaluation.bench_scene import Problem, Scene
-from tracking3d.evaluation.bench_timing import backends, give_threads
+from tracking3d.speed.scene import Problem, Scene
+from tracking3d.speed.timing import backends, give_threads
 
 ITERATIONS = 3
 _TINY = Problem(size=16, frames=1, channels=1, texture=8, frequency=2)
@@ -37,7 +37,7 @@ def peak_memory(name: str, problem: Problem, device: torch.device, threads: int 
     if resident_memory() is None:
         return None
     asked = json.dumps({"name": name, "problem": asdict(problem), "threads": threads})
-    command = [sys.executable, "-m", "tracking3d.evaluation.bench_memory", asked]
+    command = [sys.executable, "-m", "tracking3d.speed.memory", asked]
     environment = {**os.environ, "MALLOC_MMAP_THRESHOLD_": str(_GIVE_BACK)}
     answer = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True).stdout
     return float(answer)

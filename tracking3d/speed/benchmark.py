@@ -17,11 +17,11 @@ from typing import Any
 
 import torch
 
-from tracking3d.evaluation.bench_growth import measure_growth
-from tracking3d.evaluation.bench_memory import peak_memory
-from tracking3d.evaluation.bench_scene import Problem, default_texture
-from tracking3d.evaluation.bench_timing import DENSE, Duration, find_device, median, time_backends
 from tracking3d.results.description import versions
+from tracking3d.speed.growth import measure_growth
+from tracking3d.speed.memory import peak_memory
+from tracking3d.speed.scene import Problem, default_texture
+from tracking3d.speed.timing import DENSE, Duration, find_device, median, time_backends
 
 
 def benchmark(

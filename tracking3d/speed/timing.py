@@ -12,11 +12,11 @@ from functools import partial
 import torch
 
 from tracking3d.errors import InputError
-from tracking3d.evaluation.bench_dense import render_dense
-from tracking3d.evaluation.bench_pytorch3d import can_render, render_pytorch3d
-from tracking3d.evaluation.bench_scene import Backend, Problem, Scene
 from tracking3d.rendering import prepare_backend, render
 from tracking3d.rendering.backend import why_no_numba
+from tracking3d.speed.dense import render_dense
+from tracking3d.speed.pytorch3d import can_render, render_pytorch3d
+from tracking3d.speed.scene import Backend, Problem, Scene
 
 DENSE = "dense"
 _PER_TURN = 3

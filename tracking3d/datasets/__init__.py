@@ -1,0 +1,1 @@
+"""What is known about clips, and what somebody estimated for them, in any layout on disk."""

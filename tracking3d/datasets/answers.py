@@ -1,0 +1,55 @@
+"""What somebody estimated for a clip, whoever did and in whatever format it came.
+
+Frames are named by their index in the clip. What a method does not estimate is absent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike, NDArray
+
+from tracking3d.datasets.truth import MaskReference
+
+PointTracker = Callable[[int, ArrayLike], tuple[NDArray[np.float64], NDArray[np.bool_]]]
+"""Follows the points ``(N, 2)`` of one frame: positions ``(T, N, 2)`` and visibility ``(T, N)`` in the frames of
+the clip; NaN and False where there is no answer."""
+
+
+@dataclass(frozen=True, eq=False)
+class Answers:
+    """One method's answers for one clip.
+
+    Attributes:
+        origin: The folder or file they come from, for messages.
+        asked: Indices of the frames that the method was asked for; those it has no answer for count as wrong.
+        answered: Indices of the frames with any answer.
+        given: Index of the frame whose mask or box the method was given; it is not scored as a mask.
+        masks: By frame index.
+        initial_masks: What the mask tracker gave, by frame index.
+        T_cam_obj: ``(4, 4)`` rigid, by frame index; absent where the method gave none, or not a rigid one.
+        lost: Frames that the method called lost.
+        confidence: In [0, 1] by frame index.
+        seconds: Wall time by frame index.
+        peak_memory: Bytes, where recorded.
+        mesh: Reads the estimated shape in object coordinates.
+        points: Follows points.
+    """
+
+    origin: Path
+    asked: range
+    answered: frozenset[int]
+    given: int | None = None
+    masks: Mapping[int, MaskReference] = field(default_factory=dict)
+    initial_masks: Mapping[int, MaskReference] = field(default_factory=dict)
+    T_cam_obj: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
+    lost: frozenset[int] = frozenset()
+    confidence: Mapping[int, float] = field(default_factory=dict)
+    seconds: Mapping[int, float] = field(default_factory=dict)
+    peak_memory: int | None = None
+    mesh: Callable[[], trimesh.Trimesh] | None = None
+    points: PointTracker | None = None

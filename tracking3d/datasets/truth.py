@@ -1,0 +1,159 @@
+"""What is known about one rigid object in one clip, whatever layout it was read from.
+
+OpenCV camera axes; ``x_cam = R x_obj + t``; pixel (0, 0) is the centre of the top-left pixel. Everything but
+the frames may be absent, and may be known in some frames only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from tracking3d.errors import InputError
+from tracking3d.frames import Box
+from tracking3d.geometry.camera import Camera
+from tracking3d.results.files import read_mask
+
+
+class MaskReference(Protocol):
+    """A mask that is read when it is asked for."""
+
+    def read(self) -> NDArray[np.bool_]:
+        """The mask, ``(H, W)``.
+
+        Raises:
+            InputError: If it cannot be read; names the file.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class MaskFile:
+    """A grey image; brighter than half is the object."""
+
+    path: Path
+
+    def read(self) -> NDArray[np.bool_]:
+        """See `MaskReference.read`."""
+        mask = read_mask(self.path)
+        if mask is None:
+            raise InputError(f"The mask {self.path} is not a readable image; restore or remove it.")
+        return mask
+
+
+@dataclass(frozen=True)
+class DepthFile:
+    """A 16-bit image of the depth along the camera's z axis; 0 is unknown.
+
+    Attributes:
+        path: The image.
+        scale: Length of one count in the unit of the poses.
+    """
+
+    path: Path
+    scale: float
+
+    def read(self) -> NDArray[np.float64]:
+        """The depth ``(H, W)`` in the unit of the poses; 0 where it is unknown.
+
+        Raises:
+            InputError: If it is not a readable 16-bit image.
+        """
+        image = cv2.imread(str(self.path), cv2.IMREAD_UNCHANGED)
+        if image is None or image.dtype != np.uint16 or image.ndim != 2:
+            raise InputError(
+                f"The depth {self.path} is not a readable 16-bit grey image; restore or remove it."
+            )
+        return image.astype(np.float64) * self.scale
+
+
+@dataclass(frozen=True, eq=False)
+class PointTruth:
+    """N surface points in T frames.
+
+    Attributes:
+        positions: ``(T, N, 2)`` pixels x and y, known where hidden too; NaN where the point is behind the camera.
+        visible: ``(T, N)`` bool.
+    """
+
+    positions: NDArray[np.float64]
+    visible: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class MeshFile:
+    """The true shape.
+
+    Attributes:
+        path: Any file that trimesh reads.
+        scale: Length of the file's unit in the unit of the poses.
+    """
+
+    path: Path
+    scale: float = 1.0
+
+    def read(self) -> trimesh.Trimesh:
+        """The mesh in object coordinates and the unit of the poses.
+
+        Raises:
+            InputError: If it is not a readable mesh.
+        """
+        try:
+            mesh = trimesh.load_mesh(self.path, process=False)
+        except Exception as error:  # every format has errors of its own
+            raise InputError(
+                f"The mesh {self.path} cannot be read ({error}); restore or remove it."
+            ) from error
+        if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+            raise InputError(f"The mesh {self.path} has no faces; restore or remove it.")
+        return mesh.apply_scale(self.scale)
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What is known about a clip. A frame's position in `frames` is its index in all that follows and in a run.
+
+    Attributes:
+        name: What tables call it.
+        frames: The images in order.
+        box: The object in frame 0 as ``(x, y, width, height)``, where a tracker starts from one.
+        camera: Of all frames, where known.
+        T_cam_obj: ``(4, 4)`` pose by frame index; only those that are known and trusted.
+        masks: The object's mask by frame index, the part behind other things included if the data know it.
+        visible_masks: Only the part that is seen; where it differs from `masks` and is known.
+        boxes: The object's box by frame index where it has no mask.
+        depth: By frame index.
+        mesh: The true shape in object coordinates.
+        points: Surface points and where they are seen.
+        initial_masks: Rough masks that come with the clip, by frame index; a tracker's input.
+        millimetres: Length of the unit of the poses in millimetres, where known.
+        symmetries: ``(S, 4, 4)`` object transforms that leave the object as it is, the identity among them.
+    """
+
+    name: str
+    frames: tuple[Path, ...]
+    box: Box | None = None
+    camera: Camera | None = None
+    T_cam_obj: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
+    masks: Mapping[int, MaskReference] = field(default_factory=dict)
+    visible_masks: Mapping[int, MaskReference] = field(default_factory=dict)
+    boxes: Mapping[int, Box] = field(default_factory=dict)
+    depth: Mapping[int, DepthFile] = field(default_factory=dict)
+    mesh: MeshFile | None = None
+    points: PointTruth | None = None
+    initial_masks: Mapping[int, MaskReference] = field(default_factory=dict)
+    millimetres: float | None = None
+    symmetries: NDArray[np.float64] = field(default_factory=lambda: np.eye(4)[None])
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """The frames' names without suffix."""
+        return tuple(path.stem for path in self.frames)

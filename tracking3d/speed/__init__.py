@@ -1,0 +1,1 @@
+"""Benchmarks of the renderer: time, memory, growth."""
