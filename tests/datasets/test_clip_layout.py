@@ -39,7 +39,7 @@ def test_a_demo_clip_holds_exactly_what_was_synthesized(demo):
     assert truth.names == ("000000", "000001", "000002")
     for n in range(3):
         assert (read_image(demo / "frames" / f"{n:06d}.png") == made.images[n]).all()
-        assert (truth.mask(n) == made.masks[n]).all()
+        assert (truth.masks[n].read() == made.masks[n]).all()
         assert truth.T_cam_obj[n] == pytest.approx(made.T_cam_obj[n], abs=1e-15)
 
 
@@ -84,7 +84,7 @@ def test_real_clips_open(shared_data, name, frames, poses, masks):
     assert len(truth.names) == frames
     assert len(truth.masks) == masks
     assert poses is None or len(truth.T_cam_obj) == poses
-    assert truth.mask(0).any()
+    assert truth.masks[0].read().any()
 
 
 def test_a_clip_without_truth_has_nothing_to_score(shared_data):
@@ -141,7 +141,7 @@ def test_a_trusted_pose_that_is_no_rotation_is_named_and_an_untrusted_one_is_ign
 def test_a_damaged_true_mask_is_named(clip):
     (clip / "masks" / "000001.png").write_bytes(b"not an image")
     with pytest.raises(InputError, match=r"000001\.png is not a readable image"):
-        read_truth(clip).mask(1)
+        read_truth(clip).masks[1].read()
 
 
 def test_only_finite_rotations_with_a_translation_are_rigid():

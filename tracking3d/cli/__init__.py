@@ -21,9 +21,9 @@ app = typer.Typer(
 )
 app.command(name="run")(run.run)
 app.command(name="demo")(demo.demo)
-app.command(name="evaluate")(evaluate.evaluate)
 app.command(name="points")(points.points)
 app.command(name="plugins")(plugins.plugins)
+app.add_typer(evaluate.app, name="evaluate")
 app.add_typer(config.app, name="config")
 app.add_typer(bench.app, name="bench")
 

@@ -31,13 +31,12 @@ def demo(
     from tracking3d.recording import record
     from tracking3d.results.files import write_atomic
     from tracking3d.synthesis.convex_clips import make_demo_clip
-    from tracking3d.trackers.crops import box_of
     from tracking3d.video import open_source
 
     settings = configure(None, None, None, tracker="csrt", features="rgb", runtime={"seed": seed})
     clip, folder = make_demo_clip(out / "clip", seed=seed), out / "run"
     source = open_source(clip / "frames")
-    box = box_of(read_truth(clip).mask(0))
+    box = read_truth(clip).box
     command = f"tracking3d demo --seed {seed}"
     with progress(source.count, quiet) as listener:
         record(source, settings, folder, box=box, command=command, overwrite=True, listener=listener)

@@ -1,6 +1,7 @@
 """What somebody estimated for a clip, whoever did and in whatever format it came.
 
-Frames are named by their index in the clip. What a method does not estimate is absent.
+Frames are named by their index in the clip. None is what a method does not estimate; what it does estimate counts as
+wrong in the frames that it has no answer for.
 """
 
 from __future__ import annotations
@@ -31,11 +32,11 @@ class Answers:
         given: Index of the frame whose mask or box the method was given; it is not scored as a mask.
         masks: By frame index.
         initial_masks: What the mask tracker gave, by frame index.
-        T_cam_obj: ``(4, 4)`` rigid, by frame index; absent where the method gave none, or not a rigid one.
+        T_cam_obj: ``(4, 4)`` rigid, by frame index; without those that are not rigid.
         lost: Frames that the method called lost.
         confidence: In [0, 1] by frame index.
         seconds: Wall time by frame index.
-        peak_memory: Bytes, where recorded.
+        peak_memory_mb: Most memory held, in 10^6 bytes, where recorded.
         mesh: Reads the estimated shape in object coordinates.
         points: Follows points.
     """
@@ -44,12 +45,12 @@ class Answers:
     asked: range
     answered: frozenset[int]
     given: int | None = None
-    masks: Mapping[int, MaskReference] = field(default_factory=dict)
-    initial_masks: Mapping[int, MaskReference] = field(default_factory=dict)
-    T_cam_obj: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
+    masks: Mapping[int, MaskReference] | None = None
+    initial_masks: Mapping[int, MaskReference] | None = None
+    T_cam_obj: Mapping[int, NDArray[np.float64]] | None = None
     lost: frozenset[int] = frozenset()
     confidence: Mapping[int, float] = field(default_factory=dict)
     seconds: Mapping[int, float] = field(default_factory=dict)
-    peak_memory: int | None = None
+    peak_memory_mb: float | None = None
     mesh: Callable[[], trimesh.Trimesh] | None = None
     points: PointTracker | None = None

@@ -3,17 +3,25 @@
 ::
 
     frames/000000.jpg|png ...    the images; their names, in natural order, are the frames
-    masks/000000.png ...         0/255, where known
-    poses.json                   per frame R, t and trusted; OpenCV axes, x_cam = R x_obj + t; where known
-    camera.json                  K, width, height; where known
+    masks/000000.png ...         0/255, the whole object, hidden parts too if they are known
+    visible_masks/000000.png     0/255, only what is seen, where it differs and is known
+    rough_masks/000000.png       0/255, not the truth but a tracker's input; also initial_masks/
+    depth/000000.png             uint16, along the camera's z axis
+    poses.json                   per frame R, t and trusted; OpenCV axes, x_cam = R x_obj + t; units
+    camera.json                  K, width, height; depth_scale: unit of the poses per count of depth, else a millimetre
+    truth_camera.json            the same of the true camera, where a tracker is told the wrong one
     init.json                    the first frame's bbox_xywh and mask
-    info.json                    source, frames, note
+    mesh.obj                     the shape, in the unit of the poses
+    points.npz                   positions (T, N, 2) and visible (T, N)
+    info.json                    source, frames, note, millimetres per unit, symmetries (S, 4, 4)
+
+Everything but the frames may be absent.
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -21,49 +29,26 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tracking3d.datasets.cameras import read_camera
+from tracking3d.datasets.json_files import read_json
+from tracking3d.datasets.truth import DepthFile, MaskFile, MeshFile, PointTruth, Truth
 from tracking3d.errors import InputError
+from tracking3d.frames import Box
 from tracking3d.geometry.camera import Camera
-from tracking3d.results.files import read_mask, write_atomic, write_image, write_mask, writing
+from tracking3d.results.files import write_atomic, write_image, write_mask, writing
+from tracking3d.trackers.crops import box_of
 from tracking3d.video.image_sequence import images_among
 
 POSE_CONVENTION = "T_cam_obj: x_cam = R x_obj + t; OpenCV axes"
 
-
-@dataclass(frozen=True, eq=False)
-class Truth:
-    """What is known about a clip.
-
-    Attributes:
-        folder: The clip.
-        names: Names of all frames without suffix; a frame's position here is its index in a run.
-        T_cam_obj: ``(4, 4)`` pose of each frame whose pose is known and trusted, by frame index.
-        masks: Mask file of each frame which has one, by frame index.
-    """
-
-    folder: Path
-    names: tuple[str, ...]
-    T_cam_obj: dict[int, NDArray[np.float64]]
-    masks: dict[int, Path]
-
-    def mask(self, index: int) -> NDArray[np.bool_]:
-        """``(H, W)`` true mask of frame ``index``, which must be in `masks`.
-
-        Raises:
-            InputError: If its file is not a readable image.
-        """
-        mask = read_mask(self.masks[index])
-        if mask is None:
-            raise InputError(
-                f"The true mask {self.masks[index]} is not a readable image; restore or remove it."
-            )
-        return mask
+_MILLIMETRES = {"metres": 1000.0, "centimetres": 10.0, "millimetres": 1.0}
 
 
 def read_truth(folder: Path) -> Truth:
     """Open a clip with known truth.
 
     Raises:
-        InputError: If the folder or its frames are missing, it has neither masks nor poses, or its poses are
+        InputError: If the folder or its frames are missing, there is nothing to score, or a file of it is
             malformed.
     """
     if not folder.is_dir():
@@ -73,15 +58,78 @@ def read_truth(folder: Path) -> Truth:
         raise InputError(
             f"The clip {folder} has no images in frames/; give a folder in the layout of a truth clip."
         )
-    names = tuple(file.stem for file in frames)
-    index = {name: n for n, name in enumerate(names)}
-    masks = {index[file.stem]: file for file in _images(folder / "masks") if file.stem in index}
-    poses = _read_poses(folder / "poses.json", index)
-    if not masks and not poses:
+    index = {file.stem: n for n, file in enumerate(frames)}
+    masks = _masks(folder / "masks", index)
+    visible_masks = _masks(folder / "visible_masks", index)
+    poses, millimetres = read_poses(folder / "poses.json", index)
+    points = _read_points(folder / "points.npz", len(frames))
+    if not (masks or visible_masks or poses or points):
         raise InputError(
             f"The clip {folder} has neither masks/ nor trusted poses in poses.json: nothing to score."
         )
-    return Truth(folder, names, poses, masks)
+    told, true = (_camera(folder / name) for name in ("camera.json", "truth_camera.json"))
+    info = _optional(folder / "info.json")
+    millimetres = _length(info.get("millimetres", millimetres), folder / "info.json", "millimetres")
+    mesh = folder / "mesh.obj"
+    return Truth(
+        name=folder.resolve().name,
+        frames=tuple(frames),
+        box=_initial_box(folder, visible_masks.get(0, masks.get(0))),
+        camera=true or told,
+        told_camera=told if true else None,
+        T_cam_obj=poses,
+        masks=masks or visible_masks,
+        visible_masks=visible_masks,
+        depth=_depth(folder, index, millimetres),
+        mesh=MeshFile(mesh) if mesh.is_file() else None,
+        points=points,
+        initial_masks=_masks(folder / "rough_masks", index) or _masks(folder / "initial_masks", index),
+        millimetres=millimetres,
+        symmetries=symmetries_of(info.get("symmetries", []), str(folder / "info.json")),
+    )
+
+
+def read_poses(file: Path, index: dict[str, int]) -> tuple[dict[int, NDArray[np.float64]], float | None]:
+    """Read ``poses.json`` of the clip layout.
+
+    Args:
+        file: There are no poses if it does not exist.
+        index: Of each frame by its name.
+
+    Returns:
+        The trusted poses ``(4, 4)`` by frame index, and the length of their unit in millimetres, where known.
+
+    Raises:
+        InputError: If the file is not of that kind, or a trusted pose is not rigid.
+    """
+    if not file.exists():
+        return {}, None
+    try:
+        document = json.loads(file.read_text(encoding="utf-8"))
+        frames: dict[str, dict[str, Any]] = document["frames"]
+        entries = frames.items()
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{file} is not a poses file: it needs JSON with the key frames.") from error
+    poses = {}
+    for name, entry in entries:
+        try:
+            T = np.eye(4)
+            T[:3, :3] = entry["R"]
+            T[:3, 3] = entry["t"]
+            trusted = bool(entry.get("trusted", True))
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise InputError(
+                f"{file}: frame {name} needs R (3 x 3) and t (3); correct that entry."
+            ) from error
+        if not trusted or name not in index:
+            continue
+        if not is_rigid(T):
+            raise InputError(
+                f"{file}: R of frame {name} is not a rotation; correct it or mark it trusted: false."
+            )
+        poses[index[name]] = T
+    unit = str(document.get("units", "")).partition(" ")[0]
+    return poses, _MILLIMETRES.get(unit)
 
 
 def write_clip(
@@ -130,35 +178,6 @@ def write_clip(
         write_atomic(folder / file, json.dumps(document, indent=1).encode() + b"\n")
 
 
-def _read_poses(file: Path, index: dict[str, int]) -> dict[int, NDArray[np.float64]]:
-    if not file.exists():
-        return {}
-    try:
-        frames: dict[str, dict[str, Any]] = json.loads(file.read_text(encoding="utf-8"))["frames"]
-        entries = frames.items()
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{file} is not a poses file: it needs JSON with the key frames.") from error
-    poses = {}
-    for name, entry in entries:
-        try:
-            T = np.eye(4)
-            T[:3, :3] = entry["R"]
-            T[:3, 3] = entry["t"]
-            trusted = bool(entry.get("trusted", True))
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
-            raise InputError(
-                f"{file}: frame {name} needs R (3 x 3) and t (3); correct that entry."
-            ) from error
-        if not trusted or name not in index:
-            continue
-        if not is_rigid(T):
-            raise InputError(
-                f"{file}: R of frame {name} is not a rotation; correct it or mark it trusted: false."
-            )
-        poses[index[name]] = T
-    return poses
-
-
 def is_rigid(T: NDArray[np.float64], tolerance: float = 1e-3) -> bool:
     """Whether ``T`` is a finite ``(4, 4)`` rigid transform."""
     if T.shape != (4, 4) or not np.isfinite(T).all():
@@ -170,3 +189,87 @@ def is_rigid(T: NDArray[np.float64], tolerance: float = 1e-3) -> bool:
 def _images(folder: Path) -> list[Path]:
     """The images in ``folder`` in natural order; none if there is no such folder."""
     return images_among(folder.iterdir()) if folder.is_dir() else []
+
+
+def _masks(folder: Path, index: dict[str, int]) -> dict[int, MaskFile]:
+    return {index[file.stem]: MaskFile(file) for file in _images(folder) if file.stem in index}
+
+
+def _optional(file: Path) -> dict[str, Any]:
+    return read_json(file) if file.exists() else {}
+
+
+def _camera(file: Path) -> Camera | None:
+    return read_camera(file) if file.exists() else None
+
+
+def _depth(folder: Path, index: dict[str, int], millimetres: float | None) -> dict[int, DepthFile]:
+    files = [file for file in _images(folder / "depth") if file.stem in index]
+    if not files:
+        return {}
+    file = folder / "camera.json"
+    scale = _length(_optional(file).get("depth_scale", 1 / (millimetres or 1000.0)), file, "depth_scale")
+    return {index[image.stem]: DepthFile(image, scale) for image in files}
+
+
+def _initial_box(folder: Path, mask: MaskFile | None) -> Box | None:
+    """What init.json says of frame 0, or else the bounding box of its mask."""
+    file = folder / "init.json"
+    init = _optional(file)
+    if "bbox_xywh" not in init or init.get("frame", 0) != 0:
+        return box_of(mask.read()) if mask else None
+    try:
+        x, y, width, height = (float(value) for value in init["bbox_xywh"])
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{file}: bbox_xywh must be four numbers x, y, width, height.") from error
+    return x, y, width, height
+
+
+def _read_points(file: Path, frames: int) -> PointTruth | None:
+    if not file.exists():
+        return None
+    try:
+        with np.load(file, allow_pickle=False) as arrays:
+            points = PointTruth(arrays["positions"].astype(np.float64), arrays["visible"].astype(bool))
+    except (OSError, ValueError, KeyError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+        raise InputError(f"{file} cannot be read as positions and visible ({error}); restore it.") from error
+    shape = points.visible.shape
+    if len(shape) != 2 or shape[0] != frames or points.positions.shape != (*shape, 2):
+        raise InputError(
+            f"{file}: positions must be (T, N, 2) and visible (T, N) for the clip's {frames} frames, "
+            f"not {points.positions.shape} and {shape}."
+        )
+    if not np.isfinite(points.positions[points.visible]).all():
+        raise InputError(f"{file}: a visible point has a position that is no finite number; correct it.")
+    return points
+
+
+def _length(value: Any, file: Path, key: str) -> Any:
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < np.inf:
+        raise InputError(f"{file}: {key} must be a positive number, not {value!r}.")
+    return float(value)
+
+
+def symmetries_of(value: Any, origin: str) -> NDArray[np.float64]:
+    """Check transforms that leave an object as it is.
+
+    Args:
+        value: A list of 4 x 4 matrices, or of their 16 values row by row.
+        origin: What messages call it: its file.
+
+    Returns:
+        ``(S, 4, 4)``, the identity first.
+
+    Raises:
+        InputError: If they are not rigid transforms.
+    """
+    try:
+        transforms = np.asarray(value, dtype=np.float64).reshape(-1, 4, 4)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{origin}: symmetries must be a list of 4 x 4 matrices.") from error
+    if not all(is_rigid(transform) for transform in transforms):
+        raise InputError(f"{origin}: symmetries must be rigid transforms; correct or remove them.")
+    others = [T for T in transforms if not np.allclose(T, np.eye(4))]
+    return np.stack([np.eye(4), *others])

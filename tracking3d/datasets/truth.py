@@ -126,6 +126,7 @@ class Truth:
         frames: The images in order.
         box: The object in frame 0 as ``(x, y, width, height)``, where a tracker starts from one.
         camera: Of all frames, where known.
+        told_camera: What a tracker is told that the camera is, where that is not the true one.
         T_cam_obj: ``(4, 4)`` pose by frame index; only those that are known and trusted.
         masks: The object's mask by frame index, the part behind other things included if the data know it.
         visible_masks: Only the part that is seen; where it differs from `masks` and is known.
@@ -142,6 +143,7 @@ class Truth:
     frames: tuple[Path, ...]
     box: Box | None = None
     camera: Camera | None = None
+    told_camera: Camera | None = None
     T_cam_obj: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
     masks: Mapping[int, MaskReference] = field(default_factory=dict)
     visible_masks: Mapping[int, MaskReference] = field(default_factory=dict)

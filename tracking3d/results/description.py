@@ -15,6 +15,7 @@ import numpy as np
 
 from tracking3d.estimation.estimate import Status
 from tracking3d.geometry.camera import Camera
+from tracking3d.process_memory import resident_memory
 from tracking3d.results.layout import CONVENTIONS, FORMAT, FORMAT_VERSION
 from tracking3d.results.records import FrameRecord
 
@@ -53,7 +54,7 @@ def description_at_start(
 
 
 def summary(records: Sequence[FrameRecord], skipped: int, seconds: float) -> dict[str, Any]:
-    """Counts, timings and mean IoU of a run.
+    """Counts, timings, mean IoU and highest memory of a run.
 
     Args:
         records: The answer for every frame.
@@ -62,6 +63,7 @@ def summary(records: Sequence[FrameRecord], skipped: int, seconds: float) -> dic
     """
     by_status = Counter(record.status for record in records)
     per_frame = [record.seconds for record in records]
+    memory = resident_memory()
     ious = [record.iou_initial for record in records if record.iou_initial is not None]
     return {
         "counts": {
@@ -76,6 +78,7 @@ def summary(records: Sequence[FrameRecord], skipped: int, seconds: float) -> dic
             "seconds_per_frame_median": float(np.median(per_frame)) if per_frame else None,
         },
         "iou_initial_mean": float(np.mean(ious)) if ious else None,
+        "peak_memory_mb": memory and memory[1],
     }
 
 

@@ -10,24 +10,21 @@ On a GPU it is the same difference in what torch's allocator has handed out.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import subprocess
 import sys
 from dataclasses import asdict
-from pathlib import Path
 
 import torch
 
+from tracking3d.process_memory import forget_peak, resident_memory
 from tracking3d.speed.scene import Problem, Scene
 from tracking3d.speed.timing import backends, give_threads
 
 ITERATIONS = 3
 _TINY = Problem(size=16, frames=1, channels=1, texture=8, frequency=2)
 _GIVE_BACK = 128 * 1024  # bytes; blocks of at least this size go back to the system at once
-_STATUS = Path("/proc/self/status")
-_CLEAR_PEAK = Path("/proc/self/clear_refs")
 
 
 def peak_memory(name: str, problem: Problem, device: torch.device, threads: int = 1) -> float | None:
@@ -41,32 +38,6 @@ def peak_memory(name: str, problem: Problem, device: torch.device, threads: int 
     environment = {**os.environ, "MALLOC_MMAP_THRESHOLD_": str(_GIVE_BACK)}
     answer = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True).stdout
     return float(answer)
-
-
-def resident_memory() -> tuple[float, float] | None:
-    """Megabytes of this process in memory: now, and at most since `forget_peak`; None where nobody tells.
-
-    Where there is no ``/proc``, both are the most since the process began.
-    """
-    if _STATUS.exists():
-        # Not getrusage: on Linux its maximum includes that of the process which started this one.
-        lines = (line.split() for line in _STATUS.read_text(encoding="ascii").splitlines())
-        kilobytes = {line[0]: int(line[1]) for line in lines if line and line[0] in ("VmRSS:", "VmHWM:")}
-        if len(kilobytes) == 2:
-            return 1.024e-3 * kilobytes["VmRSS:"], 1.024e-3 * kilobytes["VmHWM:"]
-    try:
-        import resource
-    except ImportError:  # Windows
-        return None
-    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # bytes on macOS, kilobytes elsewhere
-    peak = 1e-6 * most * (1 if sys.platform == "darwin" else 1024)
-    return peak, peak
-
-
-def forget_peak() -> None:
-    """Let the highest resident set size be that of now, where the system can do that (Linux)."""
-    with contextlib.suppress(OSError):
-        _CLEAR_PEAK.write_text("5", encoding="ascii")
 
 
 def _in_this_process(name: str, problem: Problem, threads: int) -> float | None:

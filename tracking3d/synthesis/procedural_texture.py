@@ -33,6 +33,17 @@ def paint_panel(rng: np.random.Generator, size: int = 256) -> FloatImage:
     return np.clip(panel_float + 7 * _smooth_noise(rng, (size, size), 1.5)[..., None], 0, 255)
 
 
+def paint_plain(rng: np.random.Generator, size: int, hue: float) -> FloatImage:
+    """A panel ``(size, size, 3)`` of one colour, with spots so faint that nothing can be matched by them."""
+    spots = 1.5 * _smooth_noise(rng, (size, size), size / 16)
+    return np.clip(np.float32(plain_colour(hue)) + spots[..., None], 0, 255)
+
+
+def plain_colour(hue: float) -> tuple[int, int, int]:
+    """The colour of textureless objects of a ``hue`` in [0, 1)."""
+    return _colour(hue, 0.4, 0.72)
+
+
 def paint_background(rng: np.random.Generator, width: int, height: int, clutter: float = 1.0) -> FloatImage:
     """A soft gradient ``(height, width, 3)`` with dull things on it, many at ``clutter`` 1, none at 0."""
     ramp = np.linspace(0, 1, height)[:, None, None]

@@ -1,0 +1,79 @@
+"""Jobs run in processes of their own: one that crashes costs itself only, and what is finished stays."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+
+from tracking3d.benchmark import job as job_module
+from tracking3d.benchmark.job import Job
+from tracking3d.benchmark.pool import run_jobs
+
+
+@pytest.fixture
+def jobs(clips, tmp_path):
+    def make(variant, sequences=("narrow", "wide")):
+        return [Job("clip", clips, name, variant, tmp_path / "out") for name in sequences]
+
+    return make
+
+
+def test_a_crash_and_a_failure_cost_their_own_sequence_only_and_the_rest_is_found_again(jobs, scripted):
+    told = []
+    narrow, wide = run_jobs(jobs(scripted(crash=70)), 2, told.append)
+    assert narrow.error == "" and narrow.scores["iou_mean"] > 0.3
+    assert wide.scores is None and "signal 11" in wide.error and "log.txt" in wide.error
+    assert {outcome.job.sequence for outcome in told} == {"narrow", "wide"}
+
+    again, _ = run_jobs(jobs(scripted(crash=70)), 1)
+    assert again.cached and again.scores == json.loads(json.dumps(narrow.scores))
+
+
+def test_a_failure_is_told_in_its_own_sentence(jobs, scripted):
+    [outcome] = run_jobs(jobs(scripted(fail=70), ["wide"]))
+    assert outcome.error.startswith("The mask tracker 'scripted' failed at 000000.png: RuntimeError")
+
+
+def test_a_sequence_that_cannot_be_read_is_an_outcome(jobs, scripted):
+    [outcome] = run_jobs(jobs(scripted(), ["absent"]))
+    assert outcome.scores is None and "absent" in outcome.error
+
+
+def test_equal_jobs_are_done_once(jobs, scripted):
+    first, second = run_jobs(jobs(scripted(), ["narrow"]) + jobs(scripted("another label"), ["narrow"]), 2)
+    assert sorted([first.cached, second.cached]) == [False, True]
+    assert first.scores == second.scores
+
+
+def test_what_a_result_depends_on_is_in_its_key(jobs, scripted, clips, tmp_path, monkeypatch):
+    [one] = jobs(scripted(), ["narrow"])
+    folder, score_key = one.folder, one.score_key
+    assert jobs(scripted(crash=99), ["narrow"])[0].folder != folder
+    assert jobs(scripted(masks="truth"), ["narrow"])[0].folder != folder
+    assert jobs(scripted("label"), ["narrow"])[0].folder == folder
+
+    shutil.copy(clips / "narrow/frames/000000.png", clips / "narrow/frames/000003.png")
+    assert jobs(scripted(), ["narrow"])[0].folder != folder
+    (clips / "narrow/frames/000003.png").unlink()
+
+    code = job_module.code_fingerprint
+    monkeypatch.setattr(job_module, "code_fingerprint", lambda judges: code(judges=judges) + "x" * judges)
+    [rescored] = jobs(scripted(), ["narrow"])
+    assert rescored.folder == folder and rescored.score_key != score_key
+    monkeypatch.setattr(job_module, "code_fingerprint", lambda judges: code(judges=judges) + "x")
+    assert jobs(scripted(), ["narrow"])[0].folder != folder
+
+
+def test_the_camera_of_the_dataset_is_used_unless_the_settings_say_one(jobs, scripted):
+    [one] = jobs(scripted(), ["narrow"])
+    camera = one.truth.camera
+    assert one.config.camera.intrinsics == (camera.fx, camera.fy, camera.cx, camera.cy)
+    [other] = jobs(scripted().changed("fov", camera__fov=30.0), ["narrow"])
+    assert (other.config.camera.intrinsics, other.config.camera.fov) == (None, 30.0)
+
+
+def test_a_job_survives_its_way_through_a_file(jobs, scripted):
+    [one] = jobs(scripted(masks="truth"), ["wide"])
+    assert Job.read(one.write()) == one

@@ -1,0 +1,53 @@
+"""Names for what a result depends on, so that it is computed once: code, settings, frames."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import tracking3d
+from tracking3d.benchmark.variant import DEGRADED
+from tracking3d.datasets.truth import Truth
+from tracking3d.results.description import versions
+
+PACKAGE = Path(tracking3d.__file__).parent
+JUDGES = frozenset({"benchmark", "cli", "datasets", "evaluation", "speed", "synthesis", "vot"})
+"""Rooms that measure what a run is worth; a change in them changes scores, not runs."""
+
+
+@cache
+def code_fingerprint(*, judges: bool) -> str:
+    """Hash of the package's sources, of `JUDGES` or of all other rooms, and of the versions it runs with."""
+    digest = hashlib.sha256(json.dumps(versions(), sort_keys=True).encode())
+    for path in sorted(PACKAGE.rglob("*")):
+        inside = path.relative_to(PACKAGE)
+        if path.suffix in (".py", ".yaml") and (inside.parts[0] in JUDGES) == judges:
+            digest.update(inside.as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()
+
+
+def frames_fingerprint(truth: Truth) -> str:
+    """Hash of the names and sizes of a clip's frames and of the contents of the first and the last."""
+    digest = hashlib.sha256()
+    for path in truth.frames:
+        digest.update(f"{path.name} {path.stat().st_size}\n".encode())
+    for path in (truth.frames[0], truth.frames[-1]):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def masks_fingerprint(masks: str, sequence: str) -> str:
+    """What the initial masks of a source depend on beside the frames: a folder's files, the code that degrades."""
+    if masks.startswith(DEGRADED):
+        return hashlib.sha256((PACKAGE / "synthesis/mask_degradation.py").read_bytes()).hexdigest()
+    folder = Path(masks) / sequence
+    files = sorted(folder.iterdir()) if folder.is_dir() else []
+    return key(*((file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files))
+
+
+def key(*parts: Any) -> str:
+    """Hash of parts that JSON can hold."""
+    return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()

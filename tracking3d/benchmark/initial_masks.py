@@ -1,0 +1,76 @@
+"""The masks that a variant asks for, as a folder that the tracker ``precomputed`` reads."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.benchmark.variant import DEGRADED, degraded_iou
+from tracking3d.datasets.truth import MaskReference, Truth
+from tracking3d.errors import InputError
+from tracking3d.results.files import write_mask, writing
+from tracking3d.synthesis.mask_degradation import degrade_to_iou
+from tracking3d.video.image_file import read_image
+
+SEED = 0
+
+
+def masks_for(source: str, truth: Truth, folder: Path) -> Path:
+    """The folder of masks for one sequence, made in ``folder`` where it is not there already.
+
+    Trackers see what can be seen: ``truth`` and ``degraded`` masks are those of the visible part where it is known.
+
+    Args:
+        source: ``truth``, ``initial``, ``degraded:IOU``, or a folder with a folder of masks for every sequence.
+        truth: The sequence.
+        folder: Where to write masks.
+
+    Raises:
+        InputError: If the sequence has no such masks.
+    """
+    if source == "truth":
+        return _written(truth, _seen(truth), folder)
+    if source == "initial":
+        if not truth.initial_masks:
+            raise InputError(f"{truth.name} comes with no initial masks; choose other --masks.")
+        return _written(truth, truth.initial_masks, folder)
+    if source.startswith(DEGRADED):
+        return _degraded(truth, degraded_iou(source), folder)
+    given = Path(source) / truth.name
+    if not given.is_dir():
+        raise InputError(f"{source} has no folder {truth.name} with the masks of that sequence.")
+    return given
+
+
+def _seen(truth: Truth) -> Mapping[int, MaskReference]:
+    masks = {**truth.masks, **truth.visible_masks}
+    if not masks:
+        raise InputError(f"{truth.name} has no true masks to start from; choose other --masks.")
+    return masks
+
+
+def _degraded(truth: Truth, iou: float, folder: Path) -> Path:
+    masks = _seen(truth)
+    if len(masks) < len(truth.frames):
+        raise InputError(
+            f"{truth.name} has not a true mask in every frame: there is nothing to degrade there."
+        )
+    true = np.stack([masks[n].read() for n in range(len(truth.frames))])
+    images = np.stack([read_image(path) for path in truth.frames])
+    rough = degrade_to_iou(true, images, iou, SEED)
+    return _write(truth, {n: mask for n, mask in enumerate(rough) if mask.any()}, folder)
+
+
+def _written(truth: Truth, masks: Mapping[int, MaskReference], folder: Path) -> Path:
+    return _write(truth, {n: reference.read() for n, reference in masks.items()}, folder)
+
+
+def _write(truth: Truth, masks: Mapping[int, NDArray[np.bool_]], folder: Path) -> Path:
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    for n, mask in masks.items():
+        write_mask(folder / f"{truth.names[n]}.png", mask)
+    return folder

@@ -1,0 +1,161 @@
+"""One sequence run one way, in a process of its own: ``python -m tracking3d.benchmark.job job.json``.
+
+A crash of that process, whatever its cause, costs this job only. What is finished is found again by what it
+depends on: the run by configuration, masks, frames and code; its scores by the code that judges, too.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from tracking3d.benchmark.fingerprint import code_fingerprint, frames_fingerprint, key, masks_fingerprint
+from tracking3d.benchmark.initial_masks import masks_for
+from tracking3d.benchmark.variant import Variant
+from tracking3d.config.models import PipelineConfig
+from tracking3d.datasets.layout import load_layout
+from tracking3d.datasets.reading import read_sequence
+from tracking3d.datasets.run_answers import answers_of_run
+from tracking3d.datasets.truth import Truth
+from tracking3d.errors import InputError, Tracking3dError
+from tracking3d.evaluation.score import score
+from tracking3d.recording import record
+from tracking3d.results.files import write_atomic, writing
+from tracking3d.video.image_sequence import ImageSequence
+
+JOB, SCORES, RUN, LOG, MASKS = "job.json", "scores.json", "run", "log.txt", "initial_masks"
+
+
+@dataclass(frozen=True)
+class Job:
+    """A sequence and how to run it.
+
+    Attributes:
+        layout: Name of a dataset's layout, or the YAML file of one.
+        root: Where the dataset lies.
+        sequence: The sequence's name.
+        variant: How to run it.
+        out: The folder for everything of this benchmark.
+    """
+
+    layout: str
+    root: Path
+    sequence: str
+    variant: Variant
+    out: Path
+
+    @cached_property
+    def truth(self) -> Truth:
+        """What is known about the sequence."""
+        return read_sequence(load_layout(self.layout), self.root, self.sequence)
+
+    @cached_property
+    def config(self) -> PipelineConfig:
+        """The pipeline, with the camera that the dataset tells of unless the configuration says one itself."""
+        config = self.variant.config
+        camera = self.truth.told_camera or self.truth.camera
+        if camera is None or config.camera.intrinsics is not None or config.camera.fov is not None:
+            return config
+        told = config.camera.model_copy(update={"intrinsics": (camera.fx, camera.fy, camera.cx, camera.cy)})
+        return config.model_copy(update={"camera": told})
+
+    @cached_property
+    def run_key(self) -> str:
+        """What the run depends on."""
+        masks = self.variant.masks
+        return key(
+            self.config.model_dump(mode="json"),
+            self.truth.box,
+            masks,
+            masks_fingerprint(masks, self.sequence),
+            frames_fingerprint(self.truth),
+            code_fingerprint(judges=False),
+        )
+
+    @cached_property
+    def score_key(self) -> str:
+        """What the scores depend on."""
+        return key(self.run_key, code_fingerprint(judges=True))
+
+    @property
+    def folder(self) -> Path:
+        """Where the run and its scores lie."""
+        return self.out / "runs" / Path(self.layout).stem / self.sequence / self.run_key[:16]
+
+    def finished(self) -> dict[str, Any] | None:
+        """The scores of an earlier process, if nothing that they depend on has changed since."""
+        scores = _read(self.folder / SCORES)
+        return scores["scores"] if scores and scores["key"] == self.score_key else None
+
+    def write(self) -> Path:
+        """Write the job for a process to read; returns the file."""
+        with writing(self.folder):
+            self.folder.mkdir(parents=True, exist_ok=True)
+        document = {
+            "layout": self.layout,
+            "root": str(self.root),
+            "sequence": self.sequence,
+            "variant": self.variant.model_dump(mode="json"),
+            "out": str(self.out),
+        }
+        write_atomic(self.folder / JOB, json.dumps(document, indent=1).encode())
+        return self.folder / JOB
+
+    @classmethod
+    def read(cls, file: Path) -> Job:
+        """Read what `write` wrote."""
+        document = json.loads(file.read_bytes())
+        document["variant"] = Variant.model_validate(document["variant"])
+        return cls(**{**document, "root": Path(document["root"]), "out": Path(document["out"])})
+
+
+def run_job(job: Job) -> dict[str, Any]:
+    """Track, unless the run is there, and score; the scores are written too.
+
+    Raises:
+        Tracking3dError: If the sequence cannot be read, tracked or scored.
+    """
+    run = job.folder / RUN
+    if (_read(run / "run.json") or {}).get("state") != "finished":
+        _track(job, run)
+    scores = asdict(score(answers_of_run(run, job.truth), job.truth))
+    write_atomic(job.folder / SCORES, json.dumps({"key": job.score_key, "scores": scores}, indent=1).encode())
+    return scores
+
+
+def _track(job: Job, run: Path) -> None:
+    truth, config = job.truth, job.config
+    source = ImageSequence(job.sequence, truth.frames, range(len(truth.frames)))
+    if job.variant.masks == "tracker":
+        if truth.box is None:
+            raise InputError(f"{job.sequence} has no box in its first frame; a mask tracker cannot start.")
+        record(source, config, run, box=truth.box, overwrite=True)
+        return
+    masks = masks_for(job.variant.masks, truth, job.folder / MASKS)
+    tracker = {"name": "precomputed", "path": str(masks)}
+    config = PipelineConfig.model_validate({**config.model_dump(), "tracker": tracker})
+    try:
+        record(source, config, run, overwrite=True)
+    finally:
+        if masks.is_relative_to(job.folder):  # the run keeps its own copy of them
+            shutil.rmtree(masks, ignore_errors=True)
+
+
+def _read(file: Path) -> dict[str, Any] | None:
+    try:
+        document: dict[str, Any] = json.loads(file.read_bytes())
+    except (OSError, ValueError):
+        return None
+    return document
+
+
+if __name__ == "__main__":
+    try:
+        run_job(Job.read(Path(sys.argv[1])))
+    except Tracking3dError as error:
+        sys.exit(" ".join(str(error).split()))

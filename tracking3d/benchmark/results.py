@@ -1,0 +1,148 @@
+"""The scores of one variant on many sequences: kept as JSON, averaged, printed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.markup import escape
+from rich.table import Table
+
+from tracking3d.benchmark.fingerprint import code_fingerprint
+from tracking3d.benchmark.pool import Outcome
+from tracking3d.benchmark.sequences import Dataset
+from tracking3d.benchmark.variant import Variant
+from tracking3d.errors import InputError
+from tracking3d.results.description import now, versions
+from tracking3d.results.files import write_atomic, writing
+from tracking3d.results.records import jsonable
+
+FORMAT = "tracking3d-results"
+
+COLUMNS = {
+    "iou_initial_mean": "IoU initial",
+    "iou_mean": "IoU",
+    "iou_gain_percent": "gain %",
+    "boundary_f_mean": "boundary F",
+    "rotation_error_mean_deg": "rotation °",
+    "share_under_5_deg": "under 5°",
+    "points_average_jaccard": "AJ",
+    "bop_ar": "AR",
+    "frames_lost": "lost",
+    "seconds_per_frame": "s/frame",
+}
+"""Measures that the table of a result set shows, and what it calls them."""
+
+
+@dataclass(frozen=True)
+class ResultSet:
+    """What a variant is worth on a dataset.
+
+    Attributes:
+        label: What tables call it.
+        dataset: Name of the dataset.
+        scores: Measures by sequence; None for a sequence that failed.
+        errors: Why sequences failed.
+        about: Everything else that is kept: configuration, masks, versions, code, date.
+    """
+
+    label: str
+    dataset: str
+    scores: Mapping[str, Mapping[str, Any] | None]
+    errors: Mapping[str, str]
+    about: Mapping[str, Any]
+
+    def values(self, measure: str) -> dict[str, float]:
+        """A measure by sequence, where it is known."""
+        known = {name: (scores or {}).get(measure) for name, scores in self.scores.items()}
+        return {name: float(value) for name, value in known.items() if value is not None}
+
+    def mean(self, measure: str) -> float | None:
+        """Mean of a measure over the sequences where it is known; each sequence counts once."""
+        values = list(self.values(measure).values())
+        return float(np.mean(values)) if values else None
+
+
+def collect(variant: Variant, dataset: Dataset, outcomes: Sequence[Outcome]) -> ResultSet:
+    """The result set of one variant's outcomes."""
+    about = {
+        "suite_version": dataset.version,
+        "masks": variant.masks,
+        "config": variant.config.model_dump(mode="json"),
+        "versions": versions(),
+        "code": code_fingerprint(judges=False),
+        "created": now(),
+    }
+    return ResultSet(
+        variant.label,
+        dataset.name,
+        {outcome.job.sequence: outcome.scores for outcome in outcomes},
+        {outcome.job.sequence: outcome.error for outcome in outcomes if outcome.error},
+        about,
+    )
+
+
+def write_results(results: ResultSet, file: Path) -> None:
+    """Write a result set as JSON.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
+    measures = sorted({measure for scores in results.scores.values() for measure in scores or {}})
+    document = {
+        "format": FORMAT,
+        "label": results.label,
+        "dataset": results.dataset,
+        **results.about,
+        "mean": {measure: results.mean(measure) for measure in measures},
+        "sequences": results.scores,
+        "errors": results.errors,
+    }
+    with writing(file.parent):
+        file.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(file, json.dumps(jsonable(document), indent=1).encode() + b"\n")
+
+
+def read_results(file: Path) -> ResultSet:
+    """Read what `write_results` wrote.
+
+    Raises:
+        InputError: If the file is not one of a result set.
+    """
+    try:
+        document = json.loads(file.read_bytes())
+        if document.pop("format") != FORMAT:
+            raise ValueError("another format")
+        document.pop("mean")
+        label, name, scores, errors = (document.pop(one) for one in ("label", "dataset", "sequences", "errors"))
+    except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
+        raise InputError(
+            f"{file} is not a result set ({error}); give a JSON file that `tracking3d evaluate suite` wrote."
+        ) from error
+    return ResultSet(label, name, scores, errors, document)
+
+
+def format_results(results: ResultSet) -> Table:
+    """The main measures of every sequence and their means."""
+    shown = {name: title for name, title in COLUMNS.items() if results.values(name)}
+    table = Table(title=escape(f"{results.dataset}: {results.label}"), title_justify="left")
+    table.add_column("sequence")
+    for title in shown.values():
+        table.add_column(title, justify="right")
+    for name, scores in results.scores.items():
+        table.add_row(escape(name), *(figure((scores or {}).get(measure), measure) for measure in shown))
+    table.add_section()
+    table.add_row("mean", *(figure(results.mean(measure), measure) for measure in shown), style="bold")
+    return table
+
+
+def figure(value: float | None, measure: str) -> str:
+    """A measure as tables show it."""
+    if value is None:
+        return "-"
+    digits = 1 if measure.endswith(("_deg", "_percent", "lost")) and measure != "share_under_5_deg" else 3
+    return f"{value:.{digits}f}"

@@ -1,0 +1,84 @@
+"""From the name of a dataset to its sequences: synthetic suites, real clips, and datasets in any layout."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from fnmatch import fnmatch
+from pathlib import Path
+
+from tracking3d.datasets.layout import load_layout
+from tracking3d.datasets.reading import list_sequences
+from tracking3d.errors import InputError
+from tracking3d.synthesis.suite import SUITE_VERSION, SUITES, make_suite
+
+REAL = "real"
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """Sequences to be run.
+
+    Attributes:
+        name: What results call it.
+        version: Version of a synthetic suite; None for others.
+        layout: Name of the layout, or the YAML file of one.
+        root: Where it lies.
+        sequences: Names of the sequences.
+    """
+
+    name: str
+    version: int | None
+    layout: str
+    root: Path
+    sequences: tuple[str, ...]
+
+    @property
+    def synthetic(self) -> bool:
+        """Whether it is one of the suites that this package makes."""
+        return self.name in SUITES
+
+    def only(self, patterns: list[str]) -> Dataset:
+        """The sequences that match any of the patterns, all if there is no pattern.
+
+        Raises:
+            InputError: If a pattern matches nothing.
+        """
+        for pattern in patterns:
+            if not any(fnmatch(name, pattern) for name in self.sequences):
+                raise InputError(
+                    f"{self.name} has no sequence '{pattern}'; choose from {', '.join(self.sequences)}."
+                )
+        chosen = tuple(
+            name for name in self.sequences if not patterns or any(fnmatch(name, one) for one in patterns)
+        )
+        return Dataset(self.name, self.version, self.layout, self.root, chosen)
+
+
+def open_dataset(
+    name: str, data: Path | None, out: Path, jobs: int, listener: Callable[[str], None] = lambda name: None
+) -> Dataset:
+    """Find a dataset by name; a synthetic suite that is not there yet is made.
+
+    Args:
+        name: ``smoke``, ``standard`` or ``full``; ``real`` for a folder of clips in our own layout; the name of a
+            dataset's layout; or a YAML file of one.
+        data: Where it lies; a synthetic suite's default is ``out/data/NAME``.
+        out: Folder of the benchmark.
+        jobs: Processes that make a suite.
+        listener: Is told of every sequence of a suite as it is made.
+
+    Raises:
+        InputError: If there is no such dataset, or it holds no sequence.
+    """
+    if name in SUITES:
+        folder = data or out / "data" / name
+        made = make_suite(name, folder, jobs=jobs, listener=listener)
+        return Dataset(name, SUITE_VERSION, "clip", folder, tuple(path.name for path in made))
+    if data is None:
+        raise InputError(f"Say where the dataset {name} lies: --data DIR.")
+    layout = "clip" if name == REAL else name
+    sequences = tuple(list_sequences(load_layout(layout), data))
+    if not sequences:
+        raise InputError(f"{data} holds no sequence of the dataset {name}; give its folder with --data.")
+    return Dataset(Path(name).stem, None, layout, data, sequences)

@@ -1,0 +1,219 @@
+"""Filling a table of the paper, and writing it as Markdown, CSV, JSON and a picture."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import random
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from rich.markup import escape
+from rich.table import Table as Printed
+
+from tracking3d.benchmark.pool import Listener
+from tracking3d.benchmark.results import ResultSet, write_results
+from tracking3d.benchmark.sequences import Dataset
+from tracking3d.benchmark.suite import run_suite
+from tracking3d.benchmark.tables import Row, Table
+from tracking3d.benchmark.variant import Variant
+from tracking3d.results.files import write_atomic, writing
+
+SEED = 0
+COLUMNS = ("row", "paper", "paper gain %", "here", "gain %", "rotation °", "s/frame", "sequences", "note")
+
+
+@dataclass(frozen=True)
+class Line:
+    """A filled row: the paper's figures and those measured here; None where there is none.
+
+    Attributes:
+        label: The row's name.
+        paper: The paper's measure.
+        paper_gain_percent: The paper's gain over the initial masks.
+        here: The same measure here.
+        gain_percent: Gain of the mean IoU over that of the initial masks here.
+        rotation_error_mean_deg: Mean rotation error, where the poses are known.
+        seconds_per_frame: Mean wall time.
+        sequences: Number of sequences that the figures here are the mean of.
+        note: Why something is missing.
+    """
+
+    label: str
+    paper: float | None = None
+    paper_gain_percent: float | None = None
+    here: float | None = None
+    gain_percent: float | None = None
+    rotation_error_mean_deg: float | None = None
+    seconds_per_frame: float | None = None
+    sequences: int = 0
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Filled:
+    """A table with both columns.
+
+    Attributes:
+        name: Its name.
+        caption: What it shows, on which data, with which settings.
+        lines: Its rows.
+    """
+
+    name: str
+    caption: str
+    lines: tuple[Line, ...]
+
+
+def fill(
+    table: Table,
+    base: Variant,
+    dataset: Dataset,
+    out: Path,
+    processes: int = 1,
+    initial: Mapping[str, Path] | None = None,
+    listener: Listener = lambda outcome: None,
+) -> Filled:
+    """Run what a table needs and put it beside the paper's figures; every result set is written to ``out/results``.
+
+    Args:
+        table: Which one.
+        base: The settings that its rows change.
+        dataset: The real dataset, or a synthetic suite.
+        out: Folder of the benchmark.
+        processes: Jobs at a time.
+        initial: Folders of initial masks by tracker, in lower case.
+        listener: Is told of every job.
+    """
+    plan = table.plan(base, dataset.synthetic, initial or {})
+    chosen = _chosen(table, dataset)
+    variants = {name: variant for name, variant in plan.items() if isinstance(variant, Variant)}
+    sets = run_suite(list(variants.values()), chosen, out, processes, listener)
+    results = dict(zip(variants, sets, strict=True))
+    for name, result in results.items():
+        write_results(result, out / "results" / f"{table.name}-{file_name(name)}-{chosen.name}.json")
+    lines = tuple(_line(row, table, plan, results) for row in table.rows)
+    return Filled(table.name, _caption(table, base, chosen), lines)
+
+
+def file_name(label: str) -> str:
+    """A label as a part of a file's name."""
+    return "_".join("".join(sign if sign.isalnum() else " " for sign in label.lower()).split())
+
+
+def _chosen(table: Table, dataset: Dataset) -> Dataset:
+    if dataset.synthetic:
+        return dataset.only(list(table.sequences))
+    if not 0 < table.sample < len(dataset.sequences):
+        return dataset
+    return dataset.only(sorted(random.Random(SEED).sample(dataset.sequences, table.sample)))
+
+
+def _line(
+    row: Row, table: Table, plan: Mapping[str, Variant | str], results: Mapping[str, ResultSet]
+) -> Line:
+    paper = row.paper.value if row.paper else None
+    line = Line(row.label, paper, row.paper.gain if row.paper else None)
+    if not row.plan:
+        return line
+    if row.plan not in results:
+        return replace(line, note=str(plan[row.plan]))
+    result = results[row.plan]
+    measure = "iou_initial_mean" if row.initial else table.measure
+    line = replace(
+        line,
+        here=result.mean(measure),
+        sequences=len(result.values(measure)),
+        note=f"failed: {', '.join(result.errors)}" if result.errors else "",
+    )
+    if row.initial:
+        return line
+    answer, start = result.mean("iou_mean"), result.mean("iou_initial_mean")
+    return replace(
+        line,
+        gain_percent=100 * (answer / start - 1) if answer is not None and start else None,
+        rotation_error_mean_deg=result.mean("rotation_error_mean_deg"),
+        seconds_per_frame=result.mean("seconds_per_frame"),
+    )
+
+
+def _caption(table: Table, base: Variant, dataset: Dataset) -> str:
+    version = "" if dataset.version is None else f", version {dataset.version}"
+    data = (
+        f"Column 'here' is measured on the synthetic suite {dataset.name}{version} "
+        f"({len(dataset.sequences)} sequences), as the real data are absent: an initial tracker is the true masks "
+        "degraded to the mean IoU that the paper gives for it. The columns are therefore not on the same data."
+        if dataset.synthetic
+        else f"Column 'here' is measured on {dataset.name} ({len(dataset.sequences)} sequences)."
+    )
+    paper = f"{table.title} ({table.source} of Rozumnyi et al., ICCV 2023)."
+    return " ".join(part for part in (paper, data, f"Settings: {base.label}.", table.note) if part)
+
+
+def cells(line: Line) -> tuple[str, ...]:
+    """A line as texts, in the order of `COLUMNS`."""
+    return (
+        line.label,
+        _number(line.paper, 4),
+        _number(line.paper_gain_percent, 1, sign=True),
+        _number(line.here, 4),
+        _number(line.gain_percent, 1, sign=True),
+        _number(line.rotation_error_mean_deg, 1),
+        _number(line.seconds_per_frame, 2),
+        str(line.sequences or ""),
+        line.note,
+    )
+
+
+def _number(value: float | None, digits: int, sign: bool = False) -> str:
+    return "" if value is None else f"{value:{'+' if sign else ''}.{digits}f}"
+
+
+def to_markdown(filled: Filled) -> str:
+    """The table in Markdown, its caption above it."""
+    rule = "|".join("---" if title in ("row", "note") else "---:" for title in COLUMNS)
+    rows = (" | ".join(cells(line)) for line in filled.lines)
+    head = f"{filled.caption}\n\n| {' | '.join(COLUMNS)} |\n|{rule}|\n"
+    return head + "".join(f"| {row} |\n" for row in rows)
+
+
+def to_csv(filled: Filled) -> str:
+    """The table as CSV with full precision."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(Line.__dataclass_fields__), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(asdict(line) for line in filled.lines)
+    return text.getvalue()
+
+
+def to_json(filled: Filled) -> str:
+    """The table as JSON with full precision."""
+    return json.dumps(asdict(filled), indent=1) + "\n"
+
+
+def write_table(filled: Filled, folder: Path) -> list[Path]:
+    """Write a table in all three formats; returns the files.
+
+    Raises:
+        OutputError: If they cannot be written.
+    """
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    texts: dict[str, Any] = {".md": to_markdown(filled), ".csv": to_csv(filled), ".json": to_json(filled)}
+    files = [folder / f"{filled.name}{suffix}" for suffix in texts]
+    for file, text in zip(files, texts.values(), strict=True):
+        write_atomic(file, text.encode())
+    return files
+
+
+def format_table(filled: Filled) -> Printed:
+    """The table for the terminal."""
+    printed = Printed(caption=escape(filled.caption), caption_justify="left")
+    for title in COLUMNS:
+        printed.add_column(title, justify="left" if title in ("row", "note") else "right")
+    for line in filled.lines:
+        printed.add_row(*(escape(cell) for cell in cells(line)))
+    return printed

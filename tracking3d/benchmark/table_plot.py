@@ -1,0 +1,55 @@
+"""A table of the paper as bars: its figures beside those measured here. Needs matplotlib, which is optional."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tracking3d.benchmark.table import Filled, Line
+from tracking3d.errors import OutputError
+
+_WIDTH = 0.4
+
+
+def plot_table(filled: Filled, path: Path) -> None:
+    """Draw a table into an .svg, .png or .pdf file.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
+    # The figure draws on no screen: pyplot, which would choose one, is not involved.
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    lines = [line for line in filled.lines if line.paper is not None or line.here is not None]
+    figure = Figure(figsize=(1.5 + 0.8 * len(lines), 4.5), layout="constrained")
+    axes = figure.subplots()
+    for offset, label, values in (
+        (-_WIDTH / 2, "paper", [line.paper for line in lines]),
+        (_WIDTH / 2, "here", [line.here for line in lines]),
+    ):
+        known = {place + offset: value for place, value in enumerate(values) if value is not None}
+        if known:
+            bars = axes.bar(list(known), list(known.values()), width=_WIDTH, label=label)
+            axes.bar_label(bars, fmt="%.3f", fontsize="x-small", rotation=90, padding=3)
+    axes.set_xticks(
+        range(len(lines)), [line.label for line in lines], rotation=35, ha="right", fontsize="small"
+    )
+    axes.set_ylim(_floor(lines), 1.08)
+    axes.set_ylabel("average recall" if filled.name == "bop" else "IoU")
+    axes.grid(axis="y", alpha=0.3)
+    axes.legend(loc="upper left", ncols=2, frameon=False)
+    # The same table gives the same file.
+    metadata = {".svg": {"Date": None, "Creator": None}, ".pdf": {"CreationDate": None}}.get(
+        path.suffix.lower()
+    )
+    try:
+        with rc_context({"svg.hashsalt": "tracking3d"}):
+            figure.savefig(path, dpi=150, metadata=metadata)
+    except OSError as error:
+        raise OutputError(f"{path} cannot be written: {error.strerror}") from error
+
+
+def _floor(lines: list[Line]) -> float:
+    """Where the axis begins: tenths below the least value, so that differences are seen."""
+    least = min(value for line in lines for value in (line.paper, line.here) if value is not None)
+    return max(0.0, int(10 * least - 1) / 10)

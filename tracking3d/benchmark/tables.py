@@ -1,0 +1,264 @@
+"""The paper's Tables 1 to 5 and its figure on keyframes, and what is run to stand beside them.
+
+Where the real dataset is absent, the rows run on a synthetic suite: each initial tracker is then the true masks
+degraded to the mean IoU that the paper gives for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tracking3d.benchmark import paper_numbers
+from tracking3d.benchmark.paper_numbers import Published
+from tracking3d.benchmark.variant import DEGRADED, Variant
+from tracking3d.plugins import FEATURES, list_plugins
+
+Plan = dict[str, "Variant | str"]
+"""What is run, by name; a text says why it cannot be."""
+
+DEEP = "s2dnet"
+"""The feature encoder that stands for the paper's S2DNet."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of a table.
+
+    Attributes:
+        label: Its name.
+        paper: What the paper prints there, if anything.
+        plan: Name in the plan of what is run for it; empty where the paper stands alone.
+        initial: Whether it shows the initial masks of that run, not its answers.
+    """
+
+    label: str
+    paper: Published | None = None
+    plan: str = ""
+    initial: bool = False
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of the paper and how to fill our column.
+
+    Attributes:
+        name: Its name on the command line.
+        title: What it is.
+        source: Where it stands in the paper.
+        dataset: Layout of the real dataset.
+        rows: Its rows.
+        plan: What is run: from the settings to start with, whether the data are synthetic, and folders of initial
+            masks by tracker.
+        note: What a reader has to know to compare the columns.
+        measure: The measure in the columns.
+        sequences: Patterns of the synthetic sequences that are fit for it.
+        sample: So many sequences of the real dataset are drawn, with a fixed seed; 0 for all.
+    """
+
+    name: str
+    title: str
+    source: str
+    dataset: str
+    rows: tuple[Row, ...]
+    plan: Callable[[Variant, bool, Mapping[str, Path]], Plan]
+    note: str = ""
+    measure: str = "iou_mean"
+    sequences: tuple[str, ...] = ()
+    sample: int = 0
+
+
+def _started(base: Variant, label: str, iou: float, synthetic: bool, given: Path | None) -> Variant | str:
+    """``base`` from the masks of the tracker ``label``: its own where given, their likeness on synthetic data."""
+    if given is not None:
+        return base.changed(label, masks=str(given))
+    if synthetic:
+        return base.changed(label, masks=f"{DEGRADED}{iou:g}")
+    return f"needs the masks of {label}: --initial {label.lower()}=DIR"
+
+
+def _deep(base: Variant, label: str, **settings: Any) -> Variant | str:
+    known = (info for info in list_plugins() if (info.group, info.name) == (FEATURES, DEEP))
+    if not any(info.status == "ok" for info in known):
+        return f"needs the feature encoder {DEEP}, which is not installed"
+    return base.changed(label, features={"name": DEEP}, **settings)
+
+
+def _cdtb(base: Variant, synthetic: bool, initial: Mapping[str, Path]) -> Plan:
+    plan: Plan = {
+        name: _started(base, name, paper_numbers.CDTB[name].value, synthetic, initial.get(name.lower()))
+        for name in ("CSR-DCF", "D3S", "OSTrack")
+    }
+    tracked = base.changed("csrt of this package", masks="tracker", tracker={"name": "csrt"})
+    plan["csrt"] = tracked
+    if not synthetic and "csr-dcf" not in initial:
+        plan["CSR-DCF"] = tracked
+    return plan
+
+
+def _in_hand(base: Variant, synthetic: bool, initial: Mapping[str, Path]) -> Plan:
+    iou = paper_numbers.IN_HAND["OSTrack"].value
+    return {"OSTrack": _started(base, "OSTrack", iou, synthetic, initial.get("ostrack"))}
+
+
+def _coin(base: Variant, synthetic: bool, initial: Mapping[str, Path]) -> Plan:
+    iou = paper_numbers.COIN["Coin tracking"].value
+    start = _started(base, "Coin tracking", iou, synthetic, initial.get("coin tracking"))
+    if isinstance(start, str):
+        return dict.fromkeys(("RGB", "RGB, flat prior", "S2DNet", "S2DNet, flat prior"), start)
+    return {
+        "RGB": start.changed("RGB"),
+        "RGB, flat prior": start.changed("RGB, flat prior", object__flat=True),
+        "S2DNet": _deep(start, "S2DNet"),
+        "S2DNet, flat prior": _deep(start, "S2DNet, flat prior", object__flat=True),
+    }
+
+
+LOSSES: dict[str, dict[str, Any]] = {
+    "no L_F": {"solver__weights__features": 0.0},
+    "no L_S, overlap": {"solver__weights__silhouette": 1e-6, "solver__weights__distance": 1e6},
+    "no L_S, distance": {"solver__weights__distance": 0.0},
+    "no L_M": {"solver__weights__motion": 0.0},
+    "no L_L": {"solver__weights__laplacian": 0.0},
+    "no L_T": {"solver__weights__total_variation": 0.0},
+    "L_T as in the paper": {"solver__weights__total_variation": 0.001},
+}
+"""Settings that switch a loss off, by row. `distance` is relative to `silhouette`, so that its own share is kept."""
+
+
+def _ablation_start(base: Variant, synthetic: bool, initial: Mapping[str, Path]) -> Variant | str:
+    iou = paper_numbers.ABLATION["initial masks (OSTrack)"].value
+    return _started(base, "OSTrack", iou, synthetic, initial.get("ostrack"))
+
+
+def _ablation(base: Variant, synthetic: bool, initial: Mapping[str, Path]) -> Plan:
+    start = _ablation_start(base, synthetic, initial)
+    if isinstance(start, str):
+        return dict.fromkeys(("RGB", "S2DNet", *LOSSES), start)
+    return {
+        "RGB": start.changed("RGB"),
+        "S2DNet": _deep(start, "S2DNet"),
+        **{label: start.changed(label, **settings) for label, settings in LOSSES.items()},
+    }
+
+
+def _keyframes(base: Variant, synthetic: bool, initial: Mapping[str, Path]) -> Plan:
+    start = _ablation_start(base, synthetic, initial)
+    if isinstance(start, str):
+        return {str(count): start for count in paper_numbers.KEYFRAMES}
+    return {
+        str(count): start.changed(str(count), solver__keyframes__maximum=count)
+        for count in paper_numbers.KEYFRAMES
+    }
+
+
+def _bop(base: Variant, synthetic: bool, initial: Mapping[str, Path]) -> Plan:
+    iou = paper_numbers.CDTB["OSTrack"].value
+    plan: Plan = {
+        "csrt": base.changed("csrt", masks="tracker", tracker={"name": "csrt"}),
+        "OSTrack": _started(base, "OSTrack", iou, synthetic, initial.get("ostrack")),
+    }
+    plan["truth"] = base.changed("true masks", masks="truth")
+    return plan
+
+
+def _with_gain(published: Mapping[str, Published], names: tuple[str, ...]) -> tuple[Row, ...]:
+    rows = []
+    for name in names:
+        rows += [
+            Row(name, published[name], name, initial=True),
+            Row(f"{name} + ours", published[f"{name} + ours"], name),
+        ]
+    return tuple(rows)
+
+
+TABLES: dict[str, Table] = {
+    table.name: table
+    for table in (
+        Table(
+            "cdtb",
+            "Segmentation accuracy by initial tracker",
+            "Table 1",
+            "cdtb",
+            (
+                *_with_gain(paper_numbers.CDTB, ("CSR-DCF", "D3S", "OSTrack")),
+                Row("csrt of this package", None, "csrt", initial=True),
+                Row("csrt of this package + ours", None, "csrt"),
+            ),
+            _cdtb,
+        ),
+        Table(
+            "inhand",
+            "In-hand object manipulation",
+            "Table 2",
+            "inhand",
+            (
+                Row("OSVOS", paper_numbers.IN_HAND["OSVOS"]),
+                *_with_gain(paper_numbers.IN_HAND, ("OSTrack",)),
+                Row("BackFlow (RGB-D)", paper_numbers.IN_HAND["BackFlow (RGB-D)"]),
+            ),
+            _in_hand,
+            note="The paper runs S2DNet features here, we run those of the configuration.",
+        ),
+        Table(
+            "coin",
+            "Flat objects: features and flat prior",
+            "Table 3",
+            "coin",
+            (
+                Row("Coin tracking", paper_numbers.COIN["Coin tracking"], "RGB", initial=True),
+                *(Row(name, paper_numbers.COIN[name], name) for name in list(paper_numbers.COIN)[1:]),
+            ),
+            _coin,
+            sequences=("*card*",),
+        ),
+        Table(
+            "ablation",
+            "Every loss switched off in turn",
+            "Table 4",
+            "cdtb",
+            (
+                Row(
+                    "initial masks (OSTrack)",
+                    paper_numbers.ABLATION["initial masks (OSTrack)"],
+                    "RGB",
+                    initial=True,
+                ),
+                Row("RGB", paper_numbers.ABLATION["RGB"], "RGB"),
+                Row("S2DNet", paper_numbers.ABLATION["S2DNet"], "S2DNet"),
+                *(Row(label, paper_numbers.ABLATION.get(label), label) for label in LOSSES),
+            ),
+            _ablation,
+            note="The paper's rows without a loss use S2DNet features, ours those of the configuration.",
+            sample=16,
+        ),
+        Table(
+            "bop",
+            "6DoF pose: average recall of VSD, MSSD and MSPD",
+            "Table 5",
+            "tudl",
+            (
+                *(Row(name, row) for name, row in paper_numbers.TUD_L.items() if name != "ours"),
+                Row("ours, csrt", None, "csrt"),
+                Row("ours, OSTrack", paper_numbers.TUD_L["ours"], "OSTrack"),
+                Row("ours, true masks", None, "truth"),
+            ),
+            _bop,
+            note="All but ours are given the 3D model and were trained; ours are aligned by one similarity on frame 0.",
+            measure="bop_ar",
+        ),
+        Table(
+            "keyframes",
+            "Influence of the number of keyframes",
+            "the figure on keyframes",
+            "cdtb",
+            tuple(Row(str(count), row, str(count)) for count, row in paper_numbers.KEYFRAMES.items()),
+            _keyframes,
+            note="The paper uses S2DNet features, we those of the configuration.",
+            sample=16,
+        ),
+    )
+}
+"""The tables by name."""

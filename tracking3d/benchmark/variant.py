@@ -1,0 +1,85 @@
+"""What is tried on every sequence: a configuration and where the initial masks come from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, field_validator
+
+from tracking3d.config.models import PipelineConfig
+from tracking3d.errors import InputError
+
+DEGRADED = "degraded:"
+
+MASKS_HELP = (
+    "Initial masks: tracker (the mask tracker of the configuration), truth, initial (those that come with the "
+    "clip), degraded:IOU (the truth made worse), or a folder with one of masks for every sequence."
+)
+
+
+class Variant(BaseModel):
+    """One way to run every sequence.
+
+    Attributes:
+        label: What tables call it.
+        config: The pipeline; what the masks need is set when they are known.
+        masks: ``tracker``, ``truth``, ``initial``, ``degraded:IOU``, or a folder that holds a folder of masks for
+            every sequence.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    label: str
+    config: PipelineConfig
+    masks: str = "tracker"
+
+    @field_validator("masks")
+    @classmethod
+    def _is_a_source(cls, masks: str) -> str:
+        if masks.startswith(DEGRADED):
+            degraded_iou(masks)
+        return masks
+
+    def changed(self, label: str, *, masks: str | None = None, **settings: Any) -> Variant:
+        """A variant with other masks and settings: ``solver__weights__motion=0`` sets that key."""
+        document = self.config.model_dump()
+        for path, value in settings.items():
+            *sections, key = path.split("__")
+            inner = document
+            for section in sections:
+                inner = inner[section]
+            inner[key] = value
+        config = PipelineConfig.model_validate(document)
+        return Variant(label=label, config=config, masks=masks or self.masks)
+
+
+def degraded_iou(masks: str) -> float:
+    """The mean IoU in ``degraded:IOU``.
+
+    Raises:
+        InputError: If it is not a number between 0.2 and 1.
+    """
+    try:
+        iou = float(masks.removeprefix(DEGRADED))
+    except ValueError:
+        iou = -1.0
+    if not 0.2 <= iou <= 1:
+        raise InputError(
+            f"The masks '{masks}' name no mean IoU from 0.2 to 1; write for example degraded:0.73."
+        )
+    return iou
+
+
+def check_masks(masks: str) -> None:
+    """Make sure that a source of masks can be meant.
+
+    Raises:
+        InputError: If it is none of the words, and no folder.
+    """
+    if masks.startswith(DEGRADED):
+        degraded_iou(masks)
+    elif masks not in ("tracker", "truth", "initial") and not Path(masks).is_dir():
+        raise InputError(
+            f"The masks '{masks}' are unknown; give tracker, truth, initial, degraded:IOU, or a folder that exists."
+        )

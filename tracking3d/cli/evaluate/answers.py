@@ -1,0 +1,47 @@
+"""``tracking3d evaluate ANSWERS --truth CLIP``: score a run, or somebody else's results."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tracking3d.cli.options import Debug
+
+
+def answers(
+    results: Annotated[
+        Path,
+        typer.Argument(
+            metavar="ANSWERS",
+            help="Run folder, folder of masks, BOP csv, TUM trajectory, TAP-Vid pickle or COLMAP model.",
+        ),
+    ],
+    truth: Annotated[Path, typer.Option(metavar="CLIP", help="Clip with frames/, masks/ and poses.json.")],
+    form: Annotated[
+        str | None,
+        typer.Option("--format", metavar="NAME", help="Format of the answers; recognised if left out."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON only.")] = False,
+    debug: Debug = False,
+) -> None:
+    """Score ANSWERS against the truth of the clip in CLIP."""
+    import json
+    from dataclasses import asdict
+
+    from tracking3d.cli.tables import print_table
+    from tracking3d.datasets.clip import read_truth
+    from tracking3d.evaluation.score import score
+    from tracking3d.evaluation.score_table import format_scores
+    from tracking3d.evaluation.sources import open_answers
+
+    known = read_truth(truth)
+    given, kind = open_answers(results, known, form)
+    if form is None and not as_json:
+        typer.echo(f"{results} is read as {kind}.", err=True)
+    scores = score(given, known)
+    if as_json:
+        typer.echo(json.dumps(asdict(scores), indent=2))
+    else:
+        print_table(format_scores(scores))

@@ -1,0 +1,65 @@
+"""``tracking3d evaluate suite``: every sequence of a dataset, in parallel, cached."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tracking3d.cli.evaluate.options import Data, Jobs, Masks, Out, Sequences
+from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quiet, configure
+
+
+def suite(
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="NAME",
+            help="smoke, standard, full (synthetic), real, the layout of a dataset, or a YAML file of one.",
+        ),
+    ],
+    data: Data = None,
+    masks: Masks = "tracker",
+    sequences: Sequences = None,
+    label: Annotated[str | None, typer.Option(help="What tables call the results.")] = None,
+    config: ConfigFile = None,
+    preset: Preset = None,
+    overrides: Overrides = None,
+    jobs: Jobs = 1,
+    out: Out = Path("benchmark"),
+    as_json: Annotated[bool, typer.Option("--json", help="Print the file of the results only.")] = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Run and score every sequence of a dataset; what was done before is not done again.
+
+    Writes the scores to DIR/results/LABEL-NAME.json; runs lie in DIR/runs.
+    """
+    from tracking3d.benchmark.results import format_results, write_results
+    from tracking3d.benchmark.sequences import open_dataset
+    from tracking3d.benchmark.suite import run_suite
+    from tracking3d.benchmark.table import file_name
+    from tracking3d.benchmark.variant import Variant, check_masks
+    from tracking3d.cli.evaluate.options import jobs_progress, making_progress, name_of_settings
+    from tracking3d.cli.tables import print_table
+
+    check_masks(masks)
+    settings = configure(config, preset, overrides)
+    called = label or name_of_settings(config, preset, overrides, masks)
+    variant = Variant(label=called, config=settings, masks=masks)
+    with making_progress(quiet) as made:
+        dataset = open_dataset(name, data, out, jobs, made).only(sequences or [])
+    with jobs_progress(len(dataset.sequences), quiet) as listener:
+        [results] = run_suite([variant], dataset, out, jobs, listener)
+    file = out / "results" / f"{file_name(called)}-{dataset.name}.json"
+    write_results(results, file)
+    if as_json:
+        typer.echo(file)
+    elif not quiet:
+        print_table(format_results(results))
+        typer.echo(file)
+    for sequence, error in results.errors.items():
+        typer.echo(f"{sequence} failed: {error}", err=True)
+    if results.errors:
+        raise typer.Exit(1)

@@ -1,0 +1,21 @@
+"""Results that other people's tools wrote, as `tracking3d.datasets.answers.Answers`; one module a format."""
+
+from __future__ import annotations
+
+from tracking3d.datasets.readers.bop_csv import answers_from_bop_csv
+from tracking3d.datasets.readers.colmap import answers_from_colmap
+from tracking3d.datasets.readers.masks import answers_from_masks
+from tracking3d.datasets.readers.recognition import ANSWER_FORMATS, read_answers, recognise_format
+from tracking3d.datasets.readers.tapvid import answers_from_tapvid
+from tracking3d.datasets.readers.tum import answers_from_tum
+
+__all__ = [
+    "ANSWER_FORMATS",
+    "answers_from_bop_csv",
+    "answers_from_colmap",
+    "answers_from_masks",
+    "answers_from_tapvid",
+    "answers_from_tum",
+    "read_answers",
+    "recognise_format",
+]

@@ -1,0 +1,106 @@
+"""Reading anybody's results: the format is recognised by what a file or folder holds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tracking3d.datasets.answers import Answers
+from tracking3d.datasets.readers.bop_csv import answers_from_bop_csv
+from tracking3d.datasets.readers.colmap import answers_from_colmap
+from tracking3d.datasets.readers.masks import answers_from_masks
+from tracking3d.datasets.readers.tapvid import answers_from_tapvid
+from tracking3d.datasets.readers.tum import answers_from_tum
+from tracking3d.datasets.truth import Truth
+from tracking3d.errors import InputError
+from tracking3d.video.image_sequence import images_among
+
+
+@dataclass(frozen=True)
+class AnswerFormat:
+    """A format of results.
+
+    Attributes:
+        title: What messages call it.
+        read: Reads ``(path, truth, **options)``.
+    """
+
+    title: str
+    read: Callable[..., Answers]
+
+
+ANSWER_FORMATS = {
+    "masks": AnswerFormat("mask images", answers_from_masks),
+    "bop": AnswerFormat("poses of the BOP Challenge", answers_from_bop_csv),
+    "tum": AnswerFormat("a TUM trajectory", answers_from_tum),
+    "tapvid": AnswerFormat("TAP-Vid point tracks", answers_from_tapvid),
+    "colmap": AnswerFormat("a COLMAP model", answers_from_colmap),
+}
+"""By the name that ``format`` selects."""
+
+
+def read_answers(path: Path, truth: Truth, format: str | None = None, **options: Any) -> tuple[Answers, str]:
+    """Read somebody's results for a clip.
+
+    Args:
+        path: File or folder.
+        truth: The clip.
+        format: One of `ANSWER_FORMATS`; recognised if None.
+        options: Of that format's function, such as ``object_id`` or ``of``.
+
+    Returns:
+        The answers, and what they were read as, in words.
+
+    Raises:
+        InputError: If the format is unknown or not recognised, has no such option, or the results cannot be read.
+    """
+    name = recognise_format(path) if format is None else format
+    if name not in ANSWER_FORMATS:
+        raise InputError(f"There is no format '{name}'; choose one of {', '.join(ANSWER_FORMATS)}.")
+    known = ANSWER_FORMATS[name]
+    try:
+        return known.read(path, truth, **options), known.title
+    except TypeError as error:
+        if "unexpected keyword" not in str(error):
+            raise
+        raise InputError(f"{path} is {known.title}, which has no such option ({error}).") from error
+
+
+def recognise_format(path: Path) -> str:
+    """The name in `ANSWER_FORMATS` of what ``path`` holds.
+
+    A folder with ``images.bin`` or ``images.txt``, in it or a folder below, is COLMAP's, and one with images holds
+    masks; of files, ``.csv`` is BOP's, ``.txt`` and ``.tum`` are trajectories, ``.pkl``, ``.pickle`` and ``.npz`` are
+    point tracks.
+
+    Raises:
+        InputError: If it is nothing of these.
+    """
+    if not path.exists():
+        raise InputError(f"There is nothing at {path}; check the path.")
+    if path.is_dir():
+        if any(
+            next(path.glob(f"{below}images.{suffix}"), None) for below in _BELOW for suffix in ("bin", "txt")
+        ):
+            return "colmap"
+        if images_among(path.iterdir()) or any(
+            images_among(folder.iterdir()) for folder in path.iterdir() if folder.is_dir()
+        ):
+            return "masks"
+    elif path.suffix.lower() in _SUFFIXES:
+        return _SUFFIXES[path.suffix.lower()]
+    raise InputError(f"{path} is in no format known here; name one of {', '.join(ANSWER_FORMATS)}.")
+
+
+_BELOW = ("", "*/", "sparse/*/")
+
+_SUFFIXES = {
+    ".csv": "bop",
+    ".txt": "tum",
+    ".tum": "tum",
+    ".pkl": "tapvid",
+    ".pickle": "tapvid",
+    ".npz": "tapvid",
+}

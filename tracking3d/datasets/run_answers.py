@@ -1,0 +1,81 @@
+"""A run folder as the answers of a method."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tracking3d.datasets.answers import Answers
+from tracking3d.datasets.clip import is_rigid
+from tracking3d.datasets.truth import MaskFile, MaskReference, Truth
+from tracking3d.errors import InputError
+from tracking3d.estimation.estimate import Status
+from tracking3d.results import layout
+from tracking3d.results.correspondences import track_points
+from tracking3d.results.run_reader import RunReader
+from tracking3d.video.selection import parse_selection, within
+
+
+def answers_of_run(folder: Path, truth: Truth) -> Answers:
+    """What a run answered for the clip that ``truth`` is about.
+
+    A run's frame index is the position of the frame in the clip. If ``run.json`` holds a ``selection``
+    ``START:STOP:STEP``, only those frames were asked for.
+
+    Raises:
+        InputError: If it is not a run folder, or one without any frame of the clip.
+    """
+    run = RunReader(folder)
+    selection = run.description.get("selection")
+    asked = within(parse_selection(selection and str(selection)), len(truth.frames))
+    records = {record.index: record for record in run.frames if record.index in asked}
+    if not records:
+        raise InputError(
+            f"The run {folder} has no frame of the clip {truth.name}; give the clip that this run was made on."
+        )
+    memory = run.description.get("peak_memory_mb")
+    return Answers(
+        origin=folder,
+        asked=asked,
+        answered=frozenset(records),
+        given=min(records),
+        masks={index: MaskFile(layout.mask_path(folder, index)) for index in records},
+        initial_masks=_initial_masks(folder, list(records)),
+        T_cam_obj={index: one.T_cam_obj for index, one in records.items() if is_rigid(one.T_cam_obj)},
+        lost=frozenset(index for index, one in records.items() if one.status is Status.LOST),
+        confidence={index: one.confidence for index, one in records.items() if math.isfinite(one.confidence)},
+        seconds={index: one.seconds for index, one in records.items() if math.isfinite(one.seconds)},
+        peak_memory_mb=memory if isinstance(memory, int | float) else None,
+        mesh=run.mesh if (folder / layout.OBJ).is_file() else None,
+        points=_RunPoints(run, len(truth.frames)) if (folder / layout.OBJ).is_file() else None,
+    )
+
+
+def _initial_masks(folder: Path, indices: list[int]) -> dict[int, MaskReference]:
+    files = {index: layout.initial_mask_path(folder, index) for index in indices}
+    return {index: MaskFile(file) for index, file in files.items() if file.is_file()}
+
+
+@dataclass(frozen=True, eq=False)
+class _RunPoints:
+    """Follows points by the mesh and the poses of a run; see `tracking3d.datasets.answers.PointTracker`."""
+
+    run: RunReader
+    frames: int
+
+    def __call__(self, frame: int, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        count = len(np.asarray(points))
+        positions = np.full((self.frames, count, 2), np.nan)
+        visible = np.zeros((self.frames, count), bool)
+        record = next((one for one in self.run.frames if one.index == frame), None)
+        if record is None or record.status is Status.LOST or not is_rigid(record.T_cam_obj):
+            return positions, visible  # where the object was not found, its points were not either
+        tracks = track_points(self.run, frame, points)
+        inside = tracks.frames < self.frames
+        positions[tracks.frames[inside]] = tracks.positions[inside]
+        visible[tracks.frames[inside]] = tracks.visible[inside]
+        return positions, visible

@@ -1,0 +1,215 @@
+"""One similarity between the object frame of an estimate and that of the truth, and what it leaves of translations.
+
+The camera frame is common. The object frames differ by a rotation ``A`` and an ``offset``, and the whole estimated
+scene by one ``scale``, because one camera cannot tell size from distance. The true origin lies at ``offset`` in the
+estimated object frame::
+
+    x_est  = A x_true / scale + offset
+    R_true = R_est A
+    t_true = scale (R_est offset + t_est)
+
+All frames of a clip share the three. Poses are ``T_cam_obj``; OpenCV axes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.evaluation.arrays import finite
+from tracking3d.evaluation.metrics import rotation_alignment
+
+Poses = NDArray[np.float64]
+"""``(N, 4, 4)`` rigid transforms ``T_cam_obj``."""
+
+SAMPLES = 100
+"""Sets of three frames whose exact fits are tried as starts."""
+
+_REFINED = 5
+_STEPS = 100
+_RANK = 1e-6  # a direction whose singular value is this small beside the largest is not determined
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectAlignment:
+    """How an estimated object frame lies in the true one; see the module.
+
+    Attributes:
+        A: ``(3, 3)`` rotation from the true to the estimated object frame.
+        scale: Length of the estimate's unit in that of the truth.
+        offset: ``(3,)`` the true origin in the estimated object frame and unit.
+    """
+
+    A: NDArray[np.float64]
+    scale: float
+    offset: NDArray[np.float64]
+
+    @property
+    def T_true_est(self) -> NDArray[np.float64]:
+        """``(4, 4)`` similarity from estimated to true object coordinates, for points and meshes."""
+        T = np.eye(4)
+        T[:3, :3] = self.scale * self.A.T
+        T[:3, 3] = -T[:3, :3] @ self.offset
+        return T
+
+    def poses(self, T_cam_obj: Poses) -> Poses:
+        """Estimated poses ``(N, 4, 4)`` as poses of the true object frame, in the truth's unit.
+
+        Raises:
+            ValueError: If they have another shape.
+        """
+        R, t = _split("T_cam_obj", T_cam_obj)
+        aligned = np.tile(np.eye(4), (len(R), 1, 1))
+        aligned[:, :3, :3] = R @ self.A
+        aligned[:, :3, 3] = self.scale * (R @ self.offset + t)
+        return aligned
+
+
+def align_object_frame(
+    T_est: Poses, T_true: Poses, diameter: float | None = None, seed: int = 0
+) -> ObjectAlignment:
+    """The similarity that fits a clip best, robust to a minority of wrong frames.
+
+    ``A`` is that of `rotation_alignment`. Scale and offset have the least sum of translation errors, where no error
+    counts more than half the object's diameter, the loosest threshold of BOP: a frame further off is wrong, how far
+    does not matter. Without that limit frames that are far off would rather have the scale go to zero. Fits to three
+    frames, and to all, are the starts; reweighted least squares within the limit refines the best of them. What the
+    frames leave open, as one frame alone does, is chosen so that the offset is the shortest.
+
+    Args:
+        T_est: ``(N, 4, 4)`` finite estimates.
+        T_true: ``(N, 4, 4)``.
+        diameter: Of the object in the truth's unit. Without it the limit is a tenth of the median true distance.
+        seed: Of the choice of frames.
+
+    Raises:
+        ValueError: If there is no frame, the shapes differ, or a value is not finite.
+    """
+    R_est, t_est = _split("T_est", T_est)
+    R_true, t_true = _split("T_true", T_true)
+    if len(R_est) != len(R_true) or not len(R_est):
+        raise ValueError(
+            f"poses need equal shapes (N, 4, 4) with N > 0, got {np.shape(T_est)} and {np.shape(T_true)}"
+        )
+    # In units of the median distances all columns of the equations have one order of magnitude.
+    est_unit, true_unit = (np.median(np.linalg.norm(t, axis=1)) or 1.0 for t in (t_est, t_true))
+    M = np.concatenate([R_est, t_est[..., None] / est_unit], axis=2)
+    limit = 0.1 if diameter is None else diameter / 2 / true_unit
+    *scaled_offset, scale = _fit(M, t_true / true_unit, limit, np.random.default_rng(seed))
+    return ObjectAlignment(
+        A=rotation_alignment(R_est, R_true),
+        scale=float(scale * true_unit / est_unit),
+        offset=np.array(scaled_offset) / scale * est_unit,
+    )
+
+
+def align_on_frame(
+    T_est: NDArray[np.float64], T_true: NDArray[np.float64], scale: float | None = None
+) -> ObjectAlignment:
+    """The similarity under which one frame agrees exactly, which makes all other frames drift against it.
+
+    Args:
+        T_est: ``(4, 4)`` estimated pose of that frame.
+        T_true: ``(4, 4)``.
+        scale: Length of the estimate's unit in that of the truth; from `align_object_frame` over all frames, say.
+            None takes the ratio of the two depths of this frame.
+
+    Raises:
+        ValueError: If a shape is another, a value is not finite, or the scale is not positive.
+    """
+    (R_est,), (t_est,) = _split("T_est", np.asarray(T_est)[None])
+    (R_true,), (t_true,) = _split("T_true", np.asarray(T_true)[None])
+    if scale is None and not t_est[2] * t_true[2] > 0:
+        raise ValueError(f"depths {t_est[2]} and {t_true[2]} give no scale")
+    scale = float(t_true[2] / t_est[2]) if scale is None else scale
+    if not 0 < scale < np.inf:
+        raise ValueError(f"the scale needs to be positive, got {scale}")
+    return ObjectAlignment(R_est.T @ R_true, scale, R_est.T @ (t_true / scale - t_est))
+
+
+def translation_errors(
+    T_est: Poses, T_true: Poses, alignment: ObjectAlignment, diameter: float | None = None
+) -> NDArray[np.float64]:
+    """Distance ``(N,)`` of the aligned translation from the true one, in object diameters.
+
+    Args:
+        T_est: ``(N, 4, 4)`` estimates as they are.
+        T_true: ``(N, 4, 4)``.
+        alignment: Of these poses.
+        diameter: Of the object in the truth's unit. None measures in median true depths of these frames instead.
+
+    Raises:
+        ValueError: If the shapes differ, a value is not finite, or the unit is not positive.
+    """
+    residuals = _translation_residuals(alignment, T_est, T_true)
+    unit = float(np.median(T_true[:, 2, 3])) if diameter is None and len(T_true) else diameter
+    if unit is not None and not 0 < unit < np.inf:
+        raise ValueError(f"the unit of translation errors needs to be positive, got {unit}")
+    return residuals / (unit or 1.0)
+
+
+def _split(name: str, T: Poses) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    poses = finite(name, T, None, 4, 4)
+    return poses[:, :3, :3], poses[:, :3, 3]
+
+
+def _translation_residuals(alignment: ObjectAlignment, T_est: Poses, T_true: Poses) -> NDArray[np.float64]:
+    t_true = finite("T_true", T_true, len(T_est), 4, 4)[:, :3, 3]
+    return np.linalg.norm(alignment.poses(T_est)[:, :3, 3] - t_true, axis=1)
+
+
+def _fit(
+    M: NDArray[np.float64], y: NDArray[np.float64], limit: float, random: np.random.Generator
+) -> NDArray[np.float64]:
+    """``x`` ``(4,)`` with the least sum of ``min(|M_n x - y_n|, limit)`` and a positive ``x[3]``.
+
+    Args:
+        M: ``(N, 3, 4)``.
+        y: ``(N, 3)``.
+        limit: What a distance counts at most.
+        random: Chooses the samples.
+    """
+
+    def cost(x: NDArray[np.float64]) -> float:
+        return float(np.minimum(_distances(M, y, x), limit).sum())
+
+    samples = [random.permutation(len(M))[:3] for _ in range(SAMPLES if len(M) > 3 else 0)]
+    starts = [_least_squares(M[sample], y[sample]) for sample in samples]
+    starts += [_reweighted(M, y, np.inf, _least_squares(M, y)), np.array([0.0, 0.0, 0.0, 1.0])]
+    best = sorted((x for x in starts if x[3] > _RANK), key=cost)[:_REFINED]
+    # A start is kept as it is too: refinement need not end below it.
+    refined = [x for x in (_reweighted(M, y, limit, start) for start in best) if x[3] > _RANK]
+    return min(best + refined, key=cost)
+
+
+def _reweighted(
+    M: NDArray[np.float64], y: NDArray[np.float64], limit: float, x: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Least squares weighted by the inverse of the last distances (Weiszfeld); those beyond ``limit`` are left out."""
+    for _ in range(_STEPS):
+        distances = _distances(M, y, x)
+        within = distances < limit
+        if not within.any():
+            break
+        root = np.sqrt(1 / np.maximum(distances[within], 1e-12))[:, None]
+        last, x = x, _least_squares(root[..., None] * M[within], root * y[within])
+        if np.abs(x - last).max() <= 1e-13 * np.abs(x).max():
+            break
+    return x
+
+
+def _distances(M: NDArray[np.float64], y: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.linalg.norm(M @ x - y, axis=1)
+
+
+def _least_squares(M: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The minimum ``(4,)`` of the sum of ``|M_n x - y_n|^2`` that has the shortest ``x[:3]``."""
+    rows, values = M.reshape(-1, 4), y.ravel()
+    missing = max(4 - len(rows), 0)
+    U, singular, Vt = np.linalg.svd(np.pad(rows, ((0, missing), (0, 0))), full_matrices=False)
+    known = singular > _RANK * singular[0]
+    x = Vt[known].T @ (U[:, known].T @ np.pad(values, (0, missing)) / singular[known])
+    free = Vt[~known]
+    return x - free.T @ np.linalg.lstsq(free[:, :3].T, x[:3], rcond=_RANK)[0] if len(free) else x

@@ -1,0 +1,114 @@
+"""Whether confidence can be believed, and whether "lost" is said when it should be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tracking3d.evaluation.arrays import booleans, finite
+
+BINS = 10
+"""Bins of equal width between 0 and 1."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reliability:
+    """Answers sorted into bins by confidence, the data of a reliability diagram.
+
+    Bin ``m`` holds confidences above its lower edge up to its upper edge; the first holds 0 too.
+
+    Attributes:
+        edges: ``(M + 1,)``.
+        count: ``(M,)`` answers in each bin.
+        confidence: ``(M,)`` their mean confidence; NaN in an empty bin.
+        accuracy: ``(M,)`` the share of them that is right; NaN in an empty bin.
+    """
+
+    edges: NDArray[np.float64]
+    count: NDArray[np.int64]
+    confidence: NDArray[np.float64]
+    accuracy: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Detection:
+    """How well something is detected.
+
+    Attributes:
+        precision: Share of what was called that is; None where nothing was called.
+        recall: Share of what is that was called; None where nothing is.
+        f1: Their harmonic mean, ``2 TP / (2 TP + FP + FN)``; None where nothing is and nothing was called.
+    """
+
+    precision: float | None
+    recall: float | None
+    f1: float | None
+
+
+def reliability(confidence: ArrayLike, right: ArrayLike, bins: int = BINS) -> Reliability:
+    """Sort N answers into ``bins`` bins of equal width.
+
+    Args:
+        confidence: ``(N,)`` in [0, 1].
+        right: ``(N,)`` bool.
+        bins: Number of bins M.
+
+    Raises:
+        ValueError: If the shapes differ or a confidence is not in [0, 1].
+    """
+    said = finite("confidence", confidence, None)
+    was_right = booleans("right", right, len(said))
+    if ((said < 0) | (said > 1)).any():
+        raise ValueError(f"confidence needs values in [0, 1], got {said.min()} to {said.max()}")
+    edges = np.linspace(0, 1, bins + 1)
+    bin_of = np.maximum(np.searchsorted(edges, said, side="left") - 1, 0)
+    count = np.bincount(bin_of, minlength=bins)
+    share = np.where(count, count, np.nan)
+    return Reliability(
+        edges=edges,
+        count=count,
+        confidence=np.bincount(bin_of, said, bins) / share,
+        accuracy=np.bincount(bin_of, was_right, bins) / share,
+    )
+
+
+def expected_calibration_error(confidence: ArrayLike, right: ArrayLike, bins: int = BINS) -> float | None:
+    """Mean over all answers of the gap between accuracy and mean confidence of their bin.
+
+    Guo et al., "On calibration of modern neural networks", ICML 2017. None without answers.
+
+    Args:
+        confidence: ``(N,)`` in [0, 1].
+        right: ``(N,)`` bool.
+        bins: Number of bins.
+
+    Raises:
+        ValueError: If the shapes differ or a confidence is not in [0, 1].
+    """
+    found = reliability(confidence, right, bins)
+    if not found.count.any():
+        return None
+    gaps = np.abs(found.accuracy - found.confidence)
+    return float(np.nansum(found.count * gaps) / found.count.sum())
+
+
+def detection_scores(called: ArrayLike, actual: ArrayLike) -> Detection:
+    """Precision, recall and F1 of what was called, such as lost frames, against what is.
+
+    Args:
+        called: ``(N,)`` bool.
+        actual: ``(N,)`` bool.
+
+    Raises:
+        ValueError: If the shapes differ or the values are not bool.
+    """
+    is_so = booleans("actual", actual, None)
+    said_so = booleans("called", called, len(is_so))
+    both, said, so = (np.count_nonzero(one) for one in (said_so & is_so, said_so, is_so))
+    return Detection(
+        precision=both / said if said else None,
+        recall=both / so if so else None,
+        f1=2 * both / (said + so) if said + so else None,
+    )

@@ -1,0 +1,137 @@
+"""What masks are worth: against the truth, and against the masks that the method started from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import astuple, dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.datasets.answers import Answers
+from tracking3d.datasets.truth import MaskReference, Truth
+from tracking3d.errors import InputError
+from tracking3d.evaluation.boundary import boundary_f
+from tracking3d.evaluation.metrics import mask_iou
+from tracking3d.frames import Box
+from tracking3d.trackers.crops import box_of
+
+Mask = NDArray[np.bool_]
+_EQUAL = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaskScores:
+    """Masks over the frames with a true mask or box, except the one that the method was given.
+
+    All are None where there is no such frame. Where only boxes are known, the box around a mask is compared, and
+    there is no boundary.
+
+    Attributes:
+        iou_initial_mean: Mean IoU of the mask tracker's masks; 0 where it gave none.
+        iou_mean: Mean IoU of the answers.
+        iou_gain_percent: How much larger `iou_mean` is than `iou_initial_mean`.
+        share_worse_than_initial: Share of frames where the answer's IoU is the smaller one by more than 1e-9.
+        boundary_f_initial_mean: Mean boundary F of the mask tracker's masks.
+        boundary_f_mean: Mean boundary F of the answers.
+        davis_j_mean, davis_f_mean: IoU and boundary F as DAVIS takes them, without the last frame too.
+        frames_with_mask: Number of the frames that the first four are means of.
+    """
+
+    iou_initial_mean: float | None = None
+    iou_mean: float | None = None
+    iou_gain_percent: float | None = None
+    share_worse_than_initial: float | None = None
+    boundary_f_initial_mean: float | None = None
+    boundary_f_mean: float | None = None
+    davis_j_mean: float | None = None
+    davis_f_mean: float | None = None
+    frames_with_mask: int = 0
+
+
+@dataclass(frozen=True)
+class FrameMasks:
+    """One frame's masks beside the true one; 0 for a mask that is not there, NaN without a true boundary.
+
+    Attributes:
+        iou: Of the answer.
+        iou_initial: Of the mask tracker's mask.
+        boundary_f: Of the answer.
+        boundary_f_initial: Of the mask tracker's mask.
+    """
+
+    iou: float
+    iou_initial: float
+    boundary_f: float
+    boundary_f_initial: float
+
+
+def compare_masks(answers: Answers, truth: Truth) -> dict[int, FrameMasks]:
+    """The masks of every frame that was asked for and has a true mask or box; none if the method gives no masks.
+
+    Raises:
+        InputError: If a mask cannot be read or has not the size of the true one.
+    """
+    if answers.masks is None:
+        return {}
+    return {n: _compare(answers, truth, n) for n in answers.asked if n in truth.masks or n in truth.boxes}
+
+
+def score_masks(compared: Mapping[int, FrameMasks], answers: Answers, truth: Truth) -> MaskScores:
+    """Score what `compare_masks` found; the frame whose mask the method was given does not count."""
+    scored = {n: masks for n, masks in compared.items() if n != answers.given}
+    if not scored:
+        return MaskScores()
+    values = np.array([astuple(masks) for masks in scored.values()])
+    answer, initial, f_answer, f_initial = (_mean(column) for column in values.T)
+    started = answers.initial_masks is not None
+    before_last = np.array(list(scored)) != len(truth.frames) - 1
+    return MaskScores(
+        iou_initial_mean=initial if started else None,
+        iou_mean=answer,
+        iou_gain_percent=100 * (answer / initial - 1) if started and answer is not None and initial else None,
+        share_worse_than_initial=float(np.mean(values[:, 0] < values[:, 1] - _EQUAL)) if started else None,
+        boundary_f_initial_mean=f_initial if started else None,
+        boundary_f_mean=f_answer,
+        davis_j_mean=_mean(values[before_last, 0]),
+        davis_f_mean=_mean(values[before_last, 2]),
+        frames_with_mask=len(scored),
+    )
+
+
+def box_iou(a: Box | None, b: Box | None) -> float:
+    """IoU of two boxes ``(x, y, width, height)``; 1 if there are none, 0 if there is only one."""
+    if a is None or b is None:
+        return float(a is b)
+    width = min(a[0] + a[2], b[0] + b[2]) - max(a[0], b[0])
+    height = min(a[1] + a[3], b[1] + b[3]) - max(a[1], b[1])
+    common = max(width, 0.0) * max(height, 0.0)
+    return common / (a[2] * a[3] + b[2] * b[3] - common)
+
+
+def _compare(answers: Answers, truth: Truth, index: int) -> FrameMasks:
+    masks = [_read(references, index) for references in (answers.masks, answers.initial_masks)]
+    if index not in truth.masks:
+        true_box = truth.boxes[index]
+        ious = [0.0 if mask is None else box_iou(box_of(mask), true_box) for mask in masks]
+        return FrameMasks(ious[0], ious[1], np.nan, np.nan)
+    true = truth.masks[index].read()
+    for mask in masks:
+        if mask is not None and mask.shape != true.shape:
+            raise InputError(
+                f"Frame {index}: the mask of {answers.origin} is {mask.shape[1]} x {mask.shape[0]} pixels and the "
+                f"true one of {truth.name} {true.shape[1]} x {true.shape[0]}; give the clip it was made on."
+            )
+    ious = [0.0 if mask is None else mask_iou(mask, true) for mask in masks]
+    boundaries = [0.0 if mask is None else boundary_f(mask, true) for mask in masks]
+    return FrameMasks(ious[0], ious[1], boundaries[0], boundaries[1])
+
+
+def _read(references: Mapping[int, MaskReference] | None, index: int) -> Mask | None:
+    return references[index].read() if references and index in references else None
+
+
+def _mean(values: NDArray[np.float64]) -> float | None:
+    """Mean of what is known; None if nothing is."""
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if len(known) else None

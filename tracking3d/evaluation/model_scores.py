@@ -1,0 +1,116 @@
+"""Poses and shape judged with the true mesh: BOP's average recall, Chamfer distance and F-score."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+
+from tracking3d.datasets.answers import Answers
+from tracking3d.datasets.truth import Truth
+from tracking3d.errors import InputError
+from tracking3d.evaluation.alignment import ObjectAlignment, align_on_frame
+from tracking3d.evaluation.bop import AverageRecall, average_recall, mspd, mssd
+from tracking3d.evaluation.pose_scores import PosePairs
+from tracking3d.evaluation.shape import shape_scores
+from tracking3d.evaluation.vsd import TOLERANCES, VISIBILITY_TOLERANCE, model_depth, vsd
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelScores:
+    """Poses and shape where the true mesh is known; None otherwise.
+
+    Attributes:
+        bop_ar: Mean of the next three; None unless all are known.
+        bop_ar_vsd: Average recall of the visible surface discrepancy; needs depth and the unit in millimetres.
+        bop_ar_mssd: Of the maximum surface distance.
+        bop_ar_mspd: Of the maximum projection distance; needs the camera.
+        chamfer_percent: Symmetric Chamfer distance in percent of the object's diameter.
+        shape_f_score: F-score at 2 percent of the diameter.
+    """
+
+    bop_ar: float | None = None
+    bop_ar_vsd: float | None = None
+    bop_ar_mssd: float | None = None
+    bop_ar_mspd: float | None = None
+    chamfer_percent: float | None = None
+    shape_f_score: float | None = None
+
+
+def score_model(
+    answers: Answers,
+    truth: Truth,
+    pairs: PosePairs | None,
+    alignment: ObjectAlignment | None,
+    mesh: trimesh.Trimesh | None,
+    diameter: float | None,
+) -> ModelScores:
+    """Score poses and shape against the true mesh.
+
+    Poses are carried into the true object frame by the similarity under which the first frame with an estimate
+    agrees, with the scale of all frames; the shape by ``alignment``, that of all frames. A frame without an estimate
+    is wrong at every threshold.
+
+    Args:
+        answers: The method's.
+        truth: The clip's.
+        pairs: Their poses.
+        alignment: Fitted to all frames.
+        mesh: The true shape.
+        diameter: Its diameter.
+    """
+    if pairs is None or mesh is None or diameter is None:
+        return ModelScores()
+    recall = _recall(truth, pairs, alignment, mesh, diameter)
+    shape = None
+    if alignment is not None and answers.mesh is not None:
+        try:
+            shape = shape_scores(answers.mesh(), mesh, diameter, alignment.T_true_est)
+        except (ValueError, InputError):  # the method has no surface: there is nothing to measure
+            shape = None
+    return ModelScores(
+        bop_ar=recall.mean,
+        bop_ar_vsd=recall.vsd,
+        bop_ar_mssd=recall.mssd,
+        bop_ar_mspd=recall.mspd,
+        chamfer_percent=100 * shape.chamfer if shape else None,
+        shape_f_score=shape.f_score if shape else None,
+    )
+
+
+def _recall(
+    truth: Truth,
+    pairs: PosePairs,
+    alignment: ObjectAlignment | None,
+    mesh: trimesh.Trimesh,
+    diameter: float,
+) -> AverageRecall:
+    count, camera = len(pairs.frames), truth.camera
+    distances, pixels = np.full((2, count), np.inf)
+    surface = np.full((count, len(TOLERANCES)), np.inf)
+    measured = [place for place, n in enumerate(pairs.frames) if n in truth.depth]
+    points = np.asarray(mesh.vertices, dtype=np.float64)
+    outer = np.asarray(mesh.convex_hull.vertices, dtype=np.float64)
+    if alignment is not None:
+        on_first = align_on_frame(pairs.T_est[0], pairs.T_true[0], alignment.scale)
+        for place, T_est, T_true in zip(pairs.found, on_first.poses(pairs.T_est), pairs.T_true, strict=True):
+            # The farthest point of a rigid difference lies on the hull; projections are no such thing.
+            distances[place] = mssd(T_est, T_true, outer, truth.symmetries)
+            if camera is None:
+                continue
+            pixels[place] = mspd(T_est, T_true, camera.K, points, truth.symmetries)
+            depth = truth.depth.get(pairs.frames[place])
+            if depth is not None and truth.millimetres is not None:
+                size = camera.width, camera.height
+                of_est, of_true = (model_depth(points, mesh.faces, T, camera.K, size) for T in (T_est, T_true))
+                delta = VISIBILITY_TOLERANCE / truth.millimetres
+                surface[place] = vsd(of_est, of_true, depth.read(), camera.K, delta, diameter)
+    with_depth = camera is not None and truth.millimetres is not None and bool(measured)
+    return average_recall(
+        surface[measured] if with_depth else None,
+        distances,
+        None if camera is None else pixels,
+        diameter,
+        camera.width if camera else 1,
+    )

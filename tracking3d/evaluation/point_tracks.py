@@ -1,0 +1,62 @@
+"""What point correspondences are worth, as TAP-Vid measures them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tracking3d.datasets.answers import Answers
+from tracking3d.datasets.truth import Truth
+from tracking3d.evaluation.tapvid import first_queries, tapvid_scores, to_tapvid_raster
+from tracking3d.video.image_file import read_image
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointTrackScores:
+    """Points asked for where each is first seen (TAP-Vid's query mode ``first``) and followed from there.
+
+    All are None where no true points are known or the method follows none.
+
+    Attributes:
+        points_average_jaccard: AJ over 1, 2, 4, 8 and 16 pixels of a 256 x 256 raster.
+        points_delta_average: Share of visible points within these distances, averaged.
+        points_occlusion_accuracy: Share of visibilities that are right.
+        points: Number of points that were asked for.
+    """
+
+    points_average_jaccard: float | None = None
+    points_delta_average: float | None = None
+    points_occlusion_accuracy: float | None = None
+    points: int = 0
+
+
+def score_points(answers: Answers, truth: Truth) -> PointTrackScores:
+    """Ask the method for every true point where it is first seen, and score what it says after that."""
+    if truth.points is None or answers.points is None:
+        return PointTrackScores()
+    tracks, occluded = truth.points.positions.transpose(1, 0, 2), ~truth.points.visible.T
+    queries, point = first_queries(occluded, tracks)
+    if not len(queries):
+        return PointTrackScores()
+    found = np.full((len(queries), *tracks.shape[1:]), np.nan)
+    seen = np.zeros((len(queries), tracks.shape[1]), bool)
+    for frame in np.unique(queries[:, 0]):
+        here = queries[:, 0] == frame
+        positions, visible = answers.points(int(frame), queries[here, :0:-1])
+        found[here], seen[here] = positions.transpose(1, 0, 2), visible.T
+    height, width = read_image(truth.frames[0]).shape[:2]
+    scores = tapvid_scores(
+        queries,
+        occluded[point],
+        to_tapvid_raster(tracks[point], (width, height)),
+        ~seen,
+        to_tapvid_raster(found, (width, height)),
+        "first",
+    )
+    return PointTrackScores(
+        points_average_jaccard=scores.average_jaccard,
+        points_delta_average=scores.average_within,
+        points_occlusion_accuracy=scores.occlusion_accuracy,
+        points=len(queries),
+    )

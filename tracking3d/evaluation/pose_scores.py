@@ -1,0 +1,136 @@
+"""What poses are worth: rotations and translations, each up to what one camera cannot know."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.datasets.answers import Answers
+from tracking3d.datasets.truth import Truth
+from tracking3d.evaluation.alignment import ObjectAlignment, align_object_frame, translation_errors
+from tracking3d.evaluation.metrics import (
+    aligned_rotation_errors,
+    anchored_rotation_errors,
+    consecutive_rotation_errors,
+    share_under,
+)
+
+NO_ESTIMATE = 180.0
+"""Rotation error in degrees of a frame without an estimate."""
+
+GOOD_TRANSLATION = 5.0
+"""A frame's translation counts as right below so many percent of the object's distance."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseScores:
+    """Poses over the frames with a trusted pose; see `tracking3d.evaluation.metrics` and `...alignment`.
+
+    All are None where there is no such frame.
+
+    Attributes:
+        rotation_error_mean_deg, rotation_error_median_deg, rotation_error_max_deg: Aligned by one rotation.
+        rotation_error_anchored_median_deg: Anchored at the first of these frames that has an estimate.
+        rotation_error_consecutive_median_deg: From each to the next, where both have an estimate.
+        share_under_5_deg: Share with an aligned error under 5 degrees; a lost frame counts as not.
+        translation_error_mean_percent, translation_error_median_percent: Aligned by one similarity, in percent of
+            the median true distance, over the frames that have an estimate.
+        translation_share_under_5_percent: Share with an aligned error under 5 percent of that; a frame that is lost
+            or has no estimate counts as not.
+        frames_with_pose: Number of these frames.
+    """
+
+    rotation_error_mean_deg: float | None = None
+    rotation_error_median_deg: float | None = None
+    rotation_error_max_deg: float | None = None
+    rotation_error_anchored_median_deg: float | None = None
+    rotation_error_consecutive_median_deg: float | None = None
+    share_under_5_deg: float | None = None
+    translation_error_mean_percent: float | None = None
+    translation_error_median_percent: float | None = None
+    translation_share_under_5_percent: float | None = None
+    frames_with_pose: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class PosePairs:
+    """The frames whose true pose is known, and the estimates among them.
+
+    Attributes:
+        frames: All of them that were asked for.
+        found: ``(M,)`` positions in `frames` of those that have an estimate.
+        T_est, T_true: ``(M, 4, 4)`` of these.
+    """
+
+    frames: list[int]
+    found: NDArray[np.int64]
+    T_est: NDArray[np.float64]
+    T_true: NDArray[np.float64]
+
+
+def pair_poses(answers: Answers, truth: Truth) -> PosePairs | None:
+    """The estimates beside the truth; None if the method gives no poses or none is known."""
+    frames = [n for n in answers.asked if n in truth.T_cam_obj]
+    poses = answers.T_cam_obj
+    if not frames or poses is None:
+        return None
+    found = [place for place, n in enumerate(frames) if n in poses]
+    pairs = [(poses[frames[place]], truth.T_cam_obj[frames[place]]) for place in found]
+    T_est, T_true = np.array(pairs).reshape(-1, 2, 4, 4).transpose(1, 0, 2, 3)
+    return PosePairs(frames, np.array(found, dtype=np.int64), T_est, T_true)
+
+
+def fit_alignment(pairs: PosePairs | None, diameter: float | None) -> ObjectAlignment | None:
+    """The similarity between the two object frames over all frames; None without estimates.
+
+    Args:
+        pairs: The poses.
+        diameter: Of the object in the truth's unit, where known.
+    """
+    if pairs is None or not len(pairs.found):
+        return None
+    return align_object_frame(pairs.T_est, pairs.T_true, diameter)
+
+
+def rotation_errors(pairs: PosePairs) -> NDArray[np.float64]:
+    """Aligned error of each of ``pairs.frames`` in degrees; 180 where there is no estimate."""
+    errors = np.full(len(pairs.frames), NO_ESTIMATE)
+    if len(pairs.found):
+        errors[pairs.found] = aligned_rotation_errors(pairs.T_est[:, :3, :3], pairs.T_true[:, :3, :3])
+    return errors
+
+
+def score_poses(
+    answers: Answers, truth: Truth, pairs: PosePairs | None, alignment: ObjectAlignment | None
+) -> PoseScores:
+    """Score the poses of all frames that were asked for and whose true pose is known."""
+    if pairs is None:
+        return PoseScores()
+    aligned = rotation_errors(pairs)
+    anchored = np.full(len(pairs.frames), NO_ESTIMATE)
+    consecutive = np.empty(0)
+    R_est, R_true = pairs.T_est[:, :3, :3], pairs.T_true[:, :3, :3]
+    if len(pairs.found):
+        anchored[pairs.found] = anchored_rotation_errors(R_est, R_true)
+    if len(pairs.found) > 1:
+        consecutive = consecutive_rotation_errors(R_est, R_true)[np.diff(pairs.found) == 1]
+    tracked = np.zeros(len(pairs.frames), bool)
+    tracked[pairs.found] = [pairs.frames[place] not in answers.lost for place in pairs.found]
+    moved = np.full(len(pairs.frames), np.inf)
+    if alignment is not None:
+        moved[pairs.found] = 100 * translation_errors(pairs.T_est, pairs.T_true, alignment)
+    known = moved[np.isfinite(moved)]
+    return PoseScores(
+        rotation_error_mean_deg=float(aligned.mean()),
+        rotation_error_median_deg=float(np.median(aligned)),
+        rotation_error_max_deg=float(aligned.max()),
+        rotation_error_anchored_median_deg=float(np.median(anchored)),
+        rotation_error_consecutive_median_deg=float(np.median(consecutive)) if len(consecutive) else None,
+        share_under_5_deg=share_under(np.where(tracked, aligned, NO_ESTIMATE)),
+        translation_error_mean_percent=float(known.mean()) if len(known) else None,
+        translation_error_median_percent=float(np.median(known)) if len(known) else None,
+        translation_share_under_5_percent=float(np.mean(tracked & (moved < GOOD_TRANSLATION))),
+        frames_with_pose=len(pairs.frames),
+    )

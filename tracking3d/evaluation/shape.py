@@ -1,0 +1,108 @@
+"""How far an estimated surface is from the true one.
+
+Distances run from points spread evenly over one mesh to the surface of the other. Figures are in object diameters. The
+alignment is given (`tracking3d.evaluation.alignment`); none is searched here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from tracking3d.evaluation.arrays import finite
+
+TOLERANCE = 0.02
+"""Distance in diameters below which a point of one surface is on the other."""
+
+SAMPLES = 100_000
+"""Points on each surface."""
+
+_NEAREST = 5
+
+
+@dataclass(frozen=True)
+class ShapeScores:
+    """Of one estimated mesh.
+
+    Attributes:
+        chamfer: Mean distance from the estimated to the true surface and back, half of their sum, in diameters.
+        precision: Share of the estimated surface that is on the true one.
+        recall: Share of the true surface that is on the estimated one.
+        f_score: Harmonic mean of the two.
+    """
+
+    chamfer: float
+    precision: float
+    recall: float
+    f_score: float
+
+
+def shape_scores(
+    estimated: trimesh.Trimesh,
+    true: trimesh.Trimesh,
+    diameter: float,
+    T_true_est: NDArray[np.float64] | None = None,
+    samples: int = SAMPLES,
+    seed: int = 0,
+) -> ShapeScores:
+    """Chamfer distance and F-score (Knapitsch et al., "Tanks and temples", 2017) of two meshes.
+
+    Args:
+        estimated: In estimated object coordinates.
+        true: In true object coordinates.
+        diameter: Of the true mesh, in its unit.
+        T_true_est: ``(4, 4)`` similarity from estimated to true coordinates; None if they are the same.
+        samples: Points on each surface.
+        seed: Of the points.
+
+    Raises:
+        ValueError: If a mesh has no area, or the diameter is not positive, or the similarity is not finite.
+    """
+    if not 0 < diameter < np.inf:
+        raise ValueError(f"the diameter needs to be positive, got {diameter}")
+    for name, mesh in (("estimated", estimated), ("true", true)):
+        if not (np.isfinite(mesh.area) and mesh.area > 0):
+            raise ValueError(f"the {name} mesh has the area {mesh.area}, so no surface to compare")
+    T = np.eye(4) if T_true_est is None else finite("T_true_est", T_true_est, 4, 4)
+    aligned = estimated.copy().apply_transform(T)
+    points, faces = _sample(aligned, samples, seed)
+    true_points, true_faces = _sample(true, samples, seed + 1)
+    to_true = _distances(points, true_points, true.triangles[true_faces]) / diameter
+    to_estimated = _distances(true_points, points, aligned.triangles[faces]) / diameter
+    precision, recall = (float(np.mean(one < TOLERANCE)) for one in (to_true, to_estimated))
+    return ShapeScores(
+        chamfer=float(to_true.mean() + to_estimated.mean()) / 2,
+        precision=precision,
+        recall=recall,
+        f_score=2 * precision * recall / (precision + recall) if precision + recall else 0.0,
+    )
+
+
+def _sample(mesh: trimesh.Trimesh, count: int, seed: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """``(N, 3)`` points, as many on every piece of equal area, and their faces ``(N,)``."""
+    points, faces = trimesh.sample.sample_surface(mesh, count, seed=seed)
+    return np.asarray(points), faces
+
+
+def _distances(
+    points: NDArray[np.float64], samples: NDArray[np.float64], triangles: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Distance ``(N,)`` of each point to the nearest of the triangles that hold the samples nearest to it.
+
+    To the samples alone it would be too large by the gaps between them: 0.3 % of the diameter for the default number
+    on a sphere, against 0.04 % or less.
+
+    Args:
+        points: ``(N, 3)``.
+        samples: ``(M, 3)`` points of the surface.
+        triangles: ``(M, 3, 3)`` corners of the face that each sample lies on.
+    """
+    nearest = min(_NEAREST, len(samples))
+    _, found = cKDTree(samples).query(points, k=nearest)
+    candidates = triangles[found.reshape(-1)]
+    closest = trimesh.triangles.closest_point(candidates, np.repeat(points, nearest, axis=0))
+    return np.linalg.norm(closest.reshape(-1, nearest, 3) - points[:, None], axis=2).min(1)

@@ -1,0 +1,34 @@
+"""Answers of any origin: our run folders, and the formats of others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tracking3d.datasets.answers import Answers
+from tracking3d.datasets.readers import read_answers
+from tracking3d.datasets.run_answers import answers_of_run
+from tracking3d.datasets.truth import Truth
+from tracking3d.results import layout
+
+RUN_FOLDER = "run"
+
+
+def open_answers(path: Path, truth: Truth, form: str | None = None) -> tuple[Answers, str]:
+    """Read answers for the clip that ``truth`` is about.
+
+    Args:
+        path: A run folder, or what `tracking3d.datasets.readers.read_answers` reads.
+        truth: The clip.
+        form: ``run`` or a format of `read_answers`; recognised if None.
+
+    Returns:
+        The answers, and what they were read as, in words.
+
+    Raises:
+        InputError: If there is nothing that can be read, or nothing of this clip.
+    """
+    known_to_be_other = form not in (None, RUN_FOLDER)
+    looks_like_a_run = (path / layout.RUN).exists() or not path.exists()
+    if form == RUN_FOLDER or (looks_like_a_run and not known_to_be_other):
+        return answers_of_run(path, truth), "a run folder"
+    return read_answers(path, truth, form)

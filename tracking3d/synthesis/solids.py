@@ -1,0 +1,178 @@
+"""The objects of synthetic sequences: procedural solids from a seed, and any mesh file.
+
+The procedural solids are about one unit in radius, y is up. Their shape is fixed but for the blob's, which like
+all textures comes from the seed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from tracking3d.config.explain import hint
+from tracking3d.errors import InputError
+from tracking3d.synthesis.patches import Array, Patch, assemble, cube_sphere, prism, revolved, tube
+from tracking3d.synthesis.procedural_texture import paint_panel, paint_plain
+from tracking3d.synthesis.spec import SequenceSpec
+
+PANEL = 256
+"""Side of a panel of texture in texels."""
+
+_STEPS_AROUND = 72  # of a continuous symmetry in its list of transforms: every 5 degrees
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """An object in its own coordinates.
+
+    Attributes:
+        vertices: ``(V, 3)``.
+        faces: ``(F, 3)`` int64.
+        texture: ``(H, W, 3)`` uint8, or None where the vertices have colours.
+        uvs: ``(V, 2)`` texture coordinates, v upwards; or None.
+        colours: ``(V, 3)`` uint8, or None where there is a texture.
+        millimetres: Length of the unit.
+        symmetries: ``(S, 4, 4)`` transforms that leave shape and look as they are, the identity first.
+        axis: ``(3,)`` unit, the axis through the origin of a continuous symmetry; `symmetries` then holds steps.
+        frame: Where origin and axes are, in words.
+    """
+
+    vertices: Array
+    faces: NDArray[np.int64]
+    texture: NDArray[np.uint8] | None
+    uvs: Array | None
+    colours: NDArray[np.uint8] | None
+    millimetres: float
+    symmetries: Array
+    axis: Array | None
+    frame: str
+
+    @property
+    def radius(self) -> float:
+        """Radius of the enclosing sphere around the origin."""
+        return float(np.linalg.norm(self.vertices, axis=1).max())
+
+    def mesh(self) -> trimesh.Trimesh:
+        """The shape without its colours."""
+        return trimesh.Trimesh(self.vertices, self.faces, process=False)
+
+
+def make_solid(spec: SequenceSpec) -> Solid:
+    """The object of a sequence.
+
+    Raises:
+        InputError: If it is neither a procedural object nor a mesh file with faces.
+    """
+    from tracking3d.synthesis.mesh_files import load_solid
+
+    if spec.object in PROCEDURAL:
+        return _procedural(spec)
+    path = Path(spec.object)
+    if not path.suffix and not path.exists():
+        raise InputError(
+            f"There is no object '{spec.object}' and no such mesh file; {hint(spec.object, PROCEDURAL)}"
+        )
+    return load_solid(path, spec)
+
+
+def box(rng: np.random.Generator) -> list[Patch]:
+    """A cuboid of three different sides."""
+    return prism(_rectangle(0.62, 0.48), 0.56)
+
+
+def card(rng: np.random.Generator) -> list[Patch]:
+    """A flat card, its two sides different."""
+    return prism(_rectangle(0.78, 0.55), 0.02)
+
+
+def wedge(rng: np.random.Generator) -> list[Patch]:
+    """A right-angled ramp."""
+    return prism(np.array([(-0.75, -0.4), (0.65, -0.4), (-0.75, 0.5)]), 0.45)
+
+
+def bottle(rng: np.random.Generator) -> list[Patch]:
+    """A surface of revolution with shoulders, neck and cap."""
+    profile = [(0.0, -0.9), (0.33, -0.9), (0.38, -0.84), (0.38, 0.1), (0.36, 0.25), (0.28, 0.4), (0.17, 0.52)]
+    profile += [(0.13, 0.62), (0.13, 0.72), (0.18, 0.73), (0.18, 0.93), (0.0, 0.94)]
+    return revolved(_refined(np.array(profile)), sectors=2)
+
+
+def blob(rng: np.random.Generator) -> list[Patch]:
+    """A sphere with smooth bumps and dents."""
+    centres = rng.normal(size=(14, 3))
+    centres /= np.linalg.norm(centres, axis=1, keepdims=True)
+    heights = rng.uniform(-0.22, 0.22, 14)
+    patches = cube_sphere(24)
+    shapes = [1 + np.exp(4 * (patch.vertices @ centres.T - 1)) @ heights for patch in patches]
+    largest = max(shape.max() for shape in shapes)
+    return [
+        Patch(0.95 * patch.vertices * shape[:, None] / largest, patch.faces, patch.uvs)
+        for patch, shape in zip(patches, shapes, strict=True)
+    ]
+
+
+def mug(rng: np.random.Generator) -> list[Patch]:
+    """An open mug with a handle that one can look through."""
+    wall = [(0.0, -0.62), (0.45, -0.62), (0.5, -0.57), (0.5, 0.6), (0.48, 0.62), (0.45, 0.6), (0.45, -0.5), (0.0, -0.52)]
+    body = revolved(_refined(np.array(wall)), sectors=2)
+    angle = np.linspace(-0.58, 0.58, 40) * math.pi
+    curve = np.stack([0.5 + 0.32 * np.cos(angle), 0.38 * np.sin(angle), np.zeros_like(angle)], 1)
+    handle = tube(curve, 0.075, np.array([0.0, 0.0, 1.0]))
+    return [Patch(patch.vertices - (0.12, 0, 0), patch.faces, patch.uvs) for patch in (*body, handle)]
+
+
+PROCEDURAL: dict[str, Callable[[np.random.Generator], list[Patch]]] = {
+    "box": box,
+    "bottle": bottle,
+    "blob": blob,
+    "mug": mug,
+    "card": card,
+    "wedge": wedge,
+}
+"""The procedural objects by name."""
+
+
+def _procedural(spec: SequenceSpec) -> Solid:
+    patches = PROCEDURAL[spec.object](spec.random("shape"))
+    rng = spec.random("texture")
+    if spec.textured:
+        panels = [paint_panel(rng, PANEL) for _ in patches]
+    else:
+        hue = rng.random()
+        panels = [paint_plain(rng, PANEL, hue) for _ in patches]
+    vertices, faces, uvs, texture = assemble(patches, [panel.round().astype(np.uint8) for panel in panels])
+    symmetries, axis = np.eye(4)[None], None
+    if not spec.textured and spec.object in ("box", "card"):
+        symmetries = _turns([np.zeros(3), *(math.pi * np.eye(3))])
+    if not spec.textured and spec.object == "bottle":
+        axis = np.array([0.0, 1.0, 0.0])
+        symmetries = _turns(np.linspace(0, 2 * math.pi, _STEPS_AROUND, endpoint=False)[:, None] * axis)
+    frame = "origin in the middle of the body, y up, about one unit in radius"
+    return Solid(vertices, faces, texture, uvs, None, 100.0, symmetries, axis, frame)
+
+
+def _turns(rotation_vectors: list[Array] | Array) -> Array:
+    """``(S, 4, 4)`` rotations about the origin."""
+    transforms = np.tile(np.eye(4), (len(rotation_vectors), 1, 1))
+    transforms[:, :3, :3] = Rotation.from_rotvec(np.asarray(rotation_vectors)).as_matrix()
+    return transforms
+
+
+def _rectangle(x: float, y: float) -> Array:
+    return np.array([(-x, -y), (x, -y), (x, y), (-x, y)])
+
+
+def _refined(profile: Array, step: float = 0.04) -> Array:
+    """The same polyline with points at most ``step`` apart."""
+    pieces = []
+    for start, end in zip(profile[:-1], profile[1:], strict=True):
+        count = max(math.ceil(np.linalg.norm(end - start) / step), 1)
+        pieces.append(start + np.arange(count)[:, None] / count * (end - start))
+    return np.concatenate([*pieces, profile[-1:]])

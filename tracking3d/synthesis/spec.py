@@ -1,0 +1,96 @@
+"""What a synthetic sequence is made of: object, motion, camera, disturbances and seed, all in one checked model.
+
+One `SequenceSpec` always gives the same sequence. Every random choice draws from its own stream of the seed, so
+that switching one disturbance on or off leaves all else as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, ValidationError, field_validator
+
+from tracking3d.config.explain import describe
+from tracking3d.config.models import Section
+from tracking3d.errors import InputError
+
+Strength = Annotated[float, Field(ge=0, le=1)]
+"""0 is off, 1 the strongest."""
+
+Motion = Literal["tumble", "turntable", "turn_and_back", "flip", "fast", "depth_drift", "leave_and_return"]
+"""See `tracking3d.synthesis.motions`."""
+
+PROCEDURAL_BACKGROUND = "procedural"
+
+
+class Disturbances(Section):
+    """What makes a sequence hard; each with a strength from 0 (off) to 1."""
+
+    light: Strength = Field(0.0, description="The light's direction, brightness and colour change.")
+    highlights: Strength = Field(0.0, description="Specular highlights on the object.")
+    motion_blur: Strength = Field(0.0, description="Share of the time between frames that the shutter is open.")
+    noise: Strength = Field(0.0, description="Sensor noise; 1 is a standard deviation of about 20 grey levels.")
+    low_contrast: Strength = Field(0.0, description="Grey levels shrink towards the mean, at 1 to a fifth.")
+    occluder: Strength = Field(0.0, description="A hand moves over the object; at 1 it hides up to 35 % of it.")
+    wrong_fov: Strength = Field(
+        0.0, description="The camera that a tracker is told has a wider field of view, at 1 twice the true one."
+    )
+    jpeg: Strength = Field(0.0, description="JPEG compression: quality 95 near 0, 15 at 1; 0 is lossless PNG.")
+
+
+class SequenceSpec(Section):
+    """One synthetic sequence."""
+
+    name: str = Field("sequence", pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", description="Name of its folder.")
+    object: str = Field("box", min_length=1, description="A procedural object, or a mesh file.")
+    textured: bool = Field(True, description="Printed with patterns, or nearly one plain colour.")
+    motion: Motion = Field("tumble", description="How the object moves.")
+    degrees_per_frame: float = Field(4.0, ge=0, le=60, description="Speed of rotation; the peak for `fast`.")
+    frames: int = Field(40, ge=1, le=10_000, description="Number of frames.")
+    size: tuple[int, int] = Field((320, 240), description="Width and height in pixels.")
+    fov: float = Field(45.0, ge=5, le=100, description="True vertical field of view in degrees.")
+    fill: float = Field(
+        0.7, ge=0.1, le=0.9, description="The object's largest diameter relative to the image height, frame 0."
+    )
+    background: str = Field(
+        PROCEDURAL_BACKGROUND, min_length=1, description="procedural, or a folder of images to choose from."
+    )
+    disturbances: Disturbances = Disturbances()
+    supersample: int = Field(3, ge=1, le=9, description="Rays per pixel and axis; odd: one meets the centre.")
+    seed: int = Field(0, ge=0, lt=2**32, description="Seed of all that is random.")
+
+    @field_validator("size")
+    @classmethod
+    def _images_have_a_sensible_size(cls, size: tuple[int, int]) -> tuple[int, int]:
+        if min(size) < 16 or max(size) > 4096:
+            raise ValueError("width and height must be from 16 to 4096 pixels")
+        return size
+
+    @field_validator("supersample")
+    @classmethod
+    def _one_ray_meets_the_centre(cls, supersample: int) -> int:
+        if supersample % 2 == 0:
+            raise ValueError("it must be odd")
+        return supersample
+
+    def random(self, purpose: str) -> np.random.Generator:
+        """The stream of random numbers for one purpose."""
+        return np.random.default_rng([self.seed, *purpose.encode()])
+
+
+def check_spec(settings: Mapping[str, Any], origin: str) -> SequenceSpec:
+    """The spec with these settings.
+
+    Args:
+        settings: Of `SequenceSpec`, as YAML or options give them.
+        origin: Where they come from, as messages call it.
+
+    Raises:
+        InputError: If a setting is unknown or its value makes no sense.
+    """
+    try:
+        return SequenceSpec.model_validate(settings)
+    except ValidationError as error:
+        raise InputError(f"{origin}: {describe(error, SequenceSpec)}") from error
