@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 
+import cv2
 import numpy as np
 import pytest
 
 from tracking3d.datasets.clip import is_rigid, read_truth
 from tracking3d.errors import InputError, OutputError
 from tracking3d.evaluation.metrics import mask_iou
-from tracking3d.results.files import read_mask
+from tracking3d.results.files import read_mask, write_mask
 from tracking3d.synthesis.convex_clips import SyntheticSpec, make_demo_clip, synthesize
 from tracking3d.video import read_image
 
@@ -148,3 +150,172 @@ def test_only_finite_rotations_with_a_translation_are_rigid():
     assert is_rigid(np.eye(4))
     for wrong in (np.eye(3), 2 * np.eye(4), np.full((4, 4), np.nan), np.diag([1.0, 1, -1, 1])):
         assert not is_rigid(wrong)
+
+
+def edit(file, **changes):
+    document = json.loads(file.read_text()) if file.exists() else {}
+    file.write_text(json.dumps(document | changes))
+
+
+def test_a_demo_clip_has_name_box_camera_and_rough_masks(demo):
+    made = synthesize(SyntheticSpec(frames=3, size=(96, 72), seed=3))
+    truth = read_truth(demo)
+    assert truth.name == "clip" and truth.box == made.box
+    assert truth.camera is not None
+    np.testing.assert_allclose(truth.camera.K, made.K)
+    assert (truth.camera.width, truth.camera.height) == (96, 72)
+    assert (truth.initial_masks[1].read() == read_mask(demo / "rough_masks/000001.png")).all()
+    assert truth.told_camera is truth.mesh is truth.points is truth.millimetres is None
+    assert truth.symmetries.tolist() == [np.eye(4).tolist()]
+    assert not truth.visible_masks and not truth.depth and not truth.boxes
+
+
+def test_the_name_is_that_of_the_folder_however_it_is_given(clip, monkeypatch):
+    monkeypatch.chdir(clip)
+    assert read_truth(clip / ".").name == read_truth(clip / "masks" / "..").name == "clip"
+
+
+def test_visible_masks_are_kept_beside_the_whole_ones_and_the_box_is_of_what_is_seen(clip):
+    seen = np.zeros((72, 96), bool)
+    seen[20:30, 40:60] = True
+    (clip / "visible_masks").mkdir()
+    write_mask(clip / "visible_masks/000000.png", seen)
+    (clip / "init.json").unlink()
+    truth = read_truth(clip)
+    assert list(truth.visible_masks) == [0] and len(truth.masks) == 3
+    assert (truth.visible_masks[0].read() == seen).all()
+    assert truth.box == (40, 20, 20, 10)
+    shutil.rmtree(clip / "masks")
+    truth = read_truth(clip)
+    assert (truth.masks[0].read() == seen).all() and not truth.visible_masks
+
+
+def test_the_box_is_that_of_init_json_or_else_of_the_first_mask(clip):
+    around = read_truth(clip).box
+    edit(clip / "init.json", bbox_xywh=[1, 2.5, 3, 4])
+    assert read_truth(clip).box == (1, 2.5, 3, 4)
+    edit(clip / "init.json", frame=2)
+    assert read_truth(clip).box == around
+    (clip / "init.json").unlink()
+    assert read_truth(clip).box == around
+
+
+def test_the_true_camera_may_differ_from_the_one_that_a_tracker_is_told(clip):
+    told = read_truth(clip).camera
+    assert told is not None
+    edit(clip / "truth_camera.json", K=[[90, 0, 40], [0, 91, 30], [0, 0, 1]], width=96, height=72)
+    truth = read_truth(clip)
+    assert truth.camera is not None and truth.told_camera is not None
+    assert (truth.camera.fx, truth.camera.fy) == (90, 91)
+    assert (truth.told_camera.K == told.K).all()
+
+
+@pytest.mark.parametrize(
+    ("unit", "millimetres"), [("metres", 1000), ("centimetres (about)", 10), ("inches", None)]
+)
+def test_the_unit_of_the_poses_is_known_by_its_name(clip, unit, millimetres):
+    edit(clip / "poses.json", units=unit)
+    assert read_truth(clip).millimetres == millimetres
+    edit(clip / "info.json", millimetres=25.4)
+    assert read_truth(clip).millimetres == 25.4
+
+
+def test_a_count_of_depth_is_a_millimetre_or_what_the_camera_says(clip):
+    (clip / "depth").mkdir()
+    cv2.imwrite(str(clip / "depth/000001.png"), np.full((72, 96), 250, np.uint16))
+
+    def depth():
+        (image,) = read_truth(clip).depth.items()
+        return image[0], float(image[1].read()[5, 5])
+
+    assert depth() == pytest.approx((1, 0.25))
+    edit(clip / "info.json", millimetres=10)
+    assert depth() == pytest.approx((1, 25))
+    edit(clip / "camera.json", depth_scale=0.5)
+    assert depth() == pytest.approx((1, 125))
+
+
+def test_a_mesh_and_symmetries_come_along(clip):
+    (clip / "mesh.obj").write_text("v 0 0 0\nv 3 0 0\nv 0 4 0\nf 1 2 3\n")
+    flip = np.diag([-1.0, -1, 1, 1])
+    edit(clip / "info.json", symmetries=[flip.tolist(), np.eye(4).tolist()])
+    truth = read_truth(clip)
+    assert truth.mesh is not None and truth.mesh.read().extents == pytest.approx([3, 4, 0])
+    assert truth.symmetries.tolist() == [np.eye(4).tolist(), flip.tolist()]
+
+
+def test_points_come_along_and_may_be_all_that_is_known(clip):
+    positions = np.arange(12.0).reshape(3, 2, 2)
+    visible = np.array([[1, 1], [1, 0], [0, 0]], bool)
+    positions[2] = np.nan
+    np.savez(clip / "points.npz", positions=positions, visible=visible)
+    shutil.rmtree(clip / "masks")
+    (clip / "poses.json").unlink()
+    points = read_truth(clip).points
+    assert points is not None
+    np.testing.assert_array_equal(points.positions, positions)
+    np.testing.assert_array_equal(points.visible, visible)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "reason"),
+    [
+        ({}, "cannot be read as positions and visible"),
+        ({"positions": np.zeros((3, 2, 2))}, "cannot be read as positions and visible"),
+        ({"positions": np.array([{}]), "visible": np.ones(1)}, "cannot be read as positions and visible"),
+        ({"positions": np.zeros((2, 2, 2)), "visible": np.ones((2, 2))}, "the clip's 3 frames"),
+        ({"positions": np.zeros((3, 2, 3)), "visible": np.ones((3, 2))}, "the clip's 3 frames"),
+        ({"positions": np.full((3, 2, 2), np.nan), "visible": np.ones((3, 2))}, "no finite number"),
+    ],
+)
+def test_points_of_another_form_are_named(clip, arrays, reason):
+    np.savez(clip / "points.npz", **arrays)
+    with pytest.raises(InputError, match=reason) as caught:
+        read_truth(clip)
+    assert str(clip / "points.npz") in str(caught.value)
+
+
+@pytest.mark.parametrize("data", [b"", b"not an archive", b"PK\x03\x04truncated", b"one array"])
+def test_points_that_are_no_archive_are_named(clip, data):
+    if data == b"one array":
+        stream = io.BytesIO()
+        np.save(stream, np.zeros(3))
+        data = stream.getvalue()
+    (clip / "points.npz").write_bytes(data)
+    with pytest.raises(InputError, match=r"points\.npz cannot be read as positions and visible"):
+        read_truth(clip)
+
+
+@pytest.mark.parametrize(
+    ("file", "changes", "reason"),
+    [
+        ("camera.json", {"K": [[1, 0], [0, 1]]}, "K must be 3 x 3 numbers"),
+        ("camera.json", {"K": [[0, 0, 1], [0, 1, 1], [0, 0, 1]]}, "positive focal lengths"),
+        ("camera.json", {"K": [[9, 2, 1], [0, 9, 1], [0, 0, 1]]}, "K must be fx 0 cx"),
+        ("camera.json", {"K": [[9, 0, 1], [0, 9, 1], [0, 1, 1]]}, "K must be fx 0 cx"),
+        ("camera.json", {"width": "wide"}, "width and height whole"),
+        ("truth_camera.json", {}, "K must be 3 x 3 numbers"),
+        ("init.json", {"bbox_xywh": [1, 2, 3]}, "bbox_xywh must be four numbers"),
+        ("init.json", {"bbox_xywh": None}, "bbox_xywh must be four numbers"),
+        ("info.json", {"millimetres": 0}, "millimetres must be a positive number, not 0"),
+        ("info.json", {"millimetres": "10"}, "millimetres must be a positive number, not '10'"),
+        ("info.json", {"symmetries": [[1, 2]]}, "list of 4 x 4 matrices"),
+        ("info.json", {"symmetries": [(2 * np.eye(4)).tolist()]}, "must be rigid transforms"),
+    ],
+)
+def test_wrong_values_are_named_with_their_file(clip, file, changes, reason):
+    edit(clip / file, **changes)
+    with pytest.raises(InputError, match=reason) as caught:
+        read_truth(clip)
+    assert str(clip / file) in str(caught.value)
+
+
+@pytest.mark.parametrize("file", ["camera.json", "init.json", "info.json"])
+@pytest.mark.parametrize(
+    ("text", "reason"), [("{", "cannot be read as JSON"), ("[1]", "is not a JSON object")]
+)
+def test_broken_documents_are_named(clip, file, text, reason):
+    (clip / file).write_text(text)
+    with pytest.raises(InputError, match=reason) as caught:
+        read_truth(clip)
+    assert str(clip / file) in str(caught.value)

@@ -53,7 +53,9 @@ def test_over_and_under_confidence_in_one_bin_cancel():
     )
 
 
-@pytest.mark.parametrize(("confidence", "expected"), [(0.0, 0), (0.1, 0), (0.3, 2), (0.7, 6), (0.701, 7), (1, 9)])
+@pytest.mark.parametrize(
+    ("confidence", "expected"), [(0.0, 0), (0.1, 0), (0.3, 2), (0.7, 6), (0.701, 7), (1, 9)]
+)
 def test_a_bin_holds_its_upper_edge_and_the_first_holds_zero(confidence, expected):
     count = reliability([confidence], [True]).count
     assert np.flatnonzero(count) == [expected]

@@ -72,7 +72,8 @@ def test_a_perfect_tracker_has_full_scores(mode):
 )
 def test_a_known_shift_is_under_the_known_thresholds(shift, right):
     tracks, seen = still(2, 4), np.zeros((2, 4), bool)
-    scores = tapvid_scores(queries(0, 0), seen, tracks, seen, tracks + [shift, 0.0], "first")
+    moved = tracks + np.array([shift, 0.0])
+    scores = tapvid_scores(queries(0, 0), seen, tracks, seen, moved, "first")
     assert scores.average_within == pytest.approx(right / 5)
     # A visible point that is far off is missed and wrongly claimed.
     assert scores.jaccard == tuple(float(share) for share in scores.within)
@@ -139,7 +140,11 @@ def test_without_scored_frames_there_is_no_score():
     late = tapvid_scores(queries(2, 2), seen, tracks, seen, tracks, "first")
     none = tapvid_scores(np.empty((0, 3)), seen[:0], tracks[:0], seen[:0], tracks[:0], "strided")
     for scores in (late, none):
-        assert (scores.average_within, scores.average_jaccard, scores.occlusion_accuracy) == (None, None, None)
+        assert (scores.average_within, scores.average_jaccard, scores.occlusion_accuracy) == (
+            None,
+            None,
+            None,
+        )
         assert scores.within == (None,) * 5
 
 

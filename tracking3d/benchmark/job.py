@@ -92,6 +92,11 @@ class Job:
         scores = _read(self.folder / SCORES)
         return scores["scores"] if scores and scores["key"] == self.score_key else None
 
+    def written(self) -> dict[str, Any] | None:
+        """The scores that lie there, whatever they depended on; None if there are none."""
+        scores = _read(self.folder / SCORES)
+        return scores["scores"] if scores else None
+
     def write(self) -> Path:
         """Write the job for a process to read; returns the file."""
         with writing(self.folder):

@@ -82,7 +82,7 @@ def _run(job: Job, stop: Event) -> Outcome:
     log = job.folder / LOG
     command = [sys.executable, "-m", "tracking3d.benchmark.job", str(job.write())]
     code = _call(command, log, stop)
-    scores = job.finished()
+    scores = job.written() if code == 0 else None
     error = "" if scores is not None else _reason(code, log)
     return Outcome(job, scores, error, seconds=time.monotonic() - started)
 
@@ -100,7 +100,7 @@ def _call(command: list[str], log: Path, stop: Event) -> int:
 
 def _reason(code: int, log: Path) -> str:
     if code == 0:
-        return "What it depends on changed while it ran; run it again."
+        return "Settings, frames or code changed while it ran; run it again."
     lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
     said = lines[-1].strip() if lines else "it said nothing"
     how = f"was ended by signal {-code}" if code < 0 else f"ended with code {code}"

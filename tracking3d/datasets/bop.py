@@ -108,10 +108,13 @@ def _turns(
     axis: NDArray[np.float64], offset: NDArray[np.float64], largest_step: float
 ) -> NDArray[np.float64]:
     """``(S, 4, 4)`` equal turns about the line through ``offset`` along ``axis``, the identity first."""
+    length = np.linalg.norm(axis)
+    if not length > 0:
+        raise ValueError("an axis has no direction")
     count = math.ceil(math.pi / largest_step)
     angles = 2 * np.pi * np.arange(count) / count
     turns = np.tile(np.eye(4), (count, 1, 1))
-    turns[:, :3, :3] = Rotation.from_rotvec(angles[:, None] * axis / np.linalg.norm(axis)).as_matrix()
+    turns[:, :3, :3] = Rotation.from_rotvec(angles[:, None] * axis / length).as_matrix()
     turns[:, :3, 3] = offset - turns[:, :3, :3] @ offset
     return turns
 

@@ -76,6 +76,8 @@ def read_intrinsics(file: Path, form: Literal["json", "text"], size: tuple[int, 
         numbers = next((document[key] for key in ("K", "cam_K", "intrinsics") if key in document), None)
         if numbers is None:
             numbers = [document.get(key) for key in ("fx", "fy", "cx", "cy")]
+            if None in numbers:
+                raise InputError(f"{file} has neither K nor fx, fy, cx and cy; restore it.")
         size = document.get("width", size[0]), document.get("height", size[1])
     else:
         try:

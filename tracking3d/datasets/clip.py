@@ -79,7 +79,7 @@ def read_truth(folder: Path) -> Truth:
         told_camera=told if true else None,
         T_cam_obj=poses,
         masks=masks or visible_masks,
-        visible_masks=visible_masks,
+        visible_masks=visible_masks if masks else {},
         depth=_depth(folder, index, millimetres),
         mesh=MeshFile(mesh) if mesh.is_file() else None,
         points=points,
@@ -229,9 +229,9 @@ def _read_points(file: Path, frames: int) -> PointTruth | None:
     if not file.exists():
         return None
     try:
-        with np.load(file, allow_pickle=False) as arrays:
+        with file.open("rb") as data, np.load(data, allow_pickle=False) as arrays:
             points = PointTruth(arrays["positions"].astype(np.float64), arrays["visible"].astype(bool))
-    except (OSError, ValueError, KeyError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as error:
         raise InputError(f"{file} cannot be read as positions and visible ({error}); restore it.") from error
     shape = points.visible.shape
     if len(shape) != 2 or shape[0] != frames or points.positions.shape != (*shape, 2):

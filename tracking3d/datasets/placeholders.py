@@ -32,6 +32,21 @@ class Place:
     sequence: str
     object: str | None = None
 
+    @property
+    def object_number(self) -> int:
+        """The object as a number; 1 where the sequence has only one and no name for it.
+
+        Raises:
+            InputError: If its name is not a number.
+        """
+        try:
+            return int(self.object or 1)
+        except ValueError as error:
+            raise InputError(
+                f"The object '{self.object}' of the sequence '{self.sequence}' is not a number, but the description "
+                "asks for one; correct the description."
+            ) from error
+
     def files(self, patterns: Iterable[str]) -> list[Path]:
         """The files of the first pattern that any file matches, in natural order."""
         for pattern in patterns:
@@ -55,7 +70,7 @@ class Place:
         if file is None:
             wanted = " or ".join(self._filled(pattern) or pattern for pattern in patterns)
             raise InputError(
-                f"The sequence {self.sequence} in {self.root} has no {wanted}, which holds its {what}; restore it."
+                f"The sequence '{self.sequence}' in {self.root} has no {wanted}, which holds its {what}; restore it."
             )
         return file
 

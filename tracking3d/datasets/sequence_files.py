@@ -83,7 +83,7 @@ class SequenceFiles:
         if told.values == "nonzero":
             return IndexedMask(file, None)
         if told.values == "objects":
-            return IndexedMask(file, None if self.place.object is None else int(self.place.object))
+            return IndexedMask(file, None if self.place.object is None else self.place.object_number)
         return IndexedMask(file, told.values)
 
     def regions(self, told: Regions | None) -> tuple[dict[int, MaskReference], dict[int, Box]]:
@@ -179,4 +179,4 @@ class SequenceFiles:
         if told is None or told.file is None:
             return symmetries_of(told.values if told else (), f"the description {self.layout.name}")
         file = self.place.required(told.file, "symmetries")
-        return read_symmetries(file, int(self.place.object or 1))
+        return read_symmetries(file, self.place.object_number)

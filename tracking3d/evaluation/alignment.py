@@ -74,9 +74,10 @@ def align_object_frame(
 
     ``A`` is that of `rotation_alignment`. Scale and offset have the least sum of translation errors, where no error
     counts more than half the object's diameter, the loosest threshold of BOP: a frame further off is wrong, how far
-    does not matter. Without that limit frames that are far off would rather have the scale go to zero. Fits to three
-    frames, and to all, are the starts; reweighted least squares within the limit refines the best of them. What the
-    frames leave open, as one frame alone does, is chosen so that the offset is the shortest.
+    does not matter. No offset is longer than the median estimated distance: object frames are not that far from their
+    objects, and longer ones let the scale go to zero, which hides what the estimate says. Fits to three frames, and
+    to all, are the starts; reweighted least squares within the limit refines the best of them. What the frames leave
+    open, as one frame alone does, is chosen so that the offset is the shortest.
 
     Args:
         T_est: ``(N, 4, 4)`` finite estimates.
@@ -163,7 +164,7 @@ def _translation_residuals(alignment: ObjectAlignment, T_est: Poses, T_true: Pos
 def _fit(
     M: NDArray[np.float64], y: NDArray[np.float64], limit: float, random: np.random.Generator
 ) -> NDArray[np.float64]:
-    """``x`` ``(4,)`` with the least sum of ``min(|M_n x - y_n|, limit)`` and a positive ``x[3]``.
+    """``x`` ``(4,)`` with the least sum of ``min(|M_n x - y_n|, limit)``, and ``x[:3]`` no longer than ``x[3]``.
 
     Args:
         M: ``(N, 3, 4)``.
@@ -178,10 +179,14 @@ def _fit(
     samples = [random.permutation(len(M))[:3] for _ in range(SAMPLES if len(M) > 3 else 0)]
     starts = [_least_squares(M[sample], y[sample]) for sample in samples]
     starts += [_reweighted(M, y, np.inf, _least_squares(M, y)), np.array([0.0, 0.0, 0.0, 1.0])]
-    best = sorted((x for x in starts if x[3] > _RANK), key=cost)[:_REFINED]
+    best = sorted(filter(_is_plausible, starts), key=cost)[:_REFINED]
     # A start is kept as it is too: refinement need not end below it.
-    refined = [x for x in (_reweighted(M, y, limit, start) for start in best) if x[3] > _RANK]
-    return min(best + refined, key=cost)
+    refined = [_reweighted(M, y, limit, start) for start in best]
+    return min(best + list(filter(_is_plausible, refined)), key=cost)
+
+
+def _is_plausible(x: NDArray[np.float64]) -> bool:
+    return bool(x[3] > 0 and np.linalg.norm(x[:3]) <= x[3])
 
 
 def _reweighted(

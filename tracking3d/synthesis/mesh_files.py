@@ -67,6 +67,6 @@ def _texture(mesh: trimesh.Trimesh) -> tuple[NDArray[np.uint8] | None, NDArray[n
 def _colours(mesh: trimesh.Trimesh, spec: SequenceSpec) -> NDArray[np.uint8]:
     """``(V, 3)``: the file's own where it has some, else one plain colour."""
     if spec.textured and getattr(mesh.visual, "kind", None) in ("vertex", "face"):
-        return np.asarray(mesh.visual.to_color().vertex_colors)[:, :3].astype(np.uint8)
+        return np.asarray(mesh.visual.vertex_colors)[:, :3].astype(np.uint8)
     colour = np.array(plain_colour(spec.random("texture").random()), np.uint8)
     return np.tile(colour, (len(mesh.vertices), 1))

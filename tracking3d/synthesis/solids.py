@@ -108,9 +108,9 @@ def blob(rng: np.random.Generator) -> list[Patch]:
     """A sphere with smooth bumps and dents."""
     centres = rng.normal(size=(14, 3))
     centres /= np.linalg.norm(centres, axis=1, keepdims=True)
-    heights = rng.uniform(-0.22, 0.22, 14)
+    heights = rng.choice([-0.3, 0.45], 14) * rng.uniform(0.5, 1, 14)
     patches = cube_sphere(24)
-    shapes = [1 + np.exp(4 * (patch.vertices @ centres.T - 1)) @ heights for patch in patches]
+    shapes = [1 + np.exp(7 * (patch.vertices @ centres.T - 1)) @ heights for patch in patches]
     largest = max(shape.max() for shape in shapes)
     return [
         Patch(0.95 * patch.vertices * shape[:, None] / largest, patch.faces, patch.uvs)
@@ -120,7 +120,16 @@ def blob(rng: np.random.Generator) -> list[Patch]:
 
 def mug(rng: np.random.Generator) -> list[Patch]:
     """An open mug with a handle that one can look through."""
-    wall = [(0.0, -0.62), (0.45, -0.62), (0.5, -0.57), (0.5, 0.6), (0.48, 0.62), (0.45, 0.6), (0.45, -0.5), (0.0, -0.52)]
+    wall = [
+        (0.0, -0.62),
+        (0.45, -0.62),
+        (0.5, -0.57),
+        (0.5, 0.6),
+        (0.48, 0.62),
+        (0.45, 0.6),
+        (0.45, -0.5),
+        (0.0, -0.52),
+    ]
     body = revolved(_refined(np.array(wall)), sectors=2)
     angle = np.linspace(-0.58, 0.58, 40) * math.pi
     curve = np.stack([0.5 + 0.32 * np.cos(angle), 0.38 * np.sin(angle), np.zeros_like(angle)], 1)

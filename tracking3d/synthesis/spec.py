@@ -30,14 +30,23 @@ class Disturbances(Section):
 
     light: Strength = Field(0.0, description="The light's direction, brightness and colour change.")
     highlights: Strength = Field(0.0, description="Specular highlights on the object.")
-    motion_blur: Strength = Field(0.0, description="Share of the time between frames that the shutter is open.")
-    noise: Strength = Field(0.0, description="Sensor noise; 1 is a standard deviation of about 20 grey levels.")
-    low_contrast: Strength = Field(0.0, description="Grey levels shrink towards the mean, at 1 to a fifth.")
-    occluder: Strength = Field(0.0, description="A hand moves over the object; at 1 it hides up to 35 % of it.")
-    wrong_fov: Strength = Field(
-        0.0, description="The camera that a tracker is told has a wider field of view, at 1 twice the true one."
+    motion_blur: Strength = Field(
+        0.0, description="Share of the time between frames that the shutter is open."
     )
-    jpeg: Strength = Field(0.0, description="JPEG compression: quality 95 near 0, 15 at 1; 0 is lossless PNG.")
+    noise: Strength = Field(
+        0.0, description="Sensor noise; 1 is a standard deviation of about 20 grey levels."
+    )
+    low_contrast: Strength = Field(0.0, description="Grey levels shrink towards the mean, at 1 to a fifth.")
+    occluder: Strength = Field(
+        0.0, description="A hand moves over the object; at 1 it hides up to 35 % of it."
+    )
+    wrong_fov: Strength = Field(
+        0.0,
+        description="The camera that a tracker is told has a wider field of view, at 1 twice the true one.",
+    )
+    jpeg: Strength = Field(
+        0.0, description="JPEG compression: quality 95 near 0, 15 at 1; 0 is lossless PNG."
+    )
 
 
 class SequenceSpec(Section):
@@ -52,7 +61,10 @@ class SequenceSpec(Section):
     size: tuple[int, int] = Field((320, 240), description="Width and height in pixels.")
     fov: float = Field(45.0, ge=5, le=100, description="True vertical field of view in degrees.")
     fill: float = Field(
-        0.7, ge=0.1, le=0.9, description="The object's largest diameter relative to the image height, frame 0."
+        0.7,
+        ge=0.1,
+        le=0.9,
+        description="The object's largest diameter relative to the image height, frame 0.",
     )
     background: str = Field(
         PROCEDURAL_BACKGROUND, min_length=1, description="procedural, or a folder of images to choose from."

@@ -1,0 +1,125 @@
+"""Rays against triangle meshes with Embree; which point of which triangle, in float64.
+
+Embree finds the triangle; where on it is worked out here, so that depth and texture coordinates are not limited
+by its single precision.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from tracking3d.errors import InputError
+
+Array = NDArray[np.float64]
+
+_CREASE = np.cos(np.radians(25.0))
+"""Corners whose smoothed normal is farther than this from their face's keep the face's."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """What N rays meet first.
+
+    Attributes:
+        face: ``(N,)`` int64; -1 where a ray meets nothing, and what follows means nothing there.
+        distance: ``(N,)`` along the ray, in lengths of its direction; infinite where it meets nothing.
+        weights: ``(N, 3)`` barycentric coordinates.
+    """
+
+    face: NDArray[np.int64]
+    distance: Array
+    weights: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A mesh that rays are cast at.
+
+    Attributes:
+        vertices: ``(V, 3)``.
+        faces: ``(F, 3)`` int64.
+        face_normals: ``(F, 3)`` unit; zero for triangles without area.
+        corner_normals: ``(F, 3, 3)`` unit normals at the corners of the faces, smooth where the surface is.
+        intersector: trimesh's, with Embree.
+    """
+
+    vertices: Array
+    faces: NDArray[np.int64]
+    face_normals: Array
+    corner_normals: Array
+    intersector: Any
+
+    @classmethod
+    def of(cls, mesh: trimesh.Trimesh) -> Surface:
+        """Prepare a mesh.
+
+        Raises:
+            InputError: If the package embreex is not installed.
+        """
+        try:
+            from trimesh.ray.ray_pyembree import RayMeshIntersector
+        except ImportError as error:
+            raise InputError(
+                "Synthetic sequences need the package embreex; get it with: pip install 'tracking3d[synth]'."
+            ) from error
+        vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+        a, b, c = vertices[faces].transpose(1, 0, 2)
+        area = np.cross(b - a, c - a)
+        normals = area / np.linalg.norm(area, axis=1, keepdims=True).clip(1e-300)
+        return cls(
+            vertices,
+            faces,
+            normals,
+            _corner_normals(vertices, faces, area, normals),
+            RayMeshIntersector(mesh),
+        )
+
+    def cast(self, origins: Array, directions: Array) -> Hits:
+        """First hits of rays from ``origins`` along ``directions``, both ``(N, 3)``; both sides of a face count."""
+        face = np.full(len(origins), -1, np.int64)
+        distance = np.full(len(origins), np.inf)
+        weights = np.zeros((len(origins), 3))
+        if len(origins):
+            face[:] = self.intersector.intersects_first(origins, directions)
+        hit = np.flatnonzero(face >= 0)
+        a, b, c = self.vertices[self.faces[face[hit]]].transpose(1, 0, 2)
+        # Moeller and Trumbore, Fast, minimum storage ray/triangle intersection, 1997.
+        d, s = directions[hit], origins[hit] - a
+        ab, ac = b - a, c - a
+        p, q = np.cross(d, ac), np.cross(s, ab)
+        inverse = 1 / np.einsum("ij,ij->i", ab, p)
+        v, w = inverse * np.einsum("ij,ij->i", s, p), inverse * np.einsum("ij,ij->i", d, q)
+        distance[hit] = inverse * np.einsum("ij,ij->i", ac, q)
+        # Single precision may give a triangle whose edge the exact ray just misses.
+        inside = np.stack([1 - v - w, v, w], 1).clip(0)
+        weights[hit] = inside / inside.sum(1, keepdims=True)
+        return Hits(face, distance, weights)
+
+    def blocked(self, origins: Array, directions: Array) -> NDArray[np.bool_]:
+        """Whether rays, both ``(N, 3)``, meet the mesh at all: ``(N,)``."""
+        if not len(origins):
+            return np.zeros(0, bool)
+        return np.asarray(self.intersector.intersects_first(origins, directions)) >= 0
+
+    def normals(self, face: NDArray[np.int64], weights: Array) -> Array:
+        """Smooth unit normals ``(N, 3)`` at points of faces."""
+        normals = np.einsum("nc,ncd->nd", weights, self.corner_normals[face])
+        return normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-300)
+
+
+def _corner_normals(vertices: Array, faces: NDArray[np.int64], area: Array, normals: Array) -> Array:
+    # Vertices doubled at texture seams are one point of the surface.
+    _, place = np.unique(vertices.round(9), axis=0, return_inverse=True)
+    corner = place.reshape(-1)[faces]
+    sums = np.zeros((place.max() + 1, 3))
+    for k in range(3):
+        np.add.at(sums, corner[:, k], area)
+    smooth = sums / np.linalg.norm(sums, axis=1, keepdims=True).clip(1e-300)
+    flat = np.repeat(normals[:, None], 3, 1)
+    near = np.einsum("fkd,fkd->fk", smooth[corner], flat) > _CREASE
+    return np.where(near[..., None], smooth[corner], flat)

@@ -1,0 +1,96 @@
+"""Everything of a sequence that is made once: the object, its path, camera, background and occluder."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.geometry.camera import Camera
+from tracking3d.synthesis.backgrounds import make_background
+from tracking3d.synthesis.camera_effects import linear
+from tracking3d.synthesis.motions import Path, make_path
+from tracking3d.synthesis.occluder import Hand, make_hand
+from tracking3d.synthesis.ray_casting import Surface
+from tracking3d.synthesis.solids import Solid, make_solid
+from tracking3d.synthesis.spec import SequenceSpec
+
+Array = NDArray[np.float64]
+
+_WIDEST = 120.0  # degrees; no tracker is told a wider field of view
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What frames are rendered from.
+
+    Attributes:
+        spec: What was asked for.
+        camera: The true camera of all frames.
+        told_camera: The one that a tracker is told; another where `Disturbances.wrong_fov` is on.
+        solid: The object.
+        surface: The object for rays.
+        path: Its poses over time.
+        background: ``(H, W, 3)`` linear light.
+        hand: What moves in front of it.
+        texture: ``(h, w, 3)`` linear light, no finer than the rays resolve; None where vertices have colours.
+    """
+
+    spec: SequenceSpec
+    camera: Camera
+    told_camera: Camera
+    solid: Solid
+    surface: Surface
+    path: Path
+    background: NDArray[np.float32]
+    hand: Hand | None
+    texture: NDArray[np.float32] | None
+
+    @property
+    def T_cam_obj(self) -> Array:
+        """``(N, 4, 4)`` poses of all frames."""
+        return self.path.T_cam_obj(np.arange(self.spec.frames, dtype=np.float64))
+
+
+def make_scene(spec: SequenceSpec) -> Scene:
+    """Prepare a sequence.
+
+    Raises:
+        InputError: If its object or background cannot be used, or Embree is not installed.
+    """
+    camera = Camera.from_fov(*spec.size, spec.fov, origin="synthetic")
+    told = min(spec.fov * (1 + spec.disturbances.wrong_fov), max(spec.fov, _WIDEST))
+    told_camera = Camera.from_fov(*spec.size, told, origin="synthetic, told")
+    solid = make_solid(spec)
+    surface = Surface.of(solid.mesh())
+    path = make_path(spec, camera, solid.radius)
+    hand = make_hand(spec, path, surface, solid.radius, camera)
+    background = linear(make_background(spec))
+    texture = _resolved_texture(solid, camera, path, spec.supersample)
+    return Scene(spec, camera, told_camera, solid, surface, path, background, hand, texture)
+
+
+def _resolved_texture(
+    solid: Solid, camera: Camera, path: Path, supersample: int
+) -> NDArray[np.float32] | None:
+    """The texture in linear light, halved until texels are about as far apart as rays where the object is nearest."""
+    if solid.texture is None or solid.uvs is None:
+        return None
+    texture = linear(solid.texture)
+    height, width = texture.shape[:2]
+    ab, ac = _edges(solid.vertices[solid.faces])
+    area = np.linalg.norm(np.cross(ab, ac), axis=1).sum()
+    uv_ab, uv_ac = _edges(solid.uvs[solid.faces] * (width, height))
+    texels = np.abs(uv_ab[:, 0] * uv_ac[:, 1] - uv_ab[:, 1] * uv_ac[:, 0]).sum()
+    rays = supersample * camera.fy / max(path.positions[:, 2].min(), solid.radius)  # per unit of length
+    finer = math.sqrt(texels / area) / rays if area > 0 else 1.0
+    factor = 2 ** max(0, round(math.log2(max(finer, 1.0)) - 0.25))
+    size = max(1, width // factor), max(1, height // factor)
+    return texture if factor == 1 else cv2.resize(texture, size, interpolation=cv2.INTER_AREA)
+
+
+def _edges(triangles: Array) -> tuple[Array, Array]:
+    return triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]

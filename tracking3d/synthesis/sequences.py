@@ -1,0 +1,59 @@
+"""A whole synthetic sequence in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.synthesis.frame_rendering import RenderedFrame, render_frame
+from tracking3d.synthesis.point_tracks import PointTracks, track_points
+from tracking3d.synthesis.scene import Scene, make_scene
+from tracking3d.synthesis.spec import SequenceSpec
+
+
+@dataclass(frozen=True, eq=False)
+class RenderedSequence:
+    """Images and their truth.
+
+    Attributes:
+        scene: What they show; its `Scene.T_cam_obj` are the poses.
+        images: ``(N, H, W, 3)`` uint8 RGB, before JPEG compression.
+        masks: ``(N, H, W)`` bool, the object as if nothing were in front of it.
+        visible_masks: ``(N, H, W)`` bool.
+        depth: ``(N, H, W)`` float32, z of the object in `masks`; 0 elsewhere.
+        points: Surface points and where they are seen.
+    """
+
+    scene: Scene
+    images: NDArray[np.uint8]
+    masks: NDArray[np.bool_]
+    visible_masks: NDArray[np.bool_]
+    depth: NDArray[np.float32]
+    points: PointTracks
+
+
+def render_frames(scene: Scene) -> Iterator[RenderedFrame]:
+    """Render the frames of a scene in order, one in memory at a time."""
+    for frame in range(scene.spec.frames):
+        yield render_frame(scene, frame)
+
+
+def render_sequence(spec: SequenceSpec) -> RenderedSequence:
+    """Render a sequence in memory.
+
+    Raises:
+        InputError: If its object or background cannot be used, or Embree is not installed.
+    """
+    scene = make_scene(spec)
+    frames = list(render_frames(scene))
+    return RenderedSequence(
+        scene,
+        np.stack([frame.image for frame in frames]),
+        np.stack([frame.mask for frame in frames]),
+        np.stack([frame.visible_mask for frame in frames]),
+        np.stack([frame.depth for frame in frames]),
+        track_points(scene),
+    )

@@ -1,0 +1,104 @@
+"""The fixed suites of synthetic sequences: the same everywhere, for one version of them."""
+
+from __future__ import annotations
+
+import json
+import signal
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from importlib import resources
+from multiprocessing import get_context
+from pathlib import Path
+
+import cv2
+
+from tracking3d.config.explain import hint
+from tracking3d.config.yaml_files import read_mapping
+from tracking3d.errors import InputError, OutputError
+from tracking3d.results.files import write_atomic, writing
+from tracking3d.synthesis.spec import SequenceSpec, check_spec
+from tracking3d.synthesis.writing import SUITE_VERSION, is_complete, write_sequence
+
+__all__ = ["SUITES", "SUITE_VERSION", "load_suite", "make_suite"]
+
+SUITES = ("smoke", "standard", "full")
+"""The suites by name, in order of size."""
+
+
+def load_suite(name: str) -> list[SequenceSpec]:
+    """The sequences of a suite.
+
+    Raises:
+        InputError: If there is no such suite.
+    """
+    if name not in SUITES:
+        raise InputError(f"There is no suite '{name}' (available: {', '.join(SUITES)}); {hint(name, SUITES)}")
+    with resources.as_file(resources.files("tracking3d.synthesis") / "suites" / f"{name}.yaml") as file:
+        document = read_mapping(file)
+    common = document.get("common", {})
+    return [check_spec({**common, **one}, f"suite {name}") for one in document["sequences"]]
+
+
+def make_suite(
+    name: str,
+    folder: Path,
+    *,
+    jobs: int = 1,
+    overwrite: bool = False,
+    listener: Callable[[str], None] = lambda name: None,
+) -> list[Path]:
+    """Make the sequences of a suite that are not there yet, one folder for each, and ``suite.json``.
+
+    Args:
+        name: ``smoke``, ``standard`` or ``full``.
+        folder: Where to write; made if absent.
+        jobs: Processes.
+        overwrite: Make complete sequences too.
+        listener: Is told the name of every sequence as it is made.
+
+    Returns:
+        The folders of all sequences, in the order of the suite.
+
+    Raises:
+        InputError: If there is no such suite, or Embree is not installed.
+        OutputError: If it cannot be written.
+    """
+    specs = load_suite(name)
+    missing = [spec for spec in specs if overwrite or not is_complete(folder / spec.name, spec)]
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    if jobs == 1 or len(missing) < 2:
+        for spec in missing:
+            write_sequence(folder / spec.name, spec)
+            listener(spec.name)
+    else:
+        _in_parallel(missing, folder, jobs, listener)
+    names = [spec.name for spec in specs]
+    document = {"name": name, "version": SUITE_VERSION, "sequences": names}
+    write_atomic(folder / "suite.json", json.dumps(document, indent=1).encode() + b"\n")
+    return [folder / name for name in names]
+
+
+def _in_parallel(specs: list[SequenceSpec], folder: Path, jobs: int, listener: Callable[[str], None]) -> None:
+    # Spawned, for a forked process inherits locks that threads of the parent hold.
+    with ProcessPoolExecutor(min(jobs, len(specs)), get_context("spawn"), _start) as pool:
+        waiting = {pool.submit(write_sequence, folder / spec.name, spec): spec.name for spec in specs}
+        try:
+            for done in as_completed(waiting):
+                done.result()
+                listener(waiting[done])
+        except BrokenProcessPool as error:
+            raise OutputError(
+                f"A process that makes sequences in {folder} was ended from outside, as when memory runs out; "
+                "call again with fewer --jobs, what is finished is kept."
+            ) from error
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _start() -> None:
+    """One thread a process; Ctrl-C ends it without a traceback."""
+    cv2.setNumThreads(1)
+    signal.signal(signal.SIGINT, signal.SIG_DFL)

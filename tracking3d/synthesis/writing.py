@@ -1,0 +1,173 @@
+"""A synthetic sequence on disk, in the layout of `tracking3d.datasets.clip`.
+
+``info.json`` is written last: a folder that has it is complete.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import trimesh
+from PIL import Image as PillowImage
+from trimesh.exchange.obj import export_obj
+
+from tracking3d.datasets.clip import POSE_CONVENTION
+from tracking3d.geometry.camera import Camera
+from tracking3d.results.files import write_atomic, write_image, write_mask, writing
+from tracking3d.synthesis.camera_effects import compressed
+from tracking3d.synthesis.frame_rendering import RenderedFrame, render_frame
+from tracking3d.synthesis.point_tracks import track_points
+from tracking3d.synthesis.scene import Scene, make_scene
+from tracking3d.synthesis.solids import Solid
+from tracking3d.synthesis.spec import SequenceSpec
+
+SUITE_VERSION = 1
+"""Grows with every change to the generator or the suites that changes an image or a truth."""
+
+_INFO = "info.json"
+_PARTS = ("frames", "masks", "visible_masks", "depth")
+_COUNTS = 65_000  # of depth, at the farthest
+
+
+def is_complete(folder: Path, spec: SequenceSpec) -> bool:
+    """Whether ``folder`` holds exactly this sequence, made by this version."""
+    try:
+        info = json.loads((folder / _INFO).read_text(encoding="utf-8"))
+        return bool(info["spec"] == spec.model_dump(mode="json") and info["suite_version"] == SUITE_VERSION)
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
+def write_sequence(
+    folder: Path, spec: SequenceSpec, listener: Callable[[int], None] = lambda frame: None
+) -> Path:
+    """Render a sequence and write it, one frame in memory at a time.
+
+    Args:
+        folder: Made if absent; what an earlier sequence left in it is removed.
+        spec: The sequence.
+        listener: Is told of every frame that is written.
+
+    Returns:
+        The folder.
+
+    Raises:
+        InputError: If the object or background cannot be used, or Embree is not installed.
+        OutputError: If it cannot be written.
+    """
+    scene = make_scene(spec)
+    _clear(folder)
+    scale = _depth_scale(scene)
+    first_box: list[int] = []
+    for n in range(spec.frames):
+        frame = render_frame(scene, n)
+        if n == 0:
+            first_box = list(cv2.boundingRect(frame.visible_mask.astype(np.uint8)))
+        _write_frame(folder, f"{n:06d}", frame, spec, scale)
+        listener(n)
+    _write_mesh(folder, scene.solid)
+    tracks = track_points(scene)
+    arrays = io.BytesIO()
+    np.savez_compressed(
+        arrays,
+        positions=tracks.positions.astype(np.float32),
+        visible=tracks.visible,
+        object_points=tracks.object_points,
+    )
+    write_atomic(folder / "points.npz", arrays.getvalue())
+    for name, document in _documents(scene, first_box, scale).items():
+        write_atomic(folder / name, json.dumps(document, indent=1).encode() + b"\n")
+    return folder
+
+
+def _clear(folder: Path) -> None:
+    """Make the folder, without the marks and frames of an earlier sequence."""
+    with writing(folder):
+        for part in _PARTS:
+            (folder / part).mkdir(parents=True, exist_ok=True)
+        for file in (folder / _INFO, folder / "truth_camera.json"):
+            file.unlink(missing_ok=True)
+        for part in _PARTS:
+            for file in (folder / part).glob("[0-9]" * 6 + ".*"):
+                file.unlink()
+        if not any((folder / "visible_masks").iterdir()):
+            (folder / "visible_masks").rmdir()
+
+
+def _write_frame(folder: Path, name: str, frame: RenderedFrame, spec: SequenceSpec, scale: float) -> None:
+    if spec.disturbances.jpeg > 0:
+        write_atomic(folder / "frames" / f"{name}.jpg", compressed(frame.image, spec.disturbances.jpeg))
+    else:
+        write_image(folder / "frames" / f"{name}.png", frame.image)
+    write_mask(folder / "masks" / f"{name}.png", frame.mask)
+    if spec.disturbances.occluder > 0:
+        with writing(folder):
+            (folder / "visible_masks").mkdir(exist_ok=True)
+        write_mask(folder / "visible_masks" / f"{name}.png", frame.visible_mask)
+    counts = (frame.depth / scale).round().astype(np.uint16)
+    write_atomic(folder / "depth" / f"{name}.png", cv2.imencode(".png", counts)[1].tobytes())
+
+
+def _depth_scale(scene: Scene) -> float:
+    """Length of a count of depth, such that the farthest depth of the sequence fits."""
+    return float((scene.T_cam_obj[:, 2, 3].max() + scene.solid.radius) / _COUNTS)
+
+
+def _documents(scene: Scene, box: list[int], scale: float) -> dict[str, dict[str, Any]]:
+    spec, solid = scene.spec, scene.solid
+    poses = {
+        f"{n:06d}": {"R": T[:3, :3].tolist(), "t": T[:3, 3].tolist(), "trusted": True}
+        for n, T in enumerate(scene.T_cam_obj)
+    }
+    units = "metres" if solid.millimetres == 1000 else "object radii, about"
+    documents: dict[str, dict[str, Any]] = {
+        "poses.json": {"convention": POSE_CONVENTION, "units": units, "frames": poses},
+        "camera.json": {**_intrinsics(scene.told_camera), "depth_scale": scale},
+        "init.json": {"frame": 0, "bbox_xywh": box, "mask": "masks/000000.png"},
+    }
+    if scene.told_camera != scene.camera:
+        documents["camera.json"]["note"] = "wrong on purpose; the true camera is in truth_camera.json"
+        documents["truth_camera.json"] = {**_intrinsics(scene.camera), "depth_scale": scale}
+    info: dict[str, Any] = {
+        "source": "tracking3d synth",
+        "frames": spec.frames,
+        "note": _note(spec),
+        "millimetres": solid.millimetres,
+        "object_frame": solid.frame,
+        "symmetries": solid.symmetries.tolist(),
+    }
+    if solid.axis is not None:
+        info["symmetry_axis"] = {"direction": solid.axis.tolist(), "point": [0.0, 0.0, 0.0]}
+    documents[_INFO] = {**info, "spec": spec.model_dump(mode="json"), "suite_version": SUITE_VERSION}
+    return documents
+
+
+def _intrinsics(camera: Camera) -> dict[str, Any]:
+    return {"K": camera.K.tolist(), "width": camera.width, "height": camera.height}
+
+
+def _note(spec: SequenceSpec) -> str:
+    look = "" if spec.textured else "textureless "
+    on = [f"{name} {value:g}" for name, value in spec.disturbances if value > 0]
+    return f"{look}{spec.object}, {spec.motion}; {', '.join(on) or 'undisturbed'}; the truth is exact"
+
+
+def _write_mesh(folder: Path, solid: Solid) -> None:
+    mesh = solid.mesh()
+    if solid.texture is not None and solid.uvs is not None:
+        material = trimesh.visual.material.SimpleMaterial(
+            PillowImage.fromarray(solid.texture), diffuse=(255, 255, 255), name="texture"
+        )
+        mesh.visual = trimesh.visual.TextureVisuals(solid.uvs, material=material)
+    else:
+        mesh.visual.vertex_colors = solid.colours
+    text, files = export_obj(mesh, return_texture=True, digits=9, mtl_name="mesh.mtl", header=solid.frame)
+    write_atomic(folder / "mesh.obj", text.encode())
+    for name, data in files.items():
+        write_atomic(folder / name, data)
