@@ -29,7 +29,7 @@ def test_a_file_gives_back_what_was_written(tmp_path):
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"format": "other"}', '{"format": "tracking3d-results"}'])
 def test_another_file_is_refused_by_name(tmp_path, text):
     (tmp_path / "other.json").write_text(text)
-    with pytest.raises(InputError, match="other.json is not a result set"):
+    with pytest.raises(InputError, match=r"other\.json is not a result set"):
         read_results(tmp_path / "other.json")
 
 

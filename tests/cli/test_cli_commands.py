@@ -20,7 +20,9 @@ from tracking3d.config.loading import load_config
 from tracking3d.synthesis import convex_clips
 
 BOX = ("--box", "20,10,20,20")
-COMMANDS = ["run", "demo", "evaluate", "points", "plugins", "config show", "config schema", "config validate"]
+COMMANDS = ["run", "demo", "points", "plugins", "config show", "config schema", "config validate"]
+COMMANDS += [f"evaluate {command}" for command in ("answers", "suite", "table", "compare", "peer")]
+GROUPS = ["config", "bench", "bench render", "evaluate"]
 
 
 @pytest.fixture
@@ -30,7 +32,7 @@ def finished(call, clip, script) -> Path:
     return Path("run")
 
 
-@pytest.mark.parametrize("command", ["", *COMMANDS, "config", "bench", "bench render"])
+@pytest.mark.parametrize("command", ["", *COMMANDS, *GROUPS])
 def test_every_command_has_help(call, command):
     result = call(*command.split(), "--help")
     assert result.exit_code == 0

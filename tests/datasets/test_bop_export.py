@@ -12,6 +12,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from tracking3d.datasets.bop_export import write_bop
+from tracking3d.datasets.layout import load_layout
+from tracking3d.datasets.reading import list_sequences, read_sequence
 from tracking3d.datasets.truth import DepthFile, MaskFile, MeshFile, Truth
 from tracking3d.errors import InputError, OutputError
 from tracking3d.geometry.camera import Camera
@@ -86,20 +88,20 @@ def test_poses_come_back_in_millimetres(truth, tmp_path):
         assert entry["cam_t_m2c"] == pytest.approx([10 * n, -20, 500])
 
 
-def test_a_reader_of_bop_gets_the_same_truth(truth, tmp_path):
-    reading = pytest.importorskip("tracking3d.datasets.bop", reason="there is no reader of BOP data yet")
+def test_the_reader_of_bop_gets_the_same_truth(truth, tmp_path):
     folder = written(tmp_path, truth)
-    back = reading.read_bop(folder / "test" / "000001")
+    assert list_sequences(load_layout("bop"), folder) == ["test/000001"]
+    back = read_sequence(load_layout("bop"), folder, "test/000001")
     np.testing.assert_allclose(back.camera.K, truth.camera.K)
-    assert back.millimetres is not None
+    assert back.millimetres == 1
     for n in range(3):
         expected = pose(n)
-        expected[:3, 3] *= 1000 / back.millimetres
+        expected[:3, 3] *= 1000
         assert back.T_cam_obj[n] == pytest.approx(expected)
         assert (back.masks[n].read() == truth.masks[n].read()).all()
         assert (back.visible_masks[n].read() == truth.visible_masks[n].read()).all()
-        assert back.depth[n].read() * back.millimetres == pytest.approx(truth.depth[n].read() * 1000)
-    assert back.mesh.read().extents * back.millimetres == pytest.approx([30, 40, 120])
+        assert back.depth[n].read() == pytest.approx(truth.depth[n].read() * 1000)
+    assert back.mesh.read().extents == pytest.approx([30, 40, 120])
 
 
 def test_the_camera_of_every_frame_is_told(truth, tmp_path):

@@ -223,6 +223,13 @@ def test_files_belong_to_frames_by_number_by_name_or_by_order(read, data):
     assert list(read(masks=masks, match="name").masks) == [3]
 
 
+def test_files_in_order_are_in_natural_order(read, data):
+    for name, width in (("10", 3), ("9", 2)):
+        write_grey(data / f"cup/masks/{name}.png", rectangle(2, 2, width, 1))
+    truth = read(masks={"files": "{sequence}/masks/*"}, match="order")
+    assert [int(truth.masks[n].read().sum()) for n in range(2)] == [2, 3]
+
+
 def test_two_files_of_one_frame_are_named(read, data):
     for name in ("1", "01"):
         write_grey(data / f"cup/masks/{name}.png", rectangle(2, 2, 3, 3))
@@ -436,6 +443,13 @@ def test_wrong_descriptions_get_one_sentence(tmp_path, text, reason):
     with pytest.raises(InputError, match=reason) as caught:
         load_layout(file)
     assert str(file) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_objects_need_what_lists_them(read):
+    with pytest.raises(InputError, match="mine takes objects from masks but names none"):
+        read(objects="masks")
+    with pytest.raises(InputError, match="mine takes objects from poses; that needs poses of form bop"):
+        read(objects="poses", poses={"file": "poses.json"})
 
 
 def test_an_unknown_data_set_gets_the_nearest_name():

@@ -314,14 +314,14 @@ def test_a_run_of_something_else_has_no_frame_in_common(write_run, clip):
 
 
 def test_masks_of_another_size_are_named_with_their_frame(write_run, clip):
-    with pytest.raises(InputError, match="Frame 2: the mask of .*run is 8 x 6 pixels"):
+    with pytest.raises(InputError, match=r"Frame 2: the mask of .*run is 8 x 6 pixels"):
         score_run(write_run(masks={2: np.ones((6, 8), bool)}), clip)
 
 
 def test_a_mask_that_is_missing_from_the_run_is_named(write_run, clip):
     run = write_run()
     (run / "masks" / "000003.png").unlink()
-    with pytest.raises(InputError, match="000003.png is not a readable image"):
+    with pytest.raises(InputError, match=r"000003\.png is not a readable image"):
         score_run(run, clip)
 
 

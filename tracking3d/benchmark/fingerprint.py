@@ -8,12 +8,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import tracking3d
 from tracking3d.benchmark.variant import DEGRADED
 from tracking3d.datasets.truth import Truth
 from tracking3d.results.description import versions
 
-PACKAGE = Path(tracking3d.__file__).parent
+PACKAGE = Path(__file__).parents[1]
 JUDGES = frozenset({"benchmark", "cli", "datasets", "evaluation", "speed", "synthesis", "vot"})
 """Rooms that measure what a run is worth; a change in them changes scores, not runs."""
 

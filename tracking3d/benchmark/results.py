@@ -118,7 +118,9 @@ def read_results(file: Path) -> ResultSet:
         if document.pop("format") != FORMAT:
             raise ValueError("another format")
         document.pop("mean")
-        label, name, scores, errors = (document.pop(one) for one in ("label", "dataset", "sequences", "errors"))
+        label, name, scores, errors = (
+            document.pop(one) for one in ("label", "dataset", "sequences", "errors")
+        )
     except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
         raise InputError(
             f"{file} is not a result set ({error}); give a JSON file that `tracking3d evaluate suite` wrote."

@@ -97,7 +97,9 @@ def object_names(layout: DatasetLayout, place: Place) -> list[str]:
 
 def _labels(layout: DatasetLayout, place: Place) -> list[str]:
     """Labels of the first mask."""
-    first = place.file(layout.masks.files if layout.masks else ())
+    if layout.masks is None:
+        raise InputError(f"The description {layout.name} takes objects from masks but names none; add masks.")
+    first = place.file(layout.masks.files)
     if first is None:
         return []
     labels = np.unique(read_labels(first)).tolist()
@@ -107,7 +109,11 @@ def _labels(layout: DatasetLayout, place: Place) -> list[str]:
 
 def _posed(layout: DatasetLayout, place: Place) -> list[str]:
     """Objects of scene_gt.json that no image shows twice."""
-    scene = read_scene_gt(place.required(layout.poses.file if layout.poses else (), "objects"))
+    if layout.poses is None or layout.poses.form != "bop":
+        raise InputError(
+            f"The description {layout.name} takes objects from poses; that needs poses of form bop."
+        )
+    scene = read_scene_gt(place.required(layout.poses.file, "objects"))
     shown = [[annotation.object_id for annotation in image] for image in scene.values()]
     twice = {each for image in shown for each in image if image.count(each) > 1}
     return [str(each) for each in sorted(set().union(*shown) - twice)]

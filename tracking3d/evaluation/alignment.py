@@ -86,8 +86,10 @@ def align_object_frame(
         seed: Of the choice of frames.
 
     Raises:
-        ValueError: If there is no frame, the shapes differ, or a value is not finite.
+        ValueError: If there is no frame, the shapes differ, a value is not finite, or the diameter is not positive.
     """
+    if diameter is not None and not 0 < diameter < np.inf:
+        raise ValueError(f"the diameter needs to be positive, got {diameter}")
     R_est, t_est = _split("T_est", T_est)
     R_true, t_true = _split("T_true", T_true)
     if len(R_est) != len(R_true) or not len(R_est):

@@ -36,7 +36,6 @@ class AverageRecall:
 
     Attributes:
         vsd, mssd, mspd: Of each error; None where it could not be computed.
-        mean: AR of the three; None unless all are known.
     """
 
     vsd: float | None
@@ -45,7 +44,7 @@ class AverageRecall:
 
     @property
     def mean(self) -> float | None:
-        """AR, the figure of BOP's tables."""
+        """AR, the figure of BOP's tables: the mean of the three; None unless all are known."""
         if self.vsd is None or self.mssd is None or self.mspd is None:
             return None
         return (self.vsd + self.mssd + self.mspd) / 3

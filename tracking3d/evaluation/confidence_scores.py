@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from tracking3d.datasets.answers import Answers
 from tracking3d.evaluation.calibration import detection_scores, expected_calibration_error
+from tracking3d.evaluation.mask_scores import FrameMasks
+from tracking3d.evaluation.vot import LongTermScores, LongTermSequence, long_term_scores
 
 RIGHT_ROTATION, RIGHT_IOU = 10.0, 0.7
 """A frame is right below this rotation error in degrees and above this IoU, where they are known."""
@@ -28,27 +31,34 @@ class ConfidenceScores:
         lost_precision: Share of the frames called lost that truly are; None if none was called so.
         lost_recall: Share of the truly lost frames that were called so; None if there is none.
         frames_truly_lost: Number of truly lost frames.
+        vot_precision, vot_recall, vot_f_score: VOT's long-term measures of this clip alone, at the confidence with
+            the largest F; the given frame counts as VOT counts it, with overlap and confidence 0.
     """
 
     confidence_calibration_error: float | None = None
     lost_precision: float | None = None
     lost_recall: float | None = None
     frames_truly_lost: int = 0
+    vot_precision: float | None = None
+    vot_recall: float | None = None
+    vot_f_score: float | None = None
 
 
-def score_confidence(answers: Answers, rotation: dict[int, float], iou: dict[int, float]) -> ConfidenceScores:
+def score_confidence(
+    answers: Answers, rotation: Mapping[int, float], masks: Mapping[int, FrameMasks]
+) -> ConfidenceScores:
     """Judge the self-assessment.
 
     Args:
         answers: The method's.
         rotation: Rotation error in degrees by frame.
-        iou: IoU of the answer by frame.
+        masks: The masks beside the true ones, by frame.
     """
-    frames = sorted((rotation.keys() | iou.keys()) - {answers.given})
+    frames = sorted((rotation.keys() | masks.keys()) - {answers.given})
     if not frames:
         return ConfidenceScores()
     errors = np.array([rotation.get(n, 0.0) for n in frames])
-    ious = np.array([iou.get(n, 1.0) for n in frames])
+    ious = np.array([masks[n].iou if n in masks else 1.0 for n in frames])
     right = (errors < RIGHT_ROTATION) & (ious > RIGHT_IOU)
     lost = (errors > LOST_ROTATION) | (ious < LOST_IOU)
     # Saying nothing of a frame is a way to say that it is lost.
@@ -56,9 +66,28 @@ def score_confidence(answers: Answers, rotation: dict[int, float], iou: dict[int
     detection = detection_scores(called, lost)
     said = np.array([n in answers.confidence for n in frames])
     confidence = np.array([answers.confidence[n] for n in frames if n in answers.confidence])
+    long_term = _long_term(answers, masks)
     return ConfidenceScores(
         confidence_calibration_error=expected_calibration_error(confidence, right[said]),
         lost_precision=detection.precision,
         lost_recall=detection.recall,
         frames_truly_lost=int(lost.sum()),
+        vot_precision=long_term.precision if long_term else None,
+        vot_recall=long_term.recall if long_term else None,
+        vot_f_score=long_term.f_score if long_term else None,
+    )
+
+
+def _long_term(answers: Answers, masks: Mapping[int, FrameMasks]) -> LongTermScores | None:
+    if not masks or not answers.confidence:
+        return None
+    given = answers.given
+    return long_term_scores(
+        [
+            LongTermSequence(
+                overlaps=[0.0 if n == given else one.iou for n, one in masks.items()],
+                confidence=[0.0 if n == given else answers.confidence.get(n, 0.0) for n in masks],
+                visible=[one.visible for one in masks.values()],
+            )
+        ]
     )

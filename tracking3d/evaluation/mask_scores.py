@@ -13,6 +13,7 @@ from tracking3d.datasets.truth import MaskReference, Truth
 from tracking3d.errors import InputError
 from tracking3d.evaluation.boundary import boundary_f
 from tracking3d.evaluation.metrics import mask_iou
+from tracking3d.evaluation.vot import rectangle_overlap
 from tracking3d.frames import Box
 from tracking3d.trackers.crops import box_of
 
@@ -58,12 +59,14 @@ class FrameMasks:
         iou_initial: Of the mask tracker's mask.
         boundary_f: Of the answer.
         boundary_f_initial: Of the mask tracker's mask.
+        visible: Whether the truth shows the object at all.
     """
 
     iou: float
     iou_initial: float
     boundary_f: float
     boundary_f_initial: float
+    visible: bool
 
 
 def compare_masks(answers: Answers, truth: Truth) -> dict[int, FrameMasks]:
@@ -82,7 +85,7 @@ def score_masks(compared: Mapping[int, FrameMasks], answers: Answers, truth: Tru
     scored = {n: masks for n, masks in compared.items() if n != answers.given}
     if not scored:
         return MaskScores()
-    values = np.array([astuple(masks) for masks in scored.values()])
+    values = np.array([astuple(masks)[:4] for masks in scored.values()])
     answer, initial, f_answer, f_initial = (_mean(column) for column in values.T)
     started = answers.initial_masks is not None
     before_last = np.array(list(scored)) != len(truth.frames) - 1
@@ -99,22 +102,12 @@ def score_masks(compared: Mapping[int, FrameMasks], answers: Answers, truth: Tru
     )
 
 
-def box_iou(a: Box | None, b: Box | None) -> float:
-    """IoU of two boxes ``(x, y, width, height)``; 1 if there are none, 0 if there is only one."""
-    if a is None or b is None:
-        return float(a is b)
-    width = min(a[0] + a[2], b[0] + b[2]) - max(a[0], b[0])
-    height = min(a[1] + a[3], b[1] + b[3]) - max(a[1], b[1])
-    common = max(width, 0.0) * max(height, 0.0)
-    return common / (a[2] * a[3] + b[2] * b[3] - common)
-
-
 def _compare(answers: Answers, truth: Truth, index: int) -> FrameMasks:
     masks = [_read(references, index) for references in (answers.masks, answers.initial_masks)]
     if index not in truth.masks:
         true_box = truth.boxes[index]
-        ious = [0.0 if mask is None else box_iou(box_of(mask), true_box) for mask in masks]
-        return FrameMasks(ious[0], ious[1], np.nan, np.nan)
+        ious = [0.0 if mask is None else _box_iou(mask, true_box) for mask in masks]
+        return FrameMasks(ious[0], ious[1], np.nan, np.nan, bool(true_box[2] * true_box[3] > 0))
     true = truth.masks[index].read()
     for mask in masks:
         if mask is not None and mask.shape != true.shape:
@@ -123,8 +116,18 @@ def _compare(answers: Answers, truth: Truth, index: int) -> FrameMasks:
                 f"true one of {truth.name} {true.shape[1]} x {true.shape[0]}; give the clip it was made on."
             )
     ious = [0.0 if mask is None else mask_iou(mask, true) for mask in masks]
+    if (
+        truth.boxes
+    ):  # the mask is there because it is empty: what is known of the boundary is of absent objects only
+        return FrameMasks(ious[0], ious[1], np.nan, np.nan, bool(true.any()))
     boundaries = [0.0 if mask is None else boundary_f(mask, true) for mask in masks]
-    return FrameMasks(ious[0], ious[1], boundaries[0], boundaries[1])
+    return FrameMasks(ious[0], ious[1], boundaries[0], boundaries[1], bool(true.any()))
+
+
+def _box_iou(mask: Mask, true_box: Box) -> float:
+    """IoU of the box around a mask and the true one, in whole pixels as VOT takes it."""
+    box = box_of(mask) or (0.0, 0.0, 0.0, 0.0)
+    return rectangle_overlap(box, true_box, (mask.shape[1], mask.shape[0]))
 
 
 def _read(references: Mapping[int, MaskReference] | None, index: int) -> Mask | None:

@@ -66,7 +66,7 @@ def score(answers: Answers, truth: Truth) -> Scores:
         **asdict(score_poses(answers, truth, pairs, alignment)),
         **asdict(score_points(answers, truth)),
         **asdict(score_model(answers, truth, pairs, alignment, mesh, diameter)),
-        **asdict(score_confidence(answers, rotation, {n: one.iou for n, one in masks.items()})),
+        **asdict(score_confidence(answers, rotation, masks)),
         frames=len(answers.asked),
         frames_missing=len(set(answers.asked) - answers.answered),
         frames_lost=len(answers.lost),

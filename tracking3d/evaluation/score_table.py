@@ -35,6 +35,7 @@ ROWS: tuple[tuple[str, str, str], ...] = (
     ("confidence_calibration_error", "calibration error of the confidence", ""),
     ("lost_precision", "frames called lost that are", ""),
     ("lost_recall", "lost frames that are called so", ""),
+    ("vot_f_score", "VOT long-term F-score", ""),
     ("seconds_per_frame", "seconds a frame, mean", " s"),
     ("peak_memory_mb", "most memory held", " MB"),
 )

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tracking3d.synthesis.spec import Disturbances
 
@@ -16,9 +16,9 @@ GAMMA = 2.2
 _MIDDLE = 0.45  # encoded grey that low contrast shrinks towards
 
 
-def linear(encoded: NDArray[np.floating]) -> NDArray[np.float32]:
+def linear(encoded: ArrayLike) -> NDArray[np.float32]:
     """Linear light of encoded values in [0, 255]."""
-    return (np.asarray(encoded, np.float32) / 255) ** np.float32(GAMMA)
+    return np.power(np.asarray(encoded, np.float32) / 255, GAMMA, dtype=np.float32)
 
 
 def exposed(

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.synthesis.camera_effects import exposed
+from tracking3d.synthesis.camera_effects import exposed, linear
 from tracking3d.synthesis.lighting import Lamp, lamp_at, shaded
 from tracking3d.synthesis.pixel_rays import pixels_around, ray_directions
 from tracking3d.synthesis.ray_casting import Hits, Surface
@@ -144,8 +144,7 @@ def _albedo(scene: Scene, hits: Hits) -> Array:
     corners = scene.surface.faces[hits.face]
     if scene.texture is None or scene.solid.uvs is None:
         colours = np.asarray(scene.solid.colours, np.float64)[corners]
-        albedo: Array = (np.einsum("nc,ncd->nd", hits.weights, colours) / 255) ** 2.2
-        return albedo
+        return linear(np.einsum("nc,ncd->nd", hits.weights, colours)).astype(np.float64)
     uv = np.einsum("nc,ncd->nd", hits.weights, scene.solid.uvs[corners])
     return bilinear(scene.texture, uv)
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tracking3d.errors import InputError
 from tracking3d.synthesis.procedural_texture import plain_colour
-from tracking3d.synthesis.solids import Solid
+from tracking3d.synthesis.solid import Solid
 from tracking3d.synthesis.spec import SequenceSpec
 
 _ADVICE = "give a mesh file such as OBJ, PLY, STL or GLB"
@@ -66,7 +66,11 @@ def _texture(mesh: trimesh.Trimesh) -> tuple[NDArray[np.uint8] | None, NDArray[n
 
 def _colours(mesh: trimesh.Trimesh, spec: SequenceSpec) -> NDArray[np.uint8]:
     """``(V, 3)``: the file's own where it has some, else one plain colour."""
-    if spec.textured and getattr(mesh.visual, "kind", None) in ("vertex", "face"):
+    if (
+        spec.textured
+        and isinstance(mesh.visual, trimesh.visual.ColorVisuals)
+        and mesh.visual.kind in ("vertex", "face")
+    ):
         return np.asarray(mesh.visual.vertex_colors)[:, :3].astype(np.uint8)
     colour = np.array(plain_colour(spec.random("texture").random()), np.uint8)
     return np.tile(colour, (len(mesh.vertices), 1))

@@ -151,7 +151,7 @@ def _integrated(steps: Array) -> Rotation:
 def _sway(times: Array, rng: np.random.Generator, depth: float) -> Array:
     """A small smooth movement ``(M, 3)``."""
     periods, phases = rng.uniform(40, 90, 3), rng.uniform(0, 2 * math.pi, 3)
-    return (0.15, 0.1, 0.04 * depth) * np.sin(2 * math.pi * times[:, None] / periods + phases)
+    return np.array([0.15, 0.1, 0.04 * depth]) * np.sin(2 * math.pi * times[:, None] / periods + phases)
 
 
 def _way_out(camera: Camera, depth: float) -> float:

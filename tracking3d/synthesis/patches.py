@@ -125,7 +125,7 @@ def assemble(
         row, column = divmod(k, across)
         texture[row * side : (row + 1) * side, column * side : (column + 1) * side] = panel
         inside = (0.5 + patch.uvs * (side - 1)) / side
-        uvs.append((inside + (column, down - 1 - row)) / (across, down))
+        uvs.append((inside + np.array([column, down - 1 - row])) / (across, down))
         vertices.append(patch.vertices)
         faces.append(patch.faces + count)
         count += len(patch.vertices)

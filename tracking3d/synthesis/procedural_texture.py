@@ -36,7 +36,7 @@ def paint_panel(rng: np.random.Generator, size: int = 256) -> FloatImage:
 def paint_plain(rng: np.random.Generator, size: int, hue: float) -> FloatImage:
     """A panel ``(size, size, 3)`` of one colour, with spots so faint that nothing can be matched by them."""
     spots = 1.5 * _smooth_noise(rng, (size, size), size / 16)
-    return np.clip(np.float32(plain_colour(hue)) + spots[..., None], 0, 255)
+    return np.clip(np.array(plain_colour(hue), np.float32) + spots[..., None], 0, 255)
 
 
 def plain_colour(hue: float) -> tuple[int, int, int]:

@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from tracking3d.errors import InputError
 
 Array = NDArray[np.float64]
 
-_CREASE = np.cos(np.radians(25.0))
-"""Corners whose smoothed normal is farther than this from their face's keep the face's."""
+_CREASE = np.cos(np.radians(45.0))
+"""Neighbouring faces at a greater angle meet in a sharp edge; others are one smooth surface."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,13 +114,17 @@ class Surface:
 
 
 def _corner_normals(vertices: Array, faces: NDArray[np.int64], area: Array, normals: Array) -> Array:
+    """``(F, 3, 3)``: at each corner the average by area of the faces around it that are not beyond a crease."""
     # Vertices doubled at texture seams are one point of the surface.
     _, place = np.unique(vertices.round(9), axis=0, return_inverse=True)
-    corner = place.reshape(-1)[faces]
-    sums = np.zeros((place.max() + 1, 3))
-    for k in range(3):
-        np.add.at(sums, corner[:, k], area)
-    smooth = sums / np.linalg.norm(sums, axis=1, keepdims=True).clip(1e-300)
-    flat = np.repeat(normals[:, None], 3, 1)
-    near = np.einsum("fkd,fkd->fk", smooth[corner], flat) > _CREASE
-    return np.where(near[..., None], smooth[corner], flat)
+    corner = place.reshape(-1)[faces].ravel()
+    ones = np.ones(len(corner))
+    around = csr_array((ones, (corner, np.repeat(np.arange(len(faces)), 3))))
+    here = csr_array((ones, (np.arange(len(corner)), corner)))
+    pairs = (here @ around).tocoo()  # a corner and each face around it
+    smooth = np.einsum("pd,pd->p", normals[pairs.row // 3], normals[pairs.col]) > _CREASE
+    sums = (
+        csr_array((ones[:1].repeat(smooth.sum()), (pairs.row[smooth], pairs.col[smooth])), pairs.shape) @ area
+    )
+    sums /= np.linalg.norm(sums, axis=1, keepdims=True).clip(1e-300)
+    return sums.reshape(-1, 3, 3)

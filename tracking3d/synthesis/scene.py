@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path as FilePath
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tracking3d.config.explain import hint
+from tracking3d.errors import InputError
 from tracking3d.geometry.camera import Camera
 from tracking3d.synthesis.backgrounds import make_background
 from tracking3d.synthesis.camera_effects import linear
+from tracking3d.synthesis.mesh_files import load_solid
 from tracking3d.synthesis.motions import Path, make_path
 from tracking3d.synthesis.occluder import Hand, make_hand
+from tracking3d.synthesis.procedural_solids import PROCEDURAL, make_procedural_solid
 from tracking3d.synthesis.ray_casting import Surface
-from tracking3d.synthesis.solids import Solid, make_solid
+from tracking3d.synthesis.solid import Solid
 from tracking3d.synthesis.spec import SequenceSpec
 
 Array = NDArray[np.float64]
@@ -62,15 +67,37 @@ def make_scene(spec: SequenceSpec) -> Scene:
         InputError: If its object or background cannot be used, or Embree is not installed.
     """
     camera = Camera.from_fov(*spec.size, spec.fov, origin="synthetic")
-    told = min(spec.fov * (1 + spec.disturbances.wrong_fov), max(spec.fov, _WIDEST))
-    told_camera = Camera.from_fov(*spec.size, told, origin="synthetic, told")
     solid = make_solid(spec)
     surface = Surface.of(solid.mesh())
     path = make_path(spec, camera, solid.radius)
     hand = make_hand(spec, path, surface, solid.radius, camera)
     background = linear(make_background(spec))
     texture = _resolved_texture(solid, camera, path, spec.supersample)
-    return Scene(spec, camera, told_camera, solid, surface, path, background, hand, texture)
+    return Scene(spec, camera, _told_camera(spec, camera), solid, surface, path, background, hand, texture)
+
+
+def _told_camera(spec: SequenceSpec, camera: Camera) -> Camera:
+    if spec.disturbances.wrong_fov == 0:
+        return camera
+    told = min(spec.fov * (1 + spec.disturbances.wrong_fov), _WIDEST)
+    return Camera.from_fov(*spec.size, told, origin="synthetic, wrong on purpose")
+
+
+def make_solid(spec: SequenceSpec) -> Solid:
+    """The object of a sequence.
+
+    Raises:
+        InputError: If it is neither a procedural object nor a mesh file with faces.
+    """
+    if spec.object in PROCEDURAL:
+        return make_procedural_solid(spec)
+    file = FilePath(spec.object)
+    if not file.suffix and not file.exists():
+        raise InputError(
+            f"There is no object '{spec.object}' and no such mesh file "
+            f"(objects: {', '.join(PROCEDURAL)}); {hint(spec.object, PROCEDURAL)}"
+        )
+    return load_solid(file, spec)
 
 
 def _resolved_texture(

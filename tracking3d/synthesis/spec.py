@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from tracking3d.config.explain import describe
 from tracking3d.config.models import Section
@@ -86,6 +86,12 @@ class SequenceSpec(Section):
         if supersample % 2 == 0:
             raise ValueError("it must be odd")
         return supersample
+
+    @model_validator(mode="after")
+    def _blur_has_rays_to_average(self) -> SequenceSpec:
+        if self.disturbances.motion_blur > 0 and self.supersample == 1:
+            raise ValueError("motion_blur needs a supersample of at least 3: it averages the rays of a pixel")
+        return self
 
     def random(self, purpose: str) -> np.random.Generator:
         """The stream of random numbers for one purpose."""

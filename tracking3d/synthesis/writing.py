@@ -1,12 +1,10 @@
-"""A synthetic sequence on disk, in the layout of `tracking3d.datasets.clip`.
-
-``info.json`` is written last: a folder that has it is complete.
-"""
+"""A synthetic sequence on disk, in the layout of `tracking3d.datasets.clip`."""
 
 from __future__ import annotations
 
 import io
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,19 +16,22 @@ from PIL import Image as PillowImage
 from trimesh.exchange.obj import export_obj
 
 from tracking3d.datasets.clip import POSE_CONVENTION
+from tracking3d.errors import OutputError
 from tracking3d.geometry.camera import Camera
 from tracking3d.results.files import write_atomic, write_image, write_mask, writing
+from tracking3d.results.layout import partial_path
 from tracking3d.synthesis.camera_effects import compressed
 from tracking3d.synthesis.frame_rendering import RenderedFrame, render_frame
-from tracking3d.synthesis.point_tracks import track_points
+from tracking3d.synthesis.point_tracks import PointTracks, track_points
 from tracking3d.synthesis.scene import Scene, make_scene
-from tracking3d.synthesis.solids import Solid
+from tracking3d.synthesis.solid import Solid
 from tracking3d.synthesis.spec import SequenceSpec
 
 SUITE_VERSION = 1
 """Grows with every change to the generator or the suites that changes an image or a truth."""
 
 _INFO = "info.json"
+_SOURCE = "tracking3d synth"
 _PARTS = ("frames", "masks", "visible_masks", "depth")
 _COUNTS = 65_000  # of depth, at the farthest
 
@@ -49,8 +50,10 @@ def write_sequence(
 ) -> Path:
     """Render a sequence and write it, one frame in memory at a time.
 
+    It is made in ``.NAME.part`` beside ``folder`` and takes its place when it is complete.
+
     Args:
-        folder: Made if absent; what an earlier sequence left in it is removed.
+        folder: Made if absent; an earlier synthetic sequence in it is replaced.
         spec: The sequence.
         listener: Is told of every frame that is written.
 
@@ -59,45 +62,46 @@ def write_sequence(
 
     Raises:
         InputError: If the object or background cannot be used, or Embree is not installed.
-        OutputError: If it cannot be written.
+        OutputError: If it cannot be written, or ``folder`` holds something else.
     """
+    folder = folder.absolute()
+    _check_replaceable(folder)
     scene = make_scene(spec)
-    _clear(folder)
     scale = _depth_scale(scene)
-    first_box: list[int] = []
+    partial = partial_path(folder)
+    with writing(folder):
+        if partial.exists():
+            shutil.rmtree(partial)
+        for part in _PARTS if scene.hand else set(_PARTS) - {"visible_masks"}:
+            (partial / part).mkdir(parents=True)
+    box: list[int] = []
     for n in range(spec.frames):
         frame = render_frame(scene, n)
-        if n == 0:
-            first_box = list(cv2.boundingRect(frame.visible_mask.astype(np.uint8)))
-        _write_frame(folder, f"{n:06d}", frame, spec, scale)
+        box = box or list(cv2.boundingRect(frame.visible_mask.astype(np.uint8)))
+        _write_frame(partial, f"{n:06d}", frame, spec, scale)
         listener(n)
-    _write_mesh(folder, scene.solid)
-    tracks = track_points(scene)
-    arrays = io.BytesIO()
-    np.savez_compressed(
-        arrays,
-        positions=tracks.positions.astype(np.float32),
-        visible=tracks.visible,
-        object_points=tracks.object_points,
-    )
-    write_atomic(folder / "points.npz", arrays.getvalue())
-    for name, document in _documents(scene, first_box, scale).items():
-        write_atomic(folder / name, json.dumps(document, indent=1).encode() + b"\n")
+    _write_points(partial, track_points(scene))
+    _write_mesh(partial, scene.solid)
+    for name, document in _documents(scene, box, scale).items():
+        write_atomic(partial / name, json.dumps(document, indent=1).encode() + b"\n")
+    with writing(folder):
+        if folder.exists():
+            shutil.rmtree(folder)
+        partial.rename(folder)
     return folder
 
 
-def _clear(folder: Path) -> None:
-    """Make the folder, without the marks and frames of an earlier sequence."""
+def _check_replaceable(folder: Path) -> None:
+    """Refuse to replace what is no synthetic sequence."""
     with writing(folder):
-        for part in _PARTS:
-            (folder / part).mkdir(parents=True, exist_ok=True)
-        for file in (folder / _INFO, folder / "truth_camera.json"):
-            file.unlink(missing_ok=True)
-        for part in _PARTS:
-            for file in (folder / part).glob("[0-9]" * 6 + ".*"):
-                file.unlink()
-        if not any((folder / "visible_masks").iterdir()):
-            (folder / "visible_masks").rmdir()
+        if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+            return
+    try:
+        ours = json.loads((folder / _INFO).read_text(encoding="utf-8"))["source"] == _SOURCE
+    except (OSError, ValueError, KeyError, TypeError):
+        ours = False
+    if not ours:
+        raise OutputError(f"{folder} holds something other than a synthetic sequence; choose another folder.")
 
 
 def _write_frame(folder: Path, name: str, frame: RenderedFrame, spec: SequenceSpec, scale: float) -> None:
@@ -107,11 +111,20 @@ def _write_frame(folder: Path, name: str, frame: RenderedFrame, spec: SequenceSp
         write_image(folder / "frames" / f"{name}.png", frame.image)
     write_mask(folder / "masks" / f"{name}.png", frame.mask)
     if spec.disturbances.occluder > 0:
-        with writing(folder):
-            (folder / "visible_masks").mkdir(exist_ok=True)
         write_mask(folder / "visible_masks" / f"{name}.png", frame.visible_mask)
     counts = (frame.depth / scale).round().astype(np.uint16)
     write_atomic(folder / "depth" / f"{name}.png", cv2.imencode(".png", counts)[1].tobytes())
+
+
+def _write_points(folder: Path, tracks: PointTracks) -> None:
+    arrays = io.BytesIO()
+    np.savez_compressed(
+        arrays,
+        positions=tracks.positions.astype(np.float32),
+        visible=tracks.visible,
+        object_points=tracks.object_points,
+    )
+    write_atomic(folder / "points.npz", arrays.getvalue())
 
 
 def _depth_scale(scene: Scene) -> float:
@@ -135,7 +148,7 @@ def _documents(scene: Scene, box: list[int], scale: float) -> dict[str, dict[str
         documents["camera.json"]["note"] = "wrong on purpose; the true camera is in truth_camera.json"
         documents["truth_camera.json"] = {**_intrinsics(scene.camera), "depth_scale": scale}
     info: dict[str, Any] = {
-        "source": "tracking3d synth",
+        "source": _SOURCE,
         "frames": spec.frames,
         "note": _note(spec),
         "millimetres": solid.millimetres,
@@ -166,7 +179,7 @@ def _write_mesh(folder: Path, solid: Solid) -> None:
         )
         mesh.visual = trimesh.visual.TextureVisuals(solid.uvs, material=material)
     else:
-        mesh.visual.vertex_colors = solid.colours
+        mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=solid.colours)
     text, files = export_obj(mesh, return_texture=True, digits=9, mtl_name="mesh.mtl", header=solid.frame)
     write_atomic(folder / "mesh.obj", text.encode())
     for name, data in files.items():

@@ -47,6 +47,8 @@ def prompt_of(region: Any, frame: Frame, offset: tuple[int, int] = (0, 0)) -> Pr
     try:
         if isinstance(region, list) and all(isinstance(point, tuple) for point in region):
             points = tuple((float(x), float(y)) for x, y in region)
+            if len(points) < 3 or not np.isfinite(points).all():
+                raise ValueError(f"a polygon of {len(points)} points")
             return make_prompt(frame, mask=rasterise(Polygon(points), frame.size))
         mask = np.asarray(region)
         if mask.ndim != 2 or mask.dtype.kind not in "biuf":

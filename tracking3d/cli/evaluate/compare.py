@@ -48,7 +48,7 @@ def compare(
     from tracking3d.benchmark.results import read_results
     from tracking3d.benchmark.sequences import open_dataset
     from tracking3d.benchmark.suite import run_suite
-    from tracking3d.cli.evaluate.options import jobs_progress, making_progress
+    from tracking3d.cli.evaluate.progress import jobs_progress, making_progress
     from tracking3d.cli.tables import print_table
 
     given = [a.lower().endswith(".json"), b.lower().endswith(".json")]

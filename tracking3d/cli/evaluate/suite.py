@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tracking3d.cli.evaluate.options import Data, Jobs, Masks, Out, Sequences
+from tracking3d.cli.evaluate.options import Data, Jobs, Masks, Out, Sequences, name_of_settings
 from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quiet, configure
 
 
@@ -41,7 +41,7 @@ def suite(
     from tracking3d.benchmark.suite import run_suite
     from tracking3d.benchmark.table import file_name
     from tracking3d.benchmark.variant import Variant, check_masks
-    from tracking3d.cli.evaluate.options import jobs_progress, making_progress, name_of_settings
+    from tracking3d.cli.evaluate.progress import jobs_progress, making_progress
     from tracking3d.cli.tables import print_table
 
     check_masks(masks)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tracking3d.cli.evaluate.options import Data, Jobs, Out, Sequences
+from tracking3d.cli.evaluate.options import Data, Jobs, Out, Sequences, name_of_settings
 from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quiet, configure
 from tracking3d.errors import InputError
 
@@ -49,7 +49,7 @@ def table(
     from tracking3d.benchmark.table_plot import plot_table
     from tracking3d.benchmark.tables import TABLES
     from tracking3d.benchmark.variant import Variant
-    from tracking3d.cli.evaluate.options import jobs_progress, making_progress, name_of_settings
+    from tracking3d.cli.evaluate.progress import jobs_progress, making_progress
     from tracking3d.cli.tables import print_table
     from tracking3d.speed.plot import check_plot
 

@@ -1,85 +1,30 @@
-"""The objects of synthetic sequences: procedural solids from a seed, and any mesh file.
+"""Procedural objects from a seed: box, bottle, blob, mug, card and wedge.
 
-The procedural solids are about one unit in radius, y is up. Their shape is fixed but for the blob's, which like
-all textures comes from the seed.
+They are about one unit in radius, y is up. Their shape is fixed but for the blob's, which like all textures comes
+from the seed.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
+from itertools import pairwise
 
 import numpy as np
-import trimesh
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from tracking3d.config.explain import hint
-from tracking3d.errors import InputError
 from tracking3d.synthesis.patches import Array, Patch, assemble, cube_sphere, prism, revolved, tube
 from tracking3d.synthesis.procedural_texture import paint_panel, paint_plain
+from tracking3d.synthesis.solid import Solid
 from tracking3d.synthesis.spec import SequenceSpec
 
 PANEL = 256
 """Side of a panel of texture in texels."""
 
+MILLIMETRES = 100.0
+"""Length of the unit."""
+
 _STEPS_AROUND = 72  # of a continuous symmetry in its list of transforms: every 5 degrees
-
-
-@dataclass(frozen=True, eq=False)
-class Solid:
-    """An object in its own coordinates.
-
-    Attributes:
-        vertices: ``(V, 3)``.
-        faces: ``(F, 3)`` int64.
-        texture: ``(H, W, 3)`` uint8, or None where the vertices have colours.
-        uvs: ``(V, 2)`` texture coordinates, v upwards; or None.
-        colours: ``(V, 3)`` uint8, or None where there is a texture.
-        millimetres: Length of the unit.
-        symmetries: ``(S, 4, 4)`` transforms that leave shape and look as they are, the identity first.
-        axis: ``(3,)`` unit, the axis through the origin of a continuous symmetry; `symmetries` then holds steps.
-        frame: Where origin and axes are, in words.
-    """
-
-    vertices: Array
-    faces: NDArray[np.int64]
-    texture: NDArray[np.uint8] | None
-    uvs: Array | None
-    colours: NDArray[np.uint8] | None
-    millimetres: float
-    symmetries: Array
-    axis: Array | None
-    frame: str
-
-    @property
-    def radius(self) -> float:
-        """Radius of the enclosing sphere around the origin."""
-        return float(np.linalg.norm(self.vertices, axis=1).max())
-
-    def mesh(self) -> trimesh.Trimesh:
-        """The shape without its colours."""
-        return trimesh.Trimesh(self.vertices, self.faces, process=False)
-
-
-def make_solid(spec: SequenceSpec) -> Solid:
-    """The object of a sequence.
-
-    Raises:
-        InputError: If it is neither a procedural object nor a mesh file with faces.
-    """
-    from tracking3d.synthesis.mesh_files import load_solid
-
-    if spec.object in PROCEDURAL:
-        return _procedural(spec)
-    path = Path(spec.object)
-    if not path.suffix and not path.exists():
-        raise InputError(
-            f"There is no object '{spec.object}' and no such mesh file; {hint(spec.object, PROCEDURAL)}"
-        )
-    return load_solid(path, spec)
 
 
 def box(rng: np.random.Generator) -> list[Patch]:
@@ -148,7 +93,8 @@ PROCEDURAL: dict[str, Callable[[np.random.Generator], list[Patch]]] = {
 """The procedural objects by name."""
 
 
-def _procedural(spec: SequenceSpec) -> Solid:
+def make_procedural_solid(spec: SequenceSpec) -> Solid:
+    """The procedural object of a sequence; `SequenceSpec.object` is one of `PROCEDURAL`."""
     patches = PROCEDURAL[spec.object](spec.random("shape"))
     rng = spec.random("texture")
     if spec.textured:
@@ -164,7 +110,7 @@ def _procedural(spec: SequenceSpec) -> Solid:
         axis = np.array([0.0, 1.0, 0.0])
         symmetries = _turns(np.linspace(0, 2 * math.pi, _STEPS_AROUND, endpoint=False)[:, None] * axis)
     frame = "origin in the middle of the body, y up, about one unit in radius"
-    return Solid(vertices, faces, texture, uvs, None, 100.0, symmetries, axis, frame)
+    return Solid(vertices, faces, texture, uvs, None, MILLIMETRES, symmetries, axis, frame)
 
 
 def _turns(rotation_vectors: list[Array] | Array) -> Array:
@@ -181,7 +127,7 @@ def _rectangle(x: float, y: float) -> Array:
 def _refined(profile: Array, step: float = 0.04) -> Array:
     """The same polyline with points at most ``step`` apart."""
     pieces = []
-    for start, end in zip(profile[:-1], profile[1:], strict=True):
+    for start, end in pairwise(profile):
         count = max(math.ceil(np.linalg.norm(end - start) / step), 1)
         pieces.append(start + np.arange(count)[:, None] / count * (end - start))
     return np.concatenate([*pieces, profile[-1:]])

@@ -1,0 +1,169 @@
+"""``tracking3d evaluate``: its commands, what they print and keep, and what they refuse."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tracking3d.benchmark import suite as suite_module
+from tracking3d.benchmark.pool import Outcome
+from tracking3d.benchmark.results import ResultSet, write_results
+from tracking3d.datasets.clip import write_clip
+from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
+
+
+@pytest.fixture
+def clips(tmp_path):
+    """A folder of two clips with truth."""
+    clip = synthesize(SyntheticSpec(frames=3, size=(64, 48), supersample=1))
+    for name in ("one", "two"):
+        poses, camera = clip.T_cam_obj, clip.camera
+        write_clip(tmp_path / "clips" / name, clip.images, clip.masks, poses, camera, source="test", note="")
+    return tmp_path / "clips"
+
+
+@pytest.fixture
+def jobs(monkeypatch):
+    """Answer every job at once: IoU 0.8 with preset paper and 0.9 else; the sequence ``two`` may fail."""
+    asked, failing = [], []
+
+    def run(jobs, processes, listener):
+        outcomes = []
+        for job in jobs:
+            asked.append(job)
+            iou = 0.8 if job.variant.label.startswith("paper") else 0.9
+            scores = {
+                "iou_initial_mean": 0.7,
+                "iou_mean": iou + 0.01 * len(job.sequence),
+                "rotation_error_mean_deg": None,
+                "frames_lost": 0,
+            }
+            failed = job.sequence in failing
+            outcomes.append(Outcome(job, None if failed else scores, "it crashed" if failed else ""))
+            listener(outcomes[-1])
+        return outcomes
+
+    monkeypatch.setattr(suite_module, "run_jobs", run)
+    run.asked, run.failing = asked, failing
+    return run
+
+
+def test_a_suite_is_run_printed_and_kept(call, clips, jobs):
+    result = call("evaluate", "suite", "real", "--data", clips, "--masks", "degraded:0.7", "--jobs", 2)
+    assert result.exit_code == 0, result.output
+    assert [job.sequence for job in jobs.asked] == ["one", "two"]
+    assert "0.930" in result.stdout
+    kept = json.loads(Path("benchmark/results/default_masks_degraded_0_7-real.json").read_text())
+    assert kept["mean"]["iou_mean"] == pytest.approx(0.93)
+    assert (kept["masks"], kept["config"]["tracker"]["name"]) == ("degraded:0.7", "csrt")
+
+
+def test_a_sequence_that_fails_is_named_and_the_others_are_kept(call, clips, jobs):
+    jobs.failing.append("two")
+    result = call("evaluate", "suite", "real", "--data", clips, "--label", "mine")
+    assert result.exit_code == 1
+    assert "two failed: it crashed" in result.stderr
+    kept = json.loads(Path("benchmark/results/mine-real.json").read_text())
+    assert kept["errors"] == {"two": "it crashed"} and kept["sequences"]["one"]["iou_mean"] > 0.9
+
+
+def test_only_the_sequences_that_match_are_run(call, clips, jobs, refused):
+    call("evaluate", "suite", "real", "--data", clips, "--sequence", "t*")
+    assert [job.sequence for job in jobs.asked] == ["two"]
+    words = refused("evaluate", "suite", "real", "--data", clips, "--sequence", "three")
+    assert "no sequence 'three'" in words and "one, two" in words
+
+
+def test_a_table_is_printed_and_written_in_three_formats(call, clips, jobs, monkeypatch):
+    monkeypatch.setattr(
+        "tracking3d.benchmark.sequences.make_suite", lambda name, folder, **named: made(clips)
+    )
+    arguments = ("evaluate", "table", "keyframes", "--data", clips, "--initial", f"ostrack={clips}")
+    words = call(*arguments)  # the layout of CDTB finds nothing in clips of our own
+    assert words.exit_code == 2
+    result = call("evaluate", "table", "keyframes", "--json", "--plot", "keyframes.svg")
+    assert result.exit_code == 0, result.output
+    lines = json.loads(result.stdout)["lines"]
+    assert [line["label"] for line in lines] == [str(count) for count in range(1, 11)]
+    assert lines[5]["paper"] == 0.7404 and lines[5]["here"] == pytest.approx(0.93)
+    assert {path.name for path in Path("benchmark/tables").iterdir()} == {
+        f"keyframes{suffix}" for suffix in (".md", ".csv", ".json")
+    }
+    assert Path("keyframes.svg").read_text().startswith("<?xml")
+
+
+def made(clips):
+    return sorted(clips.iterdir())
+
+
+def results(label, values):
+    scores = {f"s{n}": {"iou_mean": float(value)} for n, value in enumerate(values)}
+    return ResultSet(label, "standard", scores, {}, {})
+
+
+def test_two_files_of_results_are_compared(call, tmp_path):
+    values = np.linspace(0.5, 0.8, 6)
+    write_results(results("A", values), tmp_path / "a.json")
+    write_results(results("B", values + 0.05), tmp_path / "b.json")
+    [found] = json.loads(call("evaluate", "compare", "a.json", "b.json", "--json").stdout)
+    assert found["verdict"] == "B is better" and found["low"] == pytest.approx(0.05)
+    printed = call("evaluate", "compare", "a.json", "b.json").stdout
+    assert "B is better" in printed and "+0.050" in printed
+
+
+def test_two_presets_are_run_and_compared(call, clips, jobs):
+    result = call("evaluate", "compare", "paper", "default", "--suite", "real", "--data", clips)
+    assert result.exit_code == 0, result.output
+    assert len(jobs.asked) == 4
+    assert "B is better" in result.stdout
+
+
+def test_results_of_others_are_scored_and_said_to_be_recognised(call, clips):
+    result = call("evaluate", clips / "one/masks", "--truth", clips / "one")
+    assert result.exit_code == 0, result.output
+    assert "is read as" in result.stderr
+    scores = json.loads(call("evaluate", clips / "one/masks", "--truth", clips / "one", "--json").stdout)
+    assert scores["iou_mean"] == 1 and scores["iou_initial_mean"] is None
+    assert scores["rotation_error_mean_deg"] is None
+
+
+def test_colmap_is_a_peer_whose_unregistered_frames_are_lost(call, clips, tmp_path):
+    poses = json.loads((clips / "one/poses.json").read_text())["frames"]
+    from scipy.spatial.transform import Rotation
+
+    lines = []
+    for number, name in enumerate(list(poses)[:2], 1):
+        x, y, z, w = Rotation.from_matrix(poses[name]["R"]).as_quat()
+        numbers = " ".join(str(value) for value in (w, x, y, z, *poses[name]["t"]))
+        lines += [f"{number} {numbers} 1 {name}.png", ""]
+    (tmp_path / "model").mkdir()
+    (tmp_path / "model/images.txt").write_text("\n".join(lines) + "\n")
+    (tmp_path / "model/cameras.txt").write_text("1 PINHOLE 64 48 60 60 32 24\n")
+    (tmp_path / "model/points3D.txt").write_text("")
+    result = call("evaluate", "peer", "colmap", "model", "--truth", clips / "one", "--json")
+    scores = json.loads(result.stdout)
+    assert scores["frames_lost"] == 1 and scores["rotation_error_max_deg"] == 180
+    assert scores["rotation_error_median_deg"] == pytest.approx(0, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("evaluate suite nothing --data .", "nothing"),
+        ("evaluate suite real", "--data DIR"),
+        ("evaluate suite real --data absent", "absent"),
+        ("evaluate suite smoke --masks often", "'often' are unknown"),
+        ("evaluate suite smoke --preset absent", "no preset 'absent'"),
+        ("evaluate table nothing", "no table 'nothing'"),
+        ("evaluate table cdtb --initial d3s", "--initial d3s"),
+        ("evaluate table cdtb --plot a.bmp", ".svg"),
+        ("evaluate compare a.json b.json", "a.json is not a result set"),
+        ("evaluate compare a.json paper", "not one of each"),
+        ("evaluate peer slam model --truth .", "'slam' is unknown"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_in_a_sentence(refused, arguments, words):
+    assert words in refused(*arguments.split())

@@ -1,0 +1,172 @@
+"""The objects: closed, outward, of the promised size, with the promised symmetries; and mesh files of any kind."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from tracking3d.errors import InputError
+from tracking3d.synthesis.procedural_solids import PROCEDURAL
+from tracking3d.synthesis.ray_casting import Surface
+from tracking3d.synthesis.scene import make_solid
+from tracking3d.synthesis.spec import SequenceSpec
+
+
+def solid(name, **more):
+    return make_solid(SequenceSpec(object=str(name), **more))
+
+
+def merged(made):
+    """The shape with the vertices at seams joined."""
+    mesh = trimesh.Trimesh(made.vertices.round(7), made.faces)
+    mesh.update_faces(mesh.nondegenerate_faces())
+    return mesh
+
+
+@pytest.mark.parametrize("name", sorted(set(PROCEDURAL) - {"mug"}))
+def test_solids_are_closed_and_their_faces_look_outward(name):
+    mesh = merged(solid(name))
+    assert mesh.is_watertight and mesh.volume > 0
+
+
+@pytest.mark.parametrize("name", PROCEDURAL)
+def test_procedural_objects_are_about_one_unit_in_radius(name):
+    assert 0.8 < solid(name).radius < 1.1
+
+
+@pytest.mark.parametrize("name", PROCEDURAL)
+def test_texture_coordinates_lie_in_the_texture_and_every_face_has_an_own_place(name):
+    made = solid(name)
+    assert made.uvs.min() > 0 and made.uvs.max() < 1
+    a, b, c = made.uvs[made.faces].transpose(1, 0, 2)
+    area = 0.5 * np.abs(np.cross(np.c_[b - a, np.zeros(len(a))], np.c_[c - a, np.zeros(len(a))])[:, 2])
+    assert 0.2 < area.sum() <= 1  # overlapping faces would soon add up to more
+
+
+@pytest.mark.parametrize("name", PROCEDURAL)
+def test_textures_are_seen_upright_and_not_mirrored_from_outside(name):
+    made = solid(name)
+    a, b, c = made.uvs[made.faces].transpose(1, 0, 2)
+    turn = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
+    assert turn.min() > -1e-12
+
+
+def test_one_can_look_through_the_handle_of_the_mug_and_into_it():
+    surface = Surface.of(solid("mug").mesh())
+    ahead = np.array([[0.0, 0.0, 1.0]])
+    through, handle = (surface.cast(np.array([[x, 0.0, -5.0]]), ahead).face[0] for x in (0.57, 0.7))
+    assert through == -1 and handle >= 0
+    bottom = surface.cast(np.array([[-0.12, 5.0, 0.0]]), np.array([[0.0, -1.0, 0.0]]))
+    assert bottom.distance[0] == pytest.approx(5.52)
+
+
+def test_the_sides_of_a_card_differ():
+    made = solid("card")
+    sides = [made.texture[256 * r : 256 * (r + 1), 256 * c : 256 * (c + 1)] for r, c in ((0, 0), (0, 1))]
+    assert np.abs(sides[0].astype(int) - sides[1]).mean() > 20
+
+
+def test_the_seed_changes_the_texture_and_only_the_blobs_shape():
+    for name in PROCEDURAL:
+        one, same, other = (solid(name, seed=seed) for seed in (1, 1, 2))
+        assert (one.texture == same.texture).all() and (one.vertices == same.vertices).all()
+        assert (one.texture != other.texture).any()
+        assert (one.vertices != other.vertices).any() == (name == "blob")
+
+
+@pytest.mark.parametrize("name", PROCEDURAL)
+def test_a_textureless_object_has_nearly_one_colour(name):
+    plain, printed = solid(name, textured=False).texture, solid(name).texture
+    painted = plain[plain.any(2)]  # a texture may have more room than panels
+    assert 0.2 < painted.std(0).max() < 4
+    assert printed.std((0, 1)).min() > 25
+    assert (solid(name, textured=False).vertices == solid(name).vertices).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "count"), [("box", 4), ("card", 4), ("bottle", 72), ("mug", 1), ("blob", 1)]
+)
+def test_the_symmetries_of_textureless_objects_map_them_to_themselves(name, count):
+    made = solid(name, textured=False)
+    assert made.symmetries.shape == (count, 4, 4)
+    assert (made.symmetries[0] == np.eye(4)).all()
+    surface = Surface.of(made.mesh())
+    rng = np.random.default_rng(0)
+    origins, directions = rng.normal(0, 5, (500, 3)), rng.normal(0, 0.3, (500, 3))
+    directions -= origins
+    before = surface.cast(origins, directions).distance
+    for T in made.symmetries[:: max(1, count // 6)]:
+        assert (T[:3, 3] == 0).all()
+        after = surface.cast(origins @ T[:3, :3].T, directions @ T[:3, :3].T).distance
+        assert (np.isclose(before, after, atol=0.01)).mean() > 0.98  # but for grazed outlines
+    assert len(solid(name).symmetries) == 1
+
+
+def test_only_the_textureless_bottle_has_an_axis():
+    assert solid("bottle", textured=False).axis == pytest.approx([0, 1, 0])
+    assert solid("bottle").axis is None and solid("box", textured=False).axis is None
+
+
+def textured_mesh(folder, offset=(0.0, 0.0, 0.0)):
+    mesh = trimesh.creation.box((0.1, 0.2, 0.05)).apply_translation(offset)
+    texture = Image.fromarray(np.random.default_rng(0).integers(0, 255, (32, 32, 3), dtype=np.uint8))
+    uv = np.random.default_rng(1).random((len(mesh.vertices), 2))
+    material = trimesh.visual.material.SimpleMaterial(texture)
+    mesh.visual = trimesh.visual.TextureVisuals(uv, material=material)
+    mesh.export(folder / "thing.obj")
+    return folder / "thing.obj", np.asarray(texture)
+
+
+def test_a_mesh_file_keeps_axes_size_and_texture_and_is_centred(tmp_path):
+    file, texture = textured_mesh(tmp_path, offset=(3.0, -1.0, 0.5))
+    made = solid(file)
+    assert (made.texture == texture).all()
+    assert np.ptp(made.vertices, axis=0) == pytest.approx([0.1, 0.2, 0.05])
+    assert made.vertices.min(0) == pytest.approx(-made.vertices.max(0))
+    assert made.millimetres == 1000
+    assert "thing.obj" in made.frame and "(3, -1, 0.5)" in made.frame
+    assert len(made.faces) == 12
+
+
+def test_a_mesh_with_coloured_vertices_or_no_colours_at_all_will_do(tmp_path):
+    mesh = trimesh.creation.icosphere(1)
+    colours = np.random.default_rng(0).integers(0, 255, (len(mesh.vertices), 4), dtype=np.uint8)
+    mesh.visual.vertex_colors = colours
+    mesh.export(tmp_path / "coloured.ply")
+    assert (solid(tmp_path / "coloured.ply").colours == colours[:, :3]).all()
+    trimesh.creation.icosphere(1).export(tmp_path / "bare.stl")
+    for made in (solid(tmp_path / "bare.stl"), solid(tmp_path / "coloured.ply", textured=False)):
+        assert made.texture is None and (made.colours == made.colours[0]).all()
+
+
+def test_scans_are_loaded_with_all_faces_and_their_texture(shared_data):
+    made = solid(shared_data / "meshes" / "035_power_drill" / "textured.obj")
+    assert len(made.faces) == 5242 and made.texture.shape == (512, 512, 3)
+    assert 0.1 < made.radius < 0.2
+
+
+def test_an_object_that_does_not_exist_is_named_with_the_nearest_one():
+    with pytest.raises(InputError, match="no object 'botle'.*did you mean 'bottle'"):
+        solid("botle")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "does not exist"),
+        (b"", "cannot be read|holds no triangles"),
+        (b"\x00\xff not a mesh", "cannot be read|holds no triangles"),
+        (b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "cannot be read|holds no triangles"),
+        (b"v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "not finite"),
+        (b"v 0 0 0\nv 0 0 0\nv 0 0 0\nf 1 2 3\n", "all one point"),
+    ],
+)
+def test_a_mesh_file_that_cannot_be_used_is_refused_by_name(tmp_path, content, message):
+    file = tmp_path / "broken.obj"
+    if content is not None:
+        file.write_bytes(content)
+    with pytest.raises(InputError, match=message) as refusal:
+        solid(file)
+    assert "broken.obj" in str(refusal.value)

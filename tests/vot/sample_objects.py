@@ -1,0 +1,23 @@
+"""A short clip and a fast pipeline for the tests of the VOT tracker."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tracking3d.results.files import write_image
+from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+
+QUICK = (
+    "window.size=32 object.frequency=2 object.texture_size=16 solver.iterations=2 solver.pose_iterations=2 "
+    "solver.start_frames=1 solver.tau=2"
+)
+
+
+def sample_clip(frames: int = 3) -> SyntheticClip:
+    return synthesize(SyntheticSpec(frames=frames, size=(80, 64)))
+
+
+def write_frames(folder: Path, clip: SyntheticClip) -> list[str]:
+    for n, image in enumerate(clip.images):
+        write_image(folder / f"{n:08d}.png", image)
+    return [str(folder / f"{n:08d}.png") for n in range(len(clip.images))]

@@ -1,0 +1,48 @@
+"""What the commands of ``tracking3d evaluate`` show while sequences are made and run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from tracking3d.benchmark.pool import Listener, Outcome
+
+
+@contextmanager
+def making_progress(quiet: bool) -> Iterator[Callable[[str], None]]:
+    """Says on the standard error which sequence of a suite was made; yields the listener."""
+    yield (lambda name: None) if quiet else (lambda name: typer.echo(f"made {name}", err=True))
+
+
+@contextmanager
+def jobs_progress(count: int | None, quiet: bool) -> Iterator[Listener]:
+    """A bar over all jobs and a line for each as it is done, on the standard error; yields the listener."""
+    console = Console(stderr=True)
+    columns = BarColumn(bar_width=24), MofNCompleteColumn(), TextColumn("sequences"), TimeElapsedColumn()
+    bar = Progress(*columns, console=console, disable=quiet or not console.is_terminal, transient=True)
+    task = bar.add_task("", total=count)
+
+    def listener(outcome: Outcome) -> None:
+        bar.update(task, advance=1)
+        if not quiet:
+            bar.console.print(escape(_line(outcome)), highlight=False)
+
+    with bar:
+        yield listener
+
+
+def _line(outcome: Outcome) -> str:
+    what = f"{outcome.job.sequence} ({outcome.job.variant.label})"
+    if outcome.scores is None:
+        return f"{what} failed: {outcome.error}"
+    scores = outcome.scores
+    told = [f"IoU {scores['iou_mean']:.3f}"] if scores["iou_mean"] is not None else []
+    if scores["rotation_error_mean_deg"] is not None:
+        told.append(f"rotation {scores['rotation_error_mean_deg']:.1f} degrees")
+    took = "done before" if outcome.cached else f"{outcome.seconds:.0f} s"
+    return f"{what}: {', '.join([*told, took])}"

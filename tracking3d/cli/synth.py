@@ -1,0 +1,170 @@
+"""``tracking3d synth``: synthetic sequences with exact truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from tracking3d.cli.options import Debug, Quiet, numbers
+from tracking3d.errors import InputError
+
+_ONE = "One sequence"
+
+
+def synth(
+    out: Annotated[
+        Path, typer.Argument(metavar="OUT", help="Folder of the suite, or of the one sequence.")
+    ] = Path("synthetic"),
+    suite: Annotated[
+        str | None, typer.Option(metavar="NAME", help="A fixed suite: smoke, standard or full.")
+    ] = None,
+    object_: Annotated[
+        str | None,
+        typer.Option(
+            "--object",
+            metavar="NAME|MESH",
+            help="box, bottle, blob, mug, card, wedge, or a mesh file in metres.",
+            rich_help_panel=_ONE,
+        ),
+    ] = None,
+    motion: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="tumble, turntable, turn_and_back, flip, fast, depth_drift or leave_and_return.",
+            rich_help_panel=_ONE,
+        ),
+    ] = None,
+    frames: Annotated[
+        int | None, typer.Option(metavar="N", help="Number of frames.", rich_help_panel=_ONE)
+    ] = None,
+    size: Annotated[
+        str | None, typer.Option(metavar="W,H", help="Image size in pixels.", rich_help_panel=_ONE)
+    ] = None,
+    degrees: Annotated[
+        float | None,
+        typer.Option(metavar="DEGREES", help="Rotation per frame; the peak for fast.", rich_help_panel=_ONE),
+    ] = None,
+    fov: Annotated[
+        float | None,
+        typer.Option(metavar="DEGREES", help="True vertical field of view.", rich_help_panel=_ONE),
+    ] = None,
+    background: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DIR|procedural",
+            help="Folder of images, one is chosen by the seed.",
+            rich_help_panel=_ONE,
+        ),
+    ] = None,
+    textureless: Annotated[
+        bool, typer.Option("--textureless", help="Paint the object in one colour.", rich_help_panel=_ONE)
+    ] = False,
+    disturb: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=STRENGTH",
+            help="light, highlights, motion_blur, noise, low_contrast, occluder, wrong_fov or jpeg, from 0 to 1; "
+            "may be repeated.",
+            rich_help_panel=_ONE,
+        ),
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option(metavar="N", help="Seed of all that is random.", rich_help_panel=_ONE)
+    ] = None,
+    jobs: Annotated[int, typer.Option(min=1, max=256, help="Processes that make a suite.")] = 1,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Make again what is complete.")] = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Render sequences with exact masks, poses, depth and point tracks: a fixed suite, or one sequence.
+
+    They are ray cast, not rendered by the renderer that tracks. What is complete already is not made again.
+    """
+    given = {
+        "object": object_,
+        "motion": motion,
+        "frames": frames,
+        "size": size,
+        "degrees": degrees,
+        "fov": fov,
+        "background": background,
+        "textureless": textureless or None,
+        "disturb": disturb or None,
+        "seed": seed,
+    }
+    settings = {name: value for name, value in given.items() if value is not None}
+    if suite is not None and settings:
+        raise InputError(
+            f"--suite {suite} is fixed and does not go with --{next(iter(settings))}; leave one of them out."
+        )
+    if suite is not None:
+        _make_suite(suite, out, jobs, overwrite, quiet)
+    elif object_ is not None:
+        _make_one(settings, out, overwrite, quiet)
+    else:
+        raise InputError(
+            "Say what to make: --suite smoke, standard or full, or one sequence by --object NAME."
+        )
+
+
+def _make_suite(name: str, out: Path, jobs: int, overwrite: bool, quiet: bool) -> None:
+    from tracking3d.synthesis.suite import load_suite, make_suite
+
+    specs = load_suite(name)
+    with _progress(len(specs), "sequences", quiet) as advance:
+        folders = make_suite(name, out, jobs=jobs, overwrite=overwrite, listener=advance)
+    if not quiet:
+        typer.echo(f"{out}: {len(folders)} sequences")
+
+
+def _make_one(settings: dict[str, Any], out: Path, overwrite: bool, quiet: bool) -> None:
+    from tracking3d.synthesis.spec import check_spec
+    from tracking3d.synthesis.writing import is_complete, write_sequence
+
+    names = {"degrees": "degrees_per_frame"}
+    values = {names.get(name, name): value for name, value in settings.items()}
+    values["textured"] = not values.pop("textureless", False)
+    if "size" in values:
+        values["size"] = [round(side) for side in numbers(values["size"], 2, "--size", "W,H")]
+    values["disturbances"] = dict(_strength(item) for item in values.pop("disturb", []))
+    spec = check_spec(values, "synth")
+    if overwrite or not is_complete(out, spec):
+        with _progress(spec.frames, "frames", quiet) as advance:
+            write_sequence(out, spec, lambda frame: advance(f"frame {frame}"))
+    if not quiet:
+        typer.echo(f"{out}: {spec.frames} frames")
+
+
+def _strength(item: str) -> tuple[str, float]:
+    """``noise=0.5`` as a name and a number; whether there is such a disturbance is for the spec to say."""
+    name, equals, value = item.partition("=")
+    if not equals or not name:
+        raise InputError(f"--disturb {item} cannot be read; write it as NAME=STRENGTH, such as noise=0.5.")
+    return name.strip(), numbers(value, 1, f"--disturb {name}", "a number from 0 to 1")[0]
+
+
+@contextmanager
+def _progress(total: int, what: str, quiet: bool) -> Iterator[Callable[[str], None]]:
+    """A progress bar on the standard error; yields what to tell the name of every part that is done."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    bar = Progress(
+        BarColumn(bar_width=24),
+        MofNCompleteColumn(),
+        TextColumn(what),
+        TextColumn("{task.fields[done]}"),
+        TimeRemainingColumn(compact=True),
+        console=console,
+        disable=quiet or not console.is_terminal,
+        transient=True,
+    )
+    task = bar.add_task("", total=total, done="")
+    with bar:
+        yield lambda name: bar.update(task, advance=1, done=name)
