@@ -20,7 +20,7 @@ from tracking3d.config.loading import load_config
 from tracking3d.synthesis import convex_clips
 
 BOX = ("--box", "20,10,20,20")
-COMMANDS = ["run", "demo", "points", "plugins", "config show", "config schema", "config validate"]
+COMMANDS = ["run", "demo", "synth", "points", "plugins", "config show", "config schema", "config validate"]
 COMMANDS += [f"evaluate {command}" for command in ("answers", "suite", "table", "compare", "peer")]
 GROUPS = ["config", "bench", "bench render", "evaluate"]
 

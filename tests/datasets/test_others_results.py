@@ -313,6 +313,30 @@ def test_queries_say_in_which_frame_and_where_a_track_was_asked_for(truth, tmp_p
     assert visible[:, 2].all()
 
 
+def test_a_point_may_be_asked_for_within_a_pixel_of_its_query(truth, tmp_path):
+    arrays = tapvid_arrays(truth, SIZE)
+    arrays["query_points"] = np.column_stack([np.zeros(3), arrays["points"][:, 0, ::-1]])
+    points = answers_from_tapvid(write_pickle(tmp_path / "t.pkl", arrays), truth, raster=SIZE).points
+    first = truth.points.positions[0, :1]
+    for direction in np.array([(1, 0), (-1, 0), (0, 1), (0, -1)]):
+        assert points(0, first + 0.9 * direction)[1].any()
+        assert not points(0, first + 1.1 * direction)[1].any()
+
+
+@pytest.mark.parametrize("protocol", [2, 5])
+def test_arrays_that_an_older_numpy_pickled_are_read(truth, tmp_path, protocol):
+    data = pickle.dumps({"clip": {**tapvid_arrays(truth), "number": np.float32(1)}}, protocol)
+    if protocol == 5:  # names have their length in front, and the frame, which need not be, its own
+        assert data[2:3] == b"\x95"
+        data = data[:2] + data[11:]
+        for name in (b"numpy._core.multiarray", b"numpy._core.numeric"):
+            data = data.replace(bytes([len(name)]) + name, bytes([len(name) - 1]) + name)
+    old = data.replace(b"numpy._core", b"numpy.core")
+    assert old.count(b"numpy.core") == 2
+    (tmp_path / "t.pkl").write_bytes(old)
+    assert answers_from_tapvid(tmp_path / "t.pkl", truth).points is not None
+
+
 def test_positions_are_in_the_raster_that_is_given_or_that_of_the_video(truth, tmp_path):
     arrays = tapvid_arrays(truth, (64, 48))
     expected = truth.points.positions

@@ -23,7 +23,7 @@ AMBIENT, DIFFUSE = 0.38, 0.72
 SHININESS = 35.0
 """Blinn's exponent of the highlights."""
 
-_DIRECTION = np.array([-0.5, -0.75, -0.6])
+_DIRECTION = np.array([-0.45, -0.6, -0.75])
 _DISTANCE, _SIZE = 7.0, 0.9  # of the lamp from the object, and its radius, in object radii
 
 

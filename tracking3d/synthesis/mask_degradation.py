@@ -143,7 +143,7 @@ def _plan(
     depth = 0.2 * np.maximum(depth - np.quantile(depth, 0.6), 0)  # a part is lost only now and then
     order = 1 + rng.permutation(count - 1)
     share = min(faults.dropped, 0.1 * (1 - mean_iou))
-    dropped = {int(n) for n in order[: int(share * (count - 1))]}
+    dropped = {int(n) for n in order[: round(share * (count - 1))]}
     return {
         n: _frame(
             masks[n],
@@ -235,8 +235,7 @@ def _rough(frame: _Frame, strength: float) -> NDArray[np.bool_]:
     # Where a pixel of the drifted mask was: (place - shift) / stretch about the object's centre.
     offset = ((origin - (shift_x, shift_y)) / stretch - origin) * frame.size
     back = np.array([[1 / stretch[0], 0, offset[0]], [0, 1 / stretch[1], offset[1]]])
-    signed = _warped(frame.signed, back, frame.signed.shape)
-    signed = signed * np.exp(scale) + strength * frame.leak
+    signed = _warped(frame.signed, back, frame.signed.shape) + strength * frame.leak
     direction, depth = frame.cut
     if depth > 0:
         least, most = frame.extent

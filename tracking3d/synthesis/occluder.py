@@ -25,6 +25,7 @@ MOST_HIDDEN = 0.35
 
 _SKIN = np.array([0.62, 0.34, 0.22])  # linear light
 _AWAY = 1.4  # distance of the fingertips from the object's centre in its radii while the hand is away
+_NEARNESS = 0.88  # depth of the hand relative to that of the object's nearest possible point
 _GRID = 30  # pixels per axis with which hidden shares are measured
 
 
@@ -59,7 +60,7 @@ class Hand:
         near = math.sin(phase) ** 2
         angle = self.angle + 0.25 * math.sin(1.7 * phase)
         c, s = math.cos(angle), math.sin(angle)
-        depth = 0.8 * (centre[2] - self.radius)
+        depth = _NEARNESS * (centre[2] - self.radius)
         T = np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
         distance = _AWAY + near * (self.reach - _AWAY)
         T[:3, 3] = centre * (depth / centre[2]) + self.scale * distance * T[:3, 0]
@@ -80,9 +81,9 @@ def make_hand(spec: SequenceSpec, path: Path, surface: Surface, radius: float, c
     last = max(spec.frames - 1, 1)
     start = path.T_cam_obj(np.zeros(1))[0, :3, 3]
     # Measured in the image, the hand's unit of length is about the object's radius.
-    scale = 0.8 * (start[2] - radius) * radius / start[2]
+    scale = _NEARNESS * (start[2] - radius) * radius / start[2]
     solid = Surface.of(_hand_mesh().apply_scale(scale))
-    angle = rng.uniform(-0.25, 1.25) * math.pi  # from below or the sides
+    angle = rng.uniform(0, 2 * math.pi)
     cycles = max(1, round(last / 40))
 
     frames = np.unique(np.linspace(0, last, min(last + 1, 12 * cycles)).round())

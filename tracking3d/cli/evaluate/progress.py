@@ -30,7 +30,7 @@ def jobs_progress(count: int | None, quiet: bool) -> Iterator[Listener]:
     def listener(outcome: Outcome) -> None:
         bar.update(task, advance=1)
         if not quiet:
-            bar.console.print(escape(_line(outcome)), highlight=False)
+            bar.console.print(escape(_line(outcome)), highlight=False, soft_wrap=True)
 
     with bar:
         yield listener

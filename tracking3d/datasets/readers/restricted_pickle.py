@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
 import pickle
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ class _Unpickler(pickle.Unpickler):
             raise pickle.UnpicklingError(
                 f"it holds {module}.{name}, only numpy arrays and plain values are read"
             )
-        return getattr(importlib.import_module(module.replace("numpy.core", "numpy._core")), name)
+        return super().find_class(module, name)
 
 
 def read_pickle(file: Path) -> Any:
@@ -36,7 +36,8 @@ def read_pickle(file: Path) -> Any:
         InputError: If the file is missing, damaged or holds anything else.
     """
     try:
-        with file.open("rb") as stream:
+        # Old names of numpy's modules still lead there, with a warning.
+        with file.open("rb") as stream, warnings.catch_warnings(action="ignore"):
             return _Unpickler(stream).load()
     except FileNotFoundError as error:
         raise InputError(f"There is no file {file}; check the path.") from error
