@@ -50,7 +50,8 @@ def test_half_the_strength_changes_less(name):
 def test_the_light_of_frame_0_is_the_same_and_that_of_later_frames_is_not(plain):
     lit = sequence({"light": 1.0}, object="blob")
     assert (lit.images[0] == plain.images[0]).all()
-    assert np.abs(lit.images[4].astype(int) - plain.images[4])[plain.masks[4]].mean() > 5
+    for region in (plain.masks[4], ~plain.masks[4]):
+        assert np.abs(lit.images[4].astype(int) - plain.images[4])[region].mean() > 5
 
 
 def test_highlights_brighten_the_object_only(plain):
@@ -106,7 +107,7 @@ def test_low_contrast_shrinks_grey_levels_to_a_fifth_around_the_middle(plain):
 
 
 @pytest.mark.parametrize("name", ["box", "mug"])
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("strength", [0.4, 1.0])
 def test_the_hand_hides_as_much_as_asked_at_its_worst_and_nothing_in_frame_0(name, seed, strength):
     covered = sequence({"occluder": strength}, object=name, seed=seed, frames=9, supersample=1)
@@ -125,6 +126,13 @@ def test_what_the_hand_hides_is_skin_and_it_throws_a_shadow():
     visible = np.stack([distance_transform_edt(mask) > 3 for mask in covered.visible_masks])
     darker = free.images.astype(int).sum(-1) - covered.images.sum(-1)
     assert (darker[visible] > 20).sum() > 100 and darker[visible].min() > -6
+
+
+def test_a_hand_that_comes_from_below_throws_no_shadow_on_the_object_since_the_lamp_is_above():
+    settings = {"seed": 4, "textured": False, "supersample": 1}
+    covered, free = sequence({"occluder": 1.0}, **settings), sequence(**settings)
+    assert np.sin(covered.scene.hand.angle) > 0.9
+    assert (covered.images == free.images)[covered.visible_masks].mean() > 0.98
 
 
 def test_a_wrong_field_of_view_is_told_but_not_rendered(plain):

@@ -39,7 +39,7 @@ def test_paths_are_rigid_and_smooth_even_between_frames(motion):
 
 
 @pytest.mark.parametrize("motion", MOTIONS)
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("fov", [10.0, 45.0, 90.0])
 def test_in_frame_0_the_object_is_centred_and_fills_the_asked_share_of_the_height(motion, seed, fov):
     camera = Camera.from_fov(320, 240, fov)
@@ -95,7 +95,7 @@ def test_a_drift_in_depth_doubles_the_distance():
     assert poses("tumble")[:, 2, 3].std() < 0.15 * z[0]
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("fov", [20.0, 45.0, 80.0])
 def test_an_object_that_leaves_is_wholly_out_of_the_image_for_a_while_and_comes_back(seed, fov):
     camera = Camera.from_fov(320, 240, fov)
@@ -112,6 +112,12 @@ def test_the_seed_changes_the_path_and_the_number_of_frames_does_not_change_its_
     assert np.abs(poses(motion, seed=3) - poses(motion, seed=4)).max() > 0.1
     if motion in ("tumble", "turntable", "flip", "fast"):
         assert poses(motion, frames=10) == pytest.approx(poses(motion, frames=30)[:10], abs=1e-9)
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_the_first_view_does_not_depend_on_the_speed(motion):
+    slow, fast = (poses(motion, degrees_per_frame=degrees)[0] for degrees in (0.0, 20.0))
+    assert slow == pytest.approx(fast, abs=1e-9)
 
 
 def test_one_frame_alone_has_a_pose():

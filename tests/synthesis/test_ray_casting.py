@@ -77,14 +77,14 @@ def test_precision_does_not_depend_on_the_unit(size):
 def test_edges_of_a_box_stay_sharp_and_a_texture_seam_of_a_cylinder_does_not_show():
     box = Surface.of(trimesh.creation.box())
     assert box.corner_normals == pytest.approx(np.repeat(box.face_normals[:, None], 3, 1))
-    cylinder = trimesh.creation.cylinder(1.0, 2.0, sections=64)
+    cylinder = trimesh.creation.cylinder(1.0, 2.0, sections=32)
     split = trimesh.Trimesh(
         cylinder.triangles.reshape(-1, 3), np.arange(3 * len(cylinder.faces)).reshape(-1, 3), process=False
     )
     surface = Surface.of(split)
     side = np.abs(surface.face_normals[:, 2]) < 0.5
     radial = surface.vertices[surface.faces[side]] * (1, 1, 0)
-    assert (surface.corner_normals[side] * radial).sum(2).min() > np.cos(np.radians(3))
+    assert (surface.corner_normals[side] * radial).sum(2).min() > np.cos(np.radians(2.5))
     assert (
         np.abs(surface.face_normals[side, :2]).max() < 1 and (surface.corner_normals[~side, :, :2] == 0).all()
     )

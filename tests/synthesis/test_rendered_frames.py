@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.ndimage import (
     binary_erosion,
     binary_fill_holes,
@@ -158,6 +159,16 @@ def test_a_lamp_at_the_upper_left_lights_that_side_and_the_object_shades_itself(
     assert light[upper_left].mean() > light[lower_right].mean() + 25
 
 
+def test_an_open_surface_shows_its_colour_on_both_sides(tmp_path):
+    square = trimesh.Trimesh([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]])
+    square.export(tmp_path / "square.ply")
+    rendered = sequence(object=str(tmp_path / "square.ply"), motion="flip", frames=10, degrees_per_frame=20.0)
+    facing = rendered.scene.T_cam_obj[:, 2, 2]
+    brightness = [image[mask].mean() for image, mask in zip(rendered.images, rendered.masks, strict=True)]
+    assert facing.min() < -0.9 and facing.max() > 0.9
+    assert brightness[facing.argmin()] == pytest.approx(brightness[facing.argmax()], rel=0.1)
+
+
 def test_bilinear_lookup_meets_texel_centres_averages_between_them_and_repeats():
     texture = np.arange(12, dtype=np.float32).reshape(2, 2, 3)  # row 0 is the upper one
     assert bilinear(texture, np.array([[0.25, 0.75]]))[0] == pytest.approx(texture[0, 0])
@@ -207,10 +218,20 @@ def test_visible_points_are_those_whose_depth_the_depth_image_shows():
     assert checked > 100
 
 
-def test_points_outside_the_image_or_behind_the_hand_are_not_visible():
-    leaving = sequence(object="box", motion="leave_and_return", frames=9)
-    gone = ~leaving.masks.any((1, 2))
-    assert gone.any() and not leaving.points.visible[gone].any()
+def test_points_outside_the_image_are_not_visible():
+    beyond = np.zeros(2, int)
+    for seed in (3, 4):  # the first leaves to the left, the second to the right
+        leaving = sequence(motion="leave_and_return", frames=9, seed=seed)
+        gone = ~leaving.masks.any((1, 2))
+        assert gone.any() and not leaving.points.visible[gone].any()
+        seen = leaving.points.positions[leaving.points.visible]
+        assert (seen > -0.5).all() and (seen < (95.5, 71.5)).all()
+        x = leaving.points.positions[..., 0]
+        beyond += ((x > -45) & (x < -1)).sum(), ((x > 97) & (x < 140)).sum()
+    assert beyond.min() > 50
+
+
+def test_points_behind_the_hand_are_not_visible():
     covered = sequence(object="box", frames=5, size=(160, 120), disturbances={"occluder": 1.0})
     checked = 0
     for n in range(5):

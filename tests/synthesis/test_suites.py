@@ -6,12 +6,12 @@ import json
 
 import numpy as np
 import pytest
-import typer
 from typer.testing import CliRunner
 
-from tracking3d.cli.program import Program
-from tracking3d.cli.synth import synth
+from tracking3d.cli import app
 from tracking3d.datasets.clip import read_truth
+from tracking3d.datasets.layout import load_layout
+from tracking3d.datasets.reading import read_sequence
 from tracking3d.errors import InputError, OutputError
 from tracking3d.synthesis import suite as suite_module
 from tracking3d.synthesis.frame_rendering import render_frame
@@ -33,9 +33,6 @@ def tiny(monkeypatch):
 @pytest.fixture
 def call(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    app = typer.Typer(cls=Program, pretty_exceptions_enable=False)
-    app.command(name="synth")(synth)
-    app.callback()(lambda: None)
     return lambda *words: CliRunner().invoke(app, ["synth", *map(str, words)])
 
 
@@ -167,6 +164,17 @@ def test_the_command_makes_one_sequence_of_its_options(call, tmp_path):
     before = (tmp_path / "out" / "info.json").stat().st_mtime_ns
     assert call(*words.split(), "--disturb", "noise=0.2", "--disturb", "wrong_fov=1", "-q").stdout == ""
     assert (tmp_path / "out" / "info.json").stat().st_mtime_ns == before
+
+
+def test_the_command_writes_bops_layout_too(call, tmp_path):
+    result = call("out", "--object", "card", "--frames", 2, "--size", "64,48", "--bop", "bop")
+    assert result.exit_code == 0, result.output
+    back = read_sequence(load_layout("bop"), tmp_path / "bop", "test/000001")
+    truth = read_truth(tmp_path / "out")
+    for n in range(2):
+        assert (back.masks[n].read() == truth.masks[n].read()).all()
+        assert back.T_cam_obj[n][:3, 3] == pytest.approx(100 * truth.T_cam_obj[n][:3, 3])
+    assert pytest.approx(truth.camera.K) == back.camera.K
 
 
 def test_the_command_makes_a_suite(call, tiny, tmp_path):

@@ -8,6 +8,7 @@ import trimesh
 from PIL import Image
 
 from tracking3d.errors import InputError
+from tracking3d.synthesis.frame_rendering import bilinear
 from tracking3d.synthesis.procedural_solids import PROCEDURAL
 from tracking3d.synthesis.ray_casting import Surface
 from tracking3d.synthesis.scene import make_solid
@@ -79,6 +80,9 @@ def test_the_seed_changes_the_texture_and_only_the_blobs_shape():
 @pytest.mark.parametrize("name", PROCEDURAL)
 def test_a_textureless_object_has_nearly_one_colour(name):
     plain, printed = solid(name, textured=False).texture, solid(name).texture
+    made = solid(name, textured=False)
+    seen = bilinear(made.texture.astype(np.float32), made.uvs[made.faces].mean(1))
+    assert np.ptp(seen, axis=0).max() < 30  # all faces, none of them blank
     painted = plain[plain.any(2)]  # a texture may have more room than panels
     assert 0.2 < painted.std(0).max() < 4
     assert printed.std((0, 1)).min() > 25

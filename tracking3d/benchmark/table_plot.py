@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from tracking3d.benchmark.table import Filled, Line
-from tracking3d.errors import OutputError
+from tracking3d.speed.plot import save_figure
 
 _WIDTH = 0.4
 
@@ -17,7 +17,6 @@ def plot_table(filled: Filled, path: Path) -> None:
         OutputError: If it cannot be written.
     """
     # The figure draws on no screen: pyplot, which would choose one, is not involved.
-    from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     lines = [line for line in filled.lines if line.paper is not None or line.here is not None]
@@ -38,15 +37,7 @@ def plot_table(filled: Filled, path: Path) -> None:
     axes.set_ylabel("average recall" if filled.name == "bop" else "IoU")
     axes.grid(axis="y", alpha=0.3)
     axes.legend(loc="upper left", ncols=2, frameon=False)
-    # The same table gives the same file.
-    metadata = {".svg": {"Date": None, "Creator": None}, ".pdf": {"CreationDate": None}}.get(
-        path.suffix.lower()
-    )
-    try:
-        with rc_context({"svg.hashsalt": "tracking3d"}):
-            figure.savefig(path, dpi=150, metadata=metadata)
-    except OSError as error:
-        raise OutputError(f"{path} cannot be written: {error.strerror}") from error
+    save_figure(figure, path)
 
 
 def _floor(lines: list[Line]) -> float:

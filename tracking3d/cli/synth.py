@@ -76,6 +76,9 @@ def synth(
     seed: Annotated[
         int | None, typer.Option(metavar="N", help="Seed of all that is random.", rich_help_panel=_ONE)
     ] = None,
+    bop: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Write them as a data set in BOP's layout too.")
+    ] = None,
     jobs: Annotated[int, typer.Option(min=1, max=256, help="Processes that make a suite.")] = 1,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Make again what is complete.")] = False,
     quiet: Quiet = False,
@@ -103,16 +106,18 @@ def synth(
             f"--suite {suite} is fixed and does not go with --{next(iter(settings))}; leave one of them out."
         )
     if suite is not None:
-        _make_suite(suite, out, jobs, overwrite, quiet)
+        folders = _make_suite(suite, out, jobs, overwrite, quiet)
     elif object_ is not None:
-        _make_one(settings, out, overwrite, quiet)
+        folders = _make_one(settings, out, overwrite, quiet)
     else:
         raise InputError(
             "Say what to make: --suite smoke, standard or full, or one sequence by --object NAME."
         )
+    if bop is not None:
+        _export(folders, bop, quiet)
 
 
-def _make_suite(name: str, out: Path, jobs: int, overwrite: bool, quiet: bool) -> None:
+def _make_suite(name: str, out: Path, jobs: int, overwrite: bool, quiet: bool) -> list[Path]:
     from tracking3d.synthesis.suite import load_suite, make_suite
 
     specs = load_suite(name)
@@ -120,9 +125,19 @@ def _make_suite(name: str, out: Path, jobs: int, overwrite: bool, quiet: bool) -
         folders = make_suite(name, out, jobs=jobs, overwrite=overwrite, listener=advance)
     if not quiet:
         typer.echo(f"{out}: {len(folders)} sequences")
+    return folders
 
 
-def _make_one(settings: dict[str, Any], out: Path, overwrite: bool, quiet: bool) -> None:
+def _export(folders: list[Path], bop: Path, quiet: bool) -> None:
+    from tracking3d.datasets.bop_export import write_bop
+    from tracking3d.datasets.clip import read_truth
+
+    write_bop(bop, [read_truth(folder) for folder in folders])
+    if not quiet:
+        typer.echo(f"{bop}: {len(folders)} scenes in BOP's layout")
+
+
+def _make_one(settings: dict[str, Any], out: Path, overwrite: bool, quiet: bool) -> list[Path]:
     from tracking3d.synthesis.spec import check_spec
     from tracking3d.synthesis.writing import is_complete, write_sequence
 
@@ -138,6 +153,7 @@ def _make_one(settings: dict[str, Any], out: Path, overwrite: bool, quiet: bool)
             write_sequence(out, spec, lambda frame: advance(f"frame {frame}"))
     if not quiet:
         typer.echo(f"{out}: {spec.frames} frames")
+    return [out]
 
 
 def _strength(item: str) -> tuple[str, float]:

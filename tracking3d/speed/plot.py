@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tracking3d.errors import InputError, OutputError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 FORMATS = (".svg", ".png", ".pdf")
 _LABELS = {
@@ -46,7 +49,6 @@ def plot_growth(growth: dict[str, dict[str, Any]], path: Path) -> None:
         OutputError: If it cannot be written.
     """
     # The figure draws on no screen: pyplot, which would choose one, is not involved.
-    from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8, 6), layout="constrained")
@@ -58,7 +60,17 @@ def plot_growth(growth: dict[str, dict[str, Any]], path: Path) -> None:
         panel.set_ylabel("one iteration [ms]")
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False)
-    # The same measurements give the same file.
+    save_figure(figure, path)
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a matplotlib figure so that equal figures give equal files.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
+    from matplotlib import rc_context
+
     metadata = {".svg": {"Date": None, "Creator": None}, ".pdf": {"CreationDate": None}}.get(
         path.suffix.lower()
     )
