@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tracking3d.benchmark import suite as suite_module
 from tracking3d.benchmark.pool import Outcome
@@ -130,10 +131,24 @@ def test_results_of_others_are_scored_and_said_to_be_recognised(call, clips):
     assert scores["rotation_error_mean_deg"] is None
 
 
+def test_an_option_of_a_format_is_handed_on(call, clips, refused, tmp_path):
+    poses = json.loads((clips / "one/poses.json").read_text())["frames"]
+    lines = []
+    for number, pose in enumerate(poses.values()):
+        R, t = np.array(pose["R"]), np.array(pose["t"])
+        q = Rotation.from_matrix(R.T).as_quat()
+        lines.append(" ".join(str(value) for value in (number, *(-R.T @ t), *q)))
+    (tmp_path / "slam.txt").write_text("\n".join(lines))
+    arguments = ("evaluate", "slam.txt", "--truth", clips / "one")
+    scores = json.loads(call(*arguments, "--option", "of=camera", "--json").stdout)
+    assert scores["rotation_error_max_deg"] == pytest.approx(0, abs=1e-4)
+    assert json.loads(call(*arguments, "--json").stdout)["rotation_error_max_deg"] > 1
+    assert "no such option" in refused(*arguments, "--option", "off=camera")
+    assert "--option of cannot be read" in refused(*arguments, "--option", "of")
+
+
 def test_colmap_is_a_peer_whose_unregistered_frames_are_lost(call, clips, tmp_path):
     poses = json.loads((clips / "one/poses.json").read_text())["frames"]
-    from scipy.spatial.transform import Rotation
-
     lines = []
     for number, name in enumerate(list(poses)[:2], 1):
         x, y, z, w = Rotation.from_matrix(poses[name]["R"]).as_quat()

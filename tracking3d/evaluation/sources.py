@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from tracking3d.datasets.answers import Answers
 from tracking3d.datasets.readers import read_answers
 from tracking3d.datasets.run_answers import answers_of_run
 from tracking3d.datasets.truth import Truth
+from tracking3d.errors import InputError
 from tracking3d.results import layout
 
 RUN_FOLDER = "run"
 
 
-def open_answers(path: Path, truth: Truth, form: str | None = None) -> tuple[Answers, str]:
+def open_answers(path: Path, truth: Truth, form: str | None = None, **options: Any) -> tuple[Answers, str]:
     """Read answers for the clip that ``truth`` is about.
 
     Args:
         path: A run folder, or what `tracking3d.datasets.readers.read_answers` reads.
         truth: The clip.
         form: ``run`` or a format of `read_answers`; recognised if None.
+        options: Of that format, such as ``of`` of a trajectory; a run folder has none.
 
     Returns:
         The answers, and what they were read as, in words.
@@ -30,5 +33,9 @@ def open_answers(path: Path, truth: Truth, form: str | None = None) -> tuple[Ans
     known_to_be_other = form not in (None, RUN_FOLDER)
     looks_like_a_run = (path / layout.RUN).exists() or not path.exists()
     if form == RUN_FOLDER or (looks_like_a_run and not known_to_be_other):
+        if options:
+            raise InputError(
+                f"{path} is a run folder, which has no option {next(iter(options))}; leave it out."
+            )
         return answers_of_run(path, truth), "a run folder"
-    return read_answers(path, truth, form)
+    return read_answers(path, truth, form, **options)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from tracking3d.cli.options import Debug
+from tracking3d.errors import InputError
 
 
 def answers(
@@ -23,6 +24,12 @@ def answers(
         str | None,
         typer.Option("--format", metavar="NAME", help="Format of the answers; recognised if left out."),
     ] = None,
+    options: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--option", metavar="KEY=VALUE", help="Option of the format, such as of=camera; may be repeated."
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON only.")] = False,
     debug: Debug = False,
 ) -> None:
@@ -37,7 +44,7 @@ def answers(
     from tracking3d.evaluation.sources import open_answers
 
     known = read_truth(truth)
-    given, kind = open_answers(results, known, form)
+    given, kind = open_answers(results, known, form, **_read_options(options))
     if form is None and not as_json:
         typer.echo(f"{results} is read as {kind}.", err=True)
     scores = score(given, known)
@@ -45,3 +52,14 @@ def answers(
         typer.echo(json.dumps(asdict(scores), indent=2))
     else:
         print_table(format_scores(scores))
+
+
+def _read_options(items: list[str] | None) -> dict[str, Any]:
+    """``KEY=VALUE`` items; a value is YAML."""
+    from tracking3d.config.yaml_files import parse_yaml
+
+    pairs = [item.partition("=") for item in items or ()]
+    for key, equals, value in pairs:
+        if not key.isidentifier() or not equals:
+            raise InputError(f"--option {key}{equals}{value} cannot be read; write it as KEY=VALUE.")
+    return {key: parse_yaml(value, f"--option {key}={value}") for key, _, value in pairs}
