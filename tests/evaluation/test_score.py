@@ -152,6 +152,13 @@ def test_a_frame_without_initial_mask_has_an_initial_iou_of_zero(write_run, clip
     assert scores.share_worse_than_initial == 0.0
 
 
+def test_no_initial_mask_is_right_where_the_object_is_out_of_sight(write_run, clip):
+    empty = np.zeros((HEIGHT, WIDTH), bool)
+    cv2.imwrite(str(clip / "masks" / "000006.png"), empty.astype(np.uint8))
+    initial = {n: square(0) for n in range(FRAMES) if n != 6}
+    assert score_run(write_run(masks={6: empty}, initial=initial), clip).iou_initial_mean == 1.0
+
+
 def test_no_initial_mask_at_all_leaves_the_gain_unknown(write_run, clip):
     scores = score_run(write_run(initial={}), clip)
     assert scores.iou_initial_mean == 0.0

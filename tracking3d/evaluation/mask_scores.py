@@ -16,6 +16,7 @@ from tracking3d.evaluation.metrics import mask_iou
 from tracking3d.evaluation.vot import rectangle_overlap
 from tracking3d.frames import Box
 from tracking3d.trackers.crops import box_of
+from tracking3d.video.image_file import read_image
 
 Mask = NDArray[np.bool_]
 _EQUAL = 1e-9
@@ -29,7 +30,7 @@ class MaskScores:
     there is no boundary.
 
     Attributes:
-        iou_initial_mean: Mean IoU of the mask tracker's masks; 0 where it gave none.
+        iou_initial_mean: Mean IoU of the mask tracker's masks.
         iou_mean: Mean IoU of the answers.
         iou_gain_percent: How much larger `iou_mean` is than `iou_initial_mean`.
         share_worse_than_initial: Share of frames where the answer's IoU is the smaller one by more than 1e-9.
@@ -52,7 +53,9 @@ class MaskScores:
 
 @dataclass(frozen=True)
 class FrameMasks:
-    """One frame's masks beside the true one; 0 for a mask that is not there, NaN without a true boundary.
+    """One frame's masks beside the true one; NaN without a true boundary.
+
+    In a frame with an answer, no mask is an empty one; in one without, everything is 0.
 
     Attributes:
         iou: Of the answer.
@@ -104,6 +107,8 @@ def score_masks(compared: Mapping[int, FrameMasks], answers: Answers, truth: Tru
 
 def _compare(answers: Answers, truth: Truth, index: int) -> FrameMasks:
     masks = [_read(references, index) for references in (answers.masks, answers.initial_masks)]
+    if index in answers.answered:  # no mask is an empty one: it says that the object is nowhere
+        masks = [np.zeros(_size(truth, index), bool) if mask is None else mask for mask in masks]
     if index not in truth.masks:
         true_box = truth.boxes[index]
         ious = [0.0 if mask is None else _box_iou(mask, true_box) for mask in masks]
@@ -128,6 +133,13 @@ def _box_iou(mask: Mask, true_box: Box) -> float:
     """IoU of the box around a mask and the true one, in whole pixels as VOT takes it."""
     box = box_of(mask) or (0.0, 0.0, 0.0, 0.0)
     return rectangle_overlap(box, true_box, (mask.shape[1], mask.shape[0]))
+
+
+def _size(truth: Truth, index: int) -> tuple[int, int]:
+    height, width = (
+        truth.masks[index].read() if index in truth.masks else read_image(truth.frames[index])
+    ).shape[:2]
+    return height, width
 
 
 def _read(references: Mapping[int, MaskReference] | None, index: int) -> Mask | None:
