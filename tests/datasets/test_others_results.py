@@ -506,6 +506,39 @@ def test_registered_images_have_poses_and_the_others_are_lost(truth, tmp_path, w
     assert answers.lost == {2} and answers.asked == range(COUNT)
 
 
+POINTS = np.array([[7.0, -2.0, 30.0], [9.0, 0.0, 31.0], [8.0, 4.0, 90.0]])
+
+
+def points_text(folder):
+    lines = [f"{n} {x} {y} {z} 10 20 30 0.5 1 2 3 4" for n, (x, y, z) in enumerate(POINTS)]
+    (folder / "points3D.txt").write_text("\n".join(["# 3D point list", *lines, ""]))
+
+
+def points_binary(folder):
+    data = struct.pack("<Q", len(POINTS))
+    for n, point in enumerate(POINTS):
+        data += struct.pack("<Q3d3BdQ", n, *point, 10, 20, 30, 0.5, n) + n * struct.pack("<2i", 1, 2)
+    (folder / "points3D.bin").write_bytes(data)
+
+
+@pytest.mark.parametrize("write_points", [points_text, points_binary])
+def test_the_origin_of_a_model_is_moved_to_the_median_of_its_points(truth, tmp_path, write_points):
+    folder = colmap_text(tmp_path / "m", MODEL)
+    write_points(folder)
+    answers = answers_from_colmap(folder, truth)
+    for n in (0, 1, 3):
+        assert answers.T_cam_obj[n][:3, :3] == pytest.approx(pose(n)[:3, :3])
+        assert answers.T_cam_obj[n][:3, 3] == pytest.approx((pose(n) @ [8, 0, 31, 1])[:3])
+
+
+@pytest.mark.parametrize(("name", "data"), [("points3D.bin", b"\x05\0\0"), ("points3D.txt", b"1 2 3\n")])
+def test_damaged_points_of_a_model_are_named(truth, tmp_path, name, data):
+    folder = colmap_text(tmp_path / "m", MODEL)
+    (folder / name).write_bytes(data)
+    with pytest.raises(InputError, match=name.replace(".", r"\.")):
+        answers_from_colmap(folder, truth)
+
+
 def test_an_image_of_a_text_model_may_have_no_points(truth, tmp_path):
     answers = answers_from_colmap(colmap_text(tmp_path / "m", MODEL, points=""), truth)
     poses_agree(answers.T_cam_obj, {n: pose(n) for n in (0, 1, 3)})

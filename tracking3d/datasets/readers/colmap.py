@@ -1,7 +1,9 @@
 """Camera poses of a COLMAP model, text or binary, with the object as the world.
 
 COLMAP's poses map world to camera with OpenCV's axes, so they are ``T_cam_obj`` where the model is of the object alone.
-Only ``images`` is read; ``cameras``, ``points3D``, ``rigs`` and ``frames`` tell nothing more about poses.
+The world's origin is moved to the median of the model's points: COLMAP leaves it near the cameras, and where these are
+close together, that is many times their distances away from the object. ``cameras``, ``rigs`` and ``frames`` tell
+nothing more about poses.
 Format: https://colmap.github.io/format.html
 """
 
@@ -16,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tracking3d.datasets.answers import Answers
+from tracking3d.datasets.readers.colmap_points import read_points
 from tracking3d.datasets.readers.text_files import read_text
 from tracking3d.datasets.truth import Truth
 from tracking3d.errors import InputError
@@ -41,13 +44,17 @@ def answers_from_colmap(folder: Path, truth: Truth) -> Answers:
     Raises:
         InputError: If there is no model, it is damaged, or it has no image with the name of a frame.
     """
-    models = [_read_images(file) for file in _models(folder)]
+    models = {file: _read_images(file) for file in _models(folder)}
     if not models:
         raise InputError(
             f"{folder} holds no COLMAP model; give the folder of images.bin or images.txt, or the one above it."
         )
     index = {name: n for n, name in enumerate(truth.names)}
-    stems = {PurePosixPath(name).stem: pose for name, pose in max(models, key=len).items()}
+    largest = max(models, key=lambda file: len(models[file]))
+    T_world_obj = np.eye(4)
+    if len(points := read_points(largest.parent)):
+        T_world_obj[:3, 3] = np.median(points, axis=0)
+    stems = {PurePosixPath(name).stem: pose @ T_world_obj for name, pose in models[largest].items()}
     poses = {index[stem]: pose for stem, pose in stems.items() if stem in index}
     if not poses:
         raise InputError(
