@@ -559,7 +559,7 @@ def test_of_several_models_the_one_with_most_images_counts(truth, tmp_path):
 
 def test_rigs_and_frames_of_new_models_are_ignored(truth, tmp_path):
     folder = colmap_binary(tmp_path / "m", MODEL)
-    for name in ("rigs.bin", "frames.bin", "points3D.bin", "cameras.bin"):
+    for name in ("rigs.bin", "frames.bin", "cameras.bin"):
         (folder / name).write_bytes(b"\xff")
     assert len(answers_from_colmap(folder, truth).T_cam_obj) == 3
 
