@@ -33,14 +33,15 @@ def plot_table(filled: Filled, path: Path) -> None:
     axes.set_xticks(
         range(len(lines)), [line.label for line in lines], rotation=35, ha="right", fontsize="small"
     )
-    axes.set_ylim(_floor(lines), 1.08)
+    axes.set_ylim(*_limits(lines))
     axes.set_ylabel("average recall" if filled.name == "bop" else "IoU")
     axes.grid(axis="y", alpha=0.3)
     axes.legend(loc="upper left", ncols=2, frameon=False)
     save_figure(figure, path)
 
 
-def _floor(lines: list[Line]) -> float:
-    """Where the axis begins: tenths below the least value, so that differences are seen."""
-    least = min(value for line in lines for value in (line.paper, line.here) if value is not None)
-    return max(0.0, int(10 * least - 1) / 10)
+def _limits(lines: list[Line]) -> tuple[float, float]:
+    """Ends of the axis: near the least and the largest value, so that differences are seen, with room for labels."""
+    values = [value for line in lines for value in (line.paper, line.here) if value is not None]
+    low = max(0.0, int(20 * min(values) - 1) / 20)
+    return low, low + 1.4 * (max(values) - low)
