@@ -63,7 +63,8 @@ def run_jobs(
                 outcome = _run(job, stop)
         except Tracking3dError as error:  # the sequence cannot be read
             outcome = Outcome(job, None, str(error))
-        listener(outcome)
+        if not stop.is_set():  # what was stopped did not fail
+            listener(outcome)
         return outcome
 
     with ThreadPoolExecutor(max(processes, 1)) as pool:
