@@ -13,17 +13,21 @@ from tracking3d.datasets.truth import Truth
 from tracking3d.results.description import versions
 
 PACKAGE = Path(__file__).parents[1]
-JUDGES = frozenset({"benchmark", "cli", "datasets", "evaluation", "speed", "synthesis", "vot"})
-"""Rooms that measure what a run is worth; a change in them changes scores, not runs."""
+JUDGES = frozenset({"datasets", "evaluation"})
+"""Rooms that scores depend on, and runs do not."""
+
+BYSTANDERS = frozenset({"benchmark", "cli", "speed", "synthesis", "vot"})
+"""Rooms that neither depends on."""
 
 
 @cache
 def code_fingerprint(*, judges: bool) -> str:
-    """Hash of the package's sources, of `JUDGES` or of all other rooms, and of the versions it runs with."""
+    """Hash of the sources that scores depend on, or of those that runs depend on, and of the versions they run with."""
     digest = hashlib.sha256(json.dumps(versions(), sort_keys=True).encode())
     for path in sorted(PACKAGE.rglob("*")):
         inside = path.relative_to(PACKAGE)
-        if path.suffix in (".py", ".yaml") and (inside.parts[0] in JUDGES) == judges:
+        room = inside.parts[0]
+        if path.suffix in (".py", ".yaml") and room not in BYSTANDERS and (room in JUDGES) == judges:
             digest.update(inside.as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
     return digest.hexdigest()
 
