@@ -131,10 +131,10 @@ def _line(
     )
     if row.initial:
         return line
-    answer, start = result.mean("iou_mean"), result.mean("iou_initial_mean")
+    start = result.mean("iou_initial_mean") if table.measure == "iou_mean" else None
     return replace(
         line,
-        gain_percent=100 * (answer / start - 1) if answer is not None and start else None,
+        gain_percent=100 * (line.here / start - 1) if line.here is not None and start else None,
         rotation_error_mean_deg=result.mean("rotation_error_mean_deg"),
         seconds_per_frame=result.mean("seconds_per_frame"),
     )
