@@ -39,6 +39,7 @@ def asked(monkeypatch):
                     name: {
                         "iou_initial_mean": 0.7,
                         "iou_mean": IOU.get(variant.label, 0.77),
+                        "iou_gain_percent": 10.0 if "box" in name else -1.0,
                         "bop_ar": 0.4,
                         "rotation_error_mean_deg": 3.0,
                         "seconds_per_frame": 0.5,
@@ -169,7 +170,7 @@ def test_a_table_is_the_same_in_every_format(asked, tmp_path):
     assert float(rows[1]["here"]) == document["lines"][1]["here"]
     markdown = to_markdown(filled)
     assert markdown.startswith(filled.caption)
-    assert "| no L_M | 0.6890 | -2.0 | 0.7700 | +10.0 | 3.0 | 0.50 | 2 |  |" in markdown
+    assert "| no L_M | 0.6890 | -2.0 | 0.7700 | +10.0 | 3.0 | 0.50 | 2 | 1 |  |" in markdown
     assert format_table(filled).row_count == len(rows)
     assert {file.suffix for file in write_table(filled, tmp_path / "t")} == {".md", ".csv", ".json"}
 

@@ -23,7 +23,18 @@ from tracking3d.benchmark.variant import Variant
 from tracking3d.results.files import write_atomic, writing
 
 SEED = 0
-COLUMNS = ("row", "paper", "paper gain %", "here", "gain %", "rotation °", "s/frame", "sequences", "note")
+COLUMNS = (
+    "row",
+    "paper",
+    "paper gain %",
+    "here",
+    "gain %",
+    "rotation °",
+    "s/frame",
+    "sequences",
+    "improved",
+    "note",
+)
 
 
 @dataclass(frozen=True)
@@ -39,6 +50,7 @@ class Line:
         rotation_error_mean_deg: Mean rotation error, where the poses are known.
         seconds_per_frame: Mean wall time.
         sequences: Number of sequences that the figures here are the mean of.
+        improved: Number of those whose mean IoU is above that of their initial masks; None where none is compared.
         note: Why something is missing.
     """
 
@@ -50,6 +62,7 @@ class Line:
     rotation_error_mean_deg: float | None = None
     seconds_per_frame: float | None = None
     sequences: int = 0
+    improved: int | None = None
     note: str = ""
 
 
@@ -135,6 +148,9 @@ def _line(
     return replace(
         line,
         gain_percent=100 * (line.here / start - 1) if line.here is not None and start else None,
+        improved=None
+        if start is None
+        else sum(gain > 0 for gain in result.values("iou_gain_percent").values()),
         rotation_error_mean_deg=result.mean("rotation_error_mean_deg"),
         seconds_per_frame=result.mean("seconds_per_frame"),
     )
@@ -164,6 +180,7 @@ def cells(line: Line) -> tuple[str, ...]:
         _number(line.rotation_error_mean_deg, 1),
         _number(line.seconds_per_frame, 2),
         str(line.sequences or ""),
+        "" if line.improved is None else str(line.improved),
         line.note,
     )
 
