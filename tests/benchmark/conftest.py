@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
 from tracking3d.benchmark.variant import Variant
@@ -73,10 +72,3 @@ def scripted(tmp_path, monkeypatch):
         return Variant(label=label, config=config, masks=masks)
 
     return make
-
-
-@pytest.fixture
-def square():
-    mask = np.zeros((48, 64), bool)
-    mask[10:30, 20:40] = True
-    return mask

@@ -58,6 +58,10 @@ def test_what_a_result_depends_on_is_in_its_key(jobs, scripted, clips, tmp_path,
     assert jobs(scripted(), ["narrow"])[0].folder != folder
     (clips / "narrow/frames/000003.png").unlink()
 
+    with monkeypatch.context() as newer:
+        newer.setattr(job_module, "plugin_versions", lambda *names: [("scripted", "somebody", "2.0")])
+        assert jobs(scripted(), ["narrow"])[0].folder != folder
+
     code = job_module.code_fingerprint
     monkeypatch.setattr(job_module, "code_fingerprint", lambda judges: code(judges=judges) + "x" * judges)
     [rescored] = jobs(scripted(), ["narrow"])

@@ -10,6 +10,7 @@ from typing import Any
 
 from tracking3d.benchmark.variant import DEGRADED
 from tracking3d.datasets.truth import Truth
+from tracking3d.plugins import list_plugins
 from tracking3d.results.description import versions
 
 PACKAGE = Path(__file__).parents[1]
@@ -49,6 +50,12 @@ def masks_fingerprint(masks: str, sequence: str) -> str:
     folder = Path(masks) / sequence
     files = sorted(folder.iterdir()) if folder.is_dir() else []
     return key(*((file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files))
+
+
+def plugin_versions(*names: str) -> list[tuple[str, str, str]]:
+    """Name, package and version of the plug-ins called ``names``: others' code is not among the hashed sources."""
+    known = (info for info in list_plugins() if info.name in names and info.status == "ok")
+    return sorted((info.name, info.package, info.version) for info in known)
 
 
 def key(*parts: Any) -> str:

@@ -14,7 +14,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from tracking3d.benchmark.fingerprint import code_fingerprint, frames_fingerprint, key, masks_fingerprint
+from tracking3d.benchmark.fingerprint import (
+    code_fingerprint,
+    frames_fingerprint,
+    key,
+    masks_fingerprint,
+    plugin_versions,
+)
 from tracking3d.benchmark.initial_masks import masks_for
 from tracking3d.benchmark.variant import Variant
 from tracking3d.config.models import PipelineConfig
@@ -67,9 +73,10 @@ class Job:
     @cached_property
     def run_key(self) -> str:
         """What the run depends on."""
-        masks = self.variant.masks
+        masks, config = self.variant.masks, self.config
         return key(
-            self.config.model_dump(mode="json"),
+            plugin_versions(config.tracker.name, config.features.name),
+            config.model_dump(mode="json"),
             self.truth.box,
             masks,
             masks_fingerprint(masks, self.sequence),

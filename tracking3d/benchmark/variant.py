@@ -12,11 +12,6 @@ from tracking3d.errors import InputError
 
 DEGRADED = "degraded:"
 
-MASKS_HELP = (
-    "Initial masks: tracker (the mask tracker of the configuration), truth, initial (those that come with the "
-    "clip), degraded:IOU (the truth made worse), or a folder with one of masks for every sequence."
-)
-
 
 class Variant(BaseModel):
     """One way to run every sequence.

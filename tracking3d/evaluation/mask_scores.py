@@ -121,9 +121,7 @@ def _compare(answers: Answers, truth: Truth, index: int) -> FrameMasks:
                 f"true one of {truth.name} {true.shape[1]} x {true.shape[0]}; give the clip it was made on."
             )
     ious = [0.0 if mask is None else mask_iou(mask, true) for mask in masks]
-    if (
-        truth.boxes
-    ):  # the mask is there because it is empty: what is known of the boundary is of absent objects only
+    if truth.boxes:  # true masks beside boxes are empty ones: they tell nothing of boundaries
         return FrameMasks(ious[0], ious[1], np.nan, np.nan, bool(true.any()))
     boundaries = [0.0 if mask is None else boundary_f(mask, true) for mask in masks]
     return FrameMasks(ious[0], ious[1], boundaries[0], boundaries[1], bool(true.any()))
