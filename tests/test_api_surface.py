@@ -57,7 +57,7 @@ AT_LEAST = {
     "tracking3d.evaluation.metrics": """aligned_rotation_errors anchored_rotation_errors
         consecutive_rotation_errors mask_iou rotation_alignment share_under""",
     "tracking3d.evaluation.score": "Scores score score_run",
-    "tracking3d.synthesis.mask_degradation": "DEGRADED_LEVELS Faults degrade_to_iou",
+    "tracking3d.synthesis.mask_degradation": "Faults degrade_to_iou",
     "tracking3d.synthesis.spec": "Disturbances SequenceSpec",
     "tracking3d.synthesis.suite": "SUITES SUITE_VERSION load_suite make_suite",
     "tracking3d.synthesis.convex_clips": """SyntheticClip SyntheticSpec degrade_masks make_demo_clip

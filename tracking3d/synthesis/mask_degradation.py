@@ -16,10 +16,6 @@ from scipy.ndimage import gaussian_filter1d
 from tracking3d.evaluation.metrics import mask_iou
 from tracking3d.frames import Image
 
-DEGRADED_LEVELS = {"csrt": 0.498, "d3s": 0.732, "ostrack": 0.758}
-"""Mean IoU of three trackers' masks on real videos (Rozumnyi et al., Tracking by 3D Model Estimation of Unknown
-Objects in Videos, ICCV 2023, Table 1); https://arxiv.org/abs/2304.06419."""
-
 TOLERANCE = 0.005
 """How near to the asked mean IoU the bisection stops."""
 
