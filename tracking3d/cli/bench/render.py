@@ -1,4 +1,4 @@
-"""``tracking3d bench``: how fast the parts are on this machine."""
+"""``tracking3d bench render``: how fast the renderer is on this machine."""
 
 from __future__ import annotations
 
@@ -9,15 +9,7 @@ import typer
 
 from tracking3d.cli.options import Debug
 
-app = typer.Typer(help="Measure how fast the parts are on this machine.", no_args_is_help=True)
 
-
-@app.callback()
-def _group() -> None:
-    pass
-
-
-@app.command()
 def render(
     size: Annotated[int, typer.Option(min=16, max=1024, help="Side of the window in pixels.")] = 128,
     frames: Annotated[int, typer.Option(min=1, max=64, help="Frames in one batch.")] = 7,

@@ -1,0 +1,1 @@
+"""Neural networks in ONNX files: where they are found and how they are run."""

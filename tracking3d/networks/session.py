@@ -1,0 +1,100 @@
+"""A neural network in an ONNX file, run by onnxruntime on the CPU.
+
+Nothing but the ONNX graph is read: no code is run from a model file and nothing is unpickled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+from numpy.typing import NDArray
+
+from tracking3d.errors import InputError
+
+
+@dataclass(frozen=True)
+class TensorInfo:
+    """What a network says of one input or output.
+
+    Attributes:
+        name: Its name.
+        shape: Its sizes; None where any size will do.
+        dtype: Its element type, as numpy calls it.
+    """
+
+    name: str
+    shape: tuple[int | None, ...]
+    dtype: str
+
+
+class Network:
+    """An ONNX network ready to run; the same input gives the same output.
+
+    Args:
+        file: The ONNX file.
+        threads: CPU threads of one run.
+
+    Attributes:
+        file: The ONNX file.
+        inputs: Its inputs by name, in the network's order.
+        outputs: Its outputs by name, in the network's order.
+
+    Raises:
+        InputError: If the file is absent or is no ONNX network that onnxruntime can run.
+    """
+
+    def __init__(self, file: Path, threads: int = 1) -> None:
+        self.file = Path(file)
+        if not self.file.is_file():
+            raise InputError(f"The network {self.file} does not exist; give the path of an ONNX file.")
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = threads
+        options.inter_op_num_threads = 1
+        options.log_severity_level = 4  # what fails is raised and told in one sentence
+        # Waiting threads must not occupy the cores that the renderer needs.
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        try:
+            self._session = onnxruntime.InferenceSession(
+                str(self.file), options, providers=["CPUExecutionProvider"]
+            )
+        except Exception as error:  # onnxruntime's exceptions have no common base of their own
+            raise InputError(
+                f"{self.file} is not a network that onnxruntime can run ({_told(error)}); give an ONNX file."
+            ) from error
+        self.inputs = {node.name: _info(node) for node in self._session.get_inputs()}
+        self.outputs = {node.name: _info(node) for node in self._session.get_outputs()}
+
+    def run(self, feeds: Mapping[str, NDArray]) -> dict[str, NDArray]:
+        """Run the network once.
+
+        Args:
+            feeds: An array for each input, by name.
+
+        Returns:
+            Every output by name.
+
+        Raises:
+            InputError: If the network does not take these arrays.
+        """
+        try:
+            results = self._session.run(list(self.outputs), dict(feeds))
+        except Exception as error:
+            shapes = ", ".join(f"{name} {np.shape(value)}" for name, value in feeds.items())
+            raise InputError(f"{self.file} cannot be run on {shapes}: {_told(error)}.") from error
+        return dict(zip(self.outputs, results, strict=True))
+
+
+def _info(node: onnxruntime.NodeArg) -> TensorInfo:
+    shape = tuple(size if isinstance(size, int) else None for size in node.shape)
+    kind = node.type.removeprefix("tensor(").removesuffix(")")
+    return TensorInfo(node.name, shape, {"float": "float32", "double": "float64"}.get(kind, kind))
+
+
+def _told(error: Exception) -> str:
+    """The first line of what onnxruntime says, without its error codes."""
+    text = " ".join(str(error).split()).rpartition(" : ")[2].rstrip(".")
+    return text if len(text) <= 200 else text[:197] + "..."
