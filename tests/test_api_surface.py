@@ -16,6 +16,9 @@ from tracking3d.evaluation.score import Scores
 EXACT = {
     "tracking3d": """Frame FrameEstimate ObjectModel PipelineConfig Prompt Session Status __version__ load_config
         track""",
+    "tracking3d.plugins": """FEATURES PluginInfo TRACKERS VARIABLE build_plugin check_options list_plugins
+        load_plugin plugin_label""",
+    "tracking3d.testing": "check_encoder check_tracker",
     "tracking3d.rendering": """BackProjection BackendName Contour NormalEquations Rendering SoftBand TexelMap Visibility
         back_project channels_last contour_loss contour_normal_equations find_contour interpolate
         pose_normal_equations prepare_backend project rasterize render sample_texture signed_distance
@@ -70,7 +73,9 @@ AT_LEAST = {
     "tracking3d.geometry.pose": "Pose",
     "tracking3d.geometry.prototypes": "ellipsoid from_file icosphere sphere",
     "tracking3d.pipeline": "Session track",
-    "tracking3d.plugins": "FEATURES TRACKERS PluginInfo build_plugin check_options list_plugins load_plugin",
+    "tracking3d.networks.download": "adopt fetch",
+    "tracking3d.networks.session": "Network TensorInfo",
+    "tracking3d.networks.store": "find_network",
     "tracking3d.prompts": "make_prompt parse_box",
     "tracking3d.recording": "record",
     "tracking3d.results.correspondences": "PointTracks track_points",
@@ -90,7 +95,7 @@ FIELDS = {
     tracking3d.Frame: "index image time name",
     tracking3d.Prompt: "box mask",
     tracking3d.FrameEstimate: """index time T_cam_obj mask initial_mask status reason confidence losses
-        iterations keyframe seconds revised""",
+        iterations keyframe seconds failure revised""",
     tracking3d.ObjectModel: "vertices faces face_uvs texture texture_weight features",
     Scores: """iou_initial_mean iou_mean rotation_error_mean_deg rotation_error_median_deg
         rotation_error_anchored_median_deg share_under_5_deg share_worse_than_initial frames""",

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -17,17 +18,17 @@ from numpy.typing import NDArray
 
 from tracking3d.config.loading import load_config
 from tracking3d.config.models import CameraConfig, PipelineConfig
-from tracking3d.errors import InputError, PluginError, Tracking3dError
-from tracking3d.estimation.estimate import FrameEstimate, ObjectModel
+from tracking3d.errors import InputError
+from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.estimation.paper.solver import PaperSolver
 from tracking3d.estimation.solver import Solver
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Box, Frame, Image, MaskEstimate, Prompt, SkippedFrame
 from tracking3d.geometry.camera import DEFAULT_FIELD_OF_VIEW, Camera
-from tracking3d.plugins import FEATURES, TRACKERS, build_plugin
+from tracking3d.plugins import FEATURES, TRACKERS, build_plugin, plugin_label
+from tracking3d.plugins.guard import GuardedEncoder, GuardedTracker, PluginFailure
 from tracking3d.prompts import make_prompt
 from tracking3d.rendering import prepare_backend
-from tracking3d.trackers.protocol import MaskTracker
 
 SOLVERS: dict[str, type[PaperSolver]] = {"paper": PaperSolver}
 """Solvers by the name that `solver.name` selects."""
@@ -71,11 +72,18 @@ class Session:
         self.config = config
         self._prompt = prompt
         self._intrinsics = intrinsics, intrinsics_origin
-        self._tracker = cast(MaskTracker, build_plugin(TRACKERS, config.tracker))
-        self._encoder = cast(FeatureEncoder, build_plugin(FEATURES, config.features))
+        self._tracker = GuardedTracker(
+            build_plugin(TRACKERS, config.tracker), plugin_label(TRACKERS, config.tracker.name)
+        )
+        self._encoder = GuardedEncoder(
+            build_plugin(FEATURES, config.features), plugin_label(FEATURES, config.features.name)
+        )
         self._solver: Solver[Any] | None = None
         self._state: Any = None
         self._camera: Camera | None = None
+        self._last_mask = MaskEstimate(None)
+        self._last_pose = np.eye(4)
+        self._failures: dict[int, str] = {}
 
     @property
     def camera(self) -> Camera:
@@ -89,42 +97,67 @@ class Session:
 
         Raises:
             InputError: If the first frame has no object, or the frame has another size than the first.
-            PluginError: If the mask tracker fails.
+            PluginError: If a plug-in fails: in the first frame, or with ``runtime.on_plugin_failure`` ``stop`` in
+                any. With ``continue`` a later frame is answered with what there is, and ``failure`` says why.
         """
-        if self._solver is None:
-            height, width = frame.size
-            self._camera = choose_camera(self.config.camera, width, height, *self._intrinsics)
-            torch.manual_seed(self.config.runtime.seed)
-            mask = self._mask(frame, self._prompt or Prompt((0.0, 0.0, float(width), float(height))))
-            solver = SOLVERS[self.config.solver.name](self.config, self._camera, self._encoder)
-            self._state, estimate = solver.init(frame, mask)
-            self._solver = solver
-            return estimate
+        try:
+            return self._start(frame) if self._solver is None else self._go_on(self._solver, frame)
+        except PluginFailure as error:
+            raise error.at(_label(frame)) from error.__cause__
+
+    def _start(self, frame: Frame) -> FrameEstimate:
+        height, width = frame.size
+        self._camera = choose_camera(self.config.camera, width, height, *self._intrinsics)
+        torch.manual_seed(self.config.runtime.seed)
+        mask = self._tracker.init(frame, self._prompt or Prompt((0.0, 0.0, float(width), float(height))))
+        encoder = cast(FeatureEncoder, self._encoder)
+        solver = SOLVERS[self.config.solver.name](self.config, self._camera, encoder)
+        self._state, estimate = solver.init(frame, mask)
+        self._solver, self._last_mask, self._last_pose = solver, mask, estimate.T_cam_obj
+        return estimate
+
+    def _go_on(self, solver: Solver[Any], frame: Frame) -> FrameEstimate:
         if frame.size != (self.camera.height, self.camera.width):
             raise InputError(
                 f"{_label(frame)} has {_pixels(frame.size)} pixels but the first frame "
                 f"{_pixels((self.camera.height, self.camera.width))}; all frames must have one size."
             )
-        self._state, estimate = self._solver.step(self._state, frame, self._mask(frame))
-        return estimate
-
-    def _mask(self, frame: Frame, prompt: Prompt | None = None) -> MaskEstimate:
-        """Ask the mask tracker; whatever goes wrong in it is told as its own fault."""
-        name = f"The mask tracker '{self.config.tracker.name}'"
+        started = time.perf_counter()
+        failures = []
         try:
-            answer = self._tracker.step(frame) if prompt is None else self._tracker.init(frame, prompt)
-        except Tracking3dError:
-            raise
-        except Exception as error:
-            raise PluginError(
-                f"{name} failed at {_label(frame)}: {type(error).__name__}: {error}."
-            ) from error
-        if answer.mask is not None and answer.mask.shape != frame.size:
-            raise PluginError(
-                f"{name} gave a mask of shape {answer.mask.shape} for {_label(frame)} of {_pixels(frame.size)} "
-                "pixels; it must have the size of the frame."
-            )
-        return answer
+            mask = self._last_mask = self._tracker.step(frame)
+        except PluginFailure as error:
+            failures.append(self._excused(error))
+            mask = replace(self._last_mask, score=0.0, reason=error.reason)
+        try:
+            self._state, estimate = solver.step(self._state, frame, mask)
+        except PluginFailure as error:
+            failures.append(self._excused(error))
+            estimate = unanswered(frame, mask, self._last_pose, time.perf_counter() - started)
+        self._last_pose = estimate.T_cam_obj
+        if failures:
+            self._failures[frame.index] = "; ".join(failures)
+        revised = tuple(self._with_failure(earlier) for earlier in estimate.revised)
+        return self._with_failure(replace(estimate, revised=revised))
+
+    def _excused(self, error: PluginFailure) -> str:
+        """Why a plug-in failed, where the run goes on in spite of it."""
+        if self.config.runtime.on_plugin_failure == "stop":
+            raise error
+        return error.reason
+
+    def _with_failure(self, estimate: FrameEstimate) -> FrameEstimate:
+        """The answer for a frame in which plug-ins failed says so, and is not relied on."""
+        failure = self._failures.get(estimate.index)
+        if failure is None:
+            return estimate
+        return replace(
+            estimate,
+            status=Status.UNCERTAIN if estimate.status is Status.TRACKED else estimate.status,
+            reason="; ".join(filter(None, (failure, estimate.reason))),
+            confidence=estimate.confidence / 2,
+            failure=failure,
+        )
 
     def result(self) -> ObjectModel:
         """The object as it is known now: one textured mesh."""
@@ -185,6 +218,24 @@ def checked_image(image: Image, position: int) -> Image:
             f"Frame {position} has shape {image.shape} and type {image.dtype}; give (H, W, 3) arrays of uint8."
         )
     return image
+
+
+def unanswered(
+    frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64], seconds: float
+) -> FrameEstimate:
+    """The answer where the solver could give none: lost, with the initial mask and the pose known before."""
+    initial = mask.binary if mask.binary is not None and mask.binary.any() else None
+    return FrameEstimate(
+        index=frame.index,
+        time=frame.time,
+        T_cam_obj=T_cam_obj,
+        mask=initial if initial is not None else np.zeros(frame.size, dtype=np.bool_),
+        initial_mask=initial,
+        status=Status.LOST,
+        reason="",
+        confidence=0.0,
+        seconds=seconds,
+    )
 
 
 def choose_camera(

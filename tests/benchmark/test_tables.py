@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tracking3d.benchmark import paper_numbers, table
+from tracking3d.benchmark import paper_numbers, table, tables
 from tracking3d.benchmark.results import ResultSet
 from tracking3d.benchmark.sequences import Dataset
 from tracking3d.benchmark.table import fill, format_table, to_csv, to_json, to_markdown, write_table
@@ -17,6 +17,7 @@ from tracking3d.benchmark.table_plot import plot_table
 from tracking3d.benchmark.tables import LOSSES, TABLES
 from tracking3d.benchmark.variant import Variant
 from tracking3d.config.loading import load_config
+from tracking3d.errors import InputError
 
 BASE = Variant(label="default", config=load_config())
 SUITE = Dataset("standard", 1, "clip", Path("nowhere"), ("01_box", "05_card_flip"))
@@ -141,7 +142,8 @@ def test_each_ablated_row_differs_from_the_full_one_by_its_loss_only(asked, tmp_
         assert config == full
 
 
-def test_deep_features_that_are_not_installed_are_said_to_be(asked, tmp_path):
+def test_deep_features_that_are_not_installed_are_said_to_be(asked, tmp_path, monkeypatch):
+    monkeypatch.setattr(tables, "DEEP", "no_such_encoder")
     assert "not installed" in lines(fill(TABLES["coin"], BASE, SUITE, tmp_path))["S2DNet"].note
 
 
@@ -149,7 +151,26 @@ def test_the_coin_table_runs_flat_objects_only(asked, tmp_path):
     fill(TABLES["coin"], BASE, SUITE, tmp_path)
     [(variants, dataset)] = asked
     assert dataset.sequences == ("05_card_flip",)
-    assert [variant.config.object.flat for variant in variants] == [False, True]
+    runs = [(variant.config.features.name, variant.config.object.flat) for variant in variants]
+    assert runs == [("rgb", False), ("rgb", True), ("s2dnet", False), ("s2dnet", True)]
+
+
+def test_the_features_table_runs_every_tracker_with_both_features_and_both_priors(asked, tmp_path):
+    filled = fill(TABLES["features"], BASE, SUITE, tmp_path)
+    runs = {
+        (v.masks, v.config.tracker.name, v.config.features.name, v.config.object.flat) for v in asked[0][0]
+    }
+    assert len(runs) == 4 * 2 * 2
+    assert lines(filled)["flow, initial masks"].here == pytest.approx(0.7)
+    assert lines(filled)["true masks, S2DNet, flat prior"].here == pytest.approx(0.77)
+
+
+def test_only_the_rows_that_are_asked_for_are_run(asked, tmp_path):
+    filled = fill(TABLES["features"].only(["csrt, RGB", "csrt, S2D*prior"]), BASE, SUITE, tmp_path)
+    assert list(lines(filled)) == ["csrt, RGB", "csrt, S2DNet, flat prior"]
+    assert [variant.label for variant in asked[0][0]] == list(lines(filled))
+    with pytest.raises(InputError, match=r"Table features has no row 'nonsense'; choose from: csrt, initial"):
+        TABLES["features"].only(["csrt, RGB", "nonsense"])
 
 
 def test_one_to_ten_keyframes_are_run(asked, tmp_path):

@@ -20,9 +20,10 @@ from tracking3d.config.loading import load_config
 from tracking3d.synthesis import convex_clips
 
 BOX = ("--box", "20,10,20,20")
-COMMANDS = ["run", "demo", "synth", "points", "plugins", "config show", "config schema", "config validate"]
+COMMANDS = ["run", "demo", "synth", "points", "config show", "config schema", "config validate"]
+COMMANDS += ["plugins list", "plugins new", "models list", "models get", "models verify"]
 COMMANDS += [f"evaluate {command}" for command in ("answers", "suite", "table", "compare", "peer")]
-GROUPS = ["config", "bench", "bench render", "evaluate"]
+GROUPS = ["config", "bench", "bench render", "evaluate", "models", "plugins"]
 
 
 @pytest.fixture
@@ -90,6 +91,21 @@ def test_plugins_are_listed_with_status_and_reason(call, monkeypatch):
     [bad] = [line for line in result.stdout.splitlines() if "bad" in line]
     assert "broken" in bad
     assert "No module named 'no_such_module_at_all'" in bad
+
+
+def test_plugins_alone_lists_them(call):
+    assert call("plugins").stdout == call("plugins", "list").stdout
+
+
+def test_plugins_new_writes_a_package_or_says_why_not(call, refused):
+    result = call("plugins", "new", "my-colour", "--kind", "tracker", "--out", "here")
+    assert (result.exit_code, Path("here/tracking3d-my-colour/pyproject.toml").is_file()) == (0, True)
+    assert "pip install here/tracking3d-my-colour" in result.stdout
+    assert "exists" in refused("plugins", "new", "my-colour", "--kind", "tracker", "--out", "here")
+    assert "is no name" in refused("plugins", "new", "My_Colour", "--kind", "tracker")
+    assert "taken by the mask tracker 'csrt'" in refused("plugins", "new", "csrt", "--kind", "tracker")
+    assert "--kind" in refused("plugins", "new", "mine")
+    assert "--kind" in refused("plugins", "new", "mine", "--kind", "solver")
 
 
 def test_plugins_as_json(call):

@@ -17,7 +17,6 @@ from tracking3d.config.models import CameraConfig
 from tracking3d.errors import InputError, PluginError
 from tracking3d.frames import SkippedFrame
 from tracking3d.pipeline import choose_camera
-from tracking3d.plugins import VARIABLE
 from tracking3d.prompts import make_prompt
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 
@@ -274,44 +273,6 @@ def test_an_unknown_plugin_is_refused(clip, section, name):
     config = load_config(overrides=QUICK, **{section: name})
     with pytest.raises(PluginError, match=rf"'{name}'.*did you mean"):
         next(track(clip.images, box=clip.box, config=config))
-
-
-FAILING = """
-import numpy as np
-from pydantic import BaseModel
-from tracking3d.frames import MaskEstimate
-
-class Failing:
-    class Options(BaseModel):
-        fault: str = "raises"
-
-    @classmethod
-    def from_options(cls, options):
-        tracker = cls()
-        tracker.fault = options.fault
-        return tracker
-
-    def init(self, frame, prompt):
-        return MaskEstimate(prompt.mask.astype(np.float32))
-
-    def step(self, frame):
-        if self.fault == "raises":
-            raise ZeroDivisionError("no pixels")
-        return MaskEstimate(np.ones((3, 4), np.float32))
-"""
-
-
-@pytest.mark.parametrize(
-    ("fault", "told"), [("raises", "ZeroDivisionError: no pixels"), ("shape", r"\(3, 4\)")]
-)
-def test_a_tracker_that_fails_while_running_is_blamed_by_name(clip, tmp_path, monkeypatch, fault, told):
-    (tmp_path / "failing_tracker.py").write_text(FAILING)
-    monkeypatch.setenv(VARIABLE, f"tracking3d.trackers:failing={tmp_path / 'failing_tracker.py'}:Failing")
-    config = load_config(overrides=QUICK, tracker={"name": "failing", "fault": fault})
-    frames = track(clip.images, mask=clip.masks[0], config=config)
-    next(frames)
-    with pytest.raises(PluginError, match=rf"'failing'.*{told}"):
-        next(frames)
 
 
 # The camera

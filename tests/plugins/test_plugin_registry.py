@@ -21,6 +21,7 @@ from tracking3d.plugins import (
     check_options,
     list_plugins,
     load_plugin,
+    plugin_label,
 )
 
 
@@ -266,6 +267,28 @@ def test_environment_variable_registers_from_a_module_and_from_a_file(monkeypatc
         tracker = build_plugin(TRACKERS, PluginChoice(name=name, level={"value": 4}))
         assert tracker.options.level.value == 4
     assert load_plugin(TRACKERS, "by_file") is load_plugin(TRACKERS, "by_file")
+
+
+@pytest.mark.parametrize("by", ["file", "module"])
+def test_the_version_of_a_plugin_under_development_is_that_of_its_file(monkeypatch, tmp_path: Path, by: str):
+    file = tmp_path / "versioned_tracker.py"
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv(VARIABLE, f"{TRACKERS}:mine={file if by == 'file' else 'versioned_tracker'}:Mine")
+    versions = []
+    for text in (DEVELOPED, DEVELOPED, DEVELOPED + "# changed"):
+        file.write_text(text)
+        versions.append(found("mine").version)
+    assert versions[0] == versions[1] != versions[2]
+    assert plugin_label(TRACKERS, "mine") == f"mask tracker 'mine' ({VARIABLE} {versions[2]})"
+    file.unlink()
+    assert found("mine").version == ""
+
+
+def test_a_label_names_kind_package_and_version(register):
+    register("good", GoodTracker)
+    assert plugin_label(TRACKERS, "good") == "mask tracker 'good' (acme 2.1)"
+    with pytest.raises(PluginError, match="did you mean 'good'"):
+        plugin_label(TRACKERS, "goood")
 
 
 def test_plugin_of_the_environment_hides_an_installed_one(monkeypatch, tmp_path: Path):

@@ -58,6 +58,7 @@ def test_run_json_says_how_the_run_was_made_and_what_came_of_it(tmp_path, turnin
         "lost": 1,
         "keyframes": 1,
         "skipped": 1,
+        "failed": 0,
     }
     assert run["skipped"] == [{"index": 1, "reason": "cannot be decoded"}]
     assert run["timings"]["seconds_per_frame_mean"] == run["timings"]["seconds_per_frame_median"] == 0.5

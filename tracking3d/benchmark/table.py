@@ -103,7 +103,10 @@ def fill(
     """
     plan = table.plan(base, dataset.synthetic, initial or {})
     chosen = _chosen(table, dataset)
-    variants = {name: variant for name, variant in plan.items() if isinstance(variant, Variant)}
+    used = {row.plan for row in table.rows}
+    variants = {
+        name: variant for name, variant in plan.items() if isinstance(variant, Variant) and name in used
+    }
     sets = run_suite(list(variants.values()), chosen, out, processes, listener)
     results = dict(zip(variants, sets, strict=True))
     for name, result in results.items():

@@ -6,14 +6,16 @@ degraded to the mean IoU that the paper gives for it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
 from tracking3d.benchmark import paper_numbers
 from tracking3d.benchmark.paper_numbers import Published
 from tracking3d.benchmark.variant import DEGRADED, Variant
+from tracking3d.errors import InputError
 from tracking3d.plugins import FEATURES, list_plugins
 
 Plan = dict[str, "Variant | str"]
@@ -69,6 +71,19 @@ class Table:
     sequences: tuple[str, ...] = ()
     sample: int = 0
 
+    def only(self, patterns: Sequence[str]) -> Table:
+        """The table with the rows that match any of the patterns, all if there is no pattern.
+
+        Raises:
+            InputError: If a pattern matches nothing.
+        """
+        for pattern in patterns:
+            if not any(fnmatch(row.label, pattern) for row in self.rows):
+                labels = "; ".join(row.label for row in self.rows)
+                raise InputError(f"Table {self.name} has no row '{pattern}'; choose from: {labels}.")
+        chosen = (row for row in self.rows if not patterns or any(fnmatch(row.label, one) for one in patterns))
+        return replace(self, rows=tuple(chosen))
+
 
 def _started(base: Variant, label: str, iou: float, synthetic: bool, given: Path | None) -> Variant | str:
     """``base`` from the masks of the tracker ``label``: its own where given, their likeness on synthetic data."""
@@ -116,6 +131,9 @@ def _coin(base: Variant, synthetic: bool, initial: Mapping[str, Path]) -> Plan:
     }
 
 
+FLAT: dict[str, dict[str, Any]] = {"": {}, ", flat prior": {"object__flat": True}}
+"""The flat prior off and on, by what a row's label ends with."""
+
 LOSSES: dict[str, dict[str, Any]] = {
     "no L_F": {"solver__weights__features": 0.0},
     "no L_S, overlap": {"solver__weights__silhouette": 1e-6, "solver__weights__distance": 1e6},
@@ -161,6 +179,27 @@ def _bop(base: Variant, synthetic: bool, initial: Mapping[str, Path]) -> Plan:
         "OSTrack": _started(base, "OSTrack", iou, synthetic, initial.get("ostrack")),
     }
     plan["truth"] = base.changed("true masks", masks="truth")
+    return plan
+
+
+def _features(base: Variant, synthetic: bool, initial: Mapping[str, Path]) -> Plan:
+    iou = paper_numbers.CDTB["OSTrack"].value
+    starts: dict[str, Variant | str] = {
+        name: base.changed(name, masks="tracker", tracker={"name": name}) for name in ("csrt", "flow")
+    }
+    starts["OSTrack"] = _started(base, "OSTrack", iou, synthetic, initial.get("ostrack"))
+    starts["true masks"] = base.changed("true masks", masks="truth")
+    plan: Plan = {}
+    for name, start in starts.items():
+        for prior, settings in FLAT.items():
+            for features in ("RGB", "S2DNet"):
+                label = f"{name}, {features}{prior}"
+                if isinstance(start, str):
+                    plan[label] = start
+                elif features == "RGB":
+                    plan[label] = start.changed(label, features={"name": "rgb"}, **settings)
+                else:
+                    plan[label] = _deep(start, label, **settings)
     return plan
 
 
@@ -232,6 +271,27 @@ TABLES: dict[str, Table] = {
             ),
             _ablation,
             note="The paper's rows without a loss use S2DNet features, ours those of the configuration.",
+            sample=16,
+        ),
+        Table(
+            "features",
+            "RGB against deep features, with and without the flat prior, by initial tracker",
+            "after Tables 1, 3 and 4",
+            "cdtb",
+            tuple(
+                row
+                for name in ("csrt", "flow", "OSTrack", "true masks")
+                for row in (
+                    Row(f"{name}, initial masks", None, f"{name}, RGB", initial=True),
+                    *(
+                        Row(label, None, label)
+                        for prior in FLAT
+                        for label in (f"{name}, RGB{prior}", f"{name}, S2DNet{prior}")
+                    ),
+                )
+            ),
+            _features,
+            note="Add `--preset paper` for the published recipe.",
             sample=16,
         ),
         Table(

@@ -1,14 +1,48 @@
-"""``tracking3d plugins``: the mask trackers and feature encoders that are installed."""
+"""``tracking3d plugins``: the mask trackers and feature encoders that are installed, and how to begin a new one.
+
+``tracking3d plugins`` alone is short for ``tracking3d plugins list``.
+"""
 
 from __future__ import annotations
 
-from typing import Annotated
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from tracking3d.cli.options import Debug
 
+DEFAULT = "list"
 
+
+class _Plugins(TyperGroup):
+    """A group whose command may be left out: without one it lists."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        return super().parse_args(ctx, args if args[:1] == ["--help"] else _with_command(args))
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        return super().resolve_command(ctx, _with_command(args))
+
+
+def _with_command(args: list[str]) -> list[str]:
+    return args if args and not args[0].startswith("-") else [DEFAULT, *args]
+
+
+app = typer.Typer(
+    cls=_Plugins,
+    help="List the mask trackers and feature encoders that are installed, or begin a new one.",
+)
+
+
+class _Kind(StrEnum):
+    TRACKER = "tracker"
+    FEATURES = "features"
+
+
+@app.command(name=DEFAULT)
 def plugins(
     as_json: Annotated[
         bool, typer.Option("--json", help="Print JSON only, with the schema of the options.")
@@ -35,3 +69,19 @@ def plugins(
         cells = (info.name, info.group, info.package, info.version, info.status, info.reason)
         table.add_row(*map(escape, cells))
     print_table(table)
+
+
+@app.command()
+def new(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name that will select the plug-in.")],
+    kind: Annotated[_Kind, typer.Option(help="Mask tracker or feature encoder.")],
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", help="Folder that the package's own folder goes into.")
+    ] = Path(),
+    debug: Debug = False,
+) -> None:
+    """Write a package with a new plug-in, ready to install: pyproject, module, test, README."""
+    from tracking3d.plugins.template import write_plugin
+
+    folder = write_plugin(name, kind.value, out)
+    typer.echo(f"{folder} is written; next: pip install {folder} && pytest {folder}")

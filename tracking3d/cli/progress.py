@@ -56,6 +56,10 @@ def print_summary(folder: Path) -> None:
     for status in ("tracked", "uncertain", "lost", "skipped"):
         if counts[status] or status == "tracked":
             table.add_row(f"  {status}", f"[{_COLOURS[status]}]{counts[status]}[/]")
+    if counts["failed"]:
+        table.add_row("  with a plug-in failure", f"[red]{counts['failed']}[/]")
+        for failure in run["failures"]:
+            table.add_row(f"    {failure['frames']} of them", escape(failure["reason"]))
     table.add_row("mean IoU with the initial masks", shown(run["iou_initial_mean"]))
     table.add_row("seconds per frame", shown(seconds))
     for what, names in _OUTPUTS.items():

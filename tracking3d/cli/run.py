@@ -86,6 +86,14 @@ def run(
     seed: Annotated[
         int | None, typer.Option(help="Seed of everything random.", rich_help_panel=_RUNNING)
     ] = None,
+    on_plugin_failure: Annotated[
+        str | None,
+        typer.Option(
+            metavar="continue|stop",
+            help="When a plug-in fails in a later frame: go on with the last mask, or stop.",
+            rich_help_panel=_RUNNING,
+        ),
+    ] = None,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
@@ -110,7 +118,7 @@ def run(
         camera={"fov": fov, "intrinsics": camera or None},
         object={"flat": flat or None, "prototype": prototype},
         window={"size": size},
-        runtime={"device": device, "seed": seed},
+        runtime={"device": device, "seed": seed, "on_plugin_failure": on_plugin_failure},
     )
     if box is None and mask is None and settings.tracker.name != "precomputed":
         raise InputError(

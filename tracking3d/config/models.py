@@ -62,6 +62,15 @@ class ObjectConfig(Section):
     )
     frequency: int = Field(11, ge=1, le=40, description="Icosphere frequency f: 10 f^2 + 2 vertices.")
     texture_size: int = Field(300, ge=16, le=2048, description="Side of the feature texture in texels.")
+    texture_channels: int | None = Field(
+        None,
+        ge=1,
+        le=512,
+        description=(
+            "Features with more channels are reduced to so many by a principal component analysis inside the "
+            "first mask, and given one spread; empty keeps them as they are (paper)."
+        ),
+    )
     flat: bool = Field(
         False, description="Flat prior: project all vertices onto one plane after each iteration."
     )
@@ -229,6 +238,13 @@ class RuntimeConfig(Section):
     renderer: Literal["auto", "torch", "numba"] = Field(
         "auto",
         description="What renders: torch everywhere, numba on the CPU, or the fastest that can be used here.",
+    )
+    on_plugin_failure: Literal["continue", "stop"] = Field(
+        "continue",
+        description=(
+            "When a plug-in fails after the first frame: record why and go on with the last mask, or stop and keep "
+            "what is finished."
+        ),
     )
 
 

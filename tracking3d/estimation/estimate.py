@@ -39,6 +39,7 @@ class FrameEstimate:
         iterations: Optimizer iterations spent.
         keyframe: Whether the frame became a keyframe.
         seconds: Wall time spent on the frame.
+        failure: Which plug-in failed at this frame, and why, in words; empty where none did.
         revised: Better answers for earlier frames that this frame made possible; they replace those given before.
     """
 
@@ -54,6 +55,7 @@ class FrameEstimate:
     iterations: int = 0
     keyframe: bool = False
     seconds: float = 0.0
+    failure: str = ""
     revised: tuple[FrameEstimate, ...] = ()
 
 

@@ -85,9 +85,12 @@ def observe(
     image = crop(pixels, window)
     detail = crop(pixels, replace(window, size=2 * window.size))
     valid = crop(torch.ones(1, *frame.size, device=device), window)[0].ge(0.5).float()
-    features = encoder.encode(image[None])
+    # Features of a stride above 1 are cut out of the finer image, so as not to be coarser than the rest.
+    features = encoder.encode((image if encoder.stride == 1 else detail)[None])
     if features.shape[-1] != window.size:
-        features = functional.interpolate(features, size=(window.size, window.size), mode="bilinear")
+        features = functional.interpolate(
+            features, size=(window.size, window.size), mode="bilinear", antialias=True
+        )
     if mask is None or not mask.any():
         soft = distance = torch.zeros_like(valid)
     else:

@@ -1,10 +1,47 @@
-"""Which file a network is: a path, or the name of a known one in the user's cache."""
+"""Networks in the user's cache: which file a name or a path means, and whether it is what it should be.
+
+The cache is the platform's own folder for that (``~/.cache/tracking3d`` on Linux); the environment variable
+``TRACKING3D_CACHE`` names another.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import os
+from enum import StrEnum
 from pathlib import Path
 
+import platformdirs
+
+from tracking3d.config.explain import nearest
 from tracking3d.errors import InputError
+from tracking3d.networks.catalogue import KnownNetwork, known_networks
+
+VARIABLE = "TRACKING3D_CACHE"
+"""Environment variable that names the cache folder."""
+
+_CHUNK = 1 << 20
+
+
+class State(StrEnum):
+    """What the cache holds of a known network."""
+
+    ABSENT = "absent"
+    OK = "ok"
+    UNCHECKED = "unchecked"
+    DAMAGED = "damaged"
+
+
+def cache_folder() -> Path:
+    """The user's cache folder of tracking3d; it need not exist."""
+    if given := os.environ.get(VARIABLE):
+        return Path(given).expanduser()
+    return platformdirs.user_cache_path("tracking3d", appauthor=False)
+
+
+def network_path(network: KnownNetwork) -> Path:
+    """Where the cache keeps a network, whether it is there or not."""
+    return cache_folder() / "models" / network.file
 
 
 def find_network(name: str | Path) -> Path:
@@ -14,9 +51,69 @@ def find_network(name: str | Path) -> Path:
         name: The path of a file, or the name of a known network, see ``tracking3d models list``.
 
     Raises:
-        InputError: If there is no such file.
+        InputError: If there is no such file, or the network is known but not in the cache.
     """
     file = Path(name).expanduser()
-    if not file.is_file():
-        raise InputError(f"The network {name} does not exist; give the path of an ONNX file.")
-    return file
+    if file.is_file():
+        return file
+    if str(name) not in known_networks() and (file.suffix.lower() == ".onnx" or len(file.parts) > 1):
+        raise InputError(
+            f"The network {name} does not exist; give the path of an ONNX file, or a name that "
+            "`tracking3d models list` shows."
+        )
+    network = find_known(str(name))
+    path = network_path(network)
+    if not path.is_file():
+        raise InputError(
+            f"The network {network.name} is not in {path.parent}; fetch it with "
+            f"`tracking3d models get {network.name}`, or give the path of an ONNX file."
+        )
+    return path
+
+
+def find_known(name: str) -> KnownNetwork:
+    """The catalogue's entry of a name.
+
+    Raises:
+        InputError: If there is none; the nearest name is told.
+    """
+    networks = known_networks()
+    if name in networks:
+        return networks[name]
+    best = nearest(name, networks)
+    advice = f"did you mean '{best}'?" if best else "`tracking3d models list` shows those that are."
+    raise InputError(f"There is no known network '{name}'; {advice}")
+
+
+def state_of(network: KnownNetwork, *, check: bool = True) -> State:
+    """Whether a network is in the cache, and whether its bytes are the catalogue's.
+
+    Args:
+        network: The network.
+        check: Read the file and compare its hash; without it a file that is there is unchecked.
+
+    Raises:
+        InputError: If its file cannot be read.
+    """
+    path = network_path(network)
+    if not path.is_file():
+        return State.ABSENT
+    if network.sha256 is None or not check:
+        return State.UNCHECKED
+    return State.OK if sha256_of(path) == network.sha256 else State.DAMAGED
+
+
+def sha256_of(file: Path) -> str:
+    """SHA-256 of a file's bytes, in hexadecimal.
+
+    Raises:
+        InputError: If it cannot be read.
+    """
+    digest = hashlib.sha256()
+    try:
+        with file.open("rb") as stream:
+            while chunk := stream.read(_CHUNK):
+                digest.update(chunk)
+    except OSError as error:
+        raise InputError(f"{file} cannot be read: {error.strerror or error}.") from error
+    return digest.hexdigest()

@@ -19,6 +19,9 @@ from tracking3d.process_memory import resident_memory
 from tracking3d.results.layout import CONVENTIONS, FORMAT, FORMAT_VERSION
 from tracking3d.results.records import FrameRecord
 
+MOST_FAILURES = 20
+"""Different reasons of plug-in failures that a summary lists; the commonest come first."""
+
 
 def description_at_start(
     *,
@@ -54,7 +57,7 @@ def description_at_start(
 
 
 def summary(records: Sequence[FrameRecord], skipped: int, seconds: float) -> dict[str, Any]:
-    """Counts, timings, mean IoU and highest memory of a run.
+    """Counts, plug-in failures, timings, mean IoU and highest memory of a run.
 
     Args:
         records: The answer for every frame.
@@ -64,6 +67,7 @@ def summary(records: Sequence[FrameRecord], skipped: int, seconds: float) -> dic
     by_status = Counter(record.status for record in records)
     per_frame = [record.seconds for record in records]
     memory = resident_memory()
+    failures = Counter(record.failure for record in records if record.failure)
     ious = [record.iou_initial for record in records if record.iou_initial is not None]
     return {
         "counts": {
@@ -71,7 +75,11 @@ def summary(records: Sequence[FrameRecord], skipped: int, seconds: float) -> dic
             **{status.value: by_status[status] for status in Status},
             "keyframes": sum(record.keyframe for record in records),
             "skipped": skipped,
+            "failed": failures.total(),
         },
+        "failures": [
+            {"reason": reason, "frames": frames} for reason, frames in failures.most_common(MOST_FAILURES)
+        ],
         "timings": {
             "seconds_total": seconds,
             "seconds_per_frame_mean": float(np.mean(per_frame)) if per_frame else None,

@@ -34,6 +34,7 @@ class FrameRecord:
         iou_initial: IoU of the answer and the initial mask; None without an initial mask.
         area: Pixels of the answer's mask.
         revision: Whether this replaces an earlier answer.
+        failure: Which plug-in failed at this frame, and why; empty where none did.
     """
 
     index: int
@@ -50,6 +51,7 @@ class FrameRecord:
     iou_initial: float | None
     area: int
     revision: bool = False
+    failure: str = ""
 
     @classmethod
     def of(
@@ -75,6 +77,7 @@ class FrameRecord:
             iou_initial=mask_iou(estimate.mask, initial_mask),
             area=int(np.count_nonzero(estimate.mask)),
             revision=revision,
+            failure=estimate.failure,
         )
 
     @classmethod

@@ -33,9 +33,12 @@ class MaskMotion:
     by_flow: NDArray[np.float32]
     by_similarity: NDArray[np.float32]
     cue: NDArray[np.float32]
+    background: NDArray[np.float64] | None
 
 
-def follow_mask(last: NDArray[np.uint8], present: NDArray[np.uint8], mask: NDArray[np.float32]) -> MaskMotion:
+def follow_mask(
+    last: NDArray[np.uint8], present: NDArray[np.uint8], mask: NDArray[np.float32], similarity: bool = True
+) -> MaskMotion:
     """Carry ``mask`` ``(S, S)`` of the grey crop ``last`` ``(S, S)`` into the grey crop ``present``.
 
     DIS optical flow (Kroeger et al. 2016) runs both ways; models of motion are RANSAC fits to the flow that
@@ -52,21 +55,22 @@ def follow_mask(last: NDArray[np.uint8], present: NDArray[np.uint8], mask: NDArr
     by_flow = cv2.remap(mask, source, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
 
     inside = by_flow > 0.5
-    similarity = _fit(cv2.estimateAffinePartial2D, source, target, inside & reliable)
-    by_similarity = by_flow if similarity is None else cv2.warpAffine(mask, similarity, mask.shape[::-1])
-    cue = _motion_cue(present, source, target, inside, reliable)
-    return MaskMotion(source, by_flow, by_similarity, cue)
+    fit = _fit(cv2.estimateAffinePartial2D, source, target, inside & reliable) if similarity else None
+    by_similarity = by_flow if fit is None else cv2.warpAffine(mask, fit, mask.shape[::-1])
+    background = _fit(cv2.estimateAffinePartial2D, target, source, ~inside & reliable)
+    object_ = _fit(cv2.estimateAffine2D, target, source, inside & reliable)
+    cue = _motion_cue(present, source, target, background, object_, reliable)
+    return MaskMotion(source, by_flow, by_similarity, cue, background)
 
 
 def _motion_cue(
     grey: NDArray[np.uint8],
     source: NDArray[np.float32],
     target: NDArray[np.float32],
-    inside: NDArray[np.bool_],
+    background: NDArray[np.float64] | None,
+    object_: NDArray[np.float64] | None,
     reliable: NDArray[np.bool_],
 ) -> NDArray[np.float32]:
-    background = _fit(cv2.estimateAffinePartial2D, target, source, ~inside & reliable)
-    object_ = _fit(cv2.estimateAffine2D, target, source, inside & reliable)
     if background is None or object_ is None:
         return np.zeros(grey.shape, np.float32)
     cue = _residual(background, target, source) - _residual(object_, target, source)

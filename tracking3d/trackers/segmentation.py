@@ -10,6 +10,7 @@ looks lost. Any box tracker will do. Everything is deterministic and causal.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 
 from tracking3d.frames import Box, Image, MaskEstimate
 from tracking3d.geometry.camera import Window
+from tracking3d.trackers.background import BackgroundMemory
 from tracking3d.trackers.colour_models import GlobalColours, Palette, lab
 from tracking3d.trackers.confidence import Judgement, outline_margin, signed_distance
 from tracking3d.trackers.crops import box_iou, box_of, clip_box, cut, inside_frame, paste
@@ -27,8 +29,29 @@ _MARGIN = 0.45  # free space around the last box: how far the mask may move or g
 _AREA_CHANGE = 0.35  # a larger relative change against the moved mask is not believed
 _PATIENCE = 3  # doubtful frames in a row before each attempt to begin anew
 
-# Weights of the log-odds, against global and local colours with weight 1.
-_PRIOR, _MOTION, _WITNESS = 1.5, 2.0, 1.0
+
+@dataclass(frozen=True)
+class Cues:
+    """What a pixel's log-odds are made of: the weights of their parts. 0 switches a part off.
+
+    Attributes:
+        prior: Distance to the outline of the moved mask.
+        global_colours: Colours of the whole object and its surroundings, remembered.
+        local_colours: Colours nearby, one frame ago.
+        motion: Whether the pixel moves with the object or with the background.
+        witness: Distance beyond the box tracker's box.
+        similarity: Whether the prior is also the mask moved by one similarity, besides by dense flow.
+        smoother: Whether the edge-aware smoother follows.
+    """
+
+    prior: float = 1.5
+    global_colours: float = 1.0
+    local_colours: float = 1.0
+    motion: float = 2.0
+    witness: float = 1.0
+    change: float = 0.0
+    similarity: bool = True
+    smoother: bool = True
 
 
 class ColourSegmentation:
@@ -39,12 +62,19 @@ class ColourSegmentation:
         box: ``(x, y, w, h)`` in pixels, the object in it.
         mask: ``(H, W)`` bool, the object's first mask; segmented from the box if None.
         size: Side of the working crop in pixels.
+        cues: The weights of the evidence.
     """
 
     def __init__(
-        self, image: Image, box: Box, mask: NDArray[np.bool_] | None = None, size: int = 224
+        self,
+        image: Image,
+        box: Box,
+        mask: NDArray[np.bool_] | None = None,
+        size: int = 224,
+        cues: Cues | None = None,
     ) -> None:
         self._size = size
+        self._cues = cues or Cues()
         self._image = image
         self._mask = mask_in_box(image, box) if mask is None else mask.astype(np.float32)
         self._velocity = (0, 0)
@@ -54,6 +84,8 @@ class ColourSegmentation:
         inside, around = _sides(cut(self._mask, window))
         self._colours = GlobalColours(colours, inside, around)
         self._palette = Palette(colours)
+        self._background = BackgroundMemory(image.shape)
+        self._background.learn(image, window, around & inside_frame(image.shape, window))
         separation = self._colours.separation(colours, inside, around)
         self._judgement = Judgement(separation, margin=separation)
 
@@ -99,7 +131,8 @@ class ColourSegmentation:
         window = Window(before.left + right, before.top + down, before.side, self._size)
         last, present = cut(self._image, before), cut(image, window)
         in_frame = inside_frame(image.shape, window)
-        motion = follow_mask(_grey(last), _grey(present), cut(self._mask, before))
+        cues = self._cues
+        motion = follow_mask(_grey(last), _grey(present), cut(self._mask, before), cues.similarity)
         moved = (motion.by_flow + motion.by_similarity > 1.0) & in_frame
         area = int(np.count_nonzero(moved))
         if area < 9:
@@ -107,11 +140,16 @@ class ColourSegmentation:
 
         colours = lab(present)
         evidence = self._evidence(colours, lab(last), motion, area)
+        if cues.change:
+            if motion.background is not None:
+                self._background.move(_in_frame(motion.background, window, before))
+            evidence += cues.change * self._background.change(image, window)
         if witness is not None:
-            evidence -= _WITNESS * _distance_beyond(witness, window)
-        support = np.tanh((evidence + _PRIOR * _prior(motion, area)) / 3)
-        smooth = cv2.ximgproc.fastGlobalSmootherFilter(present, support, 100.0, 12.0)
-        mask = _clean((smooth > 0) & in_frame, moved)
+            evidence -= cues.witness * _distance_beyond(witness, window)
+        support = np.tanh((evidence + cues.prior * _prior(motion, area)) / 3)
+        if cues.smoother:
+            support = cv2.ximgproc.fastGlobalSmootherFilter(present, support, 100.0, 12.0)
+        mask = _clean((support > 0) & in_frame, moved)
         believed = bool(abs(np.count_nonzero(mask) / area - 1) <= _AREA_CHANGE)
         if not believed:
             mask = moved
@@ -120,6 +158,8 @@ class ColourSegmentation:
         separation = self._colours.separation(colours, inside, around)
         if believed:
             self._colours.update(colours, inside, around)
+            if cues.change:
+                self._background.learn(image, window, around)
         full = paste(mask, window, image.shape)
         agreement = None if witness is None else box_iou(box_of(full) or (0.0, 0.0, 0.0, 0.0), witness)
         return full, Judgement(separation, outline_margin(evidence, mask), agreement, believed)
@@ -127,6 +167,10 @@ class ColourSegmentation:
     def _evidence(
         self, colours: NDArray[np.uint8], last_colours: NDArray[np.uint8], motion: MaskMotion, area: int
     ) -> NDArray[np.float32]:
+        cues = self._cues
+        evidence = cues.global_colours * self._colours.log_ratio(colours) + cues.motion * motion.cue
+        if cues.local_colours == 0:  # half of the time goes into them
+            return evidence
         last_labels = cv2.remap(
             self._palette.label(last_colours), motion.source, None, cv2.INTER_NEAREST,
             borderMode=cv2.BORDER_REPLICATE,
@@ -135,7 +179,7 @@ class ColourSegmentation:
         local = self._palette.local_log_ratio(
             self._palette.label(colours), last_labels, motion.by_flow, radius
         )
-        return self._colours.log_ratio(colours) + local + _MOTION * motion.cue
+        return evidence + cues.local_colours * local
 
     def _begin_anew(
         self, image: Image, witness: Box, mask: NDArray[np.float32], judgement: Judgement
@@ -151,6 +195,15 @@ class ColourSegmentation:
         if fresh_judgement.separation <= judgement.separation:
             return mask, judgement
         return fresh, fresh_judgement
+
+
+def _in_frame(matrix, window, before):
+    """last frame from present frame"""
+    def frame_to_crop(w):
+        s = w.scale
+        return np.array([[s, 0, (0.5 - w.left) * s - 0.5], [0, s, (0.5 - w.top) * s - 0.5], [0, 0, 1]])
+    full = np.vstack([matrix, [0, 0, 1]])
+    return (np.linalg.inv(frame_to_crop(before)) @ full @ frame_to_crop(window))[:2]
 
 
 def _grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

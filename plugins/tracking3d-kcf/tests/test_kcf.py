@@ -1,4 +1,4 @@
-"""The kcf plug-in follows a disc, and refuses what KCF cannot start on."""
+"""The kcf plug-in keeps to the protocol, follows a disc, and refuses what KCF cannot start on."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from tracking3d_kcf import KcfTracker
 
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, Prompt
-from tracking3d.trackers.protocol import MaskTracker
+from tracking3d.testing import check_tracker
 
 
 def disc_at(x: int) -> tuple[Frame, np.ndarray]:
@@ -19,9 +19,12 @@ def disc_at(x: int) -> tuple[Frame, np.ndarray]:
     return Frame(0, np.where(mask[..., None], texture, background).astype(np.uint8), name="frame 0"), mask
 
 
+def test_it_conforms() -> None:
+    check_tracker(KcfTracker)
+
+
 def test_a_moving_disc_is_followed() -> None:
     tracker = KcfTracker.from_options(KcfTracker.Options())
-    assert isinstance(tracker, MaskTracker)
     tracker.init(disc_at(50)[0], Prompt((20.0, 30.0, 60.0, 60.0)))
     for x in range(54, 90, 4):
         frame, truth = disc_at(x)

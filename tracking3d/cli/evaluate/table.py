@@ -14,7 +14,7 @@ from tracking3d.errors import InputError
 
 def table(
     name: Annotated[
-        str, typer.Argument(metavar="TABLE", help="cdtb, inhand, coin, ablation, bop or keyframes.")
+        str, typer.Argument(metavar="TABLE", help="cdtb, inhand, coin, ablation, features, bop or keyframes.")
     ],
     data: Data = None,
     suite: Annotated[
@@ -25,6 +25,10 @@ def table(
         typer.Option(
             metavar="TRACKER=DIR", help="Masks of a tracker, a folder for every sequence; may be repeated."
         ),
+    ] = None,
+    rows: Annotated[
+        list[str] | None,
+        typer.Option("--row", metavar="PATTERN", help="Only rows that match; may be repeated."),
     ] = None,
     sequences: Sequences = None,
     config: ConfigFile = None,
@@ -57,7 +61,7 @@ def table(
         raise InputError(f"There is no table '{name}'; choose one of {', '.join(TABLES)}.")
     if plot:
         check_plot(plot)
-    wanted = TABLES[name]
+    wanted = TABLES[name].only(rows or [])
     folders = dict(_named_folder(item) for item in initial or ())
     settings = configure(config, preset, overrides)
     base = Variant(label=name_of_settings(config, preset, overrides, "tracker"), config=settings)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tracking3d.estimation.estimate import FrameEstimate
+from tracking3d.estimation.feature_space import FeatureSpace
 from tracking3d.estimation.observation import Observation
 from tracking3d.estimation.paper.problem import Parameters, Shape
 from tracking3d.geometry.camera import Camera
@@ -42,6 +43,7 @@ class Belief:
         waiting: First frames that wait for the joint start, with their answers so far; None when none waits
             any more.
         started: Whether the first frame is done.
+        space: What is made of the encoder's features; None leaves them as they are.
         renderer: Which renderer, see `tracking3d.rendering.backend`.
     """
 
@@ -56,6 +58,7 @@ class Belief:
     before: tuple[Pose, int] | None = None
     waiting: tuple[tuple[Keyframe, FrameEstimate], ...] | None = None
     started: bool = False
+    space: FeatureSpace | None = None
     renderer: str = "auto"
 
     @property

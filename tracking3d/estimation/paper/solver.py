@@ -19,6 +19,7 @@ from tracking3d.errors import InputError
 from tracking3d.estimation.appearance import visible_texture
 from tracking3d.estimation.assessment import Assessment, assess
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
+from tracking3d.estimation.feature_space import TAU, FeatureSpace, feature_channels
 from tracking3d.estimation.keyframes import Candidate, is_new_view, select_keyframes
 from tracking3d.estimation.observation import Batch, Observation, observe
 from tracking3d.estimation.paper.belief import Belief, Keyframe
@@ -51,7 +52,12 @@ class PaperSolver:
     @property
     def tau(self) -> float:
         """Convergence threshold of the appearance loss."""
-        return self.config.solver.tau or self.encoder.tau
+        reduced = self._channels < self.encoder.channels
+        return self.config.solver.tau or (TAU if reduced else self.encoder.tau)
+
+    @property
+    def _channels(self) -> int:
+        return feature_channels(self.encoder, self.config.object.texture_channels)
 
     @property
     def device(self) -> torch.device:
@@ -85,7 +91,7 @@ class PaperSolver:
             shape,
             TexelMap.of(shape.face_uvs, size),
             offsets,
-            torch.zeros(self.encoder.channels, size, size, device=self.device),
+            torch.zeros(self._channels, size, size, device=self.device),
             (),
             BackProjection(
                 torch.zeros(3, size, size, device=self.device), torch.zeros(size, size, device=self.device)
@@ -95,6 +101,10 @@ class PaperSolver:
             renderer=self.config.runtime.renderer,
         )
         observation = self._observe(belief, frame, binary, pose)
+        if self._channels < self.encoder.channels:
+            space = FeatureSpace.of(observation.features, observation.mask, self._channels)
+            belief = replace(belief, space=space)
+            observation = replace(observation, features=space.project(observation.features))
         return self._solve(belief, frame, binary, Keyframe(observation, pose), started)
 
     def step(self, state: Belief, frame: Frame, mask: MaskEstimate) -> tuple[Belief, FrameEstimate]:
@@ -129,7 +139,10 @@ class PaperSolver:
         if box is None:
             box = (0.0, 0.0, float(self.camera.width), float(self.camera.height))
         window = Window.around(box, self.config.window.margin, self.config.window.size)
-        return observe(frame, mask, window, self.camera, self.encoder, self.device)
+        observation = observe(frame, mask, window, self.camera, self.encoder, self.device)
+        if belief.space is None:
+            return observation
+        return replace(observation, features=belief.space.project(observation.features))
 
     def _best_candidate(self, belief: Belief, observation: Observation, candidates: list[Pose]) -> Pose:
         """The pose with the least loss as it stands."""

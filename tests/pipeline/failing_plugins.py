@@ -1,0 +1,100 @@
+"""Plug-ins that fail in chosen frames; the tests register this file by the environment variable."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from pydantic import BaseModel
+from torch import Tensor
+
+from tracking3d.errors import InputError
+from tracking3d.frames import Frame, MaskEstimate, Prompt
+
+Frames = tuple[int, ...]
+
+
+class FailingTracker:
+    """Answers with the prompt's mask moved along, but fails in some frames in one way."""
+
+    class Options(BaseModel):
+        fault: str
+        at: Frames
+
+    @classmethod
+    def from_options(cls, options: Options) -> FailingTracker:
+        tracker = cls()
+        tracker.options = options
+        return tracker
+
+    def init(self, frame: Frame, prompt: Prompt) -> MaskEstimate:
+        self.mask = prompt.mask
+        return self.step(frame)
+
+    def step(self, frame: Frame) -> Any:
+        mask = np.roll(self.mask, frame.index, axis=1).astype(np.float32)
+        if frame.index not in self.options.at:
+            return MaskEstimate(mask)
+        match self.options.fault:
+            case "raises":
+                raise ZeroDivisionError("no pixels")
+            case "exits":
+                raise SystemExit(3)
+            case "refuses":
+                raise InputError("The third mask is missing.")
+            case "says nothing":
+                return None
+            case "array":
+                return mask
+            case "shape":
+                return MaskEstimate(np.ones((3, 4), np.float32))
+            case "nan":
+                return MaskEstimate(mask * math.nan)
+            case "range":
+                return MaskEstimate(mask * 255)
+            case "list":
+                return MaskEstimate(mask.tolist())
+            case "score":
+                return MaskEstimate(mask, math.nan)
+        raise AssertionError(self.options.fault)
+
+
+class FailingEncoder:
+    """The colours, but fails in some calls in one way."""
+
+    channels, stride, tau = 3, 1, 2.0
+
+    class Options(BaseModel):
+        fault: str
+        at: Frames
+
+    @classmethod
+    def from_options(cls, options: Options) -> FailingEncoder:
+        encoder = cls()
+        encoder.options, encoder.calls = options, 0
+        if options.fault == "attribute":
+            encoder.channels = 0
+        return encoder
+
+    def encode(self, images: Tensor) -> Any:
+        self.calls += 1
+        if self.calls - 1 not in self.options.at:
+            return images
+        match self.options.fault:
+            case "raises":
+                raise ZeroDivisionError("no channels")
+            case "array":
+                return images.numpy()
+            case "channels":
+                return images[:, :2]
+            case "stride":
+                return images[..., ::2, ::2]
+            case "batch":
+                return images[0]
+            case "nan":
+                return images * math.nan
+            case "integers":
+                return (images * 255).to(torch.uint8)
+        raise AssertionError(self.options.fault)

@@ -1,0 +1,220 @@
+"""A plug-in that fails in the middle of a run: the frame is recorded with the reason, and the run goes on or stops."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tracking3d import Session, Status, load_config, track
+from tracking3d.errors import InputError, PluginError
+from tracking3d.frames import Prompt
+from tracking3d.plugins import VARIABLE
+from tracking3d.recording import record
+from tracking3d.results.files import write_image
+from tracking3d.results.run_reader import RunReader
+from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+from tracking3d.video import open_source
+
+HERE = Path(__file__).parent
+QUICK = [
+    "window.size=32",
+    "object.frequency=2",
+    "object.texture_size=16",
+    "solver.iterations=2",
+    "solver.pose_iterations=2",
+    "solver.start_frames=1",
+    "solver.tau=2",
+]
+TRACKER_FAULTS = {
+    "raises": "ZeroDivisionError: no pixels",
+    "exits": "SystemExit: 3",
+    "refuses": "The third mask is missing",
+    "says nothing": "it answered with None instead of a MaskEstimate",
+    "array": "it answered with a ndarray of float32 instead of a MaskEstimate",
+    "shape": "its mask has shape (3, 4), but the frame (64, 80)",
+    "nan": "its mask has values from nan to nan instead of from 0 to 1",
+    "range": "its mask has values from 0 to 255 instead of from 0 to 1",
+    "list": "its mask is a list instead of an array of float32",
+    "score": "its score is nan instead of a number from 0 to 1",
+}
+ENCODER_FAULTS = {
+    "raises": "ZeroDivisionError: no channels",
+    "array": "it answered with a ndarray of float32 instead of a tensor of float32",
+    "channels": "its features have shape (1, 2, 32, 32) instead of (1, 3, 32, 32)",
+    "stride": "its features have shape (1, 3, 16, 16) instead of (1, 3, 32, 32)",
+    "batch": "its features have shape (3, 32, 32) instead of (1, 3, 32, 32)",
+    "nan": "its features are not all finite numbers",
+    "integers": "it answered with a Tensor of torch.uint8 instead of a tensor of float32",
+}
+
+
+@pytest.fixture(scope="module")
+def clip() -> SyntheticClip:
+    return synthesize(SyntheticSpec(frames=5, size=(80, 64)))
+
+
+@pytest.fixture(autouse=True)
+def registered(monkeypatch):
+    file = HERE / "failing_plugins.py"
+    monkeypatch.setenv(
+        VARIABLE,
+        f"tracking3d.trackers:bad={file}:FailingTracker;tracking3d.features:bad={file}:FailingEncoder",
+    )
+
+
+def settings(policy: str = "continue", start_frames: int = 1, **sections):
+    overrides = [*QUICK, f"solver.start_frames={start_frames}"]
+    return load_config(overrides=overrides, runtime={"on_plugin_failure": policy}, **sections)
+
+
+def bad(fault: str, *at: int) -> dict:
+    return {"name": "bad", "fault": fault, "at": list(at)}
+
+
+def run(clip: SyntheticClip, config) -> list:
+    return list(track(clip.images, mask=clip.masks[0], config=config))
+
+
+def test_going_on_is_the_default():
+    assert load_config().runtime.on_plugin_failure == "continue"
+
+
+@pytest.mark.parametrize(("fault", "told"), TRACKER_FAULTS.items())
+def test_where_the_tracker_fails_its_last_mask_stands_in_and_the_reason_is_told(clip, fault, told):
+    answers = run(clip, settings(tracker=bad(fault, 2, 3)))
+    assert [answer.index for answer in answers] == [0, 1, 2, 3, 4]
+    for index in (2, 3):
+        answer = answers[index]
+        assert answer.failure.startswith("mask tracker 'bad' (TRACKING3D_PLUGINS ")
+        assert told in answer.failure
+        assert answer.reason.startswith(answer.failure)
+        assert answer.status is not Status.TRACKED
+        assert answer.confidence <= 0.5
+        np.testing.assert_array_equal(answer.initial_mask, answers[1].initial_mask)
+    for index in (0, 1, 4):
+        assert answers[index].failure == ""
+        np.testing.assert_array_equal(answers[index].initial_mask, np.roll(clip.masks[0], index, axis=1))
+
+
+@pytest.mark.parametrize(("fault", "told"), ENCODER_FAULTS.items())
+def test_where_the_encoder_fails_the_initial_mask_is_the_answer_and_the_frame_is_lost(clip, fault, told):
+    answers = run(clip, settings(tracker=bad("raises"), features=bad(fault, 2)))
+    lost = answers[2]
+    assert (lost.status, lost.confidence) == (Status.LOST, 0.0)
+    assert lost.failure == lost.reason
+    assert lost.failure.startswith("feature encoder 'bad' (TRACKING3D_PLUGINS ")
+    assert told in lost.failure
+    for mask in (lost.mask, lost.initial_mask):
+        np.testing.assert_array_equal(mask, np.roll(clip.masks[0], 2, axis=1))
+    np.testing.assert_array_equal(lost.T_cam_obj, answers[1].T_cam_obj)
+    assert lost.seconds > 0
+    assert [answer.failure for answer in answers if answer.index != 2] == [""] * 4
+    assert answers[3].status is not Status.LOST
+
+
+def test_a_frame_in_which_both_fail_tells_both(clip):
+    answer = run(clip, settings(tracker=bad("raises", 2), features=bad("nan", 2)))[2]
+    assert "no pixels; feature encoder 'bad'" in answer.failure
+    np.testing.assert_array_equal(answer.mask, np.roll(clip.masks[0], 1, axis=1))
+
+
+def test_all_later_frames_may_fail(clip):
+    answers = run(clip, settings(tracker=bad("raises", 1, 2, 3, 4), features=bad("raises", 1, 2, 3, 4)))
+    assert [answer.status for answer in answers[1:]] == [Status.LOST] * 4
+    for answer in answers[1:]:
+        np.testing.assert_array_equal(answer.mask, clip.masks[0])
+
+
+def test_a_failed_frame_among_the_first_keeps_its_reason_when_it_is_answered_anew(clip):
+    answers = run(clip, settings(start_frames=4, tracker=bad("raises", 1)))
+    [revision] = [earlier for earlier in answers[3].revised if earlier.index == 1]
+    assert revision.failure == answers[1].failure != ""
+    assert revision.reason.startswith(revision.failure)
+    assert revision.status is not Status.TRACKED
+    assert all(not earlier.failure for earlier in answers[3].revised if earlier.index != 1)
+
+
+@pytest.mark.parametrize(("section", "kind"), [("tracker", "mask tracker"), ("features", "feature encoder")])
+def test_with_stop_the_run_ends_and_the_message_names_plugin_version_and_frame(clip, section, kind):
+    config = settings("stop", **{"tracker": bad("raises"), section: bad("raises", 2)})
+    answers = track(clip.images, mask=clip.masks[0], config=config)
+    assert [next(answers).index for _ in range(2)] == [0, 1]
+    told = rf"^{kind} 'bad' \(TRACKING3D_PLUGINS [0-9a-f]{{12}}\) failed at frame 2: ZeroDivisionError: no \w+\.$"
+    with pytest.raises(PluginError, match=told) as caught:
+        next(answers)
+    assert isinstance(caught.value.__cause__, ZeroDivisionError)
+
+
+@pytest.mark.parametrize("policy", ["continue", "stop"])
+@pytest.mark.parametrize(
+    ("section", "fault", "told"),
+    [
+        ("tracker", "raises", r"mask tracker 'bad' .* failed at frame 0: ZeroDivisionError: no pixels\.$"),
+        ("tracker", "shape", r"mask tracker 'bad' .* failed at frame 0: its mask has shape"),
+        ("features", "raises", r"feature encoder 'bad' .* failed at frame 0: ZeroDivisionError"),
+        ("features", "nan", r"feature encoder 'bad' .* failed at frame 0: its features are not all finite"),
+    ],
+)
+def test_in_the_first_frame_any_failure_ends_the_run(clip, policy, section, fault, told):
+    config = settings(policy, **{"tracker": bad("raises"), section: bad(fault, 0)})
+    with pytest.raises(PluginError, match=told):
+        run(clip, config)
+
+
+def test_what_the_tracker_refuses_to_start_on_is_told_in_its_own_words(clip):
+    with pytest.raises(InputError, match=r"^The third mask is missing\.$"):
+        run(clip, settings(tracker=bad("refuses", 0)))
+
+
+def test_an_encoder_whose_attributes_cannot_be_used_is_refused_before_the_first_frame(clip):
+    with pytest.raises(
+        PluginError, match=r"'bad' .* is broken: its channels is 0 instead of a positive integer"
+    ):
+        Session(settings(features=bad("attribute")), Prompt((0, 0, 9, 9), clip.masks[0]))
+
+
+@pytest.fixture
+def source(clip, tmp_path):
+    folder = tmp_path / "clip"
+    folder.mkdir()
+    for index, image in enumerate(clip.images):
+        write_image(folder / f"{index:03d}.png", image)
+    return open_source(str(folder))
+
+
+def test_the_run_folder_records_every_failure_and_the_summary_counts_them(clip, source, tmp_path):
+    config = settings(tracker=bad("raises", 1, 2, 4), features=bad("nan", 1))
+    record(source, config, tmp_path / "run", mask=clip.masks[0])
+    reader = RunReader(tmp_path / "run")
+    assert reader.state == "finished"
+    assert [bool(frame.failure) for frame in reader.frames] == [False, True, True, False, True]
+    description = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert description["counts"]["failed"] == 3
+    commonest, other = description["failures"]
+    assert (commonest["frames"], other["frames"]) == (2, 1)
+    assert commonest["reason"] == reader.frames[2].failure
+    assert "no pixels" in commonest["reason"] and "not all finite" in other["reason"]
+
+
+def test_with_stop_the_finished_frames_are_kept(clip, source, tmp_path):
+    with pytest.raises(PluginError, match=r"failed at 002\.png") as caught:
+        record(source, settings("stop", tracker=bad("raises", 2)), tmp_path / "run", mask=clip.masks[0])
+    assert "What was finished until then is kept" in caught.value.__notes__[0]
+    reader = RunReader(tmp_path / "run")
+    assert (reader.state, [frame.index for frame in reader.frames]) == ("failed", [0, 1])
+    assert "no pixels" in reader.description["error"]
+
+
+def test_the_summary_on_the_screen_says_how_many_frames_failed_and_why(clip, source, tmp_path, capsys):
+    from tracking3d.cli.progress import print_summary
+
+    record(source, settings(tracker=bad("raises", 1, 2)), tmp_path / "run", mask=clip.masks[0])
+    print_summary(tmp_path / "run")
+    shown = capsys.readouterr().out
+    [count] = [line for line in shown.splitlines() if "plug-in failure" in line]
+    [reason] = [line for line in shown.splitlines() if "no pixels" in line]
+    assert "│ 2" in count
+    assert "2 of them" in reason

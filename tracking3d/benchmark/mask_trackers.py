@@ -1,0 +1,274 @@
+"""Mask trackers by themselves: how good their masks are, how long they take, what their scores are worth.
+
+No pose is estimated. Masks are compared with what is seen of the object, where the data know it, since a mask
+tracker sees no more.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
+from typing import Any, Literal, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import rankdata
+
+from tracking3d.benchmark.sequences import Dataset
+from tracking3d.config.models import PluginChoice
+from tracking3d.datasets.answers import Answers
+from tracking3d.datasets.layout import load_layout
+from tracking3d.datasets.reading import read_sequence
+from tracking3d.datasets.truth import Truth
+from tracking3d.errors import InputError, Tracking3dError
+from tracking3d.evaluation.mask_scores import compare_masks
+from tracking3d.frames import Frame, MaskEstimate, Prompt
+from tracking3d.plugins import TRACKERS, build_plugin, check_options, plugin_label
+from tracking3d.plugins.guard import GuardedTracker
+from tracking3d.prompts import make_prompt
+from tracking3d.video.image_file import read_image
+
+Start = Literal["box", "mask"]
+
+FLOW_CUES: Mapping[str, Mapping[str, Any]] = {
+    "no prior": {"prior": 0.0},
+    "no outline": {"outline": 0.0},
+    "no similarity": {"similarity": False},
+    "no global colours": {"global_colours": 0.0},
+    "no local colours": {"local_colours": 0.0},
+    "no motion": {"motion": 0.0},
+    "no background": {"background": 0.0},
+    "no novelty": {"novelty": 0.0},
+    "no smoother": {"smoother": False},
+    "no witness": {"witness": "none"},
+}
+"""What switches each cue of the tracker ``flow`` off."""
+
+
+@dataclass(frozen=True)
+class Contestant:
+    """A mask tracker and what tables call it.
+
+    Attributes:
+        label: Its name in tables.
+        choice: The plug-in and its options.
+    """
+
+    label: str
+    choice: PluginChoice
+
+    @classmethod
+    def of(cls, choice: PluginChoice) -> Self:
+        """Called by its name and the options that were given."""
+        return cls(" ".join([choice.name, *(f"{k}={v}" for k, v in choice.options.items())]), choice)
+
+
+@dataclass(frozen=True)
+class TrackedFrame:
+    """One frame after the first that has a true mask or box.
+
+    Attributes:
+        index: Its index in the sequence.
+        iou: Of the tracker's mask and the true one; no mask is an empty one.
+        boundary_f: Of the same; NaN where only a box is known.
+        score: The tracker's own.
+    """
+
+    index: int
+    iou: float
+    boundary_f: float
+    score: float
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One tracker on one sequence, or on several together.
+
+    Attributes:
+        tracker: The contestant's label.
+        sequence: The sequence's name.
+        frames: Every frame that was scored.
+        seconds: Wall time of every step, scored or not; the first frame is not among them.
+        error: Why it failed, or empty.
+    """
+
+    tracker: str
+    sequence: str
+    frames: tuple[TrackedFrame, ...] = ()
+    seconds: tuple[float, ...] = ()
+    error: str = ""
+
+    def figures(self) -> dict[str, float | int | None]:
+        """The measures by name; None where there is nothing to measure.
+
+        ``iou_mean``, ``boundary_f_mean``, ``share_under_half`` (of frames with an IoU under 0.5),
+        ``milliseconds`` (median of a frame), ``auc_50`` and ``auc_70`` (area under the ROC curve of the score as
+        a sign of an IoU of at least 0.5 and 0.7), ``frames_scored``.
+        """
+        ious, boundaries, scores = (
+            np.array([getattr(frame, name) for frame in self.frames])
+            for name in ("iou", "boundary_f", "score")
+        )
+        return {
+            "iou_mean": _mean(ious),
+            "boundary_f_mean": _mean(boundaries),
+            "share_under_half": _mean(ious < 0.5),
+            "milliseconds": 1000 * float(np.median(self.seconds)) if self.seconds else None,
+            "auc_50": area_under_roc(scores, ious >= 0.5),
+            "auc_70": area_under_roc(scores, ious >= 0.7),
+            "frames_scored": len(ious),
+        }
+
+
+def measure_trackers(
+    contestants: Sequence[Contestant],
+    dataset: Dataset,
+    start: Start = "box",
+    most_frames: int | None = None,
+    listener: Callable[[Measured], None] = lambda measured: None,
+) -> list[Measured]:
+    """Every tracker on every sequence, one after the other, so that the times mean something.
+
+    Args:
+        contestants: The trackers.
+        dataset: The sequences.
+        start: Whether trackers start from the first frame's box or from its true mask.
+        most_frames: Only so many frames of each sequence.
+        listener: Is told of every result as it is there.
+    """
+    results = []
+    for contestant in contestants:
+        for sequence in dataset.sequences:
+            results.append(_measure(contestant, dataset, sequence, start, most_frames))
+            listener(results[-1])
+    return results
+
+
+def ablation(contestant: Contestant) -> list[Contestant]:
+    """The contestant, and it with each of the cues of ``flow`` that are on switched off in turn.
+
+    Raises:
+        InputError: If it is not the tracker ``flow``.
+    """
+    if contestant.choice.name != "flow":
+        raise InputError(
+            f"The tracker '{contestant.choice.name}' has no cues to switch off; use --tracker flow."
+        )
+    given = contestant.choice.model_dump()
+    options = check_options(TRACKERS, contestant.choice).model_dump()
+    return [contestant] + [
+        Contestant(f"{contestant.label}, {label}", PluginChoice.model_validate({**given, **off}))
+        for label, off in FLOW_CUES.items()
+        if any(options[name] != value for name, value in off.items())
+    ]
+
+
+def overall(results: Sequence[Measured]) -> dict[str, dict[str, float | int | None]]:
+    """Figures by tracker: means over its sequences; areas and times over all of its frames together."""
+    figures = {}
+    for tracker in dict.fromkeys(one.tracker for one in results):
+        done = [one for one in results if one.tracker == tracker and not one.error]
+        frames = tuple(frame for one in done for frame in one.frames)
+        seconds = tuple(second for one in done for second in one.seconds)
+        pooled = Measured(tracker, "all", frames, seconds).figures()
+        means = {
+            name: _mean([figure for one in done if (figure := one.figures()[name]) is not None])
+            for name in ("iou_mean", "boundary_f_mean", "share_under_half")
+        }
+        figures[tracker] = {**pooled, **means}
+    return figures
+
+
+def area_under_roc(scores: ArrayLike, right: ArrayLike) -> float | None:
+    """The chance that a right answer has a higher score than a wrong one, ties counting half.
+
+    Args:
+        scores: ``(N,)``.
+        right: ``(N,)`` bool.
+
+    Returns:
+        In [0, 1]; None where all are right or all are wrong.
+    """
+    is_right = np.asarray(right, bool)
+    count, others = np.count_nonzero(is_right), np.count_nonzero(~is_right)
+    if not count or not others:
+        return None
+    ranks = rankdata(scores)[is_right].sum()
+    return float((ranks - count * (count + 1) / 2) / (count * others))
+
+
+def track_masks(
+    choice: PluginChoice, truth: Truth, start: Start = "box"
+) -> Iterator[tuple[Frame, MaskEstimate, float]]:
+    """Send a sequence through a mask tracker; yields each frame, the answer and the seconds it took.
+
+    Raises:
+        InputError: If the sequence cannot be read or does not tell where the object is at first.
+        PluginError: If the tracker is unknown, its options are not its own, or it fails.
+    """
+    tracker = GuardedTracker(build_plugin(TRACKERS, choice), plugin_label(TRACKERS, choice.name))
+    for index, path in enumerate(truth.frames):
+        frame = Frame(index, read_image(path), name=path.name)
+        prompt = _prompt(truth, frame, start) if index == 0 else None
+        began = time.perf_counter()
+        estimate = tracker.step(frame) if prompt is None else tracker.init(frame, prompt)
+        yield frame, estimate, time.perf_counter() - began
+
+
+def _measure(
+    contestant: Contestant, dataset: Dataset, sequence: str, start: Start, most_frames: int | None
+) -> Measured:
+    measured = Measured(contestant.label, sequence)
+    frames, seconds = [], []
+    try:
+        truth = _seen(read_sequence(load_layout(dataset.layout), dataset.root, sequence))
+        for frame, estimate, took in islice(track_masks(contestant.choice, truth, start), most_frames):
+            if frame.index:
+                seconds.append(took)
+                frames += _compare(frame, estimate, truth)
+    except Tracking3dError as error:
+        return replace(measured, error=str(error))
+    if not frames:
+        return replace(measured, error="No frame after the first has a true mask or box.")
+    return replace(measured, frames=tuple(frames), seconds=tuple(seconds))
+
+
+def _seen(truth: Truth) -> Truth:
+    return replace(truth, masks={**truth.masks, **truth.visible_masks})
+
+
+def _prompt(truth: Truth, frame: Frame, start: Start) -> Prompt:
+    if start == "mask":
+        if 0 not in truth.masks:
+            raise InputError(f"{truth.name} has no true mask of its first frame; use --start box.")
+        return make_prompt(frame, mask=truth.masks[0].read())
+    if truth.box is None:
+        raise InputError(f"{truth.name} has no box in its first frame; a mask tracker cannot start.")
+    return make_prompt(frame, box=truth.box)
+
+
+@dataclass(frozen=True, eq=False)
+class _MaskInMemory:
+    mask: NDArray[np.bool_]
+
+    def read(self) -> NDArray[np.bool_]:
+        return self.mask
+
+
+def _compare(frame: Frame, estimate: MaskEstimate, truth: Truth) -> list[TrackedFrame]:
+    """The frame's figures; none where the truth is not known."""
+    masks = {} if estimate.binary is None else {frame.index: _MaskInMemory(estimate.binary)}
+    here = range(frame.index, frame.index + 1)
+    compared = compare_masks(Answers(truth.frames[0].parent, here, frozenset(here), masks=masks), truth)
+    return [
+        TrackedFrame(index, masks.iou, masks.boundary_f, float(estimate.score))
+        for index, masks in compared.items()
+    ]
+
+
+def _mean(values: ArrayLike) -> float | None:
+    known = np.asarray(values, float)
+    known = known[np.isfinite(known)]
+    return float(known.mean()) if len(known) else None

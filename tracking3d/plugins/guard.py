@@ -1,0 +1,207 @@
+"""Plug-ins under guard: whatever goes wrong in one while it runs is told as its own fault.
+
+A guarded plug-in does what the bare one does. An exception in it, or an answer that its protocol does not allow,
+becomes a `PluginFailure`, which knows the plug-in's name, package and version.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from tracking3d.errors import PluginError, Tracking3dError
+from tracking3d.features.protocol import FeatureEncoder
+from tracking3d.frames import Frame, MaskEstimate, Prompt
+from tracking3d.plugins.registration import told
+from tracking3d.trackers.protocol import MaskTracker
+
+
+class PluginFailure(PluginError):
+    """A plug-in failed while it ran.
+
+    Args:
+        plugin: What messages call it, see `tracking3d.plugins.plugin_label`.
+        fault: What went wrong, without a full stop.
+        frame: What messages call the frame, where known.
+    """
+
+    def __init__(self, plugin: str, fault: str, frame: str = "") -> None:
+        super().__init__(f"{plugin} failed{frame and f' at {frame}'}: {fault}.")
+        self.plugin = plugin
+        self.fault = fault
+
+    @property
+    def reason(self) -> str:
+        """Plug-in and fault, without the frame and a full stop."""
+        return f"{self.plugin} failed: {self.fault}"
+
+    def at(self, frame: str) -> PluginFailure:
+        """The same with the frame in its message."""
+        return PluginFailure(self.plugin, self.fault, frame)
+
+
+class GuardedTracker:
+    """A mask tracker under guard; implements `tracking3d.trackers.protocol.MaskTracker`, but is built from one.
+
+    Args:
+        tracker: The bare tracker.
+        label: What messages call it.
+    """
+
+    def __init__(self, tracker: MaskTracker, label: str) -> None:
+        self._tracker = tracker
+        self._label = label
+
+    def init(self, frame: Frame, prompt: Prompt) -> MaskEstimate:
+        """Start on the first frame.
+
+        Raises:
+            Tracking3dError: If the tracker says that it cannot start from this, in its own words.
+            PluginFailure: If it fails otherwise, or gives what is no answer.
+        """
+        with _blamed(self._label, but=Tracking3dError):
+            answer = self._tracker.init(frame, prompt)
+        return self._checked(answer, frame)
+
+    def step(self, frame: Frame) -> MaskEstimate:
+        """Answer for the next frame.
+
+        Raises:
+            PluginFailure: If the tracker fails or gives what is no answer.
+        """
+        with _blamed(self._label):
+            answer = self._tracker.step(frame)
+        return self._checked(answer, frame)
+
+    def _checked(self, answer: Any, frame: Frame) -> MaskEstimate:
+        if fault := mask_fault(answer, frame.size):
+            raise PluginFailure(self._label, fault)
+        mask: NDArray[np.float32] | None = answer.mask
+        if mask is None or mask.dtype == np.float32:
+            return MaskEstimate(mask, float(answer.score), str(answer.reason))
+        return MaskEstimate(mask.astype(np.float32), float(answer.score), str(answer.reason))
+
+
+class GuardedEncoder:
+    """A feature encoder under guard; implements `tracking3d.features.protocol.FeatureEncoder`, but is built from one.
+
+    What else the encoder has, it has too.
+
+    Args:
+        encoder: The bare encoder.
+        label: What messages call it.
+
+    Raises:
+        PluginError: If its channels, stride or tau are no positive numbers.
+    """
+
+    channels: int
+    stride: int
+    tau: float
+
+    def __init__(self, encoder: FeatureEncoder, label: str) -> None:
+        self._encoder = encoder
+        self._label = label
+        if fault := attribute_fault(encoder):
+            raise PluginError(f"{label} is broken: {fault}.")
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        value = getattr(self._encoder, name)
+        if not callable(value):
+            return value
+
+        def guarded(*given: Any, **named: Any) -> Any:
+            with _blamed(self._label):
+                return value(*given, **named)
+
+        return guarded
+
+    def encode(self, images: Tensor) -> Tensor:
+        """Encode ``(B, 3, H, W)`` RGB in [0, 1]; nothing is remembered for gradients.
+
+        Raises:
+            PluginFailure: If the encoder fails or gives what are no features of these images.
+        """
+        with _blamed(self._label), torch.no_grad():
+            features = self._encoder.encode(images)
+        if fault := feature_fault(features, images, self._encoder):
+            raise PluginFailure(self._label, fault)
+        return features.detach()
+
+
+def mask_fault(answer: Any, size: tuple[int, int]) -> str:
+    """Why this is no answer of a mask tracker for a frame of ``size`` ``(height, width)``, or nothing."""
+    if not isinstance(answer, MaskEstimate):
+        return f"it answered with {_kind(answer)} instead of a MaskEstimate"
+    if not isinstance(answer.score, int | float | np.number) or not 0 <= answer.score <= 1:
+        return f"its score is {answer.score!r} instead of a number from 0 to 1"
+    mask: Any = answer.mask
+    if mask is None:
+        return ""
+    if not isinstance(mask, np.ndarray) or mask.dtype.kind not in "fbiu":
+        return f"its mask is {_kind(mask)} instead of an array of float32"
+    if mask.shape != size:
+        return f"its mask has shape {mask.shape}, but the frame ({size[0]}, {size[1]})"
+    if mask.size and not (mask.min() >= 0 and mask.max() <= 1):  # false for NaN too
+        return f"its mask has values from {mask.min():g} to {mask.max():g} instead of from 0 to 1"
+    return ""
+
+
+def attribute_fault(encoder: Any) -> str:
+    """Why the attributes of a feature encoder cannot be used, or nothing."""
+    for name, kind in (("channels", int | np.integer), ("stride", int | np.integer), ("tau", int | float)):
+        value = getattr(encoder, name, None)
+        if not isinstance(value, kind) or isinstance(value, bool) or not 0 < value < float("inf"):
+            what = "a positive number" if name == "tau" else "a positive integer"
+            return f"its {name} is {value!r} instead of {what}"
+    return ""
+
+
+def feature_fault(features: Any, images: Tensor, encoder: FeatureEncoder) -> str:
+    """Why these are no features of ``images`` ``(B, 3, H, W)`` by ``encoder``, or nothing."""
+    if not isinstance(features, Tensor) or not features.is_floating_point():
+        return f"it answered with {_kind(features)} instead of a tensor of float32"
+    count, _, height, width = images.shape
+    stride = encoder.stride
+    # Where the stride does not divide the size, the encoder may round either way.
+    fits = features.ndim == 4 and all(
+        abs(found - side / stride) < 1
+        for found, side in zip(features.shape[2:], (height, width), strict=True)
+    )
+    if not fits or features.shape[:2] != (count, encoder.channels):
+        expected = (count, encoder.channels, -(-height // stride), -(-width // stride))
+        return (
+            f"its features have shape {tuple(features.shape)} instead of {expected} (channels "
+            f"{encoder.channels}, stride {stride})"
+        )
+    if features.device != images.device:
+        return f"its features are on {features.device}, but the images on {images.device}"
+    if not bool(features.isfinite().all()):
+        return "its features are not all finite numbers"
+    return ""
+
+
+@contextmanager
+def _blamed(label: str, but: type[Exception] = PluginFailure) -> Iterator[None]:
+    """Turn what is raised into a failure of the plug-in, ``but`` let exceptions of that type pass."""
+    try:
+        yield
+    except but:
+        raise
+    except (Exception, SystemExit) as error:
+        raise PluginFailure(label, told(error)) from error
+
+
+def _kind(value: Any) -> str:
+    if value is None:
+        return "None"
+    dtype = getattr(value, "dtype", None)
+    return f"a {type(value).__name__}" + (f" of {dtype}" if dtype is not None else "")

@@ -1,0 +1,153 @@
+"""Which plug-ins are registered, by installed packages and by the environment variable, and how they are imported."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import os
+import sys
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from tracking3d.errors import PluginError, Tracking3dError
+
+TRACKERS = "tracking3d.trackers"
+"""Entry-point group of the mask trackers."""
+
+FEATURES = "tracking3d.features"
+"""Entry-point group of the feature encoders."""
+
+VARIABLE = "TRACKING3D_PLUGINS"
+"""Environment variable that registers plug-ins for development."""
+
+KIND = {TRACKERS: "mask tracker", FEATURES: "feature encoder"}
+"""What a plug-in of each group is called."""
+
+_METHODS = {TRACKERS: ("from_options", "init", "step"), FEATURES: ("from_options", "encode")}
+
+
+@dataclass(frozen=True)
+class Registered:
+    """A registered plug-in before anything of it is imported; ``value`` is ``module:Class``."""
+
+    name: str
+    group: str
+    value: str
+    package: str
+    version: str
+
+    @property
+    def label(self) -> str:
+        """What messages call it: kind, name, package and version."""
+        origin = f"{self.package} {self.version}".strip()
+        return f"{KIND.get(self.group, 'plug-in')} '{self.name}' ({origin})"
+
+
+def registered_plugins() -> list[Registered]:
+    """All registered plug-ins, those first that win over others of the same name; imports none of them."""
+    packaged = [
+        Registered(point.name, group, point.value, *_distribution(point))
+        for group in KIND
+        for point in metadata.entry_points(group=group)
+    ]
+    packaged.sort(key=lambda plugin: (plugin.package != "tracking3d", plugin.package.lower()))
+    return _from_environment() + packaged
+
+
+def import_plugin(plugin: Registered) -> type[Any]:
+    """Import the class and check it; raises whatever the plug-in raises, or `PluginError` with a clause."""
+    if not plugin.value:
+        raise PluginError("it is not of the form group:name=module:Class with a known group")
+    module, _, attribute = plugin.value.rpartition(":")
+    if module.endswith(".py"):
+        cls = getattr(_module_from(Path(module)), attribute)
+    else:
+        cls = metadata.EntryPoint(plugin.name, plugin.value, plugin.group).load()
+    if fault := _fault(plugin, cls):
+        raise PluginError(fault)
+    return cls
+
+
+def told(error: BaseException) -> str:
+    """An exception in one short line, without a full stop."""
+    text = " ".join(str(error).split()).rstrip(".")
+    if not isinstance(error, Tracking3dError):
+        text = f"{type(error).__name__}: {text}"
+    return text if len(text) <= 200 else text[:197] + "..."
+
+
+def _distribution(point: metadata.EntryPoint) -> tuple[str, str]:
+    """Package and version behind an entry point; its metadata may be damaged or absent."""
+    try:
+        dist = point.dist
+        return (dist.name or "unknown", dist.version or "") if dist else ("unknown", "")
+    except Exception:
+        return "unknown", ""
+
+
+def _from_environment() -> list[Registered]:
+    items = [item.strip() for item in os.environ.get(VARIABLE, "").split(";") if item.strip()]
+    plugins = []
+    for item in items:
+        head, _, value = item.partition("=")
+        group, _, name = head.strip().rpartition(":")
+        if group in KIND and name and ":" in value:
+            version = _file_version(value.rpartition(":")[0])
+            plugins.append(Registered(name, group, value, VARIABLE, version))
+        else:  # it stays in the list without a class, to be shown as broken
+            plugins.append(Registered(item, group, "", VARIABLE, ""))
+    return plugins
+
+
+def _file_version(module: str) -> str:
+    """Short hash of the file of a module under development, in place of a version; empty where it is not found."""
+    file: Path | None = None
+    if module.endswith(".py"):
+        file = Path(module)
+    else:
+        with suppress(Exception):  # looking for a module imports the packages around it
+            spec = importlib.util.find_spec(module)
+            file = Path(spec.origin) if spec and spec.origin else None
+    try:
+        return hashlib.sha256(file.read_bytes()).hexdigest()[:12] if file else ""
+    except OSError:
+        return ""
+
+
+def _module_from(file: Path) -> Any:
+    """Import a file once, under a name that cannot hide another module."""
+    name = f"_tracking3d_plugin_{file.stem}"
+    known = sys.modules.get(name)
+    if known and known.__file__ == str(file.resolve()):
+        return known
+    if not file.is_file():
+        raise PluginError(f"the file {file} does not exist")
+    spec = importlib.util.spec_from_file_location(name, file.resolve())
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # pydantic looks up postponed annotations here
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return module
+
+
+def _fault(plugin: Registered, cls: Any) -> str:
+    """Why the class is no plug-in of its group, or nothing."""
+    if not isinstance(cls, type):
+        return f"{plugin.value} is not a class"
+    options = getattr(cls, "Options", None)
+    if not (isinstance(options, type) and issubclass(options, BaseModel)):
+        return "it has no nested pydantic model Options"
+    if "name" in options.model_fields:
+        return "its Options has a field 'name', which is the plug-in's own name in a configuration"
+    if absent := [name for name in _METHODS[plugin.group] if not callable(getattr(cls, name, None))]:
+        return f"it has no method {', '.join(absent)}"
+    return ""

@@ -1,0 +1,155 @@
+"""Plug-ins by name: listed with their status, loaded, checked, built from their options."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from pydantic import BaseModel, ValidationError
+
+from tracking3d.config.explain import describe, nearest, unknown_key
+from tracking3d.config.models import PluginChoice
+from tracking3d.errors import PluginError, Tracking3dError
+from tracking3d.plugins.registration import (
+    FEATURES,
+    KIND,
+    TRACKERS,
+    Registered,
+    import_plugin,
+    registered_plugins,
+    told,
+)
+
+_ATTRIBUTES: dict[str, tuple[str, ...]] = {TRACKERS: (), FEATURES: ("channels", "stride", "tau")}
+"""What an instance has besides methods; an encoder may know its channels only once it is built."""
+
+
+@dataclass(frozen=True)
+class PluginInfo:
+    """What is known about one registered plug-in.
+
+    Attributes:
+        name: The name that selects it.
+        group: Its entry-point group.
+        package: The distribution that registers it, or ``TRACKING3D_PLUGINS``.
+        version: The distribution's version, of a module under development a short hash of its file; empty where
+            unknown.
+        status: ``duplicate`` means that another plug-in took the name first.
+        reason: Why the status is not ``ok``.
+        options: JSON schema of its options where it is ``ok``.
+    """
+
+    name: str
+    group: str
+    package: str
+    version: str
+    status: Literal["ok", "broken", "duplicate"]
+    reason: str = ""
+    options: dict[str, Any] | None = None
+
+
+def list_plugins() -> list[PluginInfo]:
+    """Every registered plug-in with its status; imports all of them, and none can stop it."""
+    infos = []
+    first: dict[tuple[str, str], Registered] = {}
+    for plugin in registered_plugins():
+        winner = first.setdefault((plugin.group, plugin.name), plugin)
+        status: Literal["ok", "broken", "duplicate"] = "ok"
+        reason, options = "", None
+        if winner is not plugin:
+            status, reason = "duplicate", f"the name is taken by the {winner.label}"
+        else:
+            try:
+                options = import_plugin(plugin).Options.model_json_schema()
+            except (Exception, SystemExit) as error:
+                status, reason = "broken", told(error)
+        infos.append(
+            PluginInfo(plugin.name, plugin.group, plugin.package, plugin.version, status, reason, options)
+        )
+    return sorted(infos, key=lambda info: (info.group != TRACKERS, info.group, info.name))
+
+
+def load_plugin(group: str, name: str) -> type[Any]:
+    """The class of a plug-in.
+
+    Args:
+        group: ``TRACKERS`` or ``FEATURES``.
+        name: The plug-in's name.
+
+    Raises:
+        PluginError: No plug-in of that name, or it cannot be imported or does not keep to the protocol.
+    """
+    return _load(_find(group, name))
+
+
+def plugin_label(group: str, name: str) -> str:
+    """What messages call a plug-in: ``mask tracker 'kcf' (tracking3d-kcf 0.1.0)``.
+
+    Raises:
+        PluginError: If there is no plug-in of that name.
+    """
+    return _find(group, name).label
+
+
+def check_options(group: str, choice: PluginChoice) -> BaseModel:
+    """Validate the options of a chosen plug-in without building it.
+
+    Returns:
+        The plug-in's own ``Options`` with every default filled in.
+
+    Raises:
+        PluginError: As `load_plugin`; or an option that is unknown, missing or out of range.
+    """
+    plugin = _find(group, choice.name)
+    model: type[BaseModel] = _load(plugin).Options
+    unknown = [key for key in choice.options if key not in model.model_fields]
+    if unknown and model.model_config.get("extra", "ignore") == "ignore":  # in silence, as pydantic would
+        raise PluginError(f"{plugin.label}: {unknown_key(unknown[:1], model, 'option')}")
+    try:
+        return model.model_validate(choice.options)
+    except ValidationError as error:
+        raise PluginError(f"{plugin.label}: {describe(error, model, 'option')}") from error
+
+
+def build_plugin(group: str, choice: PluginChoice) -> Any:
+    """Build the chosen plug-in from its options.
+
+    Returns:
+        A mask tracker or a feature encoder.
+
+    Raises:
+        PluginError: As `check_options`; or the plug-in fails while it is built.
+    """
+    options = check_options(group, choice)
+    plugin = _find(group, choice.name)
+    try:
+        instance = _load(plugin).from_options(options)
+    except Tracking3dError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise PluginError(f"{plugin.label} could not be started: {told(error)}.") from error
+    if absent := [name for name in _ATTRIBUTES[group] if not hasattr(instance, name)]:
+        raise PluginError(f"{plugin.label} is broken: it has no attribute {', '.join(absent)}.")
+    return instance
+
+
+def _find(group: str, name: str) -> Registered:
+    plugins = [plugin for plugin in registered_plugins() if plugin.group == group]
+    for plugin in plugins:
+        if plugin.name == name:
+            return plugin
+    installed = sorted({plugin.name for plugin in plugins})
+    best = nearest(name, installed)
+    advice = f"; did you mean '{best}'?" if best else "."
+    raise PluginError(
+        f"There is no {KIND[group]} '{name}' (installed: {', '.join(installed) or 'none'}){advice}"
+    )
+
+
+def _load(plugin: Registered) -> type[Any]:
+    try:
+        return import_plugin(plugin)
+    except (Exception, SystemExit) as error:
+        raise PluginError(
+            f"{plugin.label} is broken: {told(error)}; `tracking3d plugins` lists those that work."
+        ) from error

@@ -1,0 +1,196 @@
+"""Conformance checks of mask trackers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from tracking3d.frames import Frame, MaskEstimate, Prompt
+from tracking3d.plugins.guard import mask_fault
+from tracking3d.testing.clips import Clip, Size, moving_disc, plain_frames
+from tracking3d.testing.plugins import factory_of, random_state, refusal_allowed, success_expected
+from tracking3d.trackers.protocol import MaskTracker
+
+SIZES: tuple[Size, ...] = ((90, 120), (131, 97))
+"""``(height, width)`` of the clips: one wide, one tall, odd numbers among them."""
+
+_TINY: Size = (9, 12)
+
+
+def check_tracker(
+    tracker: type[Any] | Callable[[], MaskTracker] | MaskTracker,
+    *,
+    sizes: Sequence[Size] = SIZES,
+    frames: int = 4,
+    **options: Any,
+) -> None:
+    """Check that a mask tracker keeps to its protocol, `tracking3d.trackers.protocol.MaskTracker`.
+
+    It is run on short clips of a moving disc, prompted by a mask and by a box: shapes, types and ranges of the
+    answers, the same answers again and beside another tracker of its kind, frames, prompts and given answers left
+    unchanged. Then on what a pipeline can meet: frames that turn black or white, tiny frames and objects, boxes at
+    the border, blank first frames. Those it may refuse when it starts, by a `tracking3d.errors.InputError` of one
+    sentence; once started it answers every frame.
+
+    Args:
+        tracker: The plug-in's class, a function that builds one, or a tracker.
+        sizes: ``(height, width)`` of the clips, for a tracker that does not take every size.
+        frames: Frames of each clip; at least 2.
+        options: The plug-in's own options, where ``tracker`` is its class.
+
+    Raises:
+        AssertionError: If it does not; the sentence says what was expected.
+    """
+    build = factory_of(tracker, ("init", "step"), options)
+    for size in sizes:
+        clip = moving_disc(size, frames)
+        for with_mask in (True, False):
+            _check_answers(build, clip, with_mask)
+    clip = moving_disc(sizes[0], frames)
+    _check_repeatable(build, clip)
+    _check_independent(build, clip, moving_disc(sizes[0], frames, seed=1))
+    for grey in (0, 255):
+        blank = plain_frames(sizes[0], grey, 2)
+        _check_hostile(build, blank, clip.prompt(False), f"a first frame of grey value {grey}")
+        later = (*clip.frames[:2], *blank)
+        _check_hostile(build, later, clip.prompt(True), f"a clip that turns to grey value {grey}")
+    for name, prompt in _odd_prompts(clip).items():
+        _check_hostile(build, clip.frames[:2], prompt, name)
+    tiny = moving_disc(_TINY, 2)
+    for with_mask in (True, False):
+        _check_hostile(
+            build, tiny.frames, tiny.prompt(with_mask), f"frames of {_TINY[1]} x {_TINY[0]} pixels"
+        )
+
+
+def _run(tracker: MaskTracker, clip: Clip, what: str) -> list[MaskEstimate]:
+    """Every answer, checked, and copied as it was when it was given."""
+    answers = []
+    for position, frame in enumerate(clip.frames):
+        answer = _ask(tracker, frame, None if position else clip.prompt(True), f"{what}, frame {position}")
+        answers.append(_copied(answer))
+    return answers
+
+
+def _ask(tracker: MaskTracker, frame: Frame, prompt: Prompt | None, what: str) -> MaskEstimate:
+    """One answer, to be given and valid; with a prompt for the first frame."""
+    with success_expected(what):
+        answer = tracker.step(frame) if prompt is None else tracker.init(frame, prompt)
+    return _checked(answer, frame, what)
+
+
+def _checked(answer: Any, frame: Frame, what: str) -> MaskEstimate:
+    fault = mask_fault(answer, frame.size)
+    assert not fault, f"{what}: {fault}."
+    assert isinstance(answer.reason, str), f"{what}: the reason is {answer.reason!r} instead of text."
+    assert answer.mask is not None or answer.reason, (
+        f"{what}: an answer without a mask says in its reason why there is none."
+    )
+    assert answer.mask is None or answer.mask.dtype == np.float32, (
+        f"{what}: the mask is of {answer.mask.dtype} instead of float32."
+    )
+    checked: MaskEstimate = answer
+    return checked
+
+
+def _copied(answer: MaskEstimate) -> MaskEstimate:
+    mask = None if answer.mask is None else answer.mask.copy()
+    return MaskEstimate(mask, answer.score, answer.reason)
+
+
+def _check_answers(build: Callable[[], MaskTracker], clip: Clip, with_mask: bool) -> None:
+    """The answers on an easy clip, and that nothing given or taken is changed."""
+    height, width = clip.mask.shape
+    what = f"{width} x {height} pixels, prompted by a {'mask' if with_mask else 'box'}"
+    prompt = clip.prompt(with_mask)
+    images = [frame.image.copy() for frame in clip.frames]
+    tracker = build()
+    given, copies = [], []
+    for position, frame in enumerate(clip.frames):
+        step = f"{what}, frame {position}"
+        given.append(_ask(tracker, frame, None if position else prompt, step))
+        copies.append(_copied(given[-1]))
+        assert np.array_equal(frame.image, images[position]), (
+            f"{step}: the tracker has changed the frame's image; draw on a copy."
+        )
+    first = copies[0].binary
+    assert first is not None and first.any(), f"{what}: the first frame's mask must show the object."
+    assert prompt.mask is None or np.array_equal(prompt.mask, clip.mask), (
+        f"{what}: the tracker has changed the prompt's mask; work on a copy."
+    )
+    for position, (answer, copy) in enumerate(zip(given, copies, strict=True)):
+        assert _same(answer, copy), (
+            f"{what}: the answer for frame {position} was changed while later frames were tracked; give a new array."
+        )
+
+
+def _check_repeatable(build: Callable[[], MaskTracker], clip: Clip) -> None:
+    """The same frames give the same answers, whatever the global random generators hold."""
+    runs = []
+    for seed in (1, 2):
+        with random_state(seed):
+            runs.append(_run(build(), clip, "a repeated run"))
+    for position, (once, again) in enumerate(zip(*runs, strict=True)):
+        assert _same(once, again), (
+            f"Two runs on the same frames differ at frame {position}; seed what is random from the options, and "
+            "begin anew in init."
+        )
+
+
+def _check_independent(build: Callable[[], MaskTracker], clip: Clip, other: Clip) -> None:
+    """A tracker beside another on other frames answers as it does alone: nothing is shared, nothing looks ahead."""
+    first, second = build(), build()
+    if first is second:  # one tracker was given, which cannot be in two clips at once
+        alone = _run(first, clip, "a clip")
+        _run(first, other, "another clip")
+        beside = _run(first, clip, "the first clip again")
+    else:
+        alone = _run(build(), clip, "a clip alone")
+        beside = []
+        for position, (frame, distraction) in enumerate(zip(clip.frames, other.frames, strict=True)):
+            what = f"two trackers side by side, frame {position}"
+            beside.append(_copied(_ask(first, frame, None if position else clip.prompt(True), what)))
+            _ask(second, distraction, None if position else other.prompt(True), what)
+    for position, (once, again) in enumerate(zip(alone, beside, strict=True)):
+        assert _same(once, again), (
+            f"The answer for frame {position} depends on what else was tracked before or beside it; keep what is "
+            "remembered in the tracker itself, and begin anew in init."
+        )
+
+
+def _check_hostile(
+    build: Callable[[], MaskTracker], frames: Sequence[Frame], prompt: Prompt, what: str
+) -> None:
+    """It may refuse to start, in one sentence; once started it answers."""
+    tracker = build()
+    started = False
+    with refusal_allowed(what):
+        _checked(tracker.init(frames[0], prompt), frames[0], f"{what}, frame 0")
+        started = True
+    for position, frame in enumerate(frames[1:] if started else (), start=1):
+        _ask(tracker, frame, None, f"{what}, frame {position}")
+
+
+def _odd_prompts(clip: Clip) -> dict[str, Prompt]:
+    height, width = clip.mask.shape
+    pixel = np.zeros_like(clip.mask)
+    pixel[height // 2, width // 2] = True
+    x, y, w, h = clip.box
+    return {
+        "a box in the upper left corner": Prompt((0.0, 0.0, w, h)),
+        "a box in the lower right corner": Prompt((width - w, height - h, w, h)),
+        "a box as large as the frame": Prompt((0.0, 0.0, float(width), float(height))),
+        "a box with fractions of pixels": Prompt((x + 0.3, y + 0.6, w - 1.1, h - 1.2)),
+        "a box of one pixel": Prompt((width // 2, height // 2, 1.0, 1.0)),
+        "a box without a size": Prompt((x, y, 0.0, 0.0)),
+        "a mask of one pixel": Prompt((width // 2, height // 2, 1.0, 1.0), pixel),
+        "an empty mask": Prompt((x, y, w, h), np.zeros_like(clip.mask)),
+    }
+
+
+def _same(a: MaskEstimate, b: MaskEstimate) -> bool:
+    if (a.mask is None) != (b.mask is None) or a.score != b.score:
+        return False
+    return a.mask is None or b.mask is None or np.array_equal(a.mask, b.mask)

@@ -1,0 +1,125 @@
+"""Box trackers that propose where the object is: CSR-DCF, or OpenCV's networks NanoTrack and VitTrack."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.errors import InputError
+from tracking3d.frames import Box, Image
+from tracking3d.trackers.crops import clip_box
+from tracking3d.trackers.csrt import BoxTracker, CsrtTracker
+
+_LEAST_SIDE = 4  # pixels that a box tracker needs
+
+
+class BoxProposer(Protocol):
+    """Follows a box; may be started again at any frame."""
+
+    def start(self, image: Image, box: Box) -> None:
+        """Take ``box`` ``(x, y, w, h)`` as the object's place in ``image`` ``(H, W, 3)`` RGB."""
+        ...
+
+    def update(self, image: Image) -> Box | None:
+        """The box in the next image, or None where the object is lost."""
+        ...
+
+
+class CsrtBoxes:
+    """OpenCV's CSR-DCF."""
+
+    def __init__(self, options: CsrtTracker.Options) -> None:
+        self._options = options
+        self._tracker: BoxTracker | None = None
+
+    def start(self, image: Image, box: Box) -> None:
+        """See `BoxProposer.start`."""
+        self._tracker = BoxTracker(self._options, image, box)
+
+    def update(self, image: Image) -> Box | None:
+        """See `BoxProposer.update`."""
+        return None if self._tracker is None else self._tracker.update(image)
+
+
+class NetworkBoxes:
+    """A tracker of OpenCV that runs on networks: ``cv2.TrackerNano`` or ``cv2.TrackerVit``."""
+
+    def __init__(self, tracker: Any) -> None:
+        self._tracker = tracker
+        self._started = False
+
+    def start(self, image: Image, box: Box) -> None:
+        """See `BoxProposer.start`."""
+        self._started = False
+        if (rectangle := _rectangle(box, image.shape)) is None:
+            return
+        try:
+            self._tracker.init(_bgr(image), rectangle)
+            self._started = True
+        except cv2.error:  # the image is too small for its search region
+            pass
+
+    def update(self, image: Image) -> Box | None:
+        """See `BoxProposer.update`."""
+        if not self._started:
+            return None
+        try:
+            found, box = self._tracker.update(_bgr(image))
+        except cv2.error:  # the search region has left the image
+            return None
+        x, y, width, height = (float(value) for value in box)
+        return (x, y, width, height) if found and min(width, height) > 0 else None
+
+
+def nano_boxes(backbone: Path, head: Path) -> NetworkBoxes:
+    """NanoTrack from its two ONNX files.
+
+    Raises:
+        InputError: If a file is no network that OpenCV can run.
+    """
+    return NetworkBoxes(_create(cv2.TrackerNano, backbone, head))
+
+
+def vit_boxes(model: Path) -> NetworkBoxes:
+    """VitTrack from its ONNX file.
+
+    Raises:
+        InputError: If the file is no network that OpenCV can run.
+    """
+    return NetworkBoxes(_create(cv2.TrackerVit, model))
+
+
+def _create(kind: Any, *files: Path) -> Any:
+    # Networks are read first: given by name in Params, OpenCV would print warnings about its own defaults.
+    return kind.create(*(_read(file) for file in files))
+
+
+def _read(file: Path) -> Any:
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        return cv2.dnn.readNetFromONNX(str(file))
+    except cv2.error as error:
+        raise InputError(
+            f"{file} is not a network that OpenCV can run; give an ONNX file made for OpenCV's tracker."
+        ) from error
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+
+
+def _rectangle(box: Box, shape: tuple[int, ...]) -> list[int] | None:
+    """Whole pixels inside the frame; a smaller box is grown about its corner. None where nothing is left."""
+    visible = clip_box(box, shape)
+    if visible is None:
+        return None
+    x, y, width, height = visible
+    width, height = max(round(width), _LEAST_SIDE), max(round(height), _LEAST_SIDE)
+    return [max(min(int(x), shape[1] - width), 0), max(min(int(y), shape[0] - height), 0), width, height]
+
+
+def _bgr(image: Image) -> NDArray[np.uint8]:
+    return cv2.cvtColor(image, cv2.COLOR_RGB2BGR)

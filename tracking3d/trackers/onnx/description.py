@@ -1,0 +1,156 @@
+"""What a segmentation network takes and gives: a short YAML description that users can write themselves.
+
+Two kinds are known. A *saliency* network finds the object that stands out in a crop (U2-Net, IS-Net). A
+*promptable* one is an encoder, run once on an image, and a decoder that takes a box, points and a mask
+(Segment Anything and its smaller relatives).
+"""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, ValidationError
+
+from tracking3d.config.explain import describe, hint
+from tracking3d.config.models import Section
+from tracking3d.config.yaml_files import read_mapping
+from tracking3d.errors import InputError
+
+Side = Annotated[int, Field(ge=16, le=4096)]
+Triple = tuple[float, float, float]
+
+
+class ImageInput(Section):
+    """How an image becomes a network's input: resized, its grey values divided, mean and deviation removed."""
+
+    name: str | None = Field(None, description="The input's name; the network's first if not given.")
+    size: Side | tuple[Side, Side] | None = Field(
+        None, description="Side, or height and width, in pixels; the image's own size if not given."
+    )
+    fit: Literal["stretch", "pad"] = Field(
+        "stretch",
+        description="Stretch to the size, or keep the proportions and pad at the right and below.",
+    )
+    padding: Triple = Field((0.0, 0.0, 0.0), description="Red, green, blue of the padding, 0 to 255.")
+    divisor: float | Literal["max"] = Field(
+        255.0, description="Grey values are divided by it; max is the largest one of the image."
+    )
+    mean: Triple = Field((0.0, 0.0, 0.0), description="Subtracted after the division: red, green, blue.")
+    std: tuple[Annotated[float, Field(gt=0)], ...] = Field(
+        (1.0, 1.0, 1.0), min_length=3, max_length=3, description="Divided by after that: red, green, blue."
+    )
+    channels: Literal["rgb", "bgr"] = Field("rgb", description="Order of the channels.")
+    layout: Literal["nchw", "nhwc", "chw", "hwc"] = Field(
+        "nchw", description="Order of the axes: n is the batch of one image, c the channels."
+    )
+
+
+class SaliencyNetwork(Section):
+    """A network that finds what stands out in an image, without a prompt."""
+
+    kind: Literal["saliency"]
+    title: str = Field("", description="What it is, for readers.")
+    link: str = Field("", description="Where it comes from, for readers.")
+    model: str | None = Field(
+        None, description="ONNX file, or name of a known network, used where the option model is not given."
+    )
+    input: ImageInput = ImageInput()
+    output: str | None = Field(None, description="Name of the output; the network's first if not given.")
+    channel: int = Field(0, ge=0, description="Which channel of the output is the object.")
+    activation: Literal["none", "sigmoid", "softmax"] = Field(
+        "none", description="What makes shares of the output: sigmoid for logits, softmax over channels."
+    )
+    normalise: bool = Field(
+        False, description="Stretch the result so that its least value is 0 and its greatest 1."
+    )
+
+
+class Decoder(Section):
+    """Names of a prompt decoder's inputs and outputs, and the pixels it counts in."""
+
+    points: str = Field("point_coords", description="Input: points (x, y), and a box's two corners.")
+    labels: str = Field(
+        "point_labels", description="Input: 1 object, 0 background, 2 and 3 a box's corners, -1 padding."
+    )
+    mask: str | None = Field("mask_input", description="Input: the previous mask as logits; null if none.")
+    has_mask: str | None = Field("has_mask_input", description="Input: 1 where that mask counts; or null.")
+    frame_size: str | None = Field(
+        "orig_im_size", description="Input: height and width of the image before the encoder; null if none."
+    )
+    coordinates: Literal["input", "image", "unit"] = Field(
+        "input",
+        description="Points in pixels of the encoder's input, of the image, or as shares of its sides.",
+    )
+    masks: str | None = Field(None, description="Output with the mask or masks; the first if not given.")
+    grid: Literal["image", "input"] = Field(
+        "image", description="What the masks cover: the image, or the encoder's input with its padding."
+    )
+    logits: bool = Field(True, description="Masks are logits; false for shares in [0, 1].")
+    padding_point: bool = Field(False, description="Add a padding point, label -1, to prompts without a box.")
+
+
+class PromptableNetwork(Section):
+    """A network of two files: an image encoder, and a decoder of prompts."""
+
+    kind: Literal["promptable"]
+    title: str = Field("", description="What it is, for readers.")
+    link: str = Field("", description="Where it comes from, for readers.")
+    encoder_model: str | None = Field(
+        None,
+        description="ONNX file or known name of the encoder, used where the option encoder is not given.",
+    )
+    decoder_model: str | None = Field(None, description="The same of the decoder.")
+    input: ImageInput = ImageInput(size=1024, fit="pad", divisor=1.0)
+    embeddings: dict[str, str] = Field(
+        {},
+        description="Decoder input: encoder output, where their names differ; equal names need no entry.",
+    )
+    decoder: Decoder = Decoder()
+
+
+Description = SaliencyNetwork | PromptableNetwork
+
+
+def load_description(segmenter: str | Path) -> Description:
+    """Read a description.
+
+    Args:
+        segmenter: Name of one that comes with the package, or a YAML file.
+
+    Raises:
+        InputError: If there is no such description, or a key or value in it cannot be used.
+    """
+    names = builtin_descriptions()
+    if str(segmenter) in names:
+        with resources.as_file(_folder() / f"{segmenter}.yaml") as file:
+            return _read(file)
+    file = Path(segmenter).expanduser()
+    if not file.is_file():
+        raise InputError(
+            f"There is no segmenter '{segmenter}'; give a YAML file or one of {', '.join(names)}: "
+            f"{hint(str(segmenter), names)}"
+        )
+    return _read(file)
+
+
+def builtin_descriptions() -> list[str]:
+    """Names of the descriptions that come with the package."""
+    return sorted(Path(item.name).stem for item in _folder().iterdir() if item.name.endswith(".yaml"))
+
+
+def _folder() -> Any:
+    return resources.files("tracking3d.trackers.onnx") / "descriptions"
+
+
+def _read(file: Path) -> Description:
+    data = read_mapping(file)
+    models: dict[str, type[Description]] = {"saliency": SaliencyNetwork, "promptable": PromptableNetwork}
+    model = models.get(str(data.get("kind")))
+    if model is None:
+        raise InputError(f"{file}: the key 'kind' must be one of {' and '.join(models)}; write it first.")
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        raise InputError(f"{file}: {describe(error, model, 'key')}") from error

@@ -1,0 +1,91 @@
+"""Options of the mask tracker ``onnx``, and what is built from them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from tracking3d.errors import InputError
+from tracking3d.networks.store import find_network
+from tracking3d.trackers.csrt import CsrtTracker
+from tracking3d.trackers.onnx.boxes import BoxProposer, CsrtBoxes, nano_boxes, vit_boxes
+from tracking3d.trackers.onnx.description import SaliencyNetwork, load_description
+from tracking3d.trackers.onnx.promptable import PromptableSegmenter
+from tracking3d.trackers.onnx.proposals import Segmenter
+from tracking3d.trackers.onnx.saliency import SaliencySegmenter
+from tracking3d.trackers.protocol import Options
+
+
+class OnnxOptions(Options):
+    """Options of ``onnx``."""
+
+    segmenter: str = Field(
+        "u2netp", description="What the network takes and gives: a name that comes along, or a YAML file."
+    )
+    model: str | None = Field(None, description="Saliency network: ONNX file, or name of a known network.")
+    encoder: str | None = Field(None, description="Promptable network: the image encoder, alike.")
+    decoder: str | None = Field(None, description="Promptable network: the prompt decoder, alike.")
+    box: Literal["csrt", "nano", "vit"] = Field(
+        "csrt", description="Box tracker: CSR-DCF, or OpenCV's NanoTrack or VitTrack from ONNX files."
+    )
+    nano_backbone: str = Field(
+        "nanotrack_v2_backbone", description="NanoTrack's backbone: ONNX file, or name of a known network."
+    )
+    nano_head: str = Field("nanotrack_v2_head", description="NanoTrack's head, alike.")
+    vit_model: str = Field("vittrack", description="VitTrack's network, alike.")
+    csrt: CsrtTracker.Options = Field(CsrtTracker.Options(), description="CSR-DCF's own options.")
+    every: int = Field(
+        1, ge=1, le=1000, description="Run the network in every k-th frame; flow carries the mask between."
+    )
+    crops: tuple[Annotated[float, Field(ge=1, le=4)], ...] = Field(
+        (1.2, 1.5), min_length=1, description="Saliency network: factors by which the box is enlarged."
+    )
+    anchor: bool = Field(True, description="Start the box tracker anew on the box of a confident mask.")
+    threads: int = Field(1, ge=1, le=256, description="CPU threads of the network.")
+
+
+def build_segmenter(options: OnnxOptions) -> Segmenter:
+    """The segmentation network that ``options`` ask for.
+
+    Raises:
+        InputError: If a description or a file is missing or cannot be used.
+    """
+    description = load_description(options.segmenter)
+
+    def file(option: str, given: str | None, default: str | None) -> Path:
+        return _file(option, given or default, f"the segmenter '{options.segmenter}'")
+
+    if isinstance(description, SaliencyNetwork):
+        model = file("model", options.model, description.model)
+        return SaliencySegmenter(model, description, options.crops, options.threads)
+    encoder = file("encoder", options.encoder, description.encoder_model)
+    decoder = file("decoder", options.decoder, description.decoder_model)
+    return PromptableSegmenter(encoder, decoder, description, options.threads)
+
+
+def build_boxes(options: OnnxOptions) -> BoxProposer:
+    """The box tracker that ``options`` ask for.
+
+    Raises:
+        InputError: If a file is missing or cannot be used.
+    """
+    match options.box:
+        case "nano":
+            backbone = _file("nano_backbone", options.nano_backbone, "the box tracker NanoTrack")
+            return nano_boxes(backbone, _file("nano_head", options.nano_head, "the box tracker NanoTrack"))
+        case "vit":
+            return vit_boxes(_file("vit_model", options.vit_model, "the box tracker VitTrack"))
+        case _:
+            return CsrtBoxes(options.csrt)
+
+
+def _file(option: str, name: str | None, whose: str) -> Path:
+    """The file of a network; errors name the option that gives it."""
+    if name is None:
+        raise InputError(f"No ONNX file is given for {whose}; give it by the option tracker.{option}.")
+    try:
+        return find_network(name)
+    except InputError as error:
+        raise InputError(f"For {whose} (option tracker.{option}): {error}") from error

@@ -1,0 +1,164 @@
+"""Mask tracker ``onnx``: a box tracker proposes, a segmentation network in an ONNX file disposes."""
+
+from __future__ import annotations
+
+import os
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel
+
+from tracking3d.errors import InputError, PluginError
+from tracking3d.frames import Box, Frame, Image, MaskEstimate, Prompt
+from tracking3d.trackers.crops import box_iou, box_of, clip_box
+from tracking3d.trackers.onnx.judging import ColourJudge, Verdict
+from tracking3d.trackers.onnx.options import OnnxOptions, build_boxes, build_segmenter
+from tracking3d.trackers.segmentation import ColourSegmentation
+
+G=lambda k,d: float(os.environ.get('H2_'+k,d))
+_FIRST_SLACK, _SLACK = 1.05, G('SLACK',1.1)  # the box the user gave is nearer to the object than a tracker's
+_LEAST_SHARPNESS = 0.35  # of a network's mask; below, it has not found anything
+_LEAST_AGREEMENT = 0.3  # of the mask's box with the box tracker's
+_CONFIDENT = 0.7  # score from which a mask teaches colours and may re-anchor the box
+_BOX_OFF = 0.8  # IoU of the mask's box and the box tracker's, below which the latter needs it
+
+
+class OnnxTracker:
+    """Mask tracker ``onnx``.
+
+    In every frame the box tracker says where to look, the network segments there, and the masks it proposes
+    are judged by colours and by the box, never by the network's own opinion of them. The best one is the
+    answer. Beside it goes a mask carried by flow and colours: the answer between the frames that are
+    segmented, and where the network's masks cannot be used. A confident mask whose box is not the box
+    tracker's starts that anew, so that it does not stay behind on the side of the object it saw first.
+    """
+
+    Options = OnnxOptions
+
+    def __init__(self, options: OnnxOptions) -> None:
+        self._options = options
+        self._segmenter = build_segmenter(options)
+        self._boxes = build_boxes(options)
+        self._carried: ColourSegmentation | None = None
+        self._judge: ColourJudge
+        self._last_box: Box
+        self._frames_since = 0
+
+    @classmethod
+    def from_options(cls, options: BaseModel) -> Self:
+        """Build the tracker from its validated options."""
+        if not isinstance(options, OnnxOptions):
+            raise PluginError("The tracker onnx was built with options that are not its own.")
+        return cls(options)
+
+    def init(self, frame: Frame, prompt: Prompt) -> MaskEstimate:
+        """Start from a box or a mask; the prompt's mask is the first answer, else the box's segmentation.
+
+        Raises:
+            InputError: If the box lies outside the frame.
+        """
+        image, box = frame.image, prompt.box
+        if clip_box(box, image.shape) is None:
+            raise InputError(
+                f"The box {box} lies outside {frame.name or 'the first frame'}; give a box inside it."
+            )
+        estimate = self._first_answer(image, prompt)
+        mask = np.zeros(frame.size, np.float32) if estimate.mask is None else estimate.mask
+        self._judge = ColourJudge(image, mask)
+        self._carried = ColourSegmentation(image, box, mask > 0.5)
+        self._boxes.start(image, box)
+        self._last_box, self._frames_since = box, 0
+        return estimate
+
+    def step(self, frame: Frame) -> MaskEstimate:
+        """Answer for the next frame."""
+        if self._carried is None:
+            raise PluginError("The tracker onnx was asked for a frame before it was started with init.")
+        image = frame.image
+        box = self._boxes.update(image)
+        carried = self._carried.step(image, box)
+        self._frames_since += 1
+        if self._frames_since < self._options.every and not carried.reason:
+            return carried
+        self._frames_since = 0
+        return self._segmented(image, box, carried)
+
+    def correct(self, frame: Frame, mask: NDArray[np.bool_]) -> None:
+        """Re-anchor the box tracker and the carried mask on ``mask`` ``(H, W)`` in ``frame``."""
+        box = box_of(mask)
+        if box is None or self._carried is None:
+            return
+        self._carried.correct(frame.image, mask)
+        self._judge.learn(frame.image, mask.astype(np.float32))
+        self._boxes.start(frame.image, box)
+        self._last_box = box
+
+    def _first_answer(self, image: Image, prompt: Prompt) -> MaskEstimate:
+        if prompt.mask is not None:
+            return MaskEstimate(prompt.mask.astype(np.float32))
+        guess = ColourSegmentation(image, prompt.box).estimate
+        if guess.mask is None:
+            return guess
+        judge = ColourJudge(image, guess.mask)
+        best = self._best(judge, image, prompt.box, None, prompt.box, _FIRST_SLACK)
+        if reason := _unusable(best):
+            return MaskEstimate(guess.mask, guess.score / 2, f"{reason}; colours in the box stand in")
+        return MaskEstimate(best.proposal.mask, best.score)
+
+    def _segmented(self, image: Image, witness: Box | None, carried: MaskEstimate) -> MaskEstimate:
+        """The network's answer, or the carried one where the network has none that can be used."""
+        assert self._carried is not None
+        box = witness if witness is not None else self._place(carried)
+        ask=box
+        lb = None if carried.mask is None else box_of(carried.mask)
+        if G('UNION',0) and lb:
+            x0,y0=min(box[0],lb[0]),min(box[1],lb[1]); x1,y1=max(box[0]+box[2],lb[0]+lb[2]),max(box[1]+box[3],lb[1]+lb[3]); ask=(x0,y0,x1-x0,y1-y0)
+        if G('MEAN',0) and lb:
+            ask=tuple((a+b)/2 for a,b in zip(box,lb))
+        if G('LAST',0) and lb: ask=lb
+        best = self._best(self._judge, image, ask, carried.mask, witness, _SLACK)
+        if reason := _unusable(best):
+            if carried.mask is None:
+                return MaskEstimate(None, 0.0, reason)
+            return MaskEstimate(carried.mask, carried.score / 2, f"{reason}; the last mask was carried on")
+        mask = best.proposal.mask
+        place = box_of(mask)
+        assert place is not None
+        self._carried.correct(image, mask > 0.5)
+        self._last_box = place
+        if best.score >= _CONFIDENT:
+            self._judge.learn(image, mask)
+            if self._options.anchor and box_iou(place, box) < G('OFF',.8) and (not G('GROW',0) or place[2]*place[3]>box[2]*box[3]):
+                self._boxes.start(image, place)
+        if witness is None:
+            return MaskEstimate(mask, best.score / 2, "the box tracker has lost the object")
+        return MaskEstimate(mask, best.score, best.judgement.doubt)
+
+    def _best(
+        self,
+        judge: ColourJudge,
+        image: Image,
+        box: Box,
+        last: NDArray[np.float32] | None,
+        witness: Box | None,
+        slack: float,
+    ) -> Verdict:
+        proposals = self._segmenter.propose(image, box, last)
+        verdicts = [judge.verdict(image, proposal, box, slack, witness) for proposal in proposals]
+        return max(verdicts, key=lambda verdict: verdict.preference)
+
+    def _place(self, carried: MaskEstimate) -> Box:
+        """Where to look while the box tracker is lost."""
+        found = None if carried.mask is None else box_of(carried.mask)
+        return self._last_box if found is None else found
+
+
+def _unusable(verdict: Verdict) -> str:
+    """Why a mask cannot be the answer, or empty."""
+    if box_of(verdict.proposal.mask) is None:
+        return "the network found nothing"
+    if verdict.proposal.sharpness < _LEAST_SHARPNESS:
+        return "the network's mask is blurred"
+    agreement = verdict.judgement.agreement
+    return verdict.judgement.doubt if agreement is not None and agreement < _LEAST_AGREEMENT else ""
