@@ -72,10 +72,10 @@ def locally_normalized(images: Tensor) -> Tensor:
 
 
 def _conv(inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> nn.Sequential:
+    # Zeros beyond the border would tell every cell where in the image it lies, and features would say so.
     padding = (kernel - stride + 1) // 2
-    return nn.Sequential(
-        nn.Conv2d(inputs, outputs, kernel, stride, padding, bias=False), nn.BatchNorm2d(outputs), nn.ReLU()
-    )
+    convolution = nn.Conv2d(inputs, outputs, kernel, stride, padding, bias=False, padding_mode="replicate")
+    return nn.Sequential(convolution, nn.BatchNorm2d(outputs), nn.ReLU())
 
 
 def _doubled(x: Tensor) -> Tensor:

@@ -21,6 +21,9 @@ CANVAS = 1.5
 """Side of a crop's canvas over the side of a training image: what warped views may see around it."""
 
 
+SHIFT = 0.4
+"""Views are shifted by up to so much of their side: where something lies in the image must not describe it."""
+
 _TRIES = 3  # crops with texture teach more: the best of so many
 
 
@@ -81,14 +84,14 @@ def _pasted(canvas: Image, cutout: Image, rng: np.random.Generator) -> Image:
 def random_homography(size: int, rng: np.random.Generator, strength: float) -> Array:
     """``(3, 3)`` from one ``(size, size)`` image to another view of it: rotation, scale, shear, perspective, shift."""
     centre = (size - 1) / 2
-    angle = np.radians(strength * rng.uniform(-45, 45))
+    angle = np.radians(strength * rng.uniform(-60, 60))
     scale = 2.0 ** (strength * rng.uniform(-0.6, 0.6))
     tilt, stretch = rng.uniform(0, np.pi), 1 - strength * rng.uniform(0, 0.45)
     turn = _rotation(tilt) @ np.diag([1.0, stretch]) @ _rotation(-tilt)
     H = np.eye(3)
     H[:2, :2] = scale * _rotation(angle) @ turn
     H[2, :2] = strength * rng.uniform(-0.25, 0.25, 2) / centre
-    H[:2, 2] = strength * rng.uniform(-0.15, 0.15, 2) * size
+    H[:2, 2] = rng.uniform(-SHIFT, SHIFT, 2) * size
     shift = np.array([[1, 0, centre], [0, 1, centre], [0, 0, 1.0]])
     return shift @ H @ np.linalg.inv(shift)
 

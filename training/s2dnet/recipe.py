@@ -18,6 +18,9 @@ class Recipe(BaseModel):
         description="Folders of pictures with transparent parts, pasted on photographs."
     )
     teacher: Path | None = Field(None, description="ONNX file of the teacher; None trains without one.")
+    initial: Path | None = Field(
+        None, description="Checkpoint whose network is trained on; None starts anew."
+    )
     seed: int = 0
     threads: int = Field(1, ge=1, description="CPU threads of torch.")
     device: str = "cpu"

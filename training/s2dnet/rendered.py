@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pairs import Pair
+from pairs import SHIFT, Pair
 from photometry import disturb
 from tracking3d.synthesis.camera_effects import linear
 from tracking3d.synthesis.frame_rendering import RenderedFrame, render_frame
@@ -84,11 +84,17 @@ def rendered_pair(item: RenderedObject, count: int, rng: np.random.Generator, st
     pixels = np.stack([columns[chosen], rows[chosen]], 1)
     target, seen = follow(item, one, two, pixels)
     seen[np.cumsum(seen) > count] = False
+    size = item.frames[one].depth.shape[0]
+    shift = np.rint(rng.uniform(-SHIFT, SHIFT, 2) * size)
+    moved = target + shift
+    seen &= ((moved > 2) & (moved < size - 3)).all(1)
+    move = np.float32([[1, 0, shift[0]], [0, 1, shift[1]]])
+    second = cv2.warpAffine(item.frames[two].image, move, (size, size), borderMode=cv2.BORDER_REFLECT)
     images = (
         disturb(item.frames[one].image, rng, 0.3 * strength),
-        disturb(item.frames[two].image, rng, 0.5 * strength),
+        disturb(second, rng, 0.5 * strength),
     )
-    points = pixels[seen].astype(np.float32), target[seen].astype(np.float32)
+    points = pixels[seen].astype(np.float32), moved[seen].astype(np.float32)
     return Pair(images, points, -1, np.zeros(0, np.int64))
 
 

@@ -36,6 +36,8 @@ def train(recipe: Recipe, out: Path) -> None:
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: _rate(step, recipe))
     checkpoint = out / "checkpoint.pt"
     first = 0
+    if recipe.initial:
+        network.load_state_dict(torch.load(recipe.initial, weights_only=True)["network"])
     if checkpoint.exists():
         state = torch.load(checkpoint, weights_only=True)
         network.load_state_dict(state["network"])
