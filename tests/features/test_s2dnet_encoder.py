@@ -49,6 +49,18 @@ def test_features_move_with_the_image(encoder):
     assert float(same.min()) > 0.99
 
 
+def test_features_do_not_say_where_in_the_image_they_lie(encoder):
+    """A pattern that repeats must look alike wherever it is, in the middle as near the border."""
+    tile = picture((64, 64), seed=3)
+    features = encoder.encode(tile.repeat(1, 1, 6, 6))[0]
+    repeats = features[:, 32:-32, 32:-32].unflatten(1, (-1, 32)).unflatten(3, (-1, 32))  # 64 pixels are 32 cells
+    middle = repeats[:, 1, :, 1, :]
+    for row in range(repeats.shape[1]):
+        for column in range(repeats.shape[3]):
+            same = (repeats[:, row, :, column, :] * middle).sum(0)
+            assert float(same.mean()) > 0.97
+
+
 def test_light_changes_features_far_less_than_another_place_does(encoder):
     image = picture((128, 128))
     ramp = torch.linspace(0.6, 1.3, 128)

@@ -39,6 +39,7 @@ _MARGIN = 4  # pixels at the border that are neither query nor truth
 _TEXTURE = 0.006  # change of grey a pixel, in the direction of least change, over 9 x 9 pixels
 _CANDIDATES = 8  # crops of which the one with most texture is taken
 _ROTATION, _ZOOM, _PERSPECTIVE = np.radians(20.0), 1.25, 0.25
+_SHIFT = 0.25  # of the crop's side; in every warp, or features that tell where in the image they lie would do well
 _GAMMA, _SHADING, _CAST, _NOISE = 1.4, 0.5, 0.15, 0.02
 
 
@@ -78,7 +79,7 @@ def make_pairs(images: Sequence[Image], seed: int = 0, size: int = 256) -> list[
     """Cut, warp and relight images: one pair of an image for each of `STRENGTHS`.
 
     At full strength a warp turns by up to 20 degrees, zooms by up to 1.25 and foreshortens by up to 0.25 over the
-    image. Light is always changed in full: gamma 1.4, a ramp of gain from 0.5 to 1.5 in any direction, a gain of
+    image; every warp shifts by up to a quarter of the crop. Light is always changed in full: gamma 1.4, a ramp of gain from 0.5 to 1.5 in any direction, a gain of
     each channel from 0.85 to 1.15, noise of 0.02.
 
     Args:
@@ -164,9 +165,10 @@ def _homography(size: int, strength: float, rng: np.random.Generator) -> NDArray
     similarity = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
     perspective = np.eye(3)
     perspective[2, :2] = _PERSPECTIVE * across / size, _PERSPECTIVE * down / size
-    centre = np.eye(3)
+    centre, moved = np.eye(3), np.eye(3)
     centre[:2, 2] = (size - 1) / 2
-    return centre @ perspective @ similarity @ np.linalg.inv(centre)
+    moved[:2, 2] = (size - 1) / 2 + size * rng.uniform(-_SHIFT, _SHIFT, 2)
+    return moved @ perspective @ similarity @ np.linalg.inv(centre)
 
 
 def _crop(image: NDArray, top: int, left: int, size: int) -> NDArray:
