@@ -81,7 +81,9 @@ class Table:
             if not any(fnmatch(row.label, pattern) for row in self.rows):
                 labels = "; ".join(row.label for row in self.rows)
                 raise InputError(f"Table {self.name} has no row '{pattern}'; choose from: {labels}.")
-        chosen = (row for row in self.rows if not patterns or any(fnmatch(row.label, one) for one in patterns))
+        chosen = (
+            row for row in self.rows if not patterns or any(fnmatch(row.label, one) for one in patterns)
+        )
         return replace(self, rows=tuple(chosen))
 
 

@@ -49,6 +49,16 @@ class GlobalColours:
         """``(S, S)``: log of object over background likelihood of each pixel, clipped at 3."""
         return _log_ratio(self._memory * self._first + (1 - self._memory) * self._running, colours)
 
+    def rarity(self, colours: NDArray[np.uint8], image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """``(S, S)``: log of the first object's likelihood of each pixel over its share of a whole ``image``.
+
+        Args:
+            colours: ``(S, S, 3)`` Lab crop of the image.
+            image: ``(H, W, 3)`` Lab.
+        """
+        everywhere = np.ones(image.shape[:2], bool)
+        return _log_ratio(np.stack([self._first[0], _histograms(image, everywhere, everywhere)[0]]), colours)
+
     def separation(
         self, colours: NDArray[np.uint8], mask: NDArray[np.bool_], background: NDArray[np.bool_]
     ) -> float:

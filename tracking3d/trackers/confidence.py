@@ -9,9 +9,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from tracking3d.trackers.outline import signed_distance
 
 _BAND = 0.08  # width of the bands along the outline, relative to the square root of the area
 _LOST_SEPARATION = 0.1
@@ -71,9 +72,3 @@ def outline_margin(evidence: NDArray[np.float32], mask: NDArray[np.bool_]) -> fl
         return 0.0
     likeness = np.tanh(evidence / 3)
     return float(likeness[inner].mean() - likeness[outer].mean()) / 2
-
-
-def signed_distance(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """``(S, S)`` pixels to the outline: positive inside, negative outside."""
-    inside = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 3)
-    return inside - cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 3)

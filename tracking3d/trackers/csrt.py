@@ -13,9 +13,13 @@ from pydantic import BaseModel, Field
 
 from tracking3d.errors import InputError, PluginError
 from tracking3d.frames import Box, Frame, Image, MaskEstimate, Prompt
+from tracking3d.trackers.box_trackers import OpenCvBoxes
 from tracking3d.trackers.crops import box_of, clip_box
+from tracking3d.trackers.cues import Cues
 from tracking3d.trackers.protocol import Options
 from tracking3d.trackers.segmentation import ColourSegmentation
+
+_CUES = Cues(outline=0.0, background=0.0, novelty=0.0)  # the box does their work
 
 
 class CsrtTracker:
@@ -69,7 +73,7 @@ class CsrtTracker:
                 f"The box {prompt.box} lies outside {frame.name or 'the first frame'}; give a box inside it."
             )
         self._segmentation = ColourSegmentation(
-            frame.image, prompt.box, prompt.mask, size=self._options.segmentation_size
+            frame.image, prompt.box, prompt.mask, size=self._options.segmentation_size, cues=_CUES
         )
         self._boxes = BoxTracker(self._options, frame.image, prompt.box)
         return self._segmentation.estimate
@@ -93,7 +97,7 @@ class CsrtTracker:
         self._boxes = BoxTracker(self._options, frame.image, box)
 
 
-class BoxTracker:
+class BoxTracker(OpenCvBoxes):
     """OpenCV's CSR-DCF, deterministic, on RGB images at a chosen resolution.
 
     Args:
@@ -106,35 +110,4 @@ class BoxTracker:
         params = cv2.TrackerCSRT.Params()
         for name in CsrtTracker.Options.model_fields.keys() & set(dir(params)):
             setattr(params, name, getattr(options, name))
-        self._scale = options.resolution
-        self._filter: cv2.TrackerCSRT | None = cv2.TrackerCSRT.create(params)
-        view = self._view(image)
-        visible = clip_box(box, image.shape) or (0.0, 0.0, 1.0, 1.0)
-        x, y, width, height = (value * self._scale for value in visible)
-        # A filter needs a few pixels: a smaller box is grown about its corner.
-        rectangle = [int(x), int(y), max(round(width), 4), max(round(height), 4)]
-        rectangle[0] = max(min(rectangle[0], view.shape[1] - rectangle[2]), 0)
-        rectangle[1] = max(min(rectangle[1], view.shape[0] - rectangle[3]), 0)
-        cv2.setRNGSeed(0)
-        try:
-            self._filter.init(view, rectangle)
-        except cv2.error:  # an image too small or a box too slender for a filter
-            self._filter = None
-
-    def update(self, image: Image) -> Box | None:
-        """The box in the next image, or None where the filter has lost the object."""
-        if self._filter is None:
-            return None
-        cv2.setRNGSeed(0)
-        try:
-            found, box = self._filter.update(self._view(image))
-        except cv2.error:  # the object has shrunk to nothing
-            return None
-        x, y, width, height = (value / self._scale for value in box)
-        return (x, y, width, height) if found else None
-
-    def _view(self, image: Image) -> NDArray[np.uint8]:
-        bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-        if self._scale == 1:
-            return bgr
-        return cv2.resize(bgr, None, fx=self._scale, fy=self._scale, interpolation=cv2.INTER_AREA)
+        super().__init__(cv2.TrackerCSRT.create(params), image, box, options.resolution)

@@ -1,41 +1,79 @@
-"""Mask tracker ``flow``: optical flow, colours and motion carry the mask; no box tracker leads it."""
+"""Mask tracker ``flow``: optical flow, colours, motion and background carry the mask; no box leads it."""
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Literal, Self
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
 from tracking3d.errors import InputError, PluginError
-from tracking3d.frames import Frame, MaskEstimate, Prompt
+from tracking3d.frames import Box, Frame, Image, MaskEstimate, Prompt
+from tracking3d.trackers.box_trackers import OpenCvBoxes
 from tracking3d.trackers.crops import box_of, clip_box
 from tracking3d.trackers.csrt import BoxTracker, CsrtTracker
+from tracking3d.trackers.cues import Cues
 from tracking3d.trackers.protocol import Options
-from tracking3d.trackers.segmentation import ColourSegmentation, Cues
+from tracking3d.trackers.segmentation import ColourSegmentation
+
+_CUES = Cues()
 
 
 class FlowTracker:
-    """Mask tracker ``flow``."""
+    """Mask tracker ``flow``: the segmentation of ``csrt`` without a box tracker, or with one as witness only.
+
+    Every cue has a weight of its own; 0 switches it off. An object that leaves the frame is answered with no mask
+    and found again by its colours.
+    """
 
     class Options(Options):
         """Options of ``flow``."""
 
-        witness: Literal["none", "csrt"] = Field("none", description="Box tracker.")
-        segmentation_size: int = Field(224, ge=64, le=1024, description="Side of the crop in pixels.")
-        prior: float = Field(1.5, ge=0, description="Weight of the moved mask's outline.")
-        global_colours: float = Field(1.0, ge=0, description="Weight of remembered colours.")
-        local_colours: float = Field(1.0, ge=0, description="Weight of colours nearby.")
-        motion: float = Field(2.0, ge=0, description="Weight of motion.")
-        witness_weight: float = Field(1.0, ge=0, description="Weight of witness.")
-        change: float = Field(0.0, ge=0, description="Weight of change.")
-        similarity: bool = Field(True, description="similarity")
-        smoother: bool = Field(True, description="smoother")
+        segmentation_size: int = Field(
+            224, ge=64, le=1024, description="Side of the segmentation's crop in pixels."
+        )
+        prior: float = Field(
+            _CUES.prior, ge=0, le=100, description="Weight of the distance to the outline of the moved mask."
+        )
+        outline: float = Field(
+            _CUES.outline, ge=0, le=100, description="Weight in the prior of the last outline, shifted only."
+        )
+        similarity: bool = Field(
+            _CUES.similarity,
+            description="Prior also by one similarity, fitted to the flow that forward and backward agree on.",
+        )
+        global_colours: float = Field(
+            _CUES.global_colours, ge=0, le=100, description="Weight of remembered colours."
+        )
+        local_colours: float = Field(
+            _CUES.local_colours, ge=0, le=100, description="Weight of colours nearby, one frame ago."
+        )
+        motion: float = Field(
+            _CUES.motion, ge=0, le=100, description="Weight of motion with the object or the background."
+        )
+        background: float = Field(
+            _CUES.background, ge=0, le=100, description="Weight of change against the remembered background."
+        )
+        novelty: float = Field(
+            _CUES.novelty, ge=0, le=100, description="Weight of never seen colours within the outline."
+        )
+        smoother: bool = Field(
+            _CUES.smoother, description="Smooth the evidence along the edges of the image."
+        )
+        witness: Literal["none", "csrt", "kcf"] = Field(
+            "none", description="Box tracker that judges the mask and helps where it is lost."
+        )
+        witness_weight: float = Field(
+            _CUES.witness, ge=0, le=100, description="Weight of the distance beyond the witness's box."
+        )
 
     def __init__(self, options: FlowTracker.Options) -> None:
         self._options = options
         self._segmentation: ColourSegmentation | None = None
+        self._witness: OpenCvBoxes | None = None
 
     @classmethod
     def from_options(cls, options: BaseModel) -> Self:
@@ -50,37 +88,32 @@ class FlowTracker:
             raise InputError(
                 f"The box {prompt.box} lies outside {frame.name or 'the first frame'}; give a box inside it."
             )
-        o = self._options
+        options = self._options
+        weights = {one.name: getattr(options, one.name) for one in fields(Cues) if one.name != "witness"}
+        cues = Cues(**weights, witness=options.witness_weight)
         self._segmentation = ColourSegmentation(
-            frame.image,
-            prompt.box,
-            prompt.mask,
-            o.segmentation_size,
-            Cues(
-                o.prior,
-                o.global_colours,
-                o.local_colours,
-                o.motion,
-                o.witness_weight,
-                o.similarity,
-                o.smoother,
-            ),
+            frame.image, prompt.box, prompt.mask, size=options.segmentation_size, cues=cues
         )
-        self._boxes = (
-            BoxTracker(CsrtTracker.Options(), frame.image, prompt.box) if o.witness == "csrt" else None
-        )
+        self._witness = _witness(options.witness, frame.image, prompt.box)
         return self._segmentation.estimate
 
     def step(self, frame: Frame) -> MaskEstimate:
         """Answer for the next frame."""
         if self._segmentation is None:
             raise PluginError("The tracker flow was asked for a frame before it was started with init.")
-        box = self._boxes.update(frame.image) if self._boxes else None
+        box = self._witness.update(frame.image) if self._witness else None
         return self._segmentation.step(frame.image, box)
 
     def correct(self, frame: Frame, mask: NDArray[np.bool_]) -> None:
-        """Go on from ``mask`` ``(H, W)`` in ``frame``."""
+        """Go on from ``mask`` ``(H, W)`` in ``frame``, the witness too."""
         box = box_of(mask)
         if box is None or self._segmentation is None:
             return
         self._segmentation.correct(frame.image, mask)
+        self._witness = _witness(self._options.witness, frame.image, box)
+
+
+def _witness(name: str, image: Image, box: Box) -> OpenCvBoxes | None:
+    if name == "csrt":
+        return BoxTracker(CsrtTracker.Options(), image, box)
+    return OpenCvBoxes(cv2.TrackerKCF.create(), image, box) if name == "kcf" else None

@@ -27,6 +27,7 @@ class MaskMotion:
         by_similarity: ``(S, S)`` float32 in [0, 1], the last mask moved by one similarity.
         cue: ``(S, S)`` float32 pixels: how much better a pixel's motion fits the object's affine motion than
             the background's similarity; 0 where it cannot be told.
+        background: ``(2, 3)``, the background's similarity from present to last pixels; None where it cannot be told.
     """
 
     source: NDArray[np.float32]
@@ -35,6 +36,11 @@ class MaskMotion:
     cue: NDArray[np.float32]
     background: NDArray[np.float64] | None
 
+    @property
+    def moved(self) -> NDArray[np.bool_]:
+        """``(S, S)``: the last mask moved along, by flow and similarity together."""
+        return self.by_flow + self.by_similarity > 1.0
+
 
 def follow_mask(
     last: NDArray[np.uint8], present: NDArray[np.uint8], mask: NDArray[np.float32], similarity: bool = True
@@ -42,7 +48,7 @@ def follow_mask(
     """Carry ``mask`` ``(S, S)`` of the grey crop ``last`` ``(S, S)`` into the grey crop ``present``.
 
     DIS optical flow (Kroeger et al. 2016) runs both ways; models of motion are RANSAC fits to the flow that
-    survives the round trip.
+    survives the round trip. Without ``similarity`` the mask is moved by the flow alone.
     """
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     backward = dis.calc(present, last, None)

@@ -1,57 +1,37 @@
-"""Temporally consistent colour segmentation of one object: the last mask moved along, colours kept.
+"""Temporally consistent segmentation of one object: the last mask moved along, colours and background kept.
 
-GrabCut gives the first mask. From then on every pixel of a crop around the object collects log-odds from
-where the last mask has moved to, from global and local colours that are kept, from how the pixel moves, and
-from a box tracker's box where there is one; an edge-aware smoother, far cheaper than a graph cut, turns them
-into a mask. The box is a *witness*, not the master: the object is segmented anew from it only when the mask
-looks lost. Any box tracker will do. Everything is deterministic and causal.
+GrabCut gives the first mask. From then on every pixel of a crop around the object collects log-odds from where
+the last mask has moved to, from global and local colours that are kept, from how the pixel moves, from whether it
+has changed against the background, and from a box tracker's box where there is one; an edge-aware smoother, far
+cheaper than a graph cut, turns them into a mask. The box is a *witness*, not the master: the object is segmented
+anew from it only when the mask looks lost. Any box tracker will do. Everything is deterministic and causal.
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
-
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.frames import Box, Image, MaskEstimate
 from tracking3d.geometry.camera import Window
 from tracking3d.trackers.background import BackgroundMemory
-from tracking3d.trackers.colour_models import GlobalColours, Palette, lab
-from tracking3d.trackers.confidence import Judgement, outline_margin, signed_distance
-from tracking3d.trackers.crops import box_iou, box_of, clip_box, cut, inside_frame, paste
+from tracking3d.trackers.colour_models import GlobalColours, Palette
+from tracking3d.trackers.confidence import Judgement, outline_margin
+from tracking3d.trackers.crops import box_iou, box_of, clip_box, cut, paste
+from tracking3d.trackers.cues import Cues, View, colour_and_motion, decide, distance_beyond
 from tracking3d.trackers.first_mask import mask_in_box
-from tracking3d.trackers.mask_motion import MaskMotion, follow_mask
+from tracking3d.trackers.mask_motion import follow_mask
+from tracking3d.trackers.outline import both_sides, tidied, touches_border
+from tracking3d.trackers.search import find_by_colours
 
 _MARGIN = 0.45  # free space around the last box: how far the mask may move or grow in one frame
 _AREA_CHANGE = 0.35  # a larger relative change against the moved mask is not believed
+_LEAST_PART = 0.1  # of the usual area; less of it at the frame's border is out of sight
+_LEAST_PIXELS = 9  # of the crop; fewer are no mask
 _PATIENCE = 3  # doubtful frames in a row before each attempt to begin anew
+_FOUND_AGAIN = 0.6  # of the first mask's colour separation, for what is found after it was out of sight
 
-
-@dataclass(frozen=True)
-class Cues:
-    """What a pixel's log-odds are made of: the weights of their parts. 0 switches a part off.
-
-    Attributes:
-        prior: Distance to the outline of the moved mask.
-        global_colours: Colours of the whole object and its surroundings, remembered.
-        local_colours: Colours nearby, one frame ago.
-        motion: Whether the pixel moves with the object or with the background.
-        witness: Distance beyond the box tracker's box.
-        similarity: Whether the prior is also the mask moved by one similarity, besides by dense flow.
-        smoother: Whether the edge-aware smoother follows.
-    """
-
-    prior: float = 1.5
-    global_colours: float = 1.0
-    local_colours: float = 1.0
-    motion: float = 2.0
-    witness: float = 1.0
-    change: float = 0.0
-    similarity: bool = True
-    smoother: bool = True
+_Answer = tuple[NDArray[np.float32], Judgement]
 
 
 class ColourSegmentation:
@@ -73,21 +53,20 @@ class ColourSegmentation:
         size: int = 224,
         cues: Cues | None = None,
     ) -> None:
-        self._size = size
-        self._cues = cues or Cues()
+        self._size, self._cues = size, cues or Cues()
         self._image = image
         self._mask = mask_in_box(image, box) if mask is None else mask.astype(np.float32)
         self._velocity = (0, 0)
         self._doubtful_frames = 0
-        window = Window.around(box_of(self._mask) or box, _MARGIN, size)
-        colours = lab(cut(image, window))
-        inside, around = _sides(cut(self._mask, window))
-        self._colours = GlobalColours(colours, inside, around)
-        self._palette = Palette(colours)
+        self._usual_area = float(np.count_nonzero(self._mask > 0.5))
+        view = View.of(image, Window.around(box_of(self._mask) or box, _MARGIN, size))
+        inside, around = both_sides(cut(self._mask, view.window))
+        self._colours = GlobalColours(view.colours, inside, around)
+        self._palette = Palette(view.colours)
         self._background = BackgroundMemory(image.shape)
-        self._background.learn(image, window, around & inside_frame(image.shape, window))
-        separation = self._colours.separation(colours, inside, around)
-        self._judgement = Judgement(separation, margin=separation)
+        self._learn_background(image, view, around)
+        self._first_separation = self._colours.separation(view.colours, inside, around)
+        self._judgement = Judgement(self._first_separation, margin=self._first_separation)
 
     @property
     def estimate(self) -> MaskEstimate:
@@ -101,8 +80,9 @@ class ColourSegmentation:
         self._image, self._mask = image, mask.astype(np.float32)
         self._velocity, self._doubtful_frames = (0, 0), 0
         if (box := box_of(mask)) is not None:
-            window = Window.around(box, _MARGIN, self._size)
-            self._colours.update(lab(cut(image, window)), *_sides(cut(self._mask, window)))
+            view = View.of(image, Window.around(box, _MARGIN, self._size))
+            self._colours.update(view.colours, *both_sides(cut(self._mask, view.window)))
+            self._background.forget(mask)
 
     def step(self, image: Image, witness: Box | None = None) -> MaskEstimate:
         """Segment the next frame.
@@ -112,148 +92,92 @@ class ColourSegmentation:
             witness: ``(x, y, w, h)``, a box tracker's opinion, or None where there is none.
         """
         witness = None if witness is None else clip_box(witness, image.shape)
-        mask, judgement = self._follow(image, witness)
+        box = box_of(self._mask)
+        mask, judgement = self._search(image) if box is None else self._follow(image, box, witness)
         self._doubtful_frames = self._doubtful_frames + 1 if judgement.doubt else 0
         if witness is not None and self._doubtful_frames >= _PATIENCE:
             mask, judgement = self._begin_anew(image, witness, mask, judgement)
             self._doubtful_frames = 0
-        self._velocity = _shift(box_of(self._mask), box_of(mask))
+        self._velocity = _shift(box, box_of(mask))
         self._image, self._mask, self._judgement = image, mask, judgement
         return self.estimate
 
-    def _follow(self, image: Image, witness: Box | None) -> tuple[NDArray[np.float32], Judgement]:
-        out_of_sight = np.zeros(image.shape[:2], np.float32), Judgement(0.0, 0.0, believed=False)
-        box = box_of(self._mask)
-        if box is None:
-            return out_of_sight
+    def _follow(self, image: Image, box: Box, witness: Box | None) -> _Answer:
         before = Window.around(box, _MARGIN, self._size)
         right, down = self._velocity
-        window = Window(before.left + right, before.top + down, before.side, self._size)
-        last, present = cut(self._image, before), cut(image, window)
-        in_frame = inside_frame(image.shape, window)
-        cues = self._cues
-        motion = follow_mask(_grey(last), _grey(present), cut(self._mask, before), cues.similarity)
-        moved = (motion.by_flow + motion.by_similarity > 1.0) & in_frame
-        area = int(np.count_nonzero(moved))
-        if area < 9:
-            return out_of_sight
+        last = View.of(self._image, before)
+        present = View.of(image, Window(before.left + right, before.top + down, before.side, self._size))
+        last_mask = cut(self._mask, before)
+        motion = follow_mask(last.grey, present.grey, last_mask, self._cues.similarity)
+        moved = motion.moved & present.in_frame
+        area = np.count_nonzero(moved)
+        if area < _LEAST_PIXELS:
+            return _out_of_sight(image)
 
-        colours = lab(present)
-        evidence = self._evidence(colours, lab(last), motion, area)
-        if cues.change:
+        evidence = colour_and_motion(last, present, self._colours, self._palette, motion, self._cues)
+        if self._cues.background:
             if motion.background is not None:
-                self._background.move(_in_frame(motion.background, window, before))
-            evidence += cues.change * self._background.change(image, window)
+                self._background.move(motion.background, before, present.window)
+            evidence += self._cues.background * self._background.change(image, present.window)
         if witness is not None:
-            evidence -= cues.witness * _distance_beyond(witness, window)
-        support = np.tanh((evidence + cues.prior * _prior(motion, area)) / 3)
-        if cues.smoother:
-            support = cv2.ximgproc.fastGlobalSmootherFilter(present, support, 100.0, 12.0)
-        mask = _clean((support > 0) & in_frame, moved)
-        believed = bool(abs(np.count_nonzero(mask) / area - 1) <= _AREA_CHANGE)
-        if not believed:
-            mask = moved
-        inside, around = _sides(mask)
-        around &= in_frame
-        separation = self._colours.separation(colours, inside, around)
-        if believed:
-            self._colours.update(colours, inside, around)
-            if cues.change:
-                self._background.learn(image, window, around)
-        full = paste(mask, window, image.shape)
-        agreement = None if witness is None else box_iou(box_of(full) or (0.0, 0.0, 0.0, 0.0), witness)
-        return full, Judgement(separation, outline_margin(evidence, mask), agreement, believed)
+            evidence -= self._cues.witness * distance_beyond(witness, present.window)
+        mask = tidied(decide(present, evidence, last_mask, motion, self._cues), moved, motion.cue)
 
-    def _evidence(
-        self, colours: NDArray[np.uint8], last_colours: NDArray[np.uint8], motion: MaskMotion, area: int
-    ) -> NDArray[np.float32]:
-        cues = self._cues
-        evidence = cues.global_colours * self._colours.log_ratio(colours) + cues.motion * motion.cue
-        if cues.local_colours == 0:  # half of the time goes into them
-            return evidence
-        last_labels = cv2.remap(
-            self._palette.label(last_colours), motion.source, None, cv2.INTER_NEAREST,
-            borderMode=cv2.BORDER_REPLICATE,
-        )  # fmt: skip
-        radius = max(round(0.22 * math.sqrt(area)), 1)
-        local = self._palette.local_log_ratio(
-            self._palette.label(colours), last_labels, motion.by_flow, radius
-        )
-        return evidence + cues.local_colours * local
+        at_border = touches_border(moved, present.in_frame)
+        believed = bool(abs(np.count_nonzero(mask) / area - 1) <= _AREA_CHANGE)
+        if not believed and at_border:  # an object that comes or goes changes its area fast: colours decide
+            believed = self._separation(present, mask) > self._separation(present, moved)
+        mask = mask if believed else moved
+        frame_area = np.count_nonzero(mask) / present.window.scale**2
+        if at_border and frame_area < _LEAST_PART * self._usual_area:
+            return _out_of_sight(image)
+        if believed:
+            self._usual_area = self._usual_area if at_border else frame_area
+            _, around = _sides(mask, present)
+            self._colours.update(present.colours, mask, around)
+            self._learn_background(image, present, around)
+        full = paste(mask, present.window, image.shape)
+        agreement = None if witness is None else box_iou(box_of(full) or (0.0, 0.0, 0.0, 0.0), witness)
+        separation, margin = self._separation(present, mask), outline_margin(evidence, mask)
+        return full, Judgement(separation, margin, agreement, believed)
+
+    def _search(self, image: Image) -> _Answer:
+        """Where the object was out of sight: the mask of what has its colours, if anything has."""
+        found = find_by_colours(image, self._colours, self._usual_area, _MARGIN, self._size)
+        if found is None or found[2] < _FOUND_AGAIN * self._first_separation:
+            return _out_of_sight(image)
+        mask, window, separation = found
+        return paste(mask, window, image.shape), Judgement(separation, margin=separation)
 
     def _begin_anew(
         self, image: Image, witness: Box, mask: NDArray[np.float32], judgement: Judgement
-    ) -> tuple[NDArray[np.float32], Judgement]:
+    ) -> _Answer:
         """Segment from the witness's box; keep the old mask unless the new one looks more like the object."""
         fresh = mask_in_box(image, witness)
-        window = Window.around(witness, _MARGIN, self._size)
-        inside, around = _sides(cut(fresh, window))
-        around &= inside_frame(image.shape, window)
-        fresh_judgement = Judgement(
-            self._colours.separation(lab(cut(image, window)), inside, around), 0.0, judgement.agreement
-        )
-        if fresh_judgement.separation <= judgement.separation:
+        view = View.of(image, Window.around(witness, _MARGIN, self._size))
+        separation = self._separation(view, cut(fresh, view.window))
+        in_sight = box_of(mask) is not None
+        if separation <= (judgement.separation if in_sight else _FOUND_AGAIN * self._first_separation):
             return mask, judgement
-        return fresh, fresh_judgement
+        self._background.forget(fresh > 0.5)
+        return fresh, Judgement(separation, 0.0, judgement.agreement)
+
+    def _learn_background(self, image: Image, view: View, around: NDArray[np.bool_]) -> None:
+        if self._cues.background:
+            self._background.learn(image, view.window, around)
+
+    def _separation(self, view: View, mask: NDArray) -> float:
+        return self._colours.separation(view.colours, *_sides(mask, view))
 
 
-def _in_frame(matrix, window, before):
-    """last frame from present frame"""
-    def frame_to_crop(w):
-        s = w.scale
-        return np.array([[s, 0, (0.5 - w.left) * s - 0.5], [0, s, (0.5 - w.top) * s - 0.5], [0, 0, 1]])
-    full = np.vstack([matrix, [0, 0, 1]])
-    return (np.linalg.inv(frame_to_crop(before)) @ full @ frame_to_crop(window))[:2]
+def _sides(mask: NDArray, view: View) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """The two sides of a crop's mask; what lies beyond the frame is no background."""
+    inside, around = both_sides(mask)
+    return inside, around & view.in_frame
 
 
-def _grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-
-
-def _disc(radius: float) -> NDArray[np.uint8]:
-    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * max(round(radius), 1) + 1,) * 2)
-
-
-def _sides(mask: NDArray) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """The object's pixels, and those surely beyond its outline."""
-    inside = mask > 0.5
-    grown = cv2.dilate(inside.astype(np.uint8), _disc(0.05 * math.sqrt(np.count_nonzero(inside))))
-    return inside, grown == 0
-
-
-def _prior(motion: MaskMotion, area: int) -> NDArray[np.float32]:
-    distance = signed_distance(motion.by_flow > 0.5) + signed_distance(motion.by_similarity > 0.5)
-    return np.clip(distance / np.float32(0.24 * math.sqrt(area)), -4.0, 4.0)
-
-
-def _distance_beyond(box: Box, window: Window) -> NDArray[np.float32]:
-    """``(S, S)``: distance outside ``box``, 1 at 15 % of its sides, at most 2."""
-    centres = (np.arange(window.size, dtype=np.float32) + 0.5) / window.scale
-    across, down = (
-        np.maximum(np.maximum(start - at, at - start - length), 0) / (0.15 * length)
-        for at, start, length in (
-            (window.left + centres, box[0], box[2]),
-            (window.top + centres, box[1], box[3]),
-        )
-    )
-    return np.minimum(np.hypot(across, down[:, None]), 2.0).astype(np.float32)
-
-
-def _clean(mask: NDArray[np.bool_], moved: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Drop specks, components that the moved mask does not support, and pinholes."""
-    area = int(np.count_nonzero(moved))
-    disc = _disc(0.02 * math.sqrt(area))
-    tidy = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, disc)
-    tidy = cv2.morphologyEx(tidy, cv2.MORPH_CLOSE, disc)
-    count, labels = cv2.connectedComponents(tidy)
-    sizes = np.bincount(labels.ravel(), minlength=count)
-    supported = np.bincount(labels[moved], minlength=count) > 0.3 * sizes
-    supported[0] = False
-    kept = supported[labels]
-    _, labels = cv2.connectedComponents((~kept).astype(np.uint8), connectivity=4)
-    pinhole = np.bincount(labels.ravel()) < 0.02 * area
-    pinhole[0] = False
-    return kept | pinhole[labels]
+def _out_of_sight(image: Image) -> _Answer:
+    return np.zeros(image.shape[:2], np.float32), Judgement(0.0, 0.0, believed=False)
 
 
 def _shift(last: Box | None, present: Box | None) -> tuple[int, int]:

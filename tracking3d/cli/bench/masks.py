@@ -28,7 +28,7 @@ def masks(
         ),
     ],
     data: Data = None,
-    trackers: Annotated[
+    tracker: Annotated[
         list[str] | None,
         typer.Option(
             "--tracker",
@@ -73,7 +73,7 @@ def masks(
 
     chosen = [
         configure(config, preset, overrides, tracker=None if one is None else {"name": one}).tracker
-        for one in dict.fromkeys(trackers or [None])
+        for one in dict.fromkeys(tracker or (None,))
     ]
     contestants = [Contestant.of(choice) for choice in chosen]
     if ablation:

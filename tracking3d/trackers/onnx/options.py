@@ -31,9 +31,9 @@ class OnnxOptions(Options):
         "csrt", description="Box tracker: CSR-DCF, or OpenCV's NanoTrack or VitTrack from ONNX files."
     )
     nano_backbone: str = Field(
-        "nanotrack_v2_backbone", description="NanoTrack's backbone: ONNX file, or name of a known network."
+        "nanotrack-backbone", description="NanoTrack's backbone: ONNX file, or name of a known network."
     )
-    nano_head: str = Field("nanotrack_v2_head", description="NanoTrack's head, alike.")
+    nano_head: str = Field("nanotrack-head", description="NanoTrack's head, alike.")
     vit_model: str = Field("vittrack", description="VitTrack's network, alike.")
     csrt: CsrtTracker.Options = Field(CsrtTracker.Options(), description="CSR-DCF's own options.")
     every: int = Field(

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from tracking3d.errors import InputError
 from tracking3d.frames import Box, Image
 from tracking3d.networks.session import Network
+from tracking3d.trackers.crops import box_of
 from tracking3d.trackers.onnx.description import Decoder, PromptableNetwork
 from tracking3d.trackers.onnx.images import Fit, fit_image, network_input, on_image, sigmoid
 from tracking3d.trackers.onnx.judging import background_points
@@ -54,9 +55,13 @@ class PromptableSegmenter:
     def propose(self, image: Image, box: Box, last: NDArray[np.float32] | None) -> list[Proposal]:
         """See `Segmenter.propose`: the box with its centre, alone and with the last mask, and without holes.
 
-        The centre keeps the network from taking what fills the box's corners for the object.
+        The box is the mean of the box tracker's and the last mask's: the former stays behind on the side of
+        the object that it saw first, the latter knows how far the object reaches. The centre keeps the network
+        from taking what fills the box's corners for the object.
         """
         look = self.look(image)
+        if last is not None and (place := box_of(last)) is not None:
+            box = _mean(box, place)
         centre = np.array([[box[0] + box[2] / 2, box[1] + box[3] / 2, 1.0]], np.float32)
         proposals = look.ask(box, centre, origin="box and centre")
         sharpest = max(proposals, key=lambda proposal: proposal.sharpness)
@@ -168,3 +173,8 @@ class Look:
         info = self._network.inputs[name]
         missing = max(len(info.shape) - values.ndim, 0)
         return values.reshape((1,) * missing + values.shape).astype(info.dtype)
+
+
+def _mean(a: Box, b: Box) -> Box:
+    x, y, width, height = ((first + second) / 2 for first, second in zip(a, b, strict=True))
+    return (x, y, width, height)

@@ -15,6 +15,9 @@ from tracking3d.trackers.onnx.description import SaliencyNetwork
 from tracking3d.trackers.onnx.images import enlarged, fit_image, network_input, on_image, sigmoid
 from tracking3d.trackers.onnx.proposals import Proposal, sharpness
 
+# Nothing beyond the box, enlarged by this, is the object; the user's first box is nearer to it than a tracker's.
+_FIRST_SLACK, _SLACK = 1.05, 1.1
+
 
 class SaliencySegmenter:
     """Runs a saliency network on the box, enlarged by one or more factors.
@@ -38,17 +41,24 @@ class SaliencySegmenter:
         self._output = known(description.output, self._network.outputs, file, "output")
 
     def propose(self, image: Image, box: Box, last: NDArray[np.float32] | None) -> list[Proposal]:
-        """See `Segmenter.propose`; the last mask is not used."""
-        return [self._proposal(image, box, factor) for factor in self._crops]
+        """See `Segmenter.propose`: what stands out in each crop, as far as it lies about the box.
 
-    def _proposal(self, image: Image, box: Box, factor: float) -> Proposal:
+        The box is not moved towards the last mask: a hand that was once taken for a part of the object would
+        bring more of itself into the crop.
+        """
+        limits = enlarged(box, _FIRST_SLACK if last is None else _SLACK, image.shape)
+        return [self._proposal(image, box, factor, limits) for factor in self._crops]
+
+    def _proposal(self, image: Image, box: Box, factor: float, limits: tuple[slice, slice]) -> Proposal:
         rows, columns = enlarged(box, factor, image.shape)
         crop = image[rows, columns]
         fit = fit_image(crop.shape[:2], self._description.input)
         feeds = {self._input: network_input(crop, fit, self._description.input)}
         shares = self._shares(self._network.run(feeds)[self._output])
-        mask = np.zeros(image.shape[:2], np.float32)
-        mask[rows, columns] = on_image(shares, fit, padded=True)
+        whole = np.zeros(image.shape[:2], np.float32)
+        whole[rows, columns] = on_image(shares, fit, padded=True)
+        mask = np.zeros_like(whole)
+        mask[limits] = whole[limits]
         return Proposal(mask, sharpness(mask), f"crop enlarged {factor:g} times")
 
     def _shares(self, output: NDArray) -> NDArray[np.float32]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from typing import Self
 
 import numpy as np
@@ -16,12 +15,11 @@ from tracking3d.trackers.onnx.judging import ColourJudge, Verdict
 from tracking3d.trackers.onnx.options import OnnxOptions, build_boxes, build_segmenter
 from tracking3d.trackers.segmentation import ColourSegmentation
 
-G=lambda k,d: float(os.environ.get('H2_'+k,d))
-_FIRST_SLACK, _SLACK = 1.05, G('SLACK',1.1)  # the box the user gave is nearer to the object than a tracker's
 _LEAST_SHARPNESS = 0.35  # of a network's mask; below, it has not found anything
-_LEAST_AGREEMENT = 0.3  # of the mask's box with the box tracker's
-_CONFIDENT = 0.7  # score from which a mask teaches colours and may re-anchor the box
-_BOX_OFF = 0.8  # IoU of the mask's box and the box tracker's, below which the latter needs it
+_LEAST_AGREEMENT = 0.3  # IoU of the mask's box and the box tracker's
+_CONFIDENT = 0.6  # score from which a mask teaches colours and may re-anchor the box
+_STRAYED = 0.4  # IoU of the mask's box and the box tracker's, below which the latter is off the object
+_PATIENCE = 3  # confident masks in a row that find the box tracker off the object
 
 
 class OnnxTracker:
@@ -30,8 +28,8 @@ class OnnxTracker:
     In every frame the box tracker says where to look, the network segments there, and the masks it proposes
     are judged by colours and by the box, never by the network's own opinion of them. The best one is the
     answer. Beside it goes a mask carried by flow and colours: the answer between the frames that are
-    segmented, and where the network's masks cannot be used. A confident mask whose box is not the box
-    tracker's starts that anew, so that it does not stay behind on the side of the object it saw first.
+    segmented, and where the network's masks cannot be used. Confident masks start the box tracker anew where
+    it has strayed from them.
     """
 
     Options = OnnxOptions
@@ -43,7 +41,7 @@ class OnnxTracker:
         self._carried: ColourSegmentation | None = None
         self._judge: ColourJudge
         self._last_box: Box
-        self._frames_since = 0
+        self._frames_since = self._strayed = 0
 
     @classmethod
     def from_options(cls, options: BaseModel) -> Self:
@@ -68,7 +66,7 @@ class OnnxTracker:
         self._judge = ColourJudge(image, mask)
         self._carried = ColourSegmentation(image, box, mask > 0.5)
         self._boxes.start(image, box)
-        self._last_box, self._frames_since = box, 0
+        self._last_box, self._frames_since, self._strayed = box, 0, 0
         return estimate
 
     def step(self, frame: Frame) -> MaskEstimate:
@@ -90,9 +88,9 @@ class OnnxTracker:
         if box is None or self._carried is None:
             return
         self._carried.correct(frame.image, mask)
-        self._judge.learn(frame.image, mask.astype(np.float32))
+        self._judge = self._judge.corrected(frame.image, mask.astype(np.float32))
         self._boxes.start(frame.image, box)
-        self._last_box = box
+        self._last_box, self._strayed = box, 0
 
     def _first_answer(self, image: Image, prompt: Prompt) -> MaskEstimate:
         if prompt.mask is not None:
@@ -101,7 +99,7 @@ class OnnxTracker:
         if guess.mask is None:
             return guess
         judge = ColourJudge(image, guess.mask)
-        best = self._best(judge, image, prompt.box, None, prompt.box, _FIRST_SLACK)
+        best = self._best(judge, image, prompt.box, None, prompt.box)
         if reason := _unusable(best):
             return MaskEstimate(guess.mask, guess.score / 2, f"{reason}; colours in the box stand in")
         return MaskEstimate(best.proposal.mask, best.score)
@@ -110,30 +108,34 @@ class OnnxTracker:
         """The network's answer, or the carried one where the network has none that can be used."""
         assert self._carried is not None
         box = witness if witness is not None else self._place(carried)
-        ask=box
-        lb = None if carried.mask is None else box_of(carried.mask)
-        if G('UNION',0) and lb:
-            x0,y0=min(box[0],lb[0]),min(box[1],lb[1]); x1,y1=max(box[0]+box[2],lb[0]+lb[2]),max(box[1]+box[3],lb[1]+lb[3]); ask=(x0,y0,x1-x0,y1-y0)
-        if G('MEAN',0) and lb:
-            ask=tuple((a+b)/2 for a,b in zip(box,lb))
-        if G('LAST',0) and lb: ask=lb
-        best = self._best(self._judge, image, ask, carried.mask, witness, _SLACK)
+        best = self._best(self._judge, image, box, carried.mask, witness)
+        if witness is not None and carried.mask is not None and _unusable(best):
+            # One of the box tracker and the carried mask is wrong: colours tell whether it is the former.
+            other = self._best(self._judge, image, self._place(carried), carried.mask, None)
+            if not _unusable(other) and not other.judgement.doubt:
+                best, witness = other, None
         if reason := _unusable(best):
             if carried.mask is None:
                 return MaskEstimate(None, 0.0, reason)
             return MaskEstimate(carried.mask, carried.score / 2, f"{reason}; the last mask was carried on")
         mask = best.proposal.mask
-        place = box_of(mask)
-        assert place is not None
         self._carried.correct(image, mask > 0.5)
-        self._last_box = place
+        self._last_box = box_of(mask) or box
         if best.score >= _CONFIDENT:
             self._judge.learn(image, mask)
-            if self._options.anchor and box_iou(place, box) < G('OFF',.8) and (not G('GROW',0) or place[2]*place[3]>box[2]*box[3]):
-                self._boxes.start(image, place)
+        if self._options.anchor:
+            self._anchor(image, best, witness)
         if witness is None:
             return MaskEstimate(mask, best.score / 2, "the box tracker has lost the object")
         return MaskEstimate(mask, best.score, best.judgement.doubt)
+
+    def _anchor(self, image: Image, best: Verdict, witness: Box | None) -> None:
+        """Start the box tracker anew where confident masks have found it off the object, or it is lost."""
+        strayed = witness is None or box_iou(self._last_box, witness) < _STRAYED
+        self._strayed = self._strayed + 1 if strayed and best.score_without_box >= _CONFIDENT else 0
+        if self._strayed >= (1 if witness is None else _PATIENCE):
+            self._boxes.start(image, self._last_box)
+            self._strayed = 0
 
     def _best(
         self,
@@ -142,10 +144,9 @@ class OnnxTracker:
         box: Box,
         last: NDArray[np.float32] | None,
         witness: Box | None,
-        slack: float,
     ) -> Verdict:
         proposals = self._segmenter.propose(image, box, last)
-        verdicts = [judge.verdict(image, proposal, box, slack, witness) for proposal in proposals]
+        verdicts = [judge.verdict(image, proposal, witness) for proposal in proposals]
         return max(verdicts, key=lambda verdict: verdict.preference)
 
     def _place(self, carried: MaskEstimate) -> Box:
@@ -161,4 +162,4 @@ def _unusable(verdict: Verdict) -> str:
     if verdict.proposal.sharpness < _LEAST_SHARPNESS:
         return "the network's mask is blurred"
     agreement = verdict.judgement.agreement
-    return verdict.judgement.doubt if agreement is not None and agreement < _LEAST_AGREEMENT else ""
+    return "" if agreement is None or agreement >= _LEAST_AGREEMENT else verdict.judgement.doubt

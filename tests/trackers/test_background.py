@@ -1,0 +1,103 @@
+"""The background memory: what has changed, what has not, and what it cannot know."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from moving_shape import clutter
+
+from tracking3d.geometry.camera import Window
+from tracking3d.trackers.background import BackgroundMemory
+
+SHAPE = (90, 120)
+WINDOW = Window(20, 5, 80, 80)
+STAY = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+
+
+def picture(seed: int = 0) -> np.ndarray:
+    return clutter(seed, SHAPE, (20, 40, 60), (200, 160, 220)).round().astype(np.uint8)
+
+
+def memory(image: np.ndarray, background: np.ndarray | None = None, frames: int = 4) -> BackgroundMemory:
+    background = np.ones((80, 80), bool) if background is None else background
+    kept = BackgroundMemory(image.shape)
+    for _ in range(frames):
+        kept.learn(image, WINDOW, background)
+    return kept
+
+
+def test_the_same_picture_has_not_changed() -> None:
+    np.testing.assert_allclose(memory(picture()).change(picture(), WINDOW), -0.5)
+
+
+def test_a_patch_of_another_colour_has_changed_and_nothing_else() -> None:
+    image = picture()
+    image[40:60, 50:70] = 255 - image[40:60, 50:70] // 2
+    change = memory(picture()).change(image, WINDOW)
+    assert (change[38:52, 33:47] > 0.9).mean() > 0.9
+    change[33:57, 28:52] = -0.5
+    np.testing.assert_allclose(change, -0.5)
+
+
+def test_noise_that_was_seen_is_no_change() -> None:
+    rng = np.random.default_rng(0)
+
+    def noisy() -> np.ndarray:
+        return np.clip(picture() + rng.normal(0, 12, (*SHAPE, 3)), 0, 255).astype(np.uint8)
+
+    kept = BackgroundMemory(SHAPE)
+    for _ in range(15):
+        kept.learn(noisy(), WINDOW, np.ones((80, 80), bool))
+    assert (kept.change(noisy(), WINDOW) < 0).mean() > 0.99
+
+
+def test_where_the_object_has_always_been_nothing_is_known() -> None:
+    background = np.ones((80, 80), bool)
+    background[20:40, 30:50] = False
+    change = memory(picture(), background).change(255 - picture(), WINDOW)
+    np.testing.assert_array_equal(change[20:40, 30:50], 0)
+    assert np.delete(change, np.s_[20:40], axis=0).min() > -0.5 and change[50:].mean() > 0.5
+
+
+def test_what_is_known_for_one_frame_counts_less_than_what_is_known_for_many() -> None:
+    once, often = (memory(picture(), frames=n).change(picture(), WINDOW) for n in (1, 6))
+    np.testing.assert_allclose(once, often / 3)
+
+
+@pytest.mark.parametrize(("right", "down"), [(3, 0), (-2, 5)])
+def test_the_memory_moves_with_the_camera(right: int, down: int) -> None:
+    kept = memory(picture())
+    shift = np.array([[1, 0, right], [0, 1, down]], float)
+    moved = cv2.warpAffine(picture(), shift, SHAPE[::-1], borderMode=cv2.BORDER_REPLICATE)
+    unmoved = kept.change(moved, WINDOW)
+    kept.move(np.array([[1, 0, -right], [0, 1, -down]], float), WINDOW, WINDOW)
+    inner = np.s_[12:-12, 12:-12]
+    assert kept.change(moved, WINDOW)[inner].max() < -0.4
+    assert (unmoved > 0).mean() > 0.1
+
+
+def test_a_motion_of_crops_alone_is_none_of_the_camera() -> None:
+    kept = memory(picture())
+    elsewhere = Window(26, 9, 80, 80)
+    kept.move(np.array([[1, 0, 6], [0, 1, 4]], float), WINDOW, elsewhere)
+    np.testing.assert_allclose(kept.change(picture(), WINDOW), -0.5)
+
+
+def test_what_is_forgotten_is_not_known() -> None:
+    kept = memory(picture())
+    mask = np.zeros(SHAPE, bool)
+    mask[30:50, 40:60] = True
+    kept.forget(mask)
+    change = kept.change(255 - picture(), WINDOW)
+    np.testing.assert_array_equal(change[25:45, 20:40], 0)
+
+
+@pytest.mark.parametrize(
+    "window", [Window(-40, -40, 80, 64), Window(100, 70, 60, 64), Window(300, 300, 20, 64)]
+)
+def test_windows_beyond_the_frame_are_answered(window: Window) -> None:
+    kept = BackgroundMemory(SHAPE)
+    kept.learn(picture(), window, np.ones((64, 64), bool))
+    change = kept.change(picture(), window)
+    assert change.shape == (64, 64) and change.max() <= 0

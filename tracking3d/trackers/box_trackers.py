@@ -1,0 +1,55 @@
+"""Box trackers of OpenCV, made deterministic and safe to ask: a mask tracker's witnesses."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.frames import Box, Image
+from tracking3d.trackers.crops import clip_box
+
+
+class OpenCvBoxes:
+    """A box tracker of OpenCV on RGB images at a chosen resolution.
+
+    Args:
+        tracker: The tracker, not started yet.
+        image: ``(H, W, 3)`` RGB, the first frame.
+        box: ``(x, y, w, h)`` in it, in pixels; the part inside the image is tracked.
+        resolution: Scale of the image that the tracker sees.
+    """
+
+    def __init__(self, tracker: cv2.Tracker, image: Image, box: Box, resolution: float = 1.0) -> None:
+        self._scale = resolution
+        self._tracker: cv2.Tracker | None = tracker
+        view = self._view(image)
+        visible = clip_box(box, image.shape) or (0.0, 0.0, 1.0, 1.0)
+        x, y, width, height = (value * self._scale for value in visible)
+        # A filter needs a few pixels: a smaller box is grown about its corner.
+        rectangle = [int(x), int(y), max(round(width), 4), max(round(height), 4)]
+        rectangle[0] = max(min(rectangle[0], view.shape[1] - rectangle[2]), 0)
+        rectangle[1] = max(min(rectangle[1], view.shape[0] - rectangle[3]), 0)
+        cv2.setRNGSeed(0)
+        try:
+            self._tracker.init(view, rectangle)
+        except cv2.error:  # an image too small or a box too slender for a filter
+            self._tracker = None
+
+    def update(self, image: Image) -> Box | None:
+        """The box in the next image, or None where the tracker has lost the object."""
+        if self._tracker is None:
+            return None
+        cv2.setRNGSeed(0)
+        try:
+            found, box = self._tracker.update(self._view(image))
+        except cv2.error:  # the object has shrunk to nothing
+            return None
+        x, y, width, height = (value / self._scale for value in box)
+        return (x, y, width, height) if found else None
+
+    def _view(self, image: Image) -> NDArray[np.uint8]:
+        bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+        if self._scale == 1:
+            return bgr
+        return cv2.resize(bgr, None, fx=self._scale, fy=self._scale, interpolation=cv2.INTER_AREA)

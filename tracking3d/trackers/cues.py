@@ -1,0 +1,136 @@
+"""The cues that make a mask, and how they are put together; everything in the pixels of one square crop."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.frames import Box, Image
+from tracking3d.geometry.camera import Window
+from tracking3d.trackers.colour_models import GlobalColours, Palette, lab
+from tracking3d.trackers.crops import cut, inside_frame
+from tracking3d.trackers.mask_motion import MaskMotion
+from tracking3d.trackers.outline import prior, shifted_to
+
+_NEIGHBOURHOOD = 0.22  # radius within which local colours count, relative to the square root of the area
+_SMOOTHNESS, _EDGES = 100.0, 12.0  # lambda and sigma of the fast global smoother
+
+
+@dataclass(frozen=True)
+class Cues:
+    """The weights of what a pixel's log-odds are made of; 0 or False switches a cue off.
+
+    Attributes:
+        prior: Distance to the outline of the moved mask.
+        outline: Weight in the prior of the last outline, shifted only; the mask moved by flow has weight 1.
+        similarity: Whether the mask moved by one similarity has weight 1 in the prior, too.
+        global_colours: Colours of the whole object and of its surroundings, remembered.
+        local_colours: Colours nearby, one frame ago.
+        motion: Whether the pixel moves with the object or with the background.
+        background: Whether the pixel has changed against what was seen there before.
+        novelty: For the object, within the outline, where nothing else is known: it may be a new side.
+        witness: Distance beyond the box tracker's box.
+        smoother: Whether the edge-aware smoother follows.
+    """
+
+    prior: float = 1.5
+    outline: float = 2.0
+    similarity: bool = True
+    global_colours: float = 1.0
+    local_colours: float = 1.0
+    motion: float = 2.0
+    background: float = 1.0
+    novelty: float = 2.0
+    witness: float = 1.0
+    smoother: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A frame seen through a square window.
+
+    Attributes:
+        window: The window.
+        image: ``(S, S, 3)`` RGB.
+        colours: ``(S, S, 3)`` Lab.
+        in_frame: ``(S, S)`` bool, what is not beyond the frame.
+    """
+
+    window: Window
+    image: NDArray[np.uint8]
+    colours: NDArray[np.uint8]
+    in_frame: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, frame: Image, window: Window) -> Self:
+        """See ``frame`` ``(H, W, 3)`` RGB through ``window``."""
+        image = cut(frame, window)
+        return cls(window, image, lab(image), inside_frame(frame.shape, window))
+
+    @property
+    def grey(self) -> NDArray[np.uint8]:
+        """``(S, S)``."""
+        return cv2.cvtColor(self.image, cv2.COLOR_RGB2GRAY)
+
+
+def colour_and_motion(
+    last: View, present: View, colours: GlobalColours, palette: Palette, motion: MaskMotion, cues: Cues
+) -> NDArray[np.float32]:
+    """``(S, S)`` log-odds of the object by how pixels look and move."""
+    evidence = cues.global_colours * colours.log_ratio(present.colours) + cues.motion * motion.cue
+    if cues.local_colours == 0:  # they take a good part of the time
+        return evidence
+    last_labels = cv2.remap(
+        palette.label(last.colours), motion.source, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE
+    )
+    radius = max(round(_NEIGHBOURHOOD * math.sqrt(np.count_nonzero(motion.moved))), 1)
+    labels = palette.label(present.colours)
+    return evidence + cues.local_colours * palette.local_log_ratio(
+        labels, last_labels, motion.by_flow, radius
+    )
+
+
+def distance_beyond(box: Box, window: Window) -> NDArray[np.float32]:
+    """``(S, S)``: distance outside ``box``, 1 at 15 % of its sides, at most 2."""
+    centres = (np.arange(window.size, dtype=np.float32) + 0.5) / window.scale
+    across, down = (
+        np.maximum(np.maximum(start - at, at - start - length), 0) / (0.15 * length)
+        for at, start, length in (
+            (window.left + centres, box[0], box[2]),
+            (window.top + centres, box[1], box[3]),
+        )
+    )
+    return np.minimum(np.hypot(across, down[:, None]), 2.0).astype(np.float32)
+
+
+def decide(
+    present: View,
+    evidence: NDArray[np.float32],
+    last_mask: NDArray[np.float32],
+    motion: MaskMotion,
+    cues: Cues,
+) -> NDArray[np.bool_]:
+    """``(S, S)``: the object by evidence and prior, smoothed along the edges of the image.
+
+    Args:
+        present: The present frame.
+        evidence: ``(S, S)`` log-odds by everything but the prior.
+        last_mask: ``(S, S)`` in [0, 1], in the last crop.
+        motion: Where it has moved.
+        cues: The weights.
+    """
+    opinions = [(1.0, motion.by_flow)] + [(1.0, motion.by_similarity)] * cues.similarity
+    if cues.outline or cues.novelty:
+        outline = shifted_to(last_mask, np.tanh(evidence / 3))
+        opinions += [(cues.outline, outline)] * (cues.outline > 0)
+        evidence = evidence + cues.novelty * (outline > 0.5) * (1 - np.tanh(np.abs(evidence)))
+    log_odds = evidence + cues.prior * prior(opinions, int(np.count_nonzero(motion.moved)))
+    support = np.tanh(log_odds / 3).astype(np.float32)
+    if cues.smoother:
+        support = cv2.ximgproc.fastGlobalSmootherFilter(present.image, support, _SMOOTHNESS, _EDGES)
+    return (support > 0) & present.in_frame
