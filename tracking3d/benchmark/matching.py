@@ -81,8 +81,8 @@ def make_pairs(images: Sequence[Image], seed: int = 0, size: int = 256) -> list[
     """Cut, warp and relight images: one pair of an image for each of `STRENGTHS`.
 
     At full strength a warp turns by up to 20 degrees, zooms by up to 1.25 and foreshortens by up to 0.25 over the
-    image; every warp shifts by up to a quarter of the crop. Light is always changed in full: gamma 1.4, a ramp of gain from 0.5 to 1.5 in any direction, a gain of
-    each channel from 0.85 to 1.15, noise of 0.02.
+    image; every warp shifts by up to a quarter of the crop. Light is always changed in full: gamma 1.4, a ramp of
+    gain from 0.5 to 1.5 in any direction, a gain of each channel from 0.85 to 1.15, noise of 0.02.
 
     Args:
         images: ``(H, W, 3)`` uint8 RGB of any size; large ones are reduced to at most twice ``size`` first.
