@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 
 import pytest
@@ -33,7 +34,8 @@ def test_a_crash_and_a_failure_cost_their_own_sequence_only_and_the_rest_is_foun
 
 def test_a_failure_is_told_in_its_own_sentence(jobs, scripted):
     [outcome] = run_jobs(jobs(scripted(fail=70), ["wide"]))
-    assert outcome.error.startswith("The mask tracker 'scripted' failed at 000000.png: RuntimeError")
+    told = r"mask tracker 'scripted' \(TRACKING3D_PLUGINS [0-9a-f]+\) failed at 000000.png: RuntimeError"
+    assert re.match(told, outcome.error)
 
 
 def test_a_sequence_that_cannot_be_read_is_an_outcome(jobs, scripted):
