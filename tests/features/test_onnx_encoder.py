@@ -211,7 +211,7 @@ def test_a_description_with_a_fault_is_refused_with_its_file(tmp_path, text, mes
 
 
 def test_an_unknown_description_is_told_with_the_nearest_name():
-    with pytest.raises(InputError, match=r"no description 'alik'.*did you mean 'alike'"):
+    with pytest.raises(InputError, match=r"description of a feature network 'alik'.*did you mean 'alike'"):
         load_description("alik")
 
 

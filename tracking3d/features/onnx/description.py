@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from importlib import resources
-from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, ValidationError
 
-from tracking3d.config.explain import describe, hint
+from tracking3d.config.explain import describe
 from tracking3d.config.models import Section
-from tracking3d.config.yaml_files import read_mapping
 from tracking3d.errors import InputError
+from tracking3d.networks.descriptions import description_names, read_description
+
+PACKAGE = "tracking3d.features.onnx"
+"""Whose folder ``descriptions`` holds those that come along."""
 
 Triple = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0)]
@@ -79,30 +80,13 @@ def load_description(name: str | Path) -> EncoderDescription:
     Raises:
         InputError: If there is no such description, or a key or value in it cannot be used.
     """
-    names = builtin_descriptions()
-    if str(name) in names:
-        with resources.as_file(_folder() / f"{name}.yaml") as file:
-            return _read(file)
-    file = Path(name).expanduser()
-    if not file.is_file():
-        raise InputError(
-            f"There is no description '{name}' of a feature network; give a YAML file or one of "
-            f"{', '.join(names)}: {hint(str(name), names)}"
-        )
-    return _read(file)
+    file, keys = read_description(name, PACKAGE, "description of a feature network")
+    try:
+        return EncoderDescription.model_validate(keys)
+    except ValidationError as error:
+        raise InputError(f"{file}: {describe(error, EncoderDescription, 'key')}") from error
 
 
 def builtin_descriptions() -> list[str]:
     """Names of the descriptions that come with the package."""
-    return sorted(Path(item.name).stem for item in _folder().iterdir() if item.name.endswith(".yaml"))
-
-
-def _folder() -> Traversable:
-    return resources.files("tracking3d.features.onnx") / "descriptions"
-
-
-def _read(file: Path) -> EncoderDescription:
-    try:
-        return EncoderDescription.model_validate(read_mapping(file))
-    except ValidationError as error:
-        raise InputError(f"{file}: {describe(error, EncoderDescription, 'key')}") from error
+    return description_names(PACKAGE)

@@ -7,16 +7,18 @@ Two kinds are known. A *saliency* network finds the object that stands out in a 
 
 from __future__ import annotations
 
-from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, ValidationError
 
-from tracking3d.config.explain import describe, hint
+from tracking3d.config.explain import describe
 from tracking3d.config.models import Section
-from tracking3d.config.yaml_files import read_mapping
 from tracking3d.errors import InputError
+from tracking3d.networks.descriptions import description_names, read_description
+
+PACKAGE = "tracking3d.trackers.onnx"
+"""Whose folder ``descriptions`` holds those that come along."""
 
 Side = Annotated[int, Field(ge=16, le=4096)]
 Triple = tuple[float, float, float]
@@ -122,30 +124,7 @@ def load_description(segmenter: str | Path) -> Description:
     Raises:
         InputError: If there is no such description, or a key or value in it cannot be used.
     """
-    names = builtin_descriptions()
-    if str(segmenter) in names:
-        with resources.as_file(_folder() / f"{segmenter}.yaml") as file:
-            return _read(file)
-    file = Path(segmenter).expanduser()
-    if not file.is_file():
-        raise InputError(
-            f"There is no segmenter '{segmenter}'; give a YAML file or one of {', '.join(names)}: "
-            f"{hint(str(segmenter), names)}"
-        )
-    return _read(file)
-
-
-def builtin_descriptions() -> list[str]:
-    """Names of the descriptions that come with the package."""
-    return sorted(Path(item.name).stem for item in _folder().iterdir() if item.name.endswith(".yaml"))
-
-
-def _folder() -> Any:
-    return resources.files("tracking3d.trackers.onnx") / "descriptions"
-
-
-def _read(file: Path) -> Description:
-    data = read_mapping(file)
+    file, data = read_description(segmenter, PACKAGE, "segmenter")
     models: dict[str, type[Description]] = {"saliency": SaliencyNetwork, "promptable": PromptableNetwork}
     model = models.get(str(data.get("kind")))
     if model is None:
@@ -154,3 +133,8 @@ def _read(file: Path) -> Description:
         return model.model_validate(data)
     except ValidationError as error:
         raise InputError(f"{file}: {describe(error, model, 'key')}") from error
+
+
+def builtin_descriptions() -> list[str]:
+    """Names of the descriptions that come with the package."""
+    return description_names(PACKAGE)
