@@ -198,3 +198,31 @@ def test_a_batch_stacks_observations_in_order():
     assert batch.features.shape == (2, 3, 48, 48)
     assert batch.valid.shape == batch.mask.shape == batch.distance.shape == (2, 48, 48)
     assert not batch.mask[1].any()
+
+
+@pytest.mark.parametrize(("stride", "side"), [(1, 16), (2, 32), (4, 32)])
+def test_an_encoder_with_a_stride_sees_the_window_twice_as_fine(stride, side):
+    shapes = []
+
+    class Strided:
+        channels, tau = 3, 0.1
+
+        @classmethod
+        def from_options(cls, options):
+            return cls()
+
+        def encode(self, images):
+            shapes.append(tuple(images.shape))
+            return torch.nn.functional.avg_pool2d(images, self.stride)
+
+    Strided.stride = stride
+    rows, columns = np.mgrid[:60, :80]
+    image = np.dstack([3 * columns, 4 * rows, rows + columns]).astype(np.uint8)
+    seen = observe(Frame(0, image), None, Window(20, 10, 32, 16), CAMERA, Strided(), CPU)
+    assert shapes == [(1, 3, side, side)]
+    assert seen.features.shape == (3, 16, 16)
+    if stride < 4:  # a coarser map is interpolated
+        plain = observe(Frame(0, image), None, Window(20, 10, 32, 16), CAMERA, RgbEncoder(), CPU)
+        torch.testing.assert_close(
+            seen.features[:, 1:-1, 1:-1], plain.features[:, 1:-1, 1:-1], atol=0.01, rtol=0
+        )
