@@ -10,7 +10,8 @@ from torch import Tensor
 
 from tracking3d.config.models import SolverConfig
 from tracking3d.estimation.observation import Batch, Observation, mask_distance
-from tracking3d.estimation.paper.problem import Parameters, Problem, Shape
+from tracking3d.estimation.paper.problem import Parameters, Problem
+from tracking3d.estimation.shape import Shape
 from tracking3d.geometry.camera import Camera, Window
 from tracking3d.geometry.mesh import Mesh
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_about

@@ -9,8 +9,9 @@ import pytest
 import torch
 from short_runs import quick_solver, run, short_clip, true_mask
 
+from tracking3d.estimation.framing import mask_box, projected_box
 from tracking3d.estimation.paper.belief import Belief
-from tracking3d.estimation.paper.prediction import candidate_poses, mask_box, moved_to_mask, projected_box
+from tracking3d.estimation.paper.prediction import candidate_poses, moved_to_mask
 from tracking3d.evaluation.metrics import mask_iou
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
 
@@ -103,7 +104,7 @@ def test_depth_changes_by_a_quarter_at_most(belief):
 
 
 def test_the_projected_box_is_that_of_the_silhouette(belief):
-    box = projected_box(belief, belief.last[0])
+    box = projected_box(belief.vertices, belief.camera, belief.last[0])
     silhouette = belief.silhouette(belief.last[0])
     np.testing.assert_allclose(box, mask_box(silhouette), atol=1.5)
     assert mask_iou(silhouette, true_mask(0)) > 0.7
@@ -113,19 +114,19 @@ def test_the_projected_box_is_that_of_the_silhouette(belief):
 def test_the_box_of_an_object_right_before_the_camera_ends_with_the_frame(belief, gap):
     nearest = float((belief.vertices @ belief.last[0].R.T)[:, 2].min())
     pose = Pose(torch.tensor([0.0, 0.0, gap - nearest]), belief.last[0].quaternion)
-    assert projected_box(belief, pose) == (0, 0, 100, 80)
+    assert projected_box(belief.vertices, belief.camera, pose) == (0, 0, 100, 80)
 
 
 @pytest.mark.parametrize("shift", [(100.0, 0.0), (-100.0, 0.0), (0.0, 100.0), (float("nan"), 0.0)])
 def test_an_object_beside_the_frame_has_no_box(belief, shift):
     away = torch.tensor([*shift, 5.0])
-    assert projected_box(belief, Pose(away, belief.last[0].quaternion)) is None
+    assert projected_box(belief.vertices, belief.camera, Pose(away, belief.last[0].quaternion)) is None
 
 
 @pytest.mark.parametrize("depth", [0.5, 0.0, -3.0])
 def test_an_object_around_or_behind_the_camera_has_no_box(belief, depth):
     pose = Pose(torch.tensor([0.0, 0.0, depth]), belief.last[0].quaternion)
-    assert projected_box(belief, pose) is None
+    assert projected_box(belief.vertices, belief.camera, pose) is None
 
 
 def test_the_box_of_a_mask_spans_its_outer_pixels():

@@ -10,7 +10,8 @@ import torch
 from small_scenes import observed, parameters_of, pose_of, problem_of
 
 from tracking3d.config.models import SolverConfig, Weights
-from tracking3d.estimation.paper.problem import Losses, Parameters, flatten
+from tracking3d.estimation.paper.problem import Losses, Parameters
+from tracking3d.estimation.shape import flatten
 
 LOSSES = Losses(
     features=torch.tensor([0.1, 0.3]),

@@ -217,6 +217,16 @@ class SolverConfig(Section):
         ),
     )
     start_iterations: int = Field(60, ge=1, description="Iterations of each hypothesis of that joint start.")
+    final_refine: bool = Field(
+        False,
+        description=(
+            "When a video file ends, solve everything once more and every frame's pose anew; causal and refined "
+            "answers are both kept. Only for solvers that can."
+        ),
+    )
+    correct_tracker: bool = Field(
+        False, description="Re-anchor the mask tracker on the answer's mask where that is confident."
+    )
     weights: Weights = Weights()
     learning_rates: LearningRates = LearningRates()
     keyframes: KeyframeConfig = KeyframeConfig()

@@ -40,6 +40,9 @@ class FrameEstimate:
         keyframe: Whether the frame became a keyframe.
         seconds: Wall time spent on the frame.
         failure: Which plug-in failed at this frame, and why, in words; empty where none did.
+        hypothesis: Which start of the pose won, in a word or two; empty where there was no choice.
+        refined: Whether this is the answer of the final refinement, which looks at the whole video, and not the
+            causal one.
         revised: Better answers for earlier frames that this frame made possible; they replace those given before.
     """
 
@@ -56,6 +59,8 @@ class FrameEstimate:
     keyframe: bool = False
     seconds: float = 0.0
     failure: str = ""
+    hypothesis: str = ""
+    refined: bool = False
     revised: tuple[FrameEstimate, ...] = ()
 
 

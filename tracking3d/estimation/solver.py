@@ -6,7 +6,10 @@ data: a frame that cannot be estimated is answered with a status and a reason, n
 
 from __future__ import annotations
 
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel
 from tracking3d.frames import Frame, MaskEstimate
@@ -27,4 +30,26 @@ class Solver(Protocol, Generic[State]):
 
     def result(self, state: State) -> ObjectModel:
         """The object as it is known now."""
+        ...
+
+
+@runtime_checkable
+class RefiningSolver(Protocol, Generic[State]):
+    """A solver that can look at a whole video once more, when it has ended."""
+
+    def refine(self, state: State) -> State:
+        """Solve everything once more over all keyframes; the state is then for ``revisit`` and ``result`` only."""
+        ...
+
+    def revisit(
+        self, state: State, frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]
+    ) -> tuple[State, FrameEstimate]:
+        """The pose of a frame once more, against the final object; frames come in order of time.
+
+        Args:
+            state: From ``refine``, then from the last call.
+            frame: The frame.
+            mask: Its initial mask as it was.
+            T_cam_obj: ``(4, 4)`` the causal answer.
+        """
         ...

@@ -82,7 +82,7 @@ def extrapolate(before: Pose, last: Pose, steps: float = 1.0) -> Pose:
     """
     delta_R = last.R @ before.R.transpose(-1, -2)
     angle_axis = _log(delta_R) * steps
-    R = _exp(angle_axis) @ last.R
+    R = rotation_exponential(angle_axis) @ last.R
     return from_matrix(R, last.translation + (last.translation - before.translation) * steps)
 
 
@@ -93,7 +93,8 @@ def _log(R: Tensor) -> Tensor:
     return result
 
 
-def _exp(axis_angle: Tensor) -> Tensor:
+def rotation_exponential(axis_angle: Tensor) -> Tensor:
+    """``(3, 3)`` rotation by the length of ``axis_angle`` ``(3,)``, in radians, about it."""
     from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
     result: Tensor = axis_angle_to_rotation_matrix(axis_angle[None])[0]
@@ -102,4 +103,4 @@ def _exp(axis_angle: Tensor) -> Tensor:
 
 def rotation_about(axis: Tensor, degrees: float) -> Tensor:
     """``(3, 3)`` rotation about ``axis`` ``(3,)``."""
-    return _exp(functional.normalize(axis, dim=0) * math.radians(degrees))
+    return rotation_exponential(functional.normalize(axis, dim=0) * math.radians(degrees))

@@ -12,7 +12,8 @@ from torch import Tensor
 from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.estimation.feature_space import FeatureSpace
 from tracking3d.estimation.observation import Observation
-from tracking3d.estimation.paper.problem import Parameters, Shape
+from tracking3d.estimation.paper.problem import Parameters
+from tracking3d.estimation.shape import Shape
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose
 from tracking3d.rendering import BackProjection, TexelMap, back_project, project, rasterize

@@ -7,7 +7,8 @@ from typing import Literal
 
 import torch
 
-from tracking3d.estimation.paper.problem import Losses, Parameters, Problem, flatten
+from tracking3d.estimation.paper.problem import Losses, Parameters, Problem
+from tracking3d.estimation.shape import flatten
 from tracking3d.rendering import channels_last
 
 Free = Literal["all", "pose"]

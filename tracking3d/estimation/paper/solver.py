@@ -20,13 +20,15 @@ from tracking3d.estimation.appearance import visible_texture
 from tracking3d.estimation.assessment import Assessment, assess
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.estimation.feature_space import TAU, FeatureSpace, feature_channels
+from tracking3d.estimation.framing import mask_box, projected_box
 from tracking3d.estimation.keyframes import Candidate, is_new_view, select_keyframes
 from tracking3d.estimation.observation import Batch, Observation, observe
 from tracking3d.estimation.paper.belief import Belief, Keyframe
 from tracking3d.estimation.paper.joint_start import joint_start
 from tracking3d.estimation.paper.optimize import Optimum, optimize
-from tracking3d.estimation.paper.prediction import candidate_poses, mask_box, projected_box
-from tracking3d.estimation.paper.problem import Problem, Shape
+from tracking3d.estimation.paper.prediction import candidate_poses
+from tracking3d.estimation.paper.problem import Problem
+from tracking3d.estimation.shape import Shape
 from tracking3d.estimation.start import first_translation, mask_ellipse, prototype_mesh
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame, MaskEstimate
@@ -135,7 +137,7 @@ class PaperSolver:
     def _observe(
         self, belief: Belief, frame: Frame, mask: NDArray[np.bool_] | None, pose: Pose
     ) -> Observation:
-        box = mask_box(mask) if mask is not None else projected_box(belief, pose)
+        box = mask_box(mask) if mask is not None else projected_box(belief.vertices, belief.camera, pose)
         if box is None:
             box = (0.0, 0.0, float(self.camera.width), float(self.camera.height))
         window = Window.around(box, self.config.window.margin, self.config.window.size)
