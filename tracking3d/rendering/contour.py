@@ -36,6 +36,8 @@ class Contour:
         normal: ``(N, 2)`` unit normals on the screen, outward.
         length: ``(N,)`` pixels of contour that each point stands for, without gradient.
         points: ``(N, 3)`` the surface points in camera coordinates, without gradient.
+        vertices: ``(N, 2)`` int64, the ends of the edge that each point lies on.
+        share: ``(N, 2)`` how much of each end the surface point is, in space.
         frames: B.
     """
 
@@ -44,6 +46,8 @@ class Contour:
     normal: Tensor
     length: Tensor
     points: Tensor
+    vertices: Tensor
+    share: Tensor
     frames: int
 
 
@@ -68,11 +72,15 @@ def find_contour(drawn: Rendering) -> Contour:
         # Perspective: on the screen it is the inverse depth that is mixed.
         z = [drawn.x_cam[view, corner, 2] for corner in (begin, end)]
         depth = 1 / ((1 - share) / z[0] + share / z[1])
+        in_space = torch.stack([(1 - share) / z[0], share / z[1]], 1) * depth[:, None]
         K = drawn.K[view]
         ray = (position - K[:, :2, 2]) / torch.stack([K[:, 0, 0], K[:, 1, 1]], 1)
         points = functional.pad(ray, (0, 1), value=1.0) * depth[:, None]
     each = (length / count)[owner]
-    return Contour(view[kept], position[kept], normal[kept], each[kept], points[kept], len(drawn.screen))
+    return Contour(
+        view[kept], position[kept], normal[kept], each[kept], points[kept],
+        torch.stack([begin, end], 1)[kept], in_space[kept], len(drawn.screen),
+    )  # fmt: skip
 
 
 def contour_loss(contour: Contour, distance: Tensor, scale: float) -> Tensor:
@@ -96,6 +104,13 @@ def contour_distance(contour: Contour, distance: Tensor) -> Tensor:
     check_shapes(distance=(distance, f"{contour.frames} H W"))
     value, _, _ = _sampled(contour, distance)
     return value
+
+
+def contour_slopes(contour: Contour, distance: Tensor) -> tuple[Tensor, Tensor]:
+    """`contour_distance` and its slopes by x and y, ``(N, 2)``, without gradient."""
+    with torch.no_grad():
+        value, by_x, by_y = _sampled(contour, distance)
+    return value, torch.stack([by_x, by_y], 1)
 
 
 def contour_normal_equations(

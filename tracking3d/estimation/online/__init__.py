@@ -1,0 +1,1 @@
+"""The solver that joins matching with re-rendering: tracks every frame, maps when it pays."""

@@ -1,0 +1,292 @@
+"""Bundle adjustment: poses and surface points that explain tracked pixels best.
+
+Levenberg-Marquardt on a Cauchy loss by iteratively reweighted least squares. The points are eliminated from every
+step by the Schur complement, so that a system of six unknowns a frame remains (Triggs et al., "Bundle adjustment:
+a modern synthesis", 1999, section 6.1).
+
+Gauge: the leading ``fixed`` frames do not move. With one of them the size of everything is still free; the median
+depth of the points in frame 0 is then kept as the start has it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.estimation.online.reprojection import (
+    BEHIND,
+    FloatArray,
+    finite_rows,
+    moved,
+    pixel_by_point,
+    pixel_by_pose,
+    project,
+    to_camera,
+)
+
+_FIRST_DAMPING = 1e-3
+_LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e9
+_TRIES = 6
+_CONVERGED = 1e-7
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Points of an object followed through F frames.
+
+    Attributes:
+        pixels: ``(F, N, 2)`` in pixels of the full frame; anything where not visible.
+        visible: ``(F, N)`` bool.
+        weight: ``(F, N)`` how much each observation counts; all the same if None.
+    """
+
+    pixels: FloatArray
+    visible: NDArray[np.bool_]
+    weight: FloatArray | None = None
+
+    def weights(self) -> FloatArray:
+        """``(F, N)`` weights, 0 wherever there is nothing to see: not visible, or a value that is not finite."""
+        weight = np.ones(self.visible.shape) if self.weight is None else self.weight
+        sound = self.visible & np.isfinite(self.pixels).all(-1) & np.isfinite(weight)
+        return np.where(sound, np.maximum(np.nan_to_num(weight), 0.0), 0.0)
+
+
+def _nothing() -> FloatArray:
+    return np.empty((0, 0))
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """Poses and points.
+
+    Attributes:
+        R: ``(F, 3, 3)`` and
+        t: ``(F, 3)`` of every frame's ``T_cam_obj``.
+        points: ``(N, 3)`` in object coordinates; nan for points that are not known.
+        focal_factor: The focal lengths of K are to be multiplied by this.
+        cost: Mean Cauchy loss over the observations, by weight; the points' prior is part of it.
+        residual: ``(F, N)`` distance in pixels between track and projection; nan where unseen.
+        iterations: Steps that were tried.
+        origin: In a word, where it comes from.
+    """
+
+    R: FloatArray
+    t: FloatArray
+    points: FloatArray
+    focal_factor: float = 1.0
+    cost: float = math.inf
+    residual: FloatArray = field(default_factory=_nothing)
+    iterations: int = 0
+    origin: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class _System:
+    """Normal equations: poses (and focal length) C, points N, and what couples them."""
+
+    poses: FloatArray  # (C, C)
+    points: FloatArray  # (N, 3, 3)
+    coupling: FloatArray  # (N, C, 3)
+    poses_gradient: FloatArray  # (C,)
+    points_gradient: FloatArray  # (N, 3)
+
+    def step(self, damping: float) -> tuple[FloatArray, FloatArray] | None:
+        """Damped step of poses ``(C,)`` and points ``(N, 3)``; None where there is none."""
+        size, width = len(self.poses), 3 * len(self.points)
+        points = _damped(self.points, damping)
+        by_points = self.coupling @ np.linalg.inv(points)
+        flat = by_points.transpose(1, 0, 2).reshape(size, width)
+        transposed = self.coupling.transpose(0, 2, 1).reshape(width, size)
+        reduced = _damped(self.poses, damping) - flat @ transposed
+        gradient = self.poses_gradient - flat @ self.points_gradient.ravel()
+        try:
+            factor = np.linalg.cholesky(reduced)
+        except np.linalg.LinAlgError:
+            return None
+        d_poses = -np.linalg.solve(factor.T, np.linalg.solve(factor, gradient))
+        right = self.points_gradient + np.einsum("nci,c->ni", self.coupling, d_poses)
+        d_points = -np.linalg.solve(points, right[..., None])[..., 0]
+        sound = np.isfinite(d_poses).all() and np.isfinite(d_points).all()
+        return (d_poses, d_points) if sound else None
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """What stays the same during one adjustment."""
+
+    pixels: FloatArray
+    weight: FloatArray
+    K: FloatArray
+    fixed: int
+    scale: float
+    free_focal: bool
+    prior: FloatArray
+    prior_weight: FloatArray
+
+    def intrinsics(self, focal_factor: float) -> FloatArray:
+        K = self.K.copy()
+        K[0, 0] *= focal_factor
+        K[1, 1] *= focal_factor
+        return K
+
+    def evaluated(self, at: Structure) -> Structure:
+        """With its cost and its residuals."""
+        seen = self.weight > 0
+        difference = project(to_camera(at.R, at.t, at.points), self.intrinsics(at.focal_factor)) - self.pixels
+        residual = np.where(seen, np.hypot(difference[..., 0], difference[..., 1]), np.nan)
+        relative = np.where(np.isfinite(residual), residual / self.scale, BEHIND)
+        total = np.sum(self.weight * np.log1p(relative**2))
+        total += np.sum(self.prior_weight * np.sum((at.points - self.prior) ** 2, 1))
+        return replace(at, cost=float(total / max(self.weight.sum(), 1e-12)), residual=residual)
+
+    def linearised(self, at: Structure) -> _System:
+        """The quadratic model of the weighted sum of losses."""
+        K = self.intrinsics(at.focal_factor)
+        x_cam = to_camera(at.R, at.t, at.points)
+        difference = project(x_cam, K) - self.pixels
+        used = (self.weight > 0) & np.isfinite(difference).all(-1)
+        difference = np.where(used[..., None], difference, 0.0)
+        # The Cauchy loss as weights of least squares: its derivative is 2 r / (scale^2 + r^2).
+        root = np.sqrt(2 * np.where(used, self.weight, 0.0) / (self.scale**2 + np.sum(difference**2, -1)))
+        by_point = root[..., None, None] * pixel_by_point(x_cam, K)
+        residual = root[..., None] * difference
+        by_pose = pixel_by_pose(by_point, x_cam - at.t[:, None])[self.fixed :]
+        by_point_obj = by_point @ at.R[:, None]
+        free, many = len(at.R) - self.fixed, len(at.points)
+        count = 6 * free
+        size = count + self.free_focal
+        poses, gradient = np.zeros((size, size)), np.zeros(size)
+        coupling = np.zeros((many, size, 3))
+        rows = by_pose.reshape(free, 2 * many, 6)
+        blocks = rows.transpose(0, 2, 1) @ rows
+        for n in range(free):
+            poses[6 * n : 6 * n + 6, 6 * n : 6 * n + 6] = blocks[n]
+        gradient[:count] = np.einsum(
+            "fki,fk->fi", rows, residual[self.fixed :].reshape(free, 2 * many)
+        ).ravel()
+        coupling[:, :count] = np.einsum("fnki,fnkj->nfij", by_pose, by_point_obj[self.fixed :]).reshape(
+            many, count, 3
+        )
+        if self.free_focal:
+            # Depths go with the focal length: to first order the image of the object's origin plane stays.
+            pixel = project(x_cam, K) - K[:2, 2]
+            by_focal = np.where(used[..., None], root[..., None] * pixel, 0.0)
+            by_focal += by_point[..., 2] * at.t[:, None, 2:]
+            poses[count, count] = np.sum(by_focal**2)
+            gradient[count] = np.sum(by_focal * residual)
+            border = np.einsum("fnki,fnk->fi", by_pose, by_focal[self.fixed :]).ravel()
+            poses[count, :count] = poses[:count, count] = border
+            coupling[:, count] = np.einsum("fnki,fnk->ni", by_point_obj, by_focal)
+        points = np.einsum("fnki,fnkj->nij", by_point_obj, by_point_obj)
+        points += 2 * self.prior_weight[:, None, None] * np.eye(3)
+        points_gradient = np.einsum("fnki,fnk->ni", by_point_obj, residual)
+        points_gradient += 2 * self.prior_weight[:, None] * (at.points - self.prior)
+        return _System(poses, points, coupling, gradient, points_gradient)
+
+    def stepped(self, at: Structure, d_poses: FloatArray, d_points: FloatArray) -> Structure:
+        """After a step."""
+        factor, t = 1.0, at.t
+        if self.free_focal:
+            factor = float(np.exp(np.clip(d_poses[-1], -0.5, 0.5)))
+            t = t * [1.0, 1.0, factor]
+            d_poses = d_poses[:-1]
+        R_moved, t_moved = moved(at.R[self.fixed :], t[self.fixed :], d_poses.reshape(-1, 6))
+        R, t = np.concatenate([at.R[: self.fixed], R_moved]), np.concatenate([t[: self.fixed], t_moved])
+        return replace(at, R=R, t=t, points=at.points + d_points, focal_factor=at.focal_factor * factor)
+
+
+def adjust(
+    tracks: Tracks,
+    K: FloatArray,
+    start: Structure,
+    *,
+    fixed: int = 1,
+    scale: float = 1.0,
+    free_focal: bool = False,
+    iterations: int = 20,
+    point_prior: FloatArray | None = None,
+    point_prior_weight: float = 0.0,
+) -> Structure:
+    """The poses and points of least robust reprojection error near a start; never worse than the start.
+
+    Args:
+        tracks: F frames, N points.
+        K: ``(3, 3)`` of the full frame, without skew.
+        start: Points that are nan stay so and are not used.
+        fixed: How many leading frames keep their pose.
+        scale: Residual in pixels at which the Cauchy loss is ``log 2``.
+        free_focal: Solve for one factor of both focal lengths too. Fixed frames then keep their rotation and the
+            place where the object's origin is seen; their depth goes with the focal length, so that the object
+            keeps its size.
+        iterations: The most steps that are tried.
+        point_prior: ``(N, 3)`` where the points should be, for instance on a mesh; nan for those that are free.
+        point_prior_weight: What a point at distance 1 from its place costs; an observation at a residual of one
+            scale costs ``log 2``.
+
+    Raises:
+        ValueError: If shapes do not fit.
+    """
+    frames, count = tracks.visible.shape
+    if start.R.shape != (frames, 3, 3) or start.points.shape != (count, 3) or not 0 <= fixed <= frames:
+        raise ValueError(
+            "the start must have the frames and points of the tracks, and fixed be one of its frames"
+        )
+    known = finite_rows(start.points)
+    prior = np.full((count, 3), np.nan) if point_prior is None else point_prior
+    held = known & finite_rows(prior)
+    problem = _Problem(
+        pixels=np.where(tracks.visible[..., None], np.nan_to_num(tracks.pixels), 0.0),
+        weight=tracks.weights() * known,
+        K=np.asarray(K, np.float64),
+        fixed=fixed,
+        scale=scale,
+        free_focal=free_focal,
+        prior=np.where(held[:, None], prior, 0.0),
+        prior_weight=np.where(held, point_prior_weight, 0.0),
+    )
+    begun = replace(start, points=np.where(known[:, None], start.points, 0.0))
+    best = problem.evaluated(begun)
+    damping, tried, settled = _FIRST_DAMPING, 0, False
+    while tried < iterations and not settled:
+        system = problem.linearised(best)
+        for _ in range(_TRIES):
+            tried += 1
+            step = system.step(damping)
+            better = None if step is None else problem.evaluated(problem.stepped(best, *step))
+            if better is not None and better.cost < best.cost:
+                settled = best.cost - better.cost < _CONVERGED * best.cost
+                best, damping = better, max(damping / 10, _LEAST_DAMPING)
+                break
+            damping = min(damping * 10, _MOST_DAMPING)
+        else:
+            settled = True
+    if fixed == 1 and not problem.prior_weight.any():
+        best = problem.evaluated(_with_depth_of(begun, best, problem.weight.max(0, initial=0.0) > 0))
+    points = np.where(known[:, None], best.points, np.nan)
+    return replace(best, points=points, iterations=tried)
+
+
+def _with_depth_of(reference: Structure, structure: Structure, used: NDArray[np.bool_]) -> Structure:
+    """Everything scaled about frame 0's camera to the reference's median depth there; no image changes."""
+    if not used.any():
+        return structure
+    before, after = (
+        float(np.median(to_camera(s.R[0], s.t[0], s.points[used])[:, 2])) for s in (reference, structure)
+    )
+    factor = before / after * structure.focal_factor / reference.focal_factor
+    if not (math.isfinite(factor) and factor > 0):
+        return structure
+    R0, t0 = structure.R[0], structure.t[0]
+    points = (factor * structure.points @ R0.T + (factor - 1) * t0) @ R0
+    t = factor * structure.t + (1 - factor) * (structure.R @ (R0.T @ t0))
+    return replace(structure, t=t, points=points)
+
+
+def _damped(matrix: FloatArray, damping: float) -> FloatArray:
+    """Levenberg-Marquardt's: a share of each diagonal entry more, and a floor that keeps unseen parts still."""
+    diagonal = np.einsum("...ii->...i", matrix)
+    floor = 1e-9 * diagonal.max(initial=0.0) + 1e-12
+    return matrix + (damping * diagonal + floor)[..., None] * np.eye(matrix.shape[-1])

@@ -1,0 +1,68 @@
+"""Where points of a posed object are seen, and how that changes when poses and points move.
+
+A pose moves by ``d = (v, w)`` in the camera's axes: ``x_cam -> exp(w) (x_cam - t) + t + v``, so ``t`` becomes
+``t + v`` and ``R`` becomes ``exp(w) R``. That is the step of `tracking3d.rendering.normal_equations`, with the
+object's origin as pivot.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+FloatArray = NDArray[np.float64]
+
+NEAREST = 1e-6
+"""Points at this depth or less have no image."""
+
+BEHIND = 100.0
+"""A point that is seen, yet has no image, costs as much as a residual of this many robust scales."""
+
+
+def finite_rows(rows: FloatArray) -> NDArray[np.bool_]:
+    """``(...)`` bool, which of ``(..., D)`` have finite numbers only."""
+    return np.logical_and.reduce(np.isfinite(rows), axis=-1)
+
+
+def to_camera(R: FloatArray, t: FloatArray, points: FloatArray) -> FloatArray:
+    """``(..., N, 3)`` points in camera coordinates, from poses ``(..., 3, 3)`` and ``(..., 3)``."""
+    return points @ np.swapaxes(R, -1, -2) + t[..., None, :]
+
+
+def project(x_cam: FloatArray, K: FloatArray) -> FloatArray:
+    """``(..., 2)`` pixels of points ``(..., 3)`` in camera coordinates; nan for those not in front of the camera."""
+    depth = np.where(x_cam[..., 2] > NEAREST, x_cam[..., 2], np.nan)
+    focal, centre = np.array([K[0, 0], K[1, 1]]), K[:2, 2]
+    return x_cam[..., :2] / depth[..., None] * focal + centre
+
+
+def pixel_by_point(x_cam: FloatArray, K: FloatArray) -> FloatArray:
+    """``(..., 2, 3)`` derivative of `project`; zero for points not in front of the camera."""
+    seen = x_cam[..., 2] > NEAREST
+    inverse = np.where(seen, 1 / np.where(seen, x_cam[..., 2], 1.0), 0.0)
+    derivative = np.zeros((*x_cam.shape[:-1], 2, 3))
+    for row in range(2):
+        derivative[..., row, row] = K[row, row] * inverse
+        derivative[..., row, 2] = -K[row, row] * x_cam[..., row] * inverse**2
+    return derivative
+
+
+def pixel_by_pose(by_point: FloatArray, from_pivot: FloatArray) -> FloatArray:
+    """``(..., 2, 6)`` derivative of pixels by (v, w).
+
+    Args:
+        by_point: ``(..., 2, 3)`` of `pixel_by_point`.
+        from_pivot: ``(..., 3)`` points in camera coordinates less the pivot that rotations turn about.
+    """
+    # a . (w x y) is w . (y x a).
+    y, a = from_pivot[..., None, :], by_point
+    turned = np.empty_like(by_point)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        turned[..., i] = y[..., j] * a[..., k] - y[..., k] * a[..., j]
+    return np.concatenate([by_point, turned], -1)
+
+
+def moved(R: FloatArray, t: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Poses ``(F, 3, 3)`` and ``(F, 3)`` after steps ``(F, 6)``."""
+    return Rotation.from_rotvec(step[:, 3:]).as_matrix() @ R, t + step[:, :3]
