@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -32,6 +33,7 @@ class View:
         points: Landmarks and where the frame shows them.
         keypoints: For matching; ``keypoint_landmark`` ``(M,)`` says which landmark each is.
         texture: What the frame shows of the feature texture, as last computed; None before.
+        mask_weight: How far the mask is believed, in [0, 1].
     """
 
     observation: Observation
@@ -41,6 +43,7 @@ class View:
     keypoints: Keypoints = field(default_factory=Keypoints.none)
     keypoint_landmark: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     texture: BackProjection | None = None
+    mask_weight: float = 1.0
 
     @property
     def index(self) -> int:
@@ -58,6 +61,7 @@ class ObjectMap:
         vertices: ``(V, 3)``.
         landmarks: ``(N, 3)`` float64 surface points in object coordinates.
         keyframes: In order of time; the first one's pose never moves.
+        candidate: ``(N,)`` found beside the mask, and not yet known to be on the object.
         renderer: Which renderer, see `tracking3d.rendering.backend`.
     """
 
@@ -66,7 +70,16 @@ class ObjectMap:
     vertices: Tensor
     landmarks: NDArray[np.float64]
     keyframes: tuple[View, ...]
+    candidate: NDArray[np.bool_]
     renderer: str = "auto"
+
+    @cached_property
+    def sightings(self) -> NDArray[np.int64]:
+        """``(N,)`` how many keyframes show each landmark."""
+        count = np.zeros(len(self.landmarks), np.int64)
+        for view in self.keyframes:
+            count[view.points.landmark] += 1
+        return count
 
     @property
     def radius(self) -> float:
@@ -124,7 +137,7 @@ class Belief:
         followed: Points in the last frame.
         waiting: First frames that wait for the start, with their answers so far; None once it is done.
         space: What is made of the encoder's features; None leaves them as they are.
-        since_map: Frames since the map was refined.
+        due: Motion at which the next start is tried.
     """
 
     camera: Camera
@@ -136,6 +149,7 @@ class Belief:
     followed: FollowedPoints
     waiting: tuple[tuple[View, FrameEstimate], ...] | None = ()
     space: FeatureSpace | None = None
+    due: float = 0.0
 
     def moved(self, pose: Pose, index: int, grey: NDArray[np.uint8], followed: FollowedPoints) -> Belief:
         """One frame later."""

@@ -1,7 +1,8 @@
 """Poses of a flat object from tracks of its points: two unknowns of its plane, and every frame's pose.
 
-Free points make a flat object bulge and its motion wrong: almost any relief explains a plane that turns a little. A
-plane has two answers without perspective, tilted one way and the other; both are found if both fit.
+Free points make a flat object bulge and its motion wrong: almost any relief explains a plane that turns a little. Without
+perspective its tilt is hardly told either (whole families of tilts and motions have the same images), so several
+answers are given.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ SLANTS = (25.0, 50.0)
 """Degrees by which planes are tried to be tilted, in eight directions."""
 
 _STARTS = 4
+_SCREENED_POINTS = 40
 _ITERATIONS = 25
 _STEEPEST = 5.0
 _SAME_TILT = 0.3
@@ -66,12 +68,13 @@ def flat_structures(
     rays = np.column_stack(
         [(tracks.pixels[0] - K[:2, 2]) / [K[0, 0], K[1, 1]], np.ones(tracks.pixels.shape[1])]
     )
-    few = Tracks(*(part[[0, len(tracks.pixels) // 2, -1]] for part in (tracks.pixels, tracks.visible)))
+    share = np.arange(0, len(rays), max(len(rays) // _SCREENED_POINTS, 1))
+    few = Tracks(tracks.pixels[:, share], tracks.visible[:, share])
     screened = []
     for tilt in _tilts(tracks, K, rays, z0, scale):
         points = _on_plane(rays, tilt, z0)
         if points is not None:
-            start = resected(few, K, points - t0, t0, scale)
+            start = resected(few, K, points[share] - t0, t0, scale)
             screened.append((adjust(few, K, start, scale=scale, iterations=0).cost, tilt))
     screened.sort(key=lambda pair: pair[0])
     chosen: list[FloatArray] = []
@@ -119,9 +122,15 @@ def _on_plane(rays: FloatArray, tilt: FloatArray, z0: float) -> FloatArray | Non
 
 
 def _fitted(
-    tracks: Tracks, K: FloatArray, rays: FloatArray, tilt: FloatArray, t0: FloatArray, z0: float, scale: float
-) -> Structure:
-    """Tilt and poses of least cost by Levenberg-Marquardt from a start; points stay on frame 0's rays."""
+    tracks: Tracks,
+    K: FloatArray,
+    rays: FloatArray,
+    tilt: FloatArray,
+    start: Structure,
+    z0: float,
+    scale: float,
+) -> tuple[Structure, FloatArray]:
+    """Poses and tilt of least cost by Levenberg-Marquardt from a start; points stay on frame 0's rays."""
     offset = (rays - np.median(rays, 0))[:, :2]
     points = _on_plane(rays, tilt, z0)
     assert points is not None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from tracking3d.rendering import project as project_vertices
 
 FloatArray = NDArray[np.float64]
 _SAME_PLACE = 1.5  # pixels within which a keypoint is a point that is followed
+_FEWEST_WITNESSES = 12
 _SEARCH = 12.0  # pixels around its projection within which a landmark may be found again
 
 
@@ -48,6 +50,17 @@ def lift(
     x_cam = np.concatenate([ray, np.ones((len(ray), 1))], 1) * z[:, None]
     R, t = pose_arrays(view.pose)
     return (x_cam - t) @ R, met
+
+
+def mask_weight(mask: NDArray[np.bool_] | None, points: FollowedPoints) -> float:
+    """How far a mask is believed, by the share of points on the object that lie inside it."""
+    if mask is None or len(points) < _FEWEST_WITNESSES:
+        return 1.0
+    reach = max(round(0.02 * float(np.sqrt(mask.sum()))), 1)
+    wide = cv2.dilate(mask.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
+    x, y = np.rint(points.pixel).astype(int).T
+    inside = wide[y.clip(0, mask.shape[0] - 1), x.clip(0, mask.shape[1] - 1)].mean()
+    return float(np.clip((inside - 0.75) / 0.2, 0.02, 1.0))
 
 
 def to_window(view: View, pixel: NDArray[np.float32]) -> FloatArray:
@@ -120,7 +133,8 @@ def with_landmarks(
         np.concatenate([followed.pixel, added.pixel, corners[usable]]),
     )
     named = replace(view, points=points_now, keypoints=keypoints, keypoint_landmark=label)
-    return replace(known, landmarks=landmarks), named
+    candidate = np.concatenate([known.candidate, np.zeros(len(landmarks) - len(known.landmarks), bool)])
+    return replace(known, landmarks=landmarks, candidate=candidate), named
 
 
 def nearest_views(keyframes: tuple[View, ...], pose: Pose, most: int) -> list[View]:
@@ -188,7 +202,7 @@ def _bundled(
     views = [known.keyframes[position] for position in positions]
     seen = np.concatenate([view.points.landmark for view in views])
     names, counts = np.unique(seen, return_counts=True)
-    names = names[counts >= 2]
+    names = names[(counts >= 2) & ~known.candidate[names]]
     if len(names) < 8 or len(views) < 2:
         return known
     tracks = tracks_of(views, names)
@@ -258,10 +272,10 @@ def fit_shape(known: ObjectMap, positions: list[int], weights: FitWeights, round
         poses.translation,
         torch.stack([o.K for o in observations]),
         signed_distance(torch.stack([o.mask for o in observations])),
-        torch.tensor([float(o.has_mask) for o in observations]).to(known.vertices),
+        torch.tensor([v.mask_weight * v.observation.has_mask for v in views]).to(known.vertices),
     )
     names, number = np.unique(np.concatenate([v.points.landmark for v in views]), return_counts=True)
-    names = names[number >= 2]
+    names = names[(number >= 2) & ~known.candidate[names] & np.isfinite(known.landmarks[names]).all(1)]
     which = np.full(len(known.landmarks), -1)
     for n, view in enumerate(views):
         which[view.points.landmark] = n

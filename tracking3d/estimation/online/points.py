@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 MOST_POINTS = 250
+"""Points that a frame gets at least, where it has so many corners."""
+MOST_FOLLOWED = 350
 """Points that are followed at once."""
 _QUALITY = 0.01  # of the strongest corner, see cv2.goodFeaturesToTrack
 _FLOW_WINDOW = (15, 15)
@@ -35,6 +37,10 @@ class FollowedPoints:
 
     def __len__(self) -> int:
         return len(self.landmark)
+
+    def first(self, most: int) -> FollowedPoints:
+        """The first ones: they have been followed the longest."""
+        return FollowedPoints(self.landmark[:most], self.pixel[:most])
 
     def only(self, kept: NDArray[np.bool_]) -> FollowedPoints:
         """Those that are kept."""
@@ -104,6 +110,8 @@ def new_corners(
     for px, py in taken:
         cv2.circle(inside, (round(float(px)) - x, round(float(py)) - y), round(distance), 0, -1)
     crop = np.ascontiguousarray(image[box])
+    if min(crop.shape) < 16:
+        return np.zeros((0, 2), np.float32)
     corners = cv2.goodFeaturesToTrack(crop, most, _QUALITY, distance, mask=inside)
     if corners is None:
         return np.zeros((0, 2), np.float32)

@@ -1,7 +1,8 @@
 """The pose of a known object from places where its surface points are seen, with and without a start.
 
-Sampling is OpenCV's USAC over minimal sets of three points with local optimisation; its generator takes the seed, so
-that nothing global is touched. What it finds, and a start if there is one, is refined under the Cauchy loss.
+Sampling is OpenCV's USAC over minimal sets of three points with local optimisation; its answer depends on the seed
+alone, whatever OpenCV's global generator holds. What it finds, and a start if there is one, is refined under the
+Cauchy loss.
 """
 
 from __future__ import annotations
@@ -149,8 +150,8 @@ def pose_of_tracks(
     for _ in range(iterations):
         diagonal = at.matrix.diagonal()
         floor = 1e-9 * diagonal.max() + 1e-12
-        step: FloatArray = -np.linalg.solve(at.matrix + np.diag(damping * diagonal + floor), at.gradient)
-        R_new, t_new = (part[0] for part in moved(R[None], t[None], step[None]))
+        step = -np.linalg.solve(at.matrix + np.diag(damping * diagonal + floor), at.gradient)
+        R_new, t_new = (part[0] for part in moved(R[None], t[None], np.asarray(step[None], np.float64)))
         new = point_equations(points, pixels, weight, K, R_new, t_new, scale)
         if not new.cost < at.cost:
             damping = min(10 * damping, 1e9)

@@ -19,6 +19,7 @@ from tracking3d.estimation.observation import Observation, observe
 from tracking3d.estimation.online.belief import Belief, ObjectMap, View
 from tracking3d.estimation.online.keypoints import Keypoints, detect, match
 from tracking3d.estimation.online.mapping import (
+    mask_weight,
     nearest_views,
     pose_arrays,
     pose_of,
@@ -29,7 +30,7 @@ from tracking3d.estimation.online.mapping import (
     window_of,
     with_landmarks,
 )
-from tracking3d.estimation.online.points import MOST_POINTS, FollowedPoints, follow, grey, new_corners
+from tracking3d.estimation.online.points import MOST_FOLLOWED, MOST_POINTS, FollowedPoints, follow, grey, new_corners
 from tracking3d.estimation.online.pose_from_points import pose_from_points
 from tracking3d.estimation.online.pose_refinement import (
     MatchedPoints,
@@ -37,6 +38,7 @@ from tracking3d.estimation.online.pose_refinement import (
     PoseWeights,
     refine_pose,
 )
+from tracking3d.estimation.online.recruits import MOST_CANDIDATES, recruit, surroundings
 from tracking3d.estimation.online.start import solve_start
 from tracking3d.estimation.online.structure import motion_enough
 from tracking3d.estimation.online.surface_fit import FitWeights
@@ -48,8 +50,12 @@ from tracking3d.geometry.camera import Camera, Window
 from tracking3d.geometry.pose import Pose, extrapolate, rotation_angle
 from tracking3d.rendering import BackProjection, TexelMap
 
-MOTION = 0.05
+MOTION = 0.03
+_MOTION_STEP = 1.3
+_DOUBTFUL_START = 0.25
+_MOST_WAITING = 40
 VERBOSE = False
+_ENOUGH_MATURE = 30
 
 
 @dataclass(frozen=True)
@@ -85,7 +91,7 @@ class OnlineSolver:
         pose = Pose.identity(translation.to(self.device))
         shape = Shape.of(prototype_mesh(self.config.object, ellipse), self.config.object.flat, self.device)
         texels = TexelMap.of(shape.face_uvs, self.config.object.texture_size)
-        known = ObjectMap(shape, texels, shape.rest, np.zeros((0, 3)), (), self.config.runtime.renderer)
+        known = ObjectMap(shape, texels, shape.rest, np.zeros((0, 3)), (), np.zeros(0, bool), self.config.runtime.renderer)
         image = grey(frame.image)
         belief = Belief(self.camera, known, None, (pose, frame.index), None, image, FollowedPoints.none())
         observation = self._observe(belief, frame, binary, pose)
@@ -95,9 +101,10 @@ class OnlineSolver:
             observation = replace(observation, features=space.project(observation.features))
         view = View(observation, binary, pose, FollowedPoints.none())
         known, view = self._named(known, view, image)
+        known, view = self._with_candidates(known, view, image)
         answer = self._answer(frame, binary, pose, Status.UNCERTAIN, "the object has not moved enough yet", 0.3, started)
         answer = replace(answer, mask=binary)
-        belief = replace(belief, known=known, followed=view.points, waiting=((view, answer),))
+        belief = replace(belief, known=known, followed=view.points, waiting=((view, answer),), due=MOTION)
         return belief, answer
 
     def _named(self, known: ObjectMap, view: View, image: NDArray[np.uint8]) -> tuple[ObjectMap, View]:
@@ -107,6 +114,23 @@ class OnlineSolver:
         taken = np.concatenate([view.points.pixel, keypoints.pixel])
         corners = new_corners(image, inside, taken, MOST_POINTS - len(taken))
         return with_landmarks(known, self.camera, view, keypoints, corners)
+
+    def _with_candidates(self, known: ObjectMap, view: View, image: NDArray[np.uint8]) -> tuple[ObjectMap, View]:
+        """With corners beside the mask."""
+        if view.mask is None:
+            return known, view
+        there = int(known.candidate[view.points.landmark].sum())
+        corners = new_corners(image, surroundings(view.mask), view.points.pixel, MOST_CANDIDATES - there)
+        names = len(known.landmarks) + np.arange(len(corners))
+        points = FollowedPoints(
+            np.concatenate([view.points.landmark, names]), np.concatenate([view.points.pixel, corners])
+        )
+        known = replace(
+            known,
+            landmarks=np.concatenate([known.landmarks, np.full((len(corners), 3), np.nan)]),
+            candidate=np.concatenate([known.candidate, np.ones(len(corners), bool)]),
+        )
+        return known, replace(view, points=points)
 
     def step(self, state: Belief, frame: Frame, mask: MaskEstimate) -> tuple[Belief, FrameEstimate]:
         started = time.perf_counter()
@@ -124,12 +148,9 @@ class OnlineSolver:
     ) -> tuple[Belief, FrameEstimate]:
         assert state.waiting is not None
         followed = follow(state.grey, image, state.followed)
-        if mask is not None and len(followed):
-            x, y = np.rint(followed.pixel).astype(int).T
-            followed = followed.only(mask[y.clip(0, mask.shape[0] - 1), x.clip(0, mask.shape[1] - 1)])
         pose = state.last[0]
         observation = self._observe(state, frame, mask, pose)
-        view = View(observation, mask, pose, followed)
+        view = View(observation, mask, pose, followed, mask_weight=mask_weight(mask, followed.only(~state.known.candidate[followed.landmark])))
         known = state.known
         if len(followed) < 0.6 * MOST_POINTS:
             fake = replace(known, keyframes=tuple(v for v, _ in state.waiting))
@@ -142,13 +163,14 @@ class OnlineSolver:
         belief = replace(state, known=known, waiting=waiting).moved(pose, frame.index, image, view.points)
         views = [v for v, _ in waiting if v.mask is not None]
         names, counts = np.unique(np.concatenate([v.points.landmark for v in views]), return_counts=True)
+        names = names[~known.candidate[names]]
         from tracking3d.estimation.online.mapping import tracks_of
         motion = motion_enough(tracks_of(views, names)) if len(views) > 1 else 0.0
         if VERBOSE:
             print("motion", frame.index, round(motion, 3), len(view.points))
-        if motion < MOTION or len(views) < 4:
+        if motion < state.due or len(views) < 4:
             return belief, answer
-        return self._begin(belief, answer, started)
+        return self._begin(replace(belief, due=motion * _MOTION_STEP), answer, started)
 
     def _named_waiting(self, known: ObjectMap, view: View, image: NDArray[np.uint8]) -> tuple[ObjectMap, View]:
         inside = view.mask if view.mask is not None else np.ones(image.shape, bool)
@@ -180,15 +202,18 @@ class OnlineSolver:
             np.concatenate([view.points.pixel, keypoints.pixel[first][again], corners]),
         )
         landmarks = np.concatenate([known.landmarks, np.full((fresh.sum() + len(corners), 3), np.nan)])
-        return replace(known, landmarks=landmarks), replace(view, points=points, keypoints=keypoints, keypoint_landmark=label)
+        candidate = np.concatenate([known.candidate, np.zeros(len(landmarks) - len(known.landmarks), bool)])
+        known = replace(known, landmarks=landmarks, candidate=candidate)
+        return known, replace(view, points=points, keypoints=keypoints, keypoint_landmark=label)
 
     def _begin(self, state: Belief, answer: FrameEstimate, started: float) -> tuple[Belief, FrameEstimate]:
         assert state.waiting is not None
         views = [view for view, _ in state.waiting if view.mask is not None]
         starts = solve_start(state.known, self.camera, views, self.fit, self.prior, VERBOSE)
-        if not starts:
+        if not starts or (starts[0].bundle > _DOUBTFUL_START and len(state.waiting) < _MOST_WAITING):
             return state, answer
         known = starts[0].known
+        known = recruit(known, self.camera, list(range(len(known.keyframes))))
         known = refine_map(
             known, self.camera, list(range(len(known.keyframes))), weights=self.fit, prior=self.prior, rounds=3,
             bundle_iterations=20,
@@ -227,11 +252,8 @@ class OnlineSolver:
             shift = np.nan_to_num(shift)
             guess = (state.followed.pixel + shift).astype(np.float32)
         followed = follow(state.grey, image, state.followed, guess)
-        if mask is not None and len(followed):
-            x, y = np.rint(followed.pixel).astype(int).T
-            followed = followed.only(mask[y.clip(0, mask.shape[0] - 1), x.clip(0, mask.shape[1] - 1)])
         observation = self._observe(state, frame, mask, predicted)
-        view = View(observation, mask, predicted, followed)
+        view = View(observation, mask, predicted, followed, mask_weight=mask_weight(mask, followed.only(~state.known.candidate[followed.landmark])))
         candidates = {"velocity": predicted, "last": last}
         found = self._pnp(known, followed)
         if found is not None:
@@ -259,24 +281,27 @@ class OnlineSolver:
         if len(followed):
             R, t = pose_arrays(fit.pose)
             gap = np.linalg.norm(project_points(known.landmarks[followed.landmark], fit.pose, self.camera) - followed.pixel, axis=1)
-            followed = followed.only(gap < 4 * max(1.0, observation.window.side / 200))
+            young = known.sightings[followed.landmark] < 2
+            followed = followed.only(np.isnan(gap) | (gap < np.where(young, 16, 4) * max(1.0, observation.window.side / 200)))
         view = replace(view, pose=fit.pose, points=followed)
         belief = state.moved(fit.pose, frame.index, image, followed)
         silhouette = known.silhouette(fit.pose, self.camera)
         key = self._is_new(known, fit.pose)
         if key and mask is not None:
             known, view = self._named(known, view, image)
+            known, view = self._with_candidates(known, view, image)
             known = replace(known, keyframes=(*known.keyframes, view))
+            known = recruit(known, self.camera, window_of(len(known.keyframes), self.map_window))
             known = refine_map(
                 known, self.camera, window_of(len(known.keyframes), self.map_window), weights=self.fit, prior=self.prior,
             )
             pose = known.keyframes[-1].pose
-            belief = replace(belief, known=known, surface=known.surface(), last=(pose, frame.index), followed=known.keyframes[-1].points)
+            belief = replace(belief, known=known, surface=known.surface(), last=(pose, frame.index), followed=known.keyframes[-1].points.first(MOST_FOLLOWED))
             silhouette = known.silhouette(pose, self.camera)
         answer = self._answer(frame, mask, belief.last[0], Status.TRACKED, "", 0.5, started)
         answer = replace(
             answer, mask=silhouette, keyframe=bool(key), hypothesis=won, iterations=fit.iterations,
-            losses={"features": fit.appearance, "outline": fit.outline, "points": fit.points, "followed": float(len(followed))},
+            losses={"features": fit.appearance, "outline": fit.outline, "points": fit.points, "followed": float(len(followed)), "mask": view.mask_weight},
         )
         return belief, answer
 
@@ -301,14 +326,19 @@ class OnlineSolver:
         assert state.surface is not None
         position = state.known.landmarks[points.landmark]
         sound = np.isfinite(position).all(1)
+        # A landmark seen once lies where the shape was believed to be: with others at hand it is no witness.
+        mature = sound & (state.known.sightings[points.landmark] >= 2)
+        if mature.sum() >= _ENOUGH_MATURE:
+            sound = mature
         matched = MatchedPoints(
             torch.from_numpy(position[sound]).to(state.surface.vertices),
             torch.from_numpy(to_window(view, points.pixel[sound])).to(state.surface.vertices),
         )
+        weights = replace(self.weights, outline=self.weights.outline * view.mask_weight)
         if len(starts) > 1:
-            first = [refine_pose(state.surface, view.observation, start, matched, self.weights, (0, 0)) for start in starts]
+            first = [refine_pose(state.surface, view.observation, start, matched, weights, (0, 0)) for start in starts]
             starts = [min(first, key=lambda fit: fit.cost).pose]
-        return refine_pose(state.surface, view.observation, starts[0], matched, self.weights)
+        return refine_pose(state.surface, view.observation, starts[0], matched, weights)
 
     def _observe(
         self, belief: Belief, frame: Frame, mask: NDArray[np.bool_] | None, pose: Pose

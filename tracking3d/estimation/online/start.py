@@ -33,11 +33,13 @@ class Start:
     Attributes:
         known: The map, whose keyframes are the chosen views.
         cost: How badly it re-renders the views.
+        bundle: How badly its points fit their tracks.
         origin: Which hypothesis it came from.
     """
 
     known: ObjectMap
     cost: float
+    bundle: float
     origin: str
 
 
@@ -56,7 +58,7 @@ def solve_start(
     chosen = [views[i] for i in sorted(set(np.linspace(0, len(views) - 1, _VIEWS).round().astype(int).tolist()))]
     seen = np.concatenate([view.points.landmark for view in chosen])
     names, counts = np.unique(seen, return_counts=True)
-    names = names[counts >= min(3, len(chosen))]
+    names = names[(counts >= min(3, len(chosen))) & ~known.candidate[names]]
     if len(names) < 8:
         return []
     tracks = tracks_of(chosen, names)
@@ -70,12 +72,12 @@ def solve_start(
             refine_pose(surface, view.observation, view.pose, None, PoseWeights(), iterations=(0, 0))
             for view in hypothesis.keyframes
         ]
-        cost = float(np.mean([fit.cost for fit in fits]))
+        cost = float(np.mean([fit.cost for fit in fits])) + structure.cost
         if verbose:
             print(
                 f"   {structure.origin:12s} ba {structure.cost:.4f} cost {cost:.4f} app {np.mean([f.appearance for f in fits]):.3f} outline {np.mean([f.outline for f in fits]):.3f}"
             )
-        starts.append(Start(hypothesis, cost, structure.origin))
+        starts.append(Start(hypothesis, cost, structure.cost, structure.origin))
     starts.sort(key=lambda start: start.cost)
     return starts
 

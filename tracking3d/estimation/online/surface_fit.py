@@ -103,6 +103,7 @@ def fit_surface(
         rows = [_outline_rows(drawn, views, weights)]
         if landmarks is not None and len(landmarks.points):
             rows.append(_landmark_rows(shape, faces, drawn, views, landmarks, weights))
+            rows.append(_uncovered_rows(shape, drawn, views, landmarks, weights))
         offsets = (shape - rest).double().cpu().numpy().ravel()
         matrix, gradient = smoothness, smoothness @ offsets
         for jacobian, residual in rows:
@@ -177,6 +178,32 @@ def _landmark_rows(
     return _rows(corner, blocks, len(vertices)), _numpy(torch.where(sound, root * distance, 0.0))
 
 
+def _uncovered_rows(
+    vertices: Tensor, drawn: Rendering, views: Views, landmarks: Landmarks, weights: FitWeights
+) -> tuple[sparse.csr_matrix, FloatArray]:
+    """Rows of the distances, in all three directions, between landmarks beside the surface and the nearest vertex."""
+    _, face = _faces_before(drawn, views, landmarks)
+    points = landmarks.points[face < 0]
+    nearest = torch.cdist(points, vertices).argmin(1) if len(points) else face.new_zeros(0)
+    difference = vertices[nearest] - points
+    robust = 1 / (1 + difference.square().sum(1) / (2 * weights.landmarks_scale) ** 2)
+    root = (weights.landmarks * robust / max(len(landmarks.points), 1)).sqrt() / weights.landmarks_scale
+    blocks = root[:, None, None, None] * torch.eye(3).to(vertices)[None, :, None]  # (N, 3, 1, 3)
+    vertex = nearest[:, None].repeat_interleave(3, 0)
+    return _rows(vertex, blocks.reshape(-1, 1, 3), len(vertices)), _numpy((root[:, None] * difference).reshape(-1))
+
+
+def _faces_before(drawn: Rendering, views: Views, landmarks: Landmarks) -> tuple[Tensor, Tensor]:
+    """Landmarks in camera coordinates ``(N, 3)``, and the face ``(N,)`` that is seen where each is; -1 for none."""
+    view = landmarks.view
+    x_cam = torch.einsum("nij,nj->ni", views.R[view], landmarks.points) + views.t[view]
+    K = views.K[view]
+    pixel = x_cam[:, :2] / x_cam[:, 2:].clamp_min(1e-6) * torch.stack([K[:, 0, 0], K[:, 1, 1]], 1) + K[:, :2, 2]
+    size = drawn.face_index.shape[1]
+    column, row = pixel.round().long().clamp(0, size - 1).unbind(1)
+    return x_cam, drawn.face_index[view, row, column]
+
+
 def _by_object_point(slope: Tensor, points: Tensor, views: Views, view: Tensor) -> Tensor:
     """``(N, k, 3)`` derivative by the object's points of ``slope (N, k, 2)`` times their pixels."""
     x, y, z = points.unbind(1)
@@ -199,7 +226,7 @@ def _barycentric(point: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
 def _rows(vertex: Tensor, blocks: Tensor, vertices: int) -> sparse.csr_matrix:
     """Sparse ``(N, 3 V)`` with each row's blocks ``(N, k, 3)`` at its vertices ``(N, k)``."""
     count, corners, _ = blocks.shape
-    columns = (3 * vertex[:, :, None] + torch.arange(3)).reshape(count, -1)
+    columns = (3 * vertex[:, :, None] + torch.arange(3)).reshape(count, 3 * corners)
     pointer = np.arange(count + 1) * (3 * corners)
     return sparse.csr_matrix(
         (_numpy(blocks.reshape(-1)), columns.reshape(-1).cpu().numpy(), pointer), shape=(count, 3 * vertices)

@@ -1,0 +1,64 @@
+"""Points beside the mask that move with the object: they belong to it, and say where the mask is too small.
+
+Corners around the mask are followed like the object's own. Once a few keyframes show one, it is triangulated with
+their poses: a point of the object fits them and has moved in the image; one of the background fits only while
+nothing moves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.estimation.online.belief import ObjectMap
+from tracking3d.estimation.online.bundle import Structure, adjust
+from tracking3d.estimation.online.mapping import pose_arrays, tracks_of
+from tracking3d.geometry.camera import Camera
+
+MOST_CANDIDATES = 80
+_REACH = 0.25  # how far beside the mask, relative to the root of its area
+_VIEWS = 3
+_FITS, _FAILS = 1.0, 2.5  # mean residual in pixels of an object 200 pixels large
+_MOVED = 6.0  # such pixels
+
+
+def surroundings(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """``(H, W)`` the band around a mask."""
+    reach = max(round(_REACH * float(np.sqrt(mask.sum()))), 3)
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    return (cv2.dilate(mask.astype(np.uint8), kernel) > 0) & ~mask
+
+
+def recruit(known: ObjectMap, camera: Camera, positions: list[int]) -> ObjectMap:
+    """Take candidates over as landmarks, or drop them, where the keyframes at ``positions`` can tell."""
+    views = [known.keyframes[position] for position in positions]
+    names, counts = np.unique(np.concatenate([view.points.landmark for view in views]), return_counts=True)
+    names = names[(counts >= _VIEWS) & known.candidate[names]]
+    if not len(names):
+        return known
+    tracks = tracks_of(views, names)
+    poses = [pose_arrays(view.pose) for view in views]
+    R, t = np.array([pose[0] for pose in poses]), np.array([pose[1] for pose in poses])
+    first = tracks.visible.argmax(0)
+    pixel = tracks.pixels[first, np.arange(len(names))]
+    ray = (pixel - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    x_cam = np.concatenate([ray, np.ones((len(ray), 1))], 1) * t[first, 2:]
+    start = Structure(R, t, np.einsum("nji,nj->ni", R[first], x_cam - t[first]))
+    scale = max(1.0, views[-1].observation.window.side / 200)
+    found = adjust(tracks, camera.K, start, fixed=len(views), scale=scale, iterations=8)
+    residual = np.nanmean(found.residual, 0) / scale
+    motion = np.nanmax(np.linalg.norm(tracks.pixels - pixel, axis=2), 0) / scale
+    near = np.linalg.norm(found.points - known.vertices.mean(0).cpu().numpy(), axis=1) < 1.6 * known.radius
+    accepted = (residual < _FITS) & (motion > _MOVED) & near
+    rejected = ((residual > _FAILS) | ~near) & (motion > _MOVED) | ((tracks.visible.sum(0) >= 2 * _VIEWS) & ~accepted)
+    landmarks, candidate = known.landmarks.copy(), known.candidate.copy()
+    landmarks[names[accepted]] = found.points[accepted]
+    candidate[names[accepted]] = False
+    dropped = names[rejected & ~accepted]
+    keyframes = tuple(
+        replace(view, points=view.points.only(~np.isin(view.points.landmark, dropped))) for view in known.keyframes
+    )
+    return replace(known, landmarks=landmarks, candidate=candidate, keyframes=keyframes)
