@@ -220,7 +220,11 @@ def adjust(
         scale: Residual in pixels at which the Cauchy loss is ``log 2``.
         free_focal: Solve for one factor of both focal lengths too. Fixed frames then keep their rotation and the
             place where the object's origin is seen; their depth goes with the focal length, so that the object
-            keeps its size.
+            keeps its size. Only perspective within the object tells the lens: after a turn of 30 degrees with 0.3
+            pixels of noise and a radius of 80 pixels, fields of view from 25 to 65 degrees come out to 2 degrees
+            and one of 10 between 8 and 13. After a few degrees, or of a flat object, the cost hardly depends on
+            it and the answer means nothing. A start from a lens more than twice as wide or narrow may not get
+            there: start from several and compare their costs.
         iterations: The most steps that are tried.
         point_prior: ``(N, 3)`` where the points should be, for instance on a mesh; nan for those that are free.
         point_prior_weight: What a point at distance 1 from its place costs; an observation at a residual of one

@@ -10,13 +10,13 @@ and its sign always does (Necker reversal).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.estimation.online.bundle import Structure
-from tracking3d.estimation.online.reprojection import FloatArray, finite_rows
+from tracking3d.estimation.online.reprojection import FloatArray
 
 _SAMPLES = 200
 _UPGRADE_STEPS = 15
@@ -147,22 +147,6 @@ def metric_structure(
     X = np.column_stack([affine.shape[:, :2], z]) * (z0 * along[0]) @ affine.axes[0]
     t = centres + R @ (t0 - centres[0])
     return Structure(R, t, X + centres[0] - t0)
-
-
-def mirrored(structure: Structure) -> Structure:
-    """The Necker reversal: the points reversed in depth about their centre, turning the other way.
-
-    Without perspective no image tells it from ``structure``. Frame 0 keeps its pose.
-    """
-    known = finite_rows(structure.points)
-    centre = np.median(structure.points[known], 0)
-    seen = structure.R @ centre + structure.t
-    axes = np.array([onto_axis(direction) for direction in seen])
-    flip = axes.transpose(0, 2, 1) @ np.diag([1.0, 1.0, -1.0]) @ axes
-    flip0 = structure.R[0].T @ flip[0] @ structure.R[0]
-    R = flip @ structure.R @ flip0
-    points = (structure.points - centre) @ flip0 + centre
-    return replace(structure, R=R, t=seen - R @ centre, points=points, origin="mirrored")
 
 
 def _metric(affine: AffineMotion, plane: tuple[float, float] | FloatArray, c: float) -> FloatArray:

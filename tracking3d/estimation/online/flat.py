@@ -1,8 +1,8 @@
 """Poses of a flat object from tracks of its points: two unknowns of its plane, and every frame's pose.
 
-Free points make a flat object bulge and its motion wrong: almost any relief explains a plane that turns a little. Without
-perspective its tilt is hardly told either (whole families of tilts and motions have the same images), so several
-answers are given.
+Free points make a flat object bulge and its motion wrong: almost any relief explains a plane that turns a little.
+Without perspective its tilt is hardly told either (whole families of tilts and motions have the same images), so
+several answers are given.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def flat_structures(
     share = np.arange(0, len(rays), max(len(rays) // _SCREENED_POINTS, 1))
     few = Tracks(tracks.pixels[:, share], tracks.visible[:, share])
     screened = []
-    for tilt in _tilts(tracks, K, rays, z0, scale):
+    for tilt in _tilts(tracks, K, rays, scale):
         points = _on_plane(rays, tilt, z0)
         if points is not None:
             start = resected(few, K, points[share] - t0, t0, scale)
@@ -95,7 +95,7 @@ def resected(tracks: Tracks, K: FloatArray, points: FloatArray, t0: FloatArray, 
     return Structure(np.array(R), np.array(t), points)
 
 
-def _tilts(tracks: Tracks, K: FloatArray, rays: FloatArray, z0: float, scale: float) -> list[FloatArray]:
+def _tilts(tracks: Tracks, K: FloatArray, rays: FloatArray, scale: float) -> list[FloatArray]:
     """``(2,)`` slopes, see `_on_plane`: a fan, and what the last frame's homography says."""
     tilts = [np.zeros(2)]
     for direction in np.radians(np.arange(0, 360, 45)):
@@ -122,14 +122,8 @@ def _on_plane(rays: FloatArray, tilt: FloatArray, z0: float) -> FloatArray | Non
 
 
 def _fitted(
-    tracks: Tracks,
-    K: FloatArray,
-    rays: FloatArray,
-    tilt: FloatArray,
-    start: Structure,
-    z0: float,
-    scale: float,
-) -> tuple[Structure, FloatArray]:
+    tracks: Tracks, K: FloatArray, rays: FloatArray, tilt: FloatArray, t0: FloatArray, z0: float, scale: float
+) -> Structure:
     """Poses and tilt of least cost by Levenberg-Marquardt from a start; points stay on frame 0's rays."""
     offset = (rays - np.median(rays, 0))[:, :2]
     points = _on_plane(rays, tilt, z0)
@@ -150,7 +144,8 @@ def _fitted(
         jacobian[..., -2:] = by_point @ best.R[1:, None] @ by_tilt
         rows = jacobian.reshape(-1, 6 * frames + 2)
         matrix, gradient = rows.T @ rows, rows.T @ (root * difference).ravel()
-        matrix += np.diag(damping * matrix.diagonal() + 1e-9 * matrix.diagonal().max())
+        diagonal = matrix.diagonal()
+        matrix = matrix + np.diag(damping * diagonal + 1e-9 * diagonal.max() + 1e-12)
         step = -np.linalg.solve(matrix, gradient)
         moved_points = _on_plane(rays, tilt + step[-2:], z0)
         if moved_points is None:

@@ -39,7 +39,7 @@ from tracking3d.estimation.online.pose_refinement import (
     refine_pose,
 )
 from tracking3d.estimation.online.recruits import MOST_CANDIDATES, recruit, surroundings
-from tracking3d.estimation.online.start import solve_start
+from tracking3d.estimation.online.start import by_turning, solve_start
 from tracking3d.estimation.online.structure import motion_enough
 from tracking3d.estimation.online.surface_fit import FitWeights
 from tracking3d.estimation.shape import Shape
@@ -54,6 +54,8 @@ MOTION = 0.03
 _MOTION_STEP = 1.3
 _DOUBTFUL_START = 0.25
 _MOST_WAITING = 40
+_FEWEST_WAITING = 12
+_LASTING = 0.4
 VERBOSE = False
 _ENOUGH_MATURE = 30
 
@@ -95,7 +97,7 @@ class OnlineSolver:
         image = grey(frame.image)
         belief = Belief(self.camera, known, None, (pose, frame.index), None, image, FollowedPoints.none())
         observation = self._observe(belief, frame, binary, pose)
-        if self._channels < self.encoder.channels:
+        if True:
             space = FeatureSpace.of(observation.features, observation.mask, self._channels)
             belief = replace(belief, space=space)
             observation = replace(observation, features=space.project(observation.features))
@@ -168,7 +170,7 @@ class OnlineSolver:
         motion = motion_enough(tracks_of(views, names)) if len(views) > 1 else 0.0
         if VERBOSE:
             print("motion", frame.index, round(motion, 3), len(view.points))
-        if motion < state.due or len(views) < 4:
+        if (motion < state.due and len(waiting) < _MOST_WAITING) or len(views) < 4:
             return belief, answer
         return self._begin(replace(belief, due=motion * _MOTION_STEP), answer, started)
 
@@ -210,8 +212,11 @@ class OnlineSolver:
         assert state.waiting is not None
         views = [view for view, _ in state.waiting if view.mask is not None]
         starts = solve_start(state.known, self.camera, views, self.fit, self.prior, VERBOSE)
-        if not starts or (starts[0].bundle > _DOUBTFUL_START and len(state.waiting) < _MOST_WAITING):
-            return state, answer
+        if not starts or starts[0].bundle > _DOUBTFUL_START:
+            lasting = np.isin(views[0].points.landmark, views[-1].points.landmark).mean()
+            if len(state.waiting) < (_MOST_WAITING if lasting > _LASTING else _FEWEST_WAITING):
+                return state, answer
+            starts = sorted([*starts, *by_turning(state.known, self.camera, views[:: max(len(views) // 7, 1)][:8], self.fit, VERBOSE)], key=lambda start: start.cost)
         known = starts[0].known
         known = recruit(known, self.camera, list(range(len(known.keyframes))))
         known = refine_map(

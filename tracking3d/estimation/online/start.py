@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from tracking3d.estimation.observation import halved
 from tracking3d.estimation.online.belief import ObjectMap, View
 from tracking3d.estimation.online.bundle import Structure
 from tracking3d.estimation.online.mapping import (
@@ -20,6 +21,7 @@ from tracking3d.estimation.online.mapping import (
 from tracking3d.estimation.online.pose_refinement import PoseWeights, refine_pose
 from tracking3d.estimation.online.structure import structure_hypotheses
 from tracking3d.estimation.online.surface_fit import FitWeights
+from tracking3d.estimation.online.turning import improved, turning_hypotheses
 from tracking3d.estimation.start import RADIUS
 from tracking3d.geometry.camera import Camera
 
@@ -60,7 +62,7 @@ def solve_start(
     names, counts = np.unique(seen, return_counts=True)
     names = names[(counts >= min(3, len(chosen))) & ~known.candidate[names]]
     if len(names) < 8:
-        return []
+        return by_turning(known, camera, chosen, weights, verbose)
     tracks = tracks_of(chosen, names)
     _, t0 = pose_arrays(chosen[0].pose)
     starts = []
@@ -79,6 +81,37 @@ def solve_start(
             )
         starts.append(Start(hypothesis, cost, structure.cost, structure.origin))
     starts.sort(key=lambda start: start.cost)
+    return starts
+
+
+def with_observations(known: ObjectMap, views: list[View], coarse: bool) -> ObjectMap:
+    """The map with its views as they are, or at half the resolution."""
+    keyframes = [
+        replace(posed, observation=halved(view.observation) if coarse else view.observation, texture=None)
+        for posed, view in zip(known.keyframes, views, strict=True)
+    ]
+    return replace(known, keyframes=tuple(keyframes))
+
+
+def by_turning(
+    known: ObjectMap, camera: Camera, views: list[View], weights: FitWeights, verbose: bool = False
+) -> list[Start]:
+    """Starts that need no points, by rising cost."""
+    maps = [
+        (name, replace(known, keyframes=tuple(replace(v, pose=p, texture=None) for v, p in zip(views, poses, strict=True))))
+        for name, poses in turning_hypotheses(views, camera)
+    ]
+    starts: list[Start] = []
+    for survivors, rounds, coarse in ((len(maps), 2, True), (6, 4, True), (3, 4, False)):
+        starts = []
+        for name, candidate in maps[:survivors]:
+            tried = with_observations(candidate, views, coarse)
+            better, cost = improved(tried, weights, rounds, (3,))
+            starts.append(Start(with_observations(better, views, False), cost, 0.0, name))
+        starts.sort(key=lambda start: start.cost)
+        maps = [(start.origin, start.known) for start in starts]
+        if verbose:
+            print("   ", [(start.origin, round(start.cost, 4)) for start in starts[:6]])
     return starts
 
 

@@ -22,12 +22,11 @@ from tracking3d.estimation.online.factorization import (
     assumed_relief,
     measured_relief,
     metric_structure,
-    mirrored,
 )
-from tracking3d.estimation.online.flat import flat_structures, looks_flat, resected
+from tracking3d.estimation.online.flat import flat_structures, looks_flat
 from tracking3d.estimation.online.reprojection import FloatArray
 
-RELIEFS = (0.25, 0.5, 1.0)
+RELIEFS = (0.3, 0.7)
 """Depths that are tried where views do not tell it: spread about the tilted plane over the spread in x and y."""
 
 _CORE_FRAMES, _CORE_POINTS, _SCREENING_ITERATIONS, _CORE_ITERATIONS = 8, 80, 4, 10
@@ -47,7 +46,7 @@ def structure_hypotheses(
     keep: int = 4,
     seed: int = 0,
 ) -> list[Structure]:
-    """Distinct explanations of the tracks, the cheapest first; the reversal in depth of the best is among them.
+    """Distinct explanations of the tracks, the cheapest first, with reversals in depth where they fit.
 
     Flat ones are tried where homographies explain the tracks. Free points then fit better because they bend to the
     noise, so flat ones come first if the noise that they leave is not much larger, counted by degrees of freedom.
@@ -55,8 +54,7 @@ def structure_hypotheses(
     6 degrees.
 
     Frame 0 is at identity and ``t0`` in all of them. Each says in `Structure.origin` where it comes from:
-    ``affine`` (factorization), ``relief`` (the same with an assumed amount of depth), ``convex`` (points on an
-    ellipsoid's front), ``mirrored`` (the reversal of another), or ``flat`` (a plane).
+    ``affine`` (factorization), ``relief`` (the same with an assumed amount of depth) or ``flat`` (a plane).
 
     Args:
         tracks: F frames, N points; frame 0 is the first.
@@ -80,14 +78,10 @@ def structure_hypotheses(
     hold = 0.05 / radius**2
     screened = [
         _refined(part, K, start, scale, _SCREENING_ITERATIONS, hold)
-        for start in _starts(part, K, t0, z0, radius, scale, seed)
+        for start in _starts(part, K, t0, z0, scale, seed)
     ]
     found = [_refined(part, K, one, scale, _CORE_ITERATIONS, hold) for one in _distinct(screened)[: keep + 2]]
     distinct = _distinct(found)[:keep]
-    if distinct:
-        partner = _refined(part, K, mirrored(distinct[0]), scale, _CORE_ITERATIONS, hold)
-        if len(_distinct([*distinct, partner])) > len(distinct):
-            distinct = [*distinct[: keep - 1], partner]
     if looks_flat(part, K, scale):
         flat = _distinct(flat_structures(part, K, t0, z0, scale))[:2]
         distinct = flat + distinct[: max(keep - len(flat), 0)]
@@ -162,7 +156,7 @@ def _refined(
 
 
 def _starts(
-    tracks: Tracks, K: FloatArray, t0: FloatArray, z0: float, radius: float, scale: float, seed: int
+    tracks: Tracks, K: FloatArray, t0: FloatArray, z0: float, scale: float, seed: int
 ) -> Iterator[Structure]:
     """Unrefined hypotheses; all points are seen in all frames."""
     affine = affine_motion(tracks.pixels, K, 3 * scale, seed)
@@ -175,15 +169,6 @@ def _starts(
             for sign in (1, -1):
                 start = metric_structure(affine, (sign * a, sign * b, sign * c), t0, z0)
                 yield replace(start, origin=origin)
-    rays = np.column_stack(
-        [(tracks.pixels[0] - K[:2, 2]) / [K[0, 0], K[1, 1]], np.ones(tracks.pixels.shape[1])]
-    )
-    flat = (rays[:, :2] - np.median(rays[:, :2], 0)) * z0
-    outward = np.einsum("ni,ij,nj->n", flat, np.linalg.pinv(np.cov(flat.T)), flat)
-    # Uniform points of an ellipse have Mahalanobis distances up to 4; the front is nearer at the centre.
-    front = -np.sqrt(np.maximum(1 - outward / 5, 0.0)) * min(radius, 2 * float(flat.std(0).min()))
-    points = rays * (z0 + front - np.median(front))[:, None] - t0
-    yield replace(resected(tracks, K, points, t0, scale), origin="convex")
 
 
 def _noise(structure: Structure, unknowns: int) -> float:
