@@ -15,7 +15,7 @@ from tracking3d.evaluation.score import Scores
 
 EXACT = {
     "tracking3d": """Frame FrameEstimate ObjectModel PipelineConfig Prompt Session Status __version__ load_config
-        track""",
+        track track_objects""",
     "tracking3d.plugins": """FEATURES PluginInfo TRACKERS VARIABLE build_plugin check_options list_plugins
         load_plugin plugin_label""",
     "tracking3d.testing": "check_encoder check_tracker",
@@ -23,7 +23,7 @@ EXACT = {
         back_project channels_last contour_loss contour_normal_equations find_contour interpolate
         pose_normal_equations prepare_backend project rasterize render sample_texture signed_distance
         soft_silhouette texture_losses visible_texels visible_vertices""",
-    "tracking3d.video": """FrameSource Intrinsics VideoWriter natural_order open_source parse_selection
+    "tracking3d.video": """FrameSource Intrinsics LatestFrames VideoWriter natural_order open_source parse_selection
         read_image""",
 }
 """Packages that say in ``__all__`` what is public: exactly this."""
@@ -72,12 +72,12 @@ AT_LEAST = {
     "tracking3d.geometry.mesh": "Mesh",
     "tracking3d.geometry.pose": "Pose",
     "tracking3d.geometry.prototypes": "ellipsoid from_file icosphere sphere",
-    "tracking3d.pipeline": "Session track",
+    "tracking3d.pipeline": "Session track track_objects",
     "tracking3d.networks.download": "adopt fetch",
     "tracking3d.networks.session": "Network TensorInfo",
     "tracking3d.networks.store": "find_network",
     "tracking3d.prompts": "make_prompt parse_box",
-    "tracking3d.recording": "record",
+    "tracking3d.recording": "record record_objects",
     "tracking3d.results.correspondences": "PointTracks track_points",
     "tracking3d.results.mesh_export": "export_mesh load_mesh",
     "tracking3d.results.records": "FrameRecord",

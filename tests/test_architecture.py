@@ -16,7 +16,7 @@ FLOORS = [
     {"errors", "frames", "geometry", "config", "features", "networks", "process_memory"},
     {"rendering", "trackers", "video"},
     {"estimation", "plugins", "prompts", "testing"},
-    {"pipeline", "recording", "results"},
+    {"session", "pipeline", "object_recording", "recording", "results"},
     {"datasets"},
     {"synthesis", "evaluation", "speed", "viewer"},
     {"benchmark"},

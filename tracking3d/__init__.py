@@ -21,6 +21,7 @@ __all__ = [
     "__version__",
     "load_config",
     "track",
+    "track_objects",
 ]
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from tracking3d.config.models import PipelineConfig
     from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
     from tracking3d.frames import Frame, Prompt
-    from tracking3d.pipeline import Session, track
+    from tracking3d.pipeline import Session, track, track_objects
 
 _HOME = {
     "Frame": "tracking3d.frames",
@@ -40,6 +41,7 @@ _HOME = {
     "Status": "tracking3d.estimation.estimate",
     "load_config": "tracking3d.config.loading",
     "track": "tracking3d.pipeline",
+    "track_objects": "tracking3d.pipeline",
 }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -67,6 +68,31 @@ def make_prompt(frame: Frame, box: Box | None = None, mask: NDArray[np.bool_] | 
     if around is None:
         raise InputError(f"{label} is empty; mark the object in it.")
     return Prompt(around, binary)
+
+
+def make_prompts(
+    frame: Frame,
+    boxes: Sequence[Box] = (),
+    masks: Sequence[NDArray[np.bool_] | Path] = (),
+    tracker: str = "",
+) -> list[Prompt]:
+    """The prompts of several objects, first those of the boxes; see `make_prompt`.
+
+    Args:
+        frame: The first frame.
+        boxes: Each ``(x, y, width, height)`` in pixels.
+        masks: Each ``(H, W)``, or an image file of one.
+        tracker: Name of the mask tracker.
+
+    Raises:
+        InputError: If there is no object, one cannot be used, or the tracker knows the masks of one object only.
+    """
+    prompts = [make_prompt(frame, box) for box in boxes] + [make_prompt(frame, mask=mask) for mask in masks]
+    if not prompts:
+        raise InputError("Say what the objects are by boxes or masks of the first frame.")
+    if len(prompts) > 1 and tracker == "precomputed":
+        raise InputError("Precomputed masks are of one object; track several in runs of their own.")
+    return prompts
 
 
 def _checked(box: Box) -> Box:

@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from itertools import chain
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tracking3d.config.camera import choose_camera
 from tracking3d.config.models import PipelineConfig
-from tracking3d.errors import InputError, OutputError
-from tracking3d.estimation.estimate import ObjectModel
+from tracking3d.errors import InputError
 from tracking3d.frames import Box, Frame, SkippedFrame
-from tracking3d.pipeline import Session, choose_camera
-from tracking3d.prompts import make_prompt
-from tracking3d.results.records import FrameRecord
+from tracking3d.object_recording import Listener, ObjectRecording, go_through
+from tracking3d.prompts import make_prompt, make_prompts
+from tracking3d.results.layout import object_folders
 from tracking3d.results.run_writer import RunWriter
+from tracking3d.session import Session, build_encoder
 from tracking3d.video.source import FrameSource
 
-Listener = Callable[[FrameRecord | SkippedFrame], None]
-"""Is told of every frame as it is done, or skipped."""
+__all__ = ["Listener", "record", "record_objects"]
 
 
 def record(
@@ -38,6 +39,9 @@ def record(
 ) -> None:
     """Track the object through ``source`` and write the run folder.
 
+    With ``solver.final_refine`` the frames are gone through a second time, where the solver can use that and the
+    source can be read again: every frame is answered anew against the final object.
+
     Args:
         source: The frames.
         config: The pipeline.
@@ -53,16 +57,93 @@ def record(
     Raises:
         Tracking3dError: What was finished until then is kept in the folder, as it is on Ctrl-C.
     """
+    begin = partial(run_writer, source, command=command, selection=selection, overwrite=overwrite)
+    with opened(source) as frames:
+        skipped, first = first_frame(frames, source.name)
+        prompt = None if box is None and mask is None else make_prompt(first, box, mask)
+        session = Session(config, prompt, source.intrinsics, source.intrinsics_origin)
+        with begin(session, first=first, folder=folder) as writer:
+            go_through(source, chain(skipped, [first], frames), [ObjectRecording(session, writer)], listener)
+
+
+def record_objects(
+    source: FrameSource,
+    config: PipelineConfig,
+    folder: Path,
+    *,
+    boxes: Sequence[Box] = (),
+    masks: Sequence[NDArray[np.bool_] | Path] = (),
+    command: str | None = None,
+    selection: str | None = None,
+    overwrite: bool = False,
+    listener: Listener = lambda frame: None,
+) -> None:
+    """Track several objects through ``source`` in one pass; each has a run folder of its own within ``folder``.
+
+    An object that fails is ended and the others go on; the first failure is raised at the end.
+
+    Args:
+        source: The frames.
+        config: The pipeline of every object.
+        folder: Gets the run folders ``object_0``, ``object_1`` and so on, in the order of the objects.
+        boxes: The objects in the first frame; see `record` for this and what follows.
+        masks: More objects, after those of the boxes.
+        command: The command line.
+        selection: The ``START:STOP:STEP`` that the source was opened with.
+        overwrite: Replace runs that are in those folders.
+        listener: Is told of every frame of every object.
+
+    Raises:
+        Tracking3dError: What was finished until then is kept in the folders, as it is on Ctrl-C.
+    """
+    begin = partial(run_writer, source, command=command, selection=selection, overwrite=overwrite)
+    with opened(source) as frames, ExitStack() as writers:
+        skipped, first = first_frame(frames, source.name)
+        prompts = make_prompts(first, boxes, masks, config.tracker.name)
+        folders = object_folders(folder, len(prompts))
+        encoder = build_encoder(config)
+        sessions = [
+            Session(config, prompt, source.intrinsics, source.intrinsics_origin, encoder)
+            for prompt in prompts
+        ]
+        recordings = [
+            ObjectRecording(session, writers.enter_context(begin(session, first=first, folder=into)))
+            for session, into in zip(sessions, folders, strict=True)
+        ]
+        go_through(source, chain(skipped, [first], frames), recordings, listener)
+
+
+@contextmanager
+def opened(source: FrameSource) -> Iterator[Iterator[Frame | SkippedFrame]]:
+    """The frames of a source, which is let go at the end, however that comes."""
     frames = iter(source)
-    skipped, first = _first_frame(frames, source.name)
-    height, width = first.size
-    camera = choose_camera(config.camera, width, height, source.intrinsics, source.intrinsics_origin)
-    prompt = None if box is None and mask is None else make_prompt(first, box, mask)
-    session = Session(config, prompt, source.intrinsics, source.intrinsics_origin)
-    with RunWriter(
+    try:
+        yield frames
+    finally:
+        if isinstance(frames, Generator):
+            frames.close()
+
+
+def run_writer(
+    source: FrameSource,
+    session: Session,
+    *,
+    first: Frame,
+    folder: Path,
+    command: str | None,
+    selection: str | None,
+    overwrite: bool,
+) -> RunWriter:
+    """The writer of one object's run folder; see `record` for the arguments.
+
+    Raises:
+        OutputError: If the folder is in use, holds a run already, or cannot be written.
+    """
+    config, (height, width) = session.config, first.size
+    return RunWriter(
         folder,
         config=config.model_dump(mode="json"),
-        camera=camera,
+        camera=choose_camera(config.camera, width, height, source.intrinsics, source.intrinsics_origin),
         source=source.name,
         seed=config.runtime.seed,
         renderer=session.renderer,
@@ -70,42 +151,18 @@ def record(
         command=command,
         selection=selection,
         overwrite=overwrite,
-    ) as writer:
-        answer: FrameRecord | None = None
-        try:
-            for item in skipped:
-                writer.skip(item)
-                listener(item)
-            for frame in chain([first], frames):
-                if isinstance(frame, SkippedFrame):
-                    writer.skip(frame)
-                    listener(frame)
-                else:
-                    answer = writer.write(session.step(frame), frame)
-                    listener(answer)
-        except BaseException as error:
-            failed = isinstance(error, Exception)
-            if answer is not None:
-                error.add_note(f"What was finished until then is kept in {folder}.")
-            with suppress(OutputError):  # the first error is the one to tell
-                writer.finish(_model(session), "failed" if failed else "interrupted", str(error) or None)
-            raise
-        writer.finish(session.result(), "finished")
+    )
 
 
-def _first_frame(frames: Iterator[Frame | SkippedFrame], name: str) -> tuple[list[SkippedFrame], Frame]:
-    """The first frame that can be decoded, and those before it that cannot."""
+def first_frame(frames: Iterator[Frame | SkippedFrame], name: str) -> tuple[list[SkippedFrame], Frame]:
+    """The first frame that can be decoded, and those before it that cannot.
+
+    Raises:
+        InputError: If there is none.
+    """
     skipped: list[SkippedFrame] = []
     for frame in frames:
         if isinstance(frame, Frame):
             return skipped, frame
         skipped.append(frame)
     raise InputError(f"{name} has no frame that can be decoded.")
-
-
-def _model(session: Session) -> ObjectModel | None:
-    """The object as far as it is known; None where the session stopped in a state that gives none."""
-    try:
-        return session.result()
-    except Exception:
-        return None

@@ -32,6 +32,30 @@ def test_a_crash_and_a_failure_cost_their_own_sequence_only_and_the_rest_is_foun
     assert again.cached and again.scores == json.loads(json.dumps(narrow.scores))
 
 
+def test_a_job_tells_whether_memory_grew_and_scores_both_answers_of_a_refined_run(jobs, scripted):
+    [job] = jobs(scripted(), ["narrow"])
+    job.write()
+    scores = job_module.run_job(job)
+    held = json.loads((job.folder / job_module.MEMORY).read_text())
+    assert len(held) == 3 and min(held) > 50
+    assert scores["memory_growth_mb"] == pytest.approx(max(held[1:]) - held[0])
+    assert scores["causal"] is None
+
+    lines = (job.folder / job_module.RUN / "frames.jsonl").read_text().splitlines()
+    lost = json.loads(lines[-1]) | {"refined": True, "status": "lost"}
+    causal = json.loads(lines[-1])["status"] == "lost"
+    (job.folder / job_module.RUN / "frames.jsonl").write_text("\n".join([*lines, json.dumps(lost)]) + "\n")
+    scores = job_module.run_job(job)
+    assert scores["frames_lost"] == scores["causal"]["frames_lost"] + 1 - causal
+    assert scores["memory_growth_mb"] == scores["causal"]["memory_growth_mb"] is not None
+
+
+def test_growth_is_what_the_second_half_holds_more_at_most():
+    assert job_module.memory_growth([10, 30, 20, 25, 28, 33]) == 3
+    assert job_module.memory_growth([10, 30, 20, 25]) == -5
+    assert job_module.memory_growth([10]) is None and job_module.memory_growth([]) is None
+
+
 def test_a_failure_is_told_in_its_own_sentence(jobs, scripted):
     [outcome] = run_jobs(jobs(scripted(fail=70), ["wide"]))
     told = r"mask tracker 'scripted' \(TRACKING3D_PLUGINS [0-9a-f]+\) failed at 000000.png: RuntimeError"

@@ -3,10 +3,23 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from tracking3d.benchmark.results import ResultSet, format_results, read_results, write_results
+from tracking3d.benchmark.pool import Outcome
+from tracking3d.benchmark.results import (
+    ResultSet,
+    collect,
+    figure,
+    format_results,
+    read_results,
+    write_results,
+)
+from tracking3d.benchmark.sequences import Dataset
+from tracking3d.benchmark.variant import Variant
+from tracking3d.config.loading import load_config
 from tracking3d.errors import InputError
 
 SCORES = {"a": {"iou_mean": 0.5, "frames_lost": 2}, "b": {"iou_mean": 0.7, "frames_lost": None}, "c": None}
@@ -24,6 +37,55 @@ def test_a_file_gives_back_what_was_written(tmp_path):
     assert read_results(tmp_path / "new/results.json") == RESULTS
     document = json.loads((tmp_path / "new/results.json").read_text())
     assert document["mean"] == {"iou_mean": pytest.approx(0.6), "frames_lost": 2}
+
+
+REFINED = ResultSet(
+    "mine", "standard", SCORES, {"c": "it crashed"}, {}, {"a": {"iou_mean": 0.4, "frames_lost": 3}}
+)
+
+
+def test_causal_and_refined_answers_are_two_sets_of_results():
+    causal, refined = REFINED.split()
+    assert (causal.label, refined.label) == ("mine, causal", "mine, refined")
+    # Nothing of b was refined: its only answers are both.
+    assert causal.values("iou_mean") == {"a": 0.4, "b": 0.7}
+    assert refined.values("iou_mean") == {"a": 0.5, "b": 0.7}
+    assert [one.causal for one in (causal, refined)] == [{}, {}]
+    assert RESULTS.split() == [RESULTS]
+
+
+def test_a_file_gives_back_causal_answers_too_and_files_from_before_have_none(tmp_path):
+    write_results(REFINED, tmp_path / "results.json")
+    assert read_results(tmp_path / "results.json") == REFINED
+    document = json.loads((tmp_path / "results.json").read_text())
+    del document["causal"]
+    (tmp_path / "results.json").write_text(json.dumps(document))
+    assert read_results(tmp_path / "results.json").causal == {}
+
+
+def test_scores_of_jobs_are_told_apart_by_what_they_score():
+    outcome = Outcome(SimpleNamespace(sequence="a"), {"iou_mean": 0.9, "causal": {"iou_mean": 0.8}})
+    plain = Outcome(SimpleNamespace(sequence="b"), {"iou_mean": 0.6, "causal": None})
+    lost = Outcome(SimpleNamespace(sequence="c"), None, "it crashed")
+    variant = Variant(label="mine", config=load_config())
+    found = collect(variant, Dataset("real", None, "clip", Path(), ("a", "b", "c")), [outcome, plain, lost])
+    assert found.scores == {"a": {"iou_mean": 0.9}, "b": {"iou_mean": 0.6}, "c": None}
+    assert found.causal == {"a": {"iou_mean": 0.8}}
+
+
+@pytest.mark.parametrize(
+    ("value", "measure", "text"),
+    [
+        (0.1234, "share_lost", "0.123"),
+        (0.1234, "share_under_5_deg", "0.123"),
+        (2.34, "rotation_error_return_deg", "2.3"),
+        (643.21, "peak_memory_mb", "643.2"),
+        (3.5, "frames_lost", "3.5"),
+        (None, "iou_mean", "-"),
+    ],
+)
+def test_figures_have_as_many_digits_as_they_are_worth(value, measure, text):
+    assert figure(value, measure) == text
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"format": "other"}', '{"format": "tracking3d-results"}'])

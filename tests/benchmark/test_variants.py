@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 
-from tracking3d.benchmark.variant import Variant, check_masks, degraded_iou
+from tracking3d.benchmark.fingerprint import masks_fingerprint
+from tracking3d.benchmark.initial_masks import masks_for
+from tracking3d.benchmark.job import Job
+from tracking3d.benchmark.variant import Variant, check_masks, degraded_iou, noise_pixels
 from tracking3d.config.loading import load_config
+from tracking3d.datasets.clip import read_truth
 from tracking3d.errors import InputError
+from tracking3d.results.files import read_mask
 
 
 def test_a_changed_setting_is_the_only_change():
@@ -17,13 +24,48 @@ def test_a_changed_setting_is_the_only_change():
     assert base.config == load_config()
 
 
-@pytest.mark.parametrize("masks", ["degraded:", "degraded:1.2", "degraded:0.1", "degraded:nan", "nowhere"])
+@pytest.mark.parametrize(
+    "masks",
+    [
+        "degraded:",
+        "degraded:1.2",
+        "degraded:0.1",
+        "degraded:nan",
+        "noise:",
+        "noise:0",
+        "noise:nan",
+        "noise:99",
+        "hands",
+        "nowhere",
+    ],
+)
 def test_masks_that_cannot_be_meant_are_refused(masks):
     with pytest.raises(InputError, match=f"The masks '{masks}'"):
         check_masks(masks)
 
 
 def test_masks_that_can_be_meant_are_not(tmp_path):
-    for masks in ("tracker", "truth", "initial", "degraded:0.73", str(tmp_path)):
+    for masks in ("tracker", "truth", "initial", "degraded:0.73", "noise:1.5", "hand", str(tmp_path)):
         check_masks(masks)
-    assert degraded_iou("degraded:0.73") == 0.73
+    assert degraded_iou("degraded:0.73") == 0.73 and noise_pixels("noise:1.5") == 1.5
+
+
+def test_rough_masks_are_made_for_a_clip_and_the_first_one_is_true(clips, tmp_path):
+    truth = read_truth(clips / "narrow")
+    for source in ("noise:3", "hand"):
+        folder = masks_for(source, truth, tmp_path / source)
+        masks = [read_mask(folder / f"{name}.png") for name in truth.names]
+        assert (masks[0] == truth.masks[0].read()).all()
+    noisy = read_mask(tmp_path / "noise:3" / f"{truth.names[2]}.png")
+    assert (noisy != truth.masks[2].read()).any()
+    assert masks_fingerprint("hand", "narrow") == masks_fingerprint("noise:3", "narrow")
+
+
+def test_a_camera_that_is_not_told_is_not_in_the_configuration(clips, scripted, tmp_path):
+    def config(clip):
+        return Job("clip", clips, clip, scripted(), tmp_path / "out").config.camera.intrinsics
+
+    assert config("narrow") is not None
+    file = clips / "narrow" / "camera.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"told": False}))
+    assert config("narrow") is None and read_truth(clips / "narrow").camera is not None

@@ -13,6 +13,7 @@ from PIL import Image
 from typer.testing import CliRunner, Result
 
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
+from tracking3d.frames import MaskEstimate
 from tracking3d.geometry.camera import Camera
 from tracking3d.plugins import TRACKERS, build_plugin
 
@@ -35,8 +36,10 @@ def script(monkeypatch) -> Script:
     class FakeSession:
         renderer: ClassVar = {"backend": "none", "reason": "a test", "threads": 1}
 
-        def __init__(self, config, prompt, intrinsics=None, intrinsics_origin=""):
+        def __init__(self, config, prompt, intrinsics=None, intrinsics_origin="", encoder=None):
             script.built.append((config, prompt))
+            self.config = config
+            self.can_refine, self.initial_mask = False, MaskEstimate(None)
             build_plugin(TRACKERS, config.tracker)
 
         def step(self, frame):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tracking3d.benchmark import solver_table
 from tracking3d.benchmark import suite as suite_module
 from tracking3d.benchmark.pool import Outcome
 from tracking3d.benchmark.results import ResultSet, write_results
@@ -42,6 +43,8 @@ def jobs(monkeypatch):
                 "rotation_error_mean_deg": None,
                 "frames_lost": 0,
             }
+            if job.variant.config.solver.name == "online":
+                scores["causal"] = {**scores, "iou_mean": scores["iou_mean"] - 0.02}
             failed = job.sequence in failing
             outcomes.append(Outcome(job, None if failed else scores, "it crashed" if failed else ""))
             listener(outcomes[-1])
@@ -94,6 +97,40 @@ def test_a_table_is_printed_and_written_in_three_formats(call, clips, jobs, monk
         f"keyframes{suffix}" for suffix in (".md", ".csv", ".json")
     }
     assert Path("keyframes.svg").read_text().startswith("<?xml")
+
+
+def test_the_solvers_are_put_side_by_side_with_causal_and_refined_answers(call, clips, jobs, monkeypatch):
+    monkeypatch.setitem(solver_table.SOLVERS, "online", object)
+    arguments = ("evaluate", "table", "online", "--data", clips, "--masks", "noise:3", "--row", "*RGB")
+    result = call(*arguments, "--json")
+    assert result.exit_code == 0, result.output
+    document = json.loads(result.stdout)
+    assert document["columns"] == ["paper, RGB", "online, RGB, causal", "online, RGB, refined"]
+    assert document["sequences"] == ["one", "two"]
+    assert document["means"]["iou_mean"] == pytest.approx(
+        {"paper, RGB": 0.83, "online, RGB, causal": 0.91, "online, RGB, refined": 0.93}
+    )
+    assert {job.variant.masks for job in jobs.asked} == {"noise:3"}
+    assert {path.name for path in Path("benchmark/tables").iterdir()} == {
+        f"online{suffix}" for suffix in (".md", ".csv", ".json")
+    }
+    assert Path("benchmark/results/online-online_rgb-noise_3-real.json").is_file()
+    assert "0.910" in call(*arguments).stdout
+
+
+def test_the_answers_of_a_run_that_are_scored_can_be_chosen(call, clips, script, tmp_path):
+    assert call("run", clips / "one/frames", "--box", "20,10,20,20", "--out", "run").exit_code == 0
+    records = [json.loads(line) for line in Path("run/frames.jsonl").read_text().splitlines()]
+    refined = [record | {"refined": True, "status": "lost"} for record in records]
+    with Path("run/frames.jsonl").open("a") as file:
+        file.writelines(json.dumps(record) + "\n" for record in refined)
+
+    def lost(*more):
+        return json.loads(call("evaluate", "run", "--truth", clips / "one", "--json", *more).stdout)[
+            "frames_lost"
+        ]
+
+    assert (lost(), lost("--answers", "final"), lost("--answers", "causal")) == (3, 3, 0)
 
 
 def made(clips):
@@ -164,6 +201,11 @@ def test_colmap_is_a_peer_whose_unregistered_frames_are_lost(call, clips, tmp_pa
     assert scores["rotation_error_median_deg"] == pytest.approx(0, abs=1e-4)
 
 
+def test_the_answers_of_others_are_not_causal_or_final(refused, clips):
+    arguments = ("evaluate", clips / "one/masks", "--truth", clips / "one", "--answers", "causal")
+    assert "is no run folder, so it has no causal answers" in refused(*arguments)
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -174,6 +216,10 @@ def test_colmap_is_a_peer_whose_unregistered_frames_are_lost(call, clips, tmp_pa
         ("evaluate suite smoke --preset absent", "no preset 'absent'"),
         ("evaluate table nothing", "no table 'nothing'"),
         ("evaluate table cdtb --initial d3s", "--initial d3s"),
+        ("evaluate table cdtb --masks truth", "takes no --masks"),
+        ("evaluate table online --initial d3s=.", "takes no --initial"),
+        ("evaluate table online --plot a.svg", "takes no --plot"),
+        ("evaluate table online --masks noise:x", "'noise:x' name no pixels"),
         ("evaluate table cdtb --plot a.bmp", ".svg"),
         ("evaluate compare a.json b.json", "a.json is not a result set"),
         ("evaluate compare a.json paper", "not one of each"),

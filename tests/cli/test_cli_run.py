@@ -94,6 +94,44 @@ def test_masks_choose_the_tracker_and_need_no_prompt(call, clip, script, mask_fi
     assert all(config.tracker.options == {"path": "masks"} for config, _ in script.built)
 
 
+def test_several_boxes_are_several_objects_with_a_folder_each(call, clip, script):
+    result = call("run", clip, *BOX, "--box", "30,5,10,30", "--out", "run")
+    assert result.exit_code == 0, result.output
+    assert [prompt.box for _, prompt in script.built] == [(20, 10, 20, 20), (30, 5, 10, 30)]
+    for number in (0, 1):
+        folder = Path("run", f"object_{number}")
+        assert RunReader(folder).state == "finished"
+        assert f"{folder} (finished)" in result.stdout
+    assert not Path("run/run.json").exists()
+
+
+def test_several_masks_are_several_objects_too(call, clip, script, mask_file):
+    masks = np.zeros((2, 48, 64), dtype=bool)
+    masks[0, 10:20, 30:50] = masks[1, 5:15, 5:15] = True
+    files = [mask_file(mask, f"{number}.png") for number, mask in enumerate(masks)]
+    assert call("run", clip, "--mask", files[0], "--mask", files[1], "--quiet").output == ""
+    assert [prompt.box for _, prompt in script.built] == [(30, 10, 20, 10), (5, 5, 10, 10)]
+    assert sorted(path.name for path in Path("runs/clip").iterdir()) == ["object_0", "object_1"]
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [([], False), (["--final-refine"], True), (["--no-final-refine"], False)],
+)
+def test_final_refinement_is_switched_by_its_option(call, clip, script, tmp_path, options, expected):
+    (tmp_path / "mine.yaml").write_text("solver: {final_refine: false}")
+    assert call("run", clip, *BOX, "--config", "mine.yaml", *options).exit_code == 0
+    assert script.built[0][0].solver.final_refine is expected
+    (tmp_path / "mine.yaml").write_text("solver: {final_refine: true}")
+    assert call("run", clip, *BOX, "--config", "mine.yaml", *options, "--overwrite").exit_code == 0
+    assert script.built[1][0].solver.final_refine is (options != ["--no-final-refine"])
+
+
+def test_why_there_is_no_final_refinement_is_on_the_screen(call, clip, script):
+    result = call("run", clip, *BOX, "--final-refine", "--set", "solver.name=paper")
+    assert "the solver paper gives causal answers only" in result.stdout
+
+
 def test_undecodable_frame_is_skipped_and_recorded(call, clip, script):
     (clip / "002.png").write_bytes(b"no image")
     result = call("run", clip, *BOX, "--out", "run")
@@ -189,6 +227,8 @@ def test_folder_that_cannot_be_written_is_named(refused, clip, script, tmp_path)
         ("--box 100,100,9,9", "outside 000.png, which is 64 x 48"),
         ("--mask absent.png", "absent.png does not exist"),
         ("--box 1,1,9,9 --mask m.png", "either --box or --mask"),
+        ("--box 1,1,9,9 --box 1,2", "'1,2' is not four numbers"),
+        ("--box 1,1,9,9 --box 100,100,9,9", "outside 000.png, which is 64 x 48"),
         ("--masks absent", "absent"),
         ("--masks m --tracker csrt", "leave out --tracker csrt"),
         ("--box 1,1,9,9 --tracker crst", "did you mean 'csrt'?"),

@@ -13,6 +13,7 @@ from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 from tracking3d.datasets.clip import write_clip
+from tracking3d.datasets.run_answers import is_refined
 from tracking3d.errors import InputError
 from tracking3d.evaluation.mask_scores import MaskScores
 from tracking3d.evaluation.pose_scores import PoseScores
@@ -243,6 +244,117 @@ def test_a_later_line_replaces_an_earlier_one(write_run, clip):
     assert score_run(run, clip).rotation_error_max_deg == pytest.approx(0, abs=1e-9)
 
 
+@pytest.fixture
+def refined_run(write_run):
+    """A run whose causal answers drift by 2 degrees a frame and 3 pixels of mask; the refined ones are perfect."""
+    drifted = np.stack([pose(5 * n) for n in range(FRAMES)])
+    run = write_run(poses=drifted, refinement={"state": "finished", "seconds": 3.0, "frames": 8})
+    with (run / "frames.jsonl").open("a") as file:
+        file.writelines(line(n, TRUE_POSES[n], refined=True, seconds=0.1) for n in range(1, 9))
+    (run / "causal").mkdir()
+    write_masks(run / "causal", "masks", {n: square(3) for n in range(1, 9)})
+    return run
+
+
+def test_a_refined_run_is_scored_by_its_refined_answers(refined_run, clip):
+    scores = score_run(refined_run, clip)
+    assert scores.iou_mean == 1.0
+    # Frame 9 was not refined: its causal answer, 18 degrees off, stands.
+    assert scores.rotation_error_max_deg == pytest.approx(18)
+    assert scores.rotation_error_median_deg == pytest.approx(0, abs=1e-9)
+    # Half a second each for the causal answers and 3 for refining eight frames.
+    assert scores.seconds_per_frame == pytest.approx((10 * 0.5 + 3.0) / 10)
+    assert scores.seconds_per_frame_median == pytest.approx(0.5 + 3.0 / 8)
+
+
+def test_the_causal_answers_of_a_refined_run_are_scored_when_asked_for(refined_run, clip):
+    scores = score_run(refined_run, clip, refined=False)
+    assert scores.iou_mean == pytest.approx((8 * 7 / 13 + 1) / 9)
+    assert scores.rotation_error_max_deg == pytest.approx(10)
+    assert scores.seconds_per_frame == scores.seconds_per_frame_median == 0.5
+
+
+def test_a_run_without_refined_answers_is_the_same_either_way(write_run, clip):
+    run = write_run(masks={1: square(5)})
+    assert score_run(run, clip) == score_run(run, clip, refined=False)
+    assert not is_refined(run)
+
+
+def test_the_return_to_the_first_view_is_judged_by_the_turn_from_first_to_last(write_run, clip):
+    angles = [0, 20, 40, 60, 80, 80, 60, 40, 20, 0]
+    document = json.loads((clip / "poses.json").read_text())
+    for n, angle in enumerate(angles):
+        document["frames"][f"{n:06d}"]["R"] = pose(angle)[:3, :3].tolist()
+    (clip / "poses.json").write_text(json.dumps(document))
+    drifting = np.stack([pose(angle + 0.7 * n) for n, angle in enumerate(angles)])
+    assert score_run(write_run(poses=drifting), clip).rotation_error_return_deg == pytest.approx(6.3)
+
+
+@pytest.mark.parametrize("gone", [0, 9])
+def test_without_its_first_or_last_pose_a_return_is_half_a_turn_off(write_run, clip, gone):
+    angles = [0, 20, 40, 60, 80, 80, 60, 40, 20, 0]
+    document = json.loads((clip / "poses.json").read_text())
+    for n, angle in enumerate(angles):
+        document["frames"][f"{n:06d}"]["R"] = pose(angle)[:3, :3].tolist()
+    (clip / "poses.json").write_text(json.dumps(document))
+    poses = np.stack([pose(angle) for angle in angles])
+    poses[gone] = np.nan
+    assert score_run(write_run(poses=poses), clip).rotation_error_return_deg == 180
+
+
+def test_a_clip_that_ends_elsewhere_or_never_went_away_has_no_return(write_run, clip):
+    run = write_run()
+    assert score_run(run, clip).rotation_error_return_deg is None  # it ends 27 degrees away
+    document = json.loads((clip / "poses.json").read_text())
+    for entry in document["frames"].values():
+        entry["R"] = np.eye(3).tolist()
+    (clip / "poses.json").write_text(json.dumps(document))
+    assert score_run(run, clip).rotation_error_return_deg is None
+
+
+def test_the_share_under_a_limit_is_averaged_over_the_limit(write_run, clip):
+    poses = TRUE_POSES.copy()
+    poses[4] = pose(12 + 5)  # counts for three quarters of the limits up to 20 degrees
+    poses[5] = pose(15 + 30)
+    scores = score_run(write_run(poses=poses, changes={6: {"status": "lost"}}), clip)
+    assert scores.rotation_auc_20_deg == pytest.approx((7 + 0.75) / 10)
+
+
+def test_lost_and_missing_frames_are_counted_together_once(write_run, clip):
+    scores = score_run(write_run(range(8), changes={n: {"status": "lost"} for n in (1, 2, 3)}), clip)
+    assert (scores.frames_lost, scores.frames_missing) == (3, 2)
+    assert scores.share_lost == pytest.approx(0.5)
+
+
+def test_turns_about_an_axis_of_symmetry_do_not_count(write_run, clip):
+    info = json.loads((clip / "info.json").read_text())
+    info["symmetry_axis"] = {"direction": [0, 2, 0], "point": [0, 0, 0]}
+    (clip / "info.json").write_text(json.dumps(info))
+    stands_still = np.stack([pose(0)] * FRAMES)
+    leaning = stands_still.copy()
+    leaning[4, :3, :3] = Rotation.from_rotvec([np.radians(8), 0, 0]).as_matrix()
+    scores = score_run(write_run(poses=leaning), clip)
+    assert scores.rotation_error_max_deg == pytest.approx(8)
+    assert scores.rotation_error_mean_deg == pytest.approx(0.8)
+    assert scores.rotation_error_anchored_median_deg == pytest.approx(0, abs=1e-6)
+    assert scores.rotation_error_consecutive_median_deg == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.parametrize("axis", [{}, {"direction": [0, 0, 0]}, {"direction": [1, 2]}, {"direction": "y"}, 3])
+def test_an_axis_that_is_none_is_refused(write_run, clip, axis):
+    info = json.loads((clip / "info.json").read_text())
+    (clip / "info.json").write_text(json.dumps(info | {"symmetry_axis": axis}))
+    with pytest.raises(InputError, match="symmetry_axis"):
+        score_run(write_run(), clip)
+
+
+def test_confidence_that_ranks_wrong_frames_below_right_ones_has_all_of_the_area(write_run, clip):
+    poses = TRUE_POSES.copy()
+    poses[4:6] = pose(100)
+    low = {n: {"confidence": 0.2} for n in (4, 5)}
+    assert score_run(write_run(poses=poses, changes=low), clip).confidence_auc == 1.0
+
+
 def test_a_line_that_was_cut_off_is_a_missing_frame(write_run, clip):
     run = write_run()
     lines = (run / "frames.jsonl").read_text()
@@ -280,7 +392,7 @@ def test_without_true_masks_the_mask_figures_are_unknown(write_run, clip):
         mask.unlink()
     scores = score_run(write_run(), clip)
     assert all(unknown(scores, MaskScores)) and scores.frames_with_mask == 0
-    assert not any(unknown(scores, PoseScores))
+    assert unknown(scores, PoseScores).count(True) == 1  # the clip does not return to its first view
 
 
 def test_frames_without_a_true_mask_do_not_count_for_the_masks(write_run, clip):

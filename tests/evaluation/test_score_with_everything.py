@@ -142,3 +142,10 @@ def test_what_a_method_does_not_estimate_is_unknown(perfect, truth):
 def test_without_depth_there_is_no_vsd_and_no_average_recall(perfect, truth):
     scores = score(perfect, replace(truth, depth={}))
     assert (scores.bop_ar, scores.bop_ar_vsd, scores.bop_ar_mssd) == (None, None, 1)
+
+
+def test_points_of_an_object_with_an_axis_of_symmetry_cannot_be_told_apart_and_are_not_scored(truth, perfect):
+    symmetric = replace(truth, symmetry_axis=np.array([0.0, 1.0, 0.0]))
+    scores = score(perfect, symmetric)
+    assert scores.points_average_jaccard is None and scores.points == 0
+    assert scores.rotation_error_max_deg == pytest.approx(0, abs=1e-4) and scores.bop_ar == pytest.approx(1)

@@ -207,7 +207,7 @@ import os, signal, sys
 sys.path.insert(0, sys.argv[2])
 from pathlib import Path
 from conftest import turning_sphere_of
-from tracking3d.results import run_writer
+from tracking3d.results import pictures, run_writer
 
 def die(*_):
     os.kill(os.getpid(), signal.SIGKILL)
@@ -224,7 +224,7 @@ elif where == "line":  # half of its line is there
     whole = writer._append
     writer._append = lambda line: (whole(line[:60]), die())
 elif where == "overlay":  # all of it is there but the overlay
-    run_writer.draw_overlay = die
+    pictures.draw_overlay = die
 elif where == "finish":
     writer.finish = die
     writer.finish()

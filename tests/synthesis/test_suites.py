@@ -13,11 +13,13 @@ from tracking3d.datasets.clip import read_truth
 from tracking3d.datasets.layout import load_layout
 from tracking3d.datasets.reading import read_sequence
 from tracking3d.errors import InputError, OutputError
+from tracking3d.geometry.camera import Camera
 from tracking3d.synthesis import suite as suite_module
 from tracking3d.synthesis.frame_rendering import render_frame
 from tracking3d.synthesis.scene import make_scene
 from tracking3d.synthesis.spec import Disturbances, SequenceSpec, check_spec
 from tracking3d.synthesis.suite import SUITE_VERSION, SUITES, load_suite, make_suite
+from tracking3d.synthesis.writing import is_complete, write_sequence
 
 TINY = [
     SequenceSpec(name=name, object=name, frames=2, size=(32, 24), supersample=1)
@@ -42,7 +44,7 @@ def test_suites_grow_and_their_sequences_have_names_of_their_own():
         specs = load_suite(name)
         assert len({spec.name for spec in specs}) == len(specs)
         counts.append(sum(spec.frames for spec in specs))
-    assert SUITES == ("smoke", "standard", "full") and counts == sorted(counts)
+    assert SUITES == ("smoke", "standard", "hard", "full") and counts == sorted(counts)
     assert len(load_suite("smoke")) == 3 and len(load_suite("standard")) == 12
 
 
@@ -55,6 +57,63 @@ def test_suites_hold_every_object_motion_and_disturbance_they_promise(name):
     assert used == set(Disturbances.model_fields) - ({"wrong_fov"} if name == "standard" else set())
     assert {spec.textured for spec in specs} == {True, False}
     assert len({spec.seed for spec in specs}) == len(specs)
+
+
+def test_the_hard_suite_holds_what_the_standard_one_does_not():
+    specs = {spec.name: spec for spec in load_suite("hard")}
+    assert not specs.keys() & {spec.name for spec in load_suite("standard")}
+    assert 8 <= len(specs) <= 12 and all(40 <= spec.frames <= 72 for spec in specs.values())
+    untold = {spec.fov for spec in specs.values() if not spec.camera_told}
+    assert untold == {10, 25, 65}
+    plain = {spec.name for spec in specs.values() if not spec.textured}
+    assert plain == {"blob_plain"}
+    assert {spec.object for spec in specs.values()} >= {"vase", "card"}
+    assert any(spec.disturbances.occluder == 1 for spec in specs.values())
+    assert any(spec.disturbances.low_contrast > 0.8 and spec.textured for spec in specs.values())
+    for name in ("box_full_turn", "mug_full_turn", "bottle_full_turn"):
+        spec = specs[name]
+        assert spec.motion == "turntable" and spec.degrees_per_frame * (spec.frames - 1) == 360
+
+
+@pytest.mark.parametrize(
+    "name", ["box_full_turn", "mug_full_turn", "bottle_full_turn", "wedge_turn_and_back"]
+)
+def test_sequences_that_return_end_with_their_first_view(name):
+    spec = next(spec for spec in load_suite("hard") if spec.name == name)
+    poses = make_scene(spec).T_cam_obj[:, :3, :3]
+    turned = np.degrees(np.arccos(np.clip((np.einsum("nij,ij->n", poses, poses[0]) - 1) / 2, -1, 1)))
+    assert turned[-1] < 1 and turned.max() > 170
+
+
+def test_a_tracker_can_be_told_nothing_of_the_camera(tmp_path):
+    spec = TINY[0].model_copy(update={"camera_told": False, "fov": 20.0})
+    told, untold = (read_truth(write_sequence(tmp_path / s.name, s)) for s in (TINY[1], spec))
+    assert told.camera_told and not untold.camera_told
+    assert untold.told_camera is None and untold.camera == Camera.from_fov(
+        32, 24, 20.0, origin=untold.camera.origin
+    )
+
+
+def test_a_sequence_made_before_a_setting_existed_is_not_made_again(tmp_path):
+    spec = TINY[0]
+    folder = write_sequence(tmp_path / "box", spec)
+    info = json.loads((folder / "info.json").read_text())
+    del info["spec"]["camera_told"]
+    (folder / "info.json").write_text(json.dumps(info))
+    assert is_complete(folder, spec)
+    assert not is_complete(folder, spec.model_copy(update={"camera_told": False}))
+    info["spec"]["colour"] = "red"
+    (folder / "info.json").write_text(json.dumps(info))
+    assert not is_complete(folder, spec)
+
+
+def test_an_object_of_revolution_says_so_in_its_info(tmp_path):
+    spec = TINY[0].model_copy(update={"object": "vase"})
+    folder = write_sequence(tmp_path / "vase", spec)
+    assert json.loads((folder / "info.json").read_text())["symmetry"] == "continuous axis"
+    assert read_truth(folder).symmetry_axis == pytest.approx([0, 1, 0])
+    box = read_truth(write_sequence(tmp_path / "box", TINY[0]))
+    assert box.symmetry_axis is None
 
 
 @pytest.mark.parametrize("spec", [s for name in SUITES for s in load_suite(name)], ids=lambda spec: spec.name)

@@ -108,9 +108,32 @@ def test_the_symmetries_of_textureless_objects_map_them_to_themselves(name, coun
     assert len(solid(name).symmetries) == 1
 
 
-def test_only_the_textureless_bottle_has_an_axis():
-    assert solid("bottle", textured=False).axis == pytest.approx([0, 1, 0])
+def test_only_the_textureless_bottle_and_the_vase_have_an_axis():
+    for made in (solid("bottle", textured=False), solid("vase"), solid("vase", textured=False)):
+        assert made.axis == pytest.approx([0, 1, 0]) and len(made.symmetries) == 72
     assert solid("bottle").axis is None and solid("box", textured=False).axis is None
+
+
+def test_a_vase_looks_the_same_from_all_around_and_not_upside_down():
+    made = solid("vase")
+    surface = Surface.of(made.mesh())
+    height = np.linspace(-0.8, 0.8, 40)
+
+    def colours(angle, flip=1.0):
+        out = np.array([np.cos(angle), 0, np.sin(angle)])
+        hits = surface.cast(5 * out + flip * height[:, None] * (0.0, 1.0, 0.0), np.tile(-out, (40, 1)))
+        uv = np.einsum("nc,ncd->nd", hits.weights, made.uvs[made.faces[hits.face]])
+        return hits.distance, bilinear(made.texture.astype(np.float32), uv)
+
+    (reach, print_), (turned_reach, turned_print), (_, flipped) = (
+        colours(0.1),
+        colours(2.7),
+        colours(0.1, -1.0),
+    )
+    assert turned_reach == pytest.approx(reach, abs=0.003)  # it is a prism of 96 sides
+    assert np.abs(turned_print - print_).mean() < 3  # texels are not level with the height to the last digit
+    assert np.abs(flipped - print_).mean() > 30
+    assert print_.std(0).max() > 25
 
 
 def textured_mesh(folder, offset=(0.0, 0.0, 0.0)):

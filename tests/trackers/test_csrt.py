@@ -102,6 +102,51 @@ def test_a_correction_brings_a_wrong_start_back() -> None:
     assert min(iou(e.binary, m) for e, m in zip(after, truth[2:], strict=True)) > 0.85
 
 
+def test_a_correction_keeps_a_filter_that_is_on_the_object_and_renews_one_that_has_strayed() -> None:
+    frames, truth = moving_shape(4)
+    csrt = tracker()
+    csrt.init(frames[0], Prompt(box_around(truth[0])))
+    learnt = csrt._boxes
+    csrt.step(frames[1])
+    csrt.correct(frames[1], truth[1])
+    assert csrt._boxes is learnt
+    csrt.step(frames[2])
+    csrt.correct(frames[2], np.roll(truth[2], 20, axis=1))
+    assert csrt._boxes is not learnt
+
+
+def test_corrections_by_the_truth_in_every_frame_help_a_start_that_took_too_much() -> None:
+    frames, truth = moving_shape(10)
+    x, y, width, height = box_around(truth[0])
+    too_much = np.zeros(SIZE, bool)
+    too_much[int(y) - 12 : int(y + height) + 12, int(x) - 12 : int(x + width) + 12] = True
+    means = []
+    for corrected in (False, True):
+        csrt = tracker()
+        csrt.init(frames[0], Prompt((x, y, width, height), too_much))
+        overlaps = []
+        for frame, mask in zip(frames[1:], truth[1:], strict=True):
+            overlaps.append(iou(csrt.step(frame).binary, mask))
+            if corrected:
+                csrt.correct(frame, mask)
+        means.append(np.mean(overlaps[1:]))
+    assert means[1] > 0.9
+    assert means[1] > means[0] + 0.05
+
+
+def test_a_correction_in_place_keeps_the_motion_and_one_elsewhere_forgets_it() -> None:
+    frames, truth = moving_shape(4, step=10)
+    segmentation = ColourSegmentation(frames[0].image, box_around(truth[0]), truth[0])
+    for frame in frames[1:3]:
+        segmentation.step(frame.image)
+    assert segmentation._velocity[0] == pytest.approx(10, abs=2)
+    kept = segmentation._velocity
+    segmentation.correct(frames[2].image, truth[2])
+    assert segmentation._velocity == kept
+    segmentation.correct(frames[2].image, np.roll(truth[2], 110, axis=1))
+    assert segmentation._velocity == (0, 0)
+
+
 def test_an_empty_correction_changes_nothing() -> None:
     frames, truth = moving_shape(3)
     csrt = tracker()

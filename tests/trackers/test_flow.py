@@ -171,6 +171,19 @@ def test_a_correction_brings_back_what_was_out_of_sight() -> None:
     assert iou(flow.step(frames[2]).binary, truth[2]) > 0.9
 
 
+def test_a_correction_keeps_a_witness_that_is_on_the_object_and_renews_one_that_has_strayed() -> None:
+    frames, truth = moving_shape(4)
+    flow = tracker(witness="csrt")
+    flow.init(frames[0], Prompt(box_around(truth[0])))
+    learnt = flow._witness
+    flow.step(frames[1])
+    flow.correct(frames[1], truth[1])
+    assert flow._witness is learnt
+    flow.step(frames[2])
+    flow.correct(frames[2], np.roll(truth[2], 20, axis=1))
+    assert flow._witness is not learnt
+
+
 def test_an_empty_correction_changes_nothing() -> None:
     frames, truth = moving_shape(3)
     flow = tracker()

@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from tracking3d.benchmark.variant import DEGRADED
+from tracking3d.benchmark.variant import DEGRADED, HAND, NOISE
 from tracking3d.datasets.truth import Truth
 from tracking3d.plugins import list_plugins
 from tracking3d.results.description import versions
@@ -47,6 +47,8 @@ def masks_fingerprint(masks: str, sequence: str) -> str:
     """What the initial masks of a source depend on beside the frames: a folder's files, the code that degrades."""
     if masks.startswith(DEGRADED):
         return hashlib.sha256((PACKAGE / "synthesis/mask_degradation.py").read_bytes()).hexdigest()
+    if masks.startswith(NOISE) or masks == HAND:
+        return hashlib.sha256((PACKAGE / "synthesis/mask_noise.py").read_bytes()).hexdigest()
     folder = Path(masks) / sequence
     files = sorted(folder.iterdir()) if folder.is_dir() else []
     return key(*((file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files))

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.benchmark.variant import DEGRADED, degraded_iou
+from tracking3d.benchmark.variant import DEGRADED, HAND, NOISE, degraded_iou, noise_pixels
 from tracking3d.datasets.truth import MaskReference, Truth
 from tracking3d.errors import InputError
 from tracking3d.results.files import write_mask, writing
 from tracking3d.synthesis.mask_degradation import degrade_to_iou
+from tracking3d.synthesis.mask_noise import noisy_boundaries, with_hand
 from tracking3d.video.image_file import read_image
 
 SEED = 0
@@ -21,10 +22,11 @@ SEED = 0
 def masks_for(source: str, truth: Truth, folder: Path) -> Path:
     """The folder of masks for one sequence, made in ``folder`` where it is not there already.
 
-    Trackers see what can be seen: ``truth`` and ``degraded`` masks are those of the visible part where it is known.
+    Trackers see what can be seen: all but ``initial`` masks are made from those of the visible part where it is known.
 
     Args:
-        source: ``truth``, ``initial``, ``degraded:IOU``, or a folder with a folder of masks for every sequence.
+        source: ``truth``, ``initial``, ``degraded:IOU``, ``noise:PIXELS``, ``hand``, or a folder with a folder of
+            masks for every sequence.
         truth: The sequence.
         folder: Where to write masks.
 
@@ -37,8 +39,8 @@ def masks_for(source: str, truth: Truth, folder: Path) -> Path:
         if not truth.initial_masks:
             raise InputError(f"{truth.name} comes with no initial masks; choose other --masks.")
         return _written(truth, truth.initial_masks, folder)
-    if source.startswith(DEGRADED):
-        return _degraded(truth, degraded_iou(source), folder)
+    if source.startswith((DEGRADED, NOISE)) or source == HAND:
+        return _rough(truth, source, folder)
     given = Path(source) / truth.name
     if not given.is_dir():
         raise InputError(f"{source} has no folder {truth.name} with the masks of that sequence.")
@@ -52,15 +54,20 @@ def _seen(truth: Truth) -> Mapping[int, MaskReference]:
     return masks
 
 
-def _degraded(truth: Truth, iou: float, folder: Path) -> Path:
+def _rough(truth: Truth, source: str, folder: Path) -> Path:
     masks = _seen(truth)
     if len(masks) < len(truth.frames):
         raise InputError(
             f"{truth.name} has not a true mask in every frame: there is nothing to degrade there."
         )
     true = np.stack([masks[n].read() for n in range(len(truth.frames))])
-    images = np.stack([read_image(path) for path in truth.frames])
-    rough = degrade_to_iou(true, images, iou, SEED)
+    if source == HAND:
+        rough = with_hand(true, SEED)
+    elif source.startswith(NOISE):
+        rough = noisy_boundaries(true, noise_pixels(source), SEED)
+    else:
+        images = np.stack([read_image(path) for path in truth.frames])
+        rough = degrade_to_iou(true, images, degraded_iou(source), SEED)
     return _write(truth, {n: mask for n, mask in enumerate(rough) if mask.any()}, folder)
 
 

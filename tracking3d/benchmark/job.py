@@ -9,7 +9,8 @@ from __future__ import annotations
 import json
 import shutil
 import sys
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -26,15 +27,18 @@ from tracking3d.benchmark.variant import Variant
 from tracking3d.config.models import PipelineConfig
 from tracking3d.datasets.layout import load_layout
 from tracking3d.datasets.reading import read_sequence
-from tracking3d.datasets.run_answers import answers_of_run
+from tracking3d.datasets.run_answers import answers_of_run, is_refined
 from tracking3d.datasets.truth import Truth
 from tracking3d.errors import InputError, Tracking3dError
 from tracking3d.evaluation.score import score
-from tracking3d.recording import record
+from tracking3d.process_memory import resident_memory
+from tracking3d.recording import Listener, record
 from tracking3d.results.files import write_atomic, writing
 from tracking3d.video.image_sequence import ImageSequence
 
 JOB, SCORES, RUN, LOG, MASKS = "job.json", "scores.json", "run", "log.txt", "initial_masks"
+MEMORY = "memory.json"
+"""Megabytes held after each frame."""
 
 
 @dataclass(frozen=True)
@@ -62,10 +66,15 @@ class Job:
 
     @cached_property
     def config(self) -> PipelineConfig:
-        """The pipeline, with the camera that the dataset tells of unless the configuration says one itself."""
+        """The pipeline, with the camera that the dataset tells a tracker of unless the configuration says one."""
         config = self.variant.config
         camera = self.truth.told_camera or self.truth.camera
-        if camera is None or config.camera.intrinsics is not None or config.camera.fov is not None:
+        if (
+            camera is None
+            or not self.truth.camera_told
+            or config.camera.intrinsics is not None
+            or config.camera.fov is not None
+        ):
             return config
         told = config.camera.model_copy(update={"intrinsics": (camera.fx, camera.fy, camera.cx, camera.cy)})
         return config.model_copy(update={"camera": told})
@@ -129,41 +138,67 @@ class Job:
 def run_job(job: Job) -> dict[str, Any]:
     """Track, unless the run is there, and score; the scores are written too.
 
+    Those of the final answers are by name of the measure. Where there are refined answers, ``causal`` holds the scores
+    of the causal ones, else None.
+
     Raises:
         Tracking3dError: If the sequence cannot be read, tracked or scored.
     """
     run = job.folder / RUN
     if (_read(run / "run.json") or {}).get("state") != "finished":
         _track(job, run)
-    scores = asdict(score(answers_of_run(run, job.truth), job.truth))
+    growth = memory_growth(_read(job.folder / MEMORY) or [])
+
+    def judged(*, refined: bool) -> dict[str, Any]:
+        answers = answers_of_run(run, job.truth, refined=refined)
+        return asdict(score(replace(answers, memory_growth_mb=growth), job.truth))
+
+    scores = judged(refined=True) | {"causal": judged(refined=False) if is_refined(run) else None}
     write_atomic(job.folder / SCORES, json.dumps({"key": job.score_key, "scores": scores}, indent=1).encode())
     return scores
 
 
+def memory_growth(held: Sequence[float]) -> float | None:
+    """How much more was held at most in the second half of the frames than in the first; None of fewer than two."""
+    half = len(held) // 2
+    return max(held[half:]) - max(held[:half]) if half else None
+
+
 def _track(job: Job, run: Path) -> None:
+    held: list[float] = []
+
+    def after_frame(frame: object) -> None:
+        if memory := resident_memory():
+            held.append(memory[0])
+
+    _record(job, run, after_frame)
+    write_atomic(job.folder / MEMORY, json.dumps(held).encode())
+
+
+def _record(job: Job, run: Path, listener: Listener) -> None:
     truth, config = job.truth, job.config
     source = ImageSequence(job.sequence, truth.frames, range(len(truth.frames)))
     if job.variant.masks == "tracker":
         if truth.box is None:
             raise InputError(f"{job.sequence} has no box in its first frame; a mask tracker cannot start.")
-        record(source, config, run, box=truth.box, overwrite=True)
+        record(source, config, run, box=truth.box, overwrite=True, listener=listener)
         return
     masks = masks_for(job.variant.masks, truth, job.folder / MASKS)
     tracker = {"name": "precomputed", "path": str(masks)}
     config = PipelineConfig.model_validate({**config.model_dump(), "tracker": tracker})
     try:
-        record(source, config, run, overwrite=True)
+        record(source, config, run, overwrite=True, listener=listener)
     finally:
         if masks.is_relative_to(job.folder):  # the run keeps its own copy of them
             shutil.rmtree(masks, ignore_errors=True)
 
 
-def _read(file: Path) -> dict[str, Any] | None:
+def _read(file: Path) -> Any:
+    """What a JSON file holds; None if there is none that can be read."""
     try:
-        document: dict[str, Any] = json.loads(file.read_bytes())
+        return json.loads(file.read_bytes())
     except (OSError, ValueError):
         return None
-    return document
 
 
 if __name__ == "__main__":

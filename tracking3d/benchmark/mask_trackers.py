@@ -14,7 +14,6 @@ from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import rankdata
 
 from tracking3d.benchmark.sequences import Dataset
 from tracking3d.config.models import PluginChoice
@@ -23,6 +22,7 @@ from tracking3d.datasets.layout import load_layout
 from tracking3d.datasets.reading import read_sequence
 from tracking3d.datasets.truth import Truth
 from tracking3d.errors import InputError, Tracking3dError
+from tracking3d.evaluation.calibration import area_under_roc
 from tracking3d.evaluation.mask_scores import compare_masks
 from tracking3d.frames import Frame, MaskEstimate, Prompt
 from tracking3d.plugins import TRACKERS, build_plugin, check_options, plugin_label
@@ -179,24 +179,6 @@ def overall(results: Sequence[Measured]) -> dict[str, dict[str, float | int | No
         }
         figures[tracker] = {**pooled, **means}
     return figures
-
-
-def area_under_roc(scores: ArrayLike, right: ArrayLike) -> float | None:
-    """The chance that a right answer has a higher score than a wrong one, ties counting half.
-
-    Args:
-        scores: ``(N,)``.
-        right: ``(N,)`` bool.
-
-    Returns:
-        In [0, 1]; None where all are right or all are wrong.
-    """
-    is_right = np.asarray(right, bool)
-    count, others = np.count_nonzero(is_right), np.count_nonzero(~is_right)
-    if not count or not others:
-        return None
-    ranks = rankdata(scores)[is_right].sum()
-    return float((ranks - count * (count + 1) / 2) / (count * others))
 
 
 def track_masks(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,8 @@ COLUMNS = {
     "boundary_f_mean": "boundary F",
     "rotation_error_mean_deg": "rotation °",
     "share_under_5_deg": "under 5°",
+    "rotation_error_return_deg": "on return °",
+    "shape_f_score": "F-score",
     "points_average_jaccard": "AJ",
     "bop_ar": "AR",
     "frames_lost": "lost",
@@ -48,6 +50,8 @@ class ResultSet:
         scores: Measures by sequence; None for a sequence that failed.
         errors: Why sequences failed.
         about: Everything else that is kept: configuration, masks, versions, code, date.
+        causal: Measures of the causal answers, of the sequences that have refined ones too; `scores` are then those
+            of the refined ones.
     """
 
     label: str
@@ -55,6 +59,16 @@ class ResultSet:
     scores: Mapping[str, Mapping[str, Any] | None]
     errors: Mapping[str, str]
     about: Mapping[str, Any]
+    causal: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    def split(self) -> list[ResultSet]:
+        """The causal answers and the refined ones as two result sets; one where nothing was refined."""
+        if not self.causal:
+            return [self]
+        causal = replace(
+            self, label=f"{self.label}, causal", scores={**self.scores, **self.causal}, causal={}
+        )
+        return [causal, replace(self, label=f"{self.label}, refined", causal={})]
 
     def values(self, measure: str) -> dict[str, float]:
         """A measure by sequence, where it is known."""
@@ -77,12 +91,15 @@ def collect(variant: Variant, dataset: Dataset, outcomes: Sequence[Outcome]) -> 
         "code": code_fingerprint(judges=False),
         "created": now(),
     }
+    scores = {outcome.job.sequence: dict(outcome.scores) if outcome.scores else None for outcome in outcomes}
+    causal = {name: one.pop("causal", None) for name, one in scores.items() if one is not None}
     return ResultSet(
         variant.label,
         dataset.name,
-        {outcome.job.sequence: outcome.scores for outcome in outcomes},
+        scores,
         {outcome.job.sequence: outcome.error for outcome in outcomes if outcome.error},
         about,
+        {name: one for name, one in causal.items() if one},
     )
 
 
@@ -100,6 +117,7 @@ def write_results(results: ResultSet, file: Path) -> None:
         **results.about,
         "mean": {measure: results.mean(measure) for measure in measures},
         "sequences": results.scores,
+        "causal": results.causal,
         "errors": results.errors,
     }
     with writing(file.parent):
@@ -121,11 +139,12 @@ def read_results(file: Path) -> ResultSet:
         label, name, scores, errors = (
             document.pop(one) for one in ("label", "dataset", "sequences", "errors")
         )
+        causal = document.pop("causal", {})
     except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
         raise InputError(
             f"{file} is not a result set ({error}); give a JSON file that `tracking3d evaluate suite` wrote."
         ) from error
-    return ResultSet(label, name, scores, errors, document)
+    return ResultSet(label, name, scores, errors, document, causal)
 
 
 def format_results(results: ResultSet) -> Table:
@@ -146,5 +165,5 @@ def figure(value: float | None, measure: str) -> str:
     """A measure as tables show it."""
     if value is None:
         return "-"
-    digits = 1 if measure.endswith(("_deg", "_percent", "lost")) and measure != "share_under_5_deg" else 3
-    return f"{value:.{digits}f}"
+    coarse = measure.endswith(("_deg", "_percent", "_mb", "frames_lost")) and not measure.startswith("share")
+    return f"{value:.{1 if coarse else 3}f}"

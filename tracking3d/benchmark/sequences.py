@@ -61,8 +61,8 @@ def open_dataset(
     """Find a dataset by name; a synthetic suite that is not there yet is made.
 
     Args:
-        name: ``smoke``, ``standard`` or ``full``; ``real`` for a folder of clips in our own layout; the name of a
-            dataset's layout; or a YAML file of one.
+        name: One of `SUITES`; ``real`` for a folder of clips in our own layout; the name of a dataset's layout; or a
+            YAML file of one.
         data: Where it lies; a synthetic suite's default is ``out/data/NAME``.
         out: Folder of the benchmark.
         jobs: Processes that make a suite.

@@ -111,7 +111,7 @@ def fill(
     results = dict(zip(variants, sets, strict=True))
     for name, result in results.items():
         write_results(result, out / "results" / f"{table.name}-{file_name(name)}-{chosen.name}.json")
-    lines = tuple(_line(row, table, plan, results) for row in table.rows)
+    lines = tuple(line for row in table.rows for line in _lines(row, table, plan, results))
     return Filled(table.name, _caption(table, base, chosen), lines)
 
 
@@ -126,6 +126,20 @@ def _chosen(table: Table, dataset: Dataset) -> Dataset:
     if not 0 < table.sample < len(dataset.sequences):
         return dataset
     return dataset.only(sorted(random.Random(SEED).sample(dataset.sequences, table.sample)))
+
+
+def _lines(
+    row: Row, table: Table, plan: Mapping[str, Variant | str], results: Mapping[str, ResultSet]
+) -> list[Line]:
+    """A row's line; two, causal and refined, where its run has both answers and the row shows answers."""
+    result = results.get(row.plan)
+    if result is None or row.initial or not result.causal:
+        return [_line(row, table, plan, results)]
+    causal, refined = (_line(row, table, plan, {row.plan: one}) for one in result.split())
+    return [
+        replace(causal, label=f"{row.label}, causal"),
+        replace(refined, label=f"{row.label}, refined", paper=None, paper_gain_percent=None),
+    ]
 
 
 def _line(

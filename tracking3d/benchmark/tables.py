@@ -96,7 +96,8 @@ def _started(base: Variant, label: str, iou: float, synthetic: bool, given: Path
     return f"needs the masks of {label}: --initial {label.lower()}=DIR"
 
 
-def _deep(base: Variant, label: str, **settings: Any) -> Variant | str:
+def deep(base: Variant, label: str, **settings: Any) -> Variant | str:
+    """``base`` with deep features and other settings, or why that cannot be."""
     known = (info for info in list_plugins() if (info.group, info.name) == (FEATURES, DEEP))
     if not any(info.status == "ok" for info in known):
         return f"needs the feature encoder {DEEP}, which is not installed"
@@ -128,8 +129,8 @@ def _coin(base: Variant, synthetic: bool, initial: Mapping[str, Path]) -> Plan:
     return {
         "RGB": start.changed("RGB"),
         "RGB, flat prior": start.changed("RGB, flat prior", object__flat=True),
-        "S2DNet": _deep(start, "S2DNet"),
-        "S2DNet, flat prior": _deep(start, "S2DNet, flat prior", object__flat=True),
+        "S2DNet": deep(start, "S2DNet"),
+        "S2DNet, flat prior": deep(start, "S2DNet, flat prior", object__flat=True),
     }
 
 
@@ -159,7 +160,7 @@ def _ablation(base: Variant, synthetic: bool, initial: Mapping[str, Path]) -> Pl
         return dict.fromkeys(("RGB", "S2DNet", *LOSSES), start)
     return {
         "RGB": start.changed("RGB"),
-        "S2DNet": _deep(start, "S2DNet"),
+        "S2DNet": deep(start, "S2DNet"),
         **{label: start.changed(label, **settings) for label, settings in LOSSES.items()},
     }
 
@@ -201,7 +202,7 @@ def _features(base: Variant, synthetic: bool, initial: Mapping[str, Path]) -> Pl
                 elif features == "RGB":
                     plan[label] = start.changed(label, features={"name": "rgb"}, **settings)
                 else:
-                    plan[label] = _deep(start, label, **settings)
+                    plan[label] = deep(start, label, **settings)
     return plan
 
 

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, field_validator
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError
 
-DEGRADED = "degraded:"
+DEGRADED, NOISE, HAND = "degraded:", "noise:", "hand"
 
 
 class Variant(BaseModel):
@@ -19,8 +19,8 @@ class Variant(BaseModel):
     Attributes:
         label: What tables call it.
         config: The pipeline; what the masks need is set when they are known.
-        masks: ``tracker``, ``truth``, ``initial``, ``degraded:IOU``, or a folder that holds a folder of masks for
-            every sequence.
+        masks: ``tracker``, ``truth``, ``initial``, ``degraded:IOU``, ``noise:PIXELS``, ``hand``, or a folder that
+            holds a folder of masks for every sequence.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -32,8 +32,8 @@ class Variant(BaseModel):
     @field_validator("masks")
     @classmethod
     def _is_a_source(cls, masks: str) -> str:
-        if masks.startswith(DEGRADED):
-            degraded_iou(masks)
+        if masks.startswith((DEGRADED, NOISE)):
+            check_masks(masks)
         return masks
 
     def changed(self, label: str, *, masks: str | None = None, **settings: Any) -> Variant:
@@ -66,6 +66,21 @@ def degraded_iou(masks: str) -> float:
     return iou
 
 
+def noise_pixels(masks: str) -> float:
+    """The standard deviation in ``noise:PIXELS``.
+
+    Raises:
+        InputError: If it is not a number between 0.1 and 50.
+    """
+    try:
+        pixels = float(masks.removeprefix(NOISE))
+    except ValueError:
+        pixels = -1.0
+    if not 0.1 <= pixels <= 50:
+        raise InputError(f"The masks '{masks}' name no pixels from 0.1 to 50; write for example noise:1.5.")
+    return pixels
+
+
 def check_masks(masks: str) -> None:
     """Make sure that a source of masks can be meant.
 
@@ -74,7 +89,10 @@ def check_masks(masks: str) -> None:
     """
     if masks.startswith(DEGRADED):
         degraded_iou(masks)
-    elif masks not in ("tracker", "truth", "initial") and not Path(masks).is_dir():
+    elif masks.startswith(NOISE):
+        noise_pixels(masks)
+    elif masks not in ("tracker", "truth", "initial", HAND) and not Path(masks).is_dir():
         raise InputError(
-            f"The masks '{masks}' are unknown; give tracker, truth, initial, degraded:IOU, or a folder that exists."
+            f"The masks '{masks}' are unknown; give tracker, truth, initial, degraded:IOU, noise:PIXELS, hand, "
+            "or a folder that exists."
         )

@@ -22,12 +22,15 @@ _COLOURS = {"tracked": "green", "uncertain": "yellow", "lost": "red", "skipped":
 
 
 @contextmanager
-def progress(count: int | None, quiet: bool) -> Iterator[Listener]:
+def progress(count: int | None, quiet: bool, objects: int = 1) -> Iterator[Listener]:
     """A progress bar on the standard error: frame, status, IoU against the initial mask, speed, time left.
+
+    It begins again where the frames come a second time, in the final refinement.
 
     Args:
         count: Number of frames, where known.
         quiet: Show nothing, as where the standard error is no terminal.
+        objects: How many are tracked; the bar counts the frames of each.
 
     Yields:
         The listener to tell of every frame.
@@ -42,9 +45,17 @@ def progress(count: int | None, quiet: bool) -> Iterator[Listener]:
         disable=quiet or not console.is_terminal,
         transient=True,
     )
-    task = bar.add_task("", total=count, frame="first frame")
+    tasks = [bar.add_task("", total=count and count * objects, frame="first frame")]
+
+    def listener(frame: FrameRecord | SkippedFrame) -> None:
+        again = isinstance(frame, FrameRecord) and frame.refined
+        if again and len(tasks) == 1:
+            bar.update(tasks[0], visible=False)
+            tasks.append(bar.add_task("", total=bar.tasks[0].completed, frame="once more"))
+        bar.update(tasks[-1], advance=1, frame=_line(frame))
+
     with bar:
-        yield lambda frame: bar.update(task, advance=1, frame=_line(frame))
+        yield listener
 
 
 def print_summary(folder: Path) -> None:
@@ -60,6 +71,9 @@ def print_summary(folder: Path) -> None:
         table.add_row("  with a plug-in failure", f"[red]{counts['failed']}[/]")
         for failure in run["failures"]:
             table.add_row(f"    {failure['frames']} of them", escape(failure["reason"]))
+    if refinement := run.get("refinement"):
+        took = f"{refinement['frames']} frames in {shown(refinement['seconds'])} s"
+        table.add_row("final refinement", took if refinement["frames"] else escape(refinement["reason"]))
     table.add_row("mean IoU with the initial masks", shown(run["iou_initial_mean"]))
     table.add_row("seconds per frame", shown(seconds))
     for what, names in _OUTPUTS.items():
@@ -80,7 +94,8 @@ _OUTPUTS = {
 def _line(frame: FrameRecord | SkippedFrame) -> str:
     if isinstance(frame, SkippedFrame):
         return f"[{_COLOURS['skipped']}]frame {frame.index} skipped[/]"
+    once_more = "once more: " if frame.refined else ""
     return (
-        f"frame {frame.index} [{_COLOURS[frame.status]}]{frame.status}[/] "
+        f"{once_more}frame {frame.index} [{_COLOURS[frame.status]}]{frame.status}[/] "
         f"IoU {shown(frame.iou_initial)} {frame.seconds:.2f} s"
     )

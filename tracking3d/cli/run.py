@@ -6,7 +6,7 @@ import logging
 import shlex
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -24,15 +24,19 @@ def run(
         ),
     ],
     box: Annotated[
-        str | None,
+        list[str] | None,
         typer.Option(
-            metavar="X,Y,W,H", help="Object in the first frame, in pixels.", rich_help_panel=_TRACKING
+            metavar="X,Y,W,H",
+            help="Object in the first frame, in pixels; may be repeated.",
+            rich_help_panel=_TRACKING,
         ),
     ] = None,
     mask: Annotated[
-        Path | None,
+        list[Path] | None,
         typer.Option(
-            metavar="FILE", help="Mask of the object in the first frame.", rich_help_panel=_TRACKING
+            metavar="FILE",
+            help="Mask of the object in the first frame; may be repeated.",
+            rich_help_panel=_TRACKING,
         ),
     ] = None,
     masks: Annotated[
@@ -86,6 +90,15 @@ def run(
     seed: Annotated[
         int | None, typer.Option(help="Seed of everything random.", rich_help_panel=_RUNNING)
     ] = None,
+    final_refine: Annotated[
+        bool | None,
+        typer.Option(
+            "--final-refine/--no-final-refine",
+            help="When a file ends, answer for all frames once more; both answers are kept.",
+            show_default=False,
+            rich_help_panel=_RUNNING,
+        ),
+    ] = None,
     on_plugin_failure: Annotated[
         str | None,
         typer.Option(
@@ -99,9 +112,11 @@ def run(
 ) -> None:
     """Track the object through SOURCE: masks, poses and a textured mesh in a run folder.
 
-    Say what the object is by --box, --mask or --masks.
+    Say what the object is by --box, --mask or --masks. Several boxes or masks are several objects, each with a run
+    folder of its own in the one of the run.
     """
-    if box is not None and mask is not None:
+    boxes, object_masks = box or [], mask or []
+    if boxes and object_masks:
         raise InputError("Give either --box or --mask, not both.")
     chosen: dict[str, str | None] = {"name": tracker}
     if masks is not None:
@@ -118,37 +133,40 @@ def run(
         camera={"fov": fov, "intrinsics": camera or None},
         object={"flat": flat or None, "prototype": prototype},
         window={"size": size},
+        solver={"final_refine": final_refine},
         runtime={"device": device, "seed": seed, "on_plugin_failure": on_plugin_failure},
     )
-    if box is None and mask is None and settings.tracker.name != "precomputed":
+    if not boxes and not object_masks and settings.tracker.name != "precomputed":
         raise InputError(
             "Say what the object is in the first frame: --box X,Y,W,H, --mask FILE, or --masks DIR."
         )
 
     from tracking3d.cli.progress import print_summary, progress
     from tracking3d.prompts import parse_box
-    from tracking3d.recording import record
+    from tracking3d.recording import record, record_objects
+    from tracking3d.results.layout import object_folders
     from tracking3d.video import open_source
 
-    given = None if box is None else parse_box(box)
+    given = [parse_box(text) for text in boxes]
     opened = open_source(source, frames)
     folder = out or default_folder(source)
     if quiet:
         logging.getLogger("tracking3d").setLevel(logging.ERROR)
-    with progress(opened.count, quiet) as listener:
-        record(
-            opened,
-            settings,
-            folder,
-            box=given,
-            mask=mask,
-            command=shlex.join(sys.argv),
-            selection=frames,
-            overwrite=overwrite,
-            listener=listener,
-        )
-    if not quiet:
-        print_summary(folder)
+    objects = max(len(given) + len(object_masks), 1)
+    folders = object_folders(folder, objects) if objects > 1 else [folder]
+    about: dict[str, Any] = {
+        "command": shlex.join(sys.argv),
+        "selection": frames,
+        "overwrite": overwrite,
+    }
+    with progress(opened.count, quiet, objects) as about["listener"]:
+        if objects > 1:
+            record_objects(opened, settings, folder, boxes=given, masks=object_masks, **about)
+        else:
+            the_box, the_mask = next(iter(given), None), next(iter(object_masks), None)
+            record(opened, settings, folder, box=the_box, mask=the_mask, **about)
+    for one in () if quiet else folders:
+        print_summary(one)
 
 
 def default_folder(source: str) -> Path:

@@ -20,14 +20,14 @@ def synth(
         Path, typer.Argument(metavar="OUT", help="Folder of the suite, or of the one sequence.")
     ] = Path("synthetic"),
     suite: Annotated[
-        str | None, typer.Option(metavar="NAME", help="A fixed suite: smoke, standard or full.")
+        str | None, typer.Option(metavar="NAME", help="A fixed suite: smoke, standard, hard or full.")
     ] = None,
     object_: Annotated[
         str | None,
         typer.Option(
             "--object",
             metavar="NAME|MESH",
-            help="box, bottle, blob, mug, card, wedge, or a mesh file in metres.",
+            help="box, bottle, blob, mug, card, wedge, vase, or a mesh file in metres.",
             rich_help_panel=_ONE,
         ),
     ] = None,
@@ -111,7 +111,7 @@ def synth(
         folders = _make_one(settings, out, overwrite, quiet)
     else:
         raise InputError(
-            "Say what to make: --suite smoke, standard or full, or one sequence by --object NAME."
+            "Say what to make: --suite smoke, standard, hard or full, or one sequence by --object NAME."
         )
     if bop is not None:
         _export(folders, bop, quiet)

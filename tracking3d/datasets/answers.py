@@ -37,6 +37,7 @@ class Answers:
         confidence: In [0, 1] by frame index.
         seconds: Wall time by frame index.
         peak_memory_mb: Most memory held, in 10^6 bytes, where recorded.
+        memory_growth_mb: How much more was held at most in the second half of the frames than in the first.
         mesh: Reads the estimated shape in object coordinates.
         points: Follows points.
     """
@@ -52,5 +53,6 @@ class Answers:
     confidence: Mapping[int, float] = field(default_factory=dict)
     seconds: Mapping[int, float] = field(default_factory=dict)
     peak_memory_mb: float | None = None
+    memory_growth_mb: float | None = None
     mesh: Callable[[], trimesh.Trimesh] | None = None
     points: PointTracker | None = None

@@ -8,12 +8,13 @@
     rough_masks/000000.png       0/255, not the truth but a tracker's input; also initial_masks/
     depth/000000.png             uint16, along the camera's z axis
     poses.json                   per frame R, t and trusted; OpenCV axes, x_cam = R x_obj + t; units
-    camera.json                  K, width, height; depth_scale: unit of the poses per count of depth, else a millimetre
+    camera.json                  K, width, height; depth_scale: unit of the poses per count of depth, else a millimetre;
+                                 told: false where a tracker is told no camera
     truth_camera.json            the same of the true camera, where a tracker is told the wrong one
     init.json                    the first frame's bbox_xywh and mask
     mesh.obj                     the shape, in the unit of the poses
     points.npz                   positions (T, N, 2) and visible (T, N)
-    info.json                    source, frames, note, millimetres per unit, symmetries (S, 4, 4)
+    info.json                    source, frames, note, millimetres per unit, symmetries (S, 4, 4), symmetry_axis
 
 Everything but the frames may be absent.
 """
@@ -77,6 +78,7 @@ def read_truth(folder: Path) -> Truth:
         box=_initial_box(folder, visible_masks.get(0, masks.get(0))),
         camera=true or told,
         told_camera=told if true else None,
+        camera_told=_optional(folder / "camera.json").get("told", True) is not False,
         T_cam_obj=poses,
         masks=masks or visible_masks,
         visible_masks=visible_masks if masks else {},
@@ -86,6 +88,7 @@ def read_truth(folder: Path) -> Truth:
         initial_masks=_masks(folder / "rough_masks", index) or _masks(folder / "initial_masks", index),
         millimetres=millimetres,
         symmetries=symmetries_of(info.get("symmetries", []), str(folder / "info.json")),
+        symmetry_axis=_symmetry_axis(info.get("symmetry_axis"), folder / "info.json"),
     )
 
 
@@ -242,6 +245,20 @@ def _read_points(file: Path, frames: int) -> PointTruth | None:
     if not np.isfinite(points.positions[points.visible]).all():
         raise InputError(f"{file}: a visible point has a position that is no finite number; correct it.")
     return points
+
+
+def _symmetry_axis(value: Any, file: Path) -> NDArray[np.float64] | None:
+    """The unit direction ``(3,)`` in ``symmetry_axis``, or None."""
+    if value is None:
+        return None
+    try:
+        axis = np.asarray(value["direction"], dtype=np.float64).reshape(3)
+    except (TypeError, ValueError, KeyError) as error:
+        raise InputError(f"{file}: symmetry_axis needs a direction of 3 numbers; correct it.") from error
+    length = np.linalg.norm(axis)
+    if not 0 < length < np.inf:
+        raise InputError(f"{file}: the direction of symmetry_axis must not be zero or infinite; correct it.")
+    return axis / length
 
 
 def _length(value: Any, file: Path, key: str) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,20 +17,27 @@ from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import Status
 from tracking3d.results import layout
 from tracking3d.results.correspondences import track_points
+from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
 from tracking3d.video.selection import parse_selection, within
 
 
-def answers_of_run(folder: Path, truth: Truth) -> Answers:
+def answers_of_run(folder: Path, truth: Truth, *, refined: bool = True) -> Answers:
     """What a run answered for the clip that ``truth`` is about.
 
     A run's frame index is the position of the frame in the clip. If ``run.json`` holds a ``selection``
     ``START:STOP:STEP``, only those frames were asked for.
 
+    Args:
+        folder: The run folder.
+        truth: The clip.
+        refined: Take the answers of the final refinement where there are any, else the causal ones everywhere. A
+            refined answer took the time of the causal one and an equal share of the refinement's.
+
     Raises:
         InputError: If it is not a run folder, or one without any frame of the clip.
     """
-    run = RunReader(folder)
+    run = RunReader(folder, refined)
     selection = run.description.get("selection")
     asked = within(parse_selection(selection and str(selection)), len(truth.frames))
     records = {record.index: record for record in run.frames if record.index in asked}
@@ -43,16 +51,38 @@ def answers_of_run(folder: Path, truth: Truth) -> Answers:
         asked=asked,
         answered=frozenset(records),
         given=min(records),
-        masks={index: MaskFile(layout.mask_path(folder, index)) for index in records},
+        masks={index: MaskFile(run.mask_path(index)) for index in records},
         initial_masks=_initial_masks(folder, list(records)),
         T_cam_obj={index: one.T_cam_obj for index, one in records.items() if is_rigid(one.T_cam_obj)},
         lost=frozenset(index for index, one in records.items() if one.status is Status.LOST),
         confidence={index: one.confidence for index, one in records.items() if math.isfinite(one.confidence)},
-        seconds={index: one.seconds for index, one in records.items() if math.isfinite(one.seconds)},
+        seconds=_seconds(run, records),
         peak_memory_mb=memory if isinstance(memory, int | float) else None,
-        mesh=run.mesh if (folder / layout.OBJ).is_file() else None,
-        points=_RunPoints(run, len(truth.frames)) if (folder / layout.OBJ).is_file() else None,
+        mesh=run.mesh if (run.mesh_folder / layout.OBJ).is_file() else None,
+        points=_RunPoints(run, len(truth.frames)) if (run.mesh_folder / layout.OBJ).is_file() else None,
     )
+
+
+def is_refined(folder: Path) -> bool:
+    """Whether a run holds answers of a final refinement beside the causal ones.
+
+    Raises:
+        InputError: If it is not a run folder.
+    """
+    return any(record.refined for record in RunReader(folder).frames)
+
+
+def _seconds(run: RunReader, records: Mapping[int, FrameRecord]) -> dict[int, float]:
+    """Wall time by frame; of refined answers with the causal ones that came before."""
+    spent = {index: one.seconds for index, one in records.items()}
+    refined = [index for index, one in records.items() if one.refined]
+    if refined:
+        causal = {one.index: one.seconds for one in RunReader(run.folder, refined=False).frames}
+        total = (run.description.get("refinement") or {}).get("seconds")
+        for index in refined:
+            share = total / len(refined) if isinstance(total, int | float) else spent[index]
+            spent[index] = causal.get(index, 0.0) + share
+    return {index: seconds for index, seconds in spent.items() if math.isfinite(seconds)}
 
 
 def _initial_masks(folder: Path, indices: list[int]) -> dict[int, MaskReference]:

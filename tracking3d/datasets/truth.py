@@ -127,6 +127,7 @@ class Truth:
         box: The object in frame 0 as ``(x, y, width, height)``, where a tracker starts from one.
         camera: Of all frames, where known.
         told_camera: What a tracker is told that the camera is, where that is not the true one.
+        camera_told: Whether a tracker is told any camera.
         T_cam_obj: ``(4, 4)`` pose by frame index; only those that are known and trusted.
         masks: The object's mask by frame index, the part behind other things included if the data know it.
         visible_masks: Only the part that is seen; where it differs from `masks` and is known.
@@ -137,6 +138,8 @@ class Truth:
         initial_masks: Rough masks that come with the clip, by frame index; a tracker's input.
         millimetres: Length of the unit of the poses in millimetres, where known.
         symmetries: ``(S, 4, 4)`` object transforms that leave the object as it is, the identity among them.
+        symmetry_axis: ``(3,)`` unit direction in object coordinates: turned about it by any angle, the object is as
+            it was. None without such an axis.
     """
 
     name: str
@@ -144,6 +147,7 @@ class Truth:
     box: Box | None = None
     camera: Camera | None = None
     told_camera: Camera | None = None
+    camera_told: bool = True
     T_cam_obj: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
     masks: Mapping[int, MaskReference] = field(default_factory=dict)
     visible_masks: Mapping[int, MaskReference] = field(default_factory=dict)
@@ -154,6 +158,7 @@ class Truth:
     initial_masks: Mapping[int, MaskReference] = field(default_factory=dict)
     millimetres: float | None = None
     symmetries: NDArray[np.float64] = field(default_factory=lambda: np.eye(4)[None])
+    symmetry_axis: NDArray[np.float64] | None = None
 
     @cached_property
     def names(self) -> tuple[str, ...]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -72,15 +71,6 @@ class Batch:
         )
 
 
-@runtime_checkable
-class WindowEncoder(Protocol):
-    """An encoder that may know a window's features already; see `tracking3d.estimation.frame_features`."""
-
-    def encode_window(self, index: int, pixels: Tensor, window: Window) -> Tensor | None:
-        """The features ``(C, S, S)`` of a window of frame ``index`` ``(3, H, W)``; None to encode it by itself."""
-        ...
-
-
 def observe(
     frame: Frame,
     mask: NDArray[np.bool_] | None,
@@ -95,12 +85,8 @@ def observe(
     image = crop(pixels, window)
     detail = crop(pixels, replace(window, size=2 * window.size))
     valid = crop(torch.ones(1, *frame.size, device=device), window)[0].ge(0.5).float()
-    shared = (
-        encoder.encode_window(frame.index, pixels, window) if isinstance(encoder, WindowEncoder) else None
-    )
     # Features of a stride above 1 are cut out of the finer image, so as not to be coarser than the rest.
-    whole = image if encoder.stride == 1 else detail
-    features = encoder.encode(whole[None]) if shared is None else shared[None]
+    features = encoder.encode((image if encoder.stride == 1 else detail)[None])
     if features.shape[-1] != window.size:
         features = functional.interpolate(
             features, size=(window.size, window.size), mode="bilinear", antialias=True

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.stats import rankdata
 
-from tracking3d.evaluation.arrays import booleans, finite
+from tracking3d.evaluation.arrays import booleans, check_shape, finite
 
 BINS = 10
 """Bins of equal width between 0 and 1."""
@@ -92,6 +93,27 @@ def expected_calibration_error(confidence: ArrayLike, right: ArrayLike, bins: in
         return None
     gaps = np.abs(found.accuracy - found.confidence)
     return float(np.nansum(found.count * gaps) / found.count.sum())
+
+
+def area_under_roc(score: ArrayLike, right: ArrayLike) -> float | None:
+    """Area under the ROC curve: the probability that a right answer has a higher score than a wrong one.
+
+    By ranks (Mann and Whitney, 1947); ties count for a half. None where all are right or all wrong.
+
+    Args:
+        score: ``(N,)``.
+        right: ``(N,)`` bool.
+
+    Raises:
+        ValueError: If the shapes differ or a score is not finite.
+    """
+    said = finite("score", score, None)
+    was_right = np.asarray(right, bool)
+    check_shape("right", was_right.shape, len(said))
+    good, bad = np.count_nonzero(was_right), np.count_nonzero(~was_right)
+    if not good or not bad:
+        return None
+    return float((rankdata(said)[was_right].sum() - good * (good + 1) / 2) / (good * bad))
 
 
 def detection_scores(called: ArrayLike, actual: ArrayLike) -> Detection:

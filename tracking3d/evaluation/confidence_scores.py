@@ -8,7 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from tracking3d.datasets.answers import Answers
-from tracking3d.evaluation.calibration import detection_scores, expected_calibration_error
+from tracking3d.evaluation.calibration import (
+    area_under_roc,
+    detection_scores,
+    expected_calibration_error,
+)
 from tracking3d.evaluation.mask_scores import FrameMasks
 from tracking3d.evaluation.vot import LongTermScores, LongTermSequence, long_term_scores
 
@@ -28,6 +32,8 @@ class ConfidenceScores:
 
     Attributes:
         confidence_calibration_error: Expected calibration error of the confidence; None without confidences.
+        confidence_auc: Probability that a right frame has a higher confidence than a wrong one, ties for a half; None
+            where all are right or all wrong.
         lost_precision: Share of the frames called lost that truly are; None if none was called so.
         lost_recall: Share of the truly lost frames that were called so; None if there is none.
         frames_truly_lost: Number of truly lost frames.
@@ -36,12 +42,29 @@ class ConfidenceScores:
     """
 
     confidence_calibration_error: float | None = None
+    confidence_auc: float | None = None
     lost_precision: float | None = None
     lost_recall: float | None = None
     frames_truly_lost: int = 0
     vot_precision: float | None = None
     vot_recall: float | None = None
     vot_f_score: float | None = None
+
+
+def right_frames(
+    answers: Answers, rotation: Mapping[int, float], masks: Mapping[int, FrameMasks]
+) -> dict[int, bool]:
+    """Whether each frame whose truth is known is right; the given frame aside.
+
+    Args:
+        answers: The method's.
+        rotation: Rotation error in degrees by frame.
+        masks: The masks beside the true ones, by frame.
+    """
+    return {
+        n: rotation.get(n, 0.0) < RIGHT_ROTATION and (n not in masks or masks[n].iou > RIGHT_IOU)
+        for n in sorted((rotation.keys() | masks.keys()) - {answers.given})
+    }
 
 
 def score_confidence(
@@ -54,12 +77,12 @@ def score_confidence(
         rotation: Rotation error in degrees by frame.
         masks: The masks beside the true ones, by frame.
     """
-    frames = sorted((rotation.keys() | masks.keys()) - {answers.given})
-    if not frames:
+    by_frame = right_frames(answers, rotation, masks)
+    if not by_frame:
         return ConfidenceScores()
+    frames, right = list(by_frame), np.array(list(by_frame.values()))
     errors = np.array([rotation.get(n, 0.0) for n in frames])
     ious = np.array([masks[n].iou if n in masks else 1.0 for n in frames])
-    right = (errors < RIGHT_ROTATION) & (ious > RIGHT_IOU)
     lost = (errors > LOST_ROTATION) | (ious < LOST_IOU)
     # Saying nothing of a frame is a way to say that it is lost.
     called = np.array([n in answers.lost or n not in answers.answered for n in frames])
@@ -69,6 +92,7 @@ def score_confidence(
     long_term = _long_term(answers, masks)
     return ConfidenceScores(
         confidence_calibration_error=expected_calibration_error(confidence, right[said]),
+        confidence_auc=area_under_roc(confidence, right[said]),
         lost_precision=detection.precision,
         lost_recall=detection.recall,
         frames_truly_lost=int(lost.sum()),

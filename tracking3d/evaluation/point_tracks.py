@@ -16,7 +16,8 @@ from tracking3d.video.image_file import read_image
 class PointTrackScores:
     """Points asked for where each is first seen (TAP-Vid's query mode ``first``) and followed from there.
 
-    All are None where no true points are known or the method follows none.
+    All are None where no true points are known or the method follows none, and of an object with an axis of symmetry:
+    nothing in the images tells its points around the axis from each other.
 
     Attributes:
         points_average_jaccard: AJ over 1, 2, 4, 8 and 16 pixels of a 256 x 256 raster.
@@ -33,7 +34,7 @@ class PointTrackScores:
 
 def score_points(answers: Answers, truth: Truth) -> PointTrackScores:
     """Ask the method for every true point where it is first seen, and score what it says after that."""
-    if truth.points is None or answers.points is None:
+    if truth.points is None or answers.points is None or truth.symmetry_axis is not None:
         return PointTrackScores()
     tracks, occluded = truth.points.positions.transpose(1, 0, 2), ~truth.points.visible.T
     queries, point = first_queries(occluded, tracks)

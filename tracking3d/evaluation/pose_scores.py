@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from tracking3d.datasets.answers import Answers
 from tracking3d.datasets.truth import Truth
+from tracking3d.evaluation import axis_symmetry
 from tracking3d.evaluation.alignment import ObjectAlignment, align_object_frame, translation_errors
 from tracking3d.evaluation.metrics import (
     aligned_rotation_errors,
@@ -20,6 +21,12 @@ from tracking3d.evaluation.metrics import (
 NO_ESTIMATE = 180.0
 """Rotation error in degrees of a frame without an estimate."""
 
+CURVE_END = 20.0
+"""Rotation error in degrees up to which the curve of `PoseScores.rotation_auc_20_deg` runs."""
+
+AWAY, BACK = 45.0, 5.0
+"""A clip returns to its first view if its last one is within `BACK` degrees of it, after one beyond `AWAY`."""
+
 GOOD_TRANSLATION = 5.0
 """A frame's translation counts as right below so many percent of the object's distance."""
 
@@ -28,13 +35,18 @@ GOOD_TRANSLATION = 5.0
 class PoseScores:
     """Poses over the frames with a trusted pose; see `tracking3d.evaluation.metrics` and `...alignment`.
 
-    All are None where there is no such frame.
+    All are None where there is no such frame. Every one of these frames counts in all figures of rotations: one that
+    was called lost with the error of its pose, and as not right for the shares; one without a pose with 180 degrees.
+    Turns about an axis of symmetry do not count, see `tracking3d.evaluation.axis_symmetry`.
 
     Attributes:
         rotation_error_mean_deg, rotation_error_median_deg, rotation_error_max_deg: Aligned by one rotation.
         rotation_error_anchored_median_deg: Anchored at the first of these frames that has an estimate.
         rotation_error_consecutive_median_deg: From each to the next, where both have an estimate.
+        rotation_error_return_deg: Of the turn from the first to the last of these frames, in a clip that ends with
+            the view that it began with and was 45 degrees away from it in between; None in others.
         share_under_5_deg: Share with an aligned error under 5 degrees; a lost frame counts as not.
+        rotation_auc_20_deg: The same share for a limit from 0 to 20 degrees, averaged over the limit.
         translation_error_mean_percent, translation_error_median_percent: Aligned by one similarity, in percent of
             the median true distance, over the frames that have an estimate.
         translation_share_under_5_percent: Share with an aligned error under 5 percent of that; a frame that is lost
@@ -47,7 +59,9 @@ class PoseScores:
     rotation_error_max_deg: float | None = None
     rotation_error_anchored_median_deg: float | None = None
     rotation_error_consecutive_median_deg: float | None = None
+    rotation_error_return_deg: float | None = None
     share_under_5_deg: float | None = None
+    rotation_auc_20_deg: float | None = None
     translation_error_mean_percent: float | None = None
     translation_error_median_percent: float | None = None
     translation_share_under_5_percent: float | None = None
@@ -62,12 +76,16 @@ class PosePairs:
         frames: All of them that were asked for.
         found: ``(M,)`` positions in `frames` of those that have an estimate.
         T_est, T_true: ``(M, 4, 4)`` of these.
+        all_true: ``(N, 4, 4)`` true poses of all `frames`.
+        axis: ``(3,)`` axis of symmetry in true object coordinates; None without one.
     """
 
     frames: list[int]
     found: NDArray[np.int64]
     T_est: NDArray[np.float64]
     T_true: NDArray[np.float64]
+    all_true: NDArray[np.float64]
+    axis: NDArray[np.float64] | None = None
 
 
 def pair_poses(answers: Answers, truth: Truth) -> PosePairs | None:
@@ -79,7 +97,8 @@ def pair_poses(answers: Answers, truth: Truth) -> PosePairs | None:
     found = [place for place, n in enumerate(frames) if n in poses]
     pairs = [(poses[frames[place]], truth.T_cam_obj[frames[place]]) for place in found]
     T_est, T_true = np.array(pairs).reshape(-1, 2, 4, 4).transpose(1, 0, 2, 3)
-    return PosePairs(frames, np.array(found, dtype=np.int64), T_est, T_true)
+    all_true = np.array([truth.T_cam_obj[n] for n in frames])
+    return PosePairs(frames, np.array(found, dtype=np.int64), T_est, T_true, all_true, truth.symmetry_axis)
 
 
 def fit_alignment(pairs: PosePairs | None, diameter: float | None) -> ObjectAlignment | None:
@@ -98,8 +117,45 @@ def rotation_errors(pairs: PosePairs) -> NDArray[np.float64]:
     """Aligned error of each of ``pairs.frames`` in degrees; 180 where there is no estimate."""
     errors = np.full(len(pairs.frames), NO_ESTIMATE)
     if len(pairs.found):
-        errors[pairs.found] = aligned_rotation_errors(pairs.T_est[:, :3, :3], pairs.T_true[:, :3, :3])
+        R_est, R_true = pairs.T_est[:, :3, :3], pairs.T_true[:, :3, :3]
+        errors[pairs.found] = (
+            aligned_rotation_errors(R_est, R_true)
+            if pairs.axis is None
+            else axis_symmetry.aligned_axis_errors(R_est, R_true, pairs.axis)
+        )
     return errors
+
+
+def return_error(pairs: PosePairs) -> float | None:
+    """Error in degrees of the turn from the first frame to the last; None where the last view is not the first again.
+
+    180 if either has no estimate.
+    """
+    R = pairs.all_true[:, :3, :3]
+    away = _anchored(np.broadcast_to(np.eye(3), R.shape), R, pairs.axis)
+    if not (away.max() > AWAY and away[-1] < BACK):
+        return None
+    if not {0, len(pairs.frames) - 1} <= set(pairs.found.tolist()):
+        return NO_ESTIMATE
+    ends = [[0, -1]]
+    R_est, R_true = pairs.T_est[ends][0, :, :3, :3], pairs.T_true[ends][0, :, :3, :3]
+    return float(_anchored(R_est, R_true, pairs.axis)[-1])
+
+
+def _anchored(
+    R_est: NDArray[np.float64], R_true: NDArray[np.float64], axis: NDArray[np.float64] | None
+) -> NDArray[np.float64]:
+    if axis is None:
+        return anchored_rotation_errors(R_est, R_true)
+    return axis_symmetry.anchored_axis_errors(R_est, R_true, axis)
+
+
+def _consecutive(
+    R_est: NDArray[np.float64], R_true: NDArray[np.float64], axis: NDArray[np.float64] | None
+) -> NDArray[np.float64]:
+    if axis is None:
+        return consecutive_rotation_errors(R_est, R_true)
+    return axis_symmetry.consecutive_axis_errors(R_est, R_true, axis)
 
 
 def score_poses(
@@ -113,9 +169,9 @@ def score_poses(
     consecutive = np.empty(0)
     R_est, R_true = pairs.T_est[:, :3, :3], pairs.T_true[:, :3, :3]
     if len(pairs.found):
-        anchored[pairs.found] = anchored_rotation_errors(R_est, R_true)
+        anchored[pairs.found] = _anchored(R_est, R_true, pairs.axis)
     if len(pairs.found) > 1:
-        consecutive = consecutive_rotation_errors(R_est, R_true)[np.diff(pairs.found) == 1]
+        consecutive = _consecutive(R_est, R_true, pairs.axis)[np.diff(pairs.found) == 1]
     tracked = np.zeros(len(pairs.frames), bool)
     tracked[pairs.found] = [pairs.frames[place] not in answers.lost for place in pairs.found]
     moved = np.full(len(pairs.frames), np.inf)
@@ -128,7 +184,9 @@ def score_poses(
         rotation_error_max_deg=float(aligned.max()),
         rotation_error_anchored_median_deg=float(np.median(anchored)),
         rotation_error_consecutive_median_deg=float(np.median(consecutive)) if len(consecutive) else None,
+        rotation_error_return_deg=return_error(pairs),
         share_under_5_deg=share_under(np.where(tracked, aligned, NO_ESTIMATE)),
+        rotation_auc_20_deg=float(np.mean((1 - aligned / CURVE_END).clip(0) * tracked)),
         translation_error_mean_percent=float(known.mean()) if len(known) else None,
         translation_error_median_percent=float(np.median(known)) if len(known) else None,
         translation_share_under_5_percent=float(np.mean(tracked & (moved < GOOD_TRANSLATION))),

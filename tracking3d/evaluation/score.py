@@ -37,15 +37,21 @@ class Scores(MaskScores, PoseScores, PointTrackScores, ModelScores, ConfidenceSc
         frames: Number of frames of the clip that the method was asked for.
         frames_missing: How many of them it has no answer for.
         frames_lost: How many of them it called lost.
-        seconds_per_frame: Mean wall time of a frame; None where it was not recorded.
+        share_lost: Share of `frames` that it called lost or has no answer for.
+        seconds_per_frame, seconds_per_frame_median: Mean and median wall time of a frame; None where it was not
+            recorded.
         peak_memory_mb: Most memory held, in 10^6 bytes; None where it was not recorded.
+        memory_growth_mb: How much more was held at most in the second half of the frames than in the first.
     """
 
     frames: int
     frames_missing: int
     frames_lost: int
+    share_lost: float
     seconds_per_frame: float | None
+    seconds_per_frame_median: float | None
     peak_memory_mb: float | None
+    memory_growth_mb: float | None
 
 
 def score(answers: Answers, truth: Truth) -> Scores:
@@ -61,6 +67,7 @@ def score(answers: Answers, truth: Truth) -> Scores:
     rotation = {} if pairs is None else dict(zip(pairs.frames, rotation_errors(pairs).tolist(), strict=True))
     masks = compare_masks(answers, truth)
     seconds = list(answers.seconds.values())
+    missing = set(answers.asked) - answers.answered
     return Scores(
         **asdict(score_masks(masks, answers, truth)),
         **asdict(score_poses(answers, truth, pairs, alignment)),
@@ -68,19 +75,27 @@ def score(answers: Answers, truth: Truth) -> Scores:
         **asdict(score_model(answers, truth, pairs, alignment, mesh, diameter)),
         **asdict(score_confidence(answers, rotation, masks)),
         frames=len(answers.asked),
-        frames_missing=len(set(answers.asked) - answers.answered),
+        frames_missing=len(missing),
         frames_lost=len(answers.lost),
+        share_lost=len(missing | answers.lost) / len(answers.asked),
         seconds_per_frame=float(np.mean(seconds)) if seconds else None,
+        seconds_per_frame_median=float(np.median(seconds)) if seconds else None,
         peak_memory_mb=answers.peak_memory_mb,
+        memory_growth_mb=answers.memory_growth_mb,
     )
 
 
-def score_run(run_folder: Path, clip: Path) -> Scores:
+def score_run(run_folder: Path, clip: Path, *, refined: bool = True) -> Scores:
     """Score a run folder against a clip in our own layout, see `tracking3d.datasets.clip`.
+
+    Args:
+        run_folder: The run.
+        clip: The clip that it was made on.
+        refined: See `answers_of_run`.
 
     Raises:
         InputError: If either folder is not what it should be, they have no frame in common, or a mask has not
             the size of the true one.
     """
     truth = read_truth(clip)
-    return score(answers_of_run(run_folder, truth), truth)
+    return score(answers_of_run(run_folder, truth, refined=refined), truth)

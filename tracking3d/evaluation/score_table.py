@@ -10,6 +10,7 @@ ROWS: tuple[tuple[str, str, str], ...] = (
     ("frames", "frames", ""),
     ("frames_missing", "of them without an answer", ""),
     ("frames_lost", "of them called lost", ""),
+    ("share_lost", "lost or without an answer", " of frames"),
     ("iou_initial_mean", "IoU of the initial masks, mean", ""),
     ("iou_mean", "IoU of the answers, mean", ""),
     ("iou_gain_percent", "gain over the initial masks", " %"),
@@ -22,6 +23,8 @@ ROWS: tuple[tuple[str, str, str], ...] = (
     ("rotation_error_anchored_median_deg", "anchored at the first frame, median", "°"),
     ("rotation_error_consecutive_median_deg", "from frame to frame, median", "°"),
     ("share_under_5_deg", "rotation error under 5°", " of frames"),
+    ("rotation_auc_20_deg", "the same, averaged over limits up to 20°", " of frames"),
+    ("rotation_error_return_deg", "rotation error on return to the first view", "°"),
     ("translation_error_median_percent", "translation error, median", " % of the distance"),
     ("points_average_jaccard", "points: average Jaccard", ""),
     ("points_delta_average", "points: share within 1 to 16 px", ""),
@@ -33,15 +36,18 @@ ROWS: tuple[tuple[str, str, str], ...] = (
     ("chamfer_percent", "Chamfer distance", " % of the diameter"),
     ("shape_f_score", "F-score of the shape at 2 %", ""),
     ("confidence_calibration_error", "calibration error of the confidence", ""),
+    ("confidence_auc", "confidence tells right from wrong, area under the curve", ""),
     ("lost_precision", "frames called lost that are", ""),
     ("lost_recall", "lost frames that are called so", ""),
     ("vot_f_score", "VOT long-term F-score", ""),
     ("seconds_per_frame", "seconds a frame, mean", " s"),
+    ("seconds_per_frame_median", "seconds a frame, median", " s"),
     ("peak_memory_mb", "most memory held", " MB"),
+    ("memory_growth_mb", "more held in the second half than in the first", " MB"),
 )
 """Measure, label and unit."""
 
-ALWAYS = 14  # rows that are shown though unknown: what a tracker is asked first
+ALWAYS = 15  # rows that are shown though unknown: what a tracker is asked first
 
 
 def format_scores(scores: Scores) -> Table:

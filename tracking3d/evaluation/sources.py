@@ -15,13 +15,16 @@ from tracking3d.results import layout
 RUN_FOLDER = "run"
 
 
-def open_answers(path: Path, truth: Truth, form: str | None = None, **options: Any) -> tuple[Answers, str]:
+def open_answers(
+    path: Path, truth: Truth, form: str | None = None, *, refined: bool = True, **options: Any
+) -> tuple[Answers, str]:
     """Read answers for the clip that ``truth`` is about.
 
     Args:
         path: A run folder, or what `tracking3d.datasets.readers.read_answers` reads.
         truth: The clip.
         form: ``run`` or a format of `read_answers`; recognised if None.
+        refined: Of a run folder: take the answers of the final refinement where there are any, else the causal ones.
         options: Of that format, such as ``of`` of a trajectory; a run folder has none.
 
     Returns:
@@ -37,5 +40,7 @@ def open_answers(path: Path, truth: Truth, form: str | None = None, **options: A
             raise InputError(
                 f"{path} is a run folder, which has no option {next(iter(options))}; leave it out."
             )
-        return answers_of_run(path, truth), "a run folder"
+        return answers_of_run(path, truth, refined=refined), "a run folder"
+    if not refined:
+        raise InputError(f"{path} is no run folder, so it has no causal answers; leave --answers out.")
     return read_answers(path, truth, form, **options)

@@ -19,7 +19,7 @@ from tracking3d.errors import PluginError, Tracking3dError
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame, MaskEstimate, Prompt
 from tracking3d.plugins.registration import told
-from tracking3d.trackers.protocol import MaskTracker
+from tracking3d.trackers.protocol import CorrectableTracker, MaskTracker
 
 
 class PluginFailure(PluginError):
@@ -78,6 +78,21 @@ class GuardedTracker:
         with _blamed(self._label):
             answer = self._tracker.step(frame)
         return self._checked(answer, frame)
+
+    @property
+    def can_correct(self) -> bool:
+        """Whether the tracker can be re-anchored; see `tracking3d.trackers.protocol.CorrectableTracker`."""
+        return isinstance(self._tracker, CorrectableTracker)
+
+    def correct(self, frame: Frame, mask: NDArray[np.bool_]) -> None:
+        """Re-anchor the tracker on ``mask`` ``(H, W)`` in ``frame``, the latest one; nothing where it cannot be.
+
+        Raises:
+            PluginFailure: If the tracker fails.
+        """
+        if isinstance(self._tracker, CorrectableTracker):
+            with _blamed(self._label):
+                self._tracker.correct(frame, mask.copy())
 
     def _checked(self, answer: Any, frame: Frame) -> MaskEstimate:
         if fault := mask_fault(answer, frame.size):

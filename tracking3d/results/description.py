@@ -52,27 +52,54 @@ def description_at_start(
         "renderer": renderer,
         "versions": versions(),
         "conventions": CONVENTIONS,
+        "refinement": None,
         "skipped": [],
     }
 
 
-def summary(records: Sequence[FrameRecord], skipped: int, seconds: float) -> dict[str, Any]:
+def refinement(
+    state: str, reason: str = "", causal: Sequence[FrameRecord] = (), refined: int = 0, seconds: float = 0.0
+) -> dict[str, Any]:
+    """What came of a final refinement.
+
+    Args:
+        state: ``running``, ``finished``, ``interrupted``, ``failed`` or ``left out``.
+        reason: Why it has that state, in words.
+        causal: The causal answer for every frame.
+        refined: Number of frames that have a second answer.
+        seconds: Wall time it took.
+    """
+    return {
+        "state": state,
+        "reason": reason,
+        "frames": refined,
+        "kept": len(causal) - refined,
+        "seconds": seconds,
+        "causal": {**_by_status(causal), "iou_initial_mean": _mean_iou(causal)},
+    }
+
+
+def summary(
+    records: Sequence[FrameRecord],
+    skipped: int,
+    seconds: float,
+    causal: Sequence[FrameRecord] | None = None,
+) -> dict[str, Any]:
     """Counts, plug-in failures, timings, mean IoU and highest memory of a run.
 
     Args:
         records: The answer for every frame.
         skipped: Number of frames that could not be decoded.
         seconds: Wall time of the whole run.
+        causal: The causal answers, whose seconds are the run's; ``records`` themselves if None.
     """
-    by_status = Counter(record.status for record in records)
-    per_frame = [record.seconds for record in records]
+    per_frame = [record.seconds for record in (records if causal is None else causal)]
     memory = resident_memory()
     failures = Counter(record.failure for record in records if record.failure)
-    ious = [record.iou_initial for record in records if record.iou_initial is not None]
     return {
         "counts": {
             "frames": len(records),
-            **{status.value: by_status[status] for status in Status},
+            **_by_status(records),
             "keyframes": sum(record.keyframe for record in records),
             "skipped": skipped,
             "failed": failures.total(),
@@ -85,9 +112,19 @@ def summary(records: Sequence[FrameRecord], skipped: int, seconds: float) -> dic
             "seconds_per_frame_mean": float(np.mean(per_frame)) if per_frame else None,
             "seconds_per_frame_median": float(np.median(per_frame)) if per_frame else None,
         },
-        "iou_initial_mean": float(np.mean(ious)) if ious else None,
+        "iou_initial_mean": _mean_iou(records),
         "peak_memory_mb": memory and memory[1],
     }
+
+
+def _by_status(records: Sequence[FrameRecord]) -> dict[str, int]:
+    found = Counter(record.status for record in records)
+    return {status.value: found[status] for status in Status}
+
+
+def _mean_iou(records: Sequence[FrameRecord]) -> float | None:
+    ious = [record.iou_initial for record in records if record.iou_initial is not None]
+    return float(np.mean(ious)) if ious else None
 
 
 def versions() -> dict[str, str | None]:

@@ -9,12 +9,16 @@
     overlay.mp4         the video with outlines and axes
     contact_sheet.png   the run at a glance
     mesh.obj, mesh.mtl, texture.png, mesh.glb, features.npz
+    causal/             masks and mesh as they were before the final refinement
+    .refining/          what the final refinement has made so far, while it goes on
 """
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
+
+from tracking3d.errors import OutputError
 
 FORMAT = "tracking3d-run"
 FORMAT_VERSION = 1
@@ -23,6 +27,8 @@ RUN = "run.json"
 FRAMES = "frames.jsonl"
 MASKS = "masks"
 INITIAL_MASKS = "initial_masks"
+CAUSAL = "causal"
+REFINING = ".refining"
 OVERLAY = "overlay.mp4"
 CONTACT_SHEET = "contact_sheet.png"
 OBJ = "mesh.obj"
@@ -37,21 +43,38 @@ CONVENTIONS = {
     "T_cam_obj": "Object to camera: x_cam = R x_obj + t, a row-major 4 x 4 matrix.",
     "scale": "The unit of length is arbitrary unless the user gave one; only ratios mean anything.",
     "mesh": "mesh.obj and mesh.glb are in object coordinates as they are: no axis is swapped or turned.",
-    "revisions": "The last line for an index in frames.jsonl is the answer.",
+    "revisions": (
+        "The last line for an index in frames.jsonl is the answer; of those that are not refined, the last one "
+        "is the causal answer."
+    ),
 }
 
-_FILES = (RUN, FRAMES, OVERLAY, CONTACT_SHEET, OBJ, MTL, TEXTURE, GLB, FEATURES)
+MESH_FILES = (OBJ, MTL, TEXTURE, GLB, FEATURES)
+_FILES = (RUN, FRAMES, OVERLAY, CONTACT_SHEET, *MESH_FILES)
 _MASK_NAME = re.compile(r"\d{6,}\.png")
 
 
 def mask_path(folder: Path, index: int) -> Path:
-    """Where the answer's mask of frame ``index`` lies."""
+    """Where the answer's mask of frame ``index`` lies: in the run folder, or in `CAUSAL` or `REFINING` within it."""
     return folder / MASKS / f"{index:06d}.png"
 
 
 def initial_mask_path(folder: Path, index: int) -> Path:
     """Where the mask tracker's mask of frame ``index`` lies."""
     return folder / INITIAL_MASKS / f"{index:06d}.png"
+
+
+def object_folders(folder: Path, count: int) -> list[Path]:
+    """The run folders of ``count`` objects that are tracked through one video.
+
+    Raises:
+        OutputError: If ``folder`` is the run folder of one object, or holds more objects.
+    """
+    if (folder / RUN).exists():
+        raise OutputError(f"{folder} holds a run of one object; choose another --out for several.")
+    if (more := folder / f"object_{count}").exists():
+        raise OutputError(f"{folder} holds a run of more objects, such as {more.name}; choose another --out.")
+    return [folder / f"object_{number}" for number in range(count)]
 
 
 def partial_path(path: Path) -> Path:
@@ -62,7 +85,14 @@ def partial_path(path: Path) -> Path:
 def run_files(folder: Path) -> list[Path]:
     """The files in ``folder`` that bear the names a run writes, unfinished ones included."""
     named = [folder / name for name in _FILES]
-    for masks in (folder / MASKS, folder / INITIAL_MASKS):
+    named += [folder / CAUSAL / name for name in MESH_FILES]
+    named.append(folder / REFINING / OVERLAY)
+    for masks in (
+        folder / MASKS,
+        folder / INITIAL_MASKS,
+        folder / CAUSAL / MASKS,
+        folder / REFINING / MASKS,
+    ):
         if masks.is_dir():
             names = {path.name.removeprefix(".").removesuffix(".part") for path in masks.iterdir()}
             named += [masks / name for name in sorted(names) if _MASK_NAME.fullmatch(name)]

@@ -35,6 +35,8 @@ class FrameRecord:
         area: Pixels of the answer's mask.
         revision: Whether this replaces an earlier answer.
         failure: Which plug-in failed at this frame, and why; empty where none did.
+        hypothesis: Which start of the pose won, in a word or two; empty where there was no choice.
+        refined: Whether this is the answer of the final refinement, not the causal one.
     """
 
     index: int
@@ -52,6 +54,8 @@ class FrameRecord:
     area: int
     revision: bool = False
     failure: str = ""
+    hypothesis: str = ""
+    refined: bool = False
 
     @classmethod
     def of(
@@ -78,6 +82,8 @@ class FrameRecord:
             area=int(np.count_nonzero(estimate.mask)),
             revision=revision,
             failure=estimate.failure,
+            hypothesis=estimate.hypothesis,
+            refined=bool(estimate.refined),
         )
 
     @classmethod
@@ -103,10 +109,17 @@ class FrameRecord:
         return json.dumps(jsonable(vars(self)), allow_nan=False)
 
 
-def latest(records: Iterable[FrameRecord]) -> list[FrameRecord]:
-    """The answer for every frame: the last record of each index, sorted by index."""
+def latest(records: Iterable[FrameRecord], refined: bool = True) -> list[FrameRecord]:
+    """The answer for every frame: the last record of each index, sorted by index.
+
+    Args:
+        records: In the order in which they were written.
+        refined: Take the answers of the final refinement where there are any, else the causal ones everywhere.
+    """
     answers: dict[int, FrameRecord] = {}
     for record in records:
+        if record.refined and not refined:
+            continue
         before = answers.get(record.index)
         # A revision is made long after the frame was seen and no longer knows its name.
         answers[record.index] = replace(record, name=before.name) if before and not record.name else record

@@ -26,13 +26,16 @@ class RunReader:
 
     Args:
         folder: The run folder.
+        refined: Give the answers of the final refinement where there are any, else the causal ones everywhere:
+            frames, masks and mesh.
 
     Raises:
         InputError: If it is not a run folder, or one of a newer version.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, refined: bool = True) -> None:
         self.folder = Path(folder)
+        self.refined = refined
         self.description = _read_description(self.folder)
 
     @property
@@ -64,7 +67,18 @@ class RunReader:
         Raises:
             InputError: If a line before the last is damaged.
         """
-        return latest(read_records(self.folder / layout.FRAMES))
+        return latest(read_records(self.folder / layout.FRAMES), self.refined)
+
+    @cached_property
+    def _refined_frames(self) -> frozenset[int]:
+        return frozenset(record.index for record in self.frames if record.refined)
+
+    def mask_path(self, index: int) -> Path:
+        """Where the answer's mask of frame ``index`` lies."""
+        causal = layout.mask_path(self.folder / layout.CAUSAL, index)
+        if index in self._refined_frames or not causal.is_file():
+            return layout.mask_path(self.folder, index)
+        return causal
 
     def mask(self, index: int) -> NDArray[np.bool_]:
         """The answer's mask ``(H, W)`` of frame ``index``.
@@ -72,7 +86,7 @@ class RunReader:
         Raises:
             InputError: If there is none.
         """
-        path = layout.mask_path(self.folder, index)
+        path = self.mask_path(index)
         mask = read_mask(path)
         if mask is None:
             raise InputError(
@@ -84,9 +98,16 @@ class RunReader:
         """What the mask tracker gave for frame ``index``, ``(H, W)``, or None."""
         return read_mask(layout.initial_mask_path(self.folder, index))
 
+    @property
+    def mesh_folder(self) -> Path:
+        """Where the mesh that belongs to the answers lies, if there is one; see `load_mesh` and `load_model`."""
+        causal = self.folder / layout.CAUSAL
+        of_causal = not self._refined_frames and (causal / layout.OBJ).is_file()
+        return causal if of_causal else self.folder
+
     def mesh(self) -> trimesh.Trimesh:
         """The textured mesh in object coordinates; see `load_mesh`."""
-        return load_mesh(self.folder)
+        return load_mesh(self.mesh_folder)
 
 
 def read_records(path: Path) -> Iterator[FrameRecord]:

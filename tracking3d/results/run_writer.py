@@ -8,29 +8,28 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
-
-import numpy as np
 
 from tracking3d.errors import InputError, OutputError
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel
 from tracking3d.frames import Frame, SkippedFrame
 from tracking3d.geometry.camera import Camera
 from tracking3d.results import description, layout
-from tracking3d.results.contact_sheet import CROPS, Thumbnails, draw_contact_sheet
 from tracking3d.results.files import read_mask, write_atomic, write_image, write_mask, writing
 from tracking3d.results.lock import try_lock
 from tracking3d.results.mesh_export import export_mesh
-from tracking3d.results.overlay import ObjectAxes, OverlaySize, draw_overlay
+from tracking3d.results.pictures import Pictures
 from tracking3d.results.records import FrameRecord, jsonable, latest
+from tracking3d.results.refinement_writer import RefinementWriter
 from tracking3d.results.run_reader import RunReader, read_records
-from tracking3d.video.writer import VideoWriter
 
 FinalState = Literal["finished", "interrupted", "failed"]
+SKIPS_EVERY = 1.0
+"""Seconds between two writes of ``run.json`` for skipped frames; the last ones are written at the end."""
 DEFAULT_FPS = 10.0
 """Speed of the overlay video where the source has none, such as a folder of images."""
 
@@ -73,10 +72,8 @@ class RunWriter:
         self._camera = camera
         self._fps = fps or DEFAULT_FPS
         self._started = time.monotonic()
-        self._first: FrameEstimate | None = None
-        self._axes: ObjectAxes | None = None
-        self._thumbnails = Thumbnails()
-        self._video: VideoWriter | None = None
+        self._pictures = Pictures(self.folder / layout.OVERLAY, camera, self._fps)
+        self._refinement: RefinementWriter | None = None
         self._over = False
         self._description = description.description_at_start(
             config=config,
@@ -113,7 +110,8 @@ class RunWriter:
     def write(self, estimate: FrameEstimate, frame: Frame) -> FrameRecord:
         """Keep the answer for one frame, and those it revises.
 
-        Overlay and contact sheet show each frame's first answer: they are drawn while its image is there.
+        Overlay and contact sheet show each frame's first answer, since they are drawn while its image is there;
+        a final refinement draws them anew.
 
         Returns:
             What was recorded of ``estimate``.
@@ -124,22 +122,52 @@ class RunWriter:
         for revised in estimate.revised:
             self._record(revised, "", revision=True)
         record = self._record(estimate, frame.name, revision=False)
-        if self._first is None:
-            self._first = estimate
-        if self._axes is None:
-            self._axes = ObjectAxes.of(estimate, self._camera)
-        size = OverlaySize.of(self._camera)
-        overlay = draw_overlay(frame, estimate, record, self._camera, self._axes)
-        self._thumbnails.add(overlay[: size.picture], size.scale, estimate)
-        if self._video is None:
-            self._video = VideoWriter(self.folder / layout.OVERLAY, self._fps, (size.height, size.width))
-        self._video.write(overlay)
+        self._pictures.add(frame, estimate, record)
         return record
 
     def skip(self, skipped: SkippedFrame) -> None:
-        """Record a frame that could not be decoded."""
+        """Record a frame that could not be decoded, or was dropped to keep up with a camera.
+
+        Raises:
+            OutputError: If it cannot be written.
+        """
         self._description["skipped"].append({"index": skipped.index, "reason": skipped.reason})
+        # A camera drops many frames a second, and the file is written whole.
+        if time.monotonic() - self._described >= SKIPS_EVERY:
+            self._write_description()
+
+    def leave_out_refinement(self, reason: str) -> None:
+        """Record that there is no final refinement though one was asked for, and why."""
+        self._description["refinement"] = description.refinement("left out", reason)
         self._write_description()
+
+    def begin_refinement(self, model: ObjectModel) -> RefinementWriter:
+        """All frames have their causal answers; whatever comes now, the folder holds them whole.
+
+        Args:
+            model: The object as it is now; its mesh is written.
+
+        Raises:
+            OutputError: If something cannot be written.
+        """
+        self._pictures.close()
+        self._export(model)
+        causal = latest(read_records(self.folder / layout.FRAMES), refined=False)
+        self._refinement = RefinementWriter(self.folder, self._camera, self._fps, causal)
+        self._description["refinement"] = self._refinement.described("running")
+        self._write_description()
+        return self._refinement
+
+    def end_refinement(self) -> None:
+        """Put the refined answers in the place of the causal ones, which go to ``causal/``.
+
+        Raises:
+            OutputError: If it cannot be done.
+        """
+        assert self._refinement is not None
+        self._refinement.take_over(self._append_all)
+        self._description["refinement"] = self._refinement.described("finished")
+        self._pictures, self._refinement = self._refinement.pictures, None
 
     def finish(self, model: ObjectModel | None, state: FinalState, error: str | None = None) -> None:
         """Write what is made at the end and the final state, and let go of the folder.
@@ -159,7 +187,10 @@ class RunWriter:
         self._over = True
         try:
             problem = _first_problem(
-                self._close_video, partial(self._export, model), partial(self._finish, model)
+                self._pictures.close,
+                partial(self._give_up_refinement, state, error),
+                partial(self._export, model),
+                partial(self._finish, model),
             )
             if problem:
                 state, error = "failed", str(problem)
@@ -189,8 +220,12 @@ class RunWriter:
             initial = read_mask(initial_path)
         record = FrameRecord.of(estimate, name, initial, revision)
         write_mask(layout.mask_path(self.folder, estimate.index), estimate.mask)
-        self._append(record.to_json().encode() + b"\n")
+        self._append_all([record])
         return record
+
+    def _append_all(self, records: Sequence[FrameRecord]) -> None:
+        """Append the lines of all records, or none of them."""
+        self._append(b"".join(record.to_json().encode() + b"\n" for record in records))
 
     def _append(self, line: bytes) -> None:
         """Append a whole line or nothing."""
@@ -205,25 +240,29 @@ class RunWriter:
                 raise
 
     def _write_description(self) -> None:
+        self._described = time.monotonic()
         text = json.dumps(jsonable(self._description), indent=2, allow_nan=False)
         write_atomic(self.folder / layout.RUN, text.encode() + b"\n")
 
-    def _close_video(self) -> None:
-        if self._video is not None:
-            self._video.close()
+    def _give_up_refinement(self, state: FinalState, error: str | None) -> None:
+        """Where a refinement did not come to its end."""
+        if self._refinement is not None:
+            self._refinement.give_up()
+            self._description["refinement"] = self._refinement.described(state, error or "")
 
     def _export(self, model: ObjectModel | None) -> None:
         if model is not None:
             export_mesh(self.folder, model)
 
     def _finish(self, model: ObjectModel | None) -> None:
-        records = latest(read_records(self.folder / layout.FRAMES))
+        records = list(read_records(self.folder / layout.FRAMES))
         seconds = time.monotonic() - self._started
-        figures = description.summary(records, len(self._description["skipped"]), seconds)
+        figures = description.summary(
+            latest(records), len(self._description["skipped"]), seconds, latest(records, refined=False)
+        )
         self._description |= figures
-        if self._first is not None:
-            rotation = np.asarray(self._first.T_cam_obj, dtype=np.float64)[:3, :3]
-            sheet = draw_contact_sheet(self._thumbnails.spread(CROPS), model, rotation, figures)
+        sheet = self._pictures.contact_sheet(model, figures)
+        if sheet is not None:
             write_image(self.folder / layout.CONTACT_SHEET, sheet)
 
 

@@ -1,4 +1,4 @@
-"""Procedural objects from a seed: box, bottle, blob, mug, card and wedge.
+"""Procedural objects from a seed: box, bottle, blob, mug, card, wedge and vase.
 
 They are about one unit in radius, y is up. Their shape is fixed but for the blob's, which like all textures comes
 from the seed.
@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tracking3d.synthesis.patches import Array, Patch, assemble, cube_sphere, prism, revolved, tube
-from tracking3d.synthesis.procedural_texture import paint_panel, paint_plain
+from tracking3d.synthesis.procedural_texture import paint_bands, paint_panel, paint_plain
 from tracking3d.synthesis.solid import Solid
 from tracking3d.synthesis.spec import SequenceSpec
 
@@ -46,6 +46,13 @@ def bottle(rng: np.random.Generator) -> list[Patch]:
     """A surface of revolution with shoulders, neck and cap."""
     profile = [(0.0, -0.9), (0.33, -0.9), (0.38, -0.84), (0.38, 0.1), (0.36, 0.25), (0.28, 0.4), (0.17, 0.52)]
     profile += [(0.13, 0.62), (0.13, 0.72), (0.18, 0.73), (0.18, 0.93), (0.0, 0.94)]
+    return revolved(_refined(np.array(profile)), sectors=2)
+
+
+def vase(rng: np.random.Generator) -> list[Patch]:
+    """A surface of revolution with a belly; its print of bands does not tell how far it has turned."""
+    profile = [(0.0, -0.88), (0.3, -0.88), (0.36, -0.8), (0.5, -0.55), (0.58, -0.25), (0.56, 0.05)]
+    profile += [(0.44, 0.32), (0.3, 0.5), (0.26, 0.66), (0.34, 0.85), (0.32, 0.9), (0.0, 0.9)]
     return revolved(_refined(np.array(profile)), sectors=2)
 
 
@@ -89,6 +96,7 @@ PROCEDURAL: dict[str, Callable[[np.random.Generator], list[Patch]]] = {
     "mug": mug,
     "card": card,
     "wedge": wedge,
+    "vase": vase,
 }
 """The procedural objects by name."""
 
@@ -97,7 +105,9 @@ def make_procedural_solid(spec: SequenceSpec) -> Solid:
     """The procedural object of a sequence; `SequenceSpec.object` is one of `PROCEDURAL`."""
     patches = PROCEDURAL[spec.object](spec.random("shape"))
     rng = spec.random("texture")
-    if spec.textured:
+    if spec.textured and spec.object == "vase":
+        panels = [paint_bands(rng, PANEL)] * len(patches)
+    elif spec.textured:
         panels = [paint_panel(rng, PANEL) for _ in patches]
     else:
         hue = rng.random()
@@ -106,7 +116,7 @@ def make_procedural_solid(spec: SequenceSpec) -> Solid:
     symmetries, axis = np.eye(4)[None], None
     if not spec.textured and spec.object in ("box", "card"):
         symmetries = _turns([np.zeros(3), *(math.pi * np.eye(3))])
-    if not spec.textured and spec.object == "bottle":
+    if spec.object == "vase" or (not spec.textured and spec.object == "bottle"):
         axis = np.array([0.0, 1.0, 0.0])
         symmetries = _turns(np.linspace(0, 2 * math.pi, _STEPS_AROUND, endpoint=False)[:, None] * axis)
     frame = "origin in the middle of the body, y up, about one unit in radius"

@@ -39,6 +39,17 @@ def paint_plain(rng: np.random.Generator, size: int, hue: float) -> FloatImage:
     return np.clip(np.array(plain_colour(hue), np.float32) + spots[..., None], 0, 255)
 
 
+def paint_bands(rng: np.random.Generator, size: int) -> FloatImage:
+    """A panel ``(size, size, 3)`` of level bands in strong colours: every row is of one colour."""
+    hue = rng.random()
+    palette = [_colour(hue + shift, 0.55 + 0.4 * rng.random(), value) for shift, value in PALETTE]
+    edges = np.cumsum(rng.uniform(0.02, 0.08, 50)) * size
+    band = np.searchsorted(edges, (np.arange(4 * size) + 0.5) / 4)  # four samples a row: an antialiased print
+    colours = np.array(palette, np.float32)[rng.integers(0, len(palette), 51)][band]
+    rows = colours.reshape(size, 4, 3).mean(1)
+    return np.repeat(rows[:, None], size, axis=1)
+
+
 def plain_colour(hue: float) -> tuple[int, int, int]:
     """The colour of textureless objects of a ``hue`` in [0, 1)."""
     return _colour(hue, 0.4, 0.72)

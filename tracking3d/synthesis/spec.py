@@ -60,6 +60,7 @@ class SequenceSpec(Section):
     frames: int = Field(40, ge=1, le=10_000, description="Number of frames.")
     size: tuple[int, int] = Field((320, 240), description="Width and height in pixels.")
     fov: float = Field(45.0, ge=5, le=100, description="True vertical field of view in degrees.")
+    camera_told: bool = Field(True, description="Whether a tracker is told any camera.")
     fill: float = Field(
         0.7,
         ge=0.1,

@@ -22,7 +22,7 @@ from tracking3d.synthesis.writing import SUITE_VERSION, is_complete, write_seque
 
 __all__ = ["SUITES", "SUITE_VERSION", "load_suite", "make_suite"]
 
-SUITES = ("smoke", "standard", "full")
+SUITES = ("smoke", "standard", "hard", "full")
 """The suites by name, in order of size."""
 
 
@@ -51,7 +51,7 @@ def make_suite(
     """Make the sequences of a suite that are not there yet, one folder for each, and ``suite.json``.
 
     Args:
-        name: ``smoke``, ``standard`` or ``full``.
+        name: One of `SUITES`.
         folder: Where to write; made if absent.
         jobs: Processes.
         overwrite: Make complete sequences too.

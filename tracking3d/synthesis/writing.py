@@ -40,7 +40,9 @@ def is_complete(folder: Path, spec: SequenceSpec) -> bool:
     """Whether ``folder`` holds exactly this sequence, made by this version."""
     try:
         info = json.loads((folder / _INFO).read_text(encoding="utf-8"))
-        return bool(info["spec"] == spec.model_dump(mode="json") and info["suite_version"] == SUITE_VERSION)
+        # Checked, not compared as text: a sequence made before a setting existed has its default.
+        made = SequenceSpec.model_validate(info["spec"])
+        return bool(made == spec and info["suite_version"] == SUITE_VERSION)
     except (OSError, ValueError, KeyError, TypeError):
         return False
 
@@ -144,6 +146,8 @@ def _documents(scene: Scene, box: list[int], scale: float) -> dict[str, dict[str
         "camera.json": {**_intrinsics(scene.told_camera), "depth_scale": scale},
         "init.json": {"frame": 0, "bbox_xywh": box, "mask": "masks/000000.png"},
     }
+    if not spec.camera_told:
+        documents["camera.json"] |= {"told": False, "note": "true, and no tracker is told of it"}
     if scene.told_camera != scene.camera:
         documents["camera.json"]["note"] = "wrong on purpose; the true camera is in truth_camera.json"
         documents["truth_camera.json"] = {**_intrinsics(scene.camera), "depth_scale": scale}
@@ -156,6 +160,7 @@ def _documents(scene: Scene, box: list[int], scale: float) -> dict[str, dict[str
         "symmetries": solid.symmetries.tolist(),
     }
     if solid.axis is not None:
+        info["symmetry"] = "continuous axis"
         info["symmetry_axis"] = {"direction": solid.axis.tolist(), "point": [0.0, 0.0, 0.0]}
     documents[_INFO] = {**info, "spec": spec.model_dump(mode="json"), "suite_version": SUITE_VERSION}
     return documents

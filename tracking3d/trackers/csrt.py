@@ -14,10 +14,14 @@ from pydantic import BaseModel, Field
 from tracking3d.errors import InputError, PluginError
 from tracking3d.frames import Box, Frame, Image, MaskEstimate, Prompt
 from tracking3d.trackers.box_trackers import OpenCvBoxes
-from tracking3d.trackers.crops import box_of, clip_box
+from tracking3d.trackers.crops import box_iou, box_of, clip_box
 from tracking3d.trackers.cues import Cues
 from tracking3d.trackers.protocol import Options
 from tracking3d.trackers.segmentation import ColourSegmentation
+
+STRAYED = 0.7
+"""IoU of a correction's box and the box tracker's below which the latter is off the object and begins anew. Above,
+what its filter has learnt over many frames is worth more than a box that fits a little better."""
 
 _CUES = Cues(outline=0.0, background=0.0, novelty=0.0)  # the box does their work
 
@@ -57,6 +61,7 @@ class CsrtTracker:
     def __init__(self, options: CsrtTracker.Options) -> None:
         self._options = options
         self._boxes: BoxTracker | None = None
+        self._box: Box | None = None
         self._segmentation: ColourSegmentation | None = None
 
     @classmethod
@@ -75,26 +80,27 @@ class CsrtTracker:
         self._segmentation = ColourSegmentation(
             frame.image, prompt.box, prompt.mask, size=self._options.segmentation_size, cues=_CUES
         )
-        self._boxes = BoxTracker(self._options, frame.image, prompt.box)
+        self._boxes, self._box = BoxTracker(self._options, frame.image, prompt.box), prompt.box
         return self._segmentation.estimate
 
     def step(self, frame: Frame) -> MaskEstimate:
         """Answer for the next frame."""
         if self._segmentation is None or self._boxes is None:
             raise PluginError("The tracker csrt was asked for a frame before it was started with init.")
-        box = self._boxes.update(frame.image)
+        box = self._box = self._boxes.update(frame.image)
         estimate = self._segmentation.step(frame.image, box)
         if box is None and estimate.mask is not None:
             return MaskEstimate(estimate.mask, estimate.score / 2, "CSR-DCF has lost the object")
         return estimate
 
     def correct(self, frame: Frame, mask: NDArray[np.bool_]) -> None:
-        """Re-anchor the box tracker and the segmentation on ``mask`` ``(H, W)`` in ``frame``."""
+        """Re-anchor the segmentation on ``mask`` ``(H, W)`` in ``frame``, and the box tracker if it has strayed."""
         box = box_of(mask)
         if box is None or self._segmentation is None:
             return
         self._segmentation.correct(frame.image, mask)
-        self._boxes = BoxTracker(self._options, frame.image, box)
+        if self._box is None or box_iou(self._box, box) < STRAYED:
+            self._boxes, self._box = BoxTracker(self._options, frame.image, box), box
 
 
 class BoxTracker(OpenCvBoxes):

@@ -13,8 +13,8 @@ from pydantic import BaseModel, Field
 from tracking3d.errors import InputError, PluginError
 from tracking3d.frames import Box, Frame, Image, MaskEstimate, Prompt
 from tracking3d.trackers.box_trackers import OpenCvBoxes
-from tracking3d.trackers.crops import box_of, clip_box
-from tracking3d.trackers.csrt import BoxTracker, CsrtTracker
+from tracking3d.trackers.crops import box_iou, box_of, clip_box
+from tracking3d.trackers.csrt import STRAYED, BoxTracker, CsrtTracker
 from tracking3d.trackers.cues import Cues
 from tracking3d.trackers.protocol import Options
 from tracking3d.trackers.segmentation import ColourSegmentation
@@ -74,6 +74,7 @@ class FlowTracker:
         self._options = options
         self._segmentation: ColourSegmentation | None = None
         self._witness: OpenCvBoxes | None = None
+        self._witnessed: Box | None = None
 
     @classmethod
     def from_options(cls, options: BaseModel) -> Self:
@@ -95,22 +96,24 @@ class FlowTracker:
             frame.image, prompt.box, prompt.mask, size=options.segmentation_size, cues=cues
         )
         self._witness = _witness(options.witness, frame.image, prompt.box)
+        self._witnessed = prompt.box
         return self._segmentation.estimate
 
     def step(self, frame: Frame) -> MaskEstimate:
         """Answer for the next frame."""
         if self._segmentation is None:
             raise PluginError("The tracker flow was asked for a frame before it was started with init.")
-        box = self._witness.update(frame.image) if self._witness else None
-        return self._segmentation.step(frame.image, box)
+        self._witnessed = self._witness.update(frame.image) if self._witness else None
+        return self._segmentation.step(frame.image, self._witnessed)
 
     def correct(self, frame: Frame, mask: NDArray[np.bool_]) -> None:
-        """Go on from ``mask`` ``(H, W)`` in ``frame``, the witness too."""
+        """Go on from ``mask`` ``(H, W)`` in ``frame``, the witness too if it has strayed."""
         box = box_of(mask)
         if box is None or self._segmentation is None:
             return
         self._segmentation.correct(frame.image, mask)
-        self._witness = _witness(self._options.witness, frame.image, box)
+        if self._witnessed is None or box_iou(self._witnessed, box) < STRAYED:
+            self._witness, self._witnessed = _witness(self._options.witness, frame.image, box), box
 
 
 def _witness(name: str, image: Image, box: Box) -> OpenCvBoxes | None:

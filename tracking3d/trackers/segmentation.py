@@ -76,10 +76,15 @@ class ColourSegmentation:
         return MaskEstimate(self._mask, self._judgement.score, self._judgement.doubt)
 
     def correct(self, image: Image, mask: NDArray[np.bool_]) -> None:
-        """Go on from ``mask`` ``(H, W)`` in ``image``, the latest frame, and learn from its colours."""
-        self._image, self._mask = image, mask.astype(np.float32)
-        self._velocity, self._doubtful_frames = (0, 0), 0
-        if (box := box_of(mask)) is not None:
+        """Go on from ``mask`` ``(H, W)`` in ``image``, the latest frame, and learn from its colours.
+
+        A mask at the place of the last one moves on as that did; of one elsewhere nothing is known.
+        """
+        before, box = box_of(self._mask), box_of(mask)
+        if before is None or box is None or not box_iou(before, box):
+            self._velocity = (0, 0)
+        self._image, self._mask, self._doubtful_frames = image, mask.astype(np.float32), 0
+        if box is not None:
             view = View.of(image, Window.around(box, _MARGIN, self._size))
             self._colours.update(view.colours, *both_sides(cut(self._mask, view.window)))
             self._background.forget(mask)

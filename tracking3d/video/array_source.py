@@ -34,6 +34,11 @@ class ArraySource:
         """Number of selected frames where the iterable has a length."""
         return len(within(self.selection, len(self.arrays))) if isinstance(self.arrays, Sized) else None
 
+    @property
+    def repeatable(self) -> bool:
+        """Whether the iterable can be gone through again, as an iterator cannot."""
+        return not isinstance(self.arrays, Iterator)
+
     def __iter__(self) -> Iterator[Frame | SkippedFrame]:
         """Give the selected frames; an `InputError` ends it at the first item that is no RGB array."""
         return checked(self._frames(), self.name)

@@ -38,6 +38,7 @@ class ImageSequence:
     intrinsics: Intrinsics | None = None
     intrinsics_origin: str = ""
     fps: float | None = None
+    repeatable: bool = True
 
     @classmethod
     def open(cls, name: str, paths: Iterable[Path], selection: range = EVERY_FRAME) -> ImageSequence:

@@ -1,4 +1,4 @@
-"""Frames from a camera that is plugged in."""
+"""Frames from a camera that is plugged in: always the newest one, whoever takes them and however slowly."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import cv2
 
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, Image, SkippedFrame
+from tracking3d.video.latest_frames import newest
 from tracking3d.video.opencv_log import silent_opencv
 from tracking3d.video.selection import EVERY_FRAME
 from tracking3d.video.source import Intrinsics, checked
@@ -20,6 +21,8 @@ from tracking3d.video.source import Intrinsics, checked
 @dataclass(frozen=True, eq=False)
 class LiveCamera:
     """A camera by its OpenCV index; it goes on until the selection ends or the camera stops.
+
+    Frames that come while the one before is still worked on are dropped, see `tracking3d.video.latest_frames`.
 
     See `tracking3d.video.source.FrameSource` for the attributes. Times are seconds since the first frame.
     """
@@ -30,6 +33,7 @@ class LiveCamera:
     count: int | None = None
     intrinsics: Intrinsics | None = None
     intrinsics_origin: str = ""
+    repeatable: bool = False
 
     @classmethod
     def open(cls, number: int, selection: range = EVERY_FRAME) -> LiveCamera:
@@ -49,8 +53,8 @@ class LiveCamera:
         return f"camera {self.number}"
 
     def __iter__(self) -> Iterator[Frame | SkippedFrame]:
-        """Open the camera and give its frames as they come."""
-        return checked(self._frames(), self.name)
+        """Open the camera and give the newest frame whenever one is asked for, those dropped as `SkippedFrame`."""
+        return checked(newest(self._frames()), self.name)
 
     def _frames(self) -> Iterator[Frame]:
         camera = _open(self.number)

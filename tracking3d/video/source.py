@@ -25,6 +25,7 @@ class FrameSource(Protocol):
         fps: Selected frames per second (the source's rate over the step), or None where it has no rate.
         intrinsics: ``(fx, fy, cx, cy)`` in pixels where the source knows its lens, else None.
         intrinsics_origin: Where the intrinsics came from, in words; empty where there are none.
+        repeatable: Whether iterating once more gives the same frames again.
     """
 
     @property
@@ -41,6 +42,9 @@ class FrameSource(Protocol):
 
     @property
     def intrinsics_origin(self) -> str: ...  # noqa: D102
+
+    @property
+    def repeatable(self) -> bool: ...  # noqa: D102
 
     def __iter__(self) -> Iterator[Frame | SkippedFrame]:
         """Decode the selected frames.

@@ -35,6 +35,7 @@ class VideoFile:
     fps: float | None
     intrinsics: Intrinsics | None = None
     intrinsics_origin: str = ""
+    repeatable: bool = True
 
     @classmethod
     def open(cls, name: str, path: Path, selection: range = EVERY_FRAME) -> VideoFile:

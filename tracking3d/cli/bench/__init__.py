@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import typer
 
-from tracking3d.cli.bench import masks, matching, render
+from tracking3d.cli.bench import live, masks, matching, render
 
 app = typer.Typer(
     help="Measure how fast, and how good by themselves, the parts are on this machine.",
     no_args_is_help=True,
 )
 app.command(name="render")(render.render)
+app.command(name="live")(live.live)
 app.command(name="masks")(masks.masks)
 app.command(name="matching")(matching.matching)

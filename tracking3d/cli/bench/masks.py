@@ -24,7 +24,7 @@ def masks(
         str,
         typer.Argument(
             metavar="NAME",
-            help="smoke, standard, full (synthetic), real, the layout of a dataset, or a YAML file of one.",
+            help="smoke, standard, hard, full (synthetic), real, the layout of a dataset, or a YAML file of one.",
         ),
     ],
     data: Data = None,

@@ -32,7 +32,7 @@ app = typer.Typer(
     help="Score answers against the truth, run suites, fill the paper's tables, compare.",
     no_args_is_help=True,
 )
-app.command(name=DEFAULT)(answers.answers)
+app.command(name=DEFAULT)(answers.score_answers)
 app.command(name="suite")(suite.suite)
 app.command(name="table")(table.table)
 app.command(name="compare")(compare.compare)

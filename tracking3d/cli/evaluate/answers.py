@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,7 +12,14 @@ from tracking3d.cli.options import Debug
 from tracking3d.errors import InputError
 
 
-def answers(
+class Answers(StrEnum):
+    """Which answers of a run are scored."""
+
+    final = "final"
+    causal = "causal"
+
+
+def score_answers(
     results: Annotated[
         Path,
         typer.Argument(
@@ -30,6 +38,10 @@ def answers(
             "--option", metavar="KEY=VALUE", help="Option of the format, such as of=camera; may be repeated."
         ),
     ] = None,
+    answers: Annotated[
+        Answers,
+        typer.Option(help="Of a run with a final refinement: score its final answers, or the causal ones."),
+    ] = Answers.final,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON only.")] = False,
     debug: Debug = False,
 ) -> None:
@@ -44,7 +56,8 @@ def answers(
     from tracking3d.evaluation.sources import open_answers
 
     known = read_truth(truth)
-    given, kind = open_answers(results, known, form, **_read_options(options))
+    refined = answers is Answers.final
+    given, kind = open_answers(results, known, form, refined=refined, **_read_options(options))
     if form is None and not as_json:
         typer.echo(f"{results} is read as {kind}.", err=True)
     scores = score(given, known)

@@ -17,7 +17,8 @@ Masks = Annotated[
     str,
     typer.Option(
         metavar="SOURCE",
-        help="Initial masks: tracker, truth, initial, degraded:IOU, or a folder with one of masks a sequence.",
+        help="Initial masks: tracker, truth, initial, degraded:IOU, noise:PIXELS, hand, or a folder with one of masks "
+        "a sequence.",
     ),
 ]
 Sequences = Annotated[

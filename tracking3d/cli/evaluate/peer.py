@@ -26,6 +26,6 @@ def peer(
     """
     if system not in PEERS:
         raise InputError(f"The system '{system}' is unknown; choose one of {', '.join(PEERS)}.")
-    from tracking3d.cli.evaluate.answers import answers
+    from tracking3d.cli.evaluate.answers import score_answers
 
-    answers(model, truth, form=system, as_json=as_json, debug=debug)
+    score_answers(model, truth, form=system, as_json=as_json, debug=debug)

@@ -16,7 +16,7 @@ def suite(
         str,
         typer.Argument(
             metavar="NAME",
-            help="smoke, standard, full (synthetic), real, the layout of a dataset, or a YAML file of one.",
+            help="smoke, standard, hard, full (synthetic), real, the layout of a dataset, or a YAML file of one.",
         ),
     ],
     data: Data = None,
@@ -57,7 +57,8 @@ def suite(
     if as_json:
         typer.echo(file)
     elif not quiet:
-        print_table(format_results(results))
+        for one in results.split():
+            print_table(format_results(one))
         typer.echo(file)
     for sequence, error in results.errors.items():
         typer.echo(f"{sequence} failed: {error}", err=True)

@@ -57,6 +57,7 @@ _MOST_WAITING = 40
 _FEWEST_WAITING = 12
 _LASTING = 0.4
 VERBOSE = False
+REFINE_PASSES = 3
 _ENOUGH_MATURE = 30
 
 
@@ -282,12 +283,7 @@ class OnlineSolver:
                 if other_fit.appearance + self.weights.outline * other_fit.outline < fit.appearance + self.weights.outline * fit.outline:
                     fit, won = other_fit, "keyframe"
                     followed = matched
-        # drop points that do not agree
-        if len(followed):
-            R, t = pose_arrays(fit.pose)
-            gap = np.linalg.norm(project_points(known.landmarks[followed.landmark], fit.pose, self.camera) - followed.pixel, axis=1)
-            young = known.sightings[followed.landmark] < 2
-            followed = followed.only(np.isnan(gap) | (gap < np.where(young, 16, 4) * max(1.0, observation.window.side / 200)))
+        followed = self._agreeing(known, fit.pose, followed, view)
         view = replace(view, pose=fit.pose, points=followed)
         belief = state.moved(fit.pose, frame.index, image, followed)
         silhouette = known.silhouette(fit.pose, self.camera)
@@ -309,6 +305,71 @@ class OnlineSolver:
             losses={"features": fit.appearance, "outline": fit.outline, "points": fit.points, "followed": float(len(followed)), "mask": view.mask_weight},
         )
         return belief, answer
+
+    # --- once more
+    def refine(self, state: Belief) -> Belief:
+        """All keyframes together, until nothing changes much."""
+        known = state.known
+        if state.waiting is not None or not known.keyframes:
+            return state
+        everything = list(range(len(known.keyframes)))
+        for _ in range(REFINE_PASSES):
+            known = recruit(known, self.camera, everything)
+            known = refine_map(
+                known, self.camera, everything, weights=self.fit, prior=self.prior, bundle_iterations=15, rounds=2
+            )
+        return replace(state, known=known, surface=known.surface(), before=None, followed=FollowedPoints.none())
+
+    def revisit(
+        self, state: Belief, frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]
+    ) -> tuple[Belief, FrameEstimate]:
+        """A frame's pose once more, against the final map."""
+        started = time.perf_counter()
+        binary = mask.binary
+        if binary is not None and not binary.any():
+            binary = None
+        known, image = state.known, grey(frame.image)
+        own = next((view for view in known.keyframes if view.index == frame.index), None)
+        causal = pose_of(T_cam_obj[:3, :3], T_cam_obj[:3, 3], known.vertices)
+        starts = [causal]
+        followed = follow(state.grey, image, state.followed) if len(state.followed) else state.followed
+        if own is not None:
+            starts.append(own.pose)
+            new = ~np.isin(followed.landmark, own.points.landmark)
+            followed = FollowedPoints(
+                np.concatenate([own.points.landmark, followed.landmark[new]]),
+                np.concatenate([own.points.pixel, followed.pixel[new]]),
+            )
+        if state.before is not None:
+            starts.append(extrapolate(state.before[0], state.last[0], 1.0))
+        found = self._pnp(known, followed)
+        if found is not None:
+            starts.append(found)
+        view = View(
+            self._observe(state, frame, binary, starts[-1]), binary, starts[-1], followed,
+            mask_weight=mask_weight(binary, followed.only(~known.candidate[followed.landmark])),
+        )  # fmt: skip
+        fit = self._fit(state, view, starts, followed)
+        followed = self._agreeing(known, fit.pose, followed, view)
+        last = state.last if state.before is not None or own is None or frame.index else None
+        belief = replace(
+            state, before=state.last if last is not None else None, last=(fit.pose, frame.index), grey=image, followed=followed
+        )
+        answer = self._answer(frame, binary, fit.pose, Status.TRACKED, "", 0.5, started)
+        answer = replace(
+            answer, mask=known.silhouette(fit.pose, self.camera), refined=True,
+            losses={"features": fit.appearance, "outline": fit.outline, "points": fit.points, "followed": float(len(followed)), "mask": view.mask_weight},
+        )
+        return belief, answer
+
+    def _agreeing(self, known: ObjectMap, pose: Pose, followed: FollowedPoints, view: View) -> FollowedPoints:
+        """Points that are where the pose says, or of which that is not known."""
+        if not len(followed):
+            return followed
+        gap = np.linalg.norm(project_points(known.landmarks[followed.landmark], pose, self.camera) - followed.pixel, axis=1)
+        young = known.sightings[followed.landmark] < 2
+        scale = max(1.0, view.observation.window.side / 200)
+        return followed.only(np.isnan(gap) | (gap < np.where(young, 16, 4) * scale))
 
     def _is_new(self, known: ObjectMap, pose: Pose) -> bool:
         turned = min(

@@ -1,0 +1,71 @@
+"""What a run shows of itself: the overlay video and the crops of the contact sheet, drawn frame by frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tracking3d.estimation.estimate import FrameEstimate, ObjectModel
+from tracking3d.frames import Frame, Image
+from tracking3d.geometry.camera import Camera
+from tracking3d.results.contact_sheet import CROPS, Thumbnails, draw_contact_sheet
+from tracking3d.results.overlay import ObjectAxes, OverlaySize, draw_overlay
+from tracking3d.results.records import FrameRecord
+from tracking3d.video.writer import VideoWriter
+
+
+class Pictures:
+    """The pictures of one pass over the frames; the video's file is made with the first of them.
+
+    Args:
+        video: The file of the overlay video.
+        camera: The camera of the full frame.
+        fps: Speed of the video.
+    """
+
+    def __init__(self, video: Path, camera: Camera, fps: float) -> None:
+        self._file, self._camera, self._fps = video, camera, fps
+        self._video: VideoWriter | None = None
+        self._first: FrameEstimate | None = None
+        self._axes: ObjectAxes | None = None
+        self._thumbnails = Thumbnails()
+
+    def add(self, frame: Frame, estimate: FrameEstimate, record: FrameRecord) -> None:
+        """Draw the next frame while its image is there.
+
+        Raises:
+            OutputError: If the video cannot be written.
+        """
+        if self._first is None:
+            self._first = estimate
+        if self._axes is None:
+            self._axes = ObjectAxes.of(estimate, self._camera)
+        size = OverlaySize.of(self._camera)
+        overlay = draw_overlay(frame, estimate, record, self._camera, self._axes)
+        self._thumbnails.add(overlay[: size.picture], size.scale, estimate)
+        if self._video is None:
+            self._video = VideoWriter(self._file, self._fps, (size.height, size.width))
+        self._video.write(overlay)
+
+    def close(self) -> None:
+        """Finish the video.
+
+        Raises:
+            OutputError: If the rest of it cannot be written.
+        """
+        if self._video is not None:
+            self._video.close()
+
+    def contact_sheet(self, model: ObjectModel | None, figures: dict[str, Any]) -> Image | None:
+        """The contact sheet, ``(H, W, 3)``; None before the first frame.
+
+        Args:
+            model: The object; None leaves texture and mesh out.
+            figures: As `tracking3d.results.description.summary` gives them.
+        """
+        if self._first is None:
+            return None
+        rotation = np.asarray(self._first.T_cam_obj, dtype=np.float64)[:3, :3]
+        return draw_contact_sheet(self._thumbnails.spread(CROPS), model, rotation, figures)

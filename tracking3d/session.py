@@ -1,0 +1,281 @@
+"""One object tracked through one video: the parts that a configuration names, and the state between frames."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from tracking3d.config.camera import choose_camera
+from tracking3d.config.models import PipelineConfig
+from tracking3d.errors import InputError
+from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
+from tracking3d.estimation.paper.solver import PaperSolver
+from tracking3d.estimation.solver import RefiningSolver, Solver
+from tracking3d.features.protocol import FeatureEncoder
+from tracking3d.frames import Frame, MaskEstimate, Prompt
+from tracking3d.geometry.camera import Camera
+from tracking3d.plugins import FEATURES, TRACKERS, build_plugin, plugin_label
+from tracking3d.plugins.guard import GuardedEncoder, GuardedTracker, PluginFailure
+from tracking3d.rendering import prepare_backend
+
+SOLVERS: dict[str, Callable[[PipelineConfig, Camera, FeatureEncoder], Solver[Any]]] = {"paper": PaperSolver}
+"""Solvers by the name that `solver.name` selects."""
+
+SURE = 0.6
+"""Confidence from which an answer's mask is handed back to the mask tracker. An answer that is as likely wrong as right
+would teach it as many errors as it mends; the tracker ``onnx`` trusts its own masks from the same score on."""
+
+WORTH_CORRECTING = (0.5, 0.95)
+"""IoU of answer and initial mask between which the latter is corrected. Above, they differ by little more than the
+width of an outline; below, one of them is of something else, and nobody knows which."""
+
+
+class Session:
+    """One object tracked through one video: ``step`` takes each frame, ``result`` gives the object.
+
+    Args:
+        config: The pipeline.
+        prompt: The object in the first frame; None takes the mask tracker's own first mask.
+        intrinsics: fx, fy, cx, cy that the source knows of, in pixels; the configuration wins over them.
+        intrinsics_origin: Where they come from, in words.
+        encoder: A feature encoder that several sessions share, see `build_encoder`; one of its own if None.
+
+    Attributes:
+        config: The pipeline.
+        renderer: What renders, and why, see `tracking3d.rendering.prepare_backend`.
+        initial_mask: What the solver was given for the latest frame: the mask tracker's answer, or what stands in.
+
+    Raises:
+        PluginError: If a plug-in is unknown or broken.
+        InputError: If an option cannot be used on this machine.
+    """
+
+    def __init__(
+        self,
+        config: PipelineConfig,
+        prompt: Prompt | None,
+        intrinsics: tuple[float, float, float, float] | None = None,
+        intrinsics_origin: str = "",
+        encoder: FeatureEncoder | None = None,
+    ) -> None:
+        check_device(config.runtime.device)
+        if config.solver.name not in SOLVERS:
+            raise InputError(f"Unknown solver '{config.solver.name}'; choose one of {', '.join(SOLVERS)}.")
+        if prompt is None and config.tracker.name != "precomputed":
+            raise InputError("Say what the object is by either a box or a mask of the first frame.")
+        runtime = config.runtime
+        try:
+            self.renderer = prepare_backend(runtime.renderer, runtime.device, runtime.threads)
+        except ValueError as error:
+            raise InputError(f"runtime.renderer: {error}.") from error
+        self.config = config
+        self._prompt = prompt
+        self._intrinsics = intrinsics, intrinsics_origin
+        self._tracker = GuardedTracker(
+            build_plugin(TRACKERS, config.tracker), plugin_label(TRACKERS, config.tracker.name)
+        )
+        self._encoder = build_encoder(config) if encoder is None else encoder
+        self._solver: Solver[Any] | None = None
+        self._state: Any = None
+        self._camera: Camera | None = None
+        self.initial_mask = MaskEstimate(None)
+        self._last_pose = np.eye(4)
+        self._failures: dict[int, str] = {}
+        self._refined = False
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of the full frame, known from the first frame on."""
+        if self._camera is None:
+            raise RuntimeError("the camera is known after the first step")
+        return self._camera
+
+    def step(self, frame: Frame) -> FrameEstimate:
+        """Track the object in the next frame; the first call starts on it.
+
+        Raises:
+            InputError: If the first frame has no object, or the frame has another size than the first.
+            PluginError: If a plug-in fails: in the first frame, or with ``runtime.on_plugin_failure`` ``stop`` in
+                any. With ``continue`` a later frame is answered with what there is, and ``failure`` says why.
+            RuntimeError: After ``refine``.
+        """
+        if self._refined:
+            raise RuntimeError("there is no further step after refine")
+        try:
+            return self._start(frame) if self._solver is None else self._go_on(self._solver, frame)
+        except PluginFailure as error:
+            raise error.at(_label(frame)) from error.__cause__
+
+    def _start(self, frame: Frame) -> FrameEstimate:
+        height, width = frame.size
+        self._camera = choose_camera(self.config.camera, width, height, *self._intrinsics)
+        torch.manual_seed(self.config.runtime.seed)
+        mask = self._tracker.init(frame, self._prompt or Prompt((0.0, 0.0, float(width), float(height))))
+        solver: Solver[Any] = SOLVERS[self.config.solver.name](self.config, self._camera, self._encoder)
+        self._state, estimate = solver.init(frame, mask)
+        self._solver, self.initial_mask, self._last_pose = solver, mask, estimate.T_cam_obj
+        return estimate
+
+    def _go_on(self, solver: Solver[Any], frame: Frame) -> FrameEstimate:
+        if frame.size != (self.camera.height, self.camera.width):
+            raise InputError(
+                f"{_label(frame)} has {_pixels(frame.size)} pixels but the first frame "
+                f"{_pixels((self.camera.height, self.camera.width))}; all frames must have one size."
+            )
+        started = time.perf_counter()
+        failures = []
+        try:
+            mask = self._tracker.step(frame)
+        except PluginFailure as error:
+            failures.append(self._excused(error))
+            mask = replace(self.initial_mask, score=0.0, reason=error.reason)
+        self.initial_mask = mask
+        try:
+            self._state, estimate = solver.step(self._state, frame, mask)
+        except PluginFailure as error:
+            failures.append(self._excused(error))
+            estimate = unanswered(frame, mask, self._last_pose, time.perf_counter() - started)
+        self._last_pose = estimate.T_cam_obj
+        if self.config.solver.correct_tracker and self._tracker.can_correct and corrects(estimate):
+            try:
+                self._tracker.correct(frame, estimate.mask)
+            except PluginFailure as error:
+                failures.append(self._excused(error))
+        if failures:
+            self._failures[frame.index] = "; ".join(failures)
+        revised = tuple(self._with_failure(earlier) for earlier in estimate.revised)
+        return self._with_failure(replace(estimate, revised=revised))
+
+    def _excused(self, error: PluginFailure) -> str:
+        """Why a plug-in failed, where the run goes on in spite of it."""
+        if self.config.runtime.on_plugin_failure == "stop":
+            raise error
+        return error.reason
+
+    def _with_failure(self, estimate: FrameEstimate) -> FrameEstimate:
+        """The answer for a frame in which plug-ins failed says so, and is not relied on."""
+        failure = self._failures.get(estimate.index)
+        if failure is None:
+            return estimate
+        return replace(
+            estimate,
+            status=Status.UNCERTAIN if estimate.status is Status.TRACKED else estimate.status,
+            reason="; ".join(filter(None, (failure, estimate.reason))),
+            confidence=estimate.confidence / 2,
+            failure=failure,
+        )
+
+    def result(self) -> ObjectModel:
+        """The object as it is known now: one textured mesh."""
+        if self._solver is None:
+            raise RuntimeError("there is no object before the first step")
+        return self._solver.result(self._state)
+
+    @property
+    def can_refine(self) -> bool:
+        """Whether the solver can look at the whole video once more; known from the first frame on."""
+        return isinstance(self._solver, RefiningSolver)
+
+    def refine(self) -> None:
+        """Solve everything once more over what is known of the whole video.
+
+        ``step`` is over then: ``revisit`` takes the frames again, and ``result`` gives the final object.
+
+        Raises:
+            RuntimeError: If the solver cannot, see ``can_refine``.
+        """
+        self._state = self._refining().refine(self._state)
+        self._refined = True
+
+    def revisit(self, frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]) -> FrameEstimate:
+        """Answer for a frame once more, against the final object. Frames come in order of time.
+
+        Args:
+            frame: The frame.
+            mask: Its initial mask as it was, see ``initial_mask``.
+            T_cam_obj: ``(4, 4)`` the causal answer.
+
+        Raises:
+            PluginError: If a plug-in fails; the causal answer then stands, and the next frame may be asked for.
+            RuntimeError: Before ``refine``.
+        """
+        solver = self._refining()
+        if not self._refined:
+            raise RuntimeError("frames are revisited after refine")
+        try:
+            self._state, estimate = solver.revisit(self._state, frame, mask, T_cam_obj)
+        except PluginFailure as error:
+            raise error.at(_label(frame)) from error.__cause__
+        return self._with_failure(replace(estimate, refined=True))
+
+    def _refining(self) -> RefiningSolver[Any]:
+        if not isinstance(self._solver, RefiningSolver):
+            raise RuntimeError(f"the solver {self.config.solver.name} cannot refine, or has not started")
+        return self._solver
+
+
+def build_encoder(config: PipelineConfig) -> FeatureEncoder:
+    """The feature encoder that a configuration names, under guard.
+
+    Raises:
+        PluginError: If it is unknown or broken.
+    """
+    label = plugin_label(FEATURES, config.features.name)
+    return cast(FeatureEncoder, GuardedEncoder(build_plugin(FEATURES, config.features), label))
+
+
+def corrects(estimate: FrameEstimate) -> bool:
+    """Whether an answer is sure enough, and unlike the initial mask enough, to be handed back to the mask tracker."""
+    if estimate.status is not Status.TRACKED or estimate.initial_mask is None:
+        return False
+    both = np.count_nonzero(estimate.mask & estimate.initial_mask)
+    either = np.count_nonzero(estimate.mask | estimate.initial_mask)
+    least, most = WORTH_CORRECTING
+    return bool(estimate.confidence >= SURE and least * either <= both <= most * either and both)
+
+
+def unanswered(
+    frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64], seconds: float
+) -> FrameEstimate:
+    """The answer where the solver could give none: lost, with the initial mask and the pose known before."""
+    initial = mask.binary if mask.binary is not None and mask.binary.any() else None
+    return FrameEstimate(
+        index=frame.index,
+        time=frame.time,
+        T_cam_obj=T_cam_obj,
+        mask=initial if initial is not None else np.zeros(frame.size, dtype=np.bool_),
+        initial_mask=initial,
+        status=Status.LOST,
+        reason="",
+        confidence=0.0,
+        seconds=seconds,
+    )
+
+
+def check_device(name: str) -> None:
+    """Make sure that a device is there.
+
+    Raises:
+        InputError: If it is not.
+    """
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device).item()
+    except (RuntimeError, AssertionError) as error:
+        raise InputError(
+            f"The device '{name}' is not available on this machine; use --device cpu."
+        ) from error
+
+
+def _label(frame: Frame) -> str:
+    return frame.name or f"frame {frame.index}"
+
+
+def _pixels(size: tuple[int, int]) -> str:
+    return f"{size[1]} x {size[0]}"

@@ -1,0 +1,151 @@
+"""Fit the confidence on half of the sequences of finished benchmark runs, and test it on the other half.
+
+``python training/confidence.py BENCHMARK ... --evidence silhouette,features,matching`` reads every run in the folders
+``--out`` of ``tracking3d evaluate suite``. Evidence are names of losses in ``frames.jsonl``, and ``has_mask``,
+``iou_initial`` and ``recorded`` (the confidence that the run said itself). Without ``--evidence`` all losses count. A
+name with a sign, ``--evidence=-silhouette,+matching``, can only speak against an answer, or for it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tracking3d.benchmark.job import JOB, RUN, Job
+from tracking3d.datasets.run_answers import answers_of_run
+from tracking3d.errors import InputError
+from tracking3d.evaluation.calibration import area_under_roc, expected_calibration_error, reliability
+from tracking3d.evaluation.confidence_fit import PENALTY, LogisticConfidence, fit_confidence, halves, paste
+from tracking3d.evaluation.confidence_scores import right_frames
+from tracking3d.evaluation.mask_scores import compare_masks
+from tracking3d.evaluation.pose_scores import pair_poses, rotation_errors
+from tracking3d.results.run_reader import RunReader
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One frame of a run.
+
+    Attributes:
+        sequence: Its sequence.
+        evidence: What the run knew, by name.
+        right: What the truth says.
+    """
+
+    sequence: str
+    evidence: dict[str, float]
+    right: bool
+
+
+def judged_frames(benchmark: Path, solver: str | None, refined: bool) -> Iterator[Judged]:
+    """Every frame with a known truth of every finished run in a folder of benchmarks."""
+    for file in sorted(benchmark.rglob(JOB)):
+        run = file.parent / RUN
+        if not (run / "run.json").is_file():
+            continue
+        reader = RunReader(run, refined)
+        if reader.state != "finished" or solver not in (None, reader.config["solver"]["name"]):
+            continue
+        truth = Job.read(file).truth
+        answers = answers_of_run(run, truth, refined=refined)
+        pairs = pair_poses(answers, truth)
+        rotation = (
+            {} if pairs is None else dict(zip(pairs.frames, rotation_errors(pairs).tolist(), strict=True))
+        )
+        right = right_frames(answers, rotation, compare_masks(answers, truth))
+        for record in reader.frames:
+            if record.index in right:
+                known = record.iou_initial is not None
+                evidence = {
+                    **record.losses,
+                    "has_mask": float(known),
+                    "iou_initial": record.iou_initial if record.iou_initial is not None else np.nan,
+                    "recorded": record.confidence,
+                }
+                yield Judged(truth.name, evidence, right[record.index])
+
+
+def table(frames: list[Judged], names: list[str]) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Evidence ``(N,)`` by name, NaN where a frame has none, and whether the frames are right ``(N,)``."""
+    evidence = {name: np.array([one.evidence.get(name, np.nan) for one in frames]) for name in names}
+    return evidence, np.array([one.right for one in frames], dtype=bool)
+
+
+def tested(said: np.ndarray, right: np.ndarray) -> str:
+    """What confidences ``(N,)`` are worth, in words."""
+    error, area = expected_calibration_error(said, right), area_under_roc(said, right)
+    brier = float(np.mean((said - right) ** 2))
+    shown = "-" if area is None else f"{area:.3f}"
+    return f"calibration error {error:.3f}, area under the curve {shown}, Brier score {brier:.3f}"
+
+
+def main(words: list[str]) -> None:
+    """Read, fit, test and print."""
+    options = _options(words)
+    frames = [
+        one for folder in options.benchmarks for one in judged_frames(folder, options.solver, options.refined)
+    ]
+    asked = options.evidence.split(",") if options.evidence else _all_losses(frames)
+    names = [name.lstrip("+-") for name in asked]
+    signs = {name.lstrip("+-"): 1 if name[0] == "+" else -1 for name in asked if name[:1] in ("+", "-")}
+    first, second = halves([one.sequence for one in frames])
+    if not second:
+        raise InputError("At least two sequences with finished runs are needed; give other folders.")
+    fits: list[LogisticConfidence] = []
+    for fitted, other in ((first, second), (second, first)):
+        learnt, held_out = (
+            table([one for one in frames if one.sequence in half], names) for half in (fitted, other)
+        )
+        fits.append(fit_confidence(*learnt, signs, options.penalty))
+        evidence, right = held_out
+        said = fits[-1](evidence)
+        print(f"fitted on {len(fitted)} sequences, {len(learnt[1])} frames, {learnt[1].mean():.2f} right")
+        print(f"tested on {len(other)} sequences, {len(right)} frames, {right.mean():.2f} right")
+        print(f"  fitted:   {tested(said, right)}")
+        recorded = table([one for one in frames if one.sequence in other], ["recorded"])[0]["recorded"]
+        if np.isfinite(recorded).all():
+            print(f"  recorded: {tested(recorded, right)}")
+        found = reliability(said, right)
+        for low, high, count, mean, share in zip(
+            found.edges, found.edges[1:], found.count, found.confidence, found.accuracy, strict=False
+        ):
+            if count:
+                print(f"  {low:.1f} to {high:.1f}: {count:5d} frames, said {mean:.2f}, right {share:.2f}")
+    everything = fit_confidence(*table(frames, names), signs, options.penalty)
+    print("\n# fitted on the first half:")
+    print(paste(fits[0]))
+    print("\n# fitted on all sequences:")
+    print(paste(everything))
+    if options.json:
+        options.json.write_text(json.dumps({"half": asdict(fits[0]), "all": asdict(everything)}, indent=1))
+
+
+def _all_losses(frames: list[Judged]) -> list[str]:
+    names = {name for one in frames for name in one.evidence} - {"recorded", "iou_initial"}
+    return sorted(names)
+
+
+def _options(words: list[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("benchmarks", type=Path, nargs="+", help="folders of evaluate suite")
+    parser.add_argument("--evidence", help="names with commas between them")
+    parser.add_argument("--solver", help="only runs of this solver")
+    parser.add_argument("--refined", action="store_true", help="the refined answers, not the causal ones")
+    parser.add_argument(
+        "--penalty", type=float, default=PENALTY, help="how much small coefficients are liked"
+    )
+    parser.add_argument("--json", type=Path, help="write the coefficients there too")
+    return parser.parse_args(words)
+
+
+if __name__ == "__main__":
+    try:
+        main(sys.argv[1:])
+    except (InputError, ValueError) as error:
+        sys.exit(str(error))
