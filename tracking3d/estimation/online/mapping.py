@@ -63,6 +63,19 @@ def mask_weight(mask: NDArray[np.bool_] | None, points: FollowedPoints) -> float
     return float(np.clip((inside - 0.75) / 0.2, 0.02, 1.0))
 
 
+def well_inside(
+    mask: NDArray[np.bool_] | None, silhouette: NDArray[np.bool_], pixel: NDArray[np.float32], margin: float
+) -> NDArray[np.bool_]:
+    """``(N,)`` whether pixels lie in the mask or the silhouette, and at least ``margin`` from the outline of both.
+
+    What lies on an occluding outline slides over the surface as the object turns.
+    """
+    covered = silhouette if mask is None else mask | silhouette
+    depth = cv2.distanceTransform(covered.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3)
+    x, y = np.rint(pixel).astype(int).T
+    return np.asarray(depth[y.clip(0, depth.shape[0] - 1), x.clip(0, depth.shape[1] - 1)] > margin)
+
+
 def to_window(view: View, pixel: NDArray[np.float32]) -> FloatArray:
     """``(N, 2)`` pixels of the full frame in the view's window."""
     window = view.observation.window

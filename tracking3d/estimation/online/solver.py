@@ -20,6 +20,7 @@ from tracking3d.estimation.online.belief import Belief, ObjectMap, View
 from tracking3d.estimation.online.keypoints import Keypoints, detect, match
 from tracking3d.estimation.online.mapping import (
     mask_weight,
+    well_inside,
     nearest_views,
     pose_arrays,
     pose_of,
@@ -58,6 +59,7 @@ _FEWEST_WAITING = 12
 _LASTING = 0.4
 VERBOSE = False
 REFINE_PASSES = 3
+EDGE = 8.0
 _ENOUGH_MATURE = 30
 
 
@@ -369,7 +371,9 @@ class OnlineSolver:
         gap = np.linalg.norm(project_points(known.landmarks[followed.landmark], pose, self.camera) - followed.pixel, axis=1)
         young = known.sightings[followed.landmark] < 2
         scale = max(1.0, view.observation.window.side / 200)
-        return followed.only(np.isnan(gap) | (gap < np.where(young, 16, 4) * scale))
+        agrees = np.isnan(gap) | (gap < np.where(young, 16, 4) * scale)
+        inside = well_inside(view.mask, known.silhouette(pose, self.camera), followed.pixel, EDGE * scale)
+        return followed.only(agrees & (inside | known.candidate[followed.landmark]))
 
     def _is_new(self, known: ObjectMap, pose: Pose) -> bool:
         turned = min(
