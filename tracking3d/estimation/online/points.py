@@ -38,9 +38,15 @@ class FollowedPoints:
     def __len__(self) -> int:
         return len(self.landmark)
 
-    def first(self, most: int) -> FollowedPoints:
-        """The first ones: they have been followed the longest."""
-        return FollowedPoints(self.landmark[:most], self.pixel[:most])
+    def spread(self, most: int, size: float) -> FollowedPoints:
+        """At most so many: one in every square of ``size`` / 20 pixels, the oldest, then others by age."""
+        if len(self) <= most:
+            return self
+        cell = np.floor(self.pixel / max(size / 20, 1.0)).astype(np.int64)
+        _, first = np.unique(cell, axis=0, return_index=True)
+        rest = np.setdiff1d(np.arange(len(self)), first)
+        kept = np.sort(np.concatenate([first, rest])[:most])
+        return FollowedPoints(self.landmark[kept], self.pixel[kept])
 
     def only(self, kept: NDArray[np.bool_]) -> FollowedPoints:
         """Those that are kept."""
@@ -101,7 +107,7 @@ def new_corners(
     if most <= 0 or not mask.any():
         return np.zeros((0, 2), np.float32)
     size = float(np.sqrt(mask.sum()))
-    distance = max(size / 30, 3.0)
+    distance = max(size / 25, 3.0)
     margin = max(round(0.02 * size), 2)
     x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
     box = slice(y, y + height), slice(x, x + width)

@@ -16,13 +16,15 @@ from numpy.typing import NDArray
 from tracking3d.estimation.online.belief import ObjectMap
 from tracking3d.estimation.online.bundle import Structure, adjust
 from tracking3d.estimation.online.mapping import pose_arrays, tracks_of
+from tracking3d.estimation.online.reprojection import project, to_camera
 from tracking3d.geometry.camera import Camera
 
-MOST_CANDIDATES = 80
+MOST_CANDIDATES = 100
 _REACH = 0.25  # how far beside the mask, relative to the root of its area
 _VIEWS = 3
 _FITS, _FAILS = 1.0, 2.5  # mean residual in pixels of an object 200 pixels large
 _MOVED = 6.0  # such pixels
+_STAYS = 0.3  # of the way that the object would have carried it
 
 
 def surroundings(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -36,7 +38,7 @@ def recruit(known: ObjectMap, camera: Camera, positions: list[int]) -> ObjectMap
     """Take candidates over as landmarks, or drop them, where the keyframes at ``positions`` can tell."""
     views = [known.keyframes[position] for position in positions]
     names, counts = np.unique(np.concatenate([view.points.landmark for view in views]), return_counts=True)
-    names = names[(counts >= _VIEWS) & known.candidate[names]]
+    names = names[(counts >= 2) & known.candidate[names]]
     if not len(names):
         return known
     tracks = tracks_of(views, names)
@@ -51,9 +53,15 @@ def recruit(known: ObjectMap, camera: Camera, positions: list[int]) -> ObjectMap
     found = adjust(tracks, camera.K, start, fixed=len(views), scale=scale, iterations=8)
     residual = np.nanmean(found.residual, 0) / scale
     motion = np.nanmax(np.linalg.norm(tracks.pixels - pixel, axis=2), 0) / scale
+    # A point that stays while the object would have carried it along is none of it.
+    carried = np.linalg.norm(project(to_camera(R, t, start.points), camera.K) - pixel, axis=2)
+    carried = np.nanmax(np.where(tracks.visible, carried, np.nan), 0) / scale
+    stays = (carried > _MOVED) & (motion < _STAYS * carried)
     near = np.linalg.norm(found.points - known.vertices.mean(0).cpu().numpy(), axis=1) < 1.6 * known.radius
-    accepted = (residual < _FITS) & (motion > _MOVED) & near
-    rejected = ((residual > _FAILS) | ~near) & (motion > _MOVED) | ((tracks.visible.sum(0) >= 2 * _VIEWS) & ~accepted)
+    enough = tracks.visible.sum(0) >= _VIEWS
+    accepted = enough & (residual < _FITS) & (motion > _MOVED) & near & ~stays
+    rejected = stays | (enough & ((residual > _FAILS) | ~near) & (motion > _MOVED))
+    rejected |= (tracks.visible.sum(0) >= 2 * _VIEWS) & ~accepted
     landmarks, candidate = known.landmarks.copy(), known.candidate.copy()
     landmarks[names[accepted]] = found.points[accepted]
     candidate[names[accepted]] = False

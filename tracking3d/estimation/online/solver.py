@@ -117,7 +117,7 @@ class OnlineSolver:
         inside = view.mask if view.mask is not None else known.silhouette(view.pose, self.camera)
         keypoints = detect(image, inside)
         taken = np.concatenate([view.points.pixel, keypoints.pixel])
-        corners = new_corners(image, inside, taken, MOST_POINTS - len(taken))
+        corners = new_corners(image, inside, taken, MOST_POINTS)
         return with_landmarks(known, self.camera, view, keypoints, corners)
 
     def _with_candidates(self, known: ObjectMap, view: View, image: NDArray[np.uint8]) -> tuple[ObjectMap, View]:
@@ -299,7 +299,7 @@ class OnlineSolver:
                 known, self.camera, window_of(len(known.keyframes), self.map_window), weights=self.fit, prior=self.prior,
             )
             pose = known.keyframes[-1].pose
-            belief = replace(belief, known=known, surface=known.surface(), last=(pose, frame.index), followed=known.keyframes[-1].points.first(MOST_FOLLOWED))
+            belief = replace(belief, known=known, surface=known.surface(), last=(pose, frame.index), followed=known.keyframes[-1].points.spread(MOST_FOLLOWED, float(view.observation.window.side)))
             silhouette = known.silhouette(pose, self.camera)
         answer = self._answer(frame, mask, belief.last[0], Status.TRACKED, "", 0.5, started)
         answer = replace(
