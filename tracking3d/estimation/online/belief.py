@@ -10,9 +10,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tracking3d.estimation.estimate import FrameEstimate
+from tracking3d.estimation.estimate import FrameEstimate, Status
 from tracking3d.estimation.feature_space import FeatureSpace
 from tracking3d.estimation.observation import Observation
+from tracking3d.estimation.online.judgement import Usual
 from tracking3d.estimation.online.keypoints import Keypoints
 from tracking3d.estimation.online.points import FollowedPoints
 from tracking3d.estimation.online.pose_refinement import Surface
@@ -138,6 +139,8 @@ class Belief:
         waiting: First frames that wait for the start, with their answers so far; None once it is done.
         space: What is made of the encoder's features; None leaves them as they are.
         due: Motion at which the next start is tried.
+        usual: What tracked frames have cost.
+        status: Of the last frame.
     """
 
     camera: Camera
@@ -150,6 +153,8 @@ class Belief:
     waiting: tuple[tuple[View, FrameEstimate], ...] | None = ()
     space: FeatureSpace | None = None
     due: float = 0.0
+    usual: Usual = field(default_factory=Usual)
+    status: Status = Status.UNCERTAIN
 
     def moved(self, pose: Pose, index: int, grey: NDArray[np.uint8], followed: FollowedPoints) -> Belief:
         """One frame later."""

@@ -8,15 +8,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-MOST_KEYPOINTS = 250
+_MOST = 250  # keypoints of a frame
 _CONTRAST = 0.02  # half of OpenCV's: the faint texture of small objects counts
+_SIZE = 200  # pixels that the longer side of the object is scaled to, by 0.5 at least and 2 at most
+_BORDER = 8  # pixels around the object that descriptors may look at
 _RATIO = 0.8  # of the distances to the best and the second best, Lowe 2004, section 7.1
-_SIZE = 200  # pixels that the longer side of the object is enlarged to, at most twice
+_SAME_PLACE = 2.0  # pixels within which keypoints are one corner, seen at several scales and orientations
+_ROUNDING = 1e-6  # squared distance between descriptors that are the same
 
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """Keypoints of one frame.
+    """Keypoints of one frame. A corner with two orientations is there twice, as either descriptor may match.
 
     Attributes:
         pixel: ``(M, 2)`` float32 in the full frame.
@@ -36,7 +39,7 @@ class Keypoints:
 
 
 def detect(image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> Keypoints:
-    """The strongest keypoints inside a mask.
+    """The strongest keypoints inside a mask, of the object at one size whatever its size in the frame.
 
     Args:
         image: ``(H, W)`` grey.
@@ -45,39 +48,39 @@ def detect(image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> Keypoints:
     if not mask.any():
         return Keypoints.none()
     x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
-    border = 8
-    left, top = max(x - border, 0), max(y - border, 0)
-    box = slice(top, y + height + border), slice(left, x + width + border)
-    scale = min(max(_SIZE / max(width, height), 0.5), 2.0)
-    size = None
-    crop = cv2.resize(image[box], size, fx=scale, fy=scale, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
-    inside = cv2.resize(
-        mask[box].astype(np.uint8) * 255, crop.shape[::-1], interpolation=cv2.INTER_NEAREST
-    )
-    sift = cv2.SIFT_create(MOST_KEYPOINTS, contrastThreshold=_CONTRAST)
-    found, descriptors = sift.detectAndCompute(crop, inside)
-    if descriptors is None or not len(found):
+    corner = np.array([max(x - _BORDER, 0), max(y - _BORDER, 0)])
+    box = slice(corner[1], y + height + _BORDER), slice(corner[0], x + width + _BORDER)
+    original = np.array(image[box].shape[::-1])
+    scale = float(np.clip(_SIZE / max(width, height), 0.5, 2.0))
+    # Given the size and not the factor, OpenCV scales by exactly the ratio of the sizes.
+    size = np.rint(scale * original).astype(int).tolist()
+    crop = cv2.resize(image[box], size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
+    inside = cv2.resize(mask[box].astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    # Without the precise upscale all places are a quarter of a pixel too far right and down.
+    sift = cv2.SIFT.create(_MOST, contrastThreshold=_CONTRAST, enable_precise_upscale=True)
+    found, descriptor = sift.detectAndCompute(crop, inside)
+    if not len(found):
         return Keypoints.none()
-    actual = np.array([crop.shape[1] / image[box].shape[1], crop.shape[0] / image[box].shape[0]])
-    pixel = (np.array([point.pt for point in found]) + 0.5) / actual - 0.5 + [left, top]
-    # A corner with two orientations is there twice; both descriptors may match.
-    return Keypoints(pixel.astype(np.float32), np.asarray(descriptors, dtype=np.float32))
+    place = np.array([point.pt for point in found])
+    pixel = (place + 0.5) * original / size - 0.5 + corner
+    return Keypoints(pixel.astype(np.float32), np.asarray(descriptor, dtype=np.float32))
 
 
 def match(a: Keypoints, b: Keypoints) -> NDArray[np.int64]:
-    """``(K, 2)`` indices into ``a`` and ``b`` of keypoints that are each other's nearest and clearly so."""
-    if len(a) < 2 or len(b) < 2:
+    """Keypoints that are each other's nearest, and clearly so: nearer than to anything elsewhere in ``b``.
+
+    Returns:
+        ``(K, 2)`` indices into ``a`` and ``b``, each at most once.
+    """
+    if not (len(a) and len(b)):
         return np.zeros((0, 2), np.int64)
     similarity = _rooted(a.descriptor) @ _rooted(b.descriptor).T
-    distance = np.sqrt(np.maximum(2 - 2 * similarity, 0.0))
-    rows = np.arange(len(a))
+    distance = np.sqrt(np.maximum(2 - 2 * similarity, _ROUNDING))
     best = distance.argmin(1)
-    nearest = distance[rows, best]
-    others = distance.copy()
-    # Neighbours at the same place do not make a match doubtful.
-    same = np.abs(b.pixel[None, :] - b.pixel[best][:, None]).max(2) < 2
-    others[same] = np.inf
-    clear = nearest < _RATIO * others.min(1)
+    rows = np.arange(len(a))
+    gap = np.abs(b.pixel[best][:, None] - b.pixel).max(2)
+    elsewhere = np.where(gap < _SAME_PLACE, np.inf, distance).min(1)
+    clear = np.isfinite(elsewhere) & (distance[rows, best] < _RATIO * elsewhere)
     mutual = distance.argmin(0)[best] == rows
     kept = np.flatnonzero(clear & mutual)
     return np.stack([kept, best[kept]], 1)

@@ -13,11 +13,12 @@ from torch import Tensor
 from tracking3d.estimation.online.belief import ObjectMap, View
 from tracking3d.estimation.online.bundle import Structure, Tracks, adjust
 from tracking3d.estimation.online.keypoints import Keypoints, match
+from tracking3d.estimation.online.outline import outline_distance
 from tracking3d.estimation.online.points import FollowedPoints
 from tracking3d.estimation.online.surface_fit import FitWeights, Landmarks, Views, fit_surface
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, from_matrix
-from tracking3d.rendering import rasterize, signed_distance
+from tracking3d.rendering import rasterize
 from tracking3d.rendering import project as project_vertices
 
 FloatArray = NDArray[np.float64]
@@ -284,7 +285,7 @@ def fit_shape(known: ObjectMap, positions: list[int], weights: FitWeights, round
         poses.R,
         poses.translation,
         torch.stack([o.K for o in observations]),
-        signed_distance(torch.stack([o.mask for o in observations])),
+        torch.stack([outline_distance(o) for o in observations]),
         torch.tensor([v.mask_weight * v.observation.has_mask for v in views]).to(known.vertices),
     )
     names, number = np.unique(np.concatenate([v.points.landmark for v in views]), return_counts=True)

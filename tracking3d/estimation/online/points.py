@@ -1,4 +1,4 @@
-"""Points followed from frame to frame by optical flow, and found again between keyframes by their descriptors."""
+"""Points that are followed from frame to frame by optical flow, and new corners to follow."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ MOST_POINTS = 250
 """Points that a frame gets at least, where it has so many corners."""
 MOST_FOLLOWED = 350
 """Points that are followed at once."""
+_SMALLEST = 16  # pixels on either side of a mask in which corners are looked for
 _QUALITY = 0.01  # of the strongest corner, see cv2.goodFeaturesToTrack
+_SUBPIXEL_WINDOW = (3, 3)  # pixels on every side, and how far a corner may be moved
+_SUBPIXEL_STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.03)
 _FLOW_WINDOW = (15, 15)
 _FLOW_LEVELS = 3
 _ROUND_TRIP = 0.7  # pixels that a point followed there and back may miss itself by
@@ -39,17 +42,27 @@ class FollowedPoints:
         return len(self.landmark)
 
     def spread(self, most: int, size: float) -> FollowedPoints:
-        """At most so many: one in every square of ``size`` / 20 pixels, the oldest, then others by age."""
+        """At most ``most``: the oldest in every square of ``size`` / 20 pixels, then others by age.
+
+        Points stand in the order of their age, the oldest first.
+        """
         if len(self) <= most:
             return self
         cell = np.floor(self.pixel / max(size / 20, 1.0)).astype(np.int64)
-        _, first = np.unique(cell, axis=0, return_index=True)
+        first = np.sort(np.unique(cell, axis=0, return_index=True)[1])
         rest = np.setdiff1d(np.arange(len(self)), first)
         kept = np.sort(np.concatenate([first, rest])[:most])
         return FollowedPoints(self.landmark[kept], self.pixel[kept])
 
+    def joined(self, other: FollowedPoints) -> FollowedPoints:
+        """These, and those of another that are not among them."""
+        new = ~np.isin(other.landmark, self.landmark)
+        return FollowedPoints(
+            np.concatenate([self.landmark, other.landmark[new]]), np.concatenate([self.pixel, other.pixel[new]])
+        )
+
     def only(self, kept: NDArray[np.bool_]) -> FollowedPoints:
-        """Those that are kept."""
+        """Those that ``kept`` ``(N,)`` says."""
         return FollowedPoints(self.landmark[kept], self.pixel[kept])
 
 
@@ -77,20 +90,13 @@ def follow(
     """
     if not len(points):
         return points
-    start = points.pixel[:, None]
-    flags = 0 if guess is None else cv2.OPTFLOW_USE_INITIAL_FLOW
-    there = None if guess is None else guess.astype(np.float32)[:, None].copy()
-    options = {"winSize": _FLOW_WINDOW, "maxLevel": _FLOW_LEVELS}
-    there, found, _ = cv2.calcOpticalFlowPyrLK(before, now, start, there, flags=flags, **options)
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(
-        now, before, there, start.copy(), flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **options
-    )
-    miss = np.linalg.norm(back - start, axis=2)[:, 0]
+    there, found = _flow(before, now, points.pixel, points.pixel if guess is None else guess)
+    back, found_back = _flow(now, before, there, points.pixel)
+    returned = np.linalg.norm(back - points.pixel, axis=1) < _ROUND_TRIP
     height, width = now.shape
-    x, y = there[:, 0].T
-    inside = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
-    kept = (found[:, 0] > 0) & (found_back[:, 0] > 0) & (miss < _ROUND_TRIP) & inside
-    return FollowedPoints(points.landmark[kept], there[kept, 0])
+    inside = ((there >= 0) & (there <= [width - 1, height - 1])).all(1)
+    kept = found & found_back & returned & inside
+    return FollowedPoints(points.landmark[kept], there[kept])
 
 
 def new_corners(
@@ -98,31 +104,48 @@ def new_corners(
 ) -> NDArray[np.float32]:
     """``(N, 2)`` corners inside a mask, away from its outline and from points that are there already.
 
+    Distances grow with the mask: points keep a 25th of the root of its area from each other, and a 50th from the
+    outline, which slides over the surface as the object turns.
+
     Args:
         image: ``(H, W)`` grey.
         mask: ``(H, W)``.
         taken: ``(M, 2)`` pixels of points that are there.
         most: How many at most.
     """
+    none = np.zeros((0, 2), np.float32)
     if most <= 0 or not mask.any():
-        return np.zeros((0, 2), np.float32)
-    size = float(np.sqrt(mask.sum()))
-    distance = max(size / 25, 3.0)
-    margin = max(round(0.02 * size), 2)
+        return none
     x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    if min(width, height) < _SMALLEST:
+        return none
+    size = float(np.sqrt(mask.sum()))
+    distance, margin = max(size / 25, 3.0), max(round(size / 50), 2)
     box = slice(y, y + height), slice(x, x + width)
-    inside = cv2.copyMakeBorder(mask[box].astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
-    inside = cv2.erode(inside, np.ones((3, 3), np.uint8), iterations=margin, borderValue=0)[1:-1, 1:-1]
-    for px, py in taken:
-        cv2.circle(inside, (round(float(px)) - x, round(float(py)) - y), round(distance), 0, -1)
+    free = _eroded(mask[box], margin)
+    corner = np.array([x, y], np.float32)
+    for place in np.rint(taken - corner).astype(int).tolist():
+        cv2.circle(free, place, round(distance), 0, cv2.FILLED)
     crop = np.ascontiguousarray(image[box])
-    if min(crop.shape) < 16:
-        return np.zeros((0, 2), np.float32)
-    corners = cv2.goodFeaturesToTrack(crop, most, _QUALITY, distance, mask=inside)
-    if corners is None:
-        return np.zeros((0, 2), np.float32)
-    found = cv2.cornerSubPix(
-        crop, corners, (3, 3), (-1, -1), (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.03)
-    )
-    offset = np.array([x, y], np.float32)
-    return np.asarray(np.where(np.abs(found - corners) < 2, found, corners)[:, 0] + offset, dtype=np.float32)
+    coarse = cv2.goodFeaturesToTrack(crop, most, _QUALITY, distance, mask=free)
+    if coarse is None:
+        return none
+    fine = cv2.cornerSubPix(crop, coarse, _SUBPIXEL_WINDOW, (-1, -1), _SUBPIXEL_STOP)
+    return np.asarray(fine[:, 0] + corner, dtype=np.float32)
+
+
+def _flow(
+    before: NDArray[np.uint8], now: NDArray[np.uint8], start: NDArray[np.float32], guess: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Where points ``(N, 2)`` have gone, searched from a guess, and which of them were found."""
+    there, found, _ = cv2.calcOpticalFlowPyrLK(
+        before, now, np.ascontiguousarray(start, np.float32), np.array(guess, np.float32),
+        winSize=_FLOW_WINDOW, maxLevel=_FLOW_LEVELS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )  # fmt: skip
+    return there, found[:, 0] > 0
+
+
+def _eroded(mask: NDArray[np.bool_], margin: int) -> NDArray[np.uint8]:
+    """``mask`` without what is within ``margin`` of its outline or of the array's border."""
+    padded = np.pad(mask, 1).astype(np.uint8)
+    return np.ascontiguousarray(cv2.erode(padded, np.ones((3, 3), np.uint8), iterations=margin)[1:-1, 1:-1])

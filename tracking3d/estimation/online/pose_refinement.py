@@ -1,4 +1,8 @@
-"""One frame's pose against a known object: Levenberg-Marquardt on pixels, outline and matched points together."""
+"""One frame's pose against a known object: Levenberg-Marquardt on pixels, outline and matched points together.
+
+The cost is a weighted sum of three means of Cauchy losses. Covered pixels whose texture no keyframe has seen pull
+nowhere; each is charged, so that the object does not turn to where nothing contradicts it.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +12,7 @@ import torch
 from torch import Tensor
 
 from tracking3d.estimation.observation import Observation, halved
+from tracking3d.estimation.online.outline import outline_distance
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_exponential
 from tracking3d.rendering import (
     NormalEquations,
@@ -17,9 +22,13 @@ from tracking3d.rendering import (
     pose_normal_equations,
     render,
     sample_texture,
-    signed_distance,
 )
 from tracking3d.rendering.normal_equations import screen_motion
+
+_DAMPING = 1e-3  # at first; then between the limits
+_LEAST_DAMPING, _MOST_DAMPING = 1e-6, 1e3
+_ENOUGH = 1e-4  # share of the cost below which a gain ends the search
+_NEAREST = 1e-3  # depth below which matched points are seen as if they were there
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +36,8 @@ class Surface:
     """The object as poses are fitted to it.
 
     Attributes:
-        vertices: ``(V, 3)`` in object coordinates; faces: ``(F, 3)``; face_uvs: ``(F, 3, 2)``.
+        vertices: ``(V, 3)`` in object coordinates.
+        faces: ``(F, 3)`` int64; face_uvs: ``(F, 3, 2)``.
         texture: ``(C, T, T)`` features.
         seen: ``(1, T, T)`` 1 where the texture is known, else 0.
         renderer: Which renderer, see `tracking3d.rendering.backend`.
@@ -59,7 +69,17 @@ class MatchedPoints:
 
 @dataclass(frozen=True)
 class PoseWeights:
-    """What each kind of evidence counts, and where its robust loss turns over."""
+    """What each kind of evidence counts, and where its robust loss turns over.
+
+    Attributes:
+        appearance: Of the mean over the covered pixels.
+        appearance_scale: Difference of features at which the loss is ``log 2``.
+        outline: Of the mean along the outline.
+        outline_scale: Pixels at full working resolution at which the loss is ``log 2``.
+        points: Of the mean over the matched points.
+        points_scale: Pixels at full working resolution at which the loss is ``log 2``.
+        unseen: What a covered pixel of unseen texture costs, beside ``appearance``'s loss.
+    """
 
     appearance: float = 1.0
     appearance_scale: float = 0.25
@@ -80,7 +100,8 @@ class PoseFit:
         appearance: Mean Cauchy loss over the covered pixels, unseen ones charged.
         outline: Mean Cauchy loss of the outline; 0 without a mask.
         points: Mean Cauchy loss of the matched points; 0 without any.
-        information: ``(6, 6)`` matrix of the normal equations.
+        overlap: IoU of what is covered with the mask, inside the frame; 1 without a mask.
+        information: ``(6, 6)`` matrix of the normal equations, see `tracking3d.rendering.NormalEquations`.
         iterations: Evaluations spent.
     """
 
@@ -89,15 +110,32 @@ class PoseFit:
     appearance: float
     outline: float
     points: float
+    overlap: float
     information: Tensor
     iterations: int
 
 
 @dataclass(frozen=True, eq=False)
-class _Level:
+class _Evidence:
+    """What a pose is fitted to at one resolution.
+
+    Attributes:
+        observation: The frame at this resolution.
+        distance: ``(1, S, S)`` see `outline_distance`; None without a mask.
+        matched: With pixels of this resolution; None without any.
+        weights: With scales in pixels of this resolution.
+    """
+
     observation: Observation
     distance: Tensor | None
-    pixels: Tensor | None
+    matched: MatchedPoints | None
+    weights: PoseWeights
+
+    @classmethod
+    def of(cls, observation: Observation, matched: MatchedPoints | None, weights: PoseWeights) -> _Evidence:
+        """At an observation's own resolution."""
+        distance = outline_distance(observation)[None] if observation.has_mask else None
+        return cls(observation, distance, matched if matched is not None and len(matched) else None, weights)
 
 
 def refine_pose(
@@ -116,93 +154,106 @@ def refine_pose(
         start: Where to start.
         matched: Points with known places in the frame.
         weights: Of the kinds of evidence.
-        iterations: Most steps at each resolution, the last one at full working resolution.
+        iterations: Most steps at each resolution, each twice the one before, the last one the full working
+            resolution. Zeros only evaluate the start.
     """
-    levels = [_Level(observation, None, matched.pixels if matched else None)]
-    while len(levels) < len(iterations):
-        finer = levels[0]
-        pixels = None if finer.pixels is None else (finer.pixels + 0.5) / 2 - 0.5
-        levels.insert(0, _Level(halved(finer.observation), None, pixels))
-    fit: PoseFit | None = None
     pose, spent = start, 0
-    for level, steps in zip(levels, iterations, strict=True):
-        seen = level.observation
-        distance = signed_distance(seen.mask[None]) if seen.has_mask else None
-        scale = seen.window.size / observation.window.size
-        fit = _minimize(surface, replace(level, distance=distance), pose, matched, weights, steps, scale)
-        pose, spent = fit.pose, spent + fit.iterations
-    assert fit is not None
-    return replace(fit, iterations=spent)
+    for steps, halvings in zip(iterations[:-1], range(len(iterations) - 1, 0, -1), strict=True):
+        if steps:
+            coarse = _minimize(surface, _halved(observation, matched, weights, halvings), pose, steps)
+            pose, spent = coarse.pose, spent + coarse.iterations
+    fit = _minimize(surface, _Evidence.of(observation, matched, weights), pose, iterations[-1])
+    return replace(fit, iterations=spent + fit.iterations)
 
 
-def _minimize(
-    surface: Surface,
-    level: _Level,
-    pose: Pose,
-    matched: MatchedPoints | None,
-    weights: PoseWeights,
-    steps: int,
-    scale: float,
-) -> PoseFit:
-    damping = 1e-3
-    best = _evaluate(surface, level, pose, matched, weights, scale)
+def _halved(
+    observation: Observation, matched: MatchedPoints | None, weights: PoseWeights, times: int
+) -> _Evidence:
+    """The evidence at a lower resolution."""
+    for _ in range(times):
+        observation = halved(observation)
+        if matched is not None:
+            matched = replace(matched, pixels=(matched.pixels + 0.5) / 2 - 0.5)
+        weights = replace(
+            weights, outline_scale=weights.outline_scale / 2, points_scale=weights.points_scale / 2
+        )
+    return _Evidence.of(observation, matched, weights)
+
+
+def _minimize(surface: Surface, evidence: _Evidence, start: Pose, steps: int) -> PoseFit:
+    """Levenberg-Marquardt at one resolution; the cost never rises."""
+    damping = _DAMPING
+    model, best = _evaluate(surface, evidence, start)
     spent = 1
     for _ in range(steps):
-        model, fit = best
-        step = model.step(damping)[0]
-        trial = _evaluate(surface, level, moved(fit.pose, step), matched, weights, scale)
+        trial = _moved(best.pose, model.step(damping)[0])
+        trial_model, fit = _evaluate(surface, evidence, trial)
         spent += 1
-        if trial[1].cost < fit.cost:
-            gain = fit.cost - trial[1].cost
-            best, damping = trial, max(damping / 4, 1e-6)
-            if gain < 1e-4 * fit.cost:
+        gain = best.cost - fit.cost
+        if gain > 0:
+            model, best, damping = trial_model, fit, max(damping / 4, _LEAST_DAMPING)
+            if gain < _ENOUGH * (best.cost + gain):
                 break
         else:
             damping *= 8
-            if damping > 1e3:
+            if damping > _MOST_DAMPING:
                 break
-    return replace(best[1], iterations=spent)
+    return replace(best, iterations=spent)
 
 
-def _evaluate(
-    surface: Surface,
-    level: _Level,
-    pose: Pose,
-    matched: MatchedPoints | None,
-    weights: PoseWeights,
-    scale: float,
-) -> tuple[NormalEquations, PoseFit]:
-    seen = level.observation
-    R, t = pose.R[None], pose.translation[None]
-    drawn = draw(surface, seen, pose)
-    share = _known(surface, seen, drawn)
-    model = pose_normal_equations(
-        drawn, seen.features[None], t, weights.appearance_scale, share, surface.renderer
-    )
-    count = max(len(share), 1)
-    unseen = float((seen.valid.reshape(-1)[drawn.pixels] - share).clamp_min(0).sum()) / count
-    # The model's mean is over what is known; over all that is covered, what is not costs its charge.
-    appearance = float(model.cost) * float(share.sum()) / count + weights.unseen * unseen
-    if not len(share):
-        appearance = weights.unseen + 1.0
-    total = model * weights.appearance
+def _evaluate(surface: Surface, evidence: _Evidence, pose: Pose) -> tuple[NormalEquations, PoseFit]:
+    """The normal equations at a pose, and its costs."""
+    weights = evidence.weights
+    t = pose.translation[None]
+    drawn = _drawn(surface, evidence.observation, pose)
+    pixels, appearance = _appearance(surface, evidence.observation, drawn, t, weights)
+    model, cost = pixels * weights.appearance, weights.appearance * appearance
     outline = points = 0.0
-    if level.distance is not None:
+    if evidence.distance is not None:
         edge = contour_normal_equations(
-            drawn, find_contour(drawn), level.distance, t, weights.outline_scale * scale
+            drawn, find_contour(drawn), evidence.distance, t, weights.outline_scale
         )
         outline = float(edge.cost)
-        total = total + edge * weights.outline
-    if matched is not None and len(matched) and level.pixels is not None:
-        found = _points_model(matched.points, level.pixels, seen.K, R[0], t[0], weights.points_scale * scale)
+        model, cost = model + edge * weights.outline, cost + weights.outline * outline
+    if evidence.matched is not None:
+        found = _points_model(evidence.matched, evidence.observation.K, pose, weights.points_scale)
         points = float(found.cost)
-        total = total + found * weights.points
-    cost = weights.appearance * appearance + weights.outline * outline + weights.points * points
-    return total, PoseFit(pose, cost, appearance, outline, points, total.matrix[0], 1)
+        model, cost = model + found * weights.points, cost + weights.points * points
+    return model, PoseFit(
+        pose, cost, appearance, outline, points, _overlap(drawn, evidence.observation), model.matrix[0], 1
+    )
 
 
-def draw(surface: Surface, observation: Observation, pose: Pose) -> Rendering:
-    """Render the object into an observation's window."""
+def _appearance(
+    surface: Surface, observation: Observation, drawn: Rendering, t: Tensor, weights: PoseWeights
+) -> tuple[NormalEquations, float]:
+    """Normal equations of the mean loss over what is known, and the cost of all that can be compared."""
+    comparable = observation.valid * observation.mask if observation.has_mask else observation.valid
+    comparable = comparable.reshape(-1)[drawn.pixels]
+    count = float(comparable.sum())
+    if not count:
+        worst = weights.unseen + 1.0
+        return NormalEquations(t.new_zeros(1, 6, 6), t.new_zeros(1, 6), t.new_zeros(1)), worst
+    # What covers the object, or lies beside it, is left out of the comparison: the mask is to show it.
+    known = sample_texture(surface.seen, drawn.uv)[:, 0] * comparable
+    model = pose_normal_equations(
+        drawn, observation.features[None], t, weights.appearance_scale, known, surface.renderer
+    )
+    share = float(known.sum()) / count
+    return model, float(model.cost) * share + weights.unseen * (1 - share)
+
+
+def _overlap(drawn: Rendering, observation: Observation) -> float:
+    """IoU of the covered pixels with the mask, inside the frame."""
+    if not observation.has_mask:
+        return 1.0
+    inside = observation.valid > 0.5
+    covered, mask = (drawn.face_index[0] >= 0) & inside, (observation.mask > 0.5) & inside
+    return float((covered & mask).sum()) / max(float((covered | mask).sum()), 1.0)
+
+
+def _drawn(surface: Surface, observation: Observation, pose: Pose) -> Rendering:
+    """The object in an observation's window."""
     return render(
         surface.vertices,
         surface.faces,
@@ -216,22 +267,14 @@ def draw(surface: Surface, observation: Observation, pose: Pose) -> Rendering:
     )
 
 
-def _known(surface: Surface, observation: Observation, drawn: Rendering) -> Tensor:
-    """``(P,)`` how far each covered pixel can be compared: inside the frame, not hidden, texture seen before."""
-    known = sample_texture(surface.seen, drawn.uv)[:, 0] * observation.valid.reshape(-1)[drawn.pixels]
-    return known
-
-
-def _points_model(
-    points: Tensor, pixels: Tensor, K: Tensor, R: Tensor, t: Tensor, scale: float
-) -> NormalEquations:
+def _points_model(matched: MatchedPoints, K: Tensor, pose: Pose, scale: float) -> NormalEquations:
     """Normal equations of the mean Cauchy loss of the distances between projected points and pixels."""
-    x_cam = points @ R.T + t
-    x_cam = torch.cat([x_cam[:, :2], x_cam[:, 2:].clamp_min(1e-3)], 1)
+    t, count = pose.translation, len(matched)
+    x_cam = matched.points @ pose.R.T + t
+    x_cam = torch.cat([x_cam[:, :2], x_cam[:, 2:].clamp_min(_NEAREST)], 1)
     projected = x_cam[:, :2] / x_cam[:, 2:] * torch.stack([K[0, 0], K[1, 1]]) + K[:2, 2]
-    residual = projected - pixels
+    residual = projected - matched.pixels
     squared = residual.square().sum(1)
-    count = len(points)
     motion = screen_motion(x_cam, K.expand(count, 3, 3), t.expand(count, 3))
     weight = 2 / (scale**2 + squared) / count
     matrix = torch.einsum("nia,n,nib->ab", motion, weight, motion)
@@ -240,6 +283,6 @@ def _points_model(
     return NormalEquations(matrix[None], gradient[None], cost[None])
 
 
-def moved(pose: Pose, step: Tensor) -> Pose:
+def _moved(pose: Pose, step: Tensor) -> Pose:
     """The pose after a step (v, w) in the camera's axes about its own translation."""
     return from_matrix(rotation_exponential(step[3:]) @ pose.R, pose.translation + step[:3])

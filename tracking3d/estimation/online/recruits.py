@@ -13,9 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.estimation.online.belief import ObjectMap
+from tracking3d.estimation.online.belief import ObjectMap, View
 from tracking3d.estimation.online.bundle import Structure, adjust
 from tracking3d.estimation.online.mapping import pose_arrays, tracks_of
+from tracking3d.estimation.online.points import FollowedPoints, new_corners
 from tracking3d.estimation.online.reprojection import project, to_camera
 from tracking3d.geometry.camera import Camera
 
@@ -32,6 +33,24 @@ def surroundings(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     reach = max(round(_REACH * float(np.sqrt(mask.sum()))), 3)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     return (cv2.dilate(mask.astype(np.uint8), kernel) > 0) & ~mask
+
+
+def with_candidates(known: ObjectMap, view: View, image: NDArray[np.uint8]) -> tuple[ObjectMap, View]:
+    """With corners beside a view's mask."""
+    if view.mask is None:
+        return known, view
+    there = int(known.candidate[view.points.landmark].sum())
+    corners = new_corners(image, surroundings(view.mask), view.points.pixel, MOST_CANDIDATES - there)
+    names = len(known.landmarks) + np.arange(len(corners))
+    points = FollowedPoints(
+        np.concatenate([view.points.landmark, names]), np.concatenate([view.points.pixel, corners])
+    )
+    known = replace(
+        known,
+        landmarks=np.concatenate([known.landmarks, np.full((len(corners), 3), np.nan)]),
+        candidate=np.concatenate([known.candidate, np.ones(len(corners), bool)]),
+    )
+    return known, replace(view, points=points)
 
 
 def recruit(known: ObjectMap, camera: Camera, positions: list[int]) -> ObjectMap:

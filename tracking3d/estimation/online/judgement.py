@@ -1,0 +1,75 @@
+"""How far the pose of a frame is believed: by what is usual for this object, and by what witnesses there are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from tracking3d.estimation.assessment import Assessment
+from tracking3d.estimation.estimate import Status
+from tracking3d.estimation.online.pose_refinement import PoseFit
+
+ENOUGH_POINTS = 15
+"""Points that agree with a pose and settle it, whatever the pixels say."""
+_MEMORY = 0.9  # of the running means
+
+
+@dataclass(frozen=True)
+class Usual:
+    """What frames that were tracked have cost so far: running means.
+
+    Attributes:
+        appearance: Appearance loss.
+        outline: Outline loss.
+        overlap: IoU with the mask.
+    """
+
+    appearance: float = 0.2
+    outline: float = 0.3
+    overlap: float = 0.9
+
+    def updated(self, fit: PoseFit) -> Usual:
+        """With one more frame."""
+        return Usual(
+            _MEMORY * self.appearance + (1 - _MEMORY) * fit.appearance,
+            _MEMORY * self.outline + (1 - _MEMORY) * fit.outline,
+            _MEMORY * self.overlap + (1 - _MEMORY) * fit.overlap,
+        )
+
+
+def looks_wrong(fit: PoseFit, usual: Usual, points: int, mask_weight: float) -> bool:
+    """Whether costly hypotheses should be tried.
+
+    Args:
+        fit: The pose and its losses.
+        usual: What is usual.
+        points: How many landmarks agree with the pose.
+        mask_weight: How far the mask is believed.
+    """
+    if points < ENOUGH_POINTS:
+        return unusual(fit, usual, mask_weight) > 0
+    return unusual(fit, usual, mask_weight) > 1 or fit.points > 1.0
+
+
+def unusual(fit: PoseFit, usual: Usual, mask_weight: float) -> float:
+    """By how much the losses exceed what is usual: above 0 they are higher, above 1 far higher."""
+    appearance = (fit.appearance - 1.3 * usual.appearance - 0.05) / (0.5 * usual.appearance + 0.1)
+    outline = mask_weight * (fit.outline - 1.5 * usual.outline - 0.3) / (usual.outline + 0.5)
+    overlap = mask_weight * (0.85 * usual.overlap - fit.overlap) / 0.25
+    return max(appearance, outline, overlap)
+
+
+def judge(fit: PoseFit, usual: Usual, points: int, mask_weight: float, has_mask: bool) -> Assessment:
+    """Status, reason and confidence of one frame."""
+    excess = unusual(fit, usual, mask_weight)
+    if points < ENOUGH_POINTS and not has_mask:
+        return Assessment(Status.LOST, "the object is out of sight: no mask, and no points of it", 0.05)
+    if points < ENOUGH_POINTS and excess > 1:
+        reason = (
+            f"neither pixels (loss {fit.appearance:.2f}, usually {usual.appearance:.2f}) nor points "
+            f"({points}) agree with any pose"
+        )
+        return Assessment(Status.LOST, reason, 0.05)
+    confidence = min(0.95, 0.4 + 0.01 * min(points, 40)) * (1 - 0.3 * min(max(excess, 0.0), 2.0))
+    if excess > 1:
+        return Assessment(Status.UNCERTAIN, f"pixels disagree (loss {fit.appearance:.2f}), points agree", confidence)
+    return Assessment(Status.TRACKED, "", confidence)

@@ -1,0 +1,181 @@
+"""The pose of one frame against the map: cheap starts first, costly ones only where those look wrong."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from tracking3d.estimation.observation import halved
+from tracking3d.estimation.online.belief import ObjectMap, View
+from tracking3d.estimation.online.keypoints import detect, match
+from tracking3d.estimation.online.mapping import (
+    nearest_views,
+    pose_of,
+    project_points,
+    to_window,
+    well_inside,
+)
+from tracking3d.estimation.online.points import FollowedPoints
+from tracking3d.estimation.online.pose_from_points import pose_from_points
+from tracking3d.estimation.online.pose_refinement import (
+    MatchedPoints,
+    PoseFit,
+    PoseWeights,
+    Surface,
+    refine_pose,
+)
+from tracking3d.geometry.camera import Camera
+from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
+
+ENOUGH_MATURE = 30
+"""With so many landmarks of two keyframes or more, those of one alone are not asked."""
+_FEWEST_POINTS = 6  # for a pose from points
+_INLIER = 3.0  # pixels of an object 200 pixels large
+_EDGE = 8.0  # such pixels from the outline within which points slide
+_STRAY, _STRAY_YOUNG = 4.0, 16.0  # such pixels that a point may be off
+_KEYFRAMES = 6  # that a doubtful frame is matched with
+_GRID_ANGLES = (20.0, 40.0)
+_GRID_FINALISTS = 5
+_PLACED = 8  # keyframes whose poses a lost object is looked for at
+
+
+def pixel_scale(view: View) -> float:
+    """How much larger than 200 pixels a view's window is; at least 1. Tolerances in pixels go with it."""
+    return max(1.0, view.observation.window.side / 200)
+
+
+def fit_pose(
+    known: ObjectMap,
+    surface: Surface,
+    view: View,
+    starts: dict[str, Pose],
+    points: FollowedPoints,
+    weights: PoseWeights,
+) -> tuple[str, PoseFit]:
+    """The best start, and the pose refined from it."""
+    weights = replace(weights, outline=weights.outline * view.mask_weight)
+    matched = _matched(known, surface, view, points)
+    name = next(iter(starts))
+    if len(starts) > 1:
+        costs = {
+            other: refine_pose(surface, view.observation, start, matched, weights, (0, 0)).cost
+            for other, start in starts.items()
+        }
+        name = min(costs, key=lambda other: costs[other])
+    return name, refine_pose(surface, view.observation, starts[name], matched, weights)
+
+
+def pose_of_points(
+    known: ObjectMap, camera: Camera, points: FollowedPoints, view: View
+) -> tuple[Pose, FollowedPoints] | None:
+    """The pose that most points agree with, and those that do."""
+    position = known.landmarks[points.landmark]
+    if np.isfinite(position).all(1).sum() < _FEWEST_POINTS:
+        return None
+    found = pose_from_points(
+        position, points.pixel.astype(np.float64), camera.K, threshold=_INLIER * pixel_scale(view), seed=0
+    )
+    if found is None or found.count < _FEWEST_POINTS:
+        return None
+    return pose_of(found.R, found.t, known.vertices), points.only(found.inliers)
+
+
+def agreeing(
+    known: ObjectMap, camera: Camera, pose: Pose, points: FollowedPoints, view: View
+) -> FollowedPoints:
+    """Points that are where a pose says and not on the outline; of candidates neither is asked."""
+    if not len(points):
+        return points
+    gap = np.linalg.norm(project_points(known.landmarks[points.landmark], pose, camera) - points.pixel, axis=1)
+    young = known.sightings[points.landmark] < 2
+    scale = pixel_scale(view)
+    in_place = np.isnan(gap) | (gap < np.where(young, _STRAY_YOUNG, _STRAY) * scale)
+    inside = well_inside(view.mask, known.silhouette(pose, camera), points.pixel, _EDGE * scale)
+    return points.only(in_place & (inside | known.candidate[points.landmark]))
+
+
+def rematched(
+    known: ObjectMap, camera: Camera, view: View, image: NDArray[np.uint8], anywhere: bool
+) -> list[tuple[Pose, FollowedPoints]]:
+    """Poses from keypoints that are matched with keyframes, most agreeing points first.
+
+    Args:
+        known: The map.
+        camera: Of the full frame.
+        view: The frame, with the best pose so far.
+        image: ``(H, W)`` grey.
+        anywhere: Ask more keyframes than those with the nearest viewing direction.
+    """
+    region = np.ones(image.shape, bool) if view.mask is None else view.mask
+    keypoints = detect(image, region)
+    found = []
+    others = nearest_views(known.keyframes, view.pose, len(known.keyframes) if anywhere else _KEYFRAMES)
+    for other in others[: 4 * _KEYFRAMES]:
+        pairs = match(keypoints, other.keypoints)
+        names = other.keypoint_landmark[pairs[:, 1]]
+        sound = (names >= 0) & ~known.candidate[names]
+        points = FollowedPoints(names[sound], keypoints.pixel[pairs[sound, 0]])
+        pose = pose_of_points(known, camera, points, view)
+        if pose is not None:
+            found.append(pose)
+    found.sort(key=lambda one: -len(one[1]))
+    return found[:3]
+
+
+def placed_keyframes(known: ObjectMap, camera: Camera, view: View) -> list[Pose]:
+    """The poses of keyframes, moved in front of the camera to where the mask is."""
+    if view.mask is None:
+        return []
+    x1, y1 = np.argwhere(view.mask)[:, ::-1].mean(0)
+    count = len(known.keyframes)
+    chosen = np.unique(np.linspace(0, count - 1, _PLACED).round().astype(int))
+    poses = []
+    for position in chosen:
+        pose = known.keyframes[position].pose
+        x, y, z = pose.translation.tolist()
+        shift = [(x1 - camera.cx) / camera.fx * z - x, (y1 - camera.cy) / camera.fy * z - y, 0.0]
+        poses.append(Pose(pose.translation + pose.translation.new_tensor(shift), pose.quaternion))
+    return poses
+
+
+def turned_grid(
+    surface: Surface, view: View, pose: Pose, weights: PoseWeights
+) -> list[Pose]:
+    """The best of many rotations around a pose, by appearance and outline at half the resolution."""
+    small = halved(view.observation)
+    weights = replace(weights, outline=weights.outline * view.mask_weight)
+    directions = [
+        torch.tensor(axis, dtype=pose.translation.dtype) for axis in product((-1.0, 0.0, 1.0), repeat=3) if any(axis)
+    ]
+    poses = [
+        from_matrix(rotation_about(axis.to(pose.translation), angle) @ pose.R, pose.translation)
+        for axis in directions
+        for angle in _GRID_ANGLES
+    ]
+    costs = [refine_pose(surface, small, one, None, weights, (0,)).cost for one in poses]
+    best = np.argsort(np.nan_to_num(costs, nan=math.inf))[:_GRID_FINALISTS]
+    return [refine_pose(surface, small, poses[i], None, weights, (4,)).pose for i in best]
+
+
+def evidence(fit: PoseFit, weights: PoseWeights, mask_weight: float) -> float:
+    """What poses from different points are compared by: the cost without them."""
+    missed = mask_weight * (1 - fit.overlap)
+    return weights.appearance * fit.appearance + weights.outline * mask_weight * fit.outline + missed
+
+
+def _matched(known: ObjectMap, surface: Surface, view: View, points: FollowedPoints) -> MatchedPoints:
+    position = known.landmarks[points.landmark]
+    sound = np.isfinite(position).all(1)
+    # A landmark seen once lies where the shape was believed to be: with others at hand it is no witness.
+    mature = sound & (known.sightings[points.landmark] >= 2)
+    if mature.sum() >= ENOUGH_MATURE:
+        sound = mature
+    return MatchedPoints(
+        torch.from_numpy(position[sound]).to(surface.vertices),
+        torch.from_numpy(to_window(view, points.pixel[sound])).to(surface.vertices),
+    )

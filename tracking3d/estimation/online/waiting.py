@@ -1,0 +1,92 @@
+"""The first frames: their points are followed and matched until the start can be solved."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.estimation.online.belief import Belief, ObjectMap, View
+from tracking3d.estimation.online.keypoints import detect, match
+from tracking3d.estimation.online.mapping import tracks_of
+from tracking3d.estimation.online.points import MOST_POINTS, FollowedPoints, new_corners
+from tracking3d.estimation.online.start import Start, by_turning, solve_start
+from tracking3d.estimation.online.structure import motion_enough
+from tracking3d.estimation.online.surface_fit import FitWeights
+
+MOTION = 0.03
+"""Change of form at which a start is tried first, see `motion_enough`."""
+_MORE_MOTION = 1.3  # times as much before it is tried again
+_DOUBTFUL = 0.33  # bundle cost above which the points do not tell
+_MOST = 40  # frames that wait for a better one
+_FEWEST = 4  # frames that are solved together
+_FEWEST_BY_TURNING = 12
+_LASTING = 0.4  # share of the first frame's points that are still there where they can be relied on
+_LEAST_SHARED = 0.1  # share below which nothing more will be learned of the first frame
+_SPARSE = 0.6  # of `MOST_POINTS`, below which new points are looked for
+_SAME_PLACE = 1.5  # pixels
+_MATCHED_WITH = 3  # frames before
+
+
+def waiting_view(
+    known: ObjectMap, earlier: tuple[View, ...], view: View, image: NDArray[np.uint8]
+) -> tuple[ObjectMap, View]:
+    """A view whose points are followed, or found again, in it; their depth is not known yet."""
+    if len(view.points) >= _SPARSE * MOST_POINTS:
+        return known, view
+    inside = view.mask if view.mask is not None else np.ones(image.shape, bool)
+    keypoints = detect(image, inside)
+    label = np.full(len(keypoints), -1, np.int64)
+    if len(view.points) and len(keypoints):
+        gap = np.linalg.norm(keypoints.pixel[:, None] - view.points.pixel[None], axis=2)
+        label = np.where(gap.min(1) < _SAME_PLACE, view.points.landmark[gap.argmin(1)], -1)
+    taken = set(view.points.landmark.tolist())
+    for other in earlier[::-1][:_MATCHED_WITH]:
+        for here, there in match(keypoints, other.keypoints):
+            name = int(other.keypoint_landmark[there])
+            if label[here] < 0 <= name and name not in taken:
+                label[here] = name
+                taken.add(name)
+    corners = new_corners(
+        image, inside, np.concatenate([view.points.pixel, keypoints.pixel]), MOST_POINTS - len(view.points) - len(keypoints)
+    )
+    fresh = label < 0
+    base = len(known.landmarks)
+    label[fresh] = base + np.arange(fresh.sum())
+    corner_names = base + fresh.sum() + np.arange(len(corners))
+    own, first = np.unique(label, return_index=True)
+    again = ~np.isin(own, view.points.landmark)
+    points = FollowedPoints(
+        np.concatenate([view.points.landmark, own[again], corner_names]).astype(np.int64),
+        np.concatenate([view.points.pixel, keypoints.pixel[first][again], corners]),
+    )
+    added = int(fresh.sum()) + len(corners)
+    known = replace(
+        known,
+        landmarks=np.concatenate([known.landmarks, np.full((added, 3), np.nan)]),
+        candidate=np.concatenate([known.candidate, np.zeros(added, bool)]),
+    )
+    return known, replace(view, points=points, keypoints=keypoints, keypoint_landmark=label)
+
+
+def solved_start(state: Belief, weights: FitWeights, prior: float) -> tuple[Belief, Start | None]:
+    """The start, where the waiting frames can tell; else None, and when it is tried next."""
+    assert state.waiting is not None
+    views = [view for view, _ in state.waiting if view.mask is not None]
+    if len(views) < _FEWEST:
+        return state, None
+    names = np.unique(np.concatenate([view.points.landmark for view in views]))
+    motion = motion_enough(tracks_of(views, names[~state.known.candidate[names]]))
+    shared = float(np.isin(views[0].points.landmark, views[-1].points.landmark).mean())
+    waited = len(views) >= _MOST
+    if motion < max(state.due, MOTION) and not waited and shared > _LEAST_SHARED:
+        return state, None
+    state = replace(state, due=motion * _MORE_MOTION)
+    starts = solve_start(state.known, state.camera, views, weights, prior)
+    if not starts or starts[0].bundle > _DOUBTFUL:
+        if not waited and (shared > _LASTING or len(views) < _FEWEST_BY_TURNING):
+            return state, None
+        chosen = views[:: max(len(views) // 7, 1)][:8]
+        starts = sorted([*starts, *by_turning(state.known, state.camera, chosen, weights)], key=lambda start: start.cost)
+    return state, starts[0] if starts else None
