@@ -17,6 +17,7 @@ from tracking3d.rendering.contour import (
     contour_distance,
     contour_loss,
     contour_normal_equations,
+    contour_slopes,
     find_contour,
     signed_distance,
 )
@@ -76,6 +77,35 @@ def test_surface_points_of_the_contour_project_to_their_positions():
     torch.testing.assert_close(pixel[:, :2] / pixel[:, 2:], contour.position)
 
 
+def test_surface_points_of_the_contour_are_mixed_from_the_ends_of_their_edges():
+    drawn = moved(bumpy_sphere((40, 50)), STILL)
+    contour = find_contour(drawn)
+    ends = drawn.x_cam[contour.view[:, None], contour.vertices]
+    torch.testing.assert_close((contour.share[..., None] * ends).sum(1), contour.points)
+    torch.testing.assert_close(contour.share.sum(1), torch.ones_like(contour.share[:, 0]))
+    assert contour.share.min() > 0
+
+
+def test_the_ends_of_a_contour_edge_are_joined_in_the_mesh():
+    drawn = moved(bumpy_sphere((40, 50)), STILL)
+    edges = torch.cat([drawn.faces[:, [0, 1]], drawn.faces[:, [1, 2]], drawn.faces[:, [2, 0]]])
+    known = {tuple(edge) for edge in edges.tolist()}
+    assert {tuple(edge) for edge in find_contour(drawn).vertices.tolist()} <= known
+
+
+def test_the_middle_of_an_edge_on_the_screen_is_nearer_in_space_to_the_end_that_is_nearer_to_the_camera():
+    """Half-way on the screen between depths 1 and 3 is a quarter of the way in space, at depth 3 / 2."""
+    K = torch.eye(3, dtype=torch.float64)[None]
+    vertices = torch.tensor([[0.0, 0, 1], [3.0, 0, 3], [0.0, 3, 3]], dtype=torch.float64)
+    uvs, texture = torch.zeros(1, 3, 2, dtype=torch.float64), torch.zeros(1, 4, 4, dtype=torch.float64)
+    zero = torch.zeros(1, 3, dtype=torch.float64)
+    drawn = render(vertices, torch.tensor([[0, 2, 1]]), uvs, texture, K.clone(), zero, K, (3, 3))
+    contour = find_contour(drawn)
+    middle = (contour.vertices.sort(1).values == torch.tensor([0, 1])).all(1)
+    assert contour.points[middle].tolist() == [[0.75, 0.0, 1.5]]
+    assert sorted(contour.share[middle][0].tolist()) == [0.25, 0.75]
+
+
 def two_squares() -> tuple[Tensor, Tensor]:
     """A small square before a large one, both facing the camera at z = 4 and z = 5."""
     corners = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=torch.float64)
@@ -123,6 +153,31 @@ def test_gradients_by_vertices_pose_and_camera_are_those_of_finite_differences()
     for name in ("vertices", "R", "t", "K"):
         free = [value if key == name else value.detach() for key, value in arguments.items()]
         assert gradcheck(loss, tuple(free), eps=1e-7, atol=1e-4, rtol=1e-3), name
+
+
+def test_slopes_are_finite_differences_of_the_distance():
+    scene = bumpy_sphere((30, 34))
+    contour = find_contour(moved(scene, STILL))
+    generator = torch.Generator().manual_seed(0)
+    distance = 5 * torch.randn(2, 30, 34, dtype=torch.float64, generator=generator)
+    value, slope = contour_slopes(contour, distance)
+    torch.testing.assert_close(value, contour_distance(contour, distance).detach())
+    for axis in (0, 1):
+        step = torch.zeros(2, dtype=torch.float64)
+        step[axis] = 1e-6
+        ahead, behind = (
+            contour_distance(replace(contour, position=contour.position + way * step), distance)
+            for way in (1, -1)
+        )
+        torch.testing.assert_close(slope[:, axis], (ahead - behind) / 2e-6, atol=1e-5, rtol=0)
+
+
+def test_slopes_of_a_distance_that_rises_to_the_right_point_there():
+    contour = find_contour(moved(bumpy_sphere((20, 24)), STILL))
+    ramp = torch.arange(24, dtype=torch.float64).expand(2, 20, 24)
+    value, slope = contour_slopes(contour, ramp)
+    torch.testing.assert_close(value, contour.position[:, 0])
+    assert (slope == torch.tensor([1.0, 0.0])).all()
 
 
 def test_normal_equations_have_the_gradient_of_the_loss():

@@ -37,7 +37,7 @@ class Contour:
         length: ``(N,)`` pixels of contour that each point stands for, without gradient.
         points: ``(N, 3)`` the surface points in camera coordinates, without gradient.
         vertices: ``(N, 2)`` int64, the ends of the edge that each point lies on.
-        share: ``(N, 2)`` how much of each end the surface point is, in space.
+        share: ``(N, 2)`` how much of each end the surface point is in space, without gradient; sums to 1.
         frames: B.
     """
 
@@ -58,9 +58,9 @@ def find_contour(drawn: Rendering) -> Contour:
     length = along.detach().norm(dim=1)
     count = length.ceil().clamp(1, _MOST).long()
     owner, number = expand_ranges(torch.zeros_like(count), count)
-    share = (number + 0.5) / count[owner]
+    fraction = (number.to(length) + 0.5) / count[owner]
     view, begin, end, along = view[owner], begin[owner], end[owner], along[owner]
-    position = drawn.screen[view, begin] + share[:, None] * along
+    position = drawn.screen[view, begin] + fraction[:, None] * along
     with torch.no_grad():
         direction = functional.normalize(along, dim=1)
         normal = torch.stack([-direction[:, 1], direction[:, 0]], 1)
@@ -69,18 +69,16 @@ def find_contour(drawn: Rendering) -> Contour:
         beyond, in_window = _nearest_pixel(position + _PROBE * normal, height, width)
         covered = drawn.face_index.flatten()[view * height * width + beyond] >= 0
         kept = torch.nonzero(inside & ~(covered & in_window))[:, 0]
+        vertices = torch.stack([begin, end], 1)[kept]
+        ends = drawn.x_cam[view[kept][:, None], vertices]
         # Perspective: on the screen it is the inverse depth that is mixed.
-        z = [drawn.x_cam[view, corner, 2] for corner in (begin, end)]
-        depth = 1 / ((1 - share) / z[0] + share / z[1])
-        in_space = torch.stack([(1 - share) / z[0], share / z[1]], 1) * depth[:, None]
-        K = drawn.K[view]
-        ray = (position - K[:, :2, 2]) / torch.stack([K[:, 0, 0], K[:, 1, 1]], 1)
-        points = functional.pad(ray, (0, 1), value=1.0) * depth[:, None]
+        share = torch.stack([1 - fraction, fraction], 1)[kept] / ends[..., 2]
+        share = share / share.sum(1, keepdim=True)
+        points = (share[..., None] * ends).sum(1)
     each = (length / count)[owner]
     return Contour(
-        view[kept], position[kept], normal[kept], each[kept], points[kept],
-        torch.stack([begin, end], 1)[kept], in_space[kept], len(drawn.screen),
-    )  # fmt: skip
+        view[kept], position[kept], normal[kept], each[kept], points, vertices, share, len(drawn.screen)
+    )
 
 
 def contour_loss(contour: Contour, distance: Tensor, scale: float) -> Tensor:
@@ -106,13 +104,14 @@ def contour_distance(contour: Contour, distance: Tensor) -> Tensor:
     return value
 
 
+@torch.no_grad()
 def contour_slopes(contour: Contour, distance: Tensor) -> tuple[Tensor, Tensor]:
-    """`contour_distance` and its slopes by x and y, ``(N, 2)``, without gradient."""
-    with torch.no_grad():
-        value, by_x, by_y = _sampled(contour, distance)
+    """`contour_distance` and its slopes ``(N, 2)`` by x and y, without gradient."""
+    value, by_x, by_y = _sampled(contour, distance)
     return value, torch.stack([by_x, by_y], 1)
 
 
+@torch.no_grad()
 def contour_normal_equations(
     drawn: Rendering, contour: Contour, distance: Tensor, pivot: Tensor, scale: float
 ) -> NormalEquations:
@@ -125,16 +124,15 @@ def contour_normal_equations(
         pivot: ``(B, 3)`` what rotations turn about, in camera coordinates.
         scale: Pixels at which the loss is ``log 2``.
     """
-    with torch.no_grad():
-        residual, by_x, by_y = _sampled(contour, distance)
-        share = contour.length / _per_frame(contour, contour.length).clamp_min(1.0)[contour.view]
-        motion = screen_motion(contour.points, drawn.K[contour.view], pivot[contour.view])
-        jacobian = by_x[:, None] * motion[:, 0] + by_y[:, None] * motion[:, 1]  # (N, 6)
-        weight = share * 2 / (scale**2 + residual.square())
-        matrix = torch.einsum("na,n,nb->nab", jacobian, weight, jacobian)
-        gradient = (weight * residual)[:, None] * jacobian
-        cost = share * cauchy(residual, torch.zeros_like(residual), scale)
-        return NormalEquations(*(_per_frame(contour, part) for part in (matrix, gradient, cost)))
+    residual, slope = contour_slopes(contour, distance)
+    share = contour.length / _per_frame(contour, contour.length).clamp_min(1.0)[contour.view]
+    motion = screen_motion(contour.points, drawn.K[contour.view], pivot[contour.view])
+    jacobian = torch.einsum("ni,nia->na", slope, motion)
+    weight = share * 2 / (scale**2 + residual.square())
+    matrix = torch.einsum("na,n,nb->nab", jacobian, weight, jacobian)
+    gradient = (weight * residual)[:, None] * jacobian
+    cost = share * cauchy(residual, torch.zeros_like(residual), scale)
+    return NormalEquations(*(_per_frame(contour, part) for part in (matrix, gradient, cost)))
 
 
 def signed_distance(mask: Tensor) -> Tensor:

@@ -141,6 +141,7 @@ class Belief:
         due: Motion at which the next start is tried.
         usual: What tracked frames have cost.
         status: Of the last frame.
+        trail: Poses and indices of the last frames that were believed.
     """
 
     camera: Camera
@@ -155,6 +156,7 @@ class Belief:
     due: float = 0.0
     usual: Usual = field(default_factory=Usual)
     status: Status = Status.UNCERTAIN
+    trail: tuple[tuple[Pose, int], ...] = ()
 
     def moved(self, pose: Pose, index: int, grey: NDArray[np.uint8], followed: FollowedPoints) -> Belief:
         """One frame later."""

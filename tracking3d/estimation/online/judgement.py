@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from tracking3d.estimation.assessment import Assessment
 from tracking3d.estimation.estimate import Status
-from tracking3d.estimation.online.pose_refinement import PoseFit
+from tracking3d.estimation.online.pose_refinement import PoseFit, PoseWeights
 
 ENOUGH_POINTS = 15
 """Points that agree with a pose and settle it, whatever the pixels say."""
+_UNSEEN_CHARGE = PoseWeights().unseen
+_ENOUGH_KNOWN = 0.8  # share of known texture from which on it counts in full
+_MOSTLY = 0.7  # share of unseen texture
 _MEMORY = 0.9  # of the running means
 
 
@@ -51,8 +54,14 @@ def looks_wrong(fit: PoseFit, usual: Usual, points: int, mask_weight: float) -> 
 
 
 def unusual(fit: PoseFit, usual: Usual, mask_weight: float) -> float:
-    """By how much the losses exceed what is usual: above 0 they are higher, above 1 far higher."""
-    appearance = (fit.appearance - 1.3 * usual.appearance - 0.05) / (0.5 * usual.appearance + 0.1)
+    """By how much the losses exceed what is usual: above 0 they are higher, above 1 far higher.
+
+    Texture that was never seen is no evidence against a pose.
+    """
+    known = 1 - fit.unseen
+    compared = (fit.appearance - _UNSEEN_CHARGE * fit.unseen) / max(known, 1e-3)
+    appearance = (compared - 1.3 * usual.appearance - 0.05) / (0.5 * usual.appearance + 0.1)
+    appearance *= min(known / _ENOUGH_KNOWN, 1.0)
     outline = mask_weight * (fit.outline - 1.5 * usual.outline - 0.3) / (usual.outline + 0.5)
     overlap = mask_weight * (0.85 * usual.overlap - fit.overlap) / 0.25
     return max(appearance, outline, overlap)
@@ -61,15 +70,21 @@ def unusual(fit: PoseFit, usual: Usual, mask_weight: float) -> float:
 def judge(fit: PoseFit, usual: Usual, points: int, mask_weight: float, has_mask: bool) -> Assessment:
     """Status, reason and confidence of one frame."""
     excess = unusual(fit, usual, mask_weight)
-    if points < ENOUGH_POINTS and not has_mask:
+    few = points < ENOUGH_POINTS
+    if few and not has_mask:
         return Assessment(Status.LOST, "the object is out of sight: no mask, and no points of it", 0.05)
-    if points < ENOUGH_POINTS and excess > 1:
+    if few and excess > 1:
         reason = (
-            f"neither pixels (loss {fit.appearance:.2f}, usually {usual.appearance:.2f}) nor points "
-            f"({points}) agree with any pose"
+            f"neither pixels (loss {fit.appearance:.2f}, usually {usual.appearance:.2f}), nor the mask "
+            f"(overlap {fit.overlap:.2f}), nor points ({points}) agree with any pose"
         )
         return Assessment(Status.LOST, reason, 0.05)
     confidence = min(0.95, 0.4 + 0.01 * min(points, 40)) * (1 - 0.3 * min(max(excess, 0.0), 2.0))
     if excess > 1:
-        return Assessment(Status.UNCERTAIN, f"pixels disagree (loss {fit.appearance:.2f}), points agree", confidence)
+        return Assessment(
+            Status.UNCERTAIN, f"points agree, pixels do not (loss {fit.appearance:.2f})", confidence
+        )
+    if few and fit.unseen > _MOSTLY:
+        reason = "a side that was never seen before: only the outline and the motion so far tell the pose"
+        return Assessment(Status.UNCERTAIN, reason, 0.5 * confidence)
     return Assessment(Status.TRACKED, "", confidence)

@@ -14,7 +14,6 @@ _SIZE = 200  # pixels that the longer side of the object is scaled to, by 0.5 at
 _BORDER = 8  # pixels around the object that descriptors may look at
 _RATIO = 0.8  # of the distances to the best and the second best, Lowe 2004, section 7.1
 _SAME_PLACE = 2.0  # pixels within which keypoints are one corner, seen at several scales and orientations
-_ROUNDING = 1e-6  # squared distance between descriptors that are the same
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +74,7 @@ def match(a: Keypoints, b: Keypoints) -> NDArray[np.int64]:
     if not (len(a) and len(b)):
         return np.zeros((0, 2), np.int64)
     similarity = _rooted(a.descriptor) @ _rooted(b.descriptor).T
-    distance = np.sqrt(np.maximum(2 - 2 * similarity, _ROUNDING))
+    distance = np.sqrt(np.maximum(2 - 2 * similarity, 0.0))
     best = distance.argmin(1)
     rows = np.arange(len(a))
     gap = np.abs(b.pixel[best][:, None] - b.pixel).max(2)

@@ -14,7 +14,8 @@ MOST_FOLLOWED = 350
 """Points that are followed at once."""
 _SMALLEST = 16  # pixels on either side of a mask in which corners are looked for
 _QUALITY = 0.01  # of the strongest corner, see cv2.goodFeaturesToTrack
-_SUBPIXEL_WINDOW = (3, 3)  # pixels on every side, and how far a corner may be moved
+_SUBPIXEL_WINDOW = (3, 3)  # pixels on every side
+_SUBPIXEL_REACH = 2.0  # pixels that a corner may be moved by and still be in the mask
 _SUBPIXEL_STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.03)
 _FLOW_WINDOW = (15, 15)
 _FLOW_LEVELS = 3
@@ -58,7 +59,8 @@ class FollowedPoints:
         """These, and those of another that are not among them."""
         new = ~np.isin(other.landmark, self.landmark)
         return FollowedPoints(
-            np.concatenate([self.landmark, other.landmark[new]]), np.concatenate([self.pixel, other.pixel[new]])
+            np.concatenate([self.landmark, other.landmark[new]]),
+            np.concatenate([self.pixel, other.pixel[new]]),
         )
 
     def only(self, kept: NDArray[np.bool_]) -> FollowedPoints:
@@ -130,8 +132,9 @@ def new_corners(
     coarse = cv2.goodFeaturesToTrack(crop, most, _QUALITY, distance, mask=free)
     if coarse is None:
         return none
-    fine = cv2.cornerSubPix(crop, coarse, _SUBPIXEL_WINDOW, (-1, -1), _SUBPIXEL_STOP)
-    return np.asarray(fine[:, 0] + corner, dtype=np.float32)
+    fine = cv2.cornerSubPix(crop, coarse.copy(), _SUBPIXEL_WINDOW, (-1, -1), _SUBPIXEL_STOP)
+    close = (np.abs(fine - coarse) < _SUBPIXEL_REACH).all(2, keepdims=True)
+    return np.asarray(np.where(close, fine, coarse)[:, 0] + corner, dtype=np.float32)
 
 
 def _flow(

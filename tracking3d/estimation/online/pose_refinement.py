@@ -78,7 +78,7 @@ class PoseWeights:
         outline_scale: Pixels at full working resolution at which the loss is ``log 2``.
         points: Of the mean over the matched points.
         points_scale: Pixels at full working resolution at which the loss is ``log 2``.
-        unseen: What a covered pixel of unseen texture costs, beside ``appearance``'s loss.
+        unseen: What a covered pixel of unseen texture costs, in place of its loss.
     """
 
     appearance: float = 1.0
@@ -101,6 +101,7 @@ class PoseFit:
         outline: Mean Cauchy loss of the outline; 0 without a mask.
         points: Mean Cauchy loss of the matched points; 0 without any.
         overlap: IoU of what is covered with the mask, inside the frame; 1 without a mask.
+        unseen: Share of the comparable pixels whose texture was never seen, in [0, 1].
         information: ``(6, 6)`` matrix of the normal equations, see `tracking3d.rendering.NormalEquations`.
         iterations: Evaluations spent.
     """
@@ -111,6 +112,7 @@ class PoseFit:
     outline: float
     points: float
     overlap: float
+    unseen: float
     information: Tensor
     iterations: int
 
@@ -206,7 +208,7 @@ def _evaluate(surface: Surface, evidence: _Evidence, pose: Pose) -> tuple[Normal
     weights = evidence.weights
     t = pose.translation[None]
     drawn = _drawn(surface, evidence.observation, pose)
-    pixels, appearance = _appearance(surface, evidence.observation, drawn, t, weights)
+    pixels, appearance, unseen = _appearance(surface, evidence.observation, drawn, t, weights)
     model, cost = pixels * weights.appearance, weights.appearance * appearance
     outline = points = 0.0
     if evidence.distance is not None:
@@ -220,27 +222,28 @@ def _evaluate(surface: Surface, evidence: _Evidence, pose: Pose) -> tuple[Normal
         points = float(found.cost)
         model, cost = model + found * weights.points, cost + weights.points * points
     return model, PoseFit(
-        pose, cost, appearance, outline, points, _overlap(drawn, evidence.observation), model.matrix[0], 1
+        pose, cost, appearance, outline, points, _overlap(drawn, evidence.observation), unseen,
+        model.matrix[0], 1,
     )
 
 
 def _appearance(
     surface: Surface, observation: Observation, drawn: Rendering, t: Tensor, weights: PoseWeights
-) -> tuple[NormalEquations, float]:
-    """Normal equations of the mean loss over what is known, and the cost of all that can be compared."""
+) -> tuple[NormalEquations, float, float]:
+    """Normal equations of the mean loss over what is known, the cost of all that can be compared, and its unseen share."""
     comparable = observation.valid * observation.mask if observation.has_mask else observation.valid
     comparable = comparable.reshape(-1)[drawn.pixels]
     count = float(comparable.sum())
     if not count:
         worst = weights.unseen + 1.0
-        return NormalEquations(t.new_zeros(1, 6, 6), t.new_zeros(1, 6), t.new_zeros(1)), worst
+        return NormalEquations(t.new_zeros(1, 6, 6), t.new_zeros(1, 6), t.new_zeros(1)), worst, 1.0
     # What covers the object, or lies beside it, is left out of the comparison: the mask is to show it.
     known = sample_texture(surface.seen, drawn.uv)[:, 0] * comparable
     model = pose_normal_equations(
         drawn, observation.features[None], t, weights.appearance_scale, known, surface.renderer
     )
     share = float(known.sum()) / count
-    return model, float(model.cost) * share + weights.unseen * (1 - share)
+    return model, float(model.cost) * share + weights.unseen * (1 - share), 1 - share
 
 
 def _overlap(drawn: Rendering, observation: Observation) -> float:

@@ -22,8 +22,9 @@ from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.estimation.feature_space import FeatureSpace, feature_channels
 from tracking3d.estimation.framing import mask_box, projected_box
 from tracking3d.estimation.observation import Observation, observe
+from tracking3d.estimation.online.answer_mask import answer_mask
 from tracking3d.estimation.online.belief import Belief, ObjectMap, View
-from tracking3d.estimation.online.judgement import judge, looks_wrong
+from tracking3d.estimation.online.judgement import ENOUGH_POINTS, judge, looks_wrong
 from tracking3d.estimation.online.keypoints import detect
 from tracking3d.estimation.online.mapping import (
     mask_weight,
@@ -47,6 +48,7 @@ from tracking3d.estimation.online.start import Start
 from tracking3d.estimation.online.surface_fit import FitWeights
 from tracking3d.estimation.online.tracking import (
     agreeing,
+    coast,
     evidence,
     fit_pose,
     placed_keyframes,
@@ -65,6 +67,8 @@ from tracking3d.rendering import BackProjection, TexelMap
 
 _PASSES = 3
 _SPARSE = 40  # witnesses below which the map takes a frame for the sake of new points
+_TRAIL = 5  # believed frames that give the motion where nothing is seen
+_FITS = 0.8  # overlap with the mask that lets a frame without witnesses into the map
 _PAUSE = 3  # frames from one keyframe to the next for that sake
 _WAITS = "the object has not moved enough yet to tell its shape"
 
@@ -264,7 +268,7 @@ class OnlineSolver:
             usual = usual.updated(fit)
             poses.append((pose, view.index))
             revised.append(self._answered(belief, earlier, view, replace(fit, pose=pose), name))
-        belief = replace(belief, last=poses[-1], before=poses[-2], usual=usual, status=Status.TRACKED)
+        belief = replace(belief, last=poses[-1], before=poses[-2], trail=tuple(poses[-_TRAIL:]), usual=usual, status=Status.TRACKED)
         seconds = time.perf_counter() - started
         return belief, replace(revised[-1], revised=tuple(revised[:-1]), seconds=seconds)
 
@@ -300,12 +304,16 @@ class OnlineSolver:
         belief = state.moved(fit.pose, frame.index, image, kept)
         belief = replace(belief, status=judgement.status)
         if lost:
-            # The last pose that was believed is where the search goes on.
-            belief = replace(belief, last=(state.last[0], frame.index), before=None)
-        elif judgement.status is Status.TRACKED:
-            belief = replace(belief, usual=state.usual.updated(fit))
+            coasting = coast(state.trail, frame.index)
+            fit = replace(fit, pose=coasting)
+            belief = replace(belief, last=(coasting, frame.index), before=None)
+        else:
+            belief = replace(belief, trail=(*state.trail, (fit.pose, frame.index))[-_TRAIL:])
+            if judgement.status is Status.TRACKED:
+                belief = replace(belief, usual=state.usual.updated(fit))
         sparse = witnesses < _SPARSE and frame.index >= known.keyframes[-1].index + _PAUSE
-        key = not lost and mask is not None and (sparse or self._is_new(known, fit.pose))
+        sure = witnesses >= ENOUGH_POINTS or fit.overlap > _FITS
+        key = not lost and sure and mask is not None and (sparse or self._is_new(known, fit.pose))
         if key:
             belief = self._mapped(belief, view, image)
             fit = replace(fit, pose=belief.last[0])
@@ -364,6 +372,8 @@ class OnlineSolver:
     def _predicted(self, state: Belief, index: int) -> dict[str, Pose]:
         """Poses to start from, by name."""
         last, last_index = state.last
+        if state.status is Status.LOST and state.trail:
+            return {"coasting": coast(state.trail, index), "last": state.trail[-1][0]}
         if state.before is None:
             return {"last": last}
         before, before_index = state.before
@@ -425,7 +435,13 @@ class OnlineSolver:
         return replace(
             answer,
             T_cam_obj=fit.pose.matrix().numpy(),
-            mask=state.known.silhouette(fit.pose, self.camera),
+            mask=answer_mask(
+                state.known.silhouette(fit.pose, self.camera),
+                view.mask,
+                state.usual,
+                view.mask_weight,
+                witnesses >= ENOUGH_POINTS,
+            ),
             status=Status.TRACKED,
             reason="",
             confidence=0.6,
@@ -436,6 +452,7 @@ class OnlineSolver:
                 "outline": fit.outline,
                 "points": fit.points,
                 "overlap": fit.overlap,
+                "unseen": fit.unseen,
                 "witnesses": float(witnesses),
                 "mask_weight": view.mask_weight,
             },

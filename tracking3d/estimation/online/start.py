@@ -2,30 +2,41 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
 from tracking3d.estimation.observation import halved
 from tracking3d.estimation.online.belief import ObjectMap, View
 from tracking3d.estimation.online.bundle import Structure
+from tracking3d.estimation.online.joint_fit import Modes, fit_jointly
 from tracking3d.estimation.online.mapping import (
     fit_shape,
     pose_arrays,
     pose_of,
-    refine_map,
     surface_places,
     tracks_of,
 )
 from tracking3d.estimation.online.pose_refinement import PoseWeights, refine_pose
 from tracking3d.estimation.online.structure import structure_hypotheses
 from tracking3d.estimation.online.surface_fit import FitWeights
-from tracking3d.estimation.online.turning import improved, turning_hypotheses
+from tracking3d.estimation.online.turning import turning_hypotheses
 from tracking3d.estimation.start import RADIUS
 from tracking3d.geometry.camera import Camera
+from tracking3d.geometry.pose import Pose
 
 _VIEWS = 8
+_TURNING_FRAMES = (
+    12  # after the first that a start without points looks at: a turn of 30 to 60 degrees, mostly
+)
+_TURNING_VIEWS = 7
+_FEWEST_TURNING = 4
+_STAGES = (
+    (99, 5, True),
+    (5, 12, True),
+    (3, 10, False),
+)  # hypotheses that go on, evaluations, half resolution
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +57,12 @@ class Start:
 
 
 def solve_start(
-    known: ObjectMap, camera: Camera, views: list[View], weights: FitWeights, prior: float, verbose: bool = False
+    known: ObjectMap,
+    camera: Camera,
+    views: list[View],
+    weights: FitWeights,
+    prior: float,
+    verbose: bool = False,
 ) -> list[Start]:
     """Starts by rising cost; empty where the points cannot tell.
 
@@ -57,12 +73,14 @@ def solve_start(
         weights: Of the shape's terms.
         prior: See `refine_map`.
     """
-    chosen = [views[i] for i in sorted(set(np.linspace(0, len(views) - 1, _VIEWS).round().astype(int).tolist()))]
+    chosen = [
+        views[i] for i in sorted(set(np.linspace(0, len(views) - 1, _VIEWS).round().astype(int).tolist()))
+    ]
     seen = np.concatenate([view.points.landmark for view in chosen])
     names, counts = np.unique(seen, return_counts=True)
     names = names[(counts >= min(3, len(chosen))) & ~known.candidate[names]]
     if len(names) < 8:
-        return by_turning(known, camera, chosen, weights, verbose)
+        return by_turning(known, camera, views, weights)
     tracks = tracks_of(chosen, names)
     _, t0 = pose_arrays(chosen[0].pose)
     starts = []
@@ -93,29 +111,67 @@ def with_observations(known: ObjectMap, views: list[View], coarse: bool) -> Obje
     return replace(known, keyframes=tuple(keyframes))
 
 
-def by_turning(
-    known: ObjectMap, camera: Camera, views: list[View], weights: FitWeights, verbose: bool = False
-) -> list[Start]:
-    """Starts that need no points, by rising cost."""
-    maps = [
-        (name, replace(known, keyframes=tuple(replace(v, pose=p, texture=None) for v, p in zip(views, poses, strict=True))))
-        for name, poses in turning_hypotheses(views, camera)
+def by_turning(known: ObjectMap, camera: Camera, views: list[View], weights: FitWeights) -> list[Start]:
+    """The best start that needs no points, from the first of the views.
+
+    Shape and poses are fitted together from every hypothesis of `turning_hypotheses`; the better ones go on.
+
+    Args:
+        known: Prototype and landmarks; its keyframes are not looked at.
+        camera: Of the full frame.
+        views: The first frames with masks, all of them: the first `_TURNING_FRAMES` are used.
+        weights: Of the shape's terms.
+    """
+    near = [view for view in views if view.index - views[0].index <= _TURNING_FRAMES]
+    chosen = _spread(near if len(near) >= _FEWEST_TURNING else views, _TURNING_VIEWS)
+    modes = Modes.of(known.shape)
+    tried = [
+        (math.inf, name, replace(known, keyframes=_posed(chosen, poses)))
+        for name, poses in turning_hypotheses(chosen, camera)
     ]
-    starts: list[Start] = []
-    for survivors, rounds, coarse in ((len(maps), 2, True), (6, 4, True), (3, 4, False)):
-        starts = []
-        for name, candidate in maps[:survivors]:
-            tried = with_observations(candidate, views, coarse)
-            better, cost = improved(tried, weights, rounds, (3,))
-            starts.append(Start(with_observations(better, views, False), cost, 0.0, name))
-        starts.sort(key=lambda start: start.cost)
-        maps = [(start.origin, start.known) for start in starts]
-        if verbose:
-            print("   ", [(start.origin, round(start.cost, 4)) for start in starts[:6]])
-    return starts
+    for survivors, iterations, coarse in _STAGES:
+        better = []
+        for _, name, candidate in tried[:survivors]:
+            fitted, cost = fit_jointly(
+                with_observations(candidate, chosen, coarse), modes, weights, iterations
+            )
+            better.append((cost, name, fitted))
+        tried = sorted(better, key=lambda one: one[0])
+    _, name, found = tried[0]
+    found = _on_surface(found, camera)
+    surface = found.surface()
+    fits = [
+        refine_pose(surface, view.observation, view.pose, None, PoseWeights(), iterations=(0,))
+        for view in found.keyframes
+    ]
+    return [Start(found, float(np.mean([fit.cost for fit in fits])), 0.0, name)]
 
 
-def _with_structure(known: ObjectMap, views: list[View], names: np.ndarray, structure: Structure) -> ObjectMap:
+def _spread(views: list[View], most: int) -> list[View]:
+    """At most so many of the views, evenly."""
+    places = np.linspace(0, len(views) - 1, min(most, len(views))).round().astype(int)
+    return [views[place] for place in sorted(set(places.tolist()))]
+
+
+def _posed(views: list[View], poses: list[Pose]) -> tuple[View, ...]:
+    """The views as keyframes with these poses."""
+    return tuple(replace(view, pose=pose, texture=None) for view, pose in zip(views, poses, strict=True))
+
+
+def _on_surface(known: ObjectMap, camera: Camera) -> ObjectMap:
+    """The map with the landmarks of its keyframes where its surface is; they lay on the prototype's."""
+    views = list(known.keyframes)
+    names = np.unique(np.concatenate([view.points.landmark for view in views]))
+    if not len(names):
+        return known
+    landmarks = known.landmarks.copy()
+    landmarks[names] = surface_places(known, camera, views, names)
+    return replace(known, landmarks=landmarks)
+
+
+def _with_structure(
+    known: ObjectMap, views: list[View], names: np.ndarray, structure: Structure
+) -> ObjectMap:
     """The prototype with a structure's poses and points."""
     landmarks = known.landmarks.copy()
     sound = np.isfinite(structure.points).all(1)

@@ -30,7 +30,7 @@ from tracking3d.estimation.online.pose_refinement import (
     refine_pose,
 )
 from tracking3d.geometry.camera import Camera
-from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
+from tracking3d.geometry.pose import Pose, extrapolate, from_matrix, rotation_about
 
 ENOUGH_MATURE = 30
 """With so many landmarks of two keyframes or more, those of one alone are not asked."""
@@ -41,7 +41,21 @@ _STRAY, _STRAY_YOUNG = 4.0, 16.0  # such pixels that a point may be off
 _KEYFRAMES = 6  # that a doubtful frame is matched with
 _GRID_ANGLES = (20.0, 40.0)
 _GRID_FINALISTS = 5
+_COASTS = 12  # frames
 _PLACED = 8  # keyframes whose poses a lost object is looked for at
+
+
+def coast(trail: tuple[tuple[Pose, int], ...], index: int) -> Pose:
+    """Where an object is that is not seen: moving on as it did, for a while.
+
+    Args:
+        trail: Believed poses and their frame indices, in order of time; at least one.
+        index: Of the frame.
+    """
+    (first, begin), (last, end) = trail[0], trail[-1]
+    if begin == end:
+        return last
+    return extrapolate(first, last, min(index - end, _COASTS) / (end - begin))
 
 
 def pixel_scale(view: View) -> float:

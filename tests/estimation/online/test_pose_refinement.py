@@ -1,0 +1,244 @@
+"""A pose follows from pixels, outline and points together, and from each of them where the others say nothing."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from rendered_solids import SIZE, observed, pose_of, shape_of, surface_of
+from torch import Tensor
+
+from tracking3d.estimation.online.pose_refinement import (
+    MatchedPoints,
+    PoseWeights,
+    Surface,
+    _moved,
+    _points_model,
+    refine_pose,
+)
+from tracking3d.geometry.pose import Pose, rotation_angle
+
+TRUTH = pose_of(20)
+SURFACE = surface_of(shape_of())
+FRAME = observed(SURFACE, TRUTH)
+NO_MASK = observed(SURFACE, TRUTH, has_mask=False)
+FLAT = replace(SURFACE, texture=torch.full_like(SURFACE.texture, 0.4))
+AXES = [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, -1.0, 0.5)]
+
+
+def off(
+    axis: tuple[float, float, float] = (1.0, -1.0, 0.5), degrees: float = 5.0, depth: float = 1.05
+) -> Pose:
+    """The true pose, turned and moved away."""
+    length = math.sqrt(sum(part**2 for part in axis))
+    turn = torch.tensor(axis) / length * math.radians(degrees)
+    away = (depth - 1) * TRUTH.translation
+    return _moved(TRUTH, torch.cat([away, turn]))
+
+
+def degrees(pose: Pose) -> float:
+    return math.degrees(float(rotation_angle(pose.quaternion, TRUTH.quaternion)))
+
+
+def pixels_of(points: Tensor, pose: Pose, K: Tensor = FRAME.K) -> Tensor:
+    x_cam = (points @ pose.R.T + pose.translation) @ K.T
+    return x_cam[:, :2] / x_cam[:, 2:]
+
+
+def matched(count: int = 40) -> MatchedPoints:
+    """Vertices on the side that faces the camera, where the true pose shows them."""
+    x_cam = SURFACE.vertices @ TRUTH.R.T
+    facing = torch.nonzero(x_cam[:, 2] < -0.1)[:, 0]
+    points = SURFACE.vertices[facing[:: len(facing) // count][:count]]
+    return MatchedPoints(points, pixels_of(points, TRUTH))
+
+
+@pytest.mark.parametrize("axis", AXES)
+@pytest.mark.parametrize("depth", [0.95, 1.05])
+def test_pixels_and_outline_lead_to_the_true_pose_from_five_degrees_and_five_percent(axis, depth):
+    fit = refine_pose(SURFACE, FRAME, off(axis, 5.0, depth), iterations=(8, 8))
+    assert degrees(fit.pose) < 0.3
+    assert (
+        fit.pose.translation / TRUTH.translation[2] - TRUTH.translation / TRUTH.translation[2]
+    ).norm() < 0.003
+
+
+@pytest.mark.parametrize("axis", AXES)
+def test_without_a_mask_the_pixels_do_it_and_there_is_no_outline_term(axis):
+    fit = refine_pose(SURFACE, NO_MASK, off(axis, 5.0, 1.0), iterations=(8, 8))
+    assert degrees(fit.pose) < 0.7
+    assert fit.outline == 0 and fit.points == 0 and fit.overlap == 1
+    assert fit.cost == pytest.approx(fit.appearance)
+
+
+def test_where_texture_is_flat_points_alone_lead_to_the_true_pose():
+    plain = observed(FLAT, TRUTH, has_mask=False)
+    start = off()
+    assert degrees(refine_pose(FLAT, plain, start, iterations=(8, 8)).pose) > 3
+    fit = refine_pose(FLAT, plain, start, matched(), iterations=(8, 8))
+    assert degrees(fit.pose) < 0.05
+    assert (fit.pose.translation - TRUTH.translation).norm() < 0.005
+    assert fit.points < 1e-3
+
+
+def test_wrong_points_are_outvoted():
+    points = matched()
+    pixels = points.pixels.clone()
+    pixels[::4] += torch.tensor([25.0, -15.0])
+    plain = observed(FLAT, TRUTH, has_mask=False)
+    fit = refine_pose(FLAT, plain, off(), replace(points, pixels=pixels), iterations=(10, 12))
+    assert degrees(fit.pose) < 0.3
+
+
+def test_the_outline_alone_finds_where_a_plain_object_is():
+    """Not how it is turned: other ellipsoids have the same outline."""
+    start = _moved(TRUTH, torch.tensor([0.2, -0.15, 0.0, 0, 0, 0]))
+    fits = [refine_pose(FLAT, observed(FLAT, TRUTH), start, iterations=steps) for steps in ((0, 0), (10, 10))]
+    assert fits[0].overlap < 0.85 and fits[1].overlap > 0.98
+    assert fits[1].outline < 0.05 * fits[0].outline
+
+
+def test_the_true_pose_costs_next_to_nothing_and_stays():
+    fit = refine_pose(SURFACE, FRAME, TRUTH, matched())
+    assert fit.appearance < 1e-3 and fit.outline < 0.02 and fit.points < 1e-3
+    assert degrees(fit.pose) < 0.05 and fit.overlap > 0.99
+
+
+@pytest.mark.parametrize("start", [off(), off((0, 0, 1), 25.0, 1.0), off((0, 1, 0), 60.0, 1.3)])
+def test_the_cost_never_rises_with_more_steps(start):
+    costs = [refine_pose(SURFACE, FRAME, start, matched(), iterations=(n,)).cost for n in range(7)]
+    assert costs == sorted(costs, reverse=True)
+    assert costs[1] < costs[0]
+
+
+def test_no_steps_only_evaluate():
+    start = off()
+    fit = refine_pose(SURFACE, FRAME, start, matched(), iterations=(0, 0))
+    assert fit.pose is start
+    assert fit.iterations == 1
+    once = refine_pose(SURFACE, FRAME, start, matched(), iterations=(0,))
+    assert (fit.cost, fit.appearance, fit.outline, fit.points) == (
+        once.cost, once.appearance, once.outline, once.points
+    )  # fmt: skip
+
+
+def test_the_cost_is_the_weighted_sum_of_its_terms():
+    weights = PoseWeights(appearance=2.0, outline=0.7, points=0.2)
+    fit = refine_pose(SURFACE, FRAME, off(), matched(), weights, (0,))
+    assert min(fit.appearance, fit.outline, fit.points) > 0
+    assert fit.cost == pytest.approx(2.0 * fit.appearance + 0.7 * fit.outline + 0.2 * fit.points)
+
+
+def test_what_weighs_nothing_has_no_say():
+    start, wrong = off(), matched()
+    wrong = replace(wrong, pixels=wrong.pixels + 9)
+    with_points = refine_pose(SURFACE, FRAME, start, wrong, PoseWeights(points=0.0))
+    without = refine_pose(SURFACE, FRAME, start, None, PoseWeights(points=0.0))
+    assert torch.equal(with_points.pose.quaternion, without.pose.quaternion)
+    assert with_points.points > 1
+
+
+def test_no_points_are_the_same_as_none():
+    empty = MatchedPoints(torch.zeros(0, 3), torch.zeros(0, 2))
+    a, b = (refine_pose(SURFACE, FRAME, off(), points) for points in (empty, None))
+    assert a.cost == b.cost and torch.equal(a.pose.quaternion, b.pose.quaternion)
+
+
+def seen_left_half() -> Surface:
+    """Only one half of the texture is known."""
+    seen = torch.ones_like(SURFACE.seen)
+    seen[..., : seen.shape[-1] // 2] = 0
+    return replace(SURFACE, seen=seen)
+
+
+def test_unseen_texture_is_charged_and_pulls_nowhere():
+    unseen = replace(SURFACE, seen=torch.zeros_like(SURFACE.seen))
+    fit = refine_pose(unseen, NO_MASK, off(), None, PoseWeights(unseen=0.37), (0,))
+    assert fit.appearance == pytest.approx(0.37)
+    assert not fit.information.any()
+    assert torch.equal(refine_pose(unseen, NO_MASK, off()).pose.quaternion, off().quaternion)
+
+
+def test_at_the_true_pose_the_charge_is_the_share_of_what_is_unseen():
+    half = seen_left_half()
+    costs = [
+        refine_pose(half, FRAME, TRUTH, None, PoseWeights(unseen=c), (0,)).appearance for c in (0, 0.5, 1)
+    ]
+    share = costs[2] - costs[0]
+    assert 0.05 < share < 0.95
+    assert costs[1] - costs[0] == pytest.approx(share / 2)
+    everything = refine_pose(SURFACE, FRAME, TRUTH, None, PoseWeights(), (0,)).appearance
+    assert costs[0] <= everything + 1e-6
+
+
+def test_a_pose_that_turns_the_unseen_side_forward_costs_more():
+    half = seen_left_half()
+    cost = {turn: refine_pose(half, observed(SURFACE, pose_of(turn)), pose_of(turn), iterations=(0,)).cost
+            for turn in range(0, 360, 90)}  # fmt: skip
+    assert max(cost.values()) > min(cost.values()) + 0.2
+
+
+def test_the_border_of_the_frame_hides_without_a_charge():
+    cut = replace(NO_MASK, valid=NO_MASK.valid.clone())
+    cut.valid[:, SIZE // 2 :] = 0
+    cut.features[:, :, SIZE // 2 :] = 0
+    fit = refine_pose(SURFACE, cut, TRUTH, None, PoseWeights(unseen=10.0), (0,))
+    assert fit.appearance < 0.01
+
+
+def test_an_object_outside_the_window_is_the_worst_and_stays_finite():
+    away = replace(TRUTH, translation=torch.tensor([30.0, 0, 3.5]))
+    for frame in (FRAME, NO_MASK):
+        fit = refine_pose(SURFACE, frame, away)
+        assert math.isfinite(fit.cost)
+        assert fit.appearance > refine_pose(SURFACE, frame, off(), iterations=(0,)).appearance
+        assert fit.pose.translation.isfinite().all()
+    assert refine_pose(SURFACE, FRAME, away).overlap == 0
+
+
+def test_points_behind_the_camera_give_finite_numbers():
+    behind = MatchedPoints(torch.tensor([[0.0, 0, -9], [0.1, 0.2, -3.5]]), torch.full((2, 2), 30.0))
+    fit = refine_pose(SURFACE, FRAME, TRUTH, behind)
+    assert math.isfinite(fit.cost) and fit.pose.quaternion.isfinite().all()
+
+
+def test_points_at_half_the_resolution_are_the_same_points():
+    """Coarse steps alone must lead to the same pose: pixel centres are at integers at both resolutions."""
+    plain = observed(FLAT, TRUTH, has_mask=False)
+    fit = refine_pose(FLAT, plain, off(), matched(), iterations=(12, 0))
+    assert degrees(fit.pose) < 0.05 and fit.points < 1e-3
+
+
+def test_normal_equations_of_the_points_are_those_of_finite_differences():
+    """In float64: the gradient is the cost's, the matrix the sum of weighted products of the pixels' Jacobians."""
+    generator = torch.Generator().manual_seed(0)
+    points = torch.randn(9, 3, generator=generator).double() * 0.5
+    pose = Pose(TRUTH.translation.double(), TRUTH.quaternion.double())
+    K = FRAME.K.double()
+    seen = MatchedPoints(
+        points, pixels_of(points, pose, K) + 3 * torch.randn(9, 2, generator=generator).double()
+    )
+    model = _points_model(seen, K, pose, 1.5)
+    step = 1e-5 * torch.eye(6).double()
+
+    def residual(d: Tensor) -> Tensor:
+        return pixels_of(points, _moved(pose, d), K) - seen.pixels
+
+    def cost(d: Tensor) -> Tensor:
+        return torch.log1p(residual(d).square().sum(1) / 1.5**2).mean()
+
+    gradient = torch.stack([(cost(d) - cost(-d)) / 2e-5 for d in step])
+    jacobian = torch.stack([(residual(d) - residual(-d)) / 2e-5 for d in step], -1)
+    weight = 2 / (1.5**2 + residual(torch.zeros(6).double()).square().sum(1)) / 9
+    matrix = torch.einsum("nia,n,nib->ab", jacobian, weight, jacobian)
+    torch.testing.assert_close(model.cost[0], cost(torch.zeros(6).double()))
+    torch.testing.assert_close(model.gradient[0], gradient, atol=1e-6, rtol=1e-6)
+    torch.testing.assert_close(model.matrix[0], matrix, atol=1e-5, rtol=1e-6)
+
+
+def test_a_step_turns_the_object_about_its_own_origin():
+    moved = _moved(TRUTH, torch.tensor([0.0, 0, 0, 0.1, 0.2, 0.3]))
+    assert torch.equal(moved.translation, TRUTH.translation)
+    assert degrees(moved) == pytest.approx(math.degrees(math.sqrt(0.14)), rel=1e-3)

@@ -1,0 +1,254 @@
+"""Shape and poses of some views together, where no points can be followed.
+
+Levenberg-Marquardt on what the views show of the same faces (`face_equations`), on the outlines' signed distances, and
+on the Laplacian of the shape's offsets. The shape moves in the lowest modes of its Laplacian, so that all unknowns
+together make one small dense system. The first pose stays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy import sparse
+from scipy.sparse.linalg import eigsh
+from torch import Tensor
+
+from tracking3d.estimation.observation import halved
+from tracking3d.estimation.online.belief import ObjectMap
+from tracking3d.estimation.online.outline import outline_distance
+from tracking3d.estimation.online.shaded_appearance import FaceEquations, face_equations, layers_of
+from tracking3d.estimation.online.surface_fit import FitWeights
+from tracking3d.estimation.shape import Shape
+from tracking3d.geometry.pose import Pose, from_matrix, rotation_exponential
+from tracking3d.rendering import Rendering, find_contour, render
+from tracking3d.rendering.contour import contour_slopes
+from tracking3d.rendering.normal_equations import screen_motion
+
+MODES = 80
+_APPEARANCE = 4.0  # weight of the mean loss of what the views show
+_APPEARANCE_SCALE = 0.25
+_FULL_SIZE = 128.0  # pixels of a window in which outline distances are measured, whatever its resolution
+_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-5, 1e3
+_ENOUGH = 1e-4  # share of the cost below which a gain ends the search
+
+
+@dataclass(frozen=True, eq=False)
+class Modes:
+    """The lowest modes of a shape's Laplacian.
+
+    Attributes:
+        vectors: ``(V, M)`` float64 orthonormal columns.
+        bending: ``(M,)`` squared norm of each one's Laplacian.
+    """
+
+    vectors: Tensor
+    bending: Tensor
+
+    @classmethod
+    def of(cls, shape: Shape, count: int = MODES) -> Modes:
+        """The ``count`` lowest."""
+        laplacian = shape.laplacian.coalesce()
+        rows, columns = laplacian.indices().cpu().numpy()
+        L = sparse.csc_matrix(
+            (laplacian.values().double().cpu().numpy(), (rows, columns)), shape=laplacian.shape
+        )
+        count = min(count, L.shape[0] - 1)
+        bending, vectors = eigsh(L.T @ L, k=count, sigma=-1e-6, v0=np.ones(L.shape[0]))
+        vectors = torch.from_numpy(np.ascontiguousarray(vectors)).to(shape.rest.device)
+        return cls(vectors, torch.from_numpy(bending).clamp_min(0).to(vectors))
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    known: ObjectMap
+    modes: Modes
+    weights: FitWeights
+    K: Tensor
+    layers: Tensor
+    distance: Tensor
+    mask_weight: Tensor
+
+    @property
+    def size(self) -> int:
+        return int(self.distance.shape[1])
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    vertices: Tensor
+    poses: Pose
+    cost: float
+    matrix: Tensor
+    gradient: Tensor
+
+
+def fit_jointly(
+    known: ObjectMap, modes: Modes, weights: FitWeights, iterations: int
+) -> tuple[ObjectMap, float]:
+    """The map with vertices and keyframe poses, the first one's aside, that explain its keyframes better; their cost.
+
+    Args:
+        known: The map; its keyframes' observations may be halved. Landmarks are not looked at.
+        modes: In which the shape moves.
+        weights: Of outline and smoothness.
+        iterations: Most evaluations after the first.
+    """
+    problem = _problem(known, modes, weights)
+    state = _evaluated(problem, known.vertices, Pose.stack([view.pose for view in known.keyframes]))
+    damping = _DAMPING
+    for _ in range(iterations):
+        trial = _stepped(problem, state, damping)
+        if trial is not None and trial.cost < state.cost:
+            gain = state.cost - trial.cost
+            state, damping = trial, max(damping / 4, _LEAST_DAMPING)
+            if gain < _ENOUGH * state.cost:
+                break
+        else:
+            damping *= 6
+            if damping > _MOST_DAMPING:
+                break
+    keyframes = tuple(
+        replace(view, pose=state.poses[n], texture=None) for n, view in enumerate(known.keyframes)
+    )
+    return replace(known, vertices=state.vertices, keyframes=keyframes), state.cost
+
+
+def refine_without_points(
+    known: ObjectMap, positions: list[int], weights: FitWeights, iterations: int = 6
+) -> ObjectMap:
+    """A map whose shape and keyframes at ``positions`` fit together, from pixels and outlines alone.
+
+    Args:
+        known: The map.
+        positions: Which keyframes take part, rising; the first one does not move.
+        weights: Of outline and smoothness.
+        iterations: Most evaluations.
+    """
+    if len(positions) < 2:
+        return known
+    views = [known.keyframes[position] for position in positions]
+    coarse = tuple(replace(view, observation=halved(view.observation)) for view in views)
+    window = replace(known, keyframes=coarse)
+    fitted, _ = fit_jointly(window, Modes.of(known.shape), weights, iterations)
+    keyframes = list(known.keyframes)
+    for position, view, fit in zip(positions, views, fitted.keyframes, strict=True):
+        keyframes[position] = replace(view, pose=fit.pose, texture=None)
+    return replace(known, vertices=fitted.vertices, keyframes=tuple(keyframes))
+
+
+def _problem(known: ObjectMap, modes: Modes, weights: FitWeights) -> _Problem:
+    observations = [view.observation for view in known.keyframes]
+    valid = torch.stack([o.valid * (o.mask if o.has_mask else 1.0) for o in observations])
+    believed = [view.mask_weight * view.observation.has_mask for view in known.keyframes]
+    return _Problem(
+        known,
+        modes,
+        weights,
+        torch.stack([o.K for o in observations]),
+        layers_of(torch.stack([o.features for o in observations]), valid),
+        torch.stack([outline_distance(o) for o in observations]),
+        torch.tensor(believed).to(known.vertices),
+    )
+
+
+def _stepped(problem: _Problem, state: _State, damping: float) -> _State | None:
+    """The state after one step; None where there is none."""
+    count = 3 * problem.modes.vectors.shape[1]
+    poses = slice(count + 6, count + 6 * len(problem.K))
+    free = torch.ones(len(state.gradient), dtype=torch.bool)
+    free[count : count + 6] = False  # the first pose
+    matrix = state.matrix[free][:, free]
+    diagonal = matrix.diagonal()
+    damped = matrix + torch.diag(damping * diagonal + 1e-7 * diagonal.max())
+    solution, failed = torch.linalg.solve_ex(damped, -state.gradient[free])
+    if failed or not solution.isfinite().all():
+        return None
+    step = torch.zeros_like(state.gradient)
+    step[free] = solution
+    vertices = state.vertices + (problem.modes.vectors @ step[:count].reshape(-1, 3)).to(state.vertices)
+    by_view = step[poses].reshape(-1, 6).to(vertices)
+    moved = [_moved(state.poses[n + 1], part) for n, part in enumerate(by_view)]
+    return _evaluated(problem, vertices, Pose.stack([state.poses[0], *moved]))
+
+
+def _evaluated(problem: _Problem, vertices: Tensor, poses: Pose) -> _State:
+    """Cost, and normal equations in the modes, the poses and the light."""
+    known, modes = problem.known, problem.modes
+    R, t = poses.R, poses.translation
+    drawn = render(
+        vertices, known.shape.faces, known.shape.face_uvs, vertices.new_zeros(1, 8, 8), R, t, problem.K,
+        (problem.size, problem.size), backend=known.renderer,
+    )  # fmt: skip
+    shown = face_equations(drawn, problem.layers, R, t, _APPEARANCE_SCALE)
+    matrix, gradient = _in_modes(shown, modes, known.shape.faces)
+    matrix, gradient = _APPEARANCE * matrix, _APPEARANCE * gradient
+    outline = _add_outline(problem, drawn, R, t, matrix, gradient)
+    stiffness = problem.weights.smoothness / len(vertices) * modes.bending[:, None]
+    offsets = modes.vectors.T @ (vertices - known.shape.rest).double()
+    count = 3 * len(modes.bending)
+    gradient[:count] += 2 * (stiffness * offsets).reshape(-1)
+    matrix.diagonal()[:count] += 2 * stiffness.expand(-1, 3).reshape(-1)
+    cost = _APPEARANCE * shown.cost + outline + float((stiffness * offsets.square()).sum())
+    return _State(vertices, poses, cost, matrix, gradient)
+
+
+def _in_modes(shown: FaceEquations, modes: Modes, faces: Tensor) -> tuple[Tensor, Tensor]:
+    """Matrix and gradient in ``(3 M + G)`` unknowns; a mode's three directions are neighbours."""
+    corner = faces[shown.faces]
+    vertices, count = modes.vectors.shape
+    rows = corner[:, :, None].expand(-1, 3, 3).flatten().cpu().numpy()
+    columns = corner[:, None].expand(-1, 3, 3).flatten().cpu().numpy()
+    blocks = shown.corners.double().reshape(-1, 3, 3, 3, 3).cpu().numpy()  # (N, corner, xyz, corner, xyz)
+    basis = modes.vectors.cpu().numpy()
+    shape = np.zeros((count, 3, count, 3))
+    for i in range(3):
+        for j in range(i, 3):
+            entries = sparse.csr_matrix(
+                (blocks[:, :, i, :, j].ravel(), (rows, columns)), shape=(vertices, vertices)
+            )
+            part = basis.T @ (entries @ basis)
+            shape[:, i, :, j], shape[:, j, :, i] = part, part.T
+    at_corners = torch.cat([shown.mixed, shown.by_corners[..., None]], 2)
+    width = at_corners.shape[2]
+    at_vertices = at_corners.new_zeros(vertices, 3 * width).index_add(
+        0, corner.flatten(), at_corners.reshape(-1, 3 * width)
+    )
+    mixed = (modes.vectors.to(at_vertices).T @ at_vertices).reshape(3 * count, width).double()
+    top = torch.cat([torch.from_numpy(shape.reshape(3 * count, 3 * count)).to(mixed), mixed[:, :-1]], 1)
+    bottom = torch.cat([mixed[:, :-1].T, shown.rest.double()], 1)
+    return torch.cat([top, bottom]), torch.cat([mixed[:, -1], shown.by_rest.double()])
+
+
+def _add_outline(
+    problem: _Problem, drawn: Rendering, R: Tensor, t: Tensor, matrix: Tensor, gradient: Tensor
+) -> float:
+    """Add the outlines' normal equations to those in modes and poses; their cost."""
+    weights, vectors = problem.weights, problem.modes.vectors
+    contour = find_contour(drawn)
+    view = contour.view
+    scale = _FULL_SIZE / problem.size
+    residual, slope = (part * scale for part in contour_slopes(contour, problem.distance))
+    total = residual.new_zeros(contour.frames).index_add(0, view, contour.length).clamp_min(1.0)
+    weight = weights.outline * contour.length / total[view] / contour.frames * problem.mask_weight[view]
+    square = weights.outline_scale**2
+    cost = float((weight * square * torch.log1p(residual.square() / square)).sum())
+    motion = screen_motion(contour.points, problem.K[view], t[view])
+    by_pose = torch.einsum("ni,nia->na", slope, motion)
+    by_object = torch.einsum("na,nab->nb", by_pose[:, :3], R[view])
+    mode = (contour.share[:, :, None] * vectors.to(slope)[contour.vertices]).sum(1)
+    by_mode = (mode[:, :, None] * by_object[:, None]).flatten(1)
+    by_poses = by_pose.new_zeros(len(view), contour.frames, 6)
+    by_poses[torch.arange(len(view)), view] = by_pose
+    jacobian = torch.cat([by_mode, by_poses.flatten(1)], 1)
+    weighted = jacobian * (2 * weight / (1 + residual.square() / square))[:, None]
+    count = jacobian.shape[1]
+    matrix[:count, :count] += (jacobian.T @ weighted).double()
+    gradient[:count] += (weighted.T @ residual).double()
+    return cost
+
+
+def _moved(pose: Pose, step: Tensor) -> Pose:
+    """The pose after a step (v, w) in the camera's axes about its own translation."""
+    return from_matrix(rotation_exponential(step[3:]) @ pose.R, pose.translation + step[:3])
