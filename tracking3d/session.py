@@ -15,6 +15,7 @@ from tracking3d.config.camera import choose_camera
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
+from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.estimation.paper.solver import PaperSolver
 from tracking3d.estimation.solver import RefiningSolver, Solver
 from tracking3d.features.protocol import FeatureEncoder
@@ -24,7 +25,10 @@ from tracking3d.plugins import FEATURES, TRACKERS, build_plugin, plugin_label
 from tracking3d.plugins.guard import GuardedEncoder, GuardedTracker, PluginFailure
 from tracking3d.rendering import prepare_backend
 
-SOLVERS: dict[str, Callable[[PipelineConfig, Camera, FeatureEncoder], Solver[Any]]] = {"paper": PaperSolver}
+SOLVERS: dict[str, Callable[[PipelineConfig, Camera, FeatureEncoder], Solver[Any]]] = {
+    "paper": PaperSolver,
+    "online": OnlineSolver,
+}
 """Solvers by the name that `solver.name` selects."""
 
 SURE = 0.6

@@ -29,7 +29,7 @@ QUICK: dict[str, dict[str, Any]] = {
             "learning_rates": dict.fromkeys(("translation", "rotation", "vertices", "texture"), 0.03),
         },
     },
-    "default": {
+    "rerendering": {
         **_COARSE,
         "solver": {
             "iterations": 8,
@@ -51,7 +51,7 @@ def short_clip() -> SyntheticClip:
 
 
 def quick_solver(
-    preset: str = "default", encoder: FeatureEncoder | None = None, **sections: Any
+    preset: str = "rerendering", encoder: FeatureEncoder | None = None, **sections: Any
 ) -> PaperSolver:
     """A solver of a preset; ``sections`` change settings of a section on top of the quick ones."""
     quick = QUICK[preset]

@@ -17,7 +17,7 @@ from tracking3d.evaluation.metrics import mask_iou
 from tracking3d.features.rgb import RgbEncoder
 from tracking3d.frames import MaskEstimate
 
-PRESETS = pytest.mark.parametrize("preset", ["paper", "default"])
+PRESETS = pytest.mark.parametrize("preset", ["paper", "rerendering"])
 FAILS = {"tau": 1e-6}
 
 
@@ -38,20 +38,20 @@ def test_a_frame_without_a_mask_is_tracked(preset, absent):
 
 
 def test_a_gap_of_several_frames_is_tracked_through():
-    final = run(quick_solver("default"), range(9), dict.fromkeys((4, 5, 6, 7)))[0]
+    final = run(quick_solver("rerendering"), range(9), dict.fromkeys((4, 5, 6, 7)))[0]
     assert all(mask_iou(answer.mask, true_mask(answer.index)) > 0.6 for answer in final[4:])
     assert final[8].status is Status.TRACKED
 
 
 def test_a_gap_within_the_first_frames_is_tracked_through():
-    answers, _ = run(quick_solver("default", solver={"start_frames": 4}), range(5), {1: None, 2: None})
+    answers, _ = run(quick_solver("rerendering", solver={"start_frames": 4}), range(5), {1: None, 2: None})
     final = revised(answers)
     assert all(mask_iou(answer.mask, true_mask(answer.index)) > 0.6 for answer in final)
     assert [answer.initial_mask is None for answer in final] == [False, True, True, False, False]
 
 
 def test_frames_that_are_missing_altogether_are_passed_over():
-    answers, _ = run(quick_solver("default"), (0, 1, 3, 4, 7, 8))
+    answers, _ = run(quick_solver("rerendering"), (0, 1, 3, 4, 7, 8))
     assert [answer.index for answer in answers] == [0, 1, 3, 4, 7, 8]
     assert all(mask_iou(answer.mask, true_mask(answer.index)) > 0.6 for answer in answers)
 
@@ -109,7 +109,7 @@ def test_a_frame_whose_loss_is_no_number_is_lost_and_the_run_goes_on(preset):
 
 
 def test_a_broken_frame_leaves_shape_and_texture_as_they_were():
-    solver = quick_solver("default", BrokenEncoder(5))
+    solver = quick_solver("rerendering", BrokenEncoder(5))
     _, before = run(solver, range(5))
     after, answer = solver.step(before, frame(5), estimate_of(true_mask(5)))
     assert answer.status is Status.LOST
@@ -119,8 +119,8 @@ def test_a_broken_frame_leaves_shape_and_texture_as_they_were():
 
 
 def test_a_lost_frame_leaves_shape_and_texture_as_they_were():
-    _, before = run(quick_solver("default"), range(5))
-    solver = quick_solver("default", solver=FAILS)
+    _, before = run(quick_solver("rerendering"), range(5))
+    solver = quick_solver("rerendering", solver=FAILS)
     after, answer = solver.step(before, frame(9), estimate_of(true_mask(9)))
     assert answer.status is Status.LOST
     assert torch.equal(after.offsets, before.offsets)
@@ -149,14 +149,14 @@ def test_an_infinite_loss_in_the_middle_of_a_frame_loses_that_frame_only(monkeyp
         return replace(losses, features=losses.features + (math.inf if 4 in self.batch.index else 0.0))
 
     monkeypatch.setattr(Problem, "losses", failing)
-    answers, _ = run(quick_solver("default"), range(7))
+    answers, _ = run(quick_solver("rerendering"), range(7))
     assert [answer.status is Status.LOST for answer in answers] == [index == 4 for index in range(7)]
     assert "inf" in answers[4].reason
 
 
 def test_an_object_that_leaves_the_picture_stops_nothing():
     away = MaskEstimate(None)
-    solver = quick_solver("default")
+    solver = quick_solver("rerendering")
     _, state = run(solver, range(4))
     far = state.last[0]
     for shift in (
@@ -173,7 +173,7 @@ def test_an_object_that_leaves_the_picture_stops_nothing():
 
 
 def test_after_lost_frames_the_object_is_found_again():
-    solver = quick_solver("default")
+    solver = quick_solver("rerendering")
     _, known = run(solver, range(5))
     astray = replace(known.last[0], translation=known.last[0].translation + torch.tensor([1.5, 0.0, 0.5]))
     state, answer = solver.step(

@@ -19,7 +19,7 @@ from tracking3d.geometry.pose import Pose, from_matrix, rotation_about, rotation
 @pytest.fixture(scope="module")
 def waiting() -> tuple[Belief, list[Keyframe]]:
     """Five frames found one by one, and what is known after them."""
-    _, belief = run(quick_solver("default", solver={"start_frames": 8}), range(5))
+    _, belief = run(quick_solver("rerendering", solver={"start_frames": 8}), range(5))
     return belief, [keyframe for keyframe, _ in belief.waiting]
 
 
@@ -76,7 +76,7 @@ def test_the_others_turn_steadily_in_every_direction(waiting):
 
 def test_the_answer_is_the_best_of_what_was_tried_and_keeps_the_gauge(waiting):
     belief, frames = waiting
-    solver = quick_solver("default", solver={"start_iterations": 4}).config.solver
+    solver = quick_solver("rerendering", solver={"start_iterations": 4}).config.solver
     optimum = joint_start(belief, frames, solver, tau=0.2)
     assert optimum.reason == ""
     assert len(optimum.parameters.translation) == len(frames)
@@ -88,7 +88,7 @@ def test_the_answer_is_the_best_of_what_was_tried_and_keeps_the_gauge(waiting):
 
 def test_the_direction_of_the_turn_is_found(waiting):
     belief, frames = waiting
-    solver = quick_solver("default", solver={"start_iterations": 30}).config.solver
+    solver = quick_solver("rerendering", solver={"start_iterations": 30}).config.solver
     poses = joint_start(belief, frames, solver, tau=0.2).parameters.poses
     found = np.stack([poses[n].matrix().numpy()[:3, :3] for n in range(len(frames))])
     errors = aligned_rotation_errors(found, short_clip().T_cam_obj[: len(frames), :3, :3])

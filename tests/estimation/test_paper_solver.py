@@ -22,7 +22,7 @@ from tracking3d.evaluation.metrics import mask_iou
 from tracking3d.features.rgb import RgbEncoder
 from tracking3d.rendering import render
 
-PRESETS = pytest.mark.parametrize("preset", ["paper", "default"])
+PRESETS = pytest.mark.parametrize("preset", ["paper", "rerendering"])
 FAILS = {"tau": 1e-6}
 
 
@@ -89,7 +89,7 @@ def test_the_same_input_gives_the_same_answers(preset):
 
 
 def test_the_first_frame_does_not_move():
-    answers, state = run(quick_solver("default"), range(8))
+    answers, state = run(quick_solver("rerendering"), range(8))
     first = state.keyframes[0]
     assert first.observation.index == 0
     np.testing.assert_array_equal(first.pose.matrix().numpy(), answers[0].T_cam_obj)
@@ -108,7 +108,7 @@ def test_the_oldest_keyframe_does_not_move_in_the_paper_recipe():
 
 
 def test_first_frames_are_uncertain_until_they_are_solved_together_and_then_answered_anew():
-    answers, state = run(quick_solver("default", solver={"start_frames": 4}), range(6))
+    answers, state = run(quick_solver("rerendering", solver={"start_frames": 4}), range(6))
     assert [len(answer.revised) for answer in answers] == [0, 0, 0, 3, 0, 0]
     assert [better.index for better in answers[3].revised] == [0, 1, 2]
     assert all(answer.status is Status.UNCERTAIN for answer in answers[1:3])
@@ -123,7 +123,7 @@ def test_first_frames_are_uncertain_until_they_are_solved_together_and_then_answ
 
 
 def test_revised_answers_and_the_one_that_carries_them_are_one_solution():
-    answers, _ = run(quick_solver("default"), range(3))
+    answers, _ = run(quick_solver("rerendering"), range(3))
     together = {better.losses["laplacian"] for better in answers[2].revised} | {
         answers[2].losses["laplacian"]
     }
@@ -131,7 +131,7 @@ def test_revised_answers_and_the_one_that_carries_them_are_one_solution():
 
 
 def test_after_the_joint_start_its_own_motion_goes_on():
-    answers, state = run(quick_solver("default"), range(3))
+    answers, state = run(quick_solver("rerendering"), range(3))
     (before, index), last = state.before, state.last[0]
     assert index == 1
     np.testing.assert_array_equal(before.matrix().numpy(), answers[2].revised[1].T_cam_obj)
@@ -139,7 +139,7 @@ def test_after_the_joint_start_its_own_motion_goes_on():
 
 
 def test_a_video_that_ends_before_the_joint_start_has_a_result():
-    solver = quick_solver("default", solver={"start_frames": 8})
+    solver = quick_solver("rerendering", solver={"start_frames": 8})
     answers, state = run(solver, range(3))
     assert all(answer.revised == () for answer in answers)
     assert (solver.result(state).texture_weight > 0).any()
@@ -186,7 +186,7 @@ def test_memory_is_bounded_by_keyframes(preset):
 
 
 def test_memory_during_the_joint_start_is_bounded_by_its_frames():
-    solver = quick_solver("default", solver={"start_frames": 5, "keyframes": {"maximum": 2, "rotation": 0}})
+    solver = quick_solver("rerendering", solver={"start_frames": 5, "keyframes": {"maximum": 2, "rotation": 0}})
     state = None
     for index in range(12):
         mask = estimate_of(true_mask(index))
@@ -199,7 +199,7 @@ def test_memory_during_the_joint_start_is_bounded_by_its_frames():
 
 
 def test_frames_that_stay_lost_do_not_pile_up():
-    _, state = run(quick_solver("default", solver=FAILS), range(12))
+    _, state = run(quick_solver("rerendering", solver=FAILS), range(12))
     assert len(list(observations_in(state))) <= 3
 
 
@@ -224,7 +224,7 @@ def test_the_object_is_a_closed_textured_mesh(preset):
 
 def test_the_visible_texture_is_that_of_the_video():
     sharp = {"frequency": 8, "texture_size": 100}
-    solver = quick_solver("default", window={"size": 64}, object=sharp)
+    solver = quick_solver("rerendering", window={"size": 64}, object=sharp)
     answers, state = run(solver, range(4))
     model = solver.result(state)
     camera = short_clip().camera
@@ -247,7 +247,7 @@ def test_the_visible_texture_is_that_of_the_video():
 
 
 def test_flat_prior_answers_with_a_flat_object():
-    for preset in ("paper", "default"):
+    for preset in ("paper", "rerendering"):
         solver = quick_solver(preset, object={"flat": True})
         answers, state = run(solver, range(5))
         vertices = solver.result(state).vertices
@@ -267,7 +267,7 @@ def test_answers_do_not_share_memory_with_what_was_given():
 
 
 def test_a_rendered_mask_that_differs_too_much_yields_to_the_initial_one():
-    solver = quick_solver("default", solver={"agreement": 0.8})
+    solver = quick_solver("rerendering", solver={"agreement": 0.8})
     initial = np.zeros((20, 20), dtype=bool)
     initial[5:15, 5:15] = True
     judgement = Assessment(Status.TRACKED, "", 0.9)

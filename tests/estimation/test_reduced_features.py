@@ -29,8 +29,9 @@ class ManyChannels:
 @pytest.mark.parametrize(("limit", "channels", "tau"), [("4", 4, TAU), ("null", 21, 0.07), ("64", 21, 0.07)])
 def test_the_texture_has_the_channels_that_are_kept(limit, channels, tau):
     config = load_config(
+        preset="rerendering",
         overrides=[f"object.texture_channels={limit}", "object.texture_size=32", "solver.iterations=2",
-                   "solver.pose_iterations=2", "window.size=32"]
+                   "solver.pose_iterations=2", "window.size=32"],
     )  # fmt: skip
     image = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
     mask = np.zeros((48, 64), np.float32)

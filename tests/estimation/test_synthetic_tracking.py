@@ -1,4 +1,4 @@
-"""Accuracy on synthetic sequences with exact masks, against exact truth."""
+"""Accuracy of both solvers on synthetic sequences with exact masks, against exact truth."""
 
 from __future__ import annotations
 
@@ -9,16 +9,19 @@ import pytest
 
 from tracking3d.config.loading import load_config
 from tracking3d.estimation.estimate import FrameEstimate, Status
-from tracking3d.estimation.paper.solver import PaperSolver
 from tracking3d.evaluation.metrics import Angles, aligned_rotation_errors, mask_iou
 from tracking3d.features.rgb import RgbEncoder
 from tracking3d.frames import Frame, MaskEstimate
+from tracking3d.session import SOLVERS
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+
+
+PRESETS = ["default", "rerendering"]
 
 
 @dataclass(frozen=True, eq=False)
 class Tracked:
-    """A run of the default preset over a clip."""
+    """A run of a preset's solver over a clip."""
 
     clip: SyntheticClip
     answers: list[FrameEstimate]
@@ -41,9 +44,10 @@ class Tracked:
         return float(np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1))))
 
 
-def tracked(spec: SyntheticSpec, **settings: object) -> Tracked:
+def tracked(preset: str, spec: SyntheticSpec) -> Tracked:
     clip = synthesize(spec)
-    solver = PaperSolver(load_config(preset="default", **settings), clip.camera, RgbEncoder())
+    config = load_config(preset=preset)
+    solver = SOLVERS[config.solver.name](config, clip.camera, RgbEncoder())
     final: dict[int, FrameEstimate] = {}
     state = None
     for index, image in enumerate(clip.images):
@@ -54,10 +58,10 @@ def tracked(spec: SyntheticSpec, **settings: object) -> Tracked:
     return Tracked(clip, list(final.values()))
 
 
-@pytest.fixture(scope="module")
-def run() -> Tracked:
+@pytest.fixture(scope="module", params=PRESETS)
+def run(request) -> Tracked:
     """Twelve frames of a box with cut corners, which turns by 33 degrees."""
-    return tracked(SyntheticSpec(shape="chamfered_box", frames=12, degrees_per_frame=3.0))
+    return tracked(request.param, SyntheticSpec(shape="chamfered_box", frames=12, degrees_per_frame=3.0))
 
 
 def test_exact_masks_are_kept_and_rotations_found(run):
@@ -79,10 +83,11 @@ def test_every_frame_is_called_tracked(run):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("shape", ["box", "chamfered_box", "ellipsoid"])
-def test_longer_sequences_of_every_shape(shape, seed):
-    run = tracked(SyntheticSpec(shape=shape, frames=24, degrees_per_frame=3.0, seed=seed))
+def test_longer_sequences_of_every_shape(shape, seed, preset):
+    run = tracked(preset, SyntheticSpec(shape=shape, frames=24, degrees_per_frame=3.0, seed=seed))
     assert np.mean(run.ious) > 0.95
     assert np.median(run.rotation_errors) < 6
     assert run.angle_turned == pytest.approx(69, abs=8)

@@ -36,9 +36,10 @@ def clip() -> SyntheticClip:
     return synthesize(SyntheticSpec(frames=4, size=(80, 64)))
 
 
-@pytest.fixture(scope="module")
-def quick() -> PipelineConfig:
-    return load_config(overrides=QUICK)
+@pytest.fixture(scope="module", params=["default", "rerendering"])
+def quick(request) -> PipelineConfig:
+    """A preset of either solver."""
+    return load_config(preset=request.param, overrides=QUICK)
 
 
 def masks_of(answers: list[FrameEstimate]) -> list[np.ndarray]:
@@ -213,9 +214,8 @@ def test_a_mask_of_another_size_is_refused(clip, quick):
 
 def test_a_configuration_file_is_read(clip, tmp_path):
     file = tmp_path / "pipeline.yaml"
-    file.write_text(
-        "\n".join(["window: {size: 32}", "object: {frequency: 2}", "solver: {tau: 1.0e-9, iterations: 1}"])
-    )
+    recipe = ["window: {size: 32}", "object: {frequency: 2}", "solver: {tau: 1.0e-9, iterations: 1}"]
+    file.write_text("\n".join(["preset: rerendering", *recipe]))
     for config in (file, str(file)):
         [answer] = track(clip.images[:1], box=clip.box, config=config)
         assert answer.status is Status.LOST
@@ -234,6 +234,7 @@ def test_without_a_configuration_the_default_preset_is_used(clip, monkeypatch):
     monkeypatch.setattr("tracking3d.pipeline.Session", Recorder)
     assert list(track(clip.images, box=clip.box)) == [0, 1, 2, 3]
     assert used == [load_config(preset="default")]
+    assert used[0].solver.name == "online"
 
 
 @pytest.mark.parametrize("device", ["cuda:99", "abacus", "meta", ""])

@@ -65,9 +65,16 @@ def registered(monkeypatch):
     )
 
 
-def settings(policy: str = "continue", start_frames: int = 1, **sections):
-    overrides = [*QUICK, f"solver.start_frames={start_frames}"]
-    return load_config(overrides=overrides, runtime={"on_plugin_failure": policy}, **sections)
+@pytest.fixture(params=["default", "rerendering"])
+def settings(request):
+    """Make a configuration from a preset of either solver."""
+
+    def make(policy: str = "continue", **sections):
+        return load_config(
+            preset=request.param, overrides=QUICK, runtime={"on_plugin_failure": policy}, **sections
+        )
+
+    return make
 
 
 def bad(fault: str, *at: int) -> dict:
@@ -83,7 +90,7 @@ def test_going_on_is_the_default():
 
 
 @pytest.mark.parametrize(("fault", "told"), TRACKER_FAULTS.items())
-def test_where_the_tracker_fails_its_last_mask_stands_in_and_the_reason_is_told(clip, fault, told):
+def test_where_the_tracker_fails_its_last_mask_stands_in_and_the_reason_is_told(clip, fault, told, settings):
     answers = run(clip, settings(tracker=bad(fault, 2, 3)))
     assert [answer.index for answer in answers] == [0, 1, 2, 3, 4]
     for index in (2, 3):
@@ -100,7 +107,7 @@ def test_where_the_tracker_fails_its_last_mask_stands_in_and_the_reason_is_told(
 
 
 @pytest.mark.parametrize(("fault", "told"), ENCODER_FAULTS.items())
-def test_where_the_encoder_fails_the_initial_mask_is_the_answer_and_the_frame_is_lost(clip, fault, told):
+def test_where_the_encoder_fails_the_initial_mask_is_the_answer_and_the_frame_is_lost(clip, fault, told, settings):
     answers = run(clip, settings(tracker=bad("raises"), features=bad(fault, 2)))
     lost = answers[2]
     assert (lost.status, lost.confidence) == (Status.LOST, 0.0)
@@ -115,13 +122,13 @@ def test_where_the_encoder_fails_the_initial_mask_is_the_answer_and_the_frame_is
     assert answers[3].status is not Status.LOST
 
 
-def test_a_frame_in_which_both_fail_tells_both(clip):
+def test_a_frame_in_which_both_fail_tells_both(clip, settings):
     answer = run(clip, settings(tracker=bad("raises", 2), features=bad("nan", 2)))[2]
     assert "no pixels; feature encoder 'bad'" in answer.failure
     np.testing.assert_array_equal(answer.mask, np.roll(clip.masks[0], 1, axis=1))
 
 
-def test_all_later_frames_may_fail(clip):
+def test_all_later_frames_may_fail(clip, settings):
     answers = run(clip, settings(tracker=bad("raises", 1, 2, 3, 4), features=bad("raises", 1, 2, 3, 4)))
     assert [answer.status for answer in answers[1:]] == [Status.LOST] * 4
     for answer in answers[1:]:
@@ -129,7 +136,12 @@ def test_all_later_frames_may_fail(clip):
 
 
 def test_a_failed_frame_among_the_first_keeps_its_reason_when_it_is_answered_anew(clip):
-    answers = run(clip, settings(start_frames=4, tracker=bad("raises", 1)))
+    config = load_config(
+        preset="rerendering",
+        overrides=[*QUICK, "solver.start_frames=4"],
+        tracker=bad("raises", 1),
+    )
+    answers = run(clip, config)
     [revision] = [earlier for earlier in answers[3].revised if earlier.index == 1]
     assert revision.failure == answers[1].failure != ""
     assert revision.reason.startswith(revision.failure)
@@ -138,7 +150,7 @@ def test_a_failed_frame_among_the_first_keeps_its_reason_when_it_is_answered_ane
 
 
 @pytest.mark.parametrize(("section", "kind"), [("tracker", "mask tracker"), ("features", "feature encoder")])
-def test_with_stop_the_run_ends_and_the_message_names_plugin_version_and_frame(clip, section, kind):
+def test_with_stop_the_run_ends_and_the_message_names_plugin_version_and_frame(clip, section, kind, settings):
     config = settings("stop", **{"tracker": bad("raises"), section: bad("raises", 2)})
     answers = track(clip.images, mask=clip.masks[0], config=config)
     assert [next(answers).index for _ in range(2)] == [0, 1]
@@ -158,18 +170,18 @@ def test_with_stop_the_run_ends_and_the_message_names_plugin_version_and_frame(c
         ("features", "nan", r"feature encoder 'bad' .* failed at frame 0: its features are not all finite"),
     ],
 )
-def test_in_the_first_frame_any_failure_ends_the_run(clip, policy, section, fault, told):
+def test_in_the_first_frame_any_failure_ends_the_run(clip, policy, section, fault, told, settings):
     config = settings(policy, **{"tracker": bad("raises"), section: bad(fault, 0)})
     with pytest.raises(PluginError, match=told):
         run(clip, config)
 
 
-def test_what_the_tracker_refuses_to_start_on_is_told_in_its_own_words(clip):
+def test_what_the_tracker_refuses_to_start_on_is_told_in_its_own_words(clip, settings):
     with pytest.raises(InputError, match=r"^The third mask is missing\.$"):
         run(clip, settings(tracker=bad("refuses", 0)))
 
 
-def test_an_encoder_whose_attributes_cannot_be_used_is_refused_before_the_first_frame(clip):
+def test_an_encoder_whose_attributes_cannot_be_used_is_refused_before_the_first_frame(clip, settings):
     with pytest.raises(
         PluginError, match=r"'bad' .* is broken: its channels is 0 instead of a positive integer"
     ):
@@ -185,7 +197,7 @@ def source(clip, tmp_path):
     return open_source(str(folder))
 
 
-def test_the_run_folder_records_every_failure_and_the_summary_counts_them(clip, source, tmp_path):
+def test_the_run_folder_records_every_failure_and_the_summary_counts_them(clip, source, tmp_path, settings):
     config = settings(tracker=bad("raises", 1, 2, 4), features=bad("nan", 1))
     record(source, config, tmp_path / "run", mask=clip.masks[0])
     reader = RunReader(tmp_path / "run")
@@ -199,7 +211,7 @@ def test_the_run_folder_records_every_failure_and_the_summary_counts_them(clip, 
     assert "no pixels" in commonest["reason"] and "not all finite" in other["reason"]
 
 
-def test_with_stop_the_finished_frames_are_kept(clip, source, tmp_path):
+def test_with_stop_the_finished_frames_are_kept(clip, source, tmp_path, settings):
     with pytest.raises(PluginError, match=r"failed at 002\.png") as caught:
         record(source, settings("stop", tracker=bad("raises", 2)), tmp_path / "run", mask=clip.masks[0])
     assert "What was finished until then is kept" in caught.value.__notes__[0]
@@ -208,7 +220,7 @@ def test_with_stop_the_finished_frames_are_kept(clip, source, tmp_path):
     assert "no pixels" in reader.description["error"]
 
 
-def test_the_summary_on_the_screen_says_how_many_frames_failed_and_why(clip, source, tmp_path, capsys):
+def test_the_summary_on_the_screen_says_how_many_frames_failed_and_why(clip, source, tmp_path, capsys, settings):
     from tracking3d.cli.progress import print_summary
 
     record(source, settings(tracker=bad("raises", 1, 2)), tmp_path / "run", mask=clip.masks[0])

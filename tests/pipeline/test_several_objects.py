@@ -176,7 +176,8 @@ def test_when_the_last_object_stops_so_does_all(images, monkeypatch):
 def test_every_object_has_a_run_folder_as_if_it_were_alone(source, tmp_path):
     told: list = []
     record_objects(source, settings(), tmp_path / "run", boxes=[LEFT, RIGHT], listener=told.append)
-    assert [frame.index for frame in told] == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4]
+    assert [frame.index for frame in told] == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4] * 2  # the second time refined
+    assert [frame.refined for frame in told] == [False] * 10 + [True] * 10
     assert sorted(path.name for path in (tmp_path / "run").iterdir()) == ["object_0", "object_1"]
     for number, box in enumerate((LEFT, RIGHT)):
         record(source, settings(), tmp_path / f"alone_{number}", box=box)

@@ -127,10 +127,31 @@ class KeyframeConfig(Section):
     keep_first: bool = Field(False, description="Frame 0 stays a keyframe whatever happens.")
 
 
-class SolverConfig(Section):
-    """The estimator. Defaults are the paper's recipe."""
+class OnlineConfig(Section):
+    """The solver ``online``."""
 
-    name: str = Field("paper", description="Which solver.")
+    appearance: float = Field(1.0, ge=0, description="Weight of the pixels' loss in a frame's pose.")
+    outline: float = Field(0.3, ge=0, description="Weight of the outline's distance from the mask, robust.")
+    points: float = Field(1.0, ge=0, description="Weight of the followed points' distances, robust.")
+    keyframe_rotation: float = Field(
+        8.0, gt=0, description="A frame is a keyframe if it is turned more than so many degrees from all others."
+    )
+    window: int = Field(
+        12, ge=2, le=64, description="Keyframes that are refined together: half recent, half spread over the older."
+    )
+    most_keyframes: int = Field(
+        64, ge=8, le=512, description="Keyframes that are kept; the one nearest to another view goes first."
+    )
+    smoothness: float = Field(300.0, gt=0, description="Weight of the shape's Laplacian.")
+    surface_prior: float = Field(
+        20.0, ge=0, description="How strongly points are held to the surface, per squared object unit."
+    )
+
+
+class SolverConfig(Section):
+    """The estimator. Defaults are the paper's recipe; keys without another word are those of solver ``paper``."""
+
+    name: str = Field("paper", description="Which solver: paper or online.")
     iterations: int = Field(500, ge=1, le=100_000, description="Most iterations a frame.")
     tau: float | None = Field(
         None,
@@ -230,6 +251,7 @@ class SolverConfig(Section):
     weights: Weights = Weights()
     learning_rates: LearningRates = LearningRates()
     keyframes: KeyframeConfig = KeyframeConfig()
+    online: OnlineConfig = OnlineConfig()
 
 
 class RuntimeConfig(Section):

@@ -14,6 +14,7 @@ from tracking3d.estimation.online.pose_refinement import (
     MatchedPoints,
     PoseWeights,
     Surface,
+    _halved,
     _moved,
     _points_model,
     refine_pose,
@@ -113,6 +114,14 @@ def test_the_cost_never_rises_with_more_steps(start):
     assert costs[1] < costs[0]
 
 
+def test_steps_that_fail_are_damped_until_they_succeed():
+    """Twice as far away and turned by 60 degrees, the first steps lead nowhere better."""
+    plain, start = observed(FLAT, TRUTH, has_mask=False), off((1.0, 0.0, 0.0), 60.0, 2.0)
+    costs = [refine_pose(FLAT, plain, start, matched(), iterations=(n,)).cost for n in (0, 1, 2, 14)]
+    assert costs[0] == costs[1] == costs[2] > 4
+    assert costs[3] < 1e-3
+
+
 def test_no_steps_only_evaluate():
     start = off()
     fit = refine_pose(SURFACE, FRAME, start, matched(), iterations=(0, 0))
@@ -146,7 +155,7 @@ def test_no_points_are_the_same_as_none():
     assert a.cost == b.cost and torch.equal(a.pose.quaternion, b.pose.quaternion)
 
 
-def seen_left_half() -> Surface:
+def seen_right_half() -> Surface:
     """Only one half of the texture is known."""
     seen = torch.ones_like(SURFACE.seen)
     seen[..., : seen.shape[-1] // 2] = 0
@@ -162,30 +171,51 @@ def test_unseen_texture_is_charged_and_pulls_nowhere():
 
 
 def test_at_the_true_pose_the_charge_is_the_share_of_what_is_unseen():
-    half = seen_left_half()
+    half = seen_right_half()
     costs = [
         refine_pose(half, FRAME, TRUTH, None, PoseWeights(unseen=c), (0,)).appearance for c in (0, 0.5, 1)
     ]
     share = costs[2] - costs[0]
     assert 0.05 < share < 0.95
     assert costs[1] - costs[0] == pytest.approx(share / 2)
+    assert refine_pose(half, FRAME, TRUTH, iterations=(0,)).unseen == pytest.approx(share)
+    assert refine_pose(SURFACE, FRAME, TRUTH, iterations=(0,)).unseen == pytest.approx(0, abs=1e-6)
     everything = refine_pose(SURFACE, FRAME, TRUTH, None, PoseWeights(), (0,)).appearance
     assert costs[0] <= everything + 1e-6
 
 
+def test_two_halves_of_the_texture_cost_together_what_all_of_it_does():
+    half, free, start = seen_right_half(), PoseWeights(unseen=0.0), off()
+    other = replace(half, seen=1 - half.seen)
+    costs = [refine_pose(part, FRAME, start, None, free, (0,)).appearance for part in (half, other, SURFACE)]
+    assert min(costs) > 0 and costs[0] + costs[1] == pytest.approx(costs[2], rel=1e-4)
+
+
 def test_a_pose_that_turns_the_unseen_side_forward_costs_more():
-    half = seen_left_half()
+    half = seen_right_half()
     cost = {turn: refine_pose(half, observed(SURFACE, pose_of(turn)), pose_of(turn), iterations=(0,)).cost
             for turn in range(0, 360, 90)}  # fmt: skip
     assert max(cost.values()) > min(cost.values()) + 0.2
 
 
-def test_the_border_of_the_frame_hides_without_a_charge():
-    cut = replace(NO_MASK, valid=NO_MASK.valid.clone())
-    cut.valid[:, SIZE // 2 :] = 0
-    cut.features[:, :, SIZE // 2 :] = 0
+@pytest.mark.parametrize("frame", [FRAME, NO_MASK], ids=["mask", "no mask"])
+def test_the_border_of_the_frame_hides_without_a_charge(frame):
+    cut = replace(frame, valid=frame.valid.clone(), features=frame.features.clone(), mask=frame.mask.clone())
+    for part in (cut.valid, cut.features, cut.mask):
+        part[..., SIZE // 2 :] = 0
     fit = refine_pose(SURFACE, cut, TRUTH, None, PoseWeights(unseen=10.0), (0,))
     assert fit.appearance < 0.01
+    assert fit.outline < 0.02
+    assert fit.overlap > 0.99
+
+
+def test_what_covers_the_object_is_not_compared_with_it():
+    """Where the mask ends, something else is seen."""
+    covered = replace(FRAME, features=FRAME.features.clone(), mask=FRAME.mask.clone())
+    for part, value in ((covered.features, 1.0), (covered.mask, 0.0)):
+        part[..., : SIZE // 2] = value
+    fit = refine_pose(SURFACE, covered, TRUTH, iterations=(0,))
+    assert fit.appearance < 1e-3 and 0.3 < fit.overlap < 0.7
 
 
 def test_an_object_outside_the_window_is_the_worst_and_stays_finite():
@@ -198,9 +228,9 @@ def test_an_object_outside_the_window_is_the_worst_and_stays_finite():
     assert refine_pose(SURFACE, FRAME, away).overlap == 0
 
 
-def test_points_behind_the_camera_give_finite_numbers():
+def test_points_behind_the_camera_and_in_its_plane_give_finite_numbers():
     behind = MatchedPoints(torch.tensor([[0.0, 0, -9], [0.1, 0.2, -3.5]]), torch.full((2, 2), 30.0))
-    fit = refine_pose(SURFACE, FRAME, TRUTH, behind)
+    fit = refine_pose(SURFACE, FRAME, pose_of(0), behind)
     assert math.isfinite(fit.cost) and fit.pose.quaternion.isfinite().all()
 
 
@@ -209,6 +239,20 @@ def test_points_at_half_the_resolution_are_the_same_points():
     plain = observed(FLAT, TRUTH, has_mask=False)
     fit = refine_pose(FLAT, plain, off(), matched(), iterations=(12, 0))
     assert degrees(fit.pose) < 0.05 and fit.points < 1e-3
+
+
+def test_at_half_the_resolution_scales_are_half_as_many_pixels():
+    half = _halved(FRAME, matched(), PoseWeights(outline_scale=3.0, points_scale=5.0), 1)
+    assert (half.weights.outline_scale, half.weights.points_scale) == (1.5, 2.5)
+    assert half.observation.window.size == SIZE // 2
+    assert half.matched is not None
+    expected = pixels_of(half.matched.points, TRUTH, half.observation.K)
+    torch.testing.assert_close(half.matched.pixels, expected, atol=1e-4, rtol=0)
+
+
+def test_evaluations_of_all_resolutions_are_counted():
+    counts = [refine_pose(SURFACE, FRAME, off(), iterations=n).iterations for n in ((3,), (3, 0), (2, 3))]
+    assert counts == [4, 5, 7]
 
 
 def test_normal_equations_of_the_points_are_those_of_finite_differences():

@@ -144,6 +144,26 @@ def test_a_landmark_beside_the_silhouette_pulls_the_nearest_vertex():
     assert (shape - BALL.rest)[BALL.rest[:, 0] < 0].norm(dim=1).max() < 0.2 * before
 
 
+def test_landmarks_on_the_surface_pull_it_nowhere_wherever_on_their_faces_they_are():
+    front = pose_of(0)
+    seen = drawn(BALL.rest, BALL.faces, [front])
+    points = (seen.points[::7] - front.translation) @ front.R
+    landmarks = Landmarks(points, torch.zeros(len(points), dtype=torch.int64))
+    views = views_of(silhouettes(BALL.rest, BALL.faces, [front]), [front], torch.zeros(1))
+    shape = fitted(views, landmarks, FitWeights(smoothness=1e-3), rounds=3)
+    assert (shape - BALL.rest).norm(dim=1).max() < 1e-3
+
+
+def test_landmarks_count_by_their_mean():
+    poses = poses_around()[:3]
+    views = views_of(silhouettes(BALL.rest, BALL.faces, poses), poses)
+    points = 1.08 * BALL.rest[::5]
+    once = Landmarks(points, torch.zeros(len(points), dtype=torch.int64))
+    twice = Landmarks(points.repeat(2, 1), once.view.repeat(2))
+    assert (fitted(views, once) - fitted(views, twice)).norm(dim=1).max() < 1e-4
+    assert (fitted(views, once) - fitted(views)).norm(dim=1).max() > 0.01
+
+
 def test_a_landmark_ten_times_as_far_pulls_less():
     poses = poses_around()
     views = views_of(silhouettes(BALL.rest, BALL.faces, poses), poses)
@@ -271,12 +291,12 @@ def test_rows_of_the_outline_are_finite_differences():
 def test_rows_of_the_landmarks_are_finite_differences():
     """Landmarks on faces, each in a view that shows it: their distances from the plane of the face."""
     views, poses = exact_views(2)
-    centre = VERTICES[EXACT.faces].mean(1)
+    inner = torch.tensor([0.5, 0.3, 0.2], dtype=torch.float64) @ VERTICES[EXACT.faces]
     index = [drawn(VERTICES, EXACT.faces, [pose]).face_index for pose in poses]
     shown = [[face for face in range(len(EXACT.faces)) if (i == face).sum() > 12] for i in index]
     face = torch.tensor(shown[0] + shown[1])
     view = torch.tensor([0] * len(shown[0]) + [1] * len(shown[1]))
-    landmarks = Landmarks(centre[face], view)
+    landmarks = Landmarks(inner[face], view)
     weights = FitWeights(landmarks=1.3, landmarks_scale=1e6)
 
     def rows(vertices: Tensor) -> Rows:

@@ -96,7 +96,9 @@ class ObjectMap:
         K[:2, 2] += (scale - 1) / 2  # pixel centres stay at integers
         valid = observation.valid * (observation.mask if observation.has_mask else 1.0)
         if scale != 1:
-            valid = torch.nn.functional.interpolate(valid[None, None], size=values.shape[-2:], mode="bilinear")[0, 0]
+            valid = torch.nn.functional.interpolate(
+                valid[None, None], size=values.shape[-2:], mode="bilinear"
+            )[0, 0]
         return back_project(
             values, valid, self.vertices, self.shape.faces, self.texels, view.pose.R, view.pose.translation, K,
             self.renderer,
@@ -139,6 +141,7 @@ class Belief:
         waiting: First frames that wait for the start, with their answers so far; None once it is done.
         space: What is made of the encoder's features; None leaves them as they are.
         due: Motion at which the next start is tried.
+        waits_for: Why the start waits, where that is not lack of motion.
         usual: What tracked frames have cost.
         status: Of the last frame.
         trail: Poses and indices of the last frames that were believed.
@@ -154,12 +157,11 @@ class Belief:
     waiting: tuple[tuple[View, FrameEstimate], ...] | None = ()
     space: FeatureSpace | None = None
     due: float = 0.0
+    waits_for: str = ""
     usual: Usual = field(default_factory=Usual)
     status: Status = Status.UNCERTAIN
     trail: tuple[tuple[Pose, int], ...] = ()
 
     def moved(self, pose: Pose, index: int, grey: NDArray[np.uint8], followed: FollowedPoints) -> Belief:
         """One frame later."""
-        return replace(
-            self, last=(pose, index), before=self.last, grey=grey, followed=followed
-        )
+        return replace(self, last=(pose, index), before=self.last, grey=grey, followed=followed)

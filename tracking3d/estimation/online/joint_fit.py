@@ -15,8 +15,7 @@ from scipy import sparse
 from scipy.sparse.linalg import eigsh
 from torch import Tensor
 
-from tracking3d.estimation.observation import halved
-from tracking3d.estimation.online.belief import ObjectMap
+from tracking3d.estimation.online.belief import ObjectMap, View
 from tracking3d.estimation.online.outline import outline_distance
 from tracking3d.estimation.online.shaded_appearance import FaceEquations, face_equations, layers_of
 from tracking3d.estimation.online.surface_fit import FitWeights
@@ -72,7 +71,19 @@ class _Problem:
 
     @property
     def size(self) -> int:
+        """Side of the windows."""
         return int(self.distance.shape[1])
+
+    @property
+    def shape_unknowns(self) -> int:
+        """How many unknowns the shape has; six for each pose and three for each channel's light follow."""
+        return 3 * len(self.modes.bending)
+
+    @property
+    def unknowns(self) -> int:
+        """How many there are."""
+        channels = (self.layers.shape[1] - 1) // 3
+        return self.shape_unknowns + 6 * len(self.K) + 3 * channels
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,23 +107,43 @@ def fit_jointly(
         iterations: Most evaluations after the first.
     """
     problem = _problem(known, modes, weights)
-    state = _evaluated(problem, known.vertices, Pose.stack([view.pose for view in known.keyframes]))
-    damping = _DAMPING
-    for _ in range(iterations):
-        trial = _stepped(problem, state, damping)
-        if trial is not None and trial.cost < state.cost:
-            gain = state.cost - trial.cost
-            state, damping = trial, max(damping / 4, _LEAST_DAMPING)
-            if gain < _ENOUGH * state.cost:
-                break
-        else:
-            damping *= 6
-            if damping > _MOST_DAMPING:
-                break
+    free = torch.ones(problem.unknowns, dtype=torch.bool)
+    free[problem.shape_unknowns : problem.shape_unknowns + 6] = False  # the first pose
+    state = _minimized(problem, free, iterations)
     keyframes = tuple(
         replace(view, pose=state.poses[n], texture=None) for n, view in enumerate(known.keyframes)
     )
     return replace(known, vertices=state.vertices, keyframes=keyframes), state.cost
+
+
+def pose_without_points(
+    known: ObjectMap,
+    view: View,
+    references: list[int],
+    modes: Modes,
+    weights: FitWeights,
+    iterations: int = 6,
+) -> tuple[Pose, float]:
+    """The pose of one more view, against what some keyframes show under the same light, and its mask's outline.
+
+    Args:
+        known: The map, which does not change.
+        view: With a first pose.
+        references: Positions of the keyframes it is compared with.
+        modes: Of the shape.
+        weights: Of the outline.
+        iterations: Most evaluations after the first.
+
+    Returns:
+        The pose, and the cost of all these views together: it tells one first pose from another.
+    """
+    together = replace(known, keyframes=(*(known.keyframes[place] for place in references), view))
+    problem = _problem(together, modes, weights)
+    free = torch.zeros(problem.unknowns, dtype=torch.bool)
+    last = problem.shape_unknowns + 6 * len(references)
+    free[last : last + 6] = True
+    state = _minimized(problem, free, iterations)
+    return state.poses[len(references)], state.cost
 
 
 def refine_without_points(
@@ -128,13 +159,11 @@ def refine_without_points(
     """
     if len(positions) < 2:
         return known
-    views = [known.keyframes[position] for position in positions]
-    coarse = tuple(replace(view, observation=halved(view.observation)) for view in views)
-    window = replace(known, keyframes=coarse)
+    window = replace(known, keyframes=tuple(known.keyframes[position] for position in positions))
     fitted, _ = fit_jointly(window, Modes.of(known.shape), weights, iterations)
     keyframes = list(known.keyframes)
-    for position, view, fit in zip(positions, views, fitted.keyframes, strict=True):
-        keyframes[position] = replace(view, pose=fit.pose, texture=None)
+    for position, view in zip(positions, fitted.keyframes, strict=True):
+        keyframes[position] = view
     return replace(known, vertices=fitted.vertices, keyframes=tuple(keyframes))
 
 
@@ -153,12 +182,30 @@ def _problem(known: ObjectMap, modes: Modes, weights: FitWeights) -> _Problem:
     )
 
 
-def _stepped(problem: _Problem, state: _State, damping: float) -> _State | None:
+def _minimized(problem: _Problem, free: Tensor, iterations: int) -> _State:
+    """The best state that Levenberg-Marquardt reaches in the free unknowns."""
+    poses = Pose.stack([view.pose for view in problem.known.keyframes])
+    state = _evaluated(problem, problem.known.vertices, poses)
+    damping = _DAMPING
+    for _ in range(iterations):
+        trial = _stepped(problem, state, free, damping)
+        if trial is not None and trial.cost < state.cost:
+            gain = state.cost - trial.cost
+            state, damping = trial, max(damping / 4, _LEAST_DAMPING)
+            if gain < _ENOUGH * state.cost:
+                break
+        else:
+            damping *= 6
+            if damping > _MOST_DAMPING:
+                break
+    return state
+
+
+def _stepped(problem: _Problem, state: _State, free: Tensor, damping: float) -> _State | None:
     """The state after one step; None where there is none."""
-    count = 3 * problem.modes.vectors.shape[1]
-    poses = slice(count + 6, count + 6 * len(problem.K))
-    free = torch.ones(len(state.gradient), dtype=torch.bool)
-    free[count : count + 6] = False  # the first pose
+    # The light is fitted anew at every state: its part of the step is only what the others must allow for.
+    free = free.clone()
+    free[problem.shape_unknowns + 6 * len(problem.K) :] = True
     matrix = state.matrix[free][:, free]
     diagonal = matrix.diagonal()
     damped = matrix + torch.diag(damping * diagonal + 1e-7 * diagonal.max())
@@ -167,10 +214,12 @@ def _stepped(problem: _Problem, state: _State, damping: float) -> _State | None:
         return None
     step = torch.zeros_like(state.gradient)
     step[free] = solution
-    vertices = state.vertices + (problem.modes.vectors @ step[:count].reshape(-1, 3)).to(state.vertices)
-    by_view = step[poses].reshape(-1, 6).to(vertices)
-    moved = [_moved(state.poses[n + 1], part) for n, part in enumerate(by_view)]
-    return _evaluated(problem, vertices, Pose.stack([state.poses[0], *moved]))
+    shape, poses, _ = step.split(
+        [problem.shape_unknowns, 6 * len(problem.K), len(step) - problem.shape_unknowns - 6 * len(problem.K)]
+    )
+    vertices = state.vertices + (problem.modes.vectors @ shape.reshape(-1, 3)).to(state.vertices)
+    moved = [_moved(state.poses[n], part) for n, part in enumerate(poses.reshape(-1, 6).to(vertices))]
+    return _evaluated(problem, vertices, Pose.stack(moved))
 
 
 def _evaluated(problem: _Problem, vertices: Tensor, poses: Pose) -> _State:

@@ -16,14 +16,16 @@ from tracking3d.estimation.online.keypoints import Keypoints, match
 from tracking3d.estimation.online.outline import outline_distance
 from tracking3d.estimation.online.points import FollowedPoints
 from tracking3d.estimation.online.surface_fit import FitWeights, Landmarks, Views, fit_surface
+from tracking3d.estimation.shape import flatten
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, from_matrix
-from tracking3d.rendering import rasterize
 from tracking3d.rendering import project as project_vertices
+from tracking3d.rendering import rasterize
 
 FloatArray = NDArray[np.float64]
 _SAME_PLACE = 1.5  # pixels within which a keypoint is a point that is followed
 _FEWEST_WITNESSES = 12
+_MOST_BUNDLED = 1500
 _SEARCH = 12.0  # pixels around its projection within which a landmark may be found again
 
 
@@ -216,12 +218,17 @@ def _bundled(
     views = [known.keyframes[position] for position in positions]
     seen = np.concatenate([view.points.landmark for view in views])
     names, counts = np.unique(seen, return_counts=True)
-    names = names[(counts >= 2) & ~known.candidate[names]]
+    usable = (counts >= 2) & ~known.candidate[names]
+    names, counts = names[usable], counts[usable]
+    # Those that most keyframes show hold the poses together.
+    names = np.sort(names[np.argsort(-counts, kind="stable")[:_MOST_BUNDLED]])
     if len(names) < 8 or len(views) < 2:
         return known
     tracks = tracks_of(views, names)
     poses = [pose_arrays(view.pose) for view in views]
-    start = Structure(np.array([R for R, _ in poses]), np.array([t for _, t in poses]), known.landmarks[names])
+    start = Structure(
+        np.array([R for R, _ in poses]), np.array([t for _, t in poses]), known.landmarks[names]
+    )
     places = surface_places(known, camera, views, names)
     found = adjust(
         tracks, camera.K, start, fixed=1, scale=scale, iterations=iterations,
@@ -232,7 +239,9 @@ def _bundled(
     landmarks[names[sound]] = found.points[sound]
     keyframes = list(known.keyframes)
     for n, position in enumerate(positions):
-        keyframes[position] = replace(keyframes[position], pose=pose_of(found.R[n], found.t[n], known.vertices))
+        keyframes[position] = replace(
+            keyframes[position], pose=pose_of(found.R[n], found.t[n], known.vertices)
+        )
         residual = found.residual[n]
         bad = names[np.nan_to_num(residual, nan=0.0) > 4 * scale]
         if len(bad):
@@ -271,7 +280,9 @@ def tracks_of(views: list[View], names: NDArray[np.int64]) -> Tracks:
 
 def pose_of(R: FloatArray, t: FloatArray, like: Tensor) -> Pose:
     """A pose from arrays."""
-    return from_matrix(torch.from_numpy(np.ascontiguousarray(R)).to(like), torch.from_numpy(np.ascontiguousarray(t)).to(like))
+    return from_matrix(
+        torch.from_numpy(np.ascontiguousarray(R)).to(like), torch.from_numpy(np.ascontiguousarray(t)).to(like)
+    )
 
 
 def fit_shape(known: ObjectMap, positions: list[int], weights: FitWeights, rounds: int) -> ObjectMap:
@@ -300,4 +311,4 @@ def fit_shape(known: ObjectMap, positions: list[int], weights: FitWeights, round
         known.vertices, known.shape.rest, known.shape.faces, known.shape.face_uvs, known.shape.laplacian, seen,
         landmarks, weights, rounds, known.renderer,
     )  # fmt: skip
-    return replace(known, vertices=vertices)
+    return replace(known, vertices=flatten(vertices) if known.shape.flat else vertices)

@@ -72,7 +72,7 @@ class PoseWeights:
     """What each kind of evidence counts, and where its robust loss turns over.
 
     Attributes:
-        appearance: Of the mean over the covered pixels.
+        appearance: Of the mean over the covered pixels in the mask and the frame.
         appearance_scale: Difference of features at which the loss is ``log 2``.
         outline: Of the mean along the outline.
         outline_scale: Pixels at full working resolution at which the loss is ``log 2``.
@@ -97,7 +97,7 @@ class PoseFit:
     Attributes:
         pose: Of the frame.
         cost: What was minimized.
-        appearance: Mean Cauchy loss over the covered pixels, unseen ones charged.
+        appearance: Mean Cauchy loss over the covered pixels in the mask and the frame, unseen ones charged.
         outline: Mean Cauchy loss of the outline; 0 without a mask.
         points: Mean Cauchy loss of the matched points; 0 without any.
         overlap: IoU of what is covered with the mask, inside the frame; 1 without a mask.
@@ -209,7 +209,8 @@ def _evaluate(surface: Surface, evidence: _Evidence, pose: Pose) -> tuple[Normal
     t = pose.translation[None]
     drawn = _drawn(surface, evidence.observation, pose)
     pixels, appearance, unseen = _appearance(surface, evidence.observation, drawn, t, weights)
-    model, cost = pixels * weights.appearance, weights.appearance * appearance
+    # The equations are of the mean over what is known, the cost is of all that can be compared.
+    model, cost = pixels * (weights.appearance * (1 - unseen)), weights.appearance * appearance
     outline = points = 0.0
     if evidence.distance is not None:
         edge = contour_normal_equations(
@@ -224,13 +225,13 @@ def _evaluate(surface: Surface, evidence: _Evidence, pose: Pose) -> tuple[Normal
     return model, PoseFit(
         pose, cost, appearance, outline, points, _overlap(drawn, evidence.observation), unseen,
         model.matrix[0], 1,
-    )
+    )  # fmt: skip
 
 
 def _appearance(
     surface: Surface, observation: Observation, drawn: Rendering, t: Tensor, weights: PoseWeights
 ) -> tuple[NormalEquations, float, float]:
-    """Normal equations of the mean loss over what is known, the cost of all that can be compared, and its unseen share."""
+    """Normal equations of the mean loss over what is known; cost and unseen share of what can be compared."""
     comparable = observation.valid * observation.mask if observation.has_mask else observation.valid
     comparable = comparable.reshape(-1)[drawn.pixels]
     count = float(comparable.sum())

@@ -86,6 +86,7 @@ def recruit(known: ObjectMap, camera: Camera, positions: list[int]) -> ObjectMap
     candidate[names[accepted]] = False
     dropped = names[rejected & ~accepted]
     keyframes = tuple(
-        replace(view, points=view.points.only(~np.isin(view.points.landmark, dropped))) for view in known.keyframes
+        replace(view, points=view.points.only(~np.isin(view.points.landmark, dropped)))
+        for view in known.keyframes
     )
     return replace(known, landmarks=landmarks, candidate=candidate, keyframes=keyframes)

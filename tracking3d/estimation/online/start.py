@@ -15,9 +15,9 @@ from tracking3d.estimation.online.mapping import (
     fit_shape,
     pose_arrays,
     pose_of,
-    surface_places,
     tracks_of,
 )
+from tracking3d.estimation.online.points import FollowedPoints
 from tracking3d.estimation.online.pose_refinement import PoseWeights, refine_pose
 from tracking3d.estimation.online.structure import structure_hypotheses
 from tracking3d.estimation.online.surface_fit import FitWeights
@@ -27,9 +27,7 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose
 
 _VIEWS = 8
-_TURNING_FRAMES = (
-    12  # after the first that a start without points looks at: a turn of 30 to 60 degrees, mostly
-)
+_TURNING_FRAMES = 12  # after the first, for a start without points: a turn of 30 to 60 degrees, mostly
 _TURNING_VIEWS = 7
 _FEWEST_TURNING = 4
 _STAGES = (
@@ -62,7 +60,6 @@ def solve_start(
     views: list[View],
     weights: FitWeights,
     prior: float,
-    verbose: bool = False,
 ) -> list[Start]:
     """Starts by rising cost; empty where the points cannot tell.
 
@@ -93,10 +90,6 @@ def solve_start(
             for view in hypothesis.keyframes
         ]
         cost = float(np.mean([fit.cost for fit in fits])) + structure.cost
-        if verbose:
-            print(
-                f"   {structure.origin:12s} ba {structure.cost:.4f} cost {cost:.4f} app {np.mean([f.appearance for f in fits]):.3f} outline {np.mean([f.outline for f in fits]):.3f}"
-            )
         starts.append(Start(hypothesis, cost, structure.cost, structure.origin))
     starts.sort(key=lambda start: start.cost)
     return starts
@@ -138,7 +131,7 @@ def by_turning(known: ObjectMap, camera: Camera, views: list[View], weights: Fit
             better.append((cost, name, fitted))
         tried = sorted(better, key=lambda one: one[0])
     _, name, found = tried[0]
-    found = _on_surface(found, camera)
+    found = _without_points(found)
     surface = found.surface()
     fits = [
         refine_pose(surface, view.observation, view.pose, None, PoseWeights(), iterations=(0,))
@@ -158,15 +151,10 @@ def _posed(views: list[View], poses: list[Pose]) -> tuple[View, ...]:
     return tuple(replace(view, pose=pose, texture=None) for view, pose in zip(views, poses, strict=True))
 
 
-def _on_surface(known: ObjectMap, camera: Camera) -> ObjectMap:
-    """The map with the landmarks of its keyframes where its surface is; they lay on the prototype's."""
-    views = list(known.keyframes)
-    names = np.unique(np.concatenate([view.points.landmark for view in views]))
-    if not len(names):
-        return known
-    landmarks = known.landmarks.copy()
-    landmarks[names] = surface_places(known, camera, views, names)
-    return replace(known, landmarks=landmarks)
+def _without_points(known: ObjectMap) -> ObjectMap:
+    """The map without what its keyframes show of the landmarks: they did not move with the object."""
+    keyframes = tuple(replace(view, points=FollowedPoints.none()) for view in known.keyframes)
+    return replace(known, landmarks=np.full_like(known.landmarks, np.nan), keyframes=keyframes)
 
 
 def _with_structure(

@@ -42,6 +42,7 @@ _KEYFRAMES = 6  # that a doubtful frame is matched with
 _GRID_ANGLES = (20.0, 40.0)
 _GRID_FINALISTS = 5
 _COASTS = 12  # frames
+_WITNESS, _MOST_WITNESSES = 0.005, 30  # what each agreeing landmark takes off the cost, and how many do
 _PLACED = 8  # keyframes whose poses a lost object is looked for at
 
 
@@ -105,7 +106,9 @@ def agreeing(
     """Points that are where a pose says and not on the outline; of candidates neither is asked."""
     if not len(points):
         return points
-    gap = np.linalg.norm(project_points(known.landmarks[points.landmark], pose, camera) - points.pixel, axis=1)
+    gap = np.linalg.norm(
+        project_points(known.landmarks[points.landmark], pose, camera) - points.pixel, axis=1
+    )
     young = known.sightings[points.landmark] < 2
     scale = pixel_scale(view)
     in_place = np.isnan(gap) | (gap < np.where(young, _STRAY_YOUNG, _STRAY) * scale)
@@ -157,14 +160,14 @@ def placed_keyframes(known: ObjectMap, camera: Camera, view: View) -> list[Pose]
     return poses
 
 
-def turned_grid(
-    surface: Surface, view: View, pose: Pose, weights: PoseWeights
-) -> list[Pose]:
+def turned_grid(surface: Surface, view: View, pose: Pose, weights: PoseWeights) -> list[Pose]:
     """The best of many rotations around a pose, by appearance and outline at half the resolution."""
     small = halved(view.observation)
     weights = replace(weights, outline=weights.outline * view.mask_weight)
     directions = [
-        torch.tensor(axis, dtype=pose.translation.dtype) for axis in product((-1.0, 0.0, 1.0), repeat=3) if any(axis)
+        torch.tensor(axis, dtype=pose.translation.dtype)
+        for axis in product((-1.0, 0.0, 1.0), repeat=3)
+        if any(axis)
     ]
     poses = [
         from_matrix(rotation_about(axis.to(pose.translation), angle) @ pose.R, pose.translation)
@@ -174,6 +177,60 @@ def turned_grid(
     costs = [refine_pose(surface, small, one, None, weights, (0,)).cost for one in poses]
     best = np.argsort(np.nan_to_num(costs, nan=math.inf))[:_GRID_FINALISTS]
     return [refine_pose(surface, small, poses[i], None, weights, (4,)).pose for i in best]
+
+
+Found = tuple[str, PoseFit, FollowedPoints]
+"""Which start won, the pose, and the points that agree with it."""
+
+
+def searched(
+    known: ObjectMap,
+    surface: Surface,
+    camera: Camera,
+    view: View,
+    image: NDArray[np.uint8],
+    best: Found,
+    weights: PoseWeights,
+    lost: bool,
+) -> Found:
+    """The best of what was found so far and of the costly hypotheses, by what re-renders the frame.
+
+    Args:
+        known: The map; surface: its surface.
+        camera: Of the full frame.
+        view: The frame.
+        image: ``(H, W)`` grey.
+        best: What was found so far.
+        weights: Of the kinds of evidence.
+        lost: Look at all sides of the object, wherever it was before.
+    """
+
+    def fitted(name: str, pose: Pose, points: FollowedPoints, asked: FollowedPoints) -> Found:
+        _, fit = fit_pose(known, surface, view, {name: pose}, points, weights)
+        return name, fit, agreeing(known, camera, fit.pose, asked, view)
+
+    tried = [best]
+    for pose, points in rematched(known, camera, replace(view, pose=best[1].pose), image, lost):
+        tried.append(fitted("keyframe", pose, points, points))
+    if view.mask is not None:
+        centre = best[1].pose
+        if lost:
+            placed = {str(n): pose for n, pose in enumerate(placed_keyframes(known, camera, view))}
+            centre = fit_pose(known, surface, view, placed, FollowedPoints.none(), weights)[1].pose
+        for pose in turned_grid(surface, view, centre, weights):
+            tried.append(fitted("grid", pose, FollowedPoints.none(), view.points))
+    return min(
+        tried,
+        key=lambda one: (
+            evidence(one[1], weights, view.mask_weight)
+            - _WITNESS * min(witnesses(known, one[2]), _MOST_WITNESSES)
+        ),
+    )
+
+
+def witnesses(known: ObjectMap, points: FollowedPoints) -> int:
+    """How many of the points are landmarks that two keyframes have seen."""
+    return int((known.sightings[points.landmark] >= 2).sum())
 
 
 def evidence(fit: PoseFit, weights: PoseWeights, mask_weight: float) -> float:

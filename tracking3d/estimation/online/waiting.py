@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tracking3d.config.models import OnlineConfig
+from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.estimation.online.belief import Belief, ObjectMap, View
 from tracking3d.estimation.online.keypoints import detect, match
 from tracking3d.estimation.online.mapping import tracks_of
@@ -27,6 +30,8 @@ _LEAST_SHARED = 0.1  # share below which nothing more will be learned of the fir
 _SPARSE = 0.6  # of `MOST_POINTS`, below which new points are looked for
 _SAME_PLACE = 1.5  # pixels
 _MATCHED_WITH = 3  # frames before
+_LIKE_NOISE = 1.3  # times the change between neighbours that is none
+_STILL = "nothing shows that the object turns: it is still, or turns about an axis of its symmetry"
 
 
 def waiting_view(
@@ -49,7 +54,10 @@ def waiting_view(
                 label[here] = name
                 taken.add(name)
     corners = new_corners(
-        image, inside, np.concatenate([view.points.pixel, keypoints.pixel]), MOST_POINTS - len(view.points) - len(keypoints)
+        image,
+        inside,
+        np.concatenate([view.points.pixel, keypoints.pixel]),
+        MOST_POINTS - len(view.points) - len(keypoints),
     )
     fresh = label < 0
     base = len(known.landmarks)
@@ -70,7 +78,7 @@ def waiting_view(
     return known, replace(view, points=points, keypoints=keypoints, keypoint_landmark=label)
 
 
-def solved_start(state: Belief, weights: FitWeights, prior: float) -> tuple[Belief, Start | None]:
+def solved_start(state: Belief, config: OnlineConfig) -> tuple[Belief, Start | None]:
     """The start, where the waiting frames can tell; else None, and when it is tried next."""
     assert state.waiting is not None
     views = [view for view, _ in state.waiting if view.mask is not None]
@@ -82,11 +90,33 @@ def solved_start(state: Belief, weights: FitWeights, prior: float) -> tuple[Beli
     waited = len(views) >= _MOST
     if motion < max(state.due, MOTION) and not waited and shared > _LEAST_SHARED:
         return state, None
+    if waited and not _changed(views):
+        return replace(state, waiting=_fewer(state.waiting), waits_for=_STILL), None
     state = replace(state, due=motion * _MORE_MOTION)
-    starts = solve_start(state.known, state.camera, views, weights, prior)
+    weights = FitWeights(smoothness=config.smoothness)
+    starts = solve_start(state.known, state.camera, views, weights, config.surface_prior)
     if not starts or starts[0].bundle > _DOUBTFUL:
         if not waited and (shared > _LASTING or len(views) < _FEWEST_BY_TURNING):
             return state, None
         chosen = views[:: max(len(views) // 7, 1)][:8]
-        starts = sorted([*starts, *by_turning(state.known, state.camera, chosen, weights)], key=lambda start: start.cost)
+        turning = by_turning(state.known, state.camera, chosen, weights)
+        starts = sorted([*starts, *turning], key=lambda start: start.cost)
     return state, starts[0] if starts else None
+
+
+def _changed(views: list[View]) -> bool:
+    """Whether the object looks different now: by more, inside both masks, than from one frame to the next."""
+
+    def difference(a: View, b: View) -> float:
+        both = (a.observation.mask * b.observation.mask) > 0.5
+        if not bool(both.any()):
+            return 0.0
+        return float((a.observation.features - b.observation.features)[:, both].abs().mean())
+
+    neighbours = [difference(a, b) for a, b in pairwise(views)]
+    return difference(views[0], views[-1]) > _LIKE_NOISE * float(np.median(neighbours))
+
+
+def _fewer(waiting: tuple[tuple[View, FrameEstimate], ...]) -> tuple[tuple[View, FrameEstimate], ...]:
+    """Every second of the waiting frames, with the first and the last."""
+    return (*waiting[:-1:2], waiting[-1])

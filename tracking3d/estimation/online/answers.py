@@ -1,0 +1,79 @@
+"""What the solver answers for a frame."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.estimation.assessment import Assessment
+from tracking3d.estimation.estimate import FrameEstimate, Status
+from tracking3d.estimation.online.answer_mask import answer_mask
+from tracking3d.estimation.online.belief import Belief, View
+from tracking3d.estimation.online.judgement import ENOUGH_POINTS
+from tracking3d.estimation.online.pose_refinement import PoseFit
+from tracking3d.frames import Frame
+from tracking3d.geometry.pose import Pose
+
+WAITING = "the object has not moved enough yet to tell its shape"
+
+
+def unsolved(frame: Frame, mask: NDArray[np.bool_] | None, pose: Pose) -> FrameEstimate:
+    """The answer while nothing is known: the initial mask."""
+    return FrameEstimate(
+        index=frame.index,
+        time=frame.time,
+        T_cam_obj=pose.matrix().numpy(),
+        mask=mask if mask is not None else np.zeros(frame.size, dtype=np.bool_),
+        initial_mask=mask,
+        status=Status.UNCERTAIN,
+        reason=WAITING,
+        confidence=0.3,
+    )
+
+
+def solved(
+    state: Belief,
+    answer: FrameEstimate,
+    view: View,
+    fit: PoseFit,
+    won: str,
+    witnesses: int,
+    judgement: Assessment,
+) -> FrameEstimate:
+    """The answer with a pose, its judgement and the better supported mask; of a lost frame, the initial mask.
+
+    Args:
+        state: Map and camera.
+        answer: What does not depend on the pose.
+        view: The frame.
+        fit: Its pose.
+        won: Which start of the pose won.
+        witnesses: How many landmarks agree.
+        judgement: Of the frame.
+    """
+    if judgement.status is Status.LOST:
+        mask = view.mask if view.mask is not None else np.zeros_like(answer.mask)
+    else:
+        rendered = state.known.silhouette(fit.pose, state.camera)
+        mask = answer_mask(rendered, view.mask, state.usual, view.mask_weight, witnesses >= ENOUGH_POINTS)
+    return replace(
+        answer,
+        T_cam_obj=fit.pose.matrix().numpy(),
+        mask=mask,
+        status=judgement.status,
+        reason=judgement.reason,
+        confidence=judgement.confidence,
+        hypothesis=won,
+        iterations=fit.iterations,
+        losses={
+            "features": fit.appearance,
+            "outline": fit.outline,
+            "points": fit.points,
+            "overlap": fit.overlap,
+            "unseen": fit.unseen,
+            "witnesses": float(witnesses),
+            "mask_weight": view.mask_weight,
+        },
+    )

@@ -1,0 +1,82 @@
+"""A frame's way into the map: its points become landmarks, and the map is refined with it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.config.models import OnlineConfig
+from tracking3d.estimation.online.belief import ObjectMap, View
+from tracking3d.estimation.online.keeping import compacted, thinned
+from tracking3d.estimation.online.keypoints import detect
+from tracking3d.estimation.online.mapping import refine_map, window_of, with_landmarks
+from tracking3d.estimation.online.points import MOST_FOLLOWED, MOST_POINTS, FollowedPoints, new_corners
+from tracking3d.estimation.online.recruits import recruit, with_candidates
+from tracking3d.estimation.online.surface_fit import FitWeights
+from tracking3d.geometry.camera import Camera
+
+_PASSES = 3
+"""Of the final refinement."""
+
+
+def with_points(
+    known: ObjectMap, camera: Camera, view: View, image: NDArray[np.uint8]
+) -> tuple[ObjectMap, View]:
+    """With landmarks at a view's keypoints and corners, and candidates beside its mask.
+
+    Args:
+        known: The map.
+        camera: Of the full frame.
+        view: With its pose and the points that were followed into it.
+        image: ``(H, W)`` grey.
+    """
+    inside = view.mask if view.mask is not None else known.silhouette(view.pose, camera)
+    keypoints = detect(image, inside)
+    taken = np.concatenate([view.points.pixel, keypoints.pixel])
+    corners = new_corners(image, inside, taken, MOST_POINTS)
+    known, view = with_landmarks(known, camera, view, keypoints, corners)
+    return with_candidates(known, view, image)
+
+
+def with_keyframe(
+    known: ObjectMap, camera: Camera, view: View, image: NDArray[np.uint8], config: OnlineConfig
+) -> tuple[ObjectMap, FollowedPoints]:
+    """The map with a view as a new keyframe, refined over a window; and the points to follow from it."""
+    known, view = with_points(known, camera, view, image)
+    known = replace(known, keyframes=thinned((*known.keyframes, view), config.most_keyframes))
+    window = window_of(len(known.keyframes), config.window)
+    known = refined(known, camera, window, config, bundle_iterations=10, rounds=1)
+    followed = known.keyframes[-1].points.spread(MOST_FOLLOWED, float(view.observation.window.side))
+    return compacted(known, followed)
+
+
+def refined(
+    known: ObjectMap,
+    camera: Camera,
+    positions: list[int],
+    config: OnlineConfig,
+    *,
+    bundle_iterations: int,
+    rounds: int,
+) -> ObjectMap:
+    """Candidates taken over or dropped, then poses, landmarks and shape refined; see `refine_map`."""
+    known = recruit(known, camera, positions)
+    return refine_map(
+        known,
+        camera,
+        positions,
+        weights=FitWeights(smoothness=config.smoothness),
+        prior=config.surface_prior,
+        bundle_iterations=bundle_iterations,
+        rounds=rounds,
+    )
+
+
+def refined_once_more(known: ObjectMap, camera: Camera, config: OnlineConfig) -> ObjectMap:
+    """All keyframes together, until little changes."""
+    everything = list(range(len(known.keyframes)))
+    for _ in range(_PASSES):
+        known = refined(known, camera, everything, config, bundle_iterations=15, rounds=2)
+    return known

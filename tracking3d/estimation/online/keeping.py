@@ -1,0 +1,54 @@
+"""What the map keeps: a bounded number of keyframes, and the landmarks that something still refers to."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.estimation.online.belief import ObjectMap, View
+from tracking3d.estimation.online.points import FollowedPoints
+from tracking3d.geometry.pose import rotation_angle
+
+
+def thinned(keyframes: tuple[View, ...], most: int) -> tuple[View, ...]:
+    """At most so many keyframes: of the two most alike the later goes; the first and the recent half stay."""
+    kept = list(keyframes)
+    while len(kept) > most:
+        older = kept[: max(len(kept) - most // 2, 2)]
+        gaps = [
+            min(
+                float(rotation_angle(view.pose.quaternion, other.pose.quaternion))
+                for other in kept
+                if other is not view
+            )
+            for view in older[1:]
+        ]
+        kept.pop(1 + int(np.argmin(gaps)))
+    return tuple(kept)
+
+
+def compacted(known: ObjectMap, followed: FollowedPoints) -> tuple[ObjectMap, FollowedPoints]:
+    """Without landmarks that no keyframe shows and that are not followed; all are numbered anew."""
+    used = np.zeros(len(known.landmarks), bool)
+    used[followed.landmark] = True
+    for view in known.keyframes:
+        used[view.points.landmark] = True
+        used[view.keypoint_landmark[view.keypoint_landmark >= 0]] = True
+    number = np.cumsum(used) - 1
+
+    def renamed(points: FollowedPoints) -> FollowedPoints:
+        return FollowedPoints(number[points.landmark], points.pixel)
+
+    def relabelled(label: NDArray[np.int64]) -> NDArray[np.int64]:
+        return np.where(label >= 0, number[label], -1)
+
+    keyframes = tuple(
+        replace(view, points=renamed(view.points), keypoint_landmark=relabelled(view.keypoint_landmark))
+        for view in known.keyframes
+    )
+    known = replace(
+        known, landmarks=known.landmarks[used], candidate=known.candidate[used], keyframes=keyframes
+    )
+    return known, renamed(followed)
