@@ -9,7 +9,7 @@ from tracking3d.config.loading import load_config
 from tracking3d.datasets.clip import write_clip
 from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
 
-QUICK = ["solver.iterations=2", "solver.pose_iterations=2", "solver.start_frames=1", "window.size=32"]
+QUICK = ["window.size=32", "object.frequency=2"]
 
 TRACKER = '''
 import os

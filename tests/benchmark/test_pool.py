@@ -32,8 +32,17 @@ def test_a_crash_and_a_failure_cost_their_own_sequence_only_and_the_rest_is_foun
     assert again.cached and again.scores == json.loads(json.dumps(narrow.scores))
 
 
-def test_a_job_tells_whether_memory_grew_and_scores_both_answers_of_a_refined_run(jobs, scripted):
+def test_a_refined_run_is_watched_in_both_passes_and_both_its_answers_are_scored(jobs, scripted):
     [job] = jobs(scripted(), ["narrow"])
+    assert job.config.solver.final_refine
+    job.write()
+    scores = job_module.run_job(job)
+    assert len(json.loads((job.folder / job_module.MEMORY).read_text())) == 6
+    assert scores["causal"]["frames"] == scores["frames"] == 3
+
+
+def test_a_job_tells_whether_memory_grew_and_scores_both_answers_of_a_refined_run(jobs, scripted):
+    [job] = jobs(scripted().changed("causal", solver__final_refine=False), ["narrow"])
     job.write()
     scores = job_module.run_job(job)
     held = json.loads((job.folder / job_module.MEMORY).read_text())

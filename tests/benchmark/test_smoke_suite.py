@@ -18,8 +18,8 @@ def test_the_smoke_suite_is_made_tracked_and_scored(tmp_path):
     kept = json.loads((tmp_path / "results/default_masks_truth-smoke.json").read_text())
     assert kept["suite_version"] == 1 and len(kept["sequences"]) == 3 and kept["errors"] == {}
     mean = kept["mean"]
-    # Measured when this was written: 0.933 and 2.5 degrees; the margins are for rounding on other processors.
-    assert mean["iou_mean"] > 0.9
+    # Measured when the solver became `online`: 0.969 and 2.1 degrees; the margins are for other processors' rounding.
+    assert mean["iou_mean"] > 0.93
     assert mean["rotation_error_mean_deg"] < 6
     assert all(scores["bop_ar"] is not None for scores in kept["sequences"].values())
     assert all(scores["points_average_jaccard"] is not None for scores in kept["sequences"].values())

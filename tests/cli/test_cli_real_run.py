@@ -14,7 +14,7 @@ import pytest
 from tracking3d.results.run_reader import RunReader
 from tracking3d.synthesis.convex_clips import make_demo_clip
 
-QUICK = ["--size", "32", "--set", "solver.iterations=2", "--set", "object.frequency=2"]
+QUICK = ["--size", "32", "--set", "object.frequency=2"]
 
 STOPPING_TRACKER = """
 import os

@@ -28,13 +28,24 @@ def test_preset_paper_is_the_models_defaults():
 
 
 def test_presets_are_listed_and_each_is_valid():
-    assert {"default", "paper"} <= set(list_presets())
+    assert {"default", "paper", "rerendering"} <= set(list_presets())
     for name in list_presets():
         load_config(preset=name)
 
 
 def test_default_preset_is_used_when_none_is_named():
     assert load_config() == load_config(preset="default")
+
+
+def test_presets_choose_the_solver_and_only_the_default_one_looks_twice_and_corrects_the_tracker():
+    solvers = {name: load_config(preset=name).solver for name in ("default", "rerendering", "paper")}
+    assert {name: one.name for name, one in solvers.items()} == {
+        "default": "online",
+        "rerendering": "paper",
+        "paper": "paper",
+    }
+    assert [name for name, one in solvers.items() if one.final_refine] == ["default"]
+    assert [name for name, one in solvers.items() if one.correct_tracker] == ["default"]
 
 
 def test_later_layers_win_key_by_key(yaml_file):

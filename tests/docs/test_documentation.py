@@ -12,8 +12,8 @@ import yaml
 from documentation_pages import PAGES, ROOT, label
 from pydantic import BaseModel
 
-from tracking3d.config.loading import load_config
-from tracking3d.config.models import PipelineConfig
+from tracking3d.config.loading import list_presets, load_config
+from tracking3d.config.models import OnlineConfig, PipelineConfig
 from tracking3d.evaluation.score import Scores
 from tracking3d.geometry.camera import Camera
 from tracking3d.rendering import prepare_backend
@@ -59,12 +59,23 @@ def field_named(model: type[BaseModel], key: str) -> Any:
     return model.model_fields[key].annotation
 
 
-def test_method_lists_exactly_what_the_default_preset_changes():
+@pytest.mark.parametrize("preset", [name for name in list_presets() if name != "paper"])
+def test_method_lists_exactly_what_a_preset_changes(preset):
     page = (ROOT / "docs/method.md").read_text(encoding="utf-8")
-    rows = re.findall(r"^\| `([a-z_.]+)` \| ([^|]*) \| ([^|]*) \|[^|]*\|$", page, re.M)
-    documented = {key: (yaml.safe_load(paper), yaml.safe_load(default)) for key, paper, default in rows}
-    paper, default = (dict(flat(load_config(preset=name).model_dump())) for name in ("paper", "default"))
-    assert documented == {key: (paper[key], default[key]) for key in paper if paper[key] != default[key]}
+    section = re.search(
+        rf"^#+ What (?:the {preset} preset|preset {preset}) changes\n(.*?)^#", page, re.M | re.S
+    )
+    assert section
+    rows = re.findall(r"^\| `([a-z_.]+)` \| ([^|]*) \| ([^|]*) \|[^|]*\|$", section[1], re.M)
+    documented = {key: (yaml.safe_load(before), yaml.safe_load(after)) for key, before, after in rows}
+    paper, changed = (dict(flat(load_config(preset=name).model_dump())) for name in ("paper", preset))
+    assert documented == {key: (paper[key], changed[key]) for key in paper if paper[key] != changed[key]}
+
+
+def test_configuration_names_every_preset_and_every_key_of_the_online_solver():
+    page = (ROOT / "docs/configuration.md").read_text(encoding="utf-8")
+    keys = [f"solver.online.{key}" for key in OnlineConfig.model_fields]
+    assert [name for name in [*list_presets(), *keys] if f"`{name}`" not in page] == []
 
 
 def flat(settings: dict[str, Any], prefix: str = ""):

@@ -186,7 +186,9 @@ def test_memory_is_bounded_by_keyframes(preset):
 
 
 def test_memory_during_the_joint_start_is_bounded_by_its_frames():
-    solver = quick_solver("rerendering", solver={"start_frames": 5, "keyframes": {"maximum": 2, "rotation": 0}})
+    solver = quick_solver(
+        "rerendering", solver={"start_frames": 5, "keyframes": {"maximum": 2, "rotation": 0}}
+    )
     state = None
     for index in range(12):
         mask = estimate_of(true_mask(index))

@@ -15,7 +15,6 @@ from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.session import SOLVERS
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 
-
 PRESETS = ["default", "rerendering"]
 
 

@@ -17,6 +17,7 @@ FRAMES, SETTLED = 3000, 300
 ALLOWED = 15.0
 """Megabytes by which memory may vary after the first 300 frames; an image kept of every frame would be 56."""
 
+PRESETS = {"online": "default", "paper": "rerendering"}
 QUICK = [
     "window.size=32",
     "object.texture_size=64",
@@ -65,7 +66,8 @@ def test_memory_is_flat_over_three_thousand_frames(solver, tmp_path, monkeypatch
     (tmp_path / "known.py").write_text(TRACKER)
     monkeypatch.setenv("TRACKING3D_PLUGINS", f"tracking3d.trackers:known={tmp_path / 'known.py'}:Known")
     config = load_config(
-        overrides=[*QUICK, f"solver.name={solver}"],
+        preset=PRESETS[solver],
+        overrides=QUICK,
         tracker={"name": "known", "path": str(tmp_path / "masks.npy")},
     )
     session = Session(config, Prompt((0.0, 0.0, 96.0, 72.0)))

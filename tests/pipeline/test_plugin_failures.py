@@ -107,7 +107,9 @@ def test_where_the_tracker_fails_its_last_mask_stands_in_and_the_reason_is_told(
 
 
 @pytest.mark.parametrize(("fault", "told"), ENCODER_FAULTS.items())
-def test_where_the_encoder_fails_the_initial_mask_is_the_answer_and_the_frame_is_lost(clip, fault, told, settings):
+def test_where_the_encoder_fails_the_initial_mask_is_the_answer_and_the_frame_is_lost(
+    clip, fault, told, settings
+):
     answers = run(clip, settings(tracker=bad("raises"), features=bad(fault, 2)))
     lost = answers[2]
     assert (lost.status, lost.confidence) == (Status.LOST, 0.0)
@@ -220,7 +222,9 @@ def test_with_stop_the_finished_frames_are_kept(clip, source, tmp_path, settings
     assert "no pixels" in reader.description["error"]
 
 
-def test_the_summary_on_the_screen_says_how_many_frames_failed_and_why(clip, source, tmp_path, capsys, settings):
+def test_the_summary_on_the_screen_says_how_many_frames_failed_and_why(
+    clip, source, tmp_path, capsys, settings
+):
     from tracking3d.cli.progress import print_summary
 
     record(source, settings(tracker=bad("raises", 1, 2)), tmp_path / "run", mask=clip.masks[0])

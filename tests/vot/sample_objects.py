@@ -7,10 +7,7 @@ from pathlib import Path
 from tracking3d.results.files import write_image
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 
-QUICK = (
-    "window.size=32 object.frequency=2 object.texture_size=16 solver.iterations=2 solver.pose_iterations=2 "
-    "solver.start_frames=1 solver.tau=2"
-)
+QUICK = "window.size=32 object.frequency=2 object.texture_size=16"
 
 
 def sample_clip(frames: int = 3) -> SyntheticClip:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from tracking3d.config.models import CameraConfig
 from tracking3d.geometry.camera import DEFAULT_FIELD_OF_VIEW, Camera
 
@@ -20,6 +22,5 @@ def choose_camera(
         return Camera.from_fov(width, height, config.fov, f"given field of view of {config.fov:g} degrees")
     if known is not None:
         return Camera(*known, width, height, known_origin)
-    return Camera.from_fov(
-        width, height, DEFAULT_FIELD_OF_VIEW, f"default field of view of {DEFAULT_FIELD_OF_VIEW:g} degrees"
-    )
+    origin = f"default field of view of {DEFAULT_FIELD_OF_VIEW:g} degrees"
+    return replace(Camera.from_fov(width, height, DEFAULT_FIELD_OF_VIEW, origin), assumed=True)

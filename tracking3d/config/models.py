@@ -134,10 +134,15 @@ class OnlineConfig(Section):
     outline: float = Field(0.3, ge=0, description="Weight of the outline's distance from the mask, robust.")
     points: float = Field(1.0, ge=0, description="Weight of the followed points' distances, robust.")
     keyframe_rotation: float = Field(
-        8.0, gt=0, description="A frame is a keyframe if it is turned more than so many degrees from all others."
+        8.0,
+        gt=0,
+        description="A frame is a keyframe if it is turned more than so many degrees from all others.",
     )
     window: int = Field(
-        12, ge=2, le=64, description="Keyframes that are refined together: half recent, half spread over the older."
+        12,
+        ge=2,
+        le=64,
+        description="Keyframes that are refined together: half recent, half spread over the older.",
     )
     most_keyframes: int = Field(
         64, ge=8, le=512, description="Keyframes that are kept; the one nearest to another view goes first."

@@ -26,6 +26,7 @@ class Camera:
         cx, cy: Principal point in pixels.
         width, height: Frame size in pixels.
         origin: Where the intrinsics came from, in words; recorded in the run.
+        assumed: Whether nobody gave the focal length.
     """
 
     fx: float
@@ -35,6 +36,7 @@ class Camera:
     width: int
     height: int
     origin: str = "given"
+    assumed: bool = False
 
     @classmethod
     def from_fov(

@@ -74,7 +74,8 @@ def table(
     if plot:
         check_plot(plot)
     folders = dict(_named_folder(item) for item in initial or ())
-    settings = configure(config, preset, overrides)
+    # The paper's tables vary what only its solver has.
+    settings = configure(config, preset or (None if config or of_solvers else "rerendering"), overrides)
     label = name_of_settings(config, preset, overrides, "tracker")
     base = Variant(label=label, config=settings, masks=masks)
     real = REAL if of_solvers else TABLES[name].dataset

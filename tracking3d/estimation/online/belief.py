@@ -63,6 +63,7 @@ class ObjectMap:
         landmarks: ``(N, 3)`` float64 surface points in object coordinates.
         keyframes: In order of time; the first one's pose never moves.
         candidate: ``(N,)`` found beside the mask, and not yet known to be on the object.
+        pointless: Whether the object has no points that can be followed: it is known by pixels and outlines alone.
         renderer: Which renderer, see `tracking3d.rendering.backend`.
     """
 
@@ -72,6 +73,7 @@ class ObjectMap:
     landmarks: NDArray[np.float64]
     keyframes: tuple[View, ...]
     candidate: NDArray[np.bool_]
+    pointless: bool = False
     renderer: str = "auto"
 
     @cached_property

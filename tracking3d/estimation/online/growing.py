@@ -9,14 +9,17 @@ from numpy.typing import NDArray
 
 from tracking3d.config.models import OnlineConfig
 from tracking3d.estimation.online.belief import ObjectMap, View
+from tracking3d.estimation.online.joint_fit import refine_without_points
 from tracking3d.estimation.online.keeping import compacted, thinned
 from tracking3d.estimation.online.keypoints import detect
+from tracking3d.estimation.online.lens import solve_lens
 from tracking3d.estimation.online.mapping import refine_map, window_of, with_landmarks
 from tracking3d.estimation.online.points import MOST_FOLLOWED, MOST_POINTS, FollowedPoints, new_corners
 from tracking3d.estimation.online.recruits import recruit, with_candidates
 from tracking3d.estimation.online.surface_fit import FitWeights
 from tracking3d.geometry.camera import Camera
 
+_MOST_WITHOUT_POINTS = 15
 _PASSES = 3
 """Of the final refinement."""
 
@@ -32,6 +35,8 @@ def with_points(
         view: With its pose and the points that were followed into it.
         image: ``(H, W)`` grey.
     """
+    if known.pointless:
+        return known, view
     inside = view.mask if view.mask is not None else known.silhouette(view.pose, camera)
     keypoints = detect(image, inside)
     taken = np.concatenate([view.points.pixel, keypoints.pixel])
@@ -62,6 +67,9 @@ def refined(
     rounds: int,
 ) -> ObjectMap:
     """Candidates taken over or dropped, then poses, landmarks and shape refined; see `refine_map`."""
+    if known.pointless:
+        recent = list(range(len(known.keyframes)))[-_MOST_WITHOUT_POINTS:]
+        return refine_without_points(known, sorted({0, *recent}), FitWeights(smoothness=config.smoothness))
     known = recruit(known, camera, positions)
     return refine_map(
         known,
@@ -74,9 +82,11 @@ def refined(
     )
 
 
-def refined_once_more(known: ObjectMap, camera: Camera, config: OnlineConfig) -> ObjectMap:
-    """All keyframes together, until little changes."""
+def refined_once_more(known: ObjectMap, camera: Camera, config: OnlineConfig) -> tuple[ObjectMap, Camera]:
+    """All keyframes together, until little changes; and the lens, where it was assumed."""
+    if camera.assumed:
+        known, camera = solve_lens(known, camera)
     everything = list(range(len(known.keyframes)))
     for _ in range(_PASSES):
         known = refined(known, camera, everything, config, bundle_iterations=15, rounds=2)
-    return known
+    return known, camera

@@ -9,23 +9,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
-from scipy import sparse
-from scipy.sparse.linalg import eigsh
 from torch import Tensor
 
 from tracking3d.estimation.online.belief import ObjectMap, View
 from tracking3d.estimation.online.outline import outline_distance
-from tracking3d.estimation.online.shaded_appearance import FaceEquations, face_equations, layers_of
+from tracking3d.estimation.online.shaded_appearance import face_equations, layers_of
+from tracking3d.estimation.online.shape_modes import Modes, in_modes
 from tracking3d.estimation.online.surface_fit import FitWeights
-from tracking3d.estimation.shape import Shape
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_exponential
 from tracking3d.rendering import Rendering, find_contour, render
 from tracking3d.rendering.contour import contour_slopes
 from tracking3d.rendering.normal_equations import screen_motion
 
-MODES = 80
 _APPEARANCE = 4.0  # weight of the mean loss of what the views show
 _APPEARANCE_SCALE = 0.25
 _FULL_SIZE = 128.0  # pixels of a window in which outline distances are measured, whatever its resolution
@@ -34,33 +30,17 @@ _ENOUGH = 1e-4  # share of the cost below which a gain ends the search
 
 
 @dataclass(frozen=True, eq=False)
-class Modes:
-    """The lowest modes of a shape's Laplacian.
+class _Problem:
+    """What does not change during a fit.
 
     Attributes:
-        vectors: ``(V, M)`` float64 orthonormal columns.
-        bending: ``(M,)`` squared norm of each one's Laplacian.
+        known: The map that is fitted; modes, weights: As given.
+        K: ``(B, 3, 3)`` of the windows.
+        layers: See `layers_of`.
+        distance: ``(B, S, S)`` to the masks' outlines, pixels of the window.
+        mask_weight: ``(B,)`` how far each mask is believed.
     """
 
-    vectors: Tensor
-    bending: Tensor
-
-    @classmethod
-    def of(cls, shape: Shape, count: int = MODES) -> Modes:
-        """The ``count`` lowest."""
-        laplacian = shape.laplacian.coalesce()
-        rows, columns = laplacian.indices().cpu().numpy()
-        L = sparse.csc_matrix(
-            (laplacian.values().double().cpu().numpy(), (rows, columns)), shape=laplacian.shape
-        )
-        count = min(count, L.shape[0] - 1)
-        bending, vectors = eigsh(L.T @ L, k=count, sigma=-1e-6, v0=np.ones(L.shape[0]))
-        vectors = torch.from_numpy(np.ascontiguousarray(vectors)).to(shape.rest.device)
-        return cls(vectors, torch.from_numpy(bending).clamp_min(0).to(vectors))
-
-
-@dataclass(frozen=True, eq=False)
-class _Problem:
     known: ObjectMap
     modes: Modes
     weights: FitWeights
@@ -88,6 +68,8 @@ class _Problem:
 
 @dataclass(frozen=True, eq=False)
 class _State:
+    """Vertices and poses, their cost, and its normal equations in modes, poses and light."""
+
     vertices: Tensor
     poses: Pose
     cost: float
@@ -231,7 +213,7 @@ def _evaluated(problem: _Problem, vertices: Tensor, poses: Pose) -> _State:
         (problem.size, problem.size), backend=known.renderer,
     )  # fmt: skip
     shown = face_equations(drawn, problem.layers, R, t, _APPEARANCE_SCALE)
-    matrix, gradient = _in_modes(shown, modes, known.shape.faces)
+    matrix, gradient = in_modes(shown, modes, known.shape.faces)
     matrix, gradient = _APPEARANCE * matrix, _APPEARANCE * gradient
     outline = _add_outline(problem, drawn, R, t, matrix, gradient)
     stiffness = problem.weights.smoothness / len(vertices) * modes.bending[:, None]
@@ -241,33 +223,6 @@ def _evaluated(problem: _Problem, vertices: Tensor, poses: Pose) -> _State:
     matrix.diagonal()[:count] += 2 * stiffness.expand(-1, 3).reshape(-1)
     cost = _APPEARANCE * shown.cost + outline + float((stiffness * offsets.square()).sum())
     return _State(vertices, poses, cost, matrix, gradient)
-
-
-def _in_modes(shown: FaceEquations, modes: Modes, faces: Tensor) -> tuple[Tensor, Tensor]:
-    """Matrix and gradient in ``(3 M + G)`` unknowns; a mode's three directions are neighbours."""
-    corner = faces[shown.faces]
-    vertices, count = modes.vectors.shape
-    rows = corner[:, :, None].expand(-1, 3, 3).flatten().cpu().numpy()
-    columns = corner[:, None].expand(-1, 3, 3).flatten().cpu().numpy()
-    blocks = shown.corners.double().reshape(-1, 3, 3, 3, 3).cpu().numpy()  # (N, corner, xyz, corner, xyz)
-    basis = modes.vectors.cpu().numpy()
-    shape = np.zeros((count, 3, count, 3))
-    for i in range(3):
-        for j in range(i, 3):
-            entries = sparse.csr_matrix(
-                (blocks[:, :, i, :, j].ravel(), (rows, columns)), shape=(vertices, vertices)
-            )
-            part = basis.T @ (entries @ basis)
-            shape[:, i, :, j], shape[:, j, :, i] = part, part.T
-    at_corners = torch.cat([shown.mixed, shown.by_corners[..., None]], 2)
-    width = at_corners.shape[2]
-    at_vertices = at_corners.new_zeros(vertices, 3 * width).index_add(
-        0, corner.flatten(), at_corners.reshape(-1, 3 * width)
-    )
-    mixed = (modes.vectors.to(at_vertices).T @ at_vertices).reshape(3 * count, width).double()
-    top = torch.cat([torch.from_numpy(shape.reshape(3 * count, 3 * count)).to(mixed), mixed[:, :-1]], 1)
-    bottom = torch.cat([mixed[:, :-1].T, shown.rest.double()], 1)
-    return torch.cat([top, bottom]), torch.cat([mixed[:, -1], shown.by_rest.double()])
 
 
 def _add_outline(

@@ -25,6 +25,7 @@ from tracking3d.rendering import rasterize
 FloatArray = NDArray[np.float64]
 _SAME_PLACE = 1.5  # pixels within which a keypoint is a point that is followed
 _FEWEST_WITNESSES = 12
+_FEWEST_BUNDLED = 8
 _MOST_BUNDLED = 1500
 _SEARCH = 12.0  # pixels around its projection within which a landmark may be found again
 
@@ -216,19 +217,10 @@ def _bundled(
     known: ObjectMap, camera: Camera, positions: list[int], prior: float, scale: float, iterations: int
 ) -> ObjectMap:
     views = [known.keyframes[position] for position in positions]
-    seen = np.concatenate([view.points.landmark for view in views])
-    names, counts = np.unique(seen, return_counts=True)
-    usable = (counts >= 2) & ~known.candidate[names]
-    names, counts = names[usable], counts[usable]
-    # Those that most keyframes show hold the poses together.
-    names = np.sort(names[np.argsort(-counts, kind="stable")[:_MOST_BUNDLED]])
-    if len(names) < 8 or len(views) < 2:
+    names = shared_landmarks(known, views)
+    if len(names) < _FEWEST_BUNDLED or len(views) < 2:
         return known
-    tracks = tracks_of(views, names)
-    poses = [pose_arrays(view.pose) for view in views]
-    start = Structure(
-        np.array([R for R, _ in poses]), np.array([t for _, t in poses]), known.landmarks[names]
-    )
+    tracks, start = tracks_of(views, names), structure_of(known, views, names)
     places = surface_places(known, camera, views, names)
     found = adjust(
         tracks, camera.K, start, fixed=1, scale=scale, iterations=iterations,
@@ -249,6 +241,20 @@ def _bundled(
             keyframes[position] = replace(view, points=view.points.only(~np.isin(view.points.landmark, bad)))
     # Landmarks seen once move with the surface.
     return replace(known, landmarks=landmarks, keyframes=tuple(keyframes))
+
+
+def shared_landmarks(known: ObjectMap, views: list[View]) -> NDArray[np.int64]:
+    """Landmarks that two of the views or more show, rising; those that most show hold the poses together."""
+    names, counts = np.unique(np.concatenate([view.points.landmark for view in views]), return_counts=True)
+    usable = (counts >= 2) & ~known.candidate[names]
+    names, counts = names[usable], counts[usable]
+    return np.sort(names[np.argsort(-counts, kind="stable")[:_MOST_BUNDLED]])
+
+
+def structure_of(known: ObjectMap, views: list[View], names: NDArray[np.int64]) -> Structure:
+    """The views' poses and the named landmarks as they stand."""
+    poses = [pose_arrays(view.pose) for view in views]
+    return Structure(np.array([R for R, _ in poses]), np.array([t for _, t in poses]), known.landmarks[names])
 
 
 def surface_places(

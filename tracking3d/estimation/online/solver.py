@@ -25,6 +25,7 @@ from tracking3d.estimation.online.answers import solved, unsolved
 from tracking3d.estimation.online.belief import Belief, ObjectMap, View
 from tracking3d.estimation.online.growing import refined, refined_once_more, with_keyframe, with_points
 from tracking3d.estimation.online.judgement import ENOUGH_POINTS, judge, looks_wrong
+from tracking3d.estimation.online.lens import ATTEMPTS, solve_lens
 from tracking3d.estimation.online.mapping import mask_weight, pose_of, project_points
 from tracking3d.estimation.online.points import FollowedPoints, follow, grey
 from tracking3d.estimation.online.pose_refinement import PoseFit, PoseWeights
@@ -101,7 +102,13 @@ class OnlineSolver:
         shape = Shape.of(prototype_mesh(self.config.object, ellipse), self.config.object.flat, self.device)
         texels = TexelMap.of(shape.face_uvs, self.config.object.texture_size)
         known = ObjectMap(
-            shape, texels, shape.rest, np.zeros((0, 3)), (), np.zeros(0, bool), self.config.runtime.renderer
+            shape,
+            texels,
+            shape.rest,
+            np.zeros((0, 3)),
+            (),
+            np.zeros(0, bool),
+            renderer=self.config.runtime.renderer,
         )
         image = grey(frame.image)
         belief = Belief(self.camera, known, None, (pose, frame.index), None, image, FollowedPoints.none())
@@ -126,9 +133,14 @@ class OnlineSolver:
         """All keyframes together once more."""
         if state.waiting is not None:
             return state
-        known = refined_once_more(state.known, state.camera, self.online)
+        known, camera = refined_once_more(state.known, state.camera, self.online)
         return replace(
-            state, known=known, surface=known.surface(), before=None, followed=FollowedPoints.none()
+            state,
+            camera=camera,
+            known=known,
+            surface=known.surface(),
+            before=None,
+            followed=FollowedPoints.none(),
         )
 
     def revisit(
@@ -204,6 +216,8 @@ class OnlineSolver:
         pose, usual, revised, trail = known.keyframes[0].pose, belief.usual, [], []
         for view, earlier in state.waiting:
             start_pose = poses.get(view.index, pose)
+            if known.pointless:
+                view = replace(view, points=FollowedPoints.none(), mask_weight=1.0)
             fit = self._fit(belief, view, {start.origin: start_pose}, view.points)[1]
             if view.index == known.keyframes[0].index:
                 fit = replace(fit, pose=start_pose)
@@ -215,7 +229,7 @@ class OnlineSolver:
             revised.append(solved(belief, earlier, view, fit, start.origin, agreed, judgement))
         belief = replace(
             belief, last=trail[-1], before=trail[-2], trail=tuple(trail[-_TRAIL:]), usual=usual,
-            status=Status.TRACKED,
+            status=Status.TRACKED, followed=view.points,
         )  # fmt: skip
         return belief, replace(revised[-1], revised=tuple(revised[:-1]))
 
@@ -240,6 +254,9 @@ class OnlineSolver:
             belief = replace(belief, usual=state.usual.updated(fit))
         if key:
             known, followed = with_keyframe(state.known, state.camera, view, image, self.online)
+            if state.camera.assumed and len(known.keyframes) in ATTEMPTS:
+                known, camera = solve_lens(known, state.camera)
+                belief = replace(belief, camera=camera)
             fit = replace(fit, pose=known.keyframes[-1].pose)
             belief = replace(
                 belief, known=known, surface=known.surface(), last=(fit.pose, frame.index), followed=followed

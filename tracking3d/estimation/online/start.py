@@ -10,7 +10,8 @@ import numpy as np
 from tracking3d.estimation.observation import halved
 from tracking3d.estimation.online.belief import ObjectMap, View
 from tracking3d.estimation.online.bundle import Structure
-from tracking3d.estimation.online.joint_fit import Modes, fit_jointly
+from tracking3d.estimation.online.joint_fit import fit_jointly
+from tracking3d.estimation.online.keypoints import Keypoints
 from tracking3d.estimation.online.mapping import (
     fit_shape,
     pose_arrays,
@@ -19,6 +20,7 @@ from tracking3d.estimation.online.mapping import (
 )
 from tracking3d.estimation.online.points import FollowedPoints
 from tracking3d.estimation.online.pose_refinement import PoseWeights, refine_pose
+from tracking3d.estimation.online.shape_modes import Modes
 from tracking3d.estimation.online.structure import structure_hypotheses
 from tracking3d.estimation.online.surface_fit import FitWeights
 from tracking3d.estimation.online.turning import turning_hypotheses
@@ -30,11 +32,8 @@ _VIEWS = 8
 _TURNING_FRAMES = 12  # after the first, for a start without points: a turn of 30 to 60 degrees, mostly
 _TURNING_VIEWS = 7
 _FEWEST_TURNING = 4
-_STAGES = (
-    (99, 5, True),
-    (5, 12, True),
-    (3, 10, False),
-)  # hypotheses that go on, evaluations, half resolution
+# Hypotheses that go on, evaluations, half resolution.
+_STAGES = ((99, 5, True), (5, 12, True), (3, 10, False))
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,8 +152,20 @@ def _posed(views: list[View], poses: list[Pose]) -> tuple[View, ...]:
 
 def _without_points(known: ObjectMap) -> ObjectMap:
     """The map without what its keyframes show of the landmarks: they did not move with the object."""
-    keyframes = tuple(replace(view, points=FollowedPoints.none()) for view in known.keyframes)
-    return replace(known, landmarks=np.full_like(known.landmarks, np.nan), keyframes=keyframes)
+    nothing = np.zeros(0, np.int64)
+    keyframes = tuple(
+        replace(
+            view,
+            points=FollowedPoints.none(),
+            keypoints=Keypoints.none(),
+            keypoint_landmark=nothing,
+            mask_weight=1.0,
+        )
+        for view in known.keyframes
+    )
+    return replace(
+        known, landmarks=np.zeros((0, 3)), candidate=np.zeros(0, bool), keyframes=keyframes, pointless=True
+    )
 
 
 def _with_structure(

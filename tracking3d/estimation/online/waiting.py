@@ -24,7 +24,7 @@ _MORE_MOTION = 1.3  # times as much before it is tried again
 _DOUBTFUL = 0.33  # bundle cost above which the points do not tell
 _MOST = 40  # frames that wait for a better one
 _FEWEST = 4  # frames that are solved together
-_FEWEST_BY_TURNING = 12
+_FEWEST_BY_TURNING = 13
 _LASTING = 0.4  # share of the first frame's points that are still there where they can be relied on
 _LEAST_SHARED = 0.1  # share below which nothing more will be learned of the first frame
 _SPARSE = 0.6  # of `MOST_POINTS`, below which new points are looked for
@@ -98,8 +98,7 @@ def solved_start(state: Belief, config: OnlineConfig) -> tuple[Belief, Start | N
     if not starts or starts[0].bundle > _DOUBTFUL:
         if not waited and (shared > _LASTING or len(views) < _FEWEST_BY_TURNING):
             return state, None
-        chosen = views[:: max(len(views) // 7, 1)][:8]
-        turning = by_turning(state.known, state.camera, chosen, weights)
+        turning = by_turning(state.known, state.camera, views, weights)
         starts = sorted([*starts, *turning], key=lambda start: start.cost)
     return state, starts[0] if starts else None
 

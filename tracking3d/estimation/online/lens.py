@@ -1,0 +1,69 @@
+"""The focal length, where nobody gave it: solved with poses and points once the object has turned enough.
+
+A wrong lens makes the object turn too little or too much. Several lenses are tried, since the cost has a valley at
+each, and the assumed one stays unless another explains the points clearly better.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from tracking3d.estimation.online.belief import ObjectMap
+from tracking3d.estimation.online.bundle import Structure, adjust
+from tracking3d.estimation.online.mapping import pose_of, shared_landmarks, structure_of, tracks_of
+from tracking3d.geometry.camera import Camera
+
+CANDIDATES = (10.0, 25.0, 45.0, 65.0)
+"""Vertical fields of view in degrees."""
+ATTEMPTS = (10, 16, 24)
+"""Numbers of keyframes at which the lens is solved."""
+_CLEARLY = 0.92  # of the assumed lens's cost
+_SAME = math.log(1.05)  # focal lengths so near are one
+_ITERATIONS = 25
+_FEWEST = 30  # landmarks
+
+
+def solve_lens(known: ObjectMap, camera: Camera) -> tuple[ObjectMap, Camera]:
+    """The map and the camera with the focal length that explains the landmarks best.
+
+    Args:
+        known: The map.
+        camera: Of the full frame, assumed.
+    """
+    views = list(known.keyframes)
+    names = shared_landmarks(known, views)
+    if len(names) < _FEWEST:
+        return known, camera
+    tracks, start = tracks_of(views, names), structure_of(known, views, names)
+    kept = adjust(tracks, camera.K, start, iterations=_ITERATIONS)
+    tried = []
+    for field_of_view in CANDIDATES:
+        lens = Camera.from_fov(camera.width, camera.height, field_of_view).fy / camera.fy
+        stretched = replace(start, t=start.t * [1.0, 1.0, lens], focal_factor=lens)
+        tried.append(adjust(tracks, camera.K, stretched, iterations=_ITERATIONS, free_focal=True))
+    best = min(tried, key=lambda one: one.cost)
+    if best.cost > _CLEARLY * kept.cost or abs(math.log(best.focal_factor)) < _SAME:
+        return known, camera
+    return _with_lens(known, camera, names, best)
+
+
+def _with_lens(
+    known: ObjectMap, camera: Camera, names: np.ndarray, found: Structure
+) -> tuple[ObjectMap, Camera]:
+    factor = found.focal_factor
+    landmarks = known.landmarks.copy()
+    sound = np.isfinite(found.points).all(1)
+    landmarks[names[sound]] = found.points[sound]
+    keyframes = []
+    for n, view in enumerate(known.keyframes):
+        K = view.observation.K.clone()
+        K[0, 0], K[1, 1] = factor * K[0, 0], factor * K[1, 1]
+        pose = pose_of(found.R[n], found.t[n], known.vertices)
+        keyframes.append(replace(view, pose=pose, observation=replace(view.observation, K=K), texture=None))
+    degrees = 2 * math.degrees(math.atan(camera.height / (2 * factor * camera.fy)))
+    origin = f"solved field of view of {degrees:.1f} degrees"
+    camera = replace(camera, fx=factor * camera.fx, fy=factor * camera.fy, origin=origin)
+    return replace(known, landmarks=landmarks, keyframes=tuple(keyframes)), camera
