@@ -4,47 +4,76 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from tracking3d.estimation.online.judgement import Usual
+from tracking3d.estimation.online.belief import View
+from tracking3d.estimation.online.pose_refinement import Surface, drawn_at
+from tracking3d.geometry.pose import Pose
+from tracking3d.rendering import sample_texture
+from tracking3d.rendering.texture_losses import cauchy
 
 _ALIKE = 0.85  # IoU of two masks that differ along their outlines only
-_ODD = 0.85  # share of the usual overlap below which a frame's initial mask stands out
-_SOUND_SHAPE = 0.75  # usual overlap below which it is the shape that is wrong
-_DISTRUSTED = 0.5  # weight of an initial mask that points contradict
-_RENDERED_SHARE = 0.6  # of the rendered outline in the mean of both
+_SUPPORTED, _UNSUPPORTED = 0.6, 0.3  # shares of what is rendered beside the mask that settle who is right
+_FEW = 0.02  # share of the silhouette beside the mask that is an outline's width
+_AS_GOOD, _NOISE = (
+    2.0,
+    0.2,
+)  # how much worse than inside the mask a pixel beside it may fit, and how bad is fine
+_SHARE = 0.6  # of the rendered outline in the mean of both: where they are far apart it decides
 _REACH = 0.06  # of the root of the area: how far an outline pulls
 
 
 def answer_mask(
     rendered: NDArray[np.bool_],
     initial: NDArray[np.bool_] | None,
-    usual: Usual,
-    mask_weight: float,
-    witnesses: bool,
+    support: float,
 ) -> NDArray[np.bool_]:
     """The better supported of two masks ``(H, W)``, or the mean of their outlines where they are alike.
 
     Args:
         rendered: The silhouette at the frame's pose.
         initial: The mask tracker's, or None.
-        usual: How well the two overlap usually.
-        mask_weight: How far the points believe the initial mask.
-        witnesses: Whether points enough settle the pose.
+        support: How far the pixels support what is rendered beside the initial mask, see `support_beside`.
     """
     if initial is None:
         return rendered
     overlap = float((rendered & initial).sum()) / max(float((rendered | initial).sum()), 1.0)
     if overlap >= _ALIKE:
-        return _mean_outline(rendered, initial)
-    trusted = usual.overlap >= _SOUND_SHAPE and witnesses
-    stands_out = overlap < _ODD * usual.overlap
-    if trusted and (stands_out or mask_weight < _DISTRUSTED):
+        return _mean_outline(rendered, initial, _SHARE if support >= _UNSUPPORTED else 1 - _SHARE)
+    if support >= _SUPPORTED:
         return rendered
-    return _mean_outline(rendered, initial) if trusted else initial
+    return initial if support < _UNSUPPORTED else _mean_outline(rendered, initial, _SHARE)
 
 
-def _mean_outline(rendered: NDArray[np.bool_], initial: NDArray[np.bool_]) -> NDArray[np.bool_]:
+@torch.no_grad()
+def support_beside(surface: Surface, view: View, pose: Pose, scale: float) -> float:
+    """Share of the silhouette beside the initial mask that looks like the object, in [0, 1].
+
+    A pixel does whose texture is known and fits not much worse than the pixels inside the mask do. Little is known
+    of the texture where no mask ever was.
+
+    Args:
+        surface: The object.
+        view: The frame.
+        pose: Its pose.
+        scale: Of the Cauchy loss.
+    """
+    observation = view.observation
+    drawn = drawn_at(surface, observation, pose)
+    inside = observation.valid.reshape(-1)[drawn.pixels] > 0.5
+    masked = observation.mask.reshape(-1)[drawn.pixels] > 0.5
+    beside = inside & ~masked
+    if float(beside.sum()) < _FEW * max(float(inside.sum()), 1.0) or not bool((inside & masked).any()):
+        return 1.0
+    seen = sample_texture(surface.seen, drawn.uv)[:, 0] > 0.5
+    shown = observation.features.permute(1, 2, 0).reshape(-1, observation.features.shape[0])[drawn.pixels]
+    loss = cauchy(drawn.features, shown, scale).mean(1)
+    limit = _AS_GOOD * float(loss[inside & masked].median()) + _NOISE
+    return float((seen & (loss < limit))[beside].float().mean())
+
+
+def _mean_outline(rendered: NDArray[np.bool_], initial: NDArray[np.bool_], share: float) -> NDArray[np.bool_]:
     """Where the weighted mean of both signed distances, each cut off at `_REACH`, is inside."""
     reach = _REACH * float(np.sqrt(initial.sum()))
 
@@ -54,5 +83,5 @@ def _mean_outline(rendered: NDArray[np.bool_], initial: NDArray[np.bool_]) -> ND
         inward = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_5)
         return np.asarray(np.clip(outward - inward, -reach, reach), dtype=np.float32)
 
-    mean = _RENDERED_SHARE * distance(rendered) + (1 - _RENDERED_SHARE) * distance(initial)
+    mean = share * distance(rendered) + (1 - share) * distance(initial)
     return np.asarray(mean < 0)

@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from tracking3d.estimation.assessment import Assessment
 from tracking3d.estimation.estimate import FrameEstimate, Status
-from tracking3d.estimation.online.answer_mask import answer_mask
+from tracking3d.estimation.online.answer_mask import answer_mask, support_beside
 from tracking3d.estimation.online.belief import Belief, View
-from tracking3d.estimation.online.judgement import ENOUGH_POINTS
-from tracking3d.estimation.online.pose_refinement import PoseFit
+from tracking3d.estimation.online.pose_refinement import PoseFit, PoseWeights
 from tracking3d.frames import Frame
 from tracking3d.geometry.pose import Pose
 
@@ -57,7 +56,10 @@ def solved(
         mask = view.mask if view.mask is not None else np.zeros_like(answer.mask)
     else:
         rendered = state.known.silhouette(fit.pose, state.camera)
-        mask = answer_mask(rendered, view.mask, state.usual, view.mask_weight, witnesses >= ENOUGH_POINTS)
+        support = 1.0
+        if state.surface is not None and view.mask is not None:
+            support = support_beside(state.surface, view, fit.pose, PoseWeights().appearance_scale)
+        mask = answer_mask(rendered, view.mask, support)
     return replace(
         answer,
         T_cam_obj=fit.pose.matrix().numpy(),

@@ -207,7 +207,7 @@ def _evaluate(surface: Surface, evidence: _Evidence, pose: Pose) -> tuple[Normal
     """The normal equations at a pose, and its costs."""
     weights = evidence.weights
     t = pose.translation[None]
-    drawn = _drawn(surface, evidence.observation, pose)
+    drawn = drawn_at(surface, evidence.observation, pose)
     pixels, appearance, unseen = _appearance(surface, evidence.observation, drawn, t, weights)
     # The equations are of the mean over what is known, the cost is of all that can be compared.
     model, cost = pixels * (weights.appearance * (1 - unseen)), weights.appearance * appearance
@@ -256,7 +256,7 @@ def _overlap(drawn: Rendering, observation: Observation) -> float:
     return float((covered & mask).sum()) / max(float((covered | mask).sum()), 1.0)
 
 
-def _drawn(surface: Surface, observation: Observation, pose: Pose) -> Rendering:
+def drawn_at(surface: Surface, observation: Observation, pose: Pose) -> Rendering:
     """The object in an observation's window."""
     return render(
         surface.vertices,
