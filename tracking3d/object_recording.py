@@ -67,6 +67,7 @@ class ObjectRecording:
         self._causal_model = self._session.result()
         self._refinement = self._writer.begin_refinement(self._causal_model)
         self._session.refine()
+        self._writer.refine_camera(self._session.camera)
 
     def take_again(self, frame: Frame) -> FrameRecord | None:
         """Answer for a frame once more; None where it has no causal answer or there is no refinement."""

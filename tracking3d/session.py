@@ -189,12 +189,14 @@ class Session:
     def refine(self) -> None:
         """Solve everything once more over what is known of the whole video.
 
+        A focal length that nobody gave may be solved too: ``camera`` is then another one, for the refined answers.
         ``step`` is over then: ``revisit`` takes the frames again, and ``result`` gives the final object.
 
         Raises:
             RuntimeError: If the solver cannot, see ``can_refine``.
         """
         self._state = self._refining().refine(self._state)
+        self._camera = getattr(self._state, "camera", self._camera)
         self._refined = True
 
     def revisit(self, frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]) -> FrameEstimate:

@@ -168,7 +168,8 @@ def _track(job: Job, run: Path) -> None:
     held: list[float] = []
 
     def after_frame(frame: object) -> None:
-        if memory := resident_memory():
+        # The second pass holds more once, not more and more.
+        if not getattr(frame, "refined", False) and (memory := resident_memory()):
             held.append(memory[0])
 
     _record(job, run, after_frame)

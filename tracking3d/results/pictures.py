@@ -26,7 +26,7 @@ class Pictures:
     """
 
     def __init__(self, video: Path, camera: Camera, fps: float) -> None:
-        self._file, self._camera, self._fps = video, camera, fps
+        self._file, self.camera, self._fps = video, camera, fps
         self._video: VideoWriter | None = None
         self._first: FrameEstimate | None = None
         self._axes: ObjectAxes | None = None
@@ -41,9 +41,9 @@ class Pictures:
         if self._first is None:
             self._first = estimate
         if self._axes is None:
-            self._axes = ObjectAxes.of(estimate, self._camera)
-        size = OverlaySize.of(self._camera)
-        overlay = draw_overlay(frame, estimate, record, self._camera, self._axes)
+            self._axes = ObjectAxes.of(estimate, self.camera)
+        size = OverlaySize.of(self.camera)
+        overlay = draw_overlay(frame, estimate, record, self.camera, self._axes)
         self._thumbnails.add(overlay[: size.picture], size.scale, estimate)
         if self._video is None:
             self._video = VideoWriter(self._file, self._fps, (size.height, size.width))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -158,6 +159,11 @@ class RunWriter:
         self._write_description()
         return self._refinement
 
+    def refine_camera(self, camera: Camera) -> None:
+        """From here on answers are those of ``camera``; ``run.json`` names it when the refinement has ended."""
+        assert self._refinement is not None
+        self._camera = self._refinement.pictures.camera = camera
+
     def end_refinement(self) -> None:
         """Put the refined answers in the place of the causal ones, which go to ``causal/``.
 
@@ -167,6 +173,7 @@ class RunWriter:
         assert self._refinement is not None
         self._refinement.take_over(self._append_all)
         self._description["refinement"] = self._refinement.described("finished")
+        self._description["camera"] = asdict(self._camera)
         self._pictures, self._refinement = self._refinement.pictures, None
 
     def finish(self, model: ObjectModel | None, state: FinalState, error: str | None = None) -> None:

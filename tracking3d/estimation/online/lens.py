@@ -1,4 +1,4 @@
-"""The focal length, where nobody gave it: solved with poses and points once the object has turned enough.
+"""The focal length, where nobody gave it: solved with poses and points when the whole video has been seen.
 
 A wrong lens makes the object turn too little or too much. Several lenses are tried, since the cost has a valley at
 each, and the assumed one stays unless another explains the points clearly better.
@@ -18,8 +18,6 @@ from tracking3d.geometry.camera import Camera
 
 CANDIDATES = (10.0, 25.0, 45.0, 65.0)
 """Vertical fields of view in degrees."""
-ATTEMPTS = (10, 16, 24)
-"""Numbers of keyframes at which the lens is solved."""
 _CLEARLY = 0.92  # of the assumed lens's cost
 _SAME = math.log(1.05)  # focal lengths so near are one
 _ITERATIONS = 25

@@ -25,7 +25,6 @@ from tracking3d.estimation.online.answers import solved, unsolved
 from tracking3d.estimation.online.belief import Belief, ObjectMap, View
 from tracking3d.estimation.online.growing import refined, refined_once_more, with_keyframe, with_points
 from tracking3d.estimation.online.judgement import ENOUGH_POINTS, judge, looks_wrong
-from tracking3d.estimation.online.lens import ATTEMPTS, solve_lens
 from tracking3d.estimation.online.mapping import mask_weight, pose_of, project_points
 from tracking3d.estimation.online.points import FollowedPoints, follow, grey
 from tracking3d.estimation.online.pose_refinement import PoseFit, PoseWeights
@@ -254,9 +253,6 @@ class OnlineSolver:
             belief = replace(belief, usual=state.usual.updated(fit))
         if key:
             known, followed = with_keyframe(state.known, state.camera, view, image, self.online)
-            if state.camera.assumed and len(known.keyframes) in ATTEMPTS:
-                known, camera = solve_lens(known, state.camera)
-                belief = replace(belief, camera=camera)
             fit = replace(fit, pose=known.keyframes[-1].pose)
             belief = replace(
                 belief, known=known, surface=known.surface(), last=(fit.pose, frame.index), followed=followed
