@@ -3,14 +3,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
 from turned_solid import LAMP, SIZE, degrees_apart, turned, turned_map
 
 from tracking3d.estimation.online.belief import ObjectMap
 from tracking3d.estimation.online.joint_fit import (
     fit_jointly,
-    pose_without_points,
     refine_without_points,
 )
 from tracking3d.estimation.online.shaded_appearance import FaceEquations, _lit, face_equations, layers_of
@@ -125,18 +123,6 @@ def test_the_first_pose_stays() -> None:
     found, _ = fit_jointly(known, Modes.of(known.shape, 20), WEIGHTS, 3)
     assert torch.equal(found.keyframes[0].pose.matrix(), known.keyframes[0].pose.matrix())
     assert not torch.equal(found.keyframes[1].pose.matrix(), known.keyframes[1].pose.matrix())
-
-
-@pytest.mark.parametrize("textured", [True, False])
-def test_one_more_view_is_found_by_its_texture_or_by_its_shading(textured: bool) -> None:
-    known = turned_map([*ANGLES, 48.0], textured=textured)
-    modes = Modes.of(known.shape, 20)
-    before = replace(known, keyframes=known.keyframes[:-1])
-    away = replace(known.keyframes[-1], pose=turned(42.0))
-    pose, cost = pose_without_points(before, away, [1, 2, 3], modes, WEIGHTS)
-    _, worse = pose_without_points(before, away, [1, 2, 3], modes, WEIGHTS, 0)
-    assert degrees_apart(pose, turned(48.0)) < 2.0
-    assert cost < worse
 
 
 def test_keyframes_that_take_no_part_do_not_move() -> None:

@@ -12,11 +12,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from tracking3d.estimation.online.belief import ObjectMap, View
+from tracking3d.estimation.online.belief import ObjectMap
 from tracking3d.estimation.online.outline import outline_distance
 from tracking3d.estimation.online.shaded_appearance import face_equations, layers_of
 from tracking3d.estimation.online.shape_modes import Modes, in_modes
 from tracking3d.estimation.online.surface_fit import FitWeights
+from tracking3d.estimation.shape import flatten
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_exponential
 from tracking3d.rendering import Rendering, find_contour, render
 from tracking3d.rendering.contour import contour_slopes
@@ -98,36 +99,6 @@ def fit_jointly(
     return replace(known, vertices=state.vertices, keyframes=keyframes), state.cost
 
 
-def pose_without_points(
-    known: ObjectMap,
-    view: View,
-    references: list[int],
-    modes: Modes,
-    weights: FitWeights,
-    iterations: int = 6,
-) -> tuple[Pose, float]:
-    """The pose of one more view, against what some keyframes show under the same light, and its mask's outline.
-
-    Args:
-        known: The map, which does not change.
-        view: With a first pose.
-        references: Positions of the keyframes it is compared with.
-        modes: Of the shape.
-        weights: Of the outline.
-        iterations: Most evaluations after the first.
-
-    Returns:
-        The pose, and the cost of all these views together: it tells one first pose from another.
-    """
-    together = replace(known, keyframes=(*(known.keyframes[place] for place in references), view))
-    problem = _problem(together, modes, weights)
-    free = torch.zeros(problem.unknowns, dtype=torch.bool)
-    last = problem.shape_unknowns + 6 * len(references)
-    free[last : last + 6] = True
-    state = _minimized(problem, free, iterations)
-    return state.poses[len(references)], state.cost
-
-
 def refine_without_points(
     known: ObjectMap, positions: list[int], weights: FitWeights, iterations: int = 6
 ) -> ObjectMap:
@@ -146,7 +117,8 @@ def refine_without_points(
     keyframes = list(known.keyframes)
     for position, view in zip(positions, fitted.keyframes, strict=True):
         keyframes[position] = view
-    return replace(known, vertices=fitted.vertices, keyframes=tuple(keyframes))
+    vertices = flatten(fitted.vertices) if known.shape.flat else fitted.vertices
+    return replace(known, vertices=vertices, keyframes=tuple(keyframes))
 
 
 def _problem(known: ObjectMap, modes: Modes, weights: FitWeights) -> _Problem:

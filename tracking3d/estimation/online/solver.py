@@ -50,6 +50,9 @@ from tracking3d.rendering import BackProjection, TexelMap
 _SPARSE = 40  # witnesses below which the map takes a frame for the sake of new points
 _PAUSE = 3  # frames from one keyframe to the next for that sake
 _FITS = 0.8  # overlap with the mask that lets a frame without witnesses into the map
+_LOOKS_FLAT = (
+    "all points seen so far lie in one plane; if the whole object is flat, --flat tells its back side better"
+)
 _TRAIL = 5  # believed frames that give the motion where nothing is seen
 
 
@@ -230,7 +233,10 @@ class OnlineSolver:
             belief, last=trail[-1], before=trail[-2], trail=tuple(trail[-_TRAIL:]), usual=usual,
             status=Status.TRACKED, followed=view.points,
         )  # fmt: skip
-        return belief, replace(revised[-1], revised=tuple(revised[:-1]))
+        answer = replace(revised[-1], revised=tuple(revised[:-1]))
+        if start.origin == "flat" and not self.config.object.flat and not answer.reason:
+            answer = replace(answer, reason=_LOOKS_FLAT)
+        return belief, answer
 
     def _track(
         self, state: Belief, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None

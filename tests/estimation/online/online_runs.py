@@ -1,0 +1,104 @@
+"""The online solver over a small synthetic clip of a solid that turns."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.config.loading import load_config
+from tracking3d.estimation.estimate import FrameEstimate
+from tracking3d.estimation.online.belief import Belief
+from tracking3d.estimation.online.solver import OnlineSolver
+from tracking3d.evaluation.metrics import Angles, aligned_rotation_errors
+from tracking3d.features.rgb import RgbEncoder
+from tracking3d.frames import Frame, MaskEstimate
+from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
+
+FRAMES = 14
+Mask = NDArray[np.bool_] | None
+Run = tuple[Belief, list[FrameEstimate]]
+
+
+@cache
+def turning_clip() -> SyntheticClip:
+    """A box with cut corners, turning 5 degrees a frame."""
+    return synthesize(
+        SyntheticSpec(frames=FRAMES, size=(160, 120), degrees_per_frame=5.0, drift=(0.2, -0.1, 0.2))
+    )
+
+
+@cache
+def solver() -> OnlineSolver:
+    """With the default settings."""
+    return OnlineSolver(load_config(preset="default"), turning_clip().camera, RgbEncoder())
+
+
+def frame(index: int, shown: int | None = None) -> Frame:
+    """Frame ``index``, which shows the clip's image ``shown``, or the one of the same index."""
+    return Frame(index, turning_clip().images[index if shown is None else shown], name=f"frame {index}")
+
+
+def empty_frame(index: int) -> Frame:
+    """A frame in which nothing is to be seen."""
+    return Frame(index, np.full_like(turning_clip().images[0], 120))
+
+
+def estimate_of(mask: Mask) -> MaskEstimate:
+    """What a mask tracker answers."""
+    return MaskEstimate(None if mask is None else mask.astype(np.float32))
+
+
+def true_mask(index: int) -> NDArray[np.bool_]:
+    """Of an image of the clip."""
+    return turning_clip().masks[index]
+
+
+def run(frames: Iterable[tuple[Frame, Mask]]) -> Run:
+    """The state at the end, and every answer as it came."""
+    state, answers = None, []
+    for shown, mask in frames:
+        given = estimate_of(mask)
+        state, answer = solver().init(shown, given) if state is None else solver().step(state, shown, given)
+        answers.append(answer)
+    assert state is not None
+    return state, answers
+
+
+def with_true_masks(indices: Iterable[int] = range(FRAMES)) -> list[tuple[Frame, Mask]]:
+    """Frames of the clip and their masks."""
+    return [(frame(index), true_mask(index)) for index in indices]
+
+
+@cache
+def whole_run() -> Run:
+    """The whole clip with true masks."""
+    return run(with_true_masks())
+
+
+def final(answers: Iterable[FrameEstimate]) -> list[FrameEstimate]:
+    """The last causal answer for every frame, in order of time."""
+    found: dict[int, FrameEstimate] = {}
+    for answer in answers:
+        found |= {better.index: better for better in answer.revised}
+        found[answer.index] = answer
+    return [found[index] for index in sorted(found)]
+
+
+def revisited(state: Belief, answers: Iterable[FrameEstimate]) -> Run:
+    """The refined state, and every frame once more; ``answers`` are the final causal ones."""
+    state, refined = solver().refine(state), []
+    for answer in answers:
+        given = estimate_of(answer.initial_mask)
+        state, better = solver().revisit(state, frame(answer.index), given, answer.T_cam_obj)
+        refined.append(better)
+    return state, refined
+
+
+def rotation_errors(answers: list[FrameEstimate]) -> Angles:
+    """Against the clip's truth, in degrees."""
+    found = np.stack([answer.T_cam_obj[:3, :3] for answer in answers])
+    true = turning_clip().T_cam_obj[[answer.index for answer in answers], :3, :3]
+    return aligned_rotation_errors(found, true)
