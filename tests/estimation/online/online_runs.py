@@ -97,6 +97,13 @@ def revisited(state: Belief, answers: Iterable[FrameEstimate]) -> Run:
     return state, refined
 
 
+@cache
+def refined_run() -> Run:
+    """The whole run, looked at once more."""
+    state, answers = whole_run()
+    return revisited(state, final(answers))
+
+
 def rotation_errors(answers: list[FrameEstimate]) -> Angles:
     """Against the clip's truth, in degrees."""
     found = np.stack([answer.T_cam_obj[:3, :3] for answer in answers])

@@ -10,6 +10,7 @@ from online_runs import (
     estimate_of,
     final,
     frame,
+    refined_run,
     revisited,
     rotation_errors,
     run,
@@ -96,7 +97,7 @@ def test_it_turns_as_far_as_the_object_does():
 
 def test_a_second_look_is_refined_and_better():
     causal = final(whole_run()[1])
-    _, refined = revisited(whole_run()[0], causal)
+    _, refined = refined_run()
     assert all(answer.refined and answer.status is Status.TRACKED for answer in refined)
     errors = rotation_errors(refined)
     assert errors.max() < 3
@@ -113,34 +114,39 @@ def test_the_object_is_textured_where_it_was_seen():
 
 
 def test_a_step_does_not_change_the_state_it_starts_from():
-    waiting, _ = run(with_true_masks(range(started())))
-    tracking, _ = whole_run()
-    for state, index in ((waiting, started()), (tracking, FRAMES)):
-        shown, mask = frame(index, min(index, FRAMES - 1)), estimate_of(true_mask(min(index, FRAMES - 1)))
-        landmarks, vertices = state.known.landmarks.copy(), state.known.vertices.clone()
-        count = len(state.known.keyframes)
-        once, again = (solver().step(state, shown, mask)[1] for _ in range(2))
-        assert same(once, again)
-        assert len(once.revised) == len(again.revised)
-        assert all(same(a, b) for a, b in zip(once.revised, again.revised, strict=True))
-        np.testing.assert_array_equal(state.known.landmarks, landmarks)
-        assert bool((state.known.vertices == vertices).all())
-        assert len(state.known.keyframes) == count
+    state, _ = whole_run()
+    landmarks, vertices = state.known.landmarks.copy(), state.known.vertices.clone()
+    shown, given = frame(FRAMES, FRAMES - 4), estimate_of(true_mask(FRAMES - 4))
+    solver().step(state, empty_frame(FRAMES), estimate_of(None))
+    (once_more, once), (_, again) = (solver().step(state, shown, given) for _ in range(2))
+    assert same(once, again)
+    assert once_more.last[1] == FRAMES
+    assert state.last[1] == FRAMES - 1
+    np.testing.assert_array_equal(state.known.landmarks, landmarks)
+    assert bool((state.known.vertices == vertices).all())
 
 
-def test_refining_does_not_change_the_state_either():
-    state, answers = whole_run()
-    given = estimate_of(true_mask(3))
-    one, other = (
-        solver().revisit(solver().refine(state), frame(3), given, answers[3].T_cam_obj)[1] for _ in range(2)
-    )
+def test_the_same_video_gives_the_same_start():
+    answers = whole_run()[1]
+    _, again = run(with_true_masks(range(started() + 1)))
+    assert same(again[-1], answers[started()])
+    assert all(same(a, b) for a, b in zip(again[-1].revised, answers[started()].revised, strict=True))
+
+
+def test_a_revisit_does_not_change_the_state_either():
+    state, _ = refined_run()
+    given, causal = estimate_of(true_mask(3)), final(whole_run()[1])[3].T_cam_obj
+    one, other = (solver().revisit(state, frame(3), given, causal)[1] for _ in range(2))
     assert same(one, other)
 
 
-@pytest.mark.parametrize("missing", [None, np.zeros((120, 160), bool)], ids=["no mask", "an empty mask"])
-@pytest.mark.parametrize("at", [1, 8])
+@pytest.mark.parametrize(
+    ("at", "missing"),
+    [(1, None), (8, np.zeros((120, 160), bool))],
+    ids=["none while it waits", "an empty one later"],
+)
 def test_one_frame_without_a_mask_is_survived(at, missing):
-    frames = with_true_masks(range(11))
+    frames = with_true_masks(range(10))
     frames[at] = frames[at][0], missing
     _, answers = run(frames)
     answers = final(answers)

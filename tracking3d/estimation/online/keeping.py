@@ -13,17 +13,17 @@ from tracking3d.geometry.pose import rotation_angle
 
 
 def thinned(keyframes: tuple[View, ...], most: int) -> tuple[View, ...]:
-    """At most so many keyframes: of the two most alike the later goes; the first and the recent half stay."""
+    """At most so many keyframes: of the two most alike older ones the later goes; the first and the recent half stay."""
     kept = list(keyframes)
     while len(kept) > most:
         older = kept[: max(len(kept) - most // 2, 2)]
+        # Were they asked about later ones, each would go as it leaves the recent half, and nothing be kept between.
         gaps = [
             min(
-                float(rotation_angle(view.pose.quaternion, other.pose.quaternion))
-                for other in kept
-                if other is not view
+                float(rotation_angle(older[place].pose.quaternion, other.pose.quaternion))
+                for other in older[:place]
             )
-            for view in older[1:]
+            for place in range(1, len(older))
         ]
         kept.pop(1 + int(np.argmin(gaps)))
     return tuple(kept)

@@ -70,7 +70,12 @@ def recruit(known: ObjectMap, camera: Camera, positions: list[int]) -> ObjectMap
     start = Structure(R, t, np.einsum("nji,nj->ni", R[first], x_cam - t[first]))
     scale = max(1.0, views[-1].observation.window.side / 200)
     found = adjust(tracks, camera.K, start, fixed=len(views), scale=scale, iterations=8)
-    residual = np.nanmean(found.residual, 0) / scale
+    known_residual = np.isfinite(found.residual)
+    total = np.where(known_residual, found.residual, 0.0).sum(0)
+    # A point that ends behind every camera has no residual, and fits nothing.
+    residual = np.divide(
+        total / scale, known_residual.sum(0), out=np.full(len(names), np.inf), where=known_residual.any(0)
+    )
     motion = np.nanmax(np.linalg.norm(tracks.pixels - pixel, axis=2), 0) / scale
     # A point that stays while the object would have carried it along is none of it.
     carried = np.linalg.norm(project(to_camera(R, t, start.points), camera.K) - pixel, axis=2)

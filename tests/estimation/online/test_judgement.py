@@ -1,0 +1,109 @@
+"""A frame is judged by what is usual for its object, and by how many points agree."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from rendered_solids import pose_of
+
+from tracking3d.estimation.estimate import Status
+from tracking3d.estimation.online.judgement import ENOUGH_POINTS, Usual, judge, looks_wrong, unusual
+from tracking3d.estimation.online.pose_refinement import PoseFit, PoseWeights
+
+MANY, FEW = ENOUGH_POINTS, ENOUGH_POINTS - 1
+USUAL = Usual(appearance=0.2, outline=0.3, overlap=0.9)
+
+
+def fit(appearance=0.2, outline=0.3, overlap=0.9, unseen=0.0, points=0.1) -> PoseFit:
+    return PoseFit(pose_of(), 1.0, appearance, outline, points, overlap, unseen, torch.eye(6), 5)
+
+
+DOUBTFUL = fit(appearance=0.4)  # (0.4 - 0.26 - 0.05) / 0.2 = 0.45 above what is usual
+WRONG = fit(appearance=0.7)  # 1.95
+
+
+def test_what_is_usual_is_a_running_mean():
+    usual = USUAL.updated(fit(appearance=0.4, outline=0.1, overlap=0.8))
+    assert (usual.appearance, usual.outline, usual.overlap) == pytest.approx((0.22, 0.28, 0.89))
+    for _ in range(100):
+        usual = usual.updated(fit(appearance=0.4, outline=0.1, overlap=0.8))
+    assert (usual.appearance, usual.outline, usual.overlap) == pytest.approx((0.4, 0.1, 0.8), abs=1e-4)
+
+
+def test_excess_is_the_largest_of_pixels_outline_and_overlap():
+    assert unusual(fit(), USUAL, 1.0) == pytest.approx(-0.54)
+    assert unusual(DOUBTFUL, USUAL, 1.0) == pytest.approx(0.45)
+    assert unusual(fit(outline=1.55), USUAL, 1.0) == pytest.approx(1.0)
+    assert unusual(fit(overlap=0.515), USUAL, 1.0) == pytest.approx(1.0)
+
+
+def test_a_mask_that_is_not_believed_contradicts_nothing():
+    assert unusual(fit(outline=3.0, overlap=0.1), USUAL, 0.02) < 0.1
+
+
+def test_texture_that_was_never_seen_is_no_evidence_against_a_pose():
+    charge = PoseWeights().unseen
+    for unseen in (0.3, 0.6, 0.9, 1.0):
+        mixed = fit(appearance=(1 - unseen) * 0.2 + unseen * charge, unseen=unseen)
+        assert unusual(mixed, USUAL, 1.0) <= 0
+        assert not looks_wrong(mixed, USUAL, FEW, 1.0)
+    # What is known of it still speaks.
+    half_wrong = fit(appearance=0.5 * 0.9 + 0.5 * charge, unseen=0.5)
+    assert unusual(half_wrong, USUAL, 1.0) > 1
+
+
+def test_without_points_any_excess_looks_wrong():
+    assert not looks_wrong(fit(), USUAL, FEW, 1.0)
+    assert looks_wrong(DOUBTFUL, USUAL, FEW, 1.0)
+
+
+def test_with_points_only_a_large_excess_or_points_off_place_do():
+    assert not looks_wrong(DOUBTFUL, USUAL, MANY, 1.0)
+    assert looks_wrong(WRONG, USUAL, MANY, 1.0)
+    assert looks_wrong(fit(points=1.1), USUAL, MANY, 1.0)
+    assert not looks_wrong(fit(points=1.1), USUAL, FEW, 1.0)
+
+
+def test_what_is_usual_is_tracked_and_more_points_are_more_confident():
+    verdicts = [judge(fit(), USUAL, points, 1.0, True) for points in (0, MANY, 40, 400)]
+    assert all(one.status is Status.TRACKED and one.reason == "" for one in verdicts)
+    confidence = [one.confidence for one in verdicts]
+    assert confidence == pytest.approx([0.4, 0.55, 0.8, 0.8])
+
+
+def test_confidence_falls_as_losses_rise():
+    rising = [judge(fit(appearance=loss), USUAL, 40, 1.0, True).confidence for loss in (0.2, 0.4, 0.5, 0.8)]
+    assert rising == sorted(rising, reverse=True)
+    assert len(set(rising)) == 4
+    assert rising[-1] > 0
+
+
+def test_no_mask_and_no_points_is_lost():
+    verdict = judge(fit(), USUAL, FEW, 1.0, False)
+    assert verdict.status is Status.LOST
+    assert "no mask" in verdict.reason
+    assert judge(fit(), USUAL, MANY, 1.0, False).status is Status.TRACKED
+
+
+def test_neither_pixels_nor_points_is_lost_and_says_what_disagreed():
+    verdict = judge(WRONG, USUAL, FEW, 1.0, True)
+    assert verdict.status is Status.LOST
+    assert "0.70" in verdict.reason
+    assert "0.90" in verdict.reason
+    assert str(FEW) in verdict.reason
+    assert verdict.confidence < 0.1
+
+
+def test_points_against_pixels_is_uncertain():
+    verdict = judge(WRONG, USUAL, MANY, 1.0, True)
+    assert verdict.status is Status.UNCERTAIN
+    assert "points agree, pixels do not" in verdict.reason
+    assert verdict.confidence < judge(fit(), USUAL, MANY, 1.0, True).confidence
+
+
+def test_a_side_that_was_never_seen_is_uncertain_without_points():
+    unseen = fit(appearance=0.46, unseen=0.9)
+    verdict = judge(unseen, USUAL, FEW, 1.0, True)
+    assert verdict.status is Status.UNCERTAIN
+    assert "never seen" in verdict.reason
+    assert judge(unseen, USUAL, MANY, 1.0, True).status is Status.TRACKED
