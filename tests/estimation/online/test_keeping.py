@@ -65,7 +65,7 @@ def test_a_long_turn_stays_evenly_covered():
     assert angles == sorted(angles)
     assert angles[0] == 0
     assert angles[-6:] == [168, 170, 172, 174, 176, 178]
-    assert np.diff(angles[:7]).max() <= 64
+    assert np.diff(angles[:7]).max() <= 45
 
 
 def random_map(seed: int):

@@ -80,8 +80,8 @@ def waiting_view(
 
 def solved_start(state: Belief, config: OnlineConfig) -> tuple[Belief, Start | None]:
     """The start, where the waiting frames can tell; else None, and when it is tried next."""
-    assert state.waiting is not None
-    views = [view for view, _ in state.waiting if view.mask is not None]
+    waiting = state.waiting or ()
+    views = [view for view, _ in waiting if view.mask is not None]
     if len(views) < _FEWEST:
         return state, None
     names = np.unique(np.concatenate([view.points.landmark for view in views]))
@@ -90,14 +90,18 @@ def solved_start(state: Belief, config: OnlineConfig) -> tuple[Belief, Start | N
     waited = len(views) >= _MOST
     if motion < max(state.due, MOTION) and not waited and shared > _LEAST_SHARED:
         return state, None
-    if waited and not _changed(views):
-        return replace(state, waiting=_fewer(state.waiting), waits_for=_STILL), None
     state = replace(state, due=motion * _MORE_MOTION)
     weights = FitWeights(smoothness=config.smoothness)
-    starts = solve_start(state.known, state.camera, views, weights, config.surface_prior)
+    # Without motion any shape explains the points.
+    starts: list[Start] = []
+    if motion >= MOTION:
+        starts = solve_start(state.known, state.camera, views, weights, config.surface_prior)
     if not starts or starts[0].bundle > _DOUBTFUL:
         if not waited and (shared > _LASTING or len(views) < _FEWEST_BY_TURNING):
             return state, None
+        if not _changed(views):
+            kept = _fewer(waiting) if waited else waiting
+            return replace(state, waiting=kept, waits_for=_STILL), None
         turning = by_turning(state.known, state.camera, views, weights)
         starts = sorted([*starts, *turning], key=lambda start: start.cost)
     return state, starts[0] if starts else None

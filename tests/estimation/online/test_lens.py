@@ -1,0 +1,107 @@
+"""A lens that was only assumed is solved where the points tell clearly."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from tracked_solids import SIZE, degrees_between, scene
+from turned_solid import turned_map
+
+from tracking3d.estimation.online.bundle import Structure, adjust
+from tracking3d.estimation.online.lens import solve_lens
+from tracking3d.estimation.online.mapping import pose_arrays, pose_of
+from tracking3d.estimation.online.points import FollowedPoints
+from tracking3d.geometry.camera import Camera
+
+
+def solved_with(camera: Camera, truth: Camera, fov: float, count: int = 80):
+    """A map of a solid that was tracked through one lens and solved with another; and the true poses."""
+    given = scene(8, count, fov=fov, turn=70, noise=0.2)
+    stretch = [1.0, 1.0, camera.fy / truth.fy]
+    start = Structure(given.truth.R, given.truth.t * stretch, given.truth.points)
+    solved = adjust(given.tracks, camera.K, start, iterations=40)
+    base = turned_map([0.0])
+    view = base.keyframes[0]
+    K = torch.tensor(view.observation.window.K(camera)).float()
+    keyframes = []
+    for n in range(8):
+        names = np.flatnonzero(given.tracks.visible[n])
+        keyframes.append(
+            replace(
+                view,
+                observation=replace(view.observation, index=n, K=K),
+                pose=pose_of(solved.R[n], solved.t[n], base.vertices),
+                points=FollowedPoints(names, given.tracks.pixels[n, names].astype(np.float32)),
+            )
+        )
+    known = replace(
+        base,
+        landmarks=solved.points,
+        candidate=np.zeros(len(solved.points), bool),
+        keyframes=tuple(keyframes),
+    )
+    return known, given.truth
+
+
+def camera_of(fov: float) -> Camera:
+    return replace(Camera.from_fov(*SIZE, fov), assumed=True)
+
+
+def turns(known):
+    return np.array([pose_arrays(view.pose)[0] for view in known.keyframes])
+
+
+@pytest.fixture(scope="module")
+def narrow():
+    """Twenty degrees, taken for 45."""
+    assumed, true = camera_of(45), camera_of(20)
+    known, truth = solved_with(assumed, true, 20.0)
+    return known, truth, solve_lens(known, assumed)
+
+
+def test_the_focal_length_is_found(narrow):
+    _, _, (_, camera) = narrow
+    assert camera.fy == pytest.approx(camera_of(20).fy, rel=0.2)
+    assert camera.fx == camera.fy
+    assert (camera.cx, camera.cy) == (camera_of(20).cx, camera_of(20).cy)
+    assert "solved field of view" in camera.origin
+
+
+def test_the_object_turns_as_far_as_it_does_then(narrow):
+    known, truth, (better, _) = narrow
+    before, after = (degrees_between(turns(one), truth.R) for one in (known, better))
+    assert before.max() > 5
+    assert after.max() < 3
+
+
+def test_the_windows_have_the_lens_too(narrow):
+    known, _, (better, camera) = narrow
+    factor = camera.fy / camera_of(45).fy
+    for old, new in zip(known.keyframes, better.keyframes, strict=True):
+        expected = new.observation.window.K(camera)
+        torch.testing.assert_close(new.observation.K, torch.tensor(expected).float(), rtol=1e-5, atol=1e-3)
+        assert new.pose.translation[2] == pytest.approx(factor * float(old.pose.translation[2]), rel=0.25)
+
+
+def test_the_landmarks_are_seen_where_they_were(narrow):
+    _, _, (better, camera) = narrow
+    for view in better.keyframes:
+        R, t = pose_arrays(view.pose)
+        x_cam = better.landmarks[view.points.landmark] @ R.T + t
+        place = (x_cam / x_cam[:, 2:]) @ camera.K.T
+        assert np.median(np.linalg.norm(place[:, :2] - view.points.pixel, axis=1)) < 0.5
+
+
+@pytest.mark.parametrize("fov", [20.0, 45.0])
+def test_the_right_lens_stays_as_it_is(fov):
+    camera = camera_of(fov)
+    known, _ = solved_with(camera, camera, fov)
+    assert solve_lens(known, camera) == (known, camera)
+
+
+def test_few_landmarks_do_not_tell():
+    known, _ = solved_with(camera_of(45), camera_of(20), 20.0, count=25)
+    assert solve_lens(known, camera_of(45)) == (known, camera_of(45))

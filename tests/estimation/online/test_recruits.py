@@ -1,0 +1,147 @@
+"""Points beside the mask are taken over where they move with the object, and dropped where they do not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from patterns import disc, speckle
+from solid_points import pixels_of
+from turned_solid import CAMERA, turned_map
+
+from tracking3d.estimation.online import recruits
+from tracking3d.estimation.online.points import FollowedPoints
+from tracking3d.estimation.online.recruits import (
+    MOST_CANDIDATES,
+    recruit,
+    surroundings,
+    with_candidates,
+)
+
+ANGLES = [-15.0, -5.0, 5.0, 15.0]
+POINT = np.array([0.1, 0.1, -0.75])
+"""A little before the surface, on its near side in all views."""
+
+
+def with_tracks(*tracks, angles=ANGLES):
+    """The solid, and candidates with these pixels in its views; None where a view does not show one."""
+    known = turned_map(angles)
+    views = []
+    for number, view in enumerate(known.keyframes):
+        names = [n for n, track in enumerate(tracks) if track[number] is not None]
+        pixels = np.array([tracks[n][number] for n in names], np.float32).reshape(-1, 2)
+        views.append(replace(view, points=FollowedPoints(np.array(names, np.int64), pixels)))
+    return replace(
+        known,
+        keyframes=tuple(views),
+        landmarks=np.full((len(tracks), 3), np.nan),
+        candidate=np.ones(len(tracks), bool),
+    )
+
+
+def rigid(angles=ANGLES):
+    return [pixels_of(POINT[None], view)[0] for view in turned_map(angles).keyframes]
+
+
+def recruited(known):
+    return recruit(known, CAMERA, list(range(len(known.keyframes))))
+
+
+def shown(known):
+    """Names that any keyframe still shows."""
+    return set(np.concatenate([view.points.landmark for view in known.keyframes]).tolist())
+
+
+def test_a_point_that_moves_with_the_object_becomes_a_landmark_where_it_is():
+    known = recruited(with_tracks(rigid()))
+    assert known.candidate.tolist() == [False]
+    np.testing.assert_allclose(known.landmarks[0], POINT, atol=0.02)
+    assert shown(known) == {0}
+
+
+def test_a_point_of_the_background_is_dropped():
+    turns = [-40.0, -15.0, 15.0, 40.0]
+    beside = [[57.0, 34.0]] * 4
+    known = recruited(with_tracks(beside, rigid(turns), angles=turns))
+    assert shown(known) == {1}
+    assert known.candidate.tolist() == [True, False]
+
+
+def test_a_point_that_moves_otherwise_is_dropped():
+    across = [[20.0, 20.0], [26.0, 38.0], [21.0, 28.0], [40.0, 25.0]]
+    assert shown(recruited(with_tracks(across, rigid()))) == {1}
+
+
+def test_what_two_views_show_waits():
+    track = [*rigid()[:2], None, None]
+    known = recruited(with_tracks(track))
+    assert known.candidate.tolist() == [True]
+    assert shown(known) == {0}
+
+
+def test_while_nothing_moves_nothing_is_told():
+    angles = [0.0, 0.2, 0.4, 0.6]
+    known = recruited(with_tracks(rigid(angles), [[50.0, 30.0]] * 4, angles=angles))
+    assert known.candidate.tolist() == [True, True]
+    assert shown(known) == {0, 1}
+
+
+def test_what_six_views_cannot_tell_is_dropped():
+    angles = [0.0, 0.1, 0.2, 0.3, 0.4, 0.5]
+    assert not shown(recruited(with_tracks(rigid(angles), angles=angles)))
+
+
+def test_a_point_far_from_the_object_is_none_of_it():
+    # It turns with the object, at three times its radius.
+    far = np.array([0.4, 0.2, -2.4])
+    track = [pixels_of(far[None], view)[0] for view in turned_map(ANGLES).keyframes]
+    assert not shown(recruited(with_tracks(track)))
+
+
+def test_a_point_without_any_residual_is_dropped_without_a_warning(monkeypatch):
+    adjust = recruits.adjust
+
+    def behind(*arguments, **settings):
+        found = adjust(*arguments, **settings)
+        return replace(found, residual=np.full_like(found.residual, np.nan))
+
+    monkeypatch.setattr(recruits, "adjust", behind)
+    assert not shown(recruited(with_tracks(rigid())))
+
+
+def test_landmarks_are_not_asked():
+    known = with_tracks([[30.0, 30.0]] * 4)
+    known = replace(known, landmarks=POINT[None], candidate=np.zeros(1, bool))
+    assert recruited(known) is known
+
+
+MASK = disc((200, 240), (120, 100), 40)
+
+
+def test_the_surroundings_are_a_band_around_the_mask():
+    band = surroundings(MASK)
+    assert not (band & MASK).any()
+    reach = 0.25 * np.sqrt(MASK.sum())
+    assert band[100, 120 + 42]
+    assert band[100, int(120 + 40 + reach - 2)]
+    assert not band[100, int(120 + 40 + reach + 3)]
+
+
+@pytest.mark.parametrize("masked", [True, False])
+def test_candidates_are_corners_beside_the_mask_at_no_known_place(masked):
+    known = turned_map([0.0])
+    view = replace(known.keyframes[0], mask=MASK if masked else None)
+    more, shows = with_candidates(known, view, speckle())
+    if not masked:
+        assert len(more.landmarks) == len(shows.points) == 0
+        return
+    assert 10 < len(shows.points) <= MOST_CANDIDATES
+    assert more.candidate.all()
+    assert np.isnan(more.landmarks).all()
+    x, y = np.rint(shows.points.pixel).astype(int).T
+    # A corner is refined by up to two pixels.
+    assert surroundings(MASK)[y, x].mean() > 0.9
+    # The room for candidates is filled once.
+    again, _ = with_candidates(more, shows, speckle())
+    assert len(again.landmarks) <= MOST_CANDIDATES
