@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from turned_solid import CAMERA, turned_map
 
@@ -43,8 +42,3 @@ def map_with_points(angles: list[float], beyond: float = 0.6) -> ObjectMap:
         replace(view, points=FollowedPoints(names, pixels_of(points, view))) for view in known.keyframes
     )
     return replace(known, landmarks=points, candidate=np.zeros(len(points), bool), keyframes=keyframes)
-
-
-def shift_of(pose_tensor: torch.Tensor, x: float) -> torch.Tensor:
-    """A translation moved to the right."""
-    return pose_tensor + pose_tensor.new_tensor([x, 0.0, 0.0])

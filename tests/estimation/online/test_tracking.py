@@ -186,8 +186,8 @@ def test_keyframes_are_placed_where_the_mask_is(known):
 
 
 def test_witnesses_are_landmarks_that_two_keyframes_have_seen(known):
-    first = replace(known.keyframes[0], points=known.keyframes[0].points.only(known.candidate))
-    first = replace(first, points=FollowedPoints(np.arange(4), np.zeros((4, 2), np.float32)))
+    first = known.keyframes[0]
+    first = replace(first, points=first.points.only(first.points.landmark < 4))
     few = replace(known, keyframes=(first, known.keyframes[1]))
     assert witnesses(few, known.keyframes[1].points) == 4
     assert witnesses(few, FollowedPoints.none()) == 0

@@ -56,8 +56,9 @@ def solved(
         mask = view.mask if view.mask is not None else np.zeros_like(answer.mask)
     else:
         rendered = state.known.silhouette(fit.pose, state.camera)
-        support = 1.0
-        if state.surface is not None and view.mask is not None:
+        # Without texture everything beside the mask looks like the object.
+        support = 0.0 if state.known.pointless else 1.0
+        if not state.known.pointless and state.surface is not None and view.mask is not None:
             support = support_beside(state.surface, view, fit.pose, PoseWeights().appearance_scale)
         mask = answer_mask(rendered, view.mask, support)
     return replace(

@@ -13,7 +13,7 @@ from tracking3d.geometry.pose import rotation_angle
 
 
 def thinned(keyframes: tuple[View, ...], most: int) -> tuple[View, ...]:
-    """At most so many keyframes: of the two most alike older ones the later goes; the first and the recent half stay."""
+    """At most so many: of the two older ones most alike the later goes; the first and the recent half stay."""
     kept = list(keyframes)
     while len(kept) > most:
         older = kept[: max(len(kept) - most // 2, 2)]

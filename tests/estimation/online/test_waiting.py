@@ -1,0 +1,191 @@
+"""The first frames wait until they can be solved together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from patterns import disc, moved, shift, speckle, warped
+from solid_points import map_with_points
+from turned_solid import CAMERA, SIZE, turned, turned_map
+
+from tracking3d.config.models import OnlineConfig
+from tracking3d.estimation.online import waiting
+from tracking3d.estimation.online.answers import unsolved
+from tracking3d.estimation.online.belief import Belief
+from tracking3d.estimation.online.points import MOST_POINTS, FollowedPoints, follow
+from tracking3d.estimation.online.start import Start
+from tracking3d.estimation.online.waiting import solved_start, waiting_view
+from tracking3d.frames import Frame
+
+CONFIG = OnlineConfig()
+STEADY = [0.0, 6.0, 12.0, 18.0, 24.0, 30.0]
+STILL = [0.0] * 6
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """Which views a start was asked for, by kind; what it costs can be set."""
+    calls: dict = {"points": [], "turning": [], "bundle": 0.05}
+
+    def solve_start(known, camera, views, weights, prior):
+        calls["points"].append(len(views))
+        return [Start(known, 1.0, calls["bundle"], "points")] if calls["bundle"] is not None else []
+
+    def by_turning(known, camera, views, weights):
+        calls["turning"].append(len(views))
+        return [Start(known, 0.5, 0.0, "turning")]
+
+    monkeypatch.setattr(waiting, "solve_start", solve_start)
+    monkeypatch.setattr(waiting, "by_turning", by_turning)
+    return calls
+
+
+def belief_of(angles, without_mask=()) -> Belief:
+    """Frames of the turned solid that wait."""
+    known = map_with_points(angles)
+    held = []
+    for view in known.keyframes:
+        frame = Frame(view.index, np.zeros((SIZE, SIZE, 3), np.uint8))
+        if view.index // 2 in without_mask:
+            view = replace(view, mask=None)
+        held.append((view, unsolved(frame, view.mask, view.pose)))
+    nothing = replace(known, keyframes=())
+    grey = np.zeros((SIZE, SIZE), np.uint8)
+    return Belief(CAMERA, nothing, None, (turned(0), 0), None, grey, FollowedPoints.none(), tuple(held))
+
+
+def test_an_object_that_turns_is_solved(asked):
+    state, start = solved_start(belief_of(STEADY), CONFIG)
+    assert start is not None
+    assert start.origin == "points"
+    assert asked["points"] == [6]
+    assert not asked["turning"]
+    assert state.waits_for == ""
+
+
+def test_without_motion_nothing_is_tried(asked):
+    given = belief_of(STILL)
+    state, start = solved_start(given, CONFIG)
+    assert start is None
+    assert state is given
+    assert not asked["points"]
+
+
+def test_fewer_than_four_masks_are_too_few_however_it_moves(asked):
+    assert solved_start(belief_of(STEADY[:3]), CONFIG)[1] is None
+    assert solved_start(belief_of(STEADY, without_mask=(1, 2, 4)), CONFIG)[1] is None
+    assert not asked["points"]
+
+
+def test_frames_without_a_mask_are_not_solved_with_the_others(asked):
+    assert solved_start(belief_of(STEADY, without_mask=(2,)), CONFIG)[1] is not None
+    assert asked["points"] == [5]
+
+
+def test_a_doubtful_start_is_tried_again_only_after_more_motion(asked):
+    asked["bundle"] = 0.5
+    state, start = solved_start(belief_of(STEADY), CONFIG)
+    assert start is None
+    assert asked["points"] == [6]
+    again, start = solved_start(state, CONFIG)
+    assert start is None
+    assert again is state
+    assert asked["points"] == [6]
+    asked["bundle"] = 0.05
+    further = replace(belief_of([2 * angle for angle in STEADY]), due=state.due)
+    assert solved_start(further, CONFIG)[1] is not None
+
+
+def test_candidates_do_not_show_motion(asked):
+    given = belief_of(STEADY)
+    known = replace(given.known, candidate=np.ones(len(given.known.landmarks), bool))
+    assert solved_start(replace(given, known=known), CONFIG)[1] is None
+    assert not asked["points"]
+
+
+def test_points_that_do_not_tell_give_way_to_turning_at_last(asked):
+    asked["bundle"] = None
+    _, start = solved_start(belief_of(list(np.linspace(0, 60, 41))), CONFIG)
+    assert start is not None
+    assert start.origin == "turning"
+    assert asked["turning"] == [41]
+
+
+def test_what_is_still_for_long_keeps_waiting_with_fewer_frames_and_says_why(asked):
+    state, start = solved_start(belief_of([0.0] * 40), CONFIG)
+    assert start is None
+    assert "still" in state.waits_for
+    indices = [view.index for view, _ in state.waiting]
+    assert len(indices) == 21
+    assert (indices[0], indices[-1]) == (0, 78)
+    assert indices == sorted(set(indices))
+    assert not asked["turning"]
+
+
+def test_points_that_are_gone_without_having_moved_tell_no_shape(asked):
+    given = belief_of([0.0] * 14)
+    view, answer = given.waiting[-1]
+    bare = replace(view, points=view.points.only(view.points.landmark < 2))
+    state, start = solved_start(replace(given, waiting=(*given.waiting[:-1], (bare, answer))), CONFIG)
+    assert start is None
+    assert not asked["points"]
+    assert not asked["turning"]
+    assert "still" in state.waits_for
+    assert len(state.waiting) == 14
+
+
+IMAGE, MASK = speckle(), disc((200, 240), (110, 100), 60)
+MOTION = shift(3.0, -2.0)
+
+
+@pytest.fixture(scope="module")
+def first():
+    view = replace(turned_map([0.0]).keyframes[0], mask=MASK)
+    return waiting_view(turned_map([0.0]), (), view, IMAGE)
+
+
+def test_the_first_view_gets_points_inside_its_mask_whose_depth_is_unknown(first):
+    known, view = first
+    assert len(view.points) > 0.6 * MOST_POINTS
+    assert len(known.landmarks) == len(known.candidate) == len(np.unique(view.points.landmark))
+    assert np.isnan(known.landmarks).all()
+    assert not known.candidate.any()
+    x, y = np.rint(view.points.pixel).astype(int).T
+    assert MASK[y, x].mean() > 0.98
+
+
+def test_a_view_with_points_enough_stays_as_it_is(first):
+    known, view = first
+    now = warped(IMAGE, MOTION)
+    later = replace(view, points=follow(IMAGE, now, view.points))
+    again, same = waiting_view(known, (view,), later, now)
+    assert again is known
+    assert same is later
+
+
+def test_points_that_were_lost_are_found_again_by_name(first):
+    known, view = first
+    now = warped(IMAGE, MOTION)
+    bare = replace(view, mask=warped(MASK.astype(np.uint8), MOTION) > 0, points=FollowedPoints.none())
+    more, found = waiting_view(known, (view,), bare, now)
+    old = found.points.landmark < len(known.landmarks)
+    assert old.sum() > 50
+    place = dict(zip(view.points.landmark.tolist(), view.points.pixel, strict=True))
+    before = np.array([place[name] for name in found.points.landmark[old]])
+    gap = np.linalg.norm(found.points.pixel[old] - moved(before, MOTION), axis=1)
+    assert np.median(gap) < 0.3
+    assert (gap < 1.5).mean() > 0.95
+    assert len(more.landmarks) == len(known.landmarks) + (~old).sum()
+
+
+def test_names_are_unique_and_followed_points_keep_theirs(first):
+    known, view = first
+    now = warped(IMAGE, MOTION)
+    followed = follow(IMAGE, now, view.points.only(np.arange(len(view.points)) < 40))
+    bare = replace(view, mask=warped(MASK.astype(np.uint8), MOTION) > 0, points=followed)
+    _, found = waiting_view(known, (view,), bare, now)
+    assert len(np.unique(found.points.landmark)) == len(found.points)
+    np.testing.assert_array_equal(found.points.landmark[: len(followed)], followed.landmark)
+    np.testing.assert_array_equal(found.points.pixel[: len(followed)], followed.pixel)
