@@ -35,7 +35,7 @@ SURE = 0.6
 """Confidence from which an answer's mask is handed back to the mask tracker. An answer that is as likely wrong as right
 would teach it as many errors as it mends; the tracker ``onnx`` trusts its own masks from the same score on."""
 
-WORTH_CORRECTING = (0.5, 0.95)
+WORTH_CORRECTING = (0.5, 0.9)
 """IoU of answer and initial mask between which the latter is corrected. Above, they differ by little more than the
 width of an outline; below, one of them is of something else, and nobody knows which."""
 

@@ -32,7 +32,9 @@ def test_a_crash_and_a_failure_cost_their_own_sequence_only_and_the_rest_is_foun
     assert again.cached and again.scores == json.loads(json.dumps(narrow.scores))
 
 
-def test_the_memory_of_a_refined_run_is_that_of_the_first_pass_and_both_its_answers_are_scored(jobs, scripted):
+def test_the_memory_of_a_refined_run_is_that_of_the_first_pass_and_both_its_answers_are_scored(
+    jobs, scripted
+):
     [job] = jobs(scripted(), ["narrow"])
     assert job.config.solver.final_refine
     job.write()

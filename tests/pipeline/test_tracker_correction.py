@@ -113,9 +113,9 @@ def test_others_do_not(changes):
 
 
 def test_the_bounds_themselves_are_worth_correcting():
-    assert WORTH_CORRECTING == (0.5, 0.95)
+    assert WORTH_CORRECTING == (0.5, 0.9)
     assert corrects(estimate(mask=square(10, 10)))  # half of it
-    assert corrects(estimate(mask=square(10, 19)))  # 19 of 20
+    assert corrects(estimate(mask=square(10, 18)))  # 18 of 20
     assert not corrects(estimate(mask=square(10, 9)))
 
 

@@ -17,9 +17,11 @@ from tracking3d.estimation.online.points import FollowedPoints
 from tracking3d.geometry.camera import Camera
 
 
-def solved_with(camera: Camera, truth: Camera, fov: float, count: int = 80):
+def solved_with(
+    camera: Camera, truth: Camera, fov: float, count: int = 80, turn: float = 70.0, noise: float = 0.2
+):
     """A map of a solid that was tracked through one lens and solved with another; and the true poses."""
-    given = scene(8, count, fov=fov, turn=70, noise=0.2)
+    given = scene(8, count, fov=fov, turn=turn, noise=noise)
     stretch = [1.0, 1.0, camera.fy / truth.fy]
     start = Structure(given.truth.R, given.truth.t * stretch, given.truth.points)
     solved = adjust(given.tracks, camera.K, start, iterations=40)
@@ -99,6 +101,12 @@ def test_the_landmarks_are_seen_where_they_were(narrow):
 def test_the_right_lens_stays_as_it_is(fov):
     camera = camera_of(fov)
     known, _ = solved_with(camera, camera, fov)
+    assert solve_lens(known, camera) == (known, camera)
+
+
+def test_a_small_turn_does_not_tell_the_lens():
+    camera = camera_of(45)
+    known, _ = solved_with(camera, camera_of(20), 20.0, turn=6, noise=0.5)
     assert solve_lens(known, camera) == (known, camera)
 
 

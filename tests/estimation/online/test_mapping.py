@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from patterns import disc
 from solid_points import map_with_points, pixels_of
 from turned_solid import CAMERA, SIZE, degrees_apart, turned, turned_map
@@ -61,6 +62,18 @@ def test_pixels_beside_the_object_meet_nothing(known):
     view = known.keyframes[0]
     pixel = np.float32([[1, 1], [32, 32], [-30, 32], [62, 200]])
     assert lift(known, CAMERA, view, pixel)[1].tolist() == [False, True, False, False]
+
+
+def test_what_the_window_does_not_show_is_not_lifted(known):
+    view = known.keyframes[1]
+    window = Window(24, 24, 16, 64)
+    K = torch.tensor(window.K(CAMERA)).float()
+    near = replace(view, observation=replace(view.observation, window=window, K=K))
+    points, met = lift(known, CAMERA, near, np.float32([[32, 32], [23, 32], [32, 41]]))
+    assert met.tolist() == [True, False, False]
+    # The closer look meets the same place.
+    whole, _ = lift(known, CAMERA, view, np.float32([[32, 32]]))
+    np.testing.assert_allclose(points[0], whole[0], atol=0.02)
 
 
 def test_windows_are_pixels_of_the_frame_scaled(known):

@@ -74,7 +74,7 @@ def test_a_point_that_moves_otherwise_is_dropped():
 
 
 def test_what_two_views_show_waits():
-    track = [*rigid()[:2], None, None]
+    track = [rigid()[0], None, None, rigid()[3]]
     known = recruited(with_tracks(track))
     assert known.candidate.tolist() == [True]
     assert shown(known) == {0}

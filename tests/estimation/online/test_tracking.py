@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from solid_points import map_with_points, pixels_of
-from turned_solid import CAMERA, SIZE, degrees_apart, turned, turned_map
+from turned_solid import CAMERA, degrees_apart, turned, turned_map
 
 from tracking3d.estimation.online.points import FollowedPoints
 from tracking3d.estimation.online.pose_refinement import PoseWeights
@@ -132,9 +132,13 @@ def test_few_points_have_no_pose(known):
     assert pose_of_points(known, CAMERA, FollowedPoints.none(), view) is None
     nowhere = replace(known, landmarks=np.full_like(known.landmarks, np.nan))
     assert pose_of_points(nowhere, CAMERA, view.points, view) is None
-    random = np.random.default_rng(0).uniform(0, SIZE, (8, 2)).astype(np.float32)
-    anywhere = FollowedPoints(np.arange(8), random)
-    assert pose_of_points(known, CAMERA, anywhere, view) is None
+    # Five agree, and three others with nobody.
+    pixel = view.points.pixel[:8].copy()
+    pixel[5:] += np.float32([[25, 0], [0, 25], [-25, -12]])
+    assert pose_of_points(known, CAMERA, FollowedPoints(np.arange(8), pixel), view) is None
+    six = view.points.only(np.arange(len(view.points)) % 10 == 0)
+    assert len(six) >= 6
+    assert pose_of_points(known, CAMERA, six, view) is not None
 
 
 def test_the_better_start_wins_and_is_refined(known, surface):

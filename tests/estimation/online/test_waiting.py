@@ -114,12 +114,12 @@ def test_points_that_do_not_tell_give_way_to_turning_at_last(asked):
 
 
 def test_what_is_still_for_long_keeps_waiting_with_fewer_frames_and_says_why(asked):
-    state, start = solved_start(belief_of([0.0] * 40), CONFIG)
+    state, start = solved_start(belief_of([0.0] * 41), CONFIG)
     assert start is None
     assert "still" in state.waits_for
     indices = [view.index for view, _ in state.waiting]
     assert len(indices) == 21
-    assert (indices[0], indices[-1]) == (0, 78)
+    assert (indices[0], indices[-1]) == (0, 80)
     assert indices == sorted(set(indices))
     assert not asked["turning"]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from tracking3d.estimation.assessment import Assessment
@@ -13,6 +14,14 @@ ENOUGH_POINTS = 15
 _UNSEEN_CHARGE = PoseWeights().unseen
 _ENOUGH_KNOWN = 0.8  # share of known texture from which on it counts in full
 _MOSTLY = 0.7  # share of unseen texture
+_INTERCEPT = -2.96
+_TERMS = {  # weight, and the range that was seen
+    "features": (-3.60, 0.03, 0.89),
+    "outline": (-2.62, 0.017, 1.99),
+    "overlap": (7.58, 0.53, 0.993),
+    "unseen": (-13.1, 0.0004, 0.24),
+}
+_UNWITNESSED = 0.5  # confidence at most where there is no mask to compare with
 _MEMORY = 0.9  # of the running means
 
 
@@ -67,6 +76,25 @@ def unusual(fit: PoseFit, usual: Usual, mask_weight: float) -> float:
     return max(appearance, outline, overlap)
 
 
+def likelihood(fit: PoseFit) -> float:
+    """How likely a frame like this is right: a logistic regression on its losses.
+
+    Right means within 10 degrees and above an IoU of 0.7. Fitted by ``training/confidence.py`` on the frames of the
+    suite ``standard`` and of three real clips; fitted on one half of the sequences and tested on the other, the
+    calibration error is 0.05 to 0.07 and the area under the curve 0.88.
+    """
+    evidence = {
+        "features": fit.appearance,
+        "outline": fit.outline,
+        "overlap": fit.overlap,
+        "unseen": fit.unseen,
+    }
+    logit = _INTERCEPT
+    for name, (weight, low, high) in _TERMS.items():
+        logit += weight * min(max(evidence[name], low), high)
+    return 1 / (1 + math.exp(-logit))
+
+
 def judge(fit: PoseFit, usual: Usual, points: int, mask_weight: float, has_mask: bool) -> Assessment:
     """Status, reason and confidence of one frame."""
     excess = unusual(fit, usual, mask_weight)
@@ -79,7 +107,7 @@ def judge(fit: PoseFit, usual: Usual, points: int, mask_weight: float, has_mask:
             f"(overlap {fit.overlap:.2f}), nor points ({points}) agree with any pose"
         )
         return Assessment(Status.LOST, reason, 0.05)
-    confidence = min(0.95, 0.4 + 0.01 * min(points, 40)) * (1 - 0.3 * min(max(excess, 0.0), 2.0))
+    confidence = likelihood(fit) if has_mask else min(likelihood(fit), _UNWITNESSED)
     if excess > 1:
         return Assessment(
             Status.UNCERTAIN, f"points agree, pixels do not (loss {fit.appearance:.2f})", confidence
