@@ -39,11 +39,11 @@ def answer_mask(
     if initial is None:
         return rendered
     overlap = float((rendered & initial).sum()) / max(float((rendered | initial).sum()), 1.0)
-    if overlap >= _ALIKE:
-        return _mean_outline(rendered, initial, _SHARE if support >= _UNSUPPORTED else 1 - _SHARE)
-    if support >= _SUPPORTED:
+    if support < _UNSUPPORTED:
+        return initial
+    if support >= _SUPPORTED and overlap < _ALIKE:
         return rendered
-    return initial if support < _UNSUPPORTED else _mean_outline(rendered, initial, _SHARE)
+    return _mean_outline(rendered, initial)
 
 
 @torch.no_grad()
@@ -73,7 +73,7 @@ def support_beside(surface: Surface, view: View, pose: Pose, scale: float) -> fl
     return float((seen & (loss < limit))[beside].float().mean())
 
 
-def _mean_outline(rendered: NDArray[np.bool_], initial: NDArray[np.bool_], share: float) -> NDArray[np.bool_]:
+def _mean_outline(rendered: NDArray[np.bool_], initial: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Where the weighted mean of both signed distances, each cut off at `_REACH`, is inside."""
     reach = _REACH * float(np.sqrt(initial.sum()))
 
@@ -83,5 +83,5 @@ def _mean_outline(rendered: NDArray[np.bool_], initial: NDArray[np.bool_], share
         inward = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_5)
         return np.asarray(np.clip(outward - inward, -reach, reach), dtype=np.float32)
 
-    mean = share * distance(rendered) + (1 - share) * distance(initial)
+    mean = _SHARE * distance(rendered) + (1 - _SHARE) * distance(initial)
     return np.asarray(mean < 0)
