@@ -21,11 +21,13 @@ from online_runs import (
     with_true_masks,
 )
 
+from tracking3d.config.loading import load_config
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.solver import RefiningSolver
 from tracking3d.evaluation.metrics import mask_iou
 from tracking3d.frames import Frame, MaskEstimate
+from tracking3d.pipeline import track
 
 
 def overlaps(answers):
@@ -218,3 +220,12 @@ def test_a_single_pixel_as_first_mask_is_no_traceback():
     speck[60, 80] = True
     _, answers = run([(frame(0), speck), (frame(1), true_mask(1))])
     assert [answer.status for answer in answers] == [Status.UNCERTAIN] * 2
+
+
+def test_a_video_without_anything_to_follow_is_answered_with_its_masks():
+    mask = np.zeros((60, 80), bool)
+    mask[15:45, 20:50] = True
+    images = np.zeros((16, 60, 80, 3), np.uint8)
+    answers = list(track(images, mask=mask, config=load_config(overrides=["solver.correct_tracker=false"])))
+    assert {answer.status for answer in answers} == {Status.UNCERTAIN}
+    np.testing.assert_array_equal(answers[0].mask, mask)

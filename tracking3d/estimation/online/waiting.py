@@ -86,7 +86,8 @@ def solved_start(state: Belief, config: OnlineConfig) -> tuple[Belief, Start | N
         return state, None
     names = np.unique(np.concatenate([view.points.landmark for view in views]))
     motion = motion_enough(tracks_of(views, names[~state.known.candidate[names]]))
-    shared = float(np.isin(views[0].points.landmark, views[-1].points.landmark).mean())
+    still_there = np.isin(views[0].points.landmark, views[-1].points.landmark)
+    shared = float(still_there.mean()) if len(still_there) else 0.0
     waited = len(views) >= _MOST
     if motion < max(state.due, MOTION) and not waited and shared > _LEAST_SHARED:
         return state, None
