@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.config.models import ObjectConfig
+from tracking3d.errors import InputError
+from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.mesh import Mesh
 from tracking3d.geometry.prototypes import ellipsoid, from_file, sphere
@@ -35,6 +37,20 @@ class MaskEllipse:
     centre: NDArray[np.float64]
     semi_axes: NDArray[np.float64]
     directions: NDArray[np.float64]
+
+
+def first_mask(frame: Frame, mask: MaskEstimate) -> NDArray[np.bool_]:
+    """The first frame's mask ``(H, W)``, which no solver can do without.
+
+    Raises:
+        InputError: If it is missing or empty.
+    """
+    binary = mask.binary
+    if binary is None or not binary.any():
+        raise InputError(
+            f"{frame.name or 'The first frame'} has no object: its mask is empty; give another box or mask."
+        )
+    return binary
 
 
 def mask_ellipse(mask: NDArray[np.bool_]) -> MaskEllipse:

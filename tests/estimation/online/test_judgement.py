@@ -7,7 +7,14 @@ import torch
 from rendered_solids import pose_of
 
 from tracking3d.estimation.estimate import Status
-from tracking3d.estimation.online.judgement import ENOUGH_POINTS, Usual, judge, looks_wrong, unusual
+from tracking3d.estimation.online.judgement import (
+    ENOUGH_POINTS,
+    Usual,
+    judge,
+    likelihood,
+    looks_wrong,
+    unusual,
+)
 from tracking3d.estimation.online.pose_refinement import PoseFit, PoseWeights
 
 MANY, FEW = ENOUGH_POINTS, ENOUGH_POINTS - 1
@@ -113,3 +120,16 @@ def test_a_side_that_was_never_seen_is_uncertain_without_points():
     assert verdict.status is Status.UNCERTAIN
     assert "never seen" in verdict.reason
     assert judge(unseen, USUAL, MANY, 1.0, True).status is Status.TRACKED
+
+
+def test_a_good_fit_is_likely_right_and_each_loss_makes_it_less_so():
+    good = likelihood(fit())
+    assert good > 0.8
+    worse = [fit(appearance=0.8), fit(outline=1.8), fit(overlap=0.6), fit(unseen=0.2)]
+    assert all(likelihood(one) < good for one in worse)
+    assert likelihood(fit(appearance=0.9, outline=2.0, overlap=0.5, unseen=0.3)) < 0.1
+
+
+def test_beyond_the_range_it_was_fitted_on_nothing_changes():
+    assert likelihood(fit(outline=2.0)) == likelihood(fit(outline=50.0))
+    assert likelihood(fit(overlap=0.5)) == likelihood(fit(overlap=0.0))

@@ -15,7 +15,6 @@ import torch
 from numpy.typing import NDArray
 
 from tracking3d.config.models import OnlineConfig, PipelineConfig
-from tracking3d.errors import InputError
 from tracking3d.estimation.appearance import visible_texture
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.estimation.feature_space import FeatureSpace, feature_channels
@@ -40,7 +39,7 @@ from tracking3d.estimation.online.tracking import (
 )
 from tracking3d.estimation.online.waiting import solved_start, waiting_view
 from tracking3d.estimation.shape import Shape
-from tracking3d.estimation.start import first_translation, mask_ellipse, prototype_mesh
+from tracking3d.estimation.start import first_mask, first_translation, mask_ellipse, prototype_mesh
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.camera import Camera, Window
@@ -93,11 +92,7 @@ class OnlineSolver:
             InputError: If the first frame's mask is missing or empty, or the prototype cannot be used.
         """
         started = time.perf_counter()
-        binary = _usable(mask)
-        if binary is None:
-            raise InputError(
-                f"{frame.name or 'The first frame'} has no object: its mask is empty; give another box or mask."
-            )
+        binary = first_mask(frame, mask)
         ellipse = mask_ellipse(binary)
         translation = torch.tensor(first_translation(ellipse, self.camera), dtype=torch.float32)
         pose = Pose.identity(translation.to(self.device))

@@ -15,7 +15,6 @@ import torch
 from numpy.typing import NDArray
 
 from tracking3d.config.models import PipelineConfig
-from tracking3d.errors import InputError
 from tracking3d.estimation.appearance import visible_texture
 from tracking3d.estimation.assessment import Assessment, assess
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
@@ -29,7 +28,7 @@ from tracking3d.estimation.paper.optimize import Optimum, optimize
 from tracking3d.estimation.paper.prediction import candidate_poses
 from tracking3d.estimation.paper.problem import Problem
 from tracking3d.estimation.shape import Shape
-from tracking3d.estimation.start import first_translation, mask_ellipse, prototype_mesh
+from tracking3d.estimation.start import first_mask, first_translation, mask_ellipse, prototype_mesh
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.camera import Camera, Window
@@ -73,11 +72,7 @@ class PaperSolver:
             InputError: If the first frame's mask is missing or empty, or the prototype cannot be used.
         """
         started = time.perf_counter()
-        binary = mask.binary
-        if binary is None or not binary.any():
-            raise InputError(
-                f"{frame.name or 'The first frame'} has no object: its mask is empty; give another box or mask."
-            )
+        binary = first_mask(frame, mask)
         ellipse = mask_ellipse(binary)
         translation = torch.tensor(first_translation(ellipse, self.camera), dtype=torch.float32)
         pose = Pose.identity(translation.to(self.device))
