@@ -23,6 +23,7 @@ from tracking3d.benchmark.fingerprint import (
     plugin_versions,
 )
 from tracking3d.benchmark.initial_masks import masks_for
+from tracking3d.benchmark.noisy_frames import NoisyFrames
 from tracking3d.benchmark.variant import Variant
 from tracking3d.config.models import PipelineConfig
 from tracking3d.datasets.layout import load_layout
@@ -35,6 +36,7 @@ from tracking3d.process_memory import resident_memory
 from tracking3d.recording import Listener, record
 from tracking3d.results.files import write_atomic, writing
 from tracking3d.video.image_sequence import ImageSequence
+from tracking3d.video.source import FrameSource
 
 JOB, SCORES, RUN, LOG, MASKS = "job.json", "scores.json", "run", "log.txt", "initial_masks"
 MEMORY = "memory.json"
@@ -91,6 +93,7 @@ class Job:
             masks_fingerprint(masks, self.sequence),
             frames_fingerprint(self.truth),
             code_fingerprint(judges=False),
+            *self.variant.disturbance,
         )
 
     @cached_property
@@ -178,7 +181,9 @@ def _track(job: Job, run: Path) -> None:
 
 def _record(job: Job, run: Path, listener: Listener) -> None:
     truth, config = job.truth, job.config
-    source = ImageSequence(job.sequence, truth.frames, range(len(truth.frames)))
+    source: FrameSource = ImageSequence(job.sequence, truth.frames, range(len(truth.frames)))
+    if job.variant.grey_noise is not None:
+        source = NoisyFrames(source, job.variant.grey_noise)
     if job.variant.masks == "tracker":
         if truth.box is None:
             raise InputError(f"{job.sequence} has no box in its first frame; a mask tracker cannot start.")

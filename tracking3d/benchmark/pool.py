@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,15 +82,15 @@ def _run(job: Job, stop: Event) -> Outcome:
         return Outcome(job, scores, cached=True)
     log = job.folder / LOG
     command = [sys.executable, "-m", "tracking3d.benchmark.job", str(job.write())]
-    code = _call(command, log, stop)
+    code = _call(command, log, stop, job.variant.environment)
     scores = job.written() if code == 0 else None
     error = "" if scores is not None else _reason(code, log)
     return Outcome(job, scores, error, seconds=time.monotonic() - started)
 
 
-def _call(command: list[str], log: Path, stop: Event) -> int:
+def _call(command: list[str], log: Path, stop: Event, variables: Mapping[str, str]) -> int:
     # Processes that share a machine must not each take all of its cores.
-    environment = {"OMP_NUM_THREADS": "1", **os.environ}
+    environment = {"OMP_NUM_THREADS": "1", **os.environ, **variables}
     with log.open("wb") as output:
         process = subprocess.Popen(command, stdout=output, stderr=output, env=environment)
         while process.poll() is None:

@@ -21,6 +21,8 @@ class Variant(BaseModel):
         config: The pipeline; what the masks need is set when they are known.
         masks: ``tracker``, ``truth``, ``initial``, ``degraded:IOU``, ``noise:PIXELS``, ``hand``, or a folder that
             holds a folder of masks for every sequence.
+        environment: Environment variables of the process that runs it, such as which matrix kernels it uses.
+        grey_noise: Seed of one grey level of noise on the frames; None for none.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -28,6 +30,8 @@ class Variant(BaseModel):
     label: str
     config: PipelineConfig
     masks: str = "tracker"
+    environment: dict[str, str] = {}
+    grey_noise: int | None = None
 
     @field_validator("masks")
     @classmethod
@@ -35,6 +39,11 @@ class Variant(BaseModel):
         if masks.startswith((DEGRADED, NOISE)):
             check_masks(masks)
         return masks
+
+    @property
+    def disturbance(self) -> tuple[Any, ...]:
+        """What a run depends on beside configuration and masks; empty where that is nothing."""
+        return (self.environment, self.grey_noise) if self.environment or self.grey_noise is not None else ()
 
     def changed(self, label: str, *, masks: str | None = None, **settings: Any) -> Variant:
         """A variant with other masks and settings: ``solver__weights__motion=0`` sets that key."""
@@ -46,7 +55,7 @@ class Variant(BaseModel):
                 inner = inner[section]
             inner[key] = value
         config = PipelineConfig.model_validate(document)
-        return Variant(label=label, config=config, masks=masks or self.masks)
+        return self.model_copy(update={"label": label, "config": config, "masks": masks or self.masks})
 
 
 def degraded_iou(masks: str) -> float:

@@ -10,7 +10,7 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
-from tracking3d.cli.evaluate import answers, compare, peer, suite, table
+from tracking3d.cli.evaluate import answers, compare, peer, spread, suite, table
 
 DEFAULT = "answers"
 
@@ -36,4 +36,5 @@ app.command(name=DEFAULT)(answers.score_answers)
 app.command(name="suite")(suite.suite)
 app.command(name="table")(table.table)
 app.command(name="compare")(compare.compare)
+app.command(name="spread")(spread.spread)
 app.command(name="peer")(peer.peer)

@@ -1,0 +1,236 @@
+"""How far answers for the same video part: on other processors, by another renderer, with next to no noise.
+
+What rounding or one grey level changes is not known better than that: a spread is the least that any figure of the
+same sequences is uncertain by.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.markup import escape
+from rich.table import Table
+
+from tracking3d.benchmark.pool import Listener
+from tracking3d.benchmark.processors import KERNELS, kernels_of
+from tracking3d.benchmark.results import ResultSet, figure
+from tracking3d.benchmark.sequences import Dataset
+from tracking3d.benchmark.suite import run_suite
+from tracking3d.benchmark.variant import Variant
+from tracking3d.errors import InputError
+from tracking3d.results.files import write_atomic, writing
+
+AS_IT_IS = "as it is"
+RENDERERS = ("torch", "numba")
+NOISE_SEEDS = (1, 2)
+
+MEASURES = {
+    "iou_mean": ("IoU", True),
+    "boundary_f_mean": ("boundary F", True),
+    "rotation_error_mean_deg": ("rotation error, mean °", False),
+    "rotation_error_median_deg": ("rotation error, median °", False),
+    "share_under_5_deg": ("rotation under 5°", True),
+    "share_lost": ("share called lost", False),
+}
+"""Measures that are printed: what tables call them, and whether more is better."""
+
+LOST_DEGREES = 20.0
+"""Median rotation error from which a sequence counts as lost, as it does where half of its frames are called so."""
+
+
+@dataclass(frozen=True)
+class Spread:
+    """One measure under all variants.
+
+    Attributes:
+        sequence: The sequence; empty for the mean over all of them.
+        measure: Its name in the scores.
+        values: By label of the variant.
+    """
+
+    sequence: str
+    measure: str
+    values: dict[str, float]
+
+    @property
+    def mean(self) -> float:
+        """Over the variants."""
+        return float(np.mean(list(self.values.values())))
+
+    @property
+    def spread(self) -> float:
+        """From the least to the most."""
+        return max(self.values.values()) - min(self.values.values())
+
+    @property
+    def worst(self) -> tuple[str, float]:
+        """The variant with the worst value, and that value."""
+        pick = min if MEASURES[self.measure][1] else max
+        label = pick(self.values, key=self.values.__getitem__)
+        return label, self.values[label]
+
+
+def plan(base: Variant) -> tuple[list[Variant], dict[str, str]]:
+    """The variants of ``base`` that this processor can run, and why the others are left out, by label.
+
+    Those whose kernels are the ones that the processor takes anyway are left out too: they are one computation.
+    """
+    variants, left_out = [base.changed(AS_IT_IS)], {}
+    seen = {kernels_of({}): AS_IT_IS}
+    for label, environment in KERNELS.items():
+        kernels = kernels_of(environment)
+        if kernels is None:
+            left_out[label] = "this processor cannot run them"
+        elif kernels in seen:
+            left_out[label] = f"they are those of '{seen[kernels]}' ({kernels.openblas}, {kernels.aten})"
+        else:
+            seen[kernels] = label
+            variants.append(base.changed(label).model_copy(update={"environment": environment}))
+    usual = base.config.runtime.renderer
+    for renderer in RENDERERS:
+        if renderer != ("numba" if usual == "auto" else usual):
+            variants.append(base.changed(f"renderer {renderer}", runtime__renderer=renderer))
+    for seed in NOISE_SEEDS:
+        label = f"one grey level of noise, seed {seed}"
+        variants.append(base.changed(label).model_copy(update={"grey_noise": seed}))
+    return variants, left_out
+
+
+def run_spread(
+    base: Variant,
+    dataset: Dataset,
+    out: Path,
+    processes: int = 1,
+    listener: Listener = lambda outcome: None,
+) -> tuple[list[ResultSet], dict[str, str]]:
+    """Every variant on every sequence; what is left out on this processor, and why, is given beside the results.
+
+    Raises:
+        InputError: If the masks of ``base`` cannot be meant.
+    """
+    variants, left_out = plan(base)
+    return run_suite(variants, dataset, out, processes, listener), left_out
+
+
+def spreads(results: Sequence[ResultSet]) -> list[Spread]:
+    """Every measure of every sequence that all variants finished, each measure's mean over them last.
+
+    Raises:
+        InputError: If there is no such sequence.
+    """
+    found = []
+    for measure in MEASURES:
+        by_variant = {one.label: one.values(measure) for one in results}
+        common = [name for name in results[0].scores if all(name in values for values in by_variant.values())]
+        for name in common:
+            found.append(Spread(name, measure, {label: one[name] for label, one in by_variant.items()}))
+        if common:
+            means = {
+                label: float(np.mean([one[name] for name in common])) for label, one in by_variant.items()
+            }
+            found.append(Spread("", measure, means))
+    if not found:
+        raise InputError("There is no sequence that all variants finished; see what they failed of above.")
+    return found
+
+
+def flips(results: Sequence[ResultSet]) -> dict[str, list[str]]:
+    """Sequences that are lost under some variants and tracked under others, with the labels of the former."""
+    lost = {one.label: {name for name in one.scores if _is_lost(one.scores[name] or {})} for one in results}
+    everywhere = [name for name in results[0].scores if all(one.scores.get(name) for one in results)]
+    found = {name: [label for label, names in lost.items() if name in names] for name in everywhere}
+    return {name: labels for name, labels in found.items() if 0 < len(labels) < len(results)}
+
+
+def _is_lost(scores: Mapping[str, float | None]) -> bool:
+    rotation, called = scores.get("rotation_error_median_deg"), scores.get("share_lost")
+    return (rotation is not None and rotation > LOST_DEGREES) or (called is not None and called >= 0.5)
+
+
+def format_spreads(results: Sequence[ResultSet], title: str) -> list[Table]:
+    """For the terminal: measures by sequence with mean, spread and worst, then the suite's means by variant."""
+    found = spreads(results)
+    by_sequence = Table(title=escape(title), title_justify="left")
+    header, rows = _rows(found)
+    for name in header:
+        by_sequence.add_column(name, justify="left" if name in ("measure", "sequence", "under") else "right")
+    for row in rows:
+        by_sequence.add_row(*map(escape, row), style="bold" if row[1] == "mean" else None)
+    by_variant = Table(title="Means over the sequences, by variant", title_justify="left")
+    header, rows = _means(found)
+    for name in header:
+        by_variant.add_column(name, justify="left" if name == "variant" else "right")
+    for row in rows:
+        by_variant.add_row(*map(escape, row))
+    return [by_sequence, by_variant]
+
+
+def to_markdown(results: Sequence[ResultSet], title: str) -> str:
+    """The same tables in Markdown, and which sequences flip."""
+    found = spreads(results)
+    parts = [title]
+    for header, rows in (_rows(found), _means(found)):
+        lines = [header, ["---"] * len(header), *rows]
+        parts.append("\n".join(f"| {' | '.join(line)} |" for line in lines))
+    parts.append(describe_flips(results))
+    return "\n\n".join(parts) + "\n"
+
+
+def describe_flips(results: Sequence[ResultSet]) -> str:
+    """A sentence about what is tracked here and lost there."""
+    flipped = flips(results)
+    if not flipped:
+        return "No sequence is tracked under one variant and lost under another."
+    told = (f"{name} (lost {', '.join(labels)})" for name, labels in flipped.items())
+    return f"Tracked under one variant and lost under another: {'; '.join(told)}."
+
+
+def write_spreads(
+    results: Sequence[ResultSet], left_out: Mapping[str, str], title: str, file: Path
+) -> list[Path]:
+    """Write ``file`` with the suffixes ``.md`` and ``.json``, all values in the latter; returns both.
+
+    Raises:
+        OutputError: If they cannot be written.
+    """
+    with writing(file.parent):
+        file.parent.mkdir(parents=True, exist_ok=True)
+    document = {
+        "title": title,
+        "left_out": dict(left_out),
+        "flips": flips(results),
+        "spreads": [
+            asdict(one) | {"mean": one.mean, "spread": one.spread, "worst": one.worst}
+            for one in spreads(results)
+        ],
+    }
+    texts = {".md": to_markdown(results, title), ".json": json.dumps(document, indent=1) + "\n"}
+    files = [file.with_name(file.name + suffix) for suffix in texts]
+    for path, text in zip(files, texts.values(), strict=True):
+        write_atomic(path, text.encode())
+    return files
+
+
+def _rows(found: Sequence[Spread]) -> tuple[list[str], list[list[str]]]:
+    rows = []
+    for one in found:
+        label, worst = one.worst
+        figures = (_fine(value, one.measure) for value in (one.mean, one.spread, worst))
+        rows.append([MEASURES[one.measure][0], one.sequence or "mean", *figures, label])
+    return ["measure", "sequence", "mean", "spread", "worst", "under"], rows
+
+
+def _means(found: Sequence[Spread]) -> tuple[list[str], list[list[str]]]:
+    of_suite = [one for one in found if not one.sequence]
+    labels = of_suite[0].values
+    rows = [[label, *(_fine(one.values[label], one.measure) for one in of_suite)] for label in labels]
+    return ["variant", *(MEASURES[one.measure][0] for one in of_suite)], rows
+
+
+def _fine(value: float, measure: str) -> str:
+    """Degrees with two digits: differences are what is shown here."""
+    return f"{value:.2f}" if measure.endswith("_deg") else figure(value, measure)

@@ -1,0 +1,60 @@
+"""``tracking3d evaluate spread``: how far answers part where they should not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tracking3d.cli.evaluate.options import Data, Jobs, Masks, Out, Sequences, name_of_settings
+from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quiet, configure
+
+
+def spread(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="A dataset, as for evaluate suite.")] = "smoke",
+    data: Data = None,
+    masks: Masks = "tracker",
+    sequences: Sequences = None,
+    config: ConfigFile = None,
+    preset: Preset = None,
+    overrides: Overrides = None,
+    jobs: Jobs = 1,
+    out: Out = Path("benchmark"),
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Run sequences with other processors' kernels, another renderer and next to no noise: how far do answers part?
+
+    Prints mean, spread and worst case of every measure, and which sequences are tracked here and lost there. Writes
+    DIR/tables/spread-NAME-MASKS.md and .json; runs lie in DIR/runs and are not repeated.
+    """
+    from tracking3d.benchmark.sequences import open_dataset
+    from tracking3d.benchmark.spread import describe_flips, format_spreads, run_spread, write_spreads
+    from tracking3d.benchmark.table import file_name
+    from tracking3d.benchmark.variant import Variant, check_masks
+    from tracking3d.cli.evaluate.progress import jobs_progress, making_progress
+    from tracking3d.cli.tables import print_table
+
+    check_masks(masks)
+    settings = configure(config, preset, overrides)
+    base = Variant(label=name_of_settings(config, preset, overrides, "tracker"), config=settings, masks=masks)
+    with making_progress(quiet) as made:
+        dataset = open_dataset(name, data, out, jobs, made).only(sequences or [])
+    with jobs_progress(None, quiet) as listener:
+        results, left_out = run_spread(base, dataset, out, jobs, listener)
+    failed = {f"{sequence} ({one.label})": why for one in results for sequence, why in one.errors.items()}
+    for what, why in failed.items():
+        typer.echo(f"{what} failed: {why}", err=True)
+    title = f"{dataset.name} ({len(dataset.sequences)} sequences): {base.label}, masks {masks}"
+    file = out / "tables" / f"spread-{dataset.name}-{file_name(Path(masks).name)}"
+    files = write_spreads(results, left_out, title, file)
+    if not quiet:
+        for one in format_spreads(results, title):
+            print_table(one)
+        typer.echo(describe_flips(results))
+        for label, why in left_out.items():
+            typer.echo(f"Not run: {label}, {why}.")
+        typer.echo("\n".join(str(file) for file in files))
+    if failed:
+        raise typer.Exit(1)
