@@ -27,7 +27,9 @@ _APPEARANCE = 4.0  # weight of the mean loss of what the views show
 _APPEARANCE_SCALE = 0.25
 _FULL_SIZE = 128.0  # pixels of a window in which outline distances are measured, whatever its resolution
 _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-5, 1e3
-_ENOUGH = 1e-4  # share of the cost below which a gain ends the search
+_LESS, _MORE = 2.0, 4.0  # damping after a step that helped, and after one that did not
+_ENOUGH = 1e-4  # share of the cost below which a gain is small
+_SMALL_GAINS = 3  # in a row end the search; a single one is often only a step that was damped too much
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,16 +142,17 @@ def _minimized(problem: _Problem, free: Tensor, iterations: int) -> _State:
     """The best state that Levenberg-Marquardt reaches in the free unknowns."""
     poses = Pose.stack([view.pose for view in problem.known.keyframes])
     state = _evaluated(problem, problem.known.vertices, poses)
-    damping = _DAMPING
+    damping, small = _DAMPING, 0
     for _ in range(iterations):
         trial = _stepped(problem, state, free, damping)
         if trial is not None and trial.cost < state.cost:
             gain = state.cost - trial.cost
-            state, damping = trial, max(damping / 4, _LEAST_DAMPING)
-            if gain < _ENOUGH * state.cost:
+            state, damping = trial, max(damping / _LESS, _LEAST_DAMPING)
+            small = small + 1 if gain < _ENOUGH * state.cost else 0
+            if small == _SMALL_GAINS:
                 break
         else:
-            damping *= 6
+            damping *= _MORE
             if damping > _MOST_DAMPING:
                 break
     return state
