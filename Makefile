@@ -8,17 +8,22 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+TESTS := OPENBLAS_NUM_THREADS=1 $(BIN)/pytest tests plugins -n logical --maxprocesses 8 --dist loadfile
 
 .PHONY: demo test clean
 
 demo: $(VENV)/installed
 	$(BIN)/tracking3d demo --out demo
 
+# The types are checked beside the tests, and what that says is printed after them. A worker takes up to a
+# gigabyte, hence no more than eight; a file's tests share its fixtures, so one worker runs them all.
 test: $(VENV)/installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
-	$(BIN)/pytest tests plugins
+	@said=$$(mktemp); trap 'rm -f "$$said"' EXIT; \
+	echo "$(BIN)/mypy &"; $(BIN)/mypy >"$$said" 2>&1 & types=$$!; \
+	echo "$(TESTS)"; $(TESTS); tests=$$?; \
+	wait $$types; types=$$?; cat "$$said"; exit $$((tests || types))
 
 clean:
 	rm -rf $(VENV) demo build *.egg-info plugins/*/build plugins/*/*.egg-info

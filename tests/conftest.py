@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import cv2
 import pytest
 import torch
+from filelock import FileLock
+
+from tracking3d.rendering.kernels.compilation import Kernel
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
@@ -30,8 +34,21 @@ def shared_models() -> Path:
     return _shared("models")
 
 
-@pytest.fixture(scope="session", autouse=True)
-def one_thread() -> None:
+def pytest_sessionstart() -> None:
     """Tests that run side by side on few cores wait for each other's threads far longer than they compute."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_compilation(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """In a fresh clone, one worker compiles a kernel and the others wait for what it keeps."""
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        return
+    folder, compile_one = tmp_path_factory.getbasetemp().parent, Kernel._compile
+
+    def compile_once(kernel: Kernel):
+        with FileLock(folder / f"{kernel.__module__}.{kernel.__qualname__}.lock"):
+            return compile_one(kernel)
+
+    Kernel._compile = compile_once

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+
 import pytest
 
 from tracking3d.benchmark.variant import Variant
@@ -50,14 +52,21 @@ class Scripted:
 '''
 
 
-@pytest.fixture
-def clips(tmp_path):
-    """A folder of two clips: ``narrow``, 64 pixels wide, and ``wide``, 72."""
+@pytest.fixture(scope="session")
+def two_clips(tmp_path_factory):
+    """What `clips` is a copy of."""
+    folder = tmp_path_factory.mktemp("two") / "clips"
     for name, width in (("narrow", 64), ("wide", 72)):
         clip = synthesize(SyntheticSpec(frames=3, size=(width, 48), supersample=1))
         poses, camera = clip.T_cam_obj, clip.camera
-        write_clip(tmp_path / "clips" / name, clip.images, clip.masks, poses, camera, source="test", note="")
-    return tmp_path / "clips"
+        write_clip(folder / name, clip.images, clip.masks, poses, camera, source="test", note="")
+    return folder
+
+
+@pytest.fixture
+def clips(two_clips, tmp_path):
+    """A folder of two clips: ``narrow``, 64 pixels wide, and ``wide``, 72; a test may change it."""
+    return shutil.copytree(two_clips, tmp_path / "clips")
 
 
 @pytest.fixture

@@ -47,11 +47,19 @@ class Still:
 '''
 
 
+@pytest.fixture(scope="module")
+def two_clips():
+    """By name."""
+    widths = {"narrow": 64, "wide": 72}
+    return {
+        name: synthesize(SyntheticSpec(frames=3, size=(w, 48), supersample=1)) for name, w in widths.items()
+    }
+
+
 @pytest.fixture
-def bench(call, tmp_path, monkeypatch):
+def bench(call, two_clips, tmp_path, monkeypatch):
     """Call the command on two small clips with a tracker that stands still, or with flow."""
-    for name, width in (("narrow", 64), ("wide", 72)):
-        clip = synthesize(SyntheticSpec(frames=3, size=(width, 48), supersample=1))
+    for name, clip in two_clips.items():
         poses, camera = clip.T_cam_obj, clip.camera
         write_clip(tmp_path / "clips" / name, clip.images, clip.masks, poses, camera, source="test", note="")
     file = tmp_path / "still_tracker.py"

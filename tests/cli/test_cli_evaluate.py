@@ -17,10 +17,14 @@ from tracking3d.datasets.clip import write_clip
 from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
 
 
+@pytest.fixture(scope="module")
+def clip():
+    return synthesize(SyntheticSpec(frames=3, size=(64, 48), supersample=1))
+
+
 @pytest.fixture
-def clips(tmp_path):
+def clips(clip, tmp_path):
     """A folder of two clips with truth."""
-    clip = synthesize(SyntheticSpec(frames=3, size=(64, 48), supersample=1))
     for name in ("one", "two"):
         poses, camera = clip.T_cam_obj, clip.camera
         write_clip(tmp_path / "clips" / name, clip.images, clip.masks, poses, camera, source="test", note="")

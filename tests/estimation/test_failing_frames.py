@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from short_runs import estimate_of, frame, quick_solver, revised, run, true_mask
+from short_runs import estimate_of, frame, known_run, quick_solver, revised, run, true_mask
 
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import Status
@@ -27,7 +27,7 @@ FAILS = {"tau": 1e-6}
 @pytest.mark.parametrize("absent", [None, np.zeros((80, 100), bool)], ids=["none", "empty"])
 @PRESETS
 def test_a_frame_without_a_mask_is_tracked(preset, absent):
-    answers, _ = run(quick_solver(preset), range(8), {5: absent})
+    answers, _ = run(quick_solver(preset), (5, 6), {5: absent}, after=known_run(preset, 5))
     answer = answers[5]
     assert answer.status is Status.UNCERTAIN
     assert "no initial mask" in answer.reason
@@ -38,7 +38,8 @@ def test_a_frame_without_a_mask_is_tracked(preset, absent):
 
 
 def test_a_gap_of_several_frames_is_tracked_through():
-    final = run(quick_solver("rerendering"), range(9), dict.fromkeys((4, 5, 6, 7)))[0]
+    before = known_run("rerendering", 4)
+    final, _ = run(quick_solver("rerendering"), range(4, 9), dict.fromkeys((4, 5, 6, 7)), before)
     assert all(mask_iou(answer.mask, true_mask(answer.index)) > 0.6 for answer in final[4:])
     assert final[8].status is Status.TRACKED
 
@@ -51,7 +52,7 @@ def test_a_gap_within_the_first_frames_is_tracked_through():
 
 
 def test_frames_that_are_missing_altogether_are_passed_over():
-    answers, _ = run(quick_solver("rerendering"), (0, 1, 3, 4, 7, 8))
+    answers, _ = run(quick_solver("rerendering"), (3, 4, 7, 8), after=known_run("rerendering", 2))
     assert [answer.index for answer in answers] == [0, 1, 3, 4, 7, 8]
     assert all(mask_iou(answer.mask, true_mask(answer.index)) > 0.6 for answer in answers)
 
@@ -96,7 +97,7 @@ class BrokenEncoder(RgbEncoder):
 
 @PRESETS
 def test_a_frame_whose_loss_is_no_number_is_lost_and_the_run_goes_on(preset):
-    answers, state = run(quick_solver(preset, BrokenEncoder(4)), range(8))
+    answers, state = run(quick_solver(preset, BrokenEncoder(0)), range(4, 8), after=known_run(preset, 4))
     assert (answers[4].status, answers[4].confidence) == (Status.LOST, 0.0)
     assert "nan" in answers[4].reason
     np.testing.assert_array_equal(answers[4].mask, true_mask(4))
@@ -109,8 +110,8 @@ def test_a_frame_whose_loss_is_no_number_is_lost_and_the_run_goes_on(preset):
 
 
 def test_a_broken_frame_leaves_shape_and_texture_as_they_were():
-    solver = quick_solver("rerendering", BrokenEncoder(5))
-    _, before = run(solver, range(5))
+    solver = quick_solver("rerendering", BrokenEncoder(0))
+    _, before = known_run("rerendering", 5)
     after, answer = solver.step(before, frame(5), estimate_of(true_mask(5)))
     assert answer.status is Status.LOST
     assert torch.equal(after.offsets, before.offsets)
@@ -119,7 +120,7 @@ def test_a_broken_frame_leaves_shape_and_texture_as_they_were():
 
 
 def test_a_lost_frame_leaves_shape_and_texture_as_they_were():
-    _, before = run(quick_solver("rerendering"), range(5))
+    _, before = known_run("rerendering", 5)
     solver = quick_solver("rerendering", solver=FAILS)
     after, answer = solver.step(before, frame(9), estimate_of(true_mask(9)))
     assert answer.status is Status.LOST
@@ -142,14 +143,14 @@ def test_a_broken_frame_among_the_first_does_not_spoil_the_others(preset, broken
 
 
 def test_an_infinite_loss_in_the_middle_of_a_frame_loses_that_frame_only(monkeypatch):
-    healthy = Problem.losses
+    before, healthy = known_run("rerendering", 4), Problem.losses
 
     def failing(self: Problem, parameters) -> Losses:
         losses = healthy(self, parameters)
         return replace(losses, features=losses.features + (math.inf if 4 in self.batch.index else 0.0))
 
     monkeypatch.setattr(Problem, "losses", failing)
-    answers, _ = run(quick_solver("rerendering"), range(7))
+    answers, _ = run(quick_solver("rerendering"), range(4, 7), after=before)
     assert [answer.status is Status.LOST for answer in answers] == [index == 4 for index in range(7)]
     assert "inf" in answers[4].reason
 
@@ -157,7 +158,7 @@ def test_an_infinite_loss_in_the_middle_of_a_frame_loses_that_frame_only(monkeyp
 def test_an_object_that_leaves_the_picture_stops_nothing():
     away = MaskEstimate(None)
     solver = quick_solver("rerendering")
-    _, state = run(solver, range(4))
+    _, state = known_run("rerendering", 4)
     far = state.last[0]
     for shift in (
         [50.0, 0.0, 0.0],
@@ -174,7 +175,7 @@ def test_an_object_that_leaves_the_picture_stops_nothing():
 
 def test_after_lost_frames_the_object_is_found_again():
     solver = quick_solver("rerendering")
-    _, known = run(solver, range(5))
+    _, known = known_run("rerendering", 5)
     astray = replace(known.last[0], translation=known.last[0].translation + torch.tensor([1.5, 0.0, 0.5]))
     state, answer = solver.step(
         replace(known, last=(astray, 8), before=None), frame(9), estimate_of(true_mask(9))

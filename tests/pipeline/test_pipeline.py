@@ -92,18 +92,18 @@ def test_answers_come_as_the_frames_do(clip, quick):
 
 
 def test_frames_are_not_kept(clip, quick):
-    """Of 20 images that go through, only those in the optimization may stay, as tensors of their own."""
+    """Of ten images that go through, only those in the optimization may stay, as tensors of their own."""
     alive: list[weakref.ref] = []
 
     def camera():
-        for number in range(20):
+        for number in range(10):
             image = np.array(clip.images[number % 4])
             alive.append(weakref.ref(image))
             yield image
             del image
 
     session = track(camera(), mask=clip.masks[0], config=quick)
-    for _ in range(20):
+    for _ in range(10):
         next(session)
     gc.collect()
     assert sum(reference() is not None for reference in alive) <= 2

@@ -139,7 +139,7 @@ def test_what_lies_outside_the_window_is_left_out():
 
 
 def test_gradients_by_vertices_pose_and_camera_are_those_of_finite_differences():
-    scene = bumpy_sphere((24, 26), frequency=3)
+    scene = bumpy_sphere((24, 26), frequency=2)
     shifted = moved(scene, torch.tensor([[0.1, 0.05, 0, 0, 0, 0]]).repeat(2, 1))
     distance = signed_distance(covered(shifted))
     arguments = scene.arguments()

@@ -10,6 +10,7 @@ from online_runs import (
     estimate_of,
     final,
     frame,
+    known_run,
     refined_run,
     revisited,
     rotation_errors,
@@ -148,10 +149,8 @@ def test_a_revisit_does_not_change_the_state_either():
     ids=["none while it waits", "an empty one later"],
 )
 def test_one_frame_without_a_mask_is_survived(at, missing):
-    frames = with_true_masks(range(10))
-    frames[at] = frames[at][0], missing
-    _, answers = run(frames)
-    answers = final(answers)
+    given = [(frame(at), missing), *with_true_masks(range(at + 1, 10))]
+    answers = final(run(given, after=known_run(at))[1])
     assert answers[at].initial_mask is None
     assert answers[at].status is Status.TRACKED
     assert overlaps(answers[at:]).min() > 0.85
