@@ -69,8 +69,6 @@ class Session:
         encoder: FeatureEncoder | None = None,
     ) -> None:
         check_device(config.runtime.device)
-        if config.solver.name not in SOLVERS:
-            raise InputError(f"Unknown solver '{config.solver.name}'; choose one of {', '.join(SOLVERS)}.")
         if prompt is None and config.tracker.name != "precomputed":
             raise InputError("Say what the object is by either a box or a mask of the first frame.")
         runtime = config.runtime

@@ -234,7 +234,7 @@ def test_folder_that_cannot_be_written_is_named(refused, clip, script, tmp_path)
         ("--box 1,1,9,9 --tracker crst", "did you mean 'csrt'?"),
         ("--box 1,1,9,9 --features rbg", "did you mean 'rgb'?"),
         ("--box 1,1,9,9 --preset papr", "did you mean 'paper'?"),
-        ("--box 1,1,9,9 --set solver.sigmaa=1", "did you mean 'solver.sigma'?"),
+        ("--box 1,1,9,9 --set solver.pointss=1", "did you mean 'solver.points'?"),
         ("--box 1,1,9,9 --set tracker.paddin=1", "did you mean 'padding'?"),
         ("--box 1,1,9,9 --set window", "section.key=value"),
         ("--box 1,1,9,9 --config absent.yaml", "absent.yaml does not exist"),
