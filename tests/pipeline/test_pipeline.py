@@ -79,7 +79,9 @@ def test_frames_keep_their_index_and_time(clip, quick):
 def test_frames_that_could_not_be_read_are_passed_over(clip, quick):
     images = list(clip.images)
     frames = [SkippedFrame(0, "damaged"), images[0], images[1], SkippedFrame(3, "damaged"), images[3]]
-    answers = list(track(frames, mask=clip.masks[0], config=quick))
+    with pytest.raises(InputError, match=r"The first frame.*cannot be read \(damaged\).*skip_damaged"):
+        next(track(frames, mask=clip.masks[0], config=quick))
+    answers = list(track(frames, mask=clip.masks[0], config=quick, skip_damaged=True))
     assert [answer.index for answer in answers] == [1, 2, 4]
 
 

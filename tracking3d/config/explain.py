@@ -56,6 +56,8 @@ def describe(error: ValidationError, model: type[BaseModel], noun: str = "settin
     match problem["type"]:
         case "missing":
             return f"the {noun} '{path}' is missing; it is required."
+        case "model_type" | "model_attributes_type" | "dict_type" if problem["input"] is None:
+            return f"'{path}' must be a mapping of {noun}s, not null; leave it out to change nothing."
         case "model_type" | "model_attributes_type" | "dict_type":
             return f"'{path}' must be a mapping of {noun}s, not {given}."
         case "union_tag_invalid":

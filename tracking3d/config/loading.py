@@ -13,7 +13,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from tracking3d.config.explain import describe, hint
+from tracking3d.config.explain import describe, hint, shown
 from tracking3d.config.models import PipelineConfig, PluginChoice
 from tracking3d.config.yaml_files import parse_yaml, read_mapping
 from tracking3d.errors import InputError
@@ -49,13 +49,14 @@ def load_config(
     Raises:
         InputError: A file, preset, key or value that cannot be used.
     """
-    from_file = dict(read_mapping(Path(file))) if file is not None else {}
-    file_preset = from_file.pop("preset", None)
-    if not isinstance(file_preset, str | None):
-        raise InputError(f"{file}: 'preset' must be the name of a preset, not {file_preset!r}.")
+    from_file = read_mapping(Path(file), empty={}) if file is not None else {}
+    file_preset = from_file.pop("preset", {})
+    file_preset = DEFAULT_PRESET if file_preset == {} else file_preset
+    if not isinstance(file_preset, str):
+        raise InputError(f"{file}: 'preset' must be the name of a preset, not {shown(file_preset)}.")
 
     settings: dict[str, Any] = PipelineConfig().model_dump()
-    layers: list[Layer] = [_preset_layer(preset or file_preset or DEFAULT_PRESET)]
+    layers: list[Layer] = [_preset_layer(file_preset if preset is None else preset)]
     if file is not None:
         layers.append((str(file), from_file))
     spoken = [(f"--set {item}", _parse_override(item)) for item in overrides]
@@ -136,13 +137,15 @@ def _merged(
 ) -> dict[str, Any]:
     """``lower`` with the values of ``upper``, mapping by mapping.
 
-    The keys in ``choices`` have a name: under another one, nothing of ``lower`` is kept.
+    The keys in ``choices`` have a name: under another one, nothing of ``lower`` is kept. They are those of the top
+    level, where null is refused when the result is validated; further down, a section whose every line is commented
+    out changes nothing.
     """
     result = dict(lower)
     for key, value in upper.items():
         below = result.get(key)
-        if isinstance(below, dict) and value is None:
-            continue  # a section whose every line is commented out changes nothing
+        if isinstance(below, dict) and value is None and not choices:
+            continue
         if isinstance(below, dict) and isinstance(value, dict):
             if key in choices and value.get("name", below["name"]) != below["name"]:
                 below = {}

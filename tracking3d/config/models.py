@@ -43,11 +43,13 @@ class CameraConfig(Section):
 
     @field_validator("intrinsics")
     @classmethod
-    def _focal_lengths_are_positive(
+    def _are_of_a_camera(
         cls, value: tuple[float, float, float, float] | None
     ) -> tuple[float, float, float, float] | None:
         if value is not None and min(value[:2]) <= 0:
             raise ValueError("fx, fy, cx, cy with positive focal lengths fx and fy")
+        if value is not None and (min(value[:2]) < 1 or max(map(abs, value)) > 1e6):
+            raise ValueError("fx, fy, cx, cy in pixels, which are from 1 to a million")
         return value
 
 
@@ -89,7 +91,7 @@ class RuntimeConfig(Section):
     """Where and how it runs."""
 
     device: str = Field("cpu", description="cpu, cuda, or cuda:N.")
-    seed: int = Field(0, ge=0, description="Seed of everything random.")
+    seed: int = Field(0, ge=0, lt=2**64, description="Seed of everything random.")
     threads: int = Field(
         1,
         ge=1,

@@ -189,10 +189,16 @@ class PaperConfig(Section):
 
 
 def _written_out(value: Any) -> Any:
-    """``paper`` is short for ``{name: paper}``, and settings without a name are those of the default solver."""
+    """``paper`` is short for ``{name: paper}``, and settings without a name are those of the default solver.
+
+    A section whose every line is commented out changes nothing.
+    """
     if isinstance(value, str):
         return {"name": value}
-    return {"name": OnlineConfig().name, **value} if isinstance(value, Mapping) else value
+    if not isinstance(value, Mapping):
+        return value
+    empty = {key for key in ("weights", "learning_rates", "keyframes") if value.get(key, key) is None}
+    return {"name": OnlineConfig().name, **{key: value[key] for key in value if key not in empty}}
 
 
 SolverConfig = Annotated[
