@@ -30,8 +30,10 @@ EXACT = {
 
 AT_LEAST = {
     "tracking3d.config.loading": "config_schema list_presets load_config",
-    "tracking3d.config.models": """CameraConfig KeyframeConfig LearningRates ObjectConfig PipelineConfig
-        PluginChoice RuntimeConfig SolverConfig Weights WindowConfig""",
+    "tracking3d.config.models": """CameraConfig ObjectConfig PipelineConfig PluginChoice RuntimeConfig
+        SolverConfig WindowConfig""",
+    "tracking3d.config.solvers": """KeyframeConfig LearningRates OnlineConfig PaperConfig SolverConfig
+        Weights""",
     "tracking3d.errors": "InputError OutputError PluginError Tracking3dError",
     "tracking3d.estimation.estimate": "FrameEstimate ObjectModel Status",
     "tracking3d.estimation.solver": "Solver",

@@ -20,7 +20,7 @@ FLOORS = [
     {"datasets"},
     {"synthesis", "evaluation", "speed", "viewer"},
     {"benchmark"},
-    {"cli", "vot"},
+    {"cli", "vot", "__main__"},
 ]
 """``tracking3d/__init__.py`` is the front door: it imports from anywhere, and nobody imports from it."""
 

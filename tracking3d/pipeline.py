@@ -19,7 +19,7 @@ from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError, PluginError
 from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.frames import Box, Frame, Image, MaskEstimate, SkippedFrame
-from tracking3d.prompts import make_prompt, make_prompts
+from tracking3d.prompts import damaged_start, make_prompt, make_prompts
 from tracking3d.session import SOLVERS, Session, build_encoder, unanswered
 
 __all__ = ["SOLVERS", "Session", "checked_image", "choose_camera", "track", "track_objects"]
@@ -31,15 +31,18 @@ def track(
     box: Box | None = None,
     mask: NDArray[np.bool_] | None = None,
     config: PipelineConfig | Path | str | None = None,
+    skip_damaged: bool = False,
 ) -> Iterator[FrameEstimate]:
     """Track an object through frames; answers come as the frames do, memory is bounded by the keyframes.
 
     Args:
-        frames: ``(H, W, 3)`` uint8 RGB arrays, or `Frame` objects; frames that could not be read are passed over.
+        frames: ``(H, W, 3)`` uint8 RGB arrays, or `Frame` objects; frames that could not be read are passed over,
+            but not the first.
         box: The object in the first frame, ``(x, y, width, height)`` in pixels.
         mask: The object in the first frame, ``(H, W)`` bool. Either a box or a mask is given, or neither where
             the tracker knows its masks (``precomputed``).
         config: The pipeline, or a YAML file of one; the default preset if None.
+        skip_damaged: Where the first frame could not be read, take the box or mask for the first one that could.
 
     Yields:
         One estimate a frame.
@@ -49,7 +52,7 @@ def track(
     """
     session: Session | None = None
     config = _loaded(config)
-    for frame in _checked_frames(frames):
+    for frame in _checked_frames(frames, skip_damaged or (box is None and mask is None)):
         if session is None:
             prompt = None if box is None and mask is None else make_prompt(frame, box, mask)
             session = Session(config, prompt)
@@ -62,6 +65,7 @@ def track_objects(
     boxes: Sequence[Box] = (),
     masks: Sequence[NDArray[np.bool_]] = (),
     config: PipelineConfig | Path | str | None = None,
+    skip_damaged: bool = False,
 ) -> Iterator[tuple[FrameEstimate, ...]]:
     """Track several objects through frames that are gone through once; see `track`.
 
@@ -73,6 +77,7 @@ def track_objects(
         boxes: The objects in the first frame, each ``(x, y, width, height)`` in pixels.
         masks: More objects, after those of the boxes, each ``(H, W)`` bool.
         config: The pipeline of every object, or a YAML file of one; the default preset if None.
+        skip_damaged: See `track`.
 
     Yields:
         One estimate an object, in the order in which they were given.
@@ -84,7 +89,7 @@ def track_objects(
     sessions: list[Session] = []
     failures: dict[int, PluginError] = {}
     poses: list[NDArray[np.float64]] = []
-    for frame in _checked_frames(frames):
+    for frame in _checked_frames(frames, skip_damaged):
         if not sessions:
             prompts = make_prompts(frame, boxes, masks, config.tracker.name)
             encoder = build_encoder(config)
@@ -117,10 +122,13 @@ def _loaded(config: PipelineConfig | Path | str | None) -> PipelineConfig:
     return load_config(Path(config) if config is not None else None)
 
 
-def _checked_frames(frames: Iterable[Image | Frame | SkippedFrame]) -> Iterator[Frame]:
+def _checked_frames(frames: Iterable[Image | Frame | SkippedFrame], skip_damaged: bool) -> Iterator[Frame]:
     """The frames that could be read, counted, their images copied."""
     for position, item in enumerate(frames):
-        if not isinstance(item, SkippedFrame):
+        if isinstance(item, SkippedFrame):
+            if position == 0 and not skip_damaged:
+                raise damaged_start(item)
+        else:
             frame = item if isinstance(item, Frame) else Frame(position, item)
             yield replace(frame, image=checked_image(frame.image, frame.index))
 

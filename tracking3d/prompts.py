@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.errors import InputError
-from tracking3d.frames import Box, Frame, Prompt
+from tracking3d.frames import Box, Frame, Prompt, SkippedFrame
 from tracking3d.trackers.crops import box_of, clip_box
 from tracking3d.trackers.mask_files import ImageMasks, UnreadableMaskError
 
@@ -93,6 +93,14 @@ def make_prompts(
     if len(prompts) > 1 and tracker == "precomputed":
         raise InputError("Precomputed masks are of one object; track several in runs of their own.")
     return prompts
+
+
+def damaged_start(frame: SkippedFrame) -> InputError:
+    """The first frame cannot be read, and what the object is was said of that frame."""
+    return InputError(
+        f"The first frame, in which the object is given, cannot be read ({frame.reason.rstrip('.')}); begin with "
+        "another one, or give --skip-damaged (skip_damaged) where the object has not moved until the next."
+    )
 
 
 def _checked(box: Box) -> Box:

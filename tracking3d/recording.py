@@ -16,7 +16,7 @@ from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError
 from tracking3d.frames import Box, Frame, SkippedFrame
 from tracking3d.object_recording import Listener, ObjectRecording, go_through
-from tracking3d.prompts import make_prompt, make_prompts
+from tracking3d.prompts import damaged_start, make_prompt, make_prompts
 from tracking3d.results.layout import object_folders
 from tracking3d.results.run_writer import RunWriter
 from tracking3d.session import Session, build_encoder
@@ -35,6 +35,7 @@ def record(
     command: str | None = None,
     selection: str | None = None,
     overwrite: bool = False,
+    skip_damaged: bool = False,
     listener: Listener = lambda frame: None,
 ) -> None:
     """Track the object through ``source`` and write the run folder.
@@ -52,6 +53,7 @@ def record(
         command: The command line, for the record.
         selection: The ``START:STOP:STEP`` that the source was opened with, for the record.
         overwrite: Replace a run that is in the folder.
+        skip_damaged: Where the first frame cannot be read, take the box or mask for the first one that can.
         listener: Is told of every frame.
 
     Raises:
@@ -59,7 +61,7 @@ def record(
     """
     begin = partial(run_writer, source, command=command, selection=selection, overwrite=overwrite)
     with opened(source) as frames:
-        skipped, first = first_frame(frames, source.name)
+        skipped, first = first_frame(frames, source.name, skip_damaged or (box is None and mask is None))
         prompt = None if box is None and mask is None else make_prompt(first, box, mask)
         session = Session(config, prompt, source.intrinsics, source.intrinsics_origin)
         with begin(session, first=first, folder=folder) as writer:
@@ -76,6 +78,7 @@ def record_objects(
     command: str | None = None,
     selection: str | None = None,
     overwrite: bool = False,
+    skip_damaged: bool = False,
     listener: Listener = lambda frame: None,
 ) -> None:
     """Track several objects through ``source`` in one pass; each has a run folder of its own within ``folder``.
@@ -91,6 +94,7 @@ def record_objects(
         command: The command line.
         selection: The ``START:STOP:STEP`` that the source was opened with.
         overwrite: Replace runs that are in those folders.
+        skip_damaged: Where the first frame cannot be read, take the boxes and masks for the first one that can.
         listener: Is told of every frame of every object.
 
     Raises:
@@ -98,7 +102,7 @@ def record_objects(
     """
     begin = partial(run_writer, source, command=command, selection=selection, overwrite=overwrite)
     with opened(source) as frames, ExitStack() as writers:
-        skipped, first = first_frame(frames, source.name)
+        skipped, first = first_frame(frames, source.name, skip_damaged)
         prompts = make_prompts(first, boxes, masks, config.tracker.name)
         folders = object_folders(folder, len(prompts))
         encoder = build_encoder(config)
@@ -154,15 +158,19 @@ def run_writer(
     )
 
 
-def first_frame(frames: Iterator[Frame | SkippedFrame], name: str) -> tuple[list[SkippedFrame], Frame]:
+def first_frame(
+    frames: Iterator[Frame | SkippedFrame], name: str, skip_damaged: bool
+) -> tuple[list[SkippedFrame], Frame]:
     """The first frame that can be decoded, and those before it that cannot.
 
     Raises:
-        InputError: If there is none.
+        InputError: If there is none; or there are frames before it, and they must not be skipped.
     """
     skipped: list[SkippedFrame] = []
     for frame in frames:
         if isinstance(frame, Frame):
             return skipped, frame
+        if not skip_damaged:
+            raise damaged_start(frame)
         skipped.append(frame)
     raise InputError(f"{name} has no frame that can be decoded.")

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tracking3d.config.camera import choose_camera
+from tracking3d.config.camera import choose_camera, warn_of_unlikely
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
@@ -69,8 +69,6 @@ class Session:
         encoder: FeatureEncoder | None = None,
     ) -> None:
         check_device(config.runtime.device)
-        if config.solver.name not in SOLVERS:
-            raise InputError(f"Unknown solver '{config.solver.name}'; choose one of {', '.join(SOLVERS)}.")
         if prompt is None and config.tracker.name != "precomputed":
             raise InputError("Say what the object is by either a box or a mask of the first frame.")
         runtime = config.runtime
@@ -119,6 +117,7 @@ class Session:
     def _start(self, frame: Frame) -> FrameEstimate:
         height, width = frame.size
         self._camera = choose_camera(self.config.camera, width, height, *self._intrinsics)
+        warn_of_unlikely(self._camera)
         torch.manual_seed(self.config.runtime.seed)
         mask = self._tracker.init(frame, self._prompt or Prompt((0.0, 0.0, float(width), float(height))))
         solver: Solver[Any] = SOLVERS[self.config.solver.name](self.config, self._camera, self._encoder)

@@ -19,7 +19,7 @@ from tracking3d.benchmark.variant import Variant
 from tracking3d.config.loading import load_config
 from tracking3d.errors import InputError
 
-BASE = Variant(label="default", config=load_config())
+BASE = Variant(label="default", config=load_config(preset="rerendering"))
 SUITE = Dataset("standard", 1, "clip", Path("nowhere"), ("01_box", "05_card_flip"))
 REAL = Dataset("cdtb", None, "cdtb", Path("nowhere"), tuple(f"s{n:02}" for n in range(40)))
 IOU = {"OSTrack": 0.8, "CSR-DCF": 0.5}
@@ -140,6 +140,14 @@ def test_each_ablated_row_differs_from_the_full_one_by_its_loss_only(asked, tmp_
         assert config["solver"]["weights"] == expected
         config["solver"]["weights"] = full["solver"]["weights"]
         assert config == full
+
+
+@pytest.mark.parametrize("table", ["ablation", "keyframes"])
+def test_what_only_the_papers_solver_has_is_not_changed_in_another(asked, tmp_path, table):
+    online = Variant(label="default", config=load_config())
+    filled = fill(TABLES[table], online, SUITE, tmp_path)
+    assert all("solver paper: --preset rerendering" in line.note for line in filled.lines if line.paper)
+    assert asked[0][0] == []
 
 
 def test_deep_features_that_are_not_installed_are_said_to_be(asked, tmp_path, monkeypatch):

@@ -17,11 +17,11 @@ from tracking3d.results.files import read_mask
 
 
 def test_a_changed_setting_is_the_only_change():
-    base = Variant(label="base", config=load_config())
+    base = Variant(label="base", config=load_config(preset="paper"))
     changed = base.changed("no motion", solver__weights__motion=0.0, masks="degraded:0.7")
-    expected = load_config(overrides=["solver.weights.motion=0"])
+    expected = load_config(preset="paper", overrides=["solver.weights.motion=0"])
     assert (changed.label, changed.masks, changed.config) == ("no motion", "degraded:0.7", expected)
-    assert base.config == load_config()
+    assert base.config == load_config(preset="paper")
 
 
 @pytest.mark.parametrize(

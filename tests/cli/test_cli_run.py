@@ -142,9 +142,18 @@ def test_undecodable_frame_is_skipped_and_recorded(call, clip, script):
     assert [skipped["index"] for skipped in run.description["skipped"]] == [2]
 
 
-def test_first_frame_may_be_undecodable(call, clip, script):
+@pytest.mark.parametrize("frames", ["0:", "1:"])
+@pytest.mark.parametrize("objects", [BOX, [*BOX, "--box", "1,1,9,9"]], ids=["one", "two"])
+def test_a_damaged_first_frame_does_not_hand_its_box_to_the_next(refused, clip, script, frames, objects):
+    (clip / f"00{frames[0]}.png").write_bytes(b"no image")
+    line = refused("run", clip, *objects, "--out", "run", "--frames", frames)
+    assert f"00{frames[0]}.png" in line and "--skip-damaged" in line
+    assert not Path("run").exists()
+
+
+def test_a_damaged_first_frame_is_skipped_where_that_is_asked_for(call, clip, script):
     (clip / "000.png").write_bytes(b"no image")
-    assert call("run", clip, *BOX, "--out", "run").exit_code == 0
+    assert call("run", clip, *BOX, "--out", "run", "--skip-damaged").exit_code == 0
     run = RunReader(Path("run"))
     assert [frame.index for frame in run.frames] == [1, 2, 3, 4]
     assert [skipped["index"] for skipped in run.description["skipped"]] == [0]
@@ -234,7 +243,7 @@ def test_folder_that_cannot_be_written_is_named(refused, clip, script, tmp_path)
         ("--box 1,1,9,9 --tracker crst", "did you mean 'csrt'?"),
         ("--box 1,1,9,9 --features rbg", "did you mean 'rgb'?"),
         ("--box 1,1,9,9 --preset papr", "did you mean 'paper'?"),
-        ("--box 1,1,9,9 --set solver.sigmaa=1", "did you mean 'solver.sigma'?"),
+        ("--box 1,1,9,9 --set solver.pointss=1", "did you mean 'solver.points'?"),
         ("--box 1,1,9,9 --set tracker.paddin=1", "did you mean 'padding'?"),
         ("--box 1,1,9,9 --set window", "section.key=value"),
         ("--box 1,1,9,9 --config absent.yaml", "absent.yaml does not exist"),

@@ -9,6 +9,7 @@ from pydantic import ValidationError
 
 from tracking3d.config.loading import config_schema, list_presets, load_config
 from tracking3d.config.models import PipelineConfig
+from tracking3d.config.solvers import OnlineConfig, PaperConfig
 from tracking3d.config.yaml_files import parse_yaml
 from tracking3d.errors import InputError
 
@@ -23,18 +24,15 @@ def yaml_file(tmp_path: Path):
     return write
 
 
-def test_preset_paper_is_the_models_defaults():
-    assert load_config(preset="paper") == PipelineConfig()
+def test_there_is_one_default():
+    assert PipelineConfig() == load_config() == load_config(preset="default")
+    assert PipelineConfig().solver.name == "online"
 
 
 def test_presets_are_listed_and_each_is_valid():
     assert {"default", "paper", "rerendering"} <= set(list_presets())
     for name in list_presets():
         load_config(preset=name)
-
-
-def test_default_preset_is_used_when_none_is_named():
-    assert load_config() == load_config(preset="default")
 
 
 def test_presets_choose_the_solver_and_only_the_default_one_looks_twice_and_corrects_the_tracker():
@@ -77,6 +75,70 @@ def test_plugin_may_be_a_string_in_yaml_and_on_the_command_line(yaml_file):
     assert config.features.options == {"x": 1}
 
 
+SHORT_FORMS = ["solver: paper", "solver: {name: paper}", "solver:\n  name: paper\n  iterations: 500"]
+
+
+@pytest.mark.parametrize("text", SHORT_FORMS)
+def test_a_solver_is_chosen_by_its_name_and_has_its_own_defaults(yaml_file, text):
+    config = load_config(yaml_file(text))
+    assert config.solver == PaperConfig()
+    assert config.object == PipelineConfig().object
+    assert PipelineConfig(solver="paper") == config
+
+
+@pytest.mark.parametrize("section", [{"points": 0.5}, OnlineConfig(points=0.5)])
+def test_settings_without_a_name_are_those_of_the_default_solver(section):
+    assert PipelineConfig(solver=section) == load_config(overrides=["solver.points=0.5"])
+
+
+def test_a_configuration_holds_only_what_its_solver_reads():
+    online, paper = (load_config(preset=name).model_dump()["solver"] for name in ("default", "paper"))
+    assert online.keys() & paper.keys() == {"name", "final_refine", "correct_tracker"}
+    assert {"points", "window"} <= online.keys() and {"iterations", "weights"} <= paper.keys()
+
+
+def test_another_solver_drops_the_settings_of_the_one_below(yaml_file):
+    file = yaml_file("preset: rerendering\nsolver: {iterations: 7}")
+    assert load_config(file, overrides=["solver.name=online"]).solver == OnlineConfig()
+    assert load_config(file, overrides=["solver=paper"]).solver.iterations == 7
+    again = ["solver.name=paper", "solver.iterations=3", "solver.weights.motion=2"]
+    for items in (again, again[::-1]):
+        config = load_config(overrides=items)
+        assert (config.solver.iterations, config.solver.weights.motion) == (3, 2)
+        assert config.solver.weights.laplacian == 1000
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        (
+            "solver: {iterations: 40}",
+            r"'solver.iterations' is a setting of the solver 'paper', and the solver is 'online'; leave it out, or "
+            r"choose 'paper' by 'solver.name'\.$",
+        ),
+        (
+            "preset: paper\nsolver: {points: 1}",
+            "'solver.points' is a setting of the solver 'online', and the solver is",
+        ),
+        ("solver: {weights: {motion: 1}}", "'solver.weights' is a setting of the solver 'paper'"),
+        (
+            "solver: {sigma: 1, tau: 1, knum: 1, band: none, stop: plateau}",
+            "'solver.sigma', 'solver.tau', 'solver.knum' and 2 more are settings of the solver 'paper'.*leave them out",
+        ),
+        (
+            "solver: {online: {points: 1}}",
+            "'solver.online' is no section any more; the settings of the solver 'online' stand directly under 'solver'",
+        ),
+        ("preset: paper\nsolver: {online: {points: 1}}", "beside 'name: online'"),
+        ("iterations: 3", "did you mean 'solver.iterations'?"),
+    ],
+)
+def test_a_setting_of_the_other_solver_is_told_where_it_belongs(yaml_file, text, sentence):
+    with pytest.raises(InputError, match=sentence) as caught:
+        load_config(yaml_file(text))
+    assert str(caught.value).startswith(str(yaml_file(text)))
+
+
 def test_another_plugin_drops_the_options_of_the_one_below(yaml_file):
     file = yaml_file("tracker: {name: csrt, padding: 3}")
     assert load_config(file).tracker.options == {"padding": 3}
@@ -106,6 +168,7 @@ def test_override_values_are_yaml():
             "object.flat=true",
             "solver.tau=null",
             "solver.sigma=1e3",
+            "solver.name=paper",
         ]
     )
     assert config.camera.intrinsics == (500, 500, 320, 240)
@@ -138,15 +201,20 @@ def test_yaml_merge_keys_are_plain_data():
         ("solver: {sigma: 1, sigma: 2}", "'sigma' is given twice"),
         ("1: 2", "key 1 is not text"),
         ("? [a, b]\n: 1", "is not text"),
-        ("solver: {sigmaa: 3}", r"no setting 'solver.sigmaa'; did you mean 'solver.sigma'\?"),
+        ("solver: {name: paper, sigmaa: 3}", r"no setting 'solver.sigmaa'; did you mean 'solver.sigma'\?"),
         ("solvr: {sigma: 3}", r"no setting 'solvr'; did you mean 'solver'\?"),
         ("fov: 30", r"no setting 'fov'; did you mean 'camera.fov'\?"),
-        ("solver: {weights: {featurs: 3}}", r"did you mean 'solver.weights.features'\?"),
+        ("solver: {name: paper, weights: {featurs: 3}}", r"did you mean 'solver.weights.features'\?"),
         ("zzz: 30", "no setting 'zzz'; valid are camera, features"),
-        ("solver: {sigma: lots}", "'solver.sigma' must be a valid number, not 'lots'"),
+        ("solver: {name: paper, sigma: lots}", "'solver.sigma' must be a valid number, not 'lots'"),
         ("window: {size: 4}", "'window.size' must be greater than or equal to 32, not 4"),
-        ("solver: {band: erod}", "'solver.band' must be 'erode', 'soften' or 'none', not 'erod'"),
-        ("solver: {sigma: .nan}", "must be a finite number, not nan"),
+        (
+            "solver: {name: paper, band: erod}",
+            "'solver.band' must be 'erode', 'soften' or 'none', not 'erod'",
+        ),
+        ("solver: {points: .nan}", "must be a finite number, not nan"),
+        ("solver: papre", "'solver.name' must be 'online' or 'paper', not 'papre'"),
+        ("solver: {name: 5}", "'solver.name' must be 'online' or 'paper', not 5"),
         ("solver: 3", "'solver' must be a mapping of settings, not 3"),
         ("solver: [1, 2]", "'solver' must be a mapping"),
         ("tracker: [csrt]", "'tracker' must be a mapping"),
@@ -183,7 +251,9 @@ def test_malformed_override_says_how_to_write_it(item):
         load_config(overrides=[item])
 
 
-@pytest.mark.parametrize("item", ["window.size=4", "solver.sigmaa=4", "solver.sigma=!!python/name:os.system"])
+@pytest.mark.parametrize(
+    "item", ["window.size=4", "solver.points=-4", "solver.points=!!python/name:os.system"]
+)
 def test_bad_override_is_quoted(item):
     with pytest.raises(InputError) as caught:
         load_config(overrides=["window.size=64", item])
@@ -199,7 +269,7 @@ def test_unknown_preset_is_answered_with_the_nearest():
 
 def test_huge_value_is_shown_short(yaml_file):
     with pytest.raises(InputError) as caught:
-        load_config(yaml_file("solver: {sigma: " + "x" * 10_000 + "}"))
+        load_config(yaml_file("solver: {points: " + "x" * 10_000 + "}"))
     assert len(str(caught.value)) < 400
 
 
@@ -207,6 +277,9 @@ def test_schema_covers_presets_and_the_short_form_of_plugins():
     schema = config_schema()
     assert "paper" in schema["properties"]["preset"]["enum"]
     assert {"type": "string"} in schema["$defs"]["PluginChoice"]["anyOf"]
+    solvers = schema["properties"]["solver"]["anyOf"]
+    assert solvers[0]["enum"] == ["online", "paper"]
+    assert [one["$ref"].rpartition("/")[2] for one in solvers[1:]] == ["OnlineConfig", "PaperConfig"]
     assert schema["$defs"]["WindowConfig"]["properties"]["size"]["minimum"] == 32
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from small_scenes import observed, parameters_of, pose_of, problem_of
 
-from tracking3d.config.models import SolverConfig, Weights
+from tracking3d.config.solvers import PaperConfig, Weights
 from tracking3d.estimation.paper.problem import Losses, Parameters
 from tracking3d.estimation.shape import flatten
 
@@ -32,7 +32,7 @@ def test_total_is_the_weighted_sum_with_the_mean_over_frames():
 
 def test_weights_of_the_paper():
     expected = 0.2 + (0.3 + 0.02) + 0.5 + 1000 * 0.002 + 0.001 * 7.0
-    assert LOSSES.total(SolverConfig().weights).item() == pytest.approx(expected)
+    assert LOSSES.total(PaperConfig().weights).item() == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(

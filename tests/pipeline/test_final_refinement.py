@@ -12,6 +12,8 @@ from refining_solver import CausalSolver, StandInSolver
 
 from tracking3d import Frame, Session, Status, load_config
 from tracking3d.errors import InputError, PluginError
+from tracking3d.estimation.online.solver import OnlineSolver
+from tracking3d.estimation.paper.solver import PaperSolver
 from tracking3d.estimation.solver import RefiningSolver
 from tracking3d.frames import SkippedFrame
 from tracking3d.plugins.guard import PluginFailure
@@ -36,8 +38,8 @@ def clip() -> SyntheticClip:
 
 @pytest.fixture(autouse=True)
 def solvers(monkeypatch):
-    monkeypatch.setitem(SOLVERS, "stand_in", StandInSolver)
-    monkeypatch.setitem(SOLVERS, "causal", CausalSolver)
+    monkeypatch.setitem(SOLVERS, "online", StandInSolver)
+    monkeypatch.setitem(SOLVERS, "paper", CausalSolver)
     monkeypatch.setattr(CausalSolver, "faults", {})
     monkeypatch.setattr(StandInSolver, "revisit_faults", {})
     monkeypatch.setattr(StandInSolver, "seen", [])
@@ -52,7 +54,7 @@ def source(clip, tmp_path):
     return open_source(str(folder))
 
 
-def settings(solver: str = "stand_in", refine: bool = True, policy: str = "continue"):
+def settings(solver: str = "online", refine: bool = True, policy: str = "continue"):
     overrides = [
         f"solver.name={solver}",
         f"solver.final_refine={str(refine).lower()}",
@@ -79,14 +81,12 @@ def refinement_of(folder: Path) -> dict:
 
 
 def test_only_a_solver_that_can_look_again_is_a_refining_one(clip):
-    for name, can in (("stand_in", True), ("causal", False), ("paper", False)):
+    for name, can in (("online", True), ("paper", False)):
         session = Session(settings(name), make_prompt(Frame(0, clip.images[0]), mask=clip.masks[0]))
         assert not session.can_refine
-        if name != "paper":
-            session.step(Frame(0, clip.images[0]))
-            assert session.can_refine is can
-        else:
-            assert not issubclass(SOLVERS["paper"], RefiningSolver)
+        session.step(Frame(0, clip.images[0]))
+        assert session.can_refine is can
+    assert issubclass(OnlineSolver, RefiningSolver) and not issubclass(PaperSolver, RefiningSolver)
 
 
 def test_a_session_refines_and_revisits(clip):
@@ -111,9 +111,9 @@ def test_a_session_refines_and_revisits(clip):
 
 
 def test_a_session_whose_solver_cannot_refine_says_so(clip):
-    session = Session(settings("causal"), make_prompt(Frame(0, clip.images[0]), mask=clip.masks[0]))
+    session = Session(settings("paper"), make_prompt(Frame(0, clip.images[0]), mask=clip.masks[0]))
     session.step(Frame(0, clip.images[0]))
-    with pytest.raises(RuntimeError, match="causal cannot refine"):
+    with pytest.raises(RuntimeError, match="paper cannot refine"):
         session.refine()
 
 
@@ -205,9 +205,9 @@ def test_nothing_is_refined_unless_asked_for(clip, source, tmp_path):
 
 
 def test_a_solver_that_cannot_leaves_it_out_and_says_so(clip, source, tmp_path):
-    record(source, settings("causal"), tmp_path / "run", mask=clip.masks[0])
+    record(source, settings("paper"), tmp_path / "run", mask=clip.masks[0])
     told = refinement_of(tmp_path / "run")
-    assert (told["state"], told["reason"]) == ("left out", "the solver causal gives causal answers only")
+    assert (told["state"], told["reason"]) == ("left out", "the solver paper gives causal answers only")
     assert RunReader(tmp_path / "run").state == "finished"
 
 

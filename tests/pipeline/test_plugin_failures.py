@@ -23,11 +23,18 @@ QUICK = [
     "window.size=32",
     "object.frequency=2",
     "object.texture_size=16",
-    "solver.iterations=2",
-    "solver.pose_iterations=2",
-    "solver.start_frames=1",
-    "solver.tau=2",
 ]
+QUICK_PRESETS = {
+    "default": QUICK,
+    "rerendering": [
+        *QUICK,
+        "solver.iterations=2",
+        "solver.pose_iterations=2",
+        "solver.start_frames=1",
+        "solver.tau=2",
+    ],
+}
+"""A preset of either solver, each with settings that are quick."""
 TRACKER_FAULTS = {
     "raises": "ZeroDivisionError: no pixels",
     "exits": "SystemExit: 3",
@@ -65,13 +72,16 @@ def registered(monkeypatch):
     )
 
 
-@pytest.fixture(params=["default", "rerendering"])
+@pytest.fixture(params=sorted(QUICK_PRESETS))
 def settings(request):
     """Make a configuration from a preset of either solver."""
 
     def make(policy: str = "continue", **sections):
         return load_config(
-            preset=request.param, overrides=QUICK, runtime={"on_plugin_failure": policy}, **sections
+            preset=request.param,
+            overrides=QUICK_PRESETS[request.param],
+            runtime={"on_plugin_failure": policy},
+            **sections,
         )
 
     return make
@@ -140,7 +150,7 @@ def test_all_later_frames_may_fail(clip, settings):
 def test_a_failed_frame_among_the_first_keeps_its_reason_when_it_is_answered_anew(clip):
     config = load_config(
         preset="rerendering",
-        overrides=[*QUICK, "solver.start_frames=4"],
+        overrides=[*QUICK_PRESETS["rerendering"], "solver.start_frames=4"],
         tracker=bad("raises", 1),
     )
     answers = run(clip, config)

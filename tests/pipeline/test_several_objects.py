@@ -43,7 +43,7 @@ def images() -> np.ndarray:
 
 @pytest.fixture(autouse=True)
 def registered(monkeypatch):
-    monkeypatch.setitem(SOLVERS, "stand_in", StandInSolver)
+    monkeypatch.setitem(SOLVERS, "online", StandInSolver)
     monkeypatch.setattr(CausalSolver, "faults", {})
     monkeypatch.setattr(StandInSolver, "revisit_faults", {})
     monkeypatch.setattr(StandInSolver, "seen", [])
@@ -60,7 +60,7 @@ def source(images, tmp_path) -> ImageSequence:
 
 def settings(*overrides: str, policy: str = "continue", **sections) -> PipelineConfig:
     return load_config(
-        overrides=["solver.name=stand_in", "tracker.name=flow", "tracker.segmentation_size=64", *overrides],
+        overrides=["tracker.name=flow", "tracker.segmentation_size=64", *overrides],
         runtime={"on_plugin_failure": policy},
         **sections,
     )

@@ -80,7 +80,7 @@ CHANGES: dict = {}
 
 @pytest.fixture(autouse=True)
 def registered(monkeypatch):
-    monkeypatch.setitem(SOLVERS, "sure", SureSolver)
+    monkeypatch.setitem(SOLVERS, "online", SureSolver)
     here = Path(__file__)
     monkeypatch.setenv(
         VARIABLE,
@@ -124,7 +124,7 @@ def answers(tracker: dict | str, correct: bool = True, policy: str = "continue",
     CHANGES.clear()
     CHANGES.update({"status": Status.TRACKED, "confidence": 0.9} | changes)
     config = load_config(
-        overrides=["solver.name=sure", f"solver.correct_tracker={str(correct).lower()}"],
+        overrides=[f"solver.correct_tracker={str(correct).lower()}"],
         tracker=tracker,
         runtime={"on_plugin_failure": policy},
     )

@@ -54,11 +54,6 @@ MEASURES = {
 }
 """Measures of the table, and what it calls them."""
 
-_PAPER: dict[str, Any] = {
-    "solver__name": "paper",
-    "solver__final_refine": False,
-    "solver__correct_tracker": False,
-}
 _NOTE = (
     "Rotation errors are aligned by one rotation and all frames count: one called lost with the error of its pose, "
     "and as wrong for the share under 5°; one without a pose as 180°. Means are over the sequences for which every "
@@ -114,16 +109,19 @@ class SideBySide:
 def plan(base: Variant) -> Plan:
     """What is run: both solvers with RGB and deep features; `paper` as it is published, without what came later."""
     variants: Plan = {}
+    own = base.config.solver.model_dump()
     for solver in ("paper", NAME):
-        settings = _PAPER if solver == "paper" else {"solver__name": solver}
+        settings: dict[str, Any] = own if own["name"] == solver else {"name": solver}
+        if solver == "paper":
+            settings = {**settings, "final_refine": False, "correct_tracker": False}
         for features in ("RGB", "S2DNet"):
             label = f"{solver}, {features}"
             if solver not in SOLVERS:
                 variants[label] = f"there is no solver {solver}"
             elif features == "RGB":
-                variants[label] = base.changed(label, features={"name": "rgb"}, **settings)
+                variants[label] = base.changed(label, features={"name": "rgb"}, solver=settings)
             else:
-                variants[label] = deep(base, label, **settings)
+                variants[label] = deep(base, label, solver=settings)
     return variants
 
 

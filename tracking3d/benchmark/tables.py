@@ -150,6 +150,8 @@ LOSSES: dict[str, dict[str, Any]] = {
 
 
 def _ablation_start(base: Variant, synthetic: bool, initial: Mapping[str, Path]) -> Variant | str:
+    if base.config.solver.name != "paper":
+        return "changes settings of the solver paper: --preset rerendering"
     iou = paper_numbers.ABLATION["initial masks (OSTrack)"].value
     return _started(base, "OSTrack", iou, synthetic, initial.get("ostrack"))
 

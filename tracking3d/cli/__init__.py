@@ -16,7 +16,6 @@ app = typer.Typer(
     cls=Program,
     help="Track a rigid object in an ordinary RGB video: masks, poses and a textured mesh.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 app.command(name="run")(run.run)

@@ -1,21 +1,28 @@
 """How every command ends: one sentence instead of a traceback, and an exit code.
 
-0 done, 1 a fault of the program itself, 2 something the user gave cannot be used, 130 interrupted.
+0 done, 1 a fault of the program itself, 2 something the user gave cannot be used or the machine has too little of,
+130 interrupted, 141 nobody reads what is printed.
 """
 
 from __future__ import annotations
 
+import errno
+import os
+import re
 import sys
 import traceback
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 import typer
 from typer.core import TyperGroup
 
-from tracking3d.errors import Tracking3dError
+from tracking3d.errors import InputError, Tracking3dError
 
 INTERRUPTED = 130
+UNREAD = 141
+"""What a shell calls the end of a program whose output is piped into one that has ended, such as ``head``."""
 
 
 class Program(TyperGroup):
@@ -24,12 +31,19 @@ class Program(TyperGroup):
     def main(self, args: Sequence[str] | None = None, *more: Any, **extra: Any) -> Any:
         """Run a command line (``sys.argv`` if None) and leave with its exit code."""
         arguments = sys.argv[1:] if args is None else list(args)
+        _print_anything()
         try:
+            _refuse_empty(arguments)
             code = super().main(arguments, *more, **{**extra, "standalone_mode": False})
+            sys.stdout.flush()
         except Exception as error:
             if "--debug" in arguments:
                 traceback.print_exc()
             code = _report(error)
+        except SystemExit as error:  # click and rich leave so where nobody reads what they print
+            code = UNREAD if _is_unread(error.__context__) else error.code
+        if code == UNREAD:
+            _print_nowhere()
         # Of what ended well, --help and --version give 0 and the other commands nothing.
         sys.exit(code if isinstance(code, int) else 0)
 
@@ -46,10 +60,14 @@ def _report(error: Exception) -> int:
     """Print the error as a sentence and return the exit code."""
     if isinstance(error, typer.Abort):
         return INTERRUPTED
+    if _is_unread(error):
+        return UNREAD
     if isinstance(error, Tracking3dError):
         sentence, code = str(error), 2
     elif hasattr(error, "format_message"):  # the command line itself is wrong
         sentence, code = _usage(error), 2
+    elif too_little := _too_little(error):
+        sentence, code = too_little, 2
     else:
         what = f"{type(error).__name__}: {error}"
         sentence, code = f"this is a fault of tracking3d ({what}); run it with --debug to see where.", 1
@@ -58,9 +76,64 @@ def _report(error: Exception) -> int:
     return code
 
 
+def _too_little(error: BaseException) -> str:
+    """What the machine has too little of, in a sentence; empty where that is not the reason."""
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        _print_nowhere()
+        return (
+            f"what is printed cannot be written ({error.strerror}); free some space, or print somewhere else."
+        )
+    if isinstance(error, MemoryError) or _NO_MEMORY.search(str(error)):
+        return (
+            "there is not enough memory; lower --size (window.size), object.texture_size or solver.most_keyframes, "
+            "track fewer objects at once, or end other programs."
+        )
+    return ""
+
+
+_NO_MEMORY = re.compile(
+    "can't allocate memory|cannot allocate memory|failed to allocate|out of memory|insufficient memory|"
+    "bad_alloc|can't start new thread|failed to map segment",
+    re.IGNORECASE,
+)
+"""How torch, OpenCV, LLVM and the system say that memory has ended; not all of them raise a `MemoryError`."""
+
+
+def _is_unread(error: BaseException | None) -> bool:
+    return isinstance(error, BrokenPipeError)
+
+
+def _print_anything() -> None:
+    """A terminal that has no sign for a letter shows its number instead of ending the program."""
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _print_nowhere() -> None:
+    """What is still to be printed, when Python ends too, is lost in silence."""
+    with suppress(OSError, ValueError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
+
+
+def _refuse_empty(arguments: Sequence[str]) -> None:
+    """An option with nothing behind it is an unset variable of a script more likely than a choice.
+
+    Raises:
+        InputError: If there is one, or an empty argument.
+    """
+    for option, value in zip(["", *arguments], arguments, strict=False):
+        if value == "" or re.fullmatch("--[a-z-]+=", value):
+            name = value.rstrip("=") or (option if option.startswith("-") else "an argument")
+            raise InputError(f"{name} is empty; give it a value or leave it out.")
+
+
 def _print(line: str, error: BaseException) -> None:
-    for text in (line, *getattr(error, "__notes__", ())):
-        typer.echo(text, err=True)
+    with suppress(OSError):  # where nothing can be printed the exit code has to do
+        for text in (line, *getattr(error, "__notes__", ())):
+            typer.echo(text, err=True)
 
 
 def _usage(error: Any) -> str:

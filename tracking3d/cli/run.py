@@ -80,6 +80,14 @@ def run(
             metavar="START:STOP:STEP", help="Which frames, counted from 0.", rich_help_panel=_RUNNING
         ),
     ] = None,
+    skip_damaged: Annotated[
+        bool,
+        typer.Option(
+            "--skip-damaged",
+            help="Where the first frame cannot be read, take the box or mask for the first one that can.",
+            rich_help_panel=_RUNNING,
+        ),
+    ] = False,
     config: ConfigFile = None,
     preset: Preset = None,
     overrides: Overrides = None,
@@ -123,14 +131,16 @@ def run(
         if tracker not in (None, "precomputed"):
             raise InputError(f"--masks is for the tracker precomputed; leave out --tracker {tracker}.")
         chosen = {"name": "precomputed", "path": str(masks)}
-    camera = intrinsics and numbers(intrinsics, 4, "--intrinsics", "FX,FY,CX,CY in pixels")
+    camera = None
+    if intrinsics is not None:
+        camera = numbers(intrinsics, 4, "--intrinsics", "FX,FY,CX,CY in pixels")
     settings = configure(
         config,
         preset,
         overrides,
         tracker=chosen,
         features=features,
-        camera={"fov": fov, "intrinsics": camera or None},
+        camera={"fov": fov, "intrinsics": camera},
         object={"flat": flat or None, "prototype": prototype},
         window={"size": size},
         solver={"final_refine": final_refine},
@@ -158,6 +168,7 @@ def run(
         "command": shlex.join(sys.argv),
         "selection": frames,
         "overwrite": overwrite,
+        "skip_damaged": skip_damaged,
     }
     with progress(opened.count, quiet, objects) as about["listener"]:
         if objects > 1:

@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
+import logging
+import math
 from dataclasses import replace
 
 from tracking3d.config.models import CameraConfig
+from tracking3d.errors import InputError
 from tracking3d.geometry.camera import DEFAULT_FIELD_OF_VIEW, Camera
+
+GIVEN = "given intrinsics"
+"""Where a camera comes from whose intrinsics the user gave."""
+
+USUAL_ANGLES = (3.0, 110.0)
+"""Fields of view in degrees beyond which a pinhole camera is more likely a mistake."""
+
+_log = logging.getLogger(__name__)
 
 
 def choose_camera(
@@ -15,12 +26,60 @@ def choose_camera(
     known: tuple[float, float, float, float] | None = None,
     known_origin: str = "",
 ) -> Camera:
-    """The camera by what is known best: given intrinsics, given field of view, the source's own, 45 degrees."""
+    """The camera by what is known best: given intrinsics, given field of view, the source's own, 45 degrees.
+
+    Raises:
+        InputError: If the intrinsics that were given cannot be of images of that size.
+    """
     if config.intrinsics is not None:
-        return Camera(*config.intrinsics, width, height, "given intrinsics")
+        camera = Camera(*config.intrinsics, width, height, GIVEN)
+        _check(camera)
+        return camera
     if config.fov is not None:
         return Camera.from_fov(width, height, config.fov, f"given field of view of {config.fov:g} degrees")
     if known is not None:
         return Camera(*known, width, height, known_origin)
     origin = f"default field of view of {DEFAULT_FIELD_OF_VIEW:g} degrees"
     return replace(Camera.from_fov(width, height, DEFAULT_FIELD_OF_VIEW, origin), assumed=True)
+
+
+def warn_of_unlikely(camera: Camera) -> None:
+    """Tell the log where given intrinsics are possible for images of that size, but hardly meant."""
+    if camera.origin != GIVEN:
+        return
+    least, most = USUAL_ANGLES
+    angles = _angles(camera)
+    inside = 0 <= camera.cx < camera.width and 0 <= camera.cy < camera.height
+    if min(angles) < least or max(angles) > most:
+        _log.warning(
+            "%s; that is hardly a camera's, so look whether they are of images of that size.", _told(camera)
+        )
+    elif not inside:
+        _log.warning("%s, whose centre %g, %g lies outside them.", _told(camera), camera.cx, camera.cy)
+
+
+def _check(camera: Camera) -> None:
+    if not all(1 <= angle <= 170 for angle in _angles(camera)):
+        raise InputError(f"{_told(camera)}; camera.intrinsics is fx, fy, cx, cy in pixels of these images.")
+    if not (
+        -camera.width <= camera.cx <= 2 * camera.width and -camera.height <= camera.cy <= 2 * camera.height
+    ):
+        raise InputError(
+            f"{_told(camera)}, but their centre {camera.cx:g}, {camera.cy:g} lies far outside them; "
+            "camera.intrinsics is fx, fy, cx, cy in pixels of these images."
+        )
+
+
+def _angles(camera: Camera) -> tuple[float, float]:
+    """What the focal lengths alone say of the horizontal and vertical field of view, in degrees."""
+    horizontal = 2 * math.atan2(camera.width / 2, camera.fx)
+    return math.degrees(horizontal), math.degrees(2 * math.atan2(camera.height / 2, camera.fy))
+
+
+def _told(camera: Camera) -> str:
+    given = ",".join(f"{value:g}" for value in (camera.fx, camera.fy, camera.cx, camera.cy))
+    horizontal, vertical = _angles(camera)
+    return (
+        f"The intrinsics {given} give images of {camera.width} x {camera.height} pixels a field of view of "
+        f"{horizontal:.3g} x {vertical:.3g} degrees"
+    )

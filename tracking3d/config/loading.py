@@ -1,19 +1,19 @@
 """One configuration from its layers: model defaults, preset, file, ``--set``, and options given directly.
 
-A later layer wins key by key. Where a layer names another plug-in, the options that lower layers gave to the
-old one are dropped; options without a name belong to whatever plug-in is chosen.
+A later layer wins key by key. Where a layer names another solver or plug-in, the settings that lower layers gave to
+the old one are dropped; settings without a name belong to whatever solver or plug-in is chosen.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
-from tracking3d.config.explain import describe, hint
+from tracking3d.config.explain import describe, hint, shown
 from tracking3d.config.models import PipelineConfig, PluginChoice
 from tracking3d.config.yaml_files import parse_yaml, read_mapping
 from tracking3d.errors import InputError
@@ -21,9 +21,11 @@ from tracking3d.errors import InputError
 DEFAULT_PRESET = "default"
 """The preset that is used when none is named."""
 
-_PLUGIN_SECTIONS = [
-    name for name, field in PipelineConfig.model_fields.items() if field.annotation is PluginChoice
+_CHOICES = [
+    "solver",
+    *(name for name, field in PipelineConfig.model_fields.items() if field.annotation is PluginChoice),
 ]
+"""Sections whose ``name`` says what their other keys belong to."""
 
 Layer = tuple[str, Mapping[str, Any]]
 """Where settings come from, as messages call it, and the settings."""
@@ -47,24 +49,25 @@ def load_config(
     Raises:
         InputError: A file, preset, key or value that cannot be used.
     """
-    from_file = dict(read_mapping(Path(file))) if file is not None else {}
-    file_preset = from_file.pop("preset", None)
-    if not isinstance(file_preset, str | None):
-        raise InputError(f"{file}: 'preset' must be the name of a preset, not {file_preset!r}.")
+    from_file = read_mapping(Path(file), empty={}) if file is not None else {}
+    file_preset = from_file.pop("preset", {})
+    file_preset = DEFAULT_PRESET if file_preset == {} else file_preset
+    if not isinstance(file_preset, str):
+        raise InputError(f"{file}: 'preset' must be the name of a preset, not {shown(file_preset)}.")
 
     settings: dict[str, Any] = PipelineConfig().model_dump()
-    layers: list[Layer] = [_preset_layer(preset or file_preset or DEFAULT_PRESET)]
+    layers: list[Layer] = [_preset_layer(file_preset if preset is None else preset)]
     if file is not None:
         layers.append((str(file), from_file))
     spoken = [(f"--set {item}", _parse_override(item)) for item in overrides]
     spoken.append(("", direct))
-    # The plug-ins chosen on the command line come first, so that the options of a `--set tracker.path=...`
+    # What is chosen on the command line comes first, so that the options of a `--set tracker.path=...`
     # beside a `--tracker precomputed` are those of the latter.
-    chosen = ("", _plugin_names(layer for _, layer in spoken))
+    chosen = [(origin, _chosen_names(layer)) for origin, layer in spoken]
 
-    for origin, layer in [*layers, chosen, *spoken]:
-        settings = _merged(settings, _without_shorthand(layer), _PLUGIN_SECTIONS)
-        config = _validated(settings, origin)
+    for origin, layer in [*layers, *chosen, *spoken]:
+        config = _validated(_merged(settings, _without_shorthand(layer), _CHOICES), origin)
+        settings = config.model_dump()
     return config
 
 
@@ -85,6 +88,10 @@ def config_schema() -> dict[str, Any]:
     }
     choice = schema["$defs"]["PluginChoice"]
     schema["$defs"]["PluginChoice"] = {"anyOf": [{"type": "string"}, choice]}
+    solver = schema["properties"]["solver"]
+    solvers = solver.pop("oneOf")
+    names = list(solver.pop("discriminator")["mapping"])
+    solver["anyOf"] = [{"type": "string", "enum": names}, *solvers]
     return schema
 
 
@@ -111,34 +118,36 @@ def _parse_override(item: str) -> dict[str, Any]:
 def _without_shorthand(layer: Mapping[str, Any]) -> dict[str, Any]:
     """Write ``tracker: csrt`` as ``tracker: {name: csrt}``."""
     return {
-        key: {"name": value} if key in _PLUGIN_SECTIONS and isinstance(value, str) else value
+        key: {"name": value} if key in _CHOICES and isinstance(value, str) else value
         for key, value in layer.items()
     }
 
 
-def _plugin_names(layers: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
-    names: dict[str, Any] = {}
-    for layer in layers:
-        for section, value in _without_shorthand(layer).items():
-            if section in _PLUGIN_SECTIONS and isinstance(value, dict) and isinstance(value.get("name"), str):
-                names[section] = {"name": value["name"]}
-    return names
+def _chosen_names(layer: Mapping[str, Any]) -> dict[str, Any]:
+    """What a layer chooses, without the settings of it."""
+    return {
+        section: {"name": value["name"]}
+        for section, value in _without_shorthand(layer).items()
+        if section in _CHOICES and isinstance(value, dict) and isinstance(value.get("name"), str)
+    }
 
 
 def _merged(
-    lower: Mapping[str, Any], upper: Mapping[str, Any], plugins: Sequence[str] = ()
+    lower: Mapping[str, Any], upper: Mapping[str, Any], choices: Sequence[str] = ()
 ) -> dict[str, Any]:
     """``lower`` with the values of ``upper``, mapping by mapping.
 
-    The keys in ``plugins`` hold plug-in choices: under another name, nothing of ``lower`` is kept.
+    The keys in ``choices`` have a name: under another one, nothing of ``lower`` is kept. They are those of the top
+    level, where null is refused when the result is validated; further down, a section whose every line is commented
+    out changes nothing.
     """
     result = dict(lower)
     for key, value in upper.items():
         below = result.get(key)
-        if isinstance(below, dict) and value is None:
-            continue  # a section whose every line is commented out changes nothing
+        if isinstance(below, dict) and value is None and not choices:
+            continue
         if isinstance(below, dict) and isinstance(value, dict):
-            if key in plugins and value.get("name", below["name"]) != below["name"]:
+            if key in choices and value.get("name", below["name"]) != below["name"]:
                 below = {}
             value = _merged(below, value)
         result[key] = value

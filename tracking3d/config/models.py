@@ -1,6 +1,6 @@
 """What can be configured, as pydantic models: every key, its default, its range and what it means.
 
-The defaults are the paper's (preset ``paper``); ``tracking3d/config/presets`` holds what other presets change.
+The defaults are those of preset ``default``; ``tracking3d/config/presets`` holds what other presets change.
 """
 
 from __future__ import annotations
@@ -9,11 +9,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-
-class Section(BaseModel):
-    """Base of all sections: frozen, and unknown keys are errors."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+from tracking3d.config.section import Section
+from tracking3d.config.solvers import OnlineConfig, SolverConfig
 
 
 class PluginChoice(BaseModel):
@@ -46,11 +43,13 @@ class CameraConfig(Section):
 
     @field_validator("intrinsics")
     @classmethod
-    def _focal_lengths_are_positive(
+    def _are_of_a_camera(
         cls, value: tuple[float, float, float, float] | None
     ) -> tuple[float, float, float, float] | None:
         if value is not None and min(value[:2]) <= 0:
             raise ValueError("fx, fy, cx, cy with positive focal lengths fx and fy")
+        if value is not None and (min(value[:2]) < 1 or max(map(abs, value)) > 1e6):
+            raise ValueError("fx, fy, cx, cy in pixels, which are from 1 to a million")
         return value
 
 
@@ -58,12 +57,12 @@ class ObjectConfig(Section):
     """How the object is represented (paper section 3.1)."""
 
     prototype: str = Field(
-        "sphere", description="sphere, ellipsoid (fitted to the first mask) or a mesh file."
+        "ellipsoid", description="sphere, ellipsoid (fitted to the first mask) or a mesh file."
     )
     frequency: int = Field(11, ge=1, le=40, description="Icosphere frequency f: 10 f^2 + 2 vertices.")
-    texture_size: int = Field(300, ge=16, le=2048, description="Side of the feature texture in texels.")
+    texture_size: int = Field(150, ge=16, le=2048, description="Side of the feature texture in texels.")
     texture_channels: int | None = Field(
-        None,
+        16,
         ge=1,
         le=512,
         description=(
@@ -88,182 +87,11 @@ class WindowConfig(Section):
     )
 
 
-class Weights(Section):
-    """Weights of the loss terms; 0 switches a term off (paper section 3.3)."""
-
-    features: float = Field(1.0, ge=0, description="Appearance loss, eq. 1.")
-    silhouette: float = Field(1.0, ge=0, description="Silhouette loss, IoU term of eq. 2.")
-    distance: float = Field(
-        1.0, ge=0, description="Silhouette loss, distance-transform term of eq. 2, times `silhouette`."
-    )
-    motion: float = Field(1.0, ge=0, description="Motion regularization, eq. 3.")
-    laplacian: float = Field(1000.0, ge=0, description="Laplacian shape regularization.")
-    total_variation: float = Field(0.001, ge=0, description="Total variation of the texture.")
-
-
-class LearningRates(Section):
-    """Adam's learning rate for each group of parameters (paper: 0.1 for all)."""
-
-    translation: float = Field(0.1, ge=0)
-    rotation: float = Field(0.1, ge=0)
-    vertices: float = Field(0.1, ge=0)
-    texture: float = Field(0.1, ge=0)
-
-
-class KeyframeConfig(Section):
-    """Which frames stay in the optimization (paper section 3.4)."""
-
-    maximum: int = Field(6, ge=1, le=64, description="Number of most recent keyframes that are kept.")
-    silhouette: float = Field(0.3, gt=0, description="A keyframe's silhouette loss is below this.")
-    features: float | None = Field(
-        None, gt=0, description="A keyframe's appearance loss is below this; the encoder's tau if empty."
-    )
-    translation: float = Field(
-        0.5, ge=0, description="New view: moved more than this times the object's size, or ..."
-    )
-    rotation: float = Field(
-        45.0, ge=0, description="... turned more than this many degrees since the latest keyframe."
-    )
-    keep_first: bool = Field(False, description="Frame 0 stays a keyframe whatever happens.")
-
-
-class OnlineConfig(Section):
-    """The solver ``online``."""
-
-    appearance: float = Field(1.0, ge=0, description="Weight of the pixels' loss in a frame's pose.")
-    outline: float = Field(0.3, ge=0, description="Weight of the outline's distance from the mask, robust.")
-    points: float = Field(1.0, ge=0, description="Weight of the followed points' distances, robust.")
-    keyframe_rotation: float = Field(
-        8.0,
-        gt=0,
-        description="A frame is a keyframe if it is turned more than so many degrees from all others.",
-    )
-    window: int = Field(
-        12,
-        ge=2,
-        le=64,
-        description="Keyframes that are refined together: half recent, half spread over the older.",
-    )
-    most_keyframes: int = Field(
-        64, ge=8, le=512, description="Keyframes that are kept; the one nearest to another view goes first."
-    )
-    smoothness: float = Field(300.0, gt=0, description="Weight of the shape's Laplacian.")
-    surface_prior: float = Field(
-        20.0, ge=0, description="How strongly points are held to the surface, per squared object unit."
-    )
-
-
-class SolverConfig(Section):
-    """The estimator. Defaults are the paper's recipe; keys without another word are those of solver ``paper``."""
-
-    name: str = Field("paper", description="Which solver: paper or online.")
-    iterations: int = Field(500, ge=1, le=100_000, description="Most iterations a frame.")
-    tau: float | None = Field(
-        None,
-        gt=0,
-        description="Converged when the appearance loss is below this; the encoder's own if empty.",
-    )
-    cauchy_scale: float = Field(0.25, gt=0, description="Scale of the Cauchy loss.")
-    sigma: float = Field(7000.0, gt=0, description="Sharpness of the soft silhouette, per squared NDC unit.")
-    boxlen: float = Field(
-        0.02, gt=0, lt=1, description="Reach of the soft silhouette beyond a face's box, NDC."
-    )
-    knum: int = Field(30, ge=1, description="Most faces that a soft-silhouette pixel counts.")
-    band: Literal["erode", "soften", "none"] = Field(
-        "erode",
-        description=(
-            "How the bias of the soft band is removed: erode the silhouette 3x3, soften the target by the "
-            "same kernel, or not."
-        ),
-    )
-    motion_translation: float = Field(
-        0.1, ge=0, description="Free translation a frame since the last keyframe, eq. 3."
-    )
-    motion_rotation: float = Field(
-        30.0, ge=0, description="Free rotation in degrees a frame since the last keyframe, eq. 3."
-    )
-    laplacian_of: Literal["vertices", "offsets"] = Field(
-        "vertices",
-        description="Smooth the vertices themselves (SoftRas), or their offsets from the prototype.",
-    )
-    agreement: float = Field(
-        0.0,
-        ge=0,
-        le=1,
-        description=(
-            "Answer with the initial mask where the rendered one overlaps it by less than this IoU; 0 never does "
-            "(paper)."
-        ),
-    )
-    stop: Literal["threshold", "plateau"] = Field(
-        "threshold",
-        description=(
-            "End a frame as soon as the appearance loss is below tau (paper), or when the total loss, "
-            "having beaten that of the start, no longer falls; the best state is kept."
-        ),
-    )
-    patience: int = Field(10, ge=1, description="With plateau: iterations without progress before the end.")
-    prediction: Literal["last", "velocity"] = Field(
-        "last",
-        description=(
-            "A frame starts from the last pose (paper), or from the best of last pose, constant velocity "
-            "and the mask's own shift."
-        ),
-    )
-    pose_iterations: int = Field(
-        0,
-        ge=0,
-        description="Iterations on the new frame's pose alone before the joint ones; 0 for none (paper).",
-    )
-    joint: Literal["always", "new_view"] = Field(
-        "always",
-        description=(
-            "Optimize shape, texture and all poses in every frame (paper), or only in frames that show a "
-            "new view or that their pose alone cannot explain; needs pose_iterations."
-        ),
-    )
-    texture_start: Literal["zero", "backprojected"] = Field(
-        "zero",
-        description="Texels not seen before start at zero (paper), or at what the new frame shows there.",
-    )
-    unseen_charge: float | None = Field(
-        None,
-        ge=0,
-        description=(
-            "What a pixel of never seen texture costs instead of its appearance loss; empty: no difference "
-            "is made (paper)."
-        ),
-    )
-    start_frames: int = Field(
-        1,
-        ge=1,
-        le=32,
-        description=(
-            "Solve this many first frames together from several hypotheses of rotation; 1 for none (paper)."
-        ),
-    )
-    start_iterations: int = Field(60, ge=1, description="Iterations of each hypothesis of that joint start.")
-    final_refine: bool = Field(
-        False,
-        description=(
-            "When a video file ends, solve everything once more and every frame's pose anew; causal and refined "
-            "answers are both kept. Only for solvers that can."
-        ),
-    )
-    correct_tracker: bool = Field(
-        False, description="Re-anchor the mask tracker on the answer's mask where that is confident."
-    )
-    weights: Weights = Weights()
-    learning_rates: LearningRates = LearningRates()
-    keyframes: KeyframeConfig = KeyframeConfig()
-    online: OnlineConfig = OnlineConfig()
-
-
 class RuntimeConfig(Section):
     """Where and how it runs."""
 
     device: str = Field("cpu", description="cpu, cuda, or cuda:N.")
-    seed: int = Field(0, ge=0, description="Seed of everything random.")
+    seed: int = Field(0, ge=0, lt=2**64, description="Seed of everything random.")
     threads: int = Field(
         1,
         ge=1,
@@ -293,5 +121,5 @@ class PipelineConfig(Section):
     camera: CameraConfig = CameraConfig()
     object: ObjectConfig = ObjectConfig()
     window: WindowConfig = WindowConfig()
-    solver: SolverConfig = SolverConfig()
+    solver: SolverConfig = OnlineConfig()
     runtime: RuntimeConfig = RuntimeConfig()

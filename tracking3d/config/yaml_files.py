@@ -10,6 +10,10 @@ import yaml
 from tracking3d.config.explain import shown
 from tracking3d.errors import InputError
 
+_LONGEST = 256 << 10
+_MOST_VALUES = 100_000
+_DEEPEST = 60
+
 
 class _StrictLoader(yaml.SafeLoader):
     """PyYAML's safe loader (no tag runs code), which also refuses keys given twice or not as text."""
@@ -47,8 +51,25 @@ def parse_yaml(text: str, origin: str) -> Any:
     Raises:
         InputError: Not YAML, a tag that is not plain data, a key given twice or a key that is not text.
     """
+    return _parsed(text, origin)[0]
+
+
+def _parsed(text: str, origin: str) -> tuple[Any, list[str]]:
+    """The document, and the keys of its top level that nothing is written for."""
+    loader = None
     try:
-        return yaml.load(text, Loader=_StrictLoader)
+        loader = _StrictLoader(text)
+        node = loader.get_single_node()
+        if node is None:
+            return None, []
+        _check_size(node)
+        pairs = node.value if isinstance(node, yaml.MappingNode) else ()
+        empty = [
+            key.value
+            for key, value in pairs
+            if isinstance(value, yaml.ScalarNode) and not value.end_mark.index - value.start_mark.index
+        ]
+        return loader.construct_document(node), empty
     except yaml.constructor.ConstructorError as error:
         problem = error.problem or "a value cannot be read"
         if "could not determine a constructor" in problem:
@@ -63,23 +84,56 @@ def parse_yaml(text: str, origin: str) -> Any:
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         what = "nested too deeply" if isinstance(error, RecursionError) else str(error).splitlines()[0]
         raise InputError(f"{origin} is not valid YAML: {what}.") from error
+    finally:
+        if loader is not None:
+            loader.dispose()
 
 
-def read_mapping(file: Path) -> dict[str, Any]:
-    """Read a YAML file whose top level is a mapping; an empty file is an empty mapping.
+def _check_size(root: yaml.Node) -> None:
+    """Refuse nesting and aliases that stand for more than any configuration holds.
 
     Raises:
-        InputError: The file cannot be read, is not text, or holds something other than a mapping.
+        ValueError: If there is too much of either.
+    """
+    sizes: dict[int, int] = {}
+
+    def size(node: yaml.Node, depth: int) -> int:
+        if depth > _DEEPEST:
+            raise ValueError("nested too deeply")
+        if id(node) not in sizes:
+            sizes[id(node)] = 0  # a node that holds itself is refused when it is constructed
+            inner = node.value if isinstance(node, yaml.CollectionNode) else ()
+            parts = (part for item in inner for part in (item if isinstance(item, tuple) else (item,)))
+            sizes[id(node)] = 1 + sum(size(part, depth + 1) for part in parts)
+        return sizes[id(node)]
+
+    if size(root, 0) > _MOST_VALUES:
+        raise ValueError(f"its aliases stand for more than {_MOST_VALUES:,} values")
+
+
+def read_mapping(file: Path, empty: Any = None) -> dict[str, Any]:
+    """Read a YAML file whose top level is a mapping; an empty file is an empty mapping.
+
+    Args:
+        file: The file.
+        empty: What a key of the top level stands for that has nothing behind its colon.
+
+    Raises:
+        InputError: The file cannot be read, is too long, is not text, or holds something other than a mapping.
     """
     try:
-        text = file.read_text(encoding="utf-8")
+        with file.open("rb") as opened:
+            content = opened.read(_LONGEST + 1)
+        if len(content) > _LONGEST:
+            raise InputError(f"{file} is longer than {_LONGEST >> 10} KiB, which no configuration is.")
+        text = content.decode("utf-8-sig")
     except FileNotFoundError as error:
         raise InputError(f"The configuration file {file} does not exist.") from error
     except UnicodeDecodeError as error:
         raise InputError(f"{file} is not a text file; a configuration is YAML in UTF-8.") from error
     except OSError as error:
         raise InputError(f"The configuration file {file} cannot be read: {error.strerror}.") from error
-    data = parse_yaml(text, str(file))
+    data, left_empty = _parsed(text, str(file))
     if data is None:
         return {}
     if not isinstance(data, dict):
@@ -87,7 +141,7 @@ def read_mapping(file: Path) -> dict[str, Any]:
         raise InputError(
             f"{file} holds {kind} at its top level; a configuration is a mapping such as 'tracker: csrt'."
         )
-    return data
+    return {**data, **dict.fromkeys(left_empty, empty)}
 
 
 def _place(error: yaml.MarkedYAMLError) -> str:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import torch
 
-from tracking3d.config.models import KeyframeConfig
+from tracking3d.config.solvers import KeyframeConfig
 from tracking3d.geometry.pose import Pose, rotation_angle
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import logging
 from typing import Literal
 
 import torch
@@ -10,6 +11,8 @@ from torch import Tensor
 
 BackendName = Literal["auto", "torch", "numba"]
 """``auto`` takes the Numba kernels wherever they can run."""
+
+_log = logging.getLogger("tracking3d.rendering")
 
 
 def use_numba(backend: str, *tensors: Tensor) -> bool:
@@ -68,6 +71,8 @@ def prepare_backend(backend: str, device: str, threads: int = 1) -> dict[str, st
     reason = "asked for"
     if backend == "auto":
         reason = why_no_numba() or f"{chosen} is the fastest on {place}"
+        if place == "cpu" and why_no_numba():
+            _log.warning("Torch renders, several times slower than the compiled kernels: %s.", why_no_numba())
     torch.set_num_threads(1 if chosen == "numba" else threads)
     if chosen == "numba":
         from tracking3d.rendering.kernels.threads import set_num_threads
@@ -80,7 +85,9 @@ def prepare_backend(backend: str, device: str, threads: int = 1) -> dict[str, st
 def why_no_numba() -> str:
     """Why the kernels cannot be used on this machine; empty if they can."""
     try:
-        import numba  # noqa: F401
+        import numba
     except Exception as error:  # an installation that does not fit fails in many ways
         return f"numba cannot be imported ({type(error).__name__}: {error})"
+    if numba.config.DISABLE_JIT:
+        return "NUMBA_DISABLE_JIT is set, and without being compiled the kernels take hours"
     return ""

@@ -10,7 +10,7 @@ from patterns import disc, moved, shift, speckle, warped
 from solid_points import map_with_points
 from turned_solid import CAMERA, SIZE, turned, turned_map
 
-from tracking3d.config.models import OnlineConfig
+from tracking3d.config.solvers import OnlineConfig
 from tracking3d.estimation.online import waiting
 from tracking3d.estimation.online.answers import unsolved
 from tracking3d.estimation.online.belief import Belief

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.config.models import OnlineConfig
+from tracking3d.config.solvers import OnlineConfig
 from tracking3d.estimation.online.belief import ObjectMap, View
 from tracking3d.estimation.online.joint_fit import refine_without_points
 from tracking3d.estimation.online.keeping import compacted, thinned

@@ -14,7 +14,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tracking3d.config.models import OnlineConfig, PipelineConfig
+from tracking3d.config.models import PipelineConfig
+from tracking3d.config.solvers import OnlineConfig
 from tracking3d.estimation.appearance import visible_texture
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.estimation.feature_space import FeatureSpace, feature_channels
@@ -72,7 +73,8 @@ class OnlineSolver:
     @property
     def online(self) -> OnlineConfig:
         """The solver's own part of the configuration."""
-        return self.config.solver.online
+        assert isinstance(self.config.solver, OnlineConfig)
+        return self.config.solver
 
     @property
     def weights(self) -> PoseWeights:

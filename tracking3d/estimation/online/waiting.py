@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.config.models import OnlineConfig
+from tracking3d.config.solvers import OnlineConfig
 from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.estimation.online.belief import Belief, ObjectMap, View
 from tracking3d.estimation.online.keypoints import detect, match

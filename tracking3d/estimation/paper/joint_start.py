@@ -12,7 +12,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from tracking3d.config.models import SolverConfig
+from tracking3d.config.solvers import PaperConfig
 from tracking3d.estimation.observation import Batch, halved
 from tracking3d.estimation.paper.belief import Belief, Keyframe
 from tracking3d.estimation.paper.optimize import Optimum, optimize
@@ -26,7 +26,7 @@ _SEMIFINALISTS = 6
 _FINALISTS = 2
 
 
-def joint_start(belief: Belief, frames: list[Keyframe], config: SolverConfig, tau: float) -> Optimum:
+def joint_start(belief: Belief, frames: list[Keyframe], config: PaperConfig, tau: float) -> Optimum:
     """Solve shape, texture and all poses of ``frames``; the first pose is fixed.
 
     Args:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from torch import Tensor
 from torch.nn import functional
 
-from tracking3d.config.models import SolverConfig, Weights
+from tracking3d.config.solvers import PaperConfig, Weights
 from tracking3d.estimation import losses
 from tracking3d.estimation.observation import Batch
 from tracking3d.estimation.shape import Shape
@@ -93,7 +93,7 @@ class Problem:
 
     shape: Shape
     batch: Batch
-    config: SolverConfig
+    config: PaperConfig
     seen: Tensor | None = None
     previous: tuple[Pose, int] | None = None
     backend: str = "auto"

@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from tracking3d.config.models import PipelineConfig
+from tracking3d.config.solvers import PaperConfig
 from tracking3d.estimation.appearance import visible_texture
 from tracking3d.estimation.assessment import Assessment, assess
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
@@ -51,10 +52,16 @@ class PaperSolver:
     encoder: FeatureEncoder
 
     @property
+    def settings(self) -> PaperConfig:
+        """The solver's own part of the configuration."""
+        assert isinstance(self.config.solver, PaperConfig)
+        return self.config.solver
+
+    @property
     def tau(self) -> float:
         """Convergence threshold of the appearance loss."""
         reduced = self._channels < self.encoder.channels
-        return self.config.solver.tau or (TAU if reduced else self.encoder.tau)
+        return self.settings.tau or (TAU if reduced else self.encoder.tau)
 
     @property
     def _channels(self) -> int:
@@ -94,7 +101,7 @@ class PaperSolver:
                 torch.zeros(3, size, size, device=self.device), torch.zeros(size, size, device=self.device)
             ),
             (pose, frame.index),
-            waiting=() if self.config.solver.start_frames > 1 else None,
+            waiting=() if self.settings.start_frames > 1 else None,
             renderer=self.config.runtime.renderer,
         )
         observation = self._observe(belief, frame, binary, pose)
@@ -111,7 +118,7 @@ class PaperSolver:
         if binary is not None and not binary.any():
             binary = None
         candidates = [state.last[0]]
-        if self.config.solver.prediction == "velocity":
+        if self.settings.prediction == "velocity":
             candidates = candidate_poses(state, frame.index, binary)
         observation = self._observe(state, frame, binary, candidates[0])
         pose = self._best_candidate(state, observation, candidates)
@@ -150,20 +157,18 @@ class PaperSolver:
         for pose in candidates:
             with torch.no_grad():
                 losses = problem.losses(belief.parameters([Keyframe(observation, pose)]))
-            totals.append(float(losses.total(self.config.solver.weights)))
+            totals.append(float(losses.total(self.settings.weights)))
         return candidates[int(np.argmin(np.nan_to_num(totals, nan=np.inf)))]
 
     def _problem_of_pose(self, belief: Belief, observation: Observation) -> Problem:
         """One frame against the shape and texture known so far."""
         seen = previous = None
-        if self.config.solver.unseen_charge is not None:
+        if self.settings.unseen_charge is not None:
             seen = (belief.seen_with_keyframes().weight > 0).float()[None]
         if belief.keyframes:
             keyframe = belief.keyframes[-1]
             previous = keyframe.pose, keyframe.observation.index
-        return Problem(
-            belief.shape, Batch.of([observation]), self.config.solver, seen, previous, belief.renderer
-        )
+        return Problem(belief.shape, Batch.of([observation]), self.settings, seen, previous, belief.renderer)
 
     def _solve(
         self, belief: Belief, frame: Frame, mask: NDArray[np.bool_] | None, current: Keyframe, started: float
@@ -171,7 +176,7 @@ class PaperSolver:
         """Optimize, judge, choose keyframes, answer."""
         first, iterations = not belief.started, 0
         optimum = None
-        if self.config.solver.pose_iterations and not first:
+        if self.settings.pose_iterations and not first:
             optimum = self._refine_pose(belief, current)
             iterations = optimum.iterations
             if not optimum.reason:
@@ -216,7 +221,7 @@ class PaperSolver:
         if initial is None:
             return rendered, judgement
         iou = float(np.sum(rendered & initial)) / max(float(np.sum(rendered | initial)), 1.0)
-        if iou >= self.config.solver.agreement:
+        if iou >= self.settings.agreement:
             return rendered, judgement
         reason = f"the rendered mask overlaps the initial one by an IoU of {iou:.2f} only, so that one is the answer"
         return initial, replace(judgement, status=Status.UNCERTAIN, reason=reason)
@@ -226,23 +231,23 @@ class PaperSolver:
         return optimize(
             self._problem_of_pose(belief, current.observation),
             belief.parameters([current]),
-            iterations=self.config.solver.pose_iterations,
+            iterations=self.settings.pose_iterations,
             tau=self.tau,
             free="pose",
         )
 
     def _needs_joint(self, belief: Belief, current: Keyframe, optimum: Optimum) -> bool:
         """Whether shape and texture have something to learn from this frame."""
-        if self.config.solver.joint == "always" or belief.waiting is not None or not belief.keyframes:
+        if self.settings.joint == "always" or belief.waiting is not None or not belief.keyframes:
             return True
         if self._judge(optimum, -1, current.observation.has_mask).status is Status.LOST:
             return True
         latest = belief.keyframes[-1].pose
-        return is_new_view(latest, current.pose, belief.object_size, self.config.solver.keyframes)
+        return is_new_view(latest, current.pose, belief.object_size, self.settings.keyframes)
 
     def _with_new_texture(self, belief: Belief, current: Keyframe) -> Belief:
         """Start texels that no keyframe has seen at what the new frame shows."""
-        if self.config.solver.texture_start == "zero":
+        if self.settings.texture_start == "zero":
             return belief
         shown = belief.back_project(current.observation.features, current)
         new = (belief.seen_with_keyframes().weight <= 0) & (shown.weight > 0)
@@ -250,7 +255,7 @@ class PaperSolver:
 
     def _optimize(self, belief: Belief, current: Keyframe) -> tuple[list[Keyframe], Optimum]:
         """Everything over the keyframes and the new frame; over all first frames when the joint start is due."""
-        config = self.config.solver
+        config = self.settings
         waiting = belief.waiting or ()
         if waiting and len(waiting) + 1 == config.start_frames:
             frames = [keyframe for keyframe, _ in waiting] + [current]
@@ -266,8 +271,8 @@ class PaperSolver:
     def _judge(self, optimum: Optimum, position: int, has_mask: bool) -> Assessment:
         losses = optimum.losses.of_frame(position)
         silhouette = losses["silhouette"] + losses["distance"]
-        limit = self.config.solver.keyframes.silhouette
-        if self.config.solver.stop == "threshold":
+        limit = self.settings.keyframes.silhouette
+        if self.settings.stop == "threshold":
             # The paper's failure is that its stopping rule was not reached, by all frames together.
             losses["features"] = float(optimum.losses.features.mean())
         return assess(losses["features"], silhouette, has_mask, self.tau, limit, optimum.reason)
@@ -282,7 +287,7 @@ class PaperSolver:
         candidates = [
             Candidate(keyframe.pose, silhouette[i], appearance[i]) for i, keyframe in enumerate(moved)
         ]
-        criteria = self.config.solver.keyframes
+        criteria = self.settings.keyframes
         kept = select_keyframes(candidates, found.object_size, self.tau, criteria)
         seen = belief.seen
         for i, keyframe in enumerate(moved[:-1]):
@@ -298,7 +303,7 @@ class PaperSolver:
         if belief.waiting is None:
             return known, answer
         count = len(belief.waiting) + 1
-        if count < self.config.solver.start_frames:
+        if count < self.settings.start_frames:
             waiting = (*belief.waiting, (Keyframe(frames[-1].observation, known.last[0]), answer))
             if answer.status is Status.TRACKED and len(waiting) > 1:
                 reason = "the first frames are not yet solved together"

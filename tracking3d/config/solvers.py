@@ -1,0 +1,207 @@
+"""The settings of each solver, and the choice between them by ``solver.name``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field
+
+from tracking3d.config.section import Section
+
+FinalRefine = Annotated[
+    bool,
+    Field(
+        description=(
+            "When a video file ends, solve everything once more and every frame's pose anew; causal and refined "
+            "answers are both kept. Only for solvers that can."
+        )
+    ),
+]
+CorrectTracker = Annotated[
+    bool, Field(description="Re-anchor the mask tracker on the answer's mask where that is confident.")
+]
+
+
+class OnlineConfig(Section):
+    """The solver ``online``: matched points joined with re-rendering."""
+
+    name: Literal["online"] = Field("online", description="Which solver: paper or online.")
+    final_refine: FinalRefine = True
+    correct_tracker: CorrectTracker = True
+    appearance: float = Field(1.0, ge=0, description="Weight of the pixels' loss in a frame's pose.")
+    outline: float = Field(0.3, ge=0, description="Weight of the outline's distance from the mask, robust.")
+    points: float = Field(1.0, ge=0, description="Weight of the followed points' distances, robust.")
+    keyframe_rotation: float = Field(
+        8.0,
+        gt=0,
+        description="A frame is a keyframe if it is turned more than so many degrees from all others.",
+    )
+    window: int = Field(
+        12,
+        ge=2,
+        le=64,
+        description="Keyframes that are refined together: half recent, half spread over the older.",
+    )
+    most_keyframes: int = Field(
+        64, ge=8, le=512, description="Keyframes that are kept; the one nearest to another view goes first."
+    )
+    smoothness: float = Field(300.0, gt=0, description="Weight of the shape's Laplacian.")
+    surface_prior: float = Field(
+        20.0, ge=0, description="How strongly points are held to the surface, per squared object unit."
+    )
+
+
+class Weights(Section):
+    """Weights of the loss terms; 0 switches a term off (paper section 3.3)."""
+
+    features: float = Field(1.0, ge=0, description="Appearance loss, eq. 1.")
+    silhouette: float = Field(1.0, ge=0, description="Silhouette loss, IoU term of eq. 2.")
+    distance: float = Field(
+        1.0, ge=0, description="Silhouette loss, distance-transform term of eq. 2, times `silhouette`."
+    )
+    motion: float = Field(1.0, ge=0, description="Motion regularization, eq. 3.")
+    laplacian: float = Field(1000.0, ge=0, description="Laplacian shape regularization.")
+    total_variation: float = Field(0.001, ge=0, description="Total variation of the texture.")
+
+
+class LearningRates(Section):
+    """Adam's learning rate for each group of parameters (paper: 0.1 for all)."""
+
+    translation: float = Field(0.1, ge=0)
+    rotation: float = Field(0.1, ge=0)
+    vertices: float = Field(0.1, ge=0)
+    texture: float = Field(0.1, ge=0)
+
+
+class KeyframeConfig(Section):
+    """Which frames stay in the optimization (paper section 3.4)."""
+
+    maximum: int = Field(6, ge=1, le=64, description="Number of most recent keyframes that are kept.")
+    silhouette: float = Field(0.3, gt=0, description="A keyframe's silhouette loss is below this.")
+    features: float | None = Field(
+        None, gt=0, description="A keyframe's appearance loss is below this; the encoder's tau if empty."
+    )
+    translation: float = Field(
+        0.5, ge=0, description="New view: moved more than this times the object's size, or ..."
+    )
+    rotation: float = Field(
+        45.0, ge=0, description="... turned more than this many degrees since the latest keyframe."
+    )
+    keep_first: bool = Field(False, description="Frame 0 stays a keyframe whatever happens.")
+
+
+class PaperConfig(Section):
+    """The solver ``paper``. Defaults are the published recipe."""
+
+    name: Literal["paper"] = Field("paper", description="Which solver: paper or online.")
+    final_refine: FinalRefine = False
+    correct_tracker: CorrectTracker = False
+    iterations: int = Field(500, ge=1, le=100_000, description="Most iterations a frame.")
+    tau: float | None = Field(
+        None,
+        gt=0,
+        description="Converged when the appearance loss is below this; the encoder's own if empty.",
+    )
+    cauchy_scale: float = Field(0.25, gt=0, description="Scale of the Cauchy loss.")
+    sigma: float = Field(7000.0, gt=0, description="Sharpness of the soft silhouette, per squared NDC unit.")
+    boxlen: float = Field(
+        0.02, gt=0, lt=1, description="Reach of the soft silhouette beyond a face's box, NDC."
+    )
+    knum: int = Field(30, ge=1, description="Most faces that a soft-silhouette pixel counts.")
+    band: Literal["erode", "soften", "none"] = Field(
+        "erode",
+        description=(
+            "How the bias of the soft band is removed: erode the silhouette 3x3, soften the target by the "
+            "same kernel, or not."
+        ),
+    )
+    motion_translation: float = Field(
+        0.1, ge=0, description="Free translation a frame since the last keyframe, eq. 3."
+    )
+    motion_rotation: float = Field(
+        30.0, ge=0, description="Free rotation in degrees a frame since the last keyframe, eq. 3."
+    )
+    laplacian_of: Literal["vertices", "offsets"] = Field(
+        "vertices",
+        description="Smooth the vertices themselves (SoftRas), or their offsets from the prototype.",
+    )
+    agreement: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description=(
+            "Answer with the initial mask where the rendered one overlaps it by less than this IoU; 0 never does "
+            "(paper)."
+        ),
+    )
+    stop: Literal["threshold", "plateau"] = Field(
+        "threshold",
+        description=(
+            "End a frame as soon as the appearance loss is below tau (paper), or when the total loss, "
+            "having beaten that of the start, no longer falls; the best state is kept."
+        ),
+    )
+    patience: int = Field(10, ge=1, description="With plateau: iterations without progress before the end.")
+    prediction: Literal["last", "velocity"] = Field(
+        "last",
+        description=(
+            "A frame starts from the last pose (paper), or from the best of last pose, constant velocity "
+            "and the mask's own shift."
+        ),
+    )
+    pose_iterations: int = Field(
+        0,
+        ge=0,
+        description="Iterations on the new frame's pose alone before the joint ones; 0 for none (paper).",
+    )
+    joint: Literal["always", "new_view"] = Field(
+        "always",
+        description=(
+            "Optimize shape, texture and all poses in every frame (paper), or only in frames that show a "
+            "new view or that their pose alone cannot explain; needs pose_iterations."
+        ),
+    )
+    texture_start: Literal["zero", "backprojected"] = Field(
+        "zero",
+        description="Texels not seen before start at zero (paper), or at what the new frame shows there.",
+    )
+    unseen_charge: float | None = Field(
+        None,
+        ge=0,
+        description=(
+            "What a pixel of never seen texture costs instead of its appearance loss; empty: no difference "
+            "is made (paper)."
+        ),
+    )
+    start_frames: int = Field(
+        1,
+        ge=1,
+        le=32,
+        description=(
+            "Solve this many first frames together from several hypotheses of rotation; 1 for none (paper)."
+        ),
+    )
+    start_iterations: int = Field(60, ge=1, description="Iterations of each hypothesis of that joint start.")
+    weights: Weights = Weights()
+    learning_rates: LearningRates = LearningRates()
+    keyframes: KeyframeConfig = KeyframeConfig()
+
+
+def _written_out(value: Any) -> Any:
+    """``paper`` is short for ``{name: paper}``, and settings without a name are those of the default solver.
+
+    A section whose every line is commented out changes nothing.
+    """
+    if isinstance(value, str):
+        return {"name": value}
+    if not isinstance(value, Mapping):
+        return value
+    empty = {key for key in ("weights", "learning_rates", "keyframes") if value.get(key, key) is None}
+    return {"name": OnlineConfig().name, **{key: value[key] for key in value if key not in empty}}
+
+
+SolverConfig = Annotated[
+    OnlineConfig | PaperConfig, Field(discriminator="name"), BeforeValidator(_written_out)
+]
+"""The solver that ``name`` chooses, with its own settings and no other's."""
