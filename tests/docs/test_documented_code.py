@@ -7,12 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from documentation_pages import ROOT, blocks, label, pages_with
+from scipy.spatial.transform import Rotation
 
 from tracking3d.config.loading import load_config
 from tracking3d.config.models import PluginChoice
+from tracking3d.estimation.estimate import FrameEstimate, Status
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame, Prompt
 from tracking3d.plugins import FEATURES, TRACKERS, build_plugin, check_options
+from tracking3d.synthesis.convex_clips import SyntheticClip
 from tracking3d.trackers.protocol import MaskTracker
 
 
@@ -22,10 +25,24 @@ def test_python_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatch):
     program: dict = {"__name__": "documented"}
     for block in blocks(page, "python"):
         exec(compile(block, f"{label(page)}, a block", "exec"), program)
+    if page.name == "README.md":
+        check_that_the_object_is_tracked(program["answers"], program["clip"])
     if page.name == "library.md":
         assert program["run"].state == "finished"
         assert len(program["poses"]) == len(program["frames"]) == len(program["run"].frames)
         assert program["tracks"].on_object.all()
+
+
+def check_that_the_object_is_tracked(answers: dict[int, FrameEstimate], clip: SyntheticClip):
+    assert list(answers) == list(range(len(clip.images)))
+    assert {answer.status for answer in answers.values()} == {Status.TRACKED}
+    last = len(clip.images) - 1
+    turned, truly_turned = (
+        Rotation.from_matrix(poses[last][:3, :3] @ poses[0][:3, :3].T)
+        for poses in ([answers[index].T_cam_obj for index in sorted(answers)], clip.T_cam_obj)
+    )
+    assert np.degrees(truly_turned.magnitude()) > 20
+    assert np.degrees((turned.inv() * truly_turned).magnitude()) < 8
 
 
 def test_documented_plugins_work_through_the_environment_variable(tmp_path, monkeypatch):

@@ -12,9 +12,14 @@ import pytest
 import trimesh
 from PIL import Image
 
+from tracking3d.datasets.truth import MeshFile
 from tracking3d.errors import InputError
+from tracking3d.geometry.gltf_axes import read_mesh_file
+from tracking3d.geometry.prototypes import from_file
 from tracking3d.results.mesh_export import export_mesh, load_mesh, load_model
 from tracking3d.results.mesh_view import render_view, turned_views
+from tracking3d.synthesis.mesh_files import load_solid
+from tracking3d.synthesis.spec import SequenceSpec
 
 
 def parse_glb(data: bytes) -> tuple[dict, bytes]:
@@ -53,10 +58,12 @@ def test_the_glb_holds_positions_texture_coordinates_and_image_as_gltf_defines_t
     start = view.get("byteOffset", 0)
     image = Image.open(io.BytesIO(binary[start : start + view["byteLength"]]))
     assert np.array_equal(np.asarray(image.convert("RGB")), model.texture)
-    # Object coordinates as they are: nothing turns the mesh on the way.
-    assert all(
-        np.allclose(node.get("matrix", np.eye(4).ravel()), np.eye(4).ravel()) for node in tree["nodes"]
-    )
+    names = [part["name"] for kind in ("nodes", "meshes", "materials") for part in tree[kind]]
+    assert names == ["tracking3d_y_up", "tracking3d_object", "tracking3d_object", "texture"]
+    # The mesh is in object coordinates; half a turn about x, above it, makes y up and z towards the viewer.
+    root, child = tree["nodes"]
+    assert (root["rotation"], root["children"], child["mesh"]) == ([1, 0, 0, 0], [1], 0)
+    assert tree["scenes"][tree["scene"]]["nodes"] == [0]
 
 
 def test_the_obj_refers_to_its_material_and_texture_with_v_upwards(tmp_path, turning_sphere):
@@ -90,10 +97,73 @@ def test_vertices_are_doubled_at_the_seam_only(tmp_path, turning_sphere):
     assert len(model.vertices) < len(mesh.vertices) < 1.2 * len(model.vertices)
 
 
+def test_the_glb_has_one_vertex_for_each_distinct_position_and_texture_coordinate(tmp_path, turning_sphere):
+    model = turning_sphere.model
+    # Texture coordinates that differ by rounding are no seam.
+    jitter = 1e-12 * np.random.default_rng(0).standard_normal(model.face_uvs.shape)
+    export_mesh(tmp_path, dataclasses.replace(model, face_uvs=model.face_uvs + jitter))
+    tree, binary = parse_glb((tmp_path / "mesh.glb").read_bytes())
+    (primitive,) = tree["meshes"][0]["primitives"]
+    position, uv = (
+        accessor(tree, binary, primitive["attributes"][key]) for key in ("POSITION", "TEXCOORD_0")
+    )
+    corners = np.concatenate([model.vertices[model.faces], model.face_uvs], axis=2).reshape(-1, 5)
+    distinct = np.unique(corners.round(6), axis=0)
+    assert len(position) == len(distinct) < len(model.faces)
+    assert len(np.unique(np.concatenate([position, uv], axis=1), axis=0)) == len(position)
+    assert len(np.unique(position, axis=0)) == len(model.vertices)
+
+
+def test_through_its_scene_graph_the_glb_is_the_obj_turned_half_about_x_with_the_texture(
+    tmp_path, turning_sphere
+):
+    export_mesh(tmp_path, turning_sphere.model)
+    obj, glb = load_mesh(tmp_path), trimesh.load_mesh(tmp_path / "mesh.glb", process=False)
+    assert np.allclose(glb.vertices[glb.faces], obj.vertices[obj.faces] * [1, -1, -1], atol=1e-6)
+    assert np.allclose(glb.vertex_normals[glb.faces], obj.vertex_normals[obj.faces] * [1, -1, -1], atol=1e-5)
+    assert np.allclose(glb.visual.uv[glb.faces], obj.visual.uv[obj.faces], atol=1e-6)
+    texture = np.asarray(glb.visual.material.baseColorTexture.convert("RGB"))
+    assert np.array_equal(texture, turning_sphere.model.texture)
+
+
+def test_a_gltf_camera_in_front_sees_what_the_first_frame_saw(tmp_path, turning_sphere):
+    export_mesh(tmp_path, turning_sphere.model)
+    mesh = trimesh.load_mesh(tmp_path / "mesh.glb", process=False)
+    # glTF's camera looks along -z with y up; it stands before the object, at positive z, and its image rows
+    # run down. The first frame's camera: the object's axes, at negative z.
+    camera = mesh.vertices - np.array([0, 0, 4.0])
+    seen = np.stack([camera[:, 0], -camera[:, 1]], axis=1) / -camera[:, 2:]
+    obj = load_mesh(tmp_path)
+    first = obj.vertices + np.array([0, 0, 4.0])
+    assert np.allclose(seen[mesh.faces], (first[:, :2] / first[:, 2:])[obj.faces], atol=1e-6)
+
+
+def test_every_reader_of_meshes_takes_the_glb_for_what_the_obj_is(tmp_path, turning_sphere):
+    export_mesh(tmp_path, turning_sphere.model)
+    obj, glb = tmp_path / "mesh.obj", tmp_path / "mesh.glb"
+
+    def triangles(read):
+        return [mesh.vertices[mesh.faces] for mesh in map(read, (obj, glb))]
+
+    spec = SequenceSpec()
+    for read in (from_file, lambda path: MeshFile(path).read(), lambda path: load_solid(path, spec)):
+        from_obj, from_glb = triangles(read)
+        assert np.allclose(from_obj, from_glb, atol=1e-6)
+
+
+def test_a_glb_of_others_is_read_with_the_axes_that_it_has(tmp_path):
+    part = trimesh.creation.box((1, 2, 3))
+    turn = trimesh.transformations.rotation_matrix(np.pi / 2, [0, 0, 1])
+    scene = trimesh.Scene()
+    scene.add_geometry(part, transform=turn)
+    scene.export(tmp_path / "box.glb")
+    assert np.allclose(MeshFile(tmp_path / "box.glb").read().extents, [2, 1, 3])
+
+
 def test_a_mesh_makes_the_round_trip(tmp_path, turning_sphere):
     model = turning_sphere.model
     export_mesh(tmp_path, model)
-    for mesh in (load_mesh(tmp_path), trimesh.load_mesh(tmp_path / "mesh.glb", process=False)):
+    for mesh in (load_mesh(tmp_path), read_mesh_file(tmp_path / "mesh.glb")):
         assert np.allclose(mesh.vertices[mesh.faces], model.vertices[model.faces], atol=1e-6)
         uv = mesh.visual.uv[mesh.faces] * [1, -1] + [0, 1]
         assert np.allclose(uv, model.face_uvs, atol=1e-6)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from tracking3d.errors import InputError
 from tracking3d.frames import Box
 from tracking3d.geometry.camera import Camera
+from tracking3d.geometry.gltf_axes import read_mesh_file
 from tracking3d.results.files import read_mask
 
 
@@ -107,7 +108,7 @@ class MeshFile:
             InputError: If it is not a readable mesh.
         """
         try:
-            mesh = trimesh.load_mesh(self.path, process=False)
+            mesh = read_mesh_file(self.path)
         except Exception as error:  # every format has errors of its own
             raise InputError(
                 f"The mesh {self.path} cannot be read ({error}); restore or remove it."

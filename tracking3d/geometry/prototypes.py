@@ -14,6 +14,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from tracking3d.errors import InputError
+from tracking3d.geometry.gltf_axes import read_mesh_file
 from tracking3d.geometry.mesh import Mesh
 
 LONGEST_EDGE = 0.25
@@ -90,7 +91,7 @@ def from_file(path: Path) -> Mesh:
     if not path.is_file():
         raise InputError(f"the prototype '{path}' does not exist: give sphere, ellipsoid or a mesh file")
     try:
-        loaded = trimesh.load_mesh(path, process=False)
+        loaded = read_mesh_file(path)
     except Exception as error:  # trimesh raises whatever its loaders raise
         reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"the prototype '{path}' cannot be read as a mesh ({reason}): {advice}") from error

@@ -42,7 +42,7 @@ CONVENTIONS = {
     "pixels": "Pixel (0, 0) is the centre of the top-left pixel; K is that of the full frame.",
     "T_cam_obj": "Object to camera: x_cam = R x_obj + t, a row-major 4 x 4 matrix.",
     "scale": "The unit of length is arbitrary unless the user gave one; only ratios mean anything.",
-    "mesh": "mesh.obj and mesh.glb are in object coordinates as they are: no axis is swapped or turned.",
+    "mesh": "mesh.obj is in object coordinates; in mesh.glb a node turns them by 180 degrees about x, so that y is up.",
     "revisions": (
         "The last line for an index in frames.jsonl is the answer; of those that are not refined, the last one "
         "is the causal answer."

@@ -1,7 +1,8 @@
 """The object as OBJ with MTL and texture.png, as GLB, and exactly as features.npz; and back.
 
-Coordinates are the object's own, unchanged, in an arbitrary unit. Viewers that take y as up show an object
-that stood upright in the video upside down until it is turned.
+Coordinates are the object's own, unchanged, in an arbitrary unit; their y axis points down. In the GLB a node above
+the mesh turns them to glTF's axes, y up, so that viewers show the object as it stood in the video. An OBJ has no such
+node: there, viewers that take y as up show it upside down until it is turned.
 
 The atlas wraps in u and is clamped in v. OBJ viewers and glTF repeat a texture beyond its edge, which is
 exactly the wrap; for glTF the clamp in v is written as well. OBJ cannot say that: there the outermost half
@@ -23,10 +24,12 @@ from trimesh.exchange.obj import export_obj
 
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import ObjectModel
+from tracking3d.geometry.gltf_axes import OBJECT_NODE, UPRIGHT_NODE, UPRIGHT_ROTATION
 from tracking3d.results.files import write_atomic
 from tracking3d.results.layout import FEATURES, GLB, MTL, OBJ, TEXTURE
 
 _REPEAT, _CLAMP, _LINEAR, _MIPMAP = 10497, 33071, 9729, 9987  # glTF's constants
+_ROUNDING = 2.0**-20  # of texture coordinates; far less than a texel
 
 
 def export_mesh(folder: Path, model: ObjectModel) -> None:
@@ -50,8 +53,10 @@ def export_mesh(folder: Path, model: ObjectModel) -> None:
     write_atomic(folder / OBJ, text.encode())
     for name, data in files.items():
         write_atomic(folder / name, data)
-    pbr = trimesh.visual.material.PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0)
-    glb = export_glb(split_mesh(model, pbr), include_normals=True, tree_postprocessor=_wrap_u_clamp_v)
+    pbr = trimesh.visual.material.PBRMaterial(
+        name=Path(TEXTURE).stem, baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0
+    )
+    glb = export_glb(split_mesh(model, pbr), include_normals=True, tree_postprocessor=_finish_gltf)
     write_atomic(folder / GLB, glb)
     exact = io.BytesIO()
     np.savez_compressed(
@@ -68,14 +73,18 @@ def export_mesh(folder: Path, model: ObjectModel) -> None:
 def split_mesh(model: ObjectModel, material: trimesh.visual.material.Material) -> trimesh.Trimesh:
     """The model with one texture coordinate a vertex: vertices are doubled only where the atlas has its seam.
 
+    Corners are one vertex where they share their place, in single precision as a GLB holds it, and their texture
+    coordinate up to rounding.
     Faces keep their order. Texture coordinates have trimesh's origin, the lower left. Normals are those of
     the unsplit mesh, so that the seam does not show.
     """
-    corners = np.concatenate([model.faces.reshape(-1, 1), model.face_uvs.reshape(-1, 2)], axis=1)
-    unique, inverse = np.unique(corners, axis=0, return_inverse=True)
-    vertex = unique[:, 0].astype(np.int64)
+    corner, face_uvs = model.faces.ravel(), model.face_uvs.reshape(-1, 2)
+    places = model.vertices[corner].astype(np.float32)
+    distinct = np.concatenate([places, np.round(face_uvs / _ROUNDING)], axis=1)
+    _, first, inverse = np.unique(distinct, axis=0, return_index=True, return_inverse=True)
+    vertex = corner[first]
     whole = trimesh.Trimesh(model.vertices, model.faces, process=False)
-    uv = np.stack([unique[:, 1], 1.0 - unique[:, 2]], axis=1)
+    uv = np.stack([face_uvs[first, 0], 1.0 - face_uvs[first, 1]], axis=1)
     return trimesh.Trimesh(
         model.vertices[vertex],
         inverse.reshape(-1, 3),
@@ -125,7 +134,15 @@ def _existing(path: Path) -> Path:
     return path
 
 
-def _wrap_u_clamp_v(tree: dict[str, Any]) -> None:
+def _finish_gltf(tree: dict[str, Any]) -> None:
+    """What trimesh does not write: the turn to glTF's axes, names, and how the texture continues beyond its edge."""
+    (mesh,) = tree["meshes"]
+    mesh["name"] = OBJECT_NODE
+    tree["nodes"] = [
+        {"name": UPRIGHT_NODE, "rotation": UPRIGHT_ROTATION, "children": [1]},
+        {"name": OBJECT_NODE, "mesh": 0},
+    ]
+    tree["scenes"] = [{"nodes": [0]}]
     tree["samplers"] = [{"wrapS": _REPEAT, "wrapT": _CLAMP, "magFilter": _LINEAR, "minFilter": _MIPMAP}]
     for texture in tree.get("textures", []):
         texture["sampler"] = 0

@@ -9,6 +9,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from tracking3d.errors import InputError
+from tracking3d.geometry.gltf_axes import read_mesh_file
 from tracking3d.synthesis.procedural_texture import plain_colour
 from tracking3d.synthesis.solid import Solid
 from tracking3d.synthesis.spec import SequenceSpec
@@ -27,7 +28,7 @@ def load_solid(path: Path, spec: SequenceSpec) -> Solid:
     if not path.is_file():
         raise InputError(f"The mesh '{path}' does not exist; {_ADVICE}.")
     try:
-        mesh = trimesh.load_mesh(path, process=False)
+        mesh = read_mesh_file(path)
     except Exception as error:  # trimesh raises whatever its loaders raise
         reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"The mesh '{path}' cannot be read ({reason}); {_ADVICE}.") from error
