@@ -63,7 +63,8 @@ def score_model(
         mesh: The true shape.
         diameter: Its diameter.
     """
-    if pairs is None or mesh is None or diameter is None:
+    pairs = pairs and pairs.with_rotation.with_position
+    if pairs is None or not pairs.frames or mesh is None or diameter is None:
         return ModelScores()
     recall = _recall(truth, pairs, alignment, mesh, diameter)
     shape = None

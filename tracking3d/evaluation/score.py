@@ -64,13 +64,13 @@ def score(answers: Answers, truth: Truth) -> Scores:
     diameter = None if mesh is None else model_diameter(mesh.vertices)
     pairs = pair_poses(answers, truth)
     alignment = fit_alignment(pairs, diameter)
-    rotation = {} if pairs is None else dict(zip(pairs.frames, rotation_errors(pairs).tolist(), strict=True))
+    rotation = {} if pairs is None else rotation_errors(pairs)
     masks = compare_masks(answers, truth)
     seconds = list(answers.seconds.values())
     missing = set(answers.asked) - answers.answered
     return Scores(
         **asdict(score_masks(masks, answers, truth)),
-        **asdict(score_poses(answers, truth, pairs, alignment)),
+        **asdict(score_poses(answers, pairs, alignment)),
         **asdict(score_points(answers, truth)),
         **asdict(score_model(answers, truth, pairs, alignment, mesh, diameter)),
         **asdict(score_confidence(answers, rotation, masks)),
