@@ -91,13 +91,15 @@ class PosePairs:
     @property
     def with_rotation(self) -> PosePairs:
         """Those whose true rotation is known."""
-        return self._where(np.isfinite(self.all_true[:, :3, :3]).all((1, 2)))
+        known: NDArray[np.bool_] = np.isfinite(self.all_true[:, :3, :3]).all((1, 2))
+        return self._where(known)
 
     @property
     def with_position(self) -> PosePairs:
         """Those whose true position is known; nothing that is seen lies in the camera's centre."""
         t = self.all_true[:, :3, 3]
-        return self._where(np.isfinite(t).all(1) & t.any(1))
+        known: NDArray[np.bool_] = np.isfinite(t).all(1) & t.any(1)
+        return self._where(known)
 
     def _where(self, known: NDArray[np.bool_]) -> PosePairs:
         kept = known[self.found]
