@@ -91,14 +91,14 @@ class PosePairs:
     @property
     def with_rotation(self) -> PosePairs:
         """Those whose true rotation is known."""
-        known: NDArray[np.bool_] = np.isfinite(self.all_true[:, :3, :3]).all((1, 2))
+        known = np.asarray(np.isfinite(self.all_true[:, :3, :3]).all((1, 2)), dtype=np.bool_)
         return self._where(known)
 
     @property
     def with_position(self) -> PosePairs:
         """Those whose true position is known; nothing that is seen lies in the camera's centre."""
         t = self.all_true[:, :3, 3]
-        known: NDArray[np.bool_] = np.isfinite(t).all(1) & t.any(1)
+        known = np.asarray(np.isfinite(t).all(1) & t.any(1), dtype=np.bool_)
         return self._where(known)
 
     def _where(self, known: NDArray[np.bool_]) -> PosePairs:
