@@ -119,8 +119,8 @@ def check_asked(tracks: PointTracks, camera: Camera) -> str:
     if not len(beside):
         return ""
     said = (
-        f"Beside the object's mesh in frame {tracks.query_frame}: {listed(beside)}; give pixels inside its outline, which "
-        f"{OVERLAY} shows."
+        f"Beside the object's mesh in frame {tracks.query_frame}: {listed(beside)}; give pixels inside its outline, "
+        f"which {OVERLAY} shows."
     )
     if len(beside) == len(tracks.query):
         raise InputError(said)
