@@ -9,7 +9,6 @@ import trimesh
 
 from tracking3d.datasets.answers import Answers
 from tracking3d.datasets.truth import Truth
-from tracking3d.errors import InputError
 from tracking3d.evaluation.alignment import ObjectAlignment, align_on_frame
 from tracking3d.evaluation.bop import AverageRecall, average_recall, mspd, mssd
 from tracking3d.evaluation.pose_scores import PosePairs
@@ -71,7 +70,7 @@ def score_model(
     if alignment is not None and answers.mesh is not None:
         try:
             shape = shape_scores(answers.mesh(), mesh, diameter, alignment.T_true_est, SAMPLES)
-        except (ValueError, InputError):  # the method has no surface: there is nothing to measure
+        except ValueError:  # the method has no surface: there is nothing to measure
             shape = None
     return ModelScores(
         bop_ar=recall.mean,
