@@ -13,7 +13,7 @@ LONGEST_MODULE = 400
 # Who lives on which floor; a module may import from lower floors and from its own room only.
 # Rooms of one floor may use each other, but never in circles.
 FLOORS = [
-    {"errors", "frames", "geometry", "config", "features", "networks", "process_memory"},
+    {"errors", "frames", "geometry", "config", "features", "networks", "process_memory", "stages"},
     {"rendering", "trackers", "video"},
     {"estimation", "plugins", "prompts", "testing"},
     {"session", "pipeline", "object_recording", "recording", "results"},

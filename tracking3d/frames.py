@@ -26,12 +26,14 @@ class Frame:
         image: ``(H, W, 3)`` uint8 RGB.
         time: Seconds since the start of the video, where known.
         name: What messages call it: a file name, or ``"frame 12"``.
+        decoding: Seconds that reading it took, where measured; one object's share, where several are tracked.
     """
 
     index: int
     image: Image
     time: float | None = None
     name: str = ""
+    decoding: float = 0.0
 
     @property
     def size(self) -> tuple[int, int]:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import time
+from collections.abc import Callable, Generator, Iterable
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -67,6 +70,7 @@ class ObjectRecording:
         self._causal_model = self._session.result()
         self._refinement = self._writer.begin_refinement(self._causal_model)
         self._session.refine()
+        self._refinement.together = self._session.refining
         self._writer.refine_camera(self._session.camera)
 
     def take_again(self, frame: Frame) -> FrameRecord | None:
@@ -128,6 +132,7 @@ def go_through(
         Tracking3dError: The first failure, at the end or as soon as no recording is left.
     """
     going_on, errors = list(recordings), list[Exception]()
+    share = 1 / len(recordings)
 
     def each(action: Callable[[ObjectRecording], FrameRecord | SkippedFrame | None]) -> None:
         for recording in tuple(going_on):
@@ -143,11 +148,11 @@ def go_through(
 
     try:
         for frame in frames:
-            each(partial(ObjectRecording.take, frame=frame))
+            each(partial(ObjectRecording.take, frame=_shared(frame, share)))
         each(partial(ObjectRecording.begin_refinement, source=source))
-        for frame in source if any(recording.refines for recording in going_on) else ():
+        for frame in timed(source) if any(recording.refines for recording in going_on) else ():
             if isinstance(frame, Frame):
-                each(partial(ObjectRecording.take_again, frame=frame))
+                each(partial(ObjectRecording.take_again, frame=_shared(frame, share)))
         each(ObjectRecording.finish)
     except BaseException as error:
         for recording in going_on:
@@ -155,6 +160,25 @@ def go_through(
         raise
     if errors:
         raise errors[0]
+
+
+def timed(source: FrameSource) -> Generator[Frame | SkippedFrame]:
+    """The frames of a source with the time that reading them took; of a live one, which is waited for, without."""
+    frames, started = iter(source), time.perf_counter()
+    try:
+        for frame in frames:
+            if isinstance(frame, Frame) and source.repeatable:
+                yield replace(frame, decoding=time.perf_counter() - started)
+            else:
+                yield frame
+            started = time.perf_counter()
+    finally:
+        if isinstance(frames, Generator):
+            frames.close()
+
+
+def _shared(frame: Frame | SkippedFrame, share: float) -> Any:
+    return replace(frame, decoding=share * frame.decoding) if isinstance(frame, Frame) else frame
 
 
 def _model(session: Session) -> ObjectModel | None:

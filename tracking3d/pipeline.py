@@ -107,7 +107,7 @@ def track_objects(
                     if len(failures) == len(sessions):
                         raise
             why = str(failures[number])
-            answer = unanswered(frame, MaskEstimate(None), poses[number], 0.0)
+            answer = unanswered(frame, MaskEstimate(None), poses[number])
             answers.append(replace(answer, reason=why, failure=why))
         yield tuple(answers)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from itertools import chain
@@ -15,7 +15,7 @@ from tracking3d.config.camera import choose_camera
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError
 from tracking3d.frames import Box, Frame, SkippedFrame
-from tracking3d.object_recording import Listener, ObjectRecording, go_through
+from tracking3d.object_recording import Listener, ObjectRecording, go_through, timed
 from tracking3d.prompts import damaged_start, make_prompt, make_prompts
 from tracking3d.results.layout import object_folders
 from tracking3d.results.run_writer import RunWriter
@@ -120,12 +120,11 @@ def record_objects(
 @contextmanager
 def opened(source: FrameSource) -> Iterator[Iterator[Frame | SkippedFrame]]:
     """The frames of a source, which is let go at the end, however that comes."""
-    frames = iter(source)
+    frames = timed(source)
     try:
         yield frames
     finally:
-        if isinstance(frames, Generator):
-            frames.close()
+        frames.close()
 
 
 def run_writer(

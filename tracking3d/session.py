@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, cast
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from tracking3d.config.camera import choose_camera, warn_of_unlikely
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError
-from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
+from tracking3d.estimation.estimate import FrameEstimate, MaskSource, ObjectModel, Status
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.estimation.paper.solver import PaperSolver
 from tracking3d.estimation.solver import RefiningSolver, Solver
@@ -24,6 +23,7 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.plugins import FEATURES, TRACKERS, build_plugin, plugin_label
 from tracking3d.plugins.guard import GuardedEncoder, GuardedTracker, PluginFailure
 from tracking3d.rendering import prepare_backend
+from tracking3d.stages import StageTimes, Stopwatch, measured
 
 SOLVERS: dict[str, Callable[[PipelineConfig, Camera, FeatureEncoder], Solver[Any]]] = {
     "paper": PaperSolver,
@@ -54,6 +54,7 @@ class Session:
         config: The pipeline.
         renderer: What renders, and why, see `tracking3d.rendering.prepare_backend`.
         initial_mask: What the solver was given for the latest frame: the mask tracker's answer, or what stands in.
+        refining: What ``refine`` took.
 
     Raises:
         PluginError: If a plug-in is unknown or broken.
@@ -90,6 +91,7 @@ class Session:
         self._last_pose = np.eye(4)
         self._failures: dict[int, str] = {}
         self._refined = False
+        self.refining = StageTimes()
 
     @property
     def camera(self) -> Camera:
@@ -110,9 +112,11 @@ class Session:
         if self._refined:
             raise RuntimeError("there is no further step after refine")
         try:
-            return self._start(frame) if self._solver is None else self._go_on(self._solver, frame)
+            with measured("solve") as watch:
+                estimate = self._start(frame) if self._solver is None else self._go_on(self._solver, frame)
         except PluginFailure as error:
             raise error.at(_label(frame)) from error.__cause__
+        return _timed(estimate, watch, frame)
 
     def _start(self, frame: Frame) -> FrameEstimate:
         height, width = frame.size
@@ -131,7 +135,6 @@ class Session:
                 f"{_label(frame)} has {_pixels(frame.size)} pixels but the first frame "
                 f"{_pixels((self.camera.height, self.camera.width))}; all frames must have one size."
             )
-        started = time.perf_counter()
         failures = []
         try:
             mask = self._tracker.step(frame)
@@ -143,7 +146,7 @@ class Session:
             self._state, estimate = solver.step(self._state, frame, mask)
         except PluginFailure as error:
             failures.append(self._excused(error))
-            estimate = unanswered(frame, mask, self._last_pose, time.perf_counter() - started)
+            estimate = unanswered(frame, mask, self._last_pose)
         self._last_pose = estimate.T_cam_obj
         if self.config.solver.correct_tracker and self._tracker.can_correct and corrects(estimate):
             try:
@@ -194,7 +197,9 @@ class Session:
         Raises:
             RuntimeError: If the solver cannot, see ``can_refine``.
         """
-        self._state = self._refining().refine(self._state)
+        with measured("map") as watch:
+            self._state = self._refining().refine(self._state)
+        self.refining = watch.times
         self._camera = getattr(self._state, "camera", self._camera)
         self._refined = True
 
@@ -214,10 +219,11 @@ class Session:
         if not self._refined:
             raise RuntimeError("frames are revisited after refine")
         try:
-            self._state, estimate = solver.revisit(self._state, frame, mask, T_cam_obj)
+            with measured("solve") as watch:
+                self._state, estimate = solver.revisit(self._state, frame, mask, T_cam_obj)
         except PluginFailure as error:
             raise error.at(_label(frame)) from error.__cause__
-        return self._with_failure(replace(estimate, refined=True))
+        return _timed(self._with_failure(replace(estimate, refined=True)), watch, frame)
 
     def _refining(self) -> RefiningSolver[Any]:
         if not isinstance(self._solver, RefiningSolver):
@@ -245,9 +251,7 @@ def corrects(estimate: FrameEstimate) -> bool:
     return bool(estimate.confidence >= SURE and least * either <= both <= most * either and both)
 
 
-def unanswered(
-    frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64], seconds: float
-) -> FrameEstimate:
+def unanswered(frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]) -> FrameEstimate:
     """The answer where the solver could give none: lost, with the initial mask and the pose known before."""
     initial = mask.binary if mask.binary is not None and mask.binary.any() else None
     return FrameEstimate(
@@ -259,7 +263,7 @@ def unanswered(
         status=Status.LOST,
         reason="",
         confidence=0.0,
-        seconds=seconds,
+        mask_source=MaskSource.handed_back(initial),
     )
 
 
@@ -276,6 +280,11 @@ def check_device(name: str) -> None:
         raise InputError(
             f"The device '{name}' is not available on this machine; use --device cpu."
         ) from error
+
+
+def _timed(estimate: FrameEstimate, watch: Stopwatch, frame: Frame) -> FrameEstimate:
+    stages = watch.times + StageTimes(decode=frame.decoding)
+    return replace(estimate, stages=stages, seconds=stages.whole)
 
 
 def _label(frame: Frame) -> str:

@@ -55,9 +55,7 @@ def judged_frames(benchmark: Path, solver: str | None, refined: bool) -> Iterato
         truth = Job.read(file).truth
         answers = answers_of_run(run, truth, refined=refined)
         pairs = pair_poses(answers, truth)
-        rotation = (
-            {} if pairs is None else dict(zip(pairs.frames, rotation_errors(pairs).tolist(), strict=True))
-        )
+        rotation = {} if pairs is None else rotation_errors(pairs)
         right = right_frames(answers, rotation, compare_masks(answers, truth))
         for record in reader.frames:
             if record.index in right:

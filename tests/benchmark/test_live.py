@@ -16,6 +16,7 @@ from tracking3d.cli import app
 from tracking3d.config.loading import load_config
 from tracking3d.datasets.clip import read_truth
 from tracking3d.errors import InputError
+from tracking3d.stages import StageTimes
 
 
 @pytest.fixture
@@ -30,6 +31,7 @@ def session(monkeypatch):
         def step(self, frame):
             made.frames.append(frame)
             time.sleep(made.seconds)
+            return SimpleNamespace(stages=StageTimes(track=made.seconds))
 
     monkeypatch.setattr(live, "Session", Timed)
     return made
@@ -40,6 +42,7 @@ def test_a_fast_pipeline_takes_every_frame(clips, session):
     assert (report.played, report.taken, report.dropped) == (25, 25, 0)
     assert report.worst_lag < 0.02 and report.longest_gap == 0
     assert report.answers_per_second == pytest.approx(50, rel=0.2)
+    assert report.seconds_per_frame == report.stages.track == 0
     assert session.prompt.box == tuple(read_truth(clips / "narrow").box)
 
 
@@ -49,6 +52,7 @@ def test_a_slow_pipeline_drops_frames_and_lags_by_its_own_time_only(clips, sessi
     assert report.taken + report.dropped == report.played == 150
     assert report.taken == len(session.frames) and 20 < report.taken < 35
     assert 0.05 <= report.median_lag < 0.08 and report.worst_lag < 0.2 and report.end_lag < 0.2
+    assert report.seconds_per_frame == pytest.approx(0.05)
     assert 3 <= report.longest_gap <= 15
     assert session.frames[0].index == 0 and session.frames[-1].index == 149
 

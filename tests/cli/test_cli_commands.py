@@ -186,7 +186,9 @@ def test_points_are_followed_as_csv_and_json(call, finished):
     assert len(rows) == 10
     assert float(rows[0]["x"]) == pytest.approx(31.5, abs=0.01)
     assert (rows[0]["on_object"], rows[1]["on_object"]) == ("1", "0")
-    tracks = json.loads(call("points", finished, *pixels, "--json").stdout)
+    result = call("points", finished, *pixels, "--json")
+    assert "Beside the object's mesh in frame 0: 0,0;" in result.stderr
+    tracks = json.loads(result.stdout)
     assert tracks["frames"] == [0, 1, 2, 3, 4]
     result = call("points", finished, *pixels, "--csv", "points.csv")
     assert (result.exit_code, result.stdout) == (0, "")
@@ -203,7 +205,10 @@ def test_points_are_followed_as_csv_and_json(call, finished):
         ("points run --xy nan,1", "--xy 'nan,1' is not 2 numbers"),
         ("points run --xy 1,1 --frame 9", "9"),
         ("points run --xy 1,1 --frame x", "--frame"),
-        ("points run --xy 1,1 --csv run/no/points.csv", "run/no/points.csv"),
+        ("points run --xy 31,23 --csv run/no/points.csv", "run/no/points.csv"),
+        ("points run --xy 31,23 --xy 64,23", "There is no pixel 64,23 in frame 0, which has 64 x 48 pixels"),
+        ("points run --xy 31,-1", "There is no pixel 31,-1"),
+        ("points run --xy 1,1 --xy 2,1", "Beside the object's mesh in frame 0: 1,1 and 2,1;"),
     ],
 )
 def test_bad_question_for_points_is_refused(refused, finished, arguments, words):

@@ -14,7 +14,7 @@ from short_runs import estimate_of, frame, known_run, quick_solver, revised, run
 
 from tracking3d.config.loading import load_config
 from tracking3d.estimation.assessment import Assessment
-from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
+from tracking3d.estimation.estimate import FrameEstimate, MaskSource, ObjectModel, Status
 from tracking3d.estimation.observation import Observation
 from tracking3d.estimation.paper.problem import Losses
 from tracking3d.estimation.paper.solver import PaperSolver
@@ -45,7 +45,7 @@ def test_every_frame_is_answered(preset):
         assert all(math.isfinite(value) for value in answer.losses.values())
         assert 0 <= answer.confidence <= 1
         assert answer.iterations >= 1
-        assert answer.seconds > 0
+        assert answer.mask_source is MaskSource.RENDERED
         assert (answer.reason == "") == (answer.status is Status.TRACKED)
     assert sum(answer.keyframe for answer in answers) >= 1
 
@@ -273,11 +273,11 @@ def test_a_rendered_mask_that_differs_too_much_yields_to_the_initial_one():
     judgement = Assessment(Status.TRACKED, "", 0.9)
     near = initial.copy()
     near[5, 5:15] = False  # IoU 0.9
-    kept, same = solver._supported(near, initial, judgement)
-    assert kept is near and same is judgement
+    kept, source, same = solver._supported(near, initial, judgement)
+    assert kept is near and same is judgement and source is MaskSource.RENDERED
     far = np.roll(initial, 3, axis=1)  # IoU 70 / 130
-    answer, doubtful = solver._supported(far, initial, judgement)
-    assert answer is initial
+    answer, source, doubtful = solver._supported(far, initial, judgement)
+    assert answer is initial and source is MaskSource.INITIAL
     assert doubtful.status is Status.UNCERTAIN and "0.54" in doubtful.reason
-    alone, _ = solver._supported(far, None, judgement)
+    alone, _, _ = solver._supported(far, None, judgement)
     assert alone is far  # there is nothing to fall back on

@@ -472,3 +472,89 @@ def test_a_real_clip_scores_its_own_truth_perfectly(write_run, shared_data, tmp_
     scores = score_run(run, shared_data / "cube_in_hand")
     assert scores.iou_mean == scores.iou_initial_mean == 1.0
     assert scores.rotation_error_max_deg == pytest.approx(0, abs=1e-6)
+
+
+def edit_poses(clip, edit):
+    file = clip / "poses.json"
+    document = json.loads(file.read_text())
+    for entry in document["frames"].values():
+        edit(entry)
+    file.write_text(json.dumps(document))
+
+
+def of_rotations(scores):
+    return [value for name, value in asdict(scores).items() if name.startswith(("rotation_", "share_under"))]
+
+
+def of_translations(scores):
+    return [value for name, value in asdict(scores).items() if name.startswith("translation_")]
+
+
+@pytest.mark.parametrize(
+    "unknown", [{"t": [0, 0, 0]}, {"t": None}, {"t": [0, 0, -4]}], ids=["zero", "none", "behind the camera"]
+)
+def test_a_truth_of_rotations_alone_scores_rotations(write_run, clip, unknown):
+    edit_poses(clip, lambda entry: entry.update(unknown))
+    poses = TRUE_POSES.copy()
+    poses[4] = poses[4] @ pose(40)
+    scores = score_run(write_run(poses=poses), clip)
+    assert scores.rotation_error_max_deg == pytest.approx(40)
+    assert scores.rotation_error_median_deg == pytest.approx(0, abs=1e-6)
+    assert scores.share_under_5_deg == 0.9
+    assert set(of_translations(scores)) == {None}
+    assert scores.frames_with_pose == FRAMES
+
+
+def test_a_truth_of_translations_alone_scores_translations(write_run, clip):
+    edit_poses(clip, lambda entry: entry.pop("R"))
+    poses = TRUE_POSES.copy()
+    poses[4, 0, 3] += 1
+    scores = score_run(write_run(poses=poses), clip)
+    assert scores.translation_share_under_5_percent == 0.9
+    assert scores.translation_error_median_percent == pytest.approx(0, abs=1e-6)
+    assert set(of_rotations(scores)) == {None}
+    assert scores.confidence_calibration_error is not None  # by the masks
+
+
+def test_of_each_frame_counts_what_is_known_of_it(write_run, clip):
+    turned = iter(range(FRAMES))
+    edit_poses(clip, lambda entry: entry.pop("R" if next(turned) < 4 else "t"))
+    poses = TRUE_POSES.copy()
+    poses[2, :3, :3] = pose(40)[:3, :3]  # its rotation is not known
+    poses[7, 0, 3] += 1  # its translation is not known
+    scores = score_run(write_run(poses=poses), clip)
+    assert scores.rotation_error_max_deg == pytest.approx(0, abs=1e-6)
+    assert scores.translation_error_mean_percent == pytest.approx(0, abs=1e-6)
+
+
+def test_an_object_that_stays_in_its_place_has_translation_errors(write_run, clip):
+    scores = score_run(write_run(), clip)  # all true positions are equal
+    assert scores.translation_error_median_percent == pytest.approx(0, abs=1e-6)
+    assert scores.translation_share_under_5_percent == 1
+
+
+def test_a_single_known_pose_is_scored(write_run, clip):
+    edit_poses(clip, lambda entry: entry.update(trusted=entry["R"] == TRUE_POSES[5, :3, :3].tolist()))
+    scores = score_run(write_run(), clip)
+    assert scores.frames_with_pose == 1
+    assert scores.rotation_error_mean_deg == pytest.approx(0, abs=1e-6)
+    assert scores.translation_error_mean_percent == pytest.approx(0, abs=1e-6)
+    assert scores.rotation_error_consecutive_median_deg is None
+
+
+def test_masks_or_poses_alone_are_scored(write_run, clip):
+    run = write_run()
+    (clip / "poses.json").rename(clip / "poses.aside")
+    alone = score_run(run, clip)
+    assert (alone.iou_mean, alone.rotation_error_mean_deg, alone.frames_with_pose) == (1.0, None, 0)
+    (clip / "poses.aside").rename(clip / "poses.json")
+    (clip / "masks").rename(clip / "aside")
+    alone = score_run(run, clip)
+    assert alone.iou_mean is None
+    assert alone.rotation_error_mean_deg == pytest.approx(0, abs=1e-6)
+
+
+def test_a_pose_of_neither_rotation_nor_translation_is_refused(write_run, clip):
+    edit_poses(clip, lambda entry: (entry.pop("R"), entry.pop("t")))
+    with pytest.raises(InputError, match=r"poses\.json: frame 000000 needs R"):
+        score_run(write_run(), clip)

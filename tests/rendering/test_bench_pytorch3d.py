@@ -12,9 +12,11 @@ import torch
 from scenes import bumpy_sphere
 
 from tracking3d.rendering import SoftBand, render
-from tracking3d.speed.pytorch3d import can_render, render_pytorch3d, to_pytorch3d
+from tracking3d.speed import pytorch3d
+from tracking3d.speed.pytorch3d import ABSENT, render_pytorch3d, to_pytorch3d, why_no_pytorch3d
 from tracking3d.speed.scene import Problem, Scene
-from tracking3d.speed.timing import backends
+from tracking3d.speed.table import format_left_out
+from tracking3d.speed.timing import backends, left_out
 
 CPU = torch.device("cpu")
 BAND = SoftBand(sigma=7000.0, boxlen=0.06)
@@ -44,20 +46,42 @@ def test_pixels_lie_where_pytorch3d_expects_them(pixel, size, expected):
 
 @pytest.mark.skipif(importlib.util.find_spec("pytorch3d") is not None, reason="PyTorch3D is installed")
 def test_an_absent_pytorch3d_is_left_out():
-    assert not can_render(CPU)
+    assert why_no_pytorch3d(CPU) == ABSENT
     assert "pytorch3d" not in backends(CPU)
+    assert not left_out(CPU)
 
 
 def test_an_installed_pytorch3d_takes_part(stand_in):
     assert "pytorch3d" in backends(CPU)
+    assert not left_out(CPU)
 
 
-def test_an_installation_that_cannot_draw_is_left_out(stand_in, monkeypatch):
+def test_an_installation_that_cannot_draw_is_left_out_with_the_reason(stand_in, monkeypatch):
     def broken(*_, **__):
-        raise RuntimeError("not compiled with GPU support")
+        raise RuntimeError("not compiled with GPU support\nand more")
 
     monkeypatch.setattr(sys.modules["pytorch3d.renderer.mesh"], "rasterize_meshes", broken)
     assert "pytorch3d" not in backends(CPU)
+    why = "it is installed but cannot render here (RuntimeError: not compiled with GPU support)"
+    assert left_out(CPU) == {"pytorch3d": why}
+    assert format_left_out({"left_out": left_out(CPU)}) == [f"pytorch3d takes no part: {why}."]
+
+
+@pytest.mark.parametrize("part", ["pytorch3d.ops", "pytorch3d.renderer.mesh", "pytorch3d.structures"])
+def test_an_installation_without_a_part_is_broken_and_not_absent(stand_in, monkeypatch, part):
+    monkeypatch.setitem(sys.modules, part, None)  # its import then fails
+    assert "pytorch3d" not in backends(CPU)
+    assert f"import of {part} halted" in left_out(CPU)["pytorch3d"]
+
+
+@torch.no_grad()
+def test_covered_pixels_stay_covered_only_with_enough_faces(stand_in, monkeypatch):
+    scene = Scene.make(Problem(size=24, frames=1, texture=24, frequency=14), CPU)
+    arguments = {**scene.parameters, **scene.constants}
+    covered = render(**arguments).face_index >= 0
+    assert ((render_pytorch3d(**arguments).face_index >= 0) == covered).all()
+    monkeypatch.setattr(pytorch3d, "FACES_PER_PIXEL", 10)
+    assert (covered & (render_pytorch3d(**arguments).face_index < 0)).any()
 
 
 def test_pytorch3d_draws_the_same_picture(stand_in):

@@ -34,7 +34,8 @@ def test_what_is_written_is_read_back(tmp_path, turning_sphere, write_run):
         assert np.array_equal(record.T_cam_obj, estimate.T_cam_obj)
         assert (record.name, record.time, record.status) == (frame.name, frame.time, estimate.status)
         assert (record.losses, record.confidence) == (estimate.losses, estimate.confidence)
-        assert (record.keyframe, record.iterations, record.seconds) == (estimate.keyframe, 12, 0.25)
+        assert (record.keyframe, record.iterations) == (estimate.keyframe, 12)
+        assert record.seconds > 0.25  # writing comes on top
         assert np.array_equal(run.mask(record.index), estimate.mask)
         assert np.array_equal(run.initial_mask(record.index), estimate.initial_mask)
         both = estimate.mask & estimate.initial_mask

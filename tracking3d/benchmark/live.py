@@ -16,6 +16,7 @@ from tracking3d.errors import InputError
 from tracking3d.frames import Box, Frame, SkippedFrame
 from tracking3d.pipeline import Session
 from tracking3d.prompts import make_prompt
+from tracking3d.stages import StageTimes
 from tracking3d.video.image_file import read_image
 from tracking3d.video.latest_frames import newest
 
@@ -39,6 +40,8 @@ class LiveReport:
         end_lag: Seconds of the last frame: a pipeline that falls behind ends with the worst.
         answers_per_second: Over the same frames as `worst_lag`.
         longest_gap: The most frames that were dropped in a row after the first `WARM_UP`.
+        seconds_per_frame: Mean time of a frame in the session, over the same frames.
+        stages: The same stage by stage; nothing is decoded or written.
     """
 
     rate: float
@@ -51,6 +54,8 @@ class LiveReport:
     end_lag: float
     answers_per_second: float | None
     longest_gap: int
+    seconds_per_frame: float | None = None
+    stages: StageTimes | None = None
 
 
 def play_live(config: PipelineConfig, truth: Truth, seconds: float = 20.0, rate: float = 15.0) -> LiveReport:
@@ -71,18 +76,19 @@ def play_live(config: PipelineConfig, truth: Truth, seconds: float = 20.0, rate:
         raise InputError(f"{truth.name} has no box in its first frame; a mask tracker cannot start.")
     images = [read_image(path) for path in truth.frames]
     last = max(round(seconds * rate), 2)
-    lags, indices, ends = [], [], []
+    lags, indices, ends, stages = [], [], [], []
     session = None
     started = time.monotonic()
     for item in newest(_to_and_fro(images, last), rate):
         if isinstance(item, SkippedFrame):
             continue
         session = session or _session(config, item, truth.box)
-        session.step(item)
+        stages.append(session.step(item).stages or StageTimes())
         ends.append(time.monotonic() - started)
         lags.append(ends[-1] - (item.time or 0.0))
         indices.append(item.index)
     settled = np.array(lags[WARM_UP:])
+    mean = sum(stages[WARM_UP:], StageTimes()) * (1 / len(settled)) if len(settled) else None
     gaps = np.diff(indices[WARM_UP - 1 :]) - 1 if len(indices) > WARM_UP else np.zeros(1)
     span = ends[-1] - ends[WARM_UP - 1] if len(settled) else 0.0
     return LiveReport(
@@ -96,6 +102,8 @@ def play_live(config: PipelineConfig, truth: Truth, seconds: float = 20.0, rate:
         end_lag=lags[-1],
         answers_per_second=len(settled) / span if span > 0 else None,
         longest_gap=int(gaps.max()),
+        seconds_per_frame=None if mean is None else mean.whole,
+        stages=mean,
     )
 
 
@@ -114,6 +122,11 @@ def format_live(report: LiveReport) -> Table:
         ("lag, median", _text(report.median_lag, 3, " s")),
         ("lag, worst", _text(report.worst_lag, 3, " s")),
         ("lag of the last frame", _text(report.end_lag, 3, " s")),
+        ("seconds a frame, mean", _text(report.seconds_per_frame, 3, " s")),
+        *(
+            (f"of it {stage}", _text(getattr(report.stages, stage, None), 3, " s"))
+            for stage in ("track", "encode", "solve", "map")
+        ),
     ):
         table.add_row(title, text)
     return table

@@ -20,6 +20,7 @@ from tracking3d.errors import InputError
 from tracking3d.results.description import now, versions
 from tracking3d.results.files import write_atomic, writing
 from tracking3d.results.records import jsonable
+from tracking3d.stages import STAGES
 
 FORMAT = "tracking3d-results"
 
@@ -27,6 +28,7 @@ COLUMNS = {
     "iou_initial_mean": "IoU initial",
     "iou_mean": "IoU",
     "iou_gain_percent": "gain %",
+    "share_own_masks": "own masks",
     "boundary_f_mean": "boundary F",
     "rotation_error_mean_deg": "rotation °",
     "share_under_5_deg": "under 5°",
@@ -158,6 +160,10 @@ def format_results(results: ResultSet) -> Table:
         table.add_row(escape(name), *(figure((scores or {}).get(measure), measure) for measure in shown))
     table.add_section()
     table.add_row("mean", *(figure(results.mean(measure), measure) for measure in shown), style="bold")
+    if (whole := results.mean("seconds_per_frame")) is not None:
+        stages = {stage: results.mean(f"seconds_{stage}") for stage in STAGES}
+        parts = ", ".join(f"{stage} {mean:.3f}" for stage, mean in stages.items() if mean is not None)
+        table.caption, table.caption_justify = f"{whole:.3f} s a frame{parts and ': '}{parts}", "left"
     return table
 
 

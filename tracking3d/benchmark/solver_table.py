@@ -30,6 +30,7 @@ from tracking3d.benchmark.variant import Variant
 from tracking3d.errors import InputError
 from tracking3d.pipeline import SOLVERS
 from tracking3d.results.files import write_atomic, writing
+from tracking3d.stages import STAGES
 
 NAME = "online"
 
@@ -37,6 +38,7 @@ MEASURES = {
     "iou_initial_mean": "IoU of the initial masks",
     "iou_mean": "IoU",
     "iou_gain_percent": "IoU gain %",
+    "share_own_masks": "share of answers that are not the initial mask",
     "share_worse_than_initial": "share of frames worse than the initial mask",
     "rotation_error_median_deg": "rotation error, median °",
     "rotation_error_mean_deg": "rotation error, mean °",
@@ -48,6 +50,7 @@ MEASURES = {
     "bop_ar": "BOP AR",
     "confidence_calibration_error": "calibration error",
     "seconds_per_frame": "seconds a frame, mean",
+    **{f"seconds_{stage}": f"of it {stage}" for stage in STAGES},
     "seconds_per_frame_median": "seconds a frame, median",
     "peak_memory_mb": "most memory, MB",
     "memory_growth_mb": "growth of memory, MB",

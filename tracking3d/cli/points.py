@@ -19,12 +19,18 @@ def points(
     csv: Annotated[Path | None, typer.Option("--csv", metavar="FILE", help="Write a CSV file.")] = None,
     debug: Debug = False,
 ) -> None:
-    """Follow the surface points under some pixels of one frame: position and visibility in every frame."""
-    from tracking3d.results.correspondences import track_points
+    """Follow the surface points under some pixels of one frame: position and visibility in every frame.
+
+    A pixel outside the frame is an error, and so is none on the object.
+    """
+    from tracking3d.results.correspondences import check_asked, track_points
     from tracking3d.results.point_files import points_to_csv, points_to_json
+    from tracking3d.results.run_reader import RunReader
 
     pixels = [numbers(text, 2, "--xy", "X,Y in pixels") for text in xy]
     tracks = track_points(run, frame, pixels)
+    if beside := check_asked(tracks, RunReader(run).camera):
+        typer.echo(beside, err=True)
     if csv is not None:
         try:
             csv.write_text(points_to_csv(tracks), encoding="utf-8")

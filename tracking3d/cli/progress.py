@@ -15,8 +15,10 @@ from tracking3d.cli.tables import print_table, shown
 from tracking3d.frames import SkippedFrame
 from tracking3d.recording import Listener
 from tracking3d.results import layout
+from tracking3d.results.description import own_masks, time_per_frame
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
+from tracking3d.stages import STAGES
 
 _COLOURS = {"tracked": "green", "uncertain": "yellow", "lost": "red", "skipped": "red"}
 
@@ -61,7 +63,7 @@ def progress(count: int | None, quiet: bool, objects: int = 1) -> Iterator[Liste
 def print_summary(folder: Path) -> None:
     """Print the closing table of the run in ``folder``."""
     run = RunReader(folder).description
-    counts, seconds = run["counts"], run["timings"]["seconds_per_frame_mean"]
+    counts, (whole, stages) = run["counts"], time_per_frame(run)
     table = Table(title=f"{escape(str(folder))} ({run['state']})", show_header=False, title_justify="left")
     table.add_row("frames", str(counts["frames"]))
     for status in ("tracked", "uncertain", "lost", "skipped"):
@@ -74,8 +76,25 @@ def print_summary(folder: Path) -> None:
     if refinement := run.get("refinement"):
         took = f"{refinement['frames']} frames in {shown(refinement['seconds'])} s"
         table.add_row("final refinement", took if refinement["frames"] else escape(refinement["reason"]))
-    table.add_row("mean IoU with the initial masks", shown(run["iou_initial_mean"]))
-    table.add_row("seconds per frame", shown(seconds))
+    own = own_masks(run)
+    if own is not None:
+        handed_back = counts["frames"] - own
+        told = f" of {counts['frames']}" + (
+            "; the others are the initial masks" if own and handed_back else ""
+        )
+        table.add_row("masks of its own", f"{own}{told if own else told + ': all are the initial masks'}")
+    if own is None or own:
+        table.add_row(
+            "mean IoU with the initial masks"
+            if own is None
+            else "  mean IoU of these with the initial masks",
+            shown(run["iou_initial_mean"] if own is None else run["iou_initial_mean_own"]),
+        )
+    table.add_row("seconds per frame", shown(whole))
+    for stage in STAGES if stages else ():
+        table.add_row(f"  {stage}", shown(getattr(stages, stage)))
+    for note in run["notes"]:
+        table.add_row("note", f"[yellow]{escape(note)}[/]")
     for what, names in _OUTPUTS.items():
         if files := [escape(str(folder / name)) for name in names if (folder / name).exists()]:
             table.add_row(what, "\n".join(files))

@@ -15,6 +15,8 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from tracking3d.datasets.truth import MaskReference
+from tracking3d.estimation.estimate import MaskSource
+from tracking3d.stages import StageTimes
 
 PointTracker = Callable[[int, ArrayLike], tuple[NDArray[np.float64], NDArray[np.bool_]]]
 """Follows the points ``(N, 2)`` of one frame: positions ``(T, N, 2)`` and visibility ``(T, N)`` in the frames of
@@ -36,6 +38,8 @@ class Answers:
         lost: Frames that the method called lost.
         confidence: In [0, 1] by frame index.
         seconds: Wall time by frame index.
+        stages: The same stage by stage, where it was recorded.
+        mask_sources: Where each answer's mask comes from, where it was recorded.
         peak_memory_mb: Most memory held, in 10^6 bytes, where recorded.
         memory_growth_mb: How much more was held at most in the second half of the frames than in the first.
         mesh: Reads the estimated shape in object coordinates.
@@ -52,6 +56,8 @@ class Answers:
     lost: frozenset[int] = frozenset()
     confidence: Mapping[int, float] = field(default_factory=dict)
     seconds: Mapping[int, float] = field(default_factory=dict)
+    stages: Mapping[int, StageTimes] = field(default_factory=dict)
+    mask_sources: Mapping[int, MaskSource] = field(default_factory=dict)
     peak_memory_mb: float | None = None
     memory_growth_mb: float | None = None
     mesh: Callable[[], trimesh.Trimesh] | None = None

@@ -23,6 +23,7 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import pdist
 from trimesh.exchange.ply import export_ply
 
+from tracking3d.datasets.clip import is_rigid
 from tracking3d.datasets.truth import MeshFile, Truth
 from tracking3d.errors import InputError
 from tracking3d.results.files import write_atomic, write_image, write_mask, writing
@@ -96,7 +97,7 @@ def _write_scene(scene: Path, truth: Truth, obj_id: int, millimetres: float) -> 
         if depth:
             _copy(depth.path, scene / "depth" / f"{n:06d}.png")
         masks = _masks(truth, n)
-        if n not in truth.T_cam_obj or masks is None:
+        if n not in truth.T_cam_obj or not is_rigid(truth.T_cam_obj[n]) or masks is None:
             continue
         for part, mask in zip(("mask", "mask_visib"), masks, strict=True):
             write_mask(scene / part / f"{n:06d}_000000.png", mask)

@@ -7,7 +7,7 @@
     visible_masks/000000.png     0/255, only what is seen, where it differs and is known
     rough_masks/000000.png       0/255, not the truth but a tracker's input; also initial_masks/
     depth/000000.png             uint16, along the camera's z axis
-    poses.json                   per frame R, t and trusted; OpenCV axes, x_cam = R x_obj + t; units
+    poses.json                   per frame R, t or one of them, and trusted; OpenCV axes, x_cam = R x_obj + t; units
     camera.json                  K, width, height; depth_scale: unit of the poses per count of depth, else a millimetre;
                                  told: false where a tracker is told no camera
     truth_camera.json            the same of the true camera, where a tracker is told the wrong one
@@ -100,7 +100,8 @@ def read_poses(file: Path, index: dict[str, int]) -> tuple[dict[int, NDArray[np.
         index: Of each frame by its name.
 
     Returns:
-        The trusted poses ``(4, 4)`` by frame index, and the length of their unit in millimetres, where known.
+        The trusted poses ``(4, 4)`` by frame index, NaN where the file gives no R or no t, and the length of their unit
+        in millimetres, where known.
 
     Raises:
         InputError: If the file is not of that kind, or a trusted pose is not rigid.
@@ -116,13 +117,16 @@ def read_poses(file: Path, index: dict[str, int]) -> tuple[dict[int, NDArray[np.
     poses = {}
     for name, entry in entries:
         try:
+            R, t = entry.get("R"), entry.get("t")
+            if R is None and t is None:
+                raise ValueError("neither is there")
             T = np.eye(4)
-            T[:3, :3] = entry["R"]
-            T[:3, 3] = entry["t"]
+            T[:3, :3] = np.eye(3) if R is None else np.asarray(R, np.float64).reshape(3, 3)
+            T[:3, 3] = 0.0 if t is None else np.asarray(t, np.float64).reshape(3)
             trusted = bool(entry.get("trusted", True))
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
+        except (AttributeError, TypeError, ValueError) as error:
             raise InputError(
-                f"{file}: frame {name} needs R (3 x 3) and t (3); correct that entry."
+                f"{file}: frame {name} needs R (3 x 3) and t (3), or one of them; correct that entry."
             ) from error
         if not trusted or name not in index:
             continue
@@ -130,6 +134,10 @@ def read_poses(file: Path, index: dict[str, int]) -> tuple[dict[int, NDArray[np.
             raise InputError(
                 f"{file}: R of frame {name} is not a rotation; correct it or mark it trusted: false."
             )
+        if R is None:
+            T[:3, :3] = np.nan
+        if t is None:
+            T[:3, 3] = np.nan
         poses[index[name]] = T
     unit = str(document.get("units", "")).partition(" ")[0]
     return poses, _MILLIMETRES.get(unit)

@@ -19,6 +19,7 @@ from tracking3d.results import layout
 from tracking3d.results.correspondences import track_points
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
+from tracking3d.stages import StageTimes
 from tracking3d.video.selection import parse_selection, within
 
 
@@ -46,6 +47,7 @@ def answers_of_run(folder: Path, truth: Truth, *, refined: bool = True) -> Answe
             f"The run {folder} has no frame of the clip {truth.name}; give the clip that this run was made on."
         )
     memory = run.description.get("peak_memory_mb")
+    seconds, stages = _times(run, records)
     return Answers(
         origin=folder,
         asked=asked,
@@ -56,7 +58,9 @@ def answers_of_run(folder: Path, truth: Truth, *, refined: bool = True) -> Answe
         T_cam_obj={index: one.T_cam_obj for index, one in records.items() if is_rigid(one.T_cam_obj)},
         lost=frozenset(index for index, one in records.items() if one.status is Status.LOST),
         confidence={index: one.confidence for index, one in records.items() if math.isfinite(one.confidence)},
-        seconds=_seconds(run, records),
+        seconds=seconds,
+        stages=stages,
+        mask_sources={n: one.mask_source for n, one in records.items() if one.mask_source is not None},
         peak_memory_mb=memory if isinstance(memory, int | float) else None,
         mesh=run.mesh if (run.mesh_folder / layout.OBJ).is_file() else None,
         points=_RunPoints(run, len(truth.frames)) if (run.mesh_folder / layout.OBJ).is_file() else None,
@@ -72,17 +76,29 @@ def is_refined(folder: Path) -> bool:
     return any(record.refined for record in RunReader(folder).frames)
 
 
-def _seconds(run: RunReader, records: Mapping[int, FrameRecord]) -> dict[int, float]:
-    """Wall time by frame; of refined answers with the causal ones that came before."""
+def _times(
+    run: RunReader, records: Mapping[int, FrameRecord]
+) -> tuple[dict[int, float], dict[int, StageTimes]]:
+    """Wall time by frame, and its stages where they are known; of refined answers with the causal ones before."""
     spent = {index: one.seconds for index, one in records.items()}
-    refined = [index for index, one in records.items() if one.refined]
-    if refined:
-        causal = {one.index: one.seconds for one in RunReader(run.folder, refined=False).frames}
-        total = (run.description.get("refinement") or {}).get("seconds")
+    stages = {index: one.stages for index, one in records.items()}
+    if refined := [index for index, one in records.items() if one.refined]:
+        causal = {one.index: one for one in RunReader(run.folder, refined=False).frames}
+        told = run.description.get("refinement") or {}
+        every = sum(one.refined for one in run.frames)
+        of_all = run.refinement_stages
+        again = None if of_all is None else of_all * (1 / every)
+        total = again.whole * every if again else told.get("seconds")
         for index in refined:
-            share = total / len(refined) if isinstance(total, int | float) else spent[index]
-            spent[index] = causal.get(index, 0.0) + share
-    return {index: seconds for index, seconds in spent.items() if math.isfinite(seconds)}
+            before = causal.get(index)
+            share = total / every if isinstance(total, int | float) else spent[index]
+            spent[index] = (before.seconds if before else 0.0) + share
+            of_causal = before.stages if before else None
+            stages[index] = of_causal + again if of_causal and again else None
+    return (
+        {index: seconds for index, seconds in spent.items() if math.isfinite(seconds)},
+        {index: one for index, one in stages.items() if one is not None and math.isfinite(one.whole)},
+    )
 
 
 def _initial_masks(folder: Path, indices: list[int]) -> dict[int, MaskReference]:

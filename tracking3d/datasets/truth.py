@@ -129,7 +129,8 @@ class Truth:
         camera: Of all frames, where known.
         told_camera: What a tracker is told that the camera is, where that is not the true one.
         camera_told: Whether a tracker is told any camera.
-        T_cam_obj: ``(4, 4)`` pose by frame index; only those that are known and trusted.
+        T_cam_obj: ``(4, 4)`` pose by frame index; only those that are known and trusted. The rotation or the
+            translation is NaN where only the other is known.
         masks: The object's mask by frame index, the part behind other things included if the data know it.
         visible_masks: Only the part that is seen; where it differs from `masks` and is known.
         boxes: The object's box by frame index where it has no mask.

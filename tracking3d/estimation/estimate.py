@@ -12,6 +12,8 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from tracking3d.stages import StageTimes
+
 
 class Status(StrEnum):
     """The estimator's own judgement of one frame."""
@@ -19,6 +21,29 @@ class Status(StrEnum):
     TRACKED = "tracked"
     UNCERTAIN = "uncertain"
     LOST = "lost"
+
+
+class MaskSource(StrEnum):
+    """Where an answer's mask comes from."""
+
+    RENDERED = "rendered"
+    """The silhouette of the object at the frame's pose."""
+    MEAN = "mean"
+    """The mean of that silhouette's outline and the initial mask's."""
+    INITIAL = "initial"
+    """The initial mask, handed back as it was."""
+    NONE = "none"
+    """Nothing: there was no initial mask to hand back."""
+
+    @classmethod
+    def handed_back(cls, initial: NDArray[np.bool_] | None) -> MaskSource:
+        """Of an answer that is the initial mask, if there is one."""
+        return cls.NONE if initial is None else cls.INITIAL
+
+    @property
+    def is_own(self) -> bool:
+        """Whether the answer is more than the input handed back."""
+        return self in (MaskSource.RENDERED, MaskSource.MEAN)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +63,9 @@ class FrameEstimate:
         losses: Each loss term at the answer, unweighted, by name.
         iterations: Optimizer iterations spent.
         keyframe: Whether the frame became a keyframe.
-        seconds: Wall time spent on the frame.
+        seconds: Wall time spent on the frame, all stages together.
+        stages: The same stage by stage, as far as they are over; None where nobody timed them.
+        mask_source: Where the mask comes from; None where it is not known.
         failure: Which plug-in failed at this frame, and why, in words; empty where none did.
         hypothesis: Which start of the pose won, in a word or two; empty where there was no choice.
         refined: Whether this is the answer of the final refinement, which looks at the whole video, and not the
@@ -61,6 +88,8 @@ class FrameEstimate:
     failure: str = ""
     hypothesis: str = ""
     refined: bool = False
+    stages: StageTimes | None = None
+    mask_source: MaskSource | None = None
     revised: tuple[FrameEstimate, ...] = ()
 
 

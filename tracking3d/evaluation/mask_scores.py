@@ -33,6 +33,8 @@ class MaskScores:
         iou_initial_mean: Mean IoU of the mask tracker's masks.
         iou_mean: Mean IoU of the answers.
         iou_gain_percent: How much larger `iou_mean` is than `iou_initial_mean`.
+        share_own_masks: Share of frames whose answer is not the initial mask handed back; no answer is none.
+            None where nobody recorded where masks come from.
         share_worse_than_initial: Share of frames where the answer's IoU is the smaller one by more than 1e-9.
         boundary_f_initial_mean: Mean boundary F of the mask tracker's masks.
         boundary_f_mean: Mean boundary F of the answers.
@@ -43,6 +45,7 @@ class MaskScores:
     iou_initial_mean: float | None = None
     iou_mean: float | None = None
     iou_gain_percent: float | None = None
+    share_own_masks: float | None = None
     share_worse_than_initial: float | None = None
     boundary_f_initial_mean: float | None = None
     boundary_f_mean: float | None = None
@@ -96,6 +99,7 @@ def score_masks(compared: Mapping[int, FrameMasks], answers: Answers, truth: Tru
         iou_initial_mean=initial if started else None,
         iou_mean=answer,
         iou_gain_percent=100 * (answer / initial - 1) if started and answer is not None and initial else None,
+        share_own_masks=_share_own(answers, list(scored)),
         share_worse_than_initial=float(np.mean(values[:, 0] < values[:, 1] - _EQUAL)) if started else None,
         boundary_f_initial_mean=f_initial if started else None,
         boundary_f_mean=f_answer,
@@ -103,6 +107,13 @@ def score_masks(compared: Mapping[int, FrameMasks], answers: Answers, truth: Tru
         davis_f_mean=_mean(values[before_last, 2]),
         frames_with_mask=len(scored),
     )
+
+
+def _share_own(answers: Answers, frames: list[int]) -> float | None:
+    answered = [n for n in frames if n in answers.answered]
+    if not answered or not all(n in answers.mask_sources for n in answered):
+        return None
+    return sum(answers.mask_sources[n].is_own for n in answered) / len(frames)
 
 
 def _compare(answers: Answers, truth: Truth, index: int) -> FrameMasks:

@@ -9,7 +9,6 @@ import trimesh
 
 from tracking3d.datasets.answers import Answers
 from tracking3d.datasets.truth import Truth
-from tracking3d.errors import InputError
 from tracking3d.evaluation.alignment import ObjectAlignment, align_on_frame
 from tracking3d.evaluation.bop import AverageRecall, average_recall, mspd, mssd
 from tracking3d.evaluation.pose_scores import PosePairs
@@ -63,14 +62,15 @@ def score_model(
         mesh: The true shape.
         diameter: Its diameter.
     """
-    if pairs is None or mesh is None or diameter is None:
+    pairs = pairs and pairs.with_rotation.with_position
+    if pairs is None or not pairs.frames or mesh is None or diameter is None:
         return ModelScores()
     recall = _recall(truth, pairs, alignment, mesh, diameter)
     shape = None
     if alignment is not None and answers.mesh is not None:
         try:
             shape = shape_scores(answers.mesh(), mesh, diameter, alignment.T_true_est, SAMPLES)
-        except (ValueError, InputError):  # the method has no surface: there is nothing to measure
+        except ValueError:  # the method has no surface: there is nothing to measure
             shape = None
     return ModelScores(
         bop_ar=recall.mean,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,8 @@ GOOD_TRANSLATION = 5.0
 class PoseScores:
     """Poses over the frames with a trusted pose; see `tracking3d.evaluation.metrics` and `...alignment`.
 
-    All are None where there is no such frame. Every one of these frames counts in all figures of rotations: one that
+    All are None where there is no such frame; those of rotations, or of translations, also where a truth knows only
+    the others. Every one of these frames counts in all figures of rotations: one that
     was called lost with the error of its pose, and as not right for the shares; one without a pose with 180 degrees.
     Turns about an axis of symmetry do not count, see `tracking3d.evaluation.axis_symmetry`.
 
@@ -76,7 +77,7 @@ class PosePairs:
         frames: All of them that were asked for.
         found: ``(M,)`` positions in `frames` of those that have an estimate.
         T_est, T_true: ``(M, 4, 4)`` of these.
-        all_true: ``(N, 4, 4)`` true poses of all `frames`.
+        all_true: ``(N, 4, 4)`` true poses of all `frames`, NaN where a rotation or a translation is not known.
         axis: ``(3,)`` axis of symmetry in true object coordinates; None without one.
     """
 
@@ -86,6 +87,30 @@ class PosePairs:
     T_true: NDArray[np.float64]
     all_true: NDArray[np.float64]
     axis: NDArray[np.float64] | None = None
+
+    @property
+    def with_rotation(self) -> PosePairs:
+        """Those whose true rotation is known."""
+        known = np.asarray(np.isfinite(self.all_true[:, :3, :3]).all((1, 2)), dtype=np.bool_)
+        return self._where(known)
+
+    @property
+    def with_position(self) -> PosePairs:
+        """Those whose true position is known; nothing that is seen lies in the camera's centre."""
+        t = self.all_true[:, :3, 3]
+        known = np.asarray(np.isfinite(t).all(1) & t.any(1), dtype=np.bool_)
+        return self._where(known)
+
+    def _where(self, known: NDArray[np.bool_]) -> PosePairs:
+        kept = known[self.found]
+        return replace(
+            self,
+            frames=[self.frames[place] for place in np.flatnonzero(known)],
+            found=(np.cumsum(known) - 1)[self.found[kept]],
+            T_est=self.T_est[kept],
+            T_true=self.T_true[kept],
+            all_true=self.all_true[known],
+        )
 
 
 def pair_poses(answers: Answers, truth: Truth) -> PosePairs | None:
@@ -102,19 +127,25 @@ def pair_poses(answers: Answers, truth: Truth) -> PosePairs | None:
 
 
 def fit_alignment(pairs: PosePairs | None, diameter: float | None) -> ObjectAlignment | None:
-    """The similarity between the two object frames over all frames; None without estimates.
+    """The similarity between the two object frames over all frames whose pose is wholly known; None without estimates.
 
     Args:
         pairs: The poses.
         diameter: Of the object in the truth's unit, where known.
     """
-    if pairs is None or not len(pairs.found):
+    whole = pairs and pairs.with_rotation.with_position
+    if whole is None or not len(whole.found):
         return None
-    return align_object_frame(pairs.T_est, pairs.T_true, diameter)
+    return align_object_frame(whole.T_est, whole.T_true, diameter)
 
 
-def rotation_errors(pairs: PosePairs) -> NDArray[np.float64]:
-    """Aligned error of each of ``pairs.frames`` in degrees; 180 where there is no estimate."""
+def rotation_errors(pairs: PosePairs) -> dict[int, float]:
+    """Aligned error in degrees of each frame whose true rotation is known; 180 where there is no estimate."""
+    pairs = pairs.with_rotation
+    return dict(zip(pairs.frames, _aligned(pairs).tolist(), strict=True))
+
+
+def _aligned(pairs: PosePairs) -> NDArray[np.float64]:
     errors = np.full(len(pairs.frames), NO_ESTIMATE)
     if len(pairs.found):
         R_est, R_true = pairs.T_est[:, :3, :3], pairs.T_true[:, :3, :3]
@@ -158,13 +189,19 @@ def _consecutive(
     return axis_symmetry.consecutive_axis_errors(R_est, R_true, axis)
 
 
-def score_poses(
-    answers: Answers, truth: Truth, pairs: PosePairs | None, alignment: ObjectAlignment | None
-) -> PoseScores:
-    """Score the poses of all frames that were asked for and whose true pose is known."""
+def score_poses(answers: Answers, pairs: PosePairs | None, alignment: ObjectAlignment | None) -> PoseScores:
+    """Score the poses of all frames that were asked for and whose true pose, or a part of it, is known."""
     if pairs is None:
         return PoseScores()
-    aligned = rotation_errors(pairs)
+    turned = _score_rotations(answers, pairs.with_rotation)
+    moved = _score_translations(answers, pairs.with_position, alignment)
+    return PoseScores(**turned, **moved, frames_with_pose=len(pairs.frames))
+
+
+def _score_rotations(answers: Answers, pairs: PosePairs) -> dict[str, float | None]:
+    if not pairs.frames:
+        return {}
+    aligned = _aligned(pairs)
     anchored = np.full(len(pairs.frames), NO_ESTIMATE)
     consecutive = np.empty(0)
     R_est, R_true = pairs.T_est[:, :3, :3], pairs.T_true[:, :3, :3]
@@ -172,23 +209,51 @@ def score_poses(
         anchored[pairs.found] = _anchored(R_est, R_true, pairs.axis)
     if len(pairs.found) > 1:
         consecutive = _consecutive(R_est, R_true, pairs.axis)[np.diff(pairs.found) == 1]
+    tracked = _tracked(answers, pairs)
+    return {
+        "rotation_error_mean_deg": float(aligned.mean()),
+        "rotation_error_median_deg": float(np.median(aligned)),
+        "rotation_error_max_deg": float(aligned.max()),
+        "rotation_error_anchored_median_deg": float(np.median(anchored)),
+        "rotation_error_consecutive_median_deg": float(np.median(consecutive)) if len(consecutive) else None,
+        "rotation_error_return_deg": return_error(pairs),
+        "share_under_5_deg": share_under(np.where(tracked, aligned, NO_ESTIMATE)),
+        "rotation_auc_20_deg": float(np.mean((1 - aligned / CURVE_END).clip(0) * tracked)),
+    }
+
+
+def _score_translations(
+    answers: Answers, pairs: PosePairs, alignment: ObjectAlignment | None
+) -> dict[str, float | None]:
+    # Errors are measured in depths, which nothing has that lies behind the camera.
+    if not pairs.frames or np.median(pairs.all_true[:, 2, 3]) <= 0:
+        return {}
+    moved = np.full(len(pairs.frames), np.inf)
+    if len(pairs.found):
+        T_true = pairs.T_true.copy()
+        T_true[:, :3, :3] = np.nan_to_num(
+            T_true[:, :3, :3]
+        )  # translations are aligned without true rotations
+        moved[pairs.found] = 100 * translation_errors(pairs.T_est, T_true, alignment or _of_positions(pairs))
+    known = moved[np.isfinite(moved)]
+    return {
+        "translation_error_mean_percent": float(known.mean()) if len(known) else None,
+        "translation_error_median_percent": float(np.median(known)) if len(known) else None,
+        "translation_share_under_5_percent": float(
+            np.mean(_tracked(answers, pairs) & (moved < GOOD_TRANSLATION))
+        ),
+    }
+
+
+def _of_positions(pairs: PosePairs) -> ObjectAlignment:
+    """Scale and offset where no true rotation is known; the rotation means nothing."""
+    T_true = pairs.T_true.copy()
+    T_true[:, :3, :3] = pairs.T_est[:, :3, :3]
+    return align_object_frame(pairs.T_est, T_true)
+
+
+def _tracked(answers: Answers, pairs: PosePairs) -> NDArray[np.bool_]:
+    """Which frames have an estimate that is not called lost."""
     tracked = np.zeros(len(pairs.frames), bool)
     tracked[pairs.found] = [pairs.frames[place] not in answers.lost for place in pairs.found]
-    moved = np.full(len(pairs.frames), np.inf)
-    if alignment is not None:
-        moved[pairs.found] = 100 * translation_errors(pairs.T_est, pairs.T_true, alignment)
-    known = moved[np.isfinite(moved)]
-    return PoseScores(
-        rotation_error_mean_deg=float(aligned.mean()),
-        rotation_error_median_deg=float(np.median(aligned)),
-        rotation_error_max_deg=float(aligned.max()),
-        rotation_error_anchored_median_deg=float(np.median(anchored)),
-        rotation_error_consecutive_median_deg=float(np.median(consecutive)) if len(consecutive) else None,
-        rotation_error_return_deg=return_error(pairs),
-        share_under_5_deg=share_under(np.where(tracked, aligned, NO_ESTIMATE)),
-        rotation_auc_20_deg=float(np.mean((1 - aligned / CURVE_END).clip(0) * tracked)),
-        translation_error_mean_percent=float(known.mean()) if len(known) else None,
-        translation_error_median_percent=float(np.median(known)) if len(known) else None,
-        translation_share_under_5_percent=float(np.mean(tracked & (moved < GOOD_TRANSLATION))),
-        frames_with_pose=len(pairs.frames),
-    )
+    return tracked

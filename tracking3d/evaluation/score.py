@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,6 +28,7 @@ from tracking3d.evaluation.pose_scores import (
     rotation_errors,
     score_poses,
 )
+from tracking3d.stages import STAGES, StageTimes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +42,8 @@ class Scores(MaskScores, PoseScores, PointTrackScores, ModelScores, ConfidenceSc
         share_lost: Share of `frames` that it called lost or has no answer for.
         seconds_per_frame, seconds_per_frame_median: Mean and median wall time of a frame; None where it was not
             recorded.
+        seconds_decode, seconds_track, seconds_encode, seconds_solve, seconds_map, seconds_write: Mean wall time of each
+            stage of a frame, see `tracking3d.stages.StageTimes`; None where it was not recorded.
         peak_memory_mb: Most memory held, in 10^6 bytes; None where it was not recorded.
         memory_growth_mb: How much more was held at most in the second half of the frames than in the first.
     """
@@ -52,6 +56,12 @@ class Scores(MaskScores, PoseScores, PointTrackScores, ModelScores, ConfidenceSc
     seconds_per_frame_median: float | None
     peak_memory_mb: float | None
     memory_growth_mb: float | None
+    seconds_decode: float | None = None
+    seconds_track: float | None = None
+    seconds_encode: float | None = None
+    seconds_solve: float | None = None
+    seconds_map: float | None = None
+    seconds_write: float | None = None
 
 
 def score(answers: Answers, truth: Truth) -> Scores:
@@ -64,13 +74,13 @@ def score(answers: Answers, truth: Truth) -> Scores:
     diameter = None if mesh is None else model_diameter(mesh.vertices)
     pairs = pair_poses(answers, truth)
     alignment = fit_alignment(pairs, diameter)
-    rotation = {} if pairs is None else dict(zip(pairs.frames, rotation_errors(pairs).tolist(), strict=True))
+    rotation = {} if pairs is None else rotation_errors(pairs)
     masks = compare_masks(answers, truth)
     seconds = list(answers.seconds.values())
     missing = set(answers.asked) - answers.answered
     return Scores(
         **asdict(score_masks(masks, answers, truth)),
-        **asdict(score_poses(answers, truth, pairs, alignment)),
+        **asdict(score_poses(answers, pairs, alignment)),
         **asdict(score_points(answers, truth)),
         **asdict(score_model(answers, truth, pairs, alignment, mesh, diameter)),
         **asdict(score_confidence(answers, rotation, masks)),
@@ -82,7 +92,16 @@ def score(answers: Answers, truth: Truth) -> Scores:
         seconds_per_frame_median=float(np.median(seconds)) if seconds else None,
         peak_memory_mb=answers.peak_memory_mb,
         memory_growth_mb=answers.memory_growth_mb,
+        **_stages(answers),
     )
+
+
+def _stages(answers: Answers) -> dict[str, Any]:
+    stages = list(answers.stages.values())
+    if not stages or len(stages) < len(answers.seconds):
+        return {}
+    mean = sum(stages, StageTimes()) * (1 / len(stages))
+    return {f"seconds_{stage}": getattr(mean, stage) for stage in STAGES}
 
 
 def score_run(run_folder: Path, clip: Path, *, refined: bool = True) -> Scores:

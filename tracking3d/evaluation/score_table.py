@@ -5,6 +5,7 @@ from __future__ import annotations
 from rich.table import Table
 
 from tracking3d.evaluation.score import Scores
+from tracking3d.stages import STAGES
 
 ROWS: tuple[tuple[str, str, str], ...] = (
     ("frames", "frames", ""),
@@ -14,6 +15,7 @@ ROWS: tuple[tuple[str, str, str], ...] = (
     ("iou_initial_mean", "IoU of the initial masks, mean", ""),
     ("iou_mean", "IoU of the answers, mean", ""),
     ("iou_gain_percent", "gain over the initial masks", " %"),
+    ("share_own_masks", "answers that are not the initial mask handed back", " of frames"),
     ("share_worse_than_initial", "worse than the initial mask", " of frames"),
     ("boundary_f_initial_mean", "boundary F of the initial masks, mean", ""),
     ("boundary_f_mean", "boundary F of the answers, mean", ""),
@@ -41,13 +43,14 @@ ROWS: tuple[tuple[str, str, str], ...] = (
     ("lost_recall", "lost frames that are called so", ""),
     ("vot_f_score", "VOT long-term F-score", ""),
     ("seconds_per_frame", "seconds a frame, mean", " s"),
+    *((f"seconds_{stage}", f"of it {stage}", " s") for stage in STAGES),
     ("seconds_per_frame_median", "seconds a frame, median", " s"),
     ("peak_memory_mb", "most memory held", " MB"),
     ("memory_growth_mb", "more held in the second half than in the first", " MB"),
 )
 """Measure, label and unit."""
 
-ALWAYS = 15  # rows that are shown though unknown: what a tracker is asked first
+ALWAYS = 16  # rows that are shown though unknown: what a tracker is asked first
 
 
 def format_scores(scores: Scores) -> Table:

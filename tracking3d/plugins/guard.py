@@ -19,6 +19,7 @@ from tracking3d.errors import PluginError, Tracking3dError
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame, MaskEstimate, Prompt
 from tracking3d.plugins.registration import told
+from tracking3d.stages import in_stage
 from tracking3d.trackers.protocol import CorrectableTracker, MaskTracker
 
 
@@ -65,7 +66,7 @@ class GuardedTracker:
             Tracking3dError: If the tracker says that it cannot start from this, in its own words.
             PluginFailure: If it fails otherwise, or gives what is no answer.
         """
-        with _blamed(self._label, but=Tracking3dError):
+        with in_stage("track"), _blamed(self._label, but=Tracking3dError):
             answer = self._tracker.init(frame, prompt)
         return self._checked(answer, frame)
 
@@ -75,7 +76,7 @@ class GuardedTracker:
         Raises:
             PluginFailure: If the tracker fails or gives what is no answer.
         """
-        with _blamed(self._label):
+        with in_stage("track"), _blamed(self._label):
             answer = self._tracker.step(frame)
         return self._checked(answer, frame)
 
@@ -91,7 +92,7 @@ class GuardedTracker:
             PluginFailure: If the tracker fails.
         """
         if isinstance(self._tracker, CorrectableTracker):
-            with _blamed(self._label):
+            with in_stage("track"), _blamed(self._label):
                 self._tracker.correct(frame, mask.copy())
 
     def _checked(self, answer: Any, frame: Frame) -> MaskEstimate:
@@ -145,7 +146,7 @@ class GuardedEncoder:
         Raises:
             PluginFailure: If the encoder fails or gives what are no features of these images.
         """
-        with _blamed(self._label), torch.no_grad():
+        with in_stage("encode"), _blamed(self._label), torch.no_grad():
             features = self._encoder.encode(images)
         if fault := feature_fault(features, images, self._encoder):
             raise PluginFailure(self._label, fault)

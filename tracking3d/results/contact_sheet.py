@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.frames import Image
 from tracking3d.results import drawing
+from tracking3d.results.description import own_masks, time_per_frame
 from tracking3d.results.mesh_view import render_view, turned_views
+from tracking3d.stages import STAGES
 
 TILE = 240
 COLUMNS = 6
@@ -70,7 +72,7 @@ def draw_contact_sheet(
     thumbnails: Sequence[Thumbnail],
     model: ObjectModel | None,
     first_rotation: NDArray[np.float64],
-    summary: dict[str, Any],
+    run: dict[str, Any],
 ) -> Image:
     """Draw the sheet.
 
@@ -78,7 +80,7 @@ def draw_contact_sheet(
         thumbnails: Crops in the order of the clip.
         model: The object; None leaves texture and mesh out.
         first_rotation: ``(3, 3)`` object to camera in the first frame; the mesh is turned away from it.
-        summary: As `tracking3d.results.description.summary` gives it.
+        run: ``run.json`` of the run, as it is at the end.
 
     Returns:
         ``(H, COLUMNS * TILE, 3)``.
@@ -91,11 +93,10 @@ def draw_contact_sheet(
         for view, rotation in enumerate(turned_views(first_rotation, COLUMNS - 2)):
             yaw = round((view + 0.5) * 360 / (COLUMNS - 2))
             tiles.append(_titled(render_view(model, rotation, TILE), f"mesh, turned {yaw} degrees"))
-    tiles.append(_legend(summary))
+    tiles.append(_legend(run))
     tiles += [_blank() for _ in range(-len(tiles) % COLUMNS)]
-    return np.concatenate(
-        [np.concatenate(tiles[i : i + COLUMNS], 1) for i in range(0, len(tiles), COLUMNS)], 0
-    )
+    rows = [np.concatenate(tiles[i : i + COLUMNS], 1) for i in range(0, len(tiles), COLUMNS)]
+    return np.concatenate([*rows, _footer(run)], 0)
 
 
 def _around(picture: Image, mask: NDArray[np.bool_], scale: float) -> Image:
@@ -125,21 +126,42 @@ def _titled(tile: Image, title: str, colour: drawing.Colour = drawing.INK) -> Im
     return tile
 
 
-def _legend(summary: dict[str, Any]) -> Image:
-    tile, counts = _blank(), summary["counts"]
-    per_frame, iou = summary["timings"]["seconds_per_frame_mean"], summary["iou_initial_mean"]
+def _legend(run: dict[str, Any]) -> Image:
+    tile, counts = _blank(), run["counts"]
     lines = [
         (f"{counts['frames']} frames", drawing.INK),
         *((f"{counts[status.value]} {status.value}", drawing.STATUS[status]) for status in Status),
         (f"{counts['keyframes']} keyframes", drawing.KEYFRAME),
         ("initial outline", drawing.INITIAL),
         ("refined outline", drawing.REFINED),
-        (f"IoU with initial {iou:.3f}" if iou is not None else "no initial masks", drawing.INK),
-        (f"{per_frame:.2f} s a frame" if per_frame is not None else "", drawing.INK),
+        *((text, drawing.INK) for text in _of_masks(run)),
     ]
     for row, (text, colour) in enumerate(lines):
         drawing.draw_text(tile, text, 16, 30 + row * 23, _LETTERS, colour)
     return tile
+
+
+def _of_masks(run: dict[str, Any]) -> list[str]:
+    """How many answers are more than the initial mask handed back, and how near those are to it."""
+    own, iou = own_masks(run), run["iou_initial_mean_own"]
+    if own is None:
+        return []
+    nearness = f"their IoU with initial {iou:.3f}" if iou is not None else "no initial masks beside"
+    return [f"{own} masks of its own", *([nearness] if own else [])]
+
+
+def _footer(run: dict[str, Any]) -> Image:
+    """Lines of text across the sheet: the time of a frame, and what one should know."""
+    whole, stages = time_per_frame(run)
+    lines = []
+    if whole is not None:
+        parts = [f"{name} {getattr(stages, name):.3f}" for name in STAGES] if stages else []
+        lines.append((": ".join(filter(None, (f"{whole:.3f} s a frame", ", ".join(parts)))), drawing.INK))
+    lines += [(f"Note: {note}", drawing.STATUS[Status.UNCERTAIN]) for note in run.get("notes", ())]
+    band = np.full((23 * len(lines) + 16 * bool(lines), COLUMNS * TILE, 3), drawing.PAPER, dtype=np.uint8)
+    for row, (text, colour) in enumerate(lines):
+        drawing.draw_text(band, text, 16, 19 + row * 23, _LETTERS, colour)
+    return band
 
 
 def _blank() -> Image:

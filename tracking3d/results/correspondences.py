@@ -19,6 +19,7 @@ from tracking3d.estimation.estimate import Status
 from tracking3d.geometry.camera import Camera
 from tracking3d.rendering.surface_visibility import DEPTH_TOLERANCE, deepest_around
 from tracking3d.rendering.visibility import NEAR, rasterize
+from tracking3d.results.layout import OVERLAY
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
 
@@ -92,6 +93,38 @@ def track_points(run: RunReader | Path, frame: int, xy: ArrayLike) -> PointTrack
         visible[row] = on_object & facing & (distance > NEAR) & (distance <= behind + tolerance)
     indices = np.array([record.index for record in run.frames], dtype=np.int64)
     return PointTracks(frame, query, indices, positions, visible, on_object, face, barycentric)
+
+
+def check_asked(tracks: PointTracks, camera: Camera) -> str:
+    """Make sure that the pixels that were asked for can have an answer.
+
+    Returns:
+        What to say of pixels beside the object, of which nothing is known; empty where there are none.
+
+    Raises:
+        InputError: If one lies outside the frame, or all lie beside the object.
+    """
+
+    def listed(pixels: NDArray[np.float64]) -> str:
+        some = " and ".join(f"{x:g},{y:g}" for x, y in pixels[:3])
+        return some + (f" and {len(pixels) - 3} more" if len(pixels) > 3 else "")
+
+    outside = tracks.query[~_in_frame(camera, tracks.query)]
+    if len(outside):
+        raise InputError(
+            f"There is no pixel {listed(outside)} in frame {tracks.query_frame}, which has {camera.width} x "
+            f"{camera.height} pixels counted from 0; give pixels on the object."
+        )
+    beside = tracks.query[~tracks.on_object]
+    if not len(beside):
+        return ""
+    said = (
+        f"Beside the object's mesh in frame {tracks.query_frame}: {listed(beside)}; give pixels inside its outline, "
+        f"which {OVERLAY} shows."
+    )
+    if len(beside) == len(tracks.query):
+        raise InputError(said)
+    return said
 
 
 def project(

@@ -13,11 +13,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from tracking3d.estimation.estimate import Status
+from tracking3d.estimation.estimate import MaskSource, Status
 from tracking3d.geometry.camera import Camera
 from tracking3d.process_memory import resident_memory
 from tracking3d.results.layout import CONVENTIONS, FORMAT, FORMAT_VERSION
 from tracking3d.results.records import FrameRecord
+from tracking3d.stages import StageTimes
 
 MOST_FAILURES = 20
 """Different reasons of plug-in failures that a summary lists; the commonest come first."""
@@ -58,7 +59,12 @@ def description_at_start(
 
 
 def refinement(
-    state: str, reason: str = "", causal: Sequence[FrameRecord] = (), refined: int = 0, seconds: float = 0.0
+    state: str,
+    reason: str = "",
+    causal: Sequence[FrameRecord] = (),
+    refined: Sequence[FrameRecord] = (),
+    seconds: float = 0.0,
+    together: StageTimes | None = None,
 ) -> dict[str, Any]:
     """What came of a final refinement.
 
@@ -66,15 +72,17 @@ def refinement(
         state: ``running``, ``finished``, ``interrupted``, ``failed`` or ``left out``.
         reason: Why it has that state, in words.
         causal: The causal answer for every frame.
-        refined: Number of frames that have a second answer.
+        refined: The second answers.
         seconds: Wall time it took.
+        together: What it took to solve everything once more, before the frames.
     """
     return {
         "state": state,
         "reason": reason,
-        "frames": refined,
-        "kept": len(causal) - refined,
+        "frames": len(refined),
+        "kept": len(causal) - len(refined),
         "seconds": seconds,
+        "stages": _plain(stages_of(refined), together),
         "causal": {**_by_status(causal), "iou_initial_mean": _mean_iou(causal)},
     }
 
@@ -85,7 +93,7 @@ def summary(
     seconds: float,
     causal: Sequence[FrameRecord] | None = None,
 ) -> dict[str, Any]:
-    """Counts, plug-in failures, timings, mean IoU and highest memory of a run.
+    """Counts, plug-in failures, timings, mean IoU, where masks come from and highest memory of a run.
 
     Args:
         records: The answer for every frame.
@@ -93,7 +101,9 @@ def summary(
         seconds: Wall time of the whole run.
         causal: The causal answers, whose seconds are the run's; ``records`` themselves if None.
     """
-    per_frame = [record.seconds for record in (records if causal is None else causal)]
+    causal = records if causal is None else causal
+    per_frame = [record.seconds for record in causal]
+    own = [record for record in records if record.mask_source is not None and record.mask_source.is_own]
     memory = resident_memory()
     failures = Counter(record.failure for record in records if record.failure)
     return {
@@ -103,6 +113,9 @@ def summary(
             "keyframes": sum(record.keyframe for record in records),
             "skipped": skipped,
             "failed": failures.total(),
+            "masks": {
+                source.value: sum(record.mask_source is source for record in records) for source in MaskSource
+            },
         },
         "failures": [
             {"reason": reason, "frames": frames} for reason, frames in failures.most_common(MOST_FAILURES)
@@ -111,10 +124,49 @@ def summary(
             "seconds_total": seconds,
             "seconds_per_frame_mean": float(np.mean(per_frame)) if per_frame else None,
             "seconds_per_frame_median": float(np.median(per_frame)) if per_frame else None,
+            "stages": _plain(stages_of(causal)),
         },
         "iou_initial_mean": _mean_iou(records),
+        "iou_initial_mean_own": _mean_iou(own),
         "peak_memory_mb": memory and memory[1],
     }
+
+
+def stages_of(records: Sequence[FrameRecord]) -> StageTimes | None:
+    """What all records together took, stage by stage; None if it is not known of one."""
+    stages = [record.stages for record in records if record.stages is not None]
+    return sum(stages, StageTimes()) if len(stages) == len(records) else None
+
+
+def time_per_frame(run: Mapping[str, Any]) -> tuple[float | None, StageTimes | None]:
+    """Mean time of a frame of a run that is over, that of the final refinement included, and its stages.
+
+    Args:
+        run: Its ``run.json``.
+    """
+    timings, refinement, frames = run["timings"], run.get("refinement") or {}, run["counts"]["frames"]
+    whole, stages = timings["seconds_per_frame_mean"], timings.get("stages")
+    if not frames or whole is None or stages is None:
+        return whole, None
+    spent = StageTimes(**stages)
+    again = StageTimes(**(refinement.get("stages") or {})) if refinement.get("frames") else StageTimes()
+    return whole + again.whole / frames, (spent + again) * (1 / frames)
+
+
+def own_masks(run: Mapping[str, Any]) -> int | None:
+    """How many answers are masks of the tracker's own, not the initial mask handed back; None where it is not known.
+
+    Args:
+        run: ``run.json`` of a run that is over.
+    """
+    masks = run["counts"].get("masks") or {}
+    if sum(masks.values()) < run["counts"]["frames"]:
+        return None
+    return sum(masks[source] for source in MaskSource if source.is_own)
+
+
+def _plain(stages: StageTimes | None, together: StageTimes | None = None) -> dict[str, float] | None:
+    return None if stages is None else asdict(stages + (together or StageTimes()))
 
 
 def _by_status(records: Sequence[FrameRecord]) -> dict[str, int]:

@@ -28,6 +28,7 @@ from tracking3d.geometry.gltf_axes import OBJECT_NODE, UPRIGHT_NODE, UPRIGHT_ROT
 from tracking3d.results.files import write_atomic
 from tracking3d.results.layout import FEATURES, GLB, MTL, OBJ, TEXTURE
 
+_FARTHEST = 1e12  # of a vertex; float32 can square it
 _REPEAT, _CLAMP, _LINEAR, _MIPMAP = 10497, 33071, 9729, 9987  # glTF's constants
 _ROUNDING = 2.0**-20  # of texture coordinates; far less than a texel
 
@@ -102,11 +103,29 @@ def load_mesh(folder: Path) -> trimesh.Trimesh:
     """
     path = _existing(folder / OBJ)
     try:
-        return trimesh.load_mesh(path, process=False, maintain_order=True)
+        mesh = trimesh.load_mesh(path, process=False, maintain_order=True)
+        fault = _mesh_fault(mesh)
     except Exception as error:  # trimesh raises whatever its loaders raise
         raise InputError(
             f"The mesh {path} cannot be read ({error}); track again with another --out."
         ) from error
+    if fault:
+        raise InputError(f"The mesh {path} {fault}; track again with another --out.")
+    return mesh
+
+
+def _mesh_fault(mesh: Any) -> str:
+    """Why that is no surface, or nothing."""
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        return "has no faces"
+    if not (np.abs(mesh.vertices) < _FARTHEST).all():
+        return "has vertices that are no sensible numbers"
+    faces = np.asarray(mesh.faces)
+    return (
+        "has faces of vertices that are not there"
+        if not 0 <= faces.min() <= faces.max() < len(mesh.vertices)
+        else ""
+    )
 
 
 def load_model(folder: Path) -> ObjectModel:

@@ -58,14 +58,14 @@ class Pictures:
         if self._video is not None:
             self._video.close()
 
-    def contact_sheet(self, model: ObjectModel | None, figures: dict[str, Any]) -> Image | None:
+    def contact_sheet(self, model: ObjectModel | None, run: dict[str, Any]) -> Image | None:
         """The contact sheet, ``(H, W, 3)``; None before the first frame.
 
         Args:
             model: The object; None leaves texture and mesh out.
-            figures: As `tracking3d.results.description.summary` gives them.
+            run: ``run.json`` of the run, as it is at the end.
         """
         if self._first is None:
             return None
         rotation = np.asarray(self._first.T_cam_obj, dtype=np.float64)[:3, :3]
-        return draw_contact_sheet(self._thumbnails.spread(CROPS), model, rotation, figures)
+        return draw_contact_sheet(self._thumbnails.spread(CROPS), model, rotation, run)

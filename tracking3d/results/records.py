@@ -5,14 +5,38 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.estimation.estimate import FrameEstimate, Status
+from tracking3d.estimation.estimate import FrameEstimate, MaskSource, Status
+from tracking3d.stages import StageTimes
+
+_KINDS: dict[str, Any] = {
+    "index": int,
+    "time": int | float | None,
+    "name": str,
+    "T_cam_obj": list,
+    "status": str,
+    "reason": str,
+    "confidence": int | float | None,
+    "losses": dict,
+    "iterations": int,
+    "keyframe": bool,
+    "seconds": int | float | None,
+    "iou_initial": int | float | None,
+    "area": int,
+    "revision": bool,
+    "failure": str,
+    "hypothesis": str,
+    "refined": bool,
+    "stages": dict | None,
+    "mask_source": str | None,
+}
+_MOST = 2**53  # the largest count that every reader of JSON knows exactly
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,13 +54,15 @@ class FrameRecord:
         losses: Each loss term at the answer, unweighted, by name; NaN where it was not a number.
         iterations: Optimizer iterations spent.
         keyframe: Whether the frame became a keyframe.
-        seconds: Wall time spent on the frame.
+        seconds: Wall time spent on the frame, all stages together; of a revision 0, see `latest`.
         iou_initial: IoU of the answer and the initial mask; None without an initial mask.
         area: Pixels of the answer's mask.
         revision: Whether this replaces an earlier answer.
         failure: Which plug-in failed at this frame, and why; empty where none did.
         hypothesis: Which start of the pose won, in a word or two; empty where there was no choice.
         refined: Whether this is the answer of the final refinement, not the causal one.
+        stages: The same time stage by stage; None where it is not known, as in runs of older versions.
+        mask_source: Where the answer's mask comes from; None where it is not known.
     """
 
     index: int
@@ -56,6 +82,8 @@ class FrameRecord:
     failure: str = ""
     hypothesis: str = ""
     refined: bool = False
+    stages: StageTimes | None = None
+    mask_source: MaskSource | None = None
 
     @classmethod
     def of(
@@ -84,7 +112,14 @@ class FrameRecord:
             failure=estimate.failure,
             hypothesis=estimate.hypothesis,
             refined=bool(estimate.refined),
+            stages=estimate.stages,
+            mask_source=estimate.mask_source,
         )
+
+    def and_wrote(self, seconds: float) -> Self:
+        """The record, with the time that writing masks and pictures took."""
+        stages = None if self.stages is None else self.stages + StageTimes(write=seconds)
+        return replace(self, stages=stages, seconds=self.seconds + seconds)
 
     @classmethod
     def from_json(cls, line: str | bytes) -> Self:
@@ -95,13 +130,20 @@ class FrameRecord:
         """
         try:
             fields = json.loads(line)
+            _check_kinds(fields)
             fields["T_cam_obj"] = np.array(fields["T_cam_obj"], dtype=np.float64).reshape(4, 4)
             fields["status"] = Status(fields["status"])
             fields["confidence"] = _number(fields["confidence"])
             fields["seconds"] = _number(fields["seconds"])
             fields["losses"] = {term: _number(value) for term, value in fields["losses"].items()}
+            if (stages := fields.get("stages")) is not None:
+                fields["stages"] = read_stages(stages)
+            if (source := fields.get("mask_source")) is not None:
+                fields["mask_source"] = MaskSource(source)
             return cls(**{key: value for key, value in fields.items() if key in cls.__dataclass_fields__})
-        except (KeyError, TypeError, AttributeError) as error:
+        except KeyError as error:
+            raise ValueError(f"there is no {error.args[0]}") from error
+        except (TypeError, AttributeError, OverflowError, RecursionError) as error:
             raise ValueError(f"not a frame record: {error}") from error
 
     def to_json(self) -> str:
@@ -122,6 +164,9 @@ def latest(records: Iterable[FrameRecord], refined: bool = True) -> list[FrameRe
             continue
         before = answers.get(record.index)
         # A revision is made long after the frame was seen and no longer knows its name.
+        if before and record.revision and not record.refined:
+            # What a revision took is counted in the frame that led to it.
+            record = replace(record, seconds=before.seconds, stages=before.stages)
         answers[record.index] = replace(record, name=before.name) if before and not record.name else record
     return [answers[index] for index in sorted(answers)]
 
@@ -135,6 +180,8 @@ def mask_iou(a: NDArray[np.bool_], b: NDArray[np.bool_] | None) -> float | None:
 
 def jsonable(value: Any) -> Any:
     """``value`` in JSON's own types: arrays as lists, paths as text, what is not a finite number as None."""
+    if isinstance(value, StageTimes):
+        return jsonable(asdict(value))
     if isinstance(value, Mapping):
         return {str(key): jsonable(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
@@ -144,6 +191,30 @@ def jsonable(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return str(value) if isinstance(value, Path) else value
+
+
+def read_stages(value: Any) -> StageTimes:
+    """Stage times from JSON; NaN where a time is null.
+
+    Raises:
+        ValueError: If it is none.
+    """
+    try:
+        return StageTimes(**{stage: _number(seconds) for stage, seconds in value.items()})
+    except (TypeError, AttributeError) as error:
+        raise ValueError(f"{value!r:.40} are no times of stages") from error
+
+
+def _check_kinds(fields: Any) -> None:
+    if not isinstance(fields, dict):
+        raise ValueError("it is no JSON object")
+    for name, kind in _KINDS.items():
+        value = fields.get(name)
+        given = name in fields and (kind is bool or not isinstance(value, bool))
+        if name in fields and not (given and isinstance(value, kind)):
+            raise ValueError(f"{name} is {value!r:.40}")
+    if not all(0 <= fields[name] <= _MOST for name in ("index", "area", "iterations")):
+        raise ValueError("index, area or iterations are no count")
 
 
 def _number(value: float | None) -> float:

@@ -21,6 +21,7 @@ from tracking3d.results import description, layout
 from tracking3d.results.files import read_mask, write_mask, writing
 from tracking3d.results.pictures import Pictures
 from tracking3d.results.records import FrameRecord
+from tracking3d.stages import StageTimes, measured
 
 
 class RefinementWriter:
@@ -35,6 +36,7 @@ class RefinementWriter:
     Attributes:
         causal: The causal answers by frame index.
         pictures: Overlay and crops of the second pass.
+        together: What it took to solve everything once more, before the frames.
 
     Raises:
         OutputError: If the folder cannot be written.
@@ -45,6 +47,7 @@ class RefinementWriter:
         self._started = time.monotonic()
         self._records: list[FrameRecord] = []
         self._taken_over = False
+        self.together = StageTimes()
         self.causal = {record.index: record for record in causal}
         self.pictures = Pictures(self._aside / layout.OVERLAY, camera, fps)
         with writing(self._aside):
@@ -66,9 +69,11 @@ class RefinementWriter:
         estimate = replace(
             estimate, refined=True, initial_mask=initial, keyframe=estimate.keyframe or causal.keyframe
         )
-        record = FrameRecord.of(estimate, frame.name, initial, revision=True)
-        write_mask(layout.mask_path(self._aside, frame.index), estimate.mask)
-        self.pictures.add(frame, estimate, record)
+        with measured("write") as watch:
+            record = FrameRecord.of(estimate, frame.name, initial, revision=True)
+            write_mask(layout.mask_path(self._aside, frame.index), estimate.mask)
+            self.pictures.add(frame, estimate, record)
+        record = record.and_wrote(watch.times.write)
         self._records.append(record)
         return record
 
@@ -124,8 +129,9 @@ class RefinementWriter:
     def described(self, state: str, reason: str = "") -> dict[str, Any]:
         """What ``run.json`` says of it, see `tracking3d.results.description.refinement`."""
         seconds = time.monotonic() - self._started
-        refined = len(self._records) if self._taken_over else 0
-        return description.refinement(state, reason, list(self.causal.values()), refined, seconds)
+        refined = self._records if self._taken_over else []
+        causal = list(self.causal.values())
+        return description.refinement(state, reason, causal, refined, seconds, self.together)
 
     def _causal_estimate(self, frame: Frame, initial: NDArray[np.bool_] | None) -> FrameEstimate:
         """The causal answer as far as it is kept: enough to draw it."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,25 @@ from tracking3d.results import layout
 from tracking3d.results.files import read_mask
 from tracking3d.results.lock import is_locked
 from tracking3d.results.mesh_export import load_mesh
-from tracking3d.results.records import FrameRecord, latest
+from tracking3d.results.records import FrameRecord, latest, read_stages
+from tracking3d.stages import StageTimes
+
+LONGEST_LINE = 2**20
+"""Bytes of a line of ``frames.jsonl``; no run writes one as long."""
+LONGEST_SIDE = 2**16
+"""Pixels of a frame."""
+_FARTHEST = 1e9  # pixels, of focal lengths and principal points
+_KINDS: dict[str, Any] = {
+    "state": str,
+    "config": dict,
+    "camera": dict,
+    "selection": str | None,
+    "refinement": dict | None,
+    "counts": dict,
+    "timings": dict,
+    "skipped": list,
+    "notes": list,
+}
 
 
 class RunReader:
@@ -41,23 +60,46 @@ class RunReader:
     @property
     def config(self) -> dict[str, Any]:
         """The configuration as used."""
-        config: dict[str, Any] = self.description["config"]
+        config: dict[str, Any] = self.description.get("config", {})
         return config
 
     @cached_property
     def camera(self) -> Camera:
-        """The camera of the full frame."""
+        """The camera of the full frame.
+
+        Raises:
+            InputError: If the run names none that can be.
+        """
         try:
-            return Camera(**self.description["camera"])
+            camera = Camera(**self.description["camera"])
+            fault = _camera_fault(camera)
         except (KeyError, TypeError) as error:
+            fault = str(error)
+        if fault:
             raise InputError(
-                f"{self.folder / layout.RUN} is damaged: it names no camera ({error})."
+                f"{self.folder / layout.RUN} is damaged: it names no camera ({fault}); restore it."
+            )
+        return camera
+
+    @property
+    def refinement_stages(self) -> StageTimes | None:
+        """What the final refinement took, stage by stage; None where that is not known.
+
+        Raises:
+            InputError: If it is damaged.
+        """
+        told = (self.description.get("refinement") or {}).get("stages")
+        try:
+            return None if told is None else read_stages(told)
+        except ValueError as error:
+            raise InputError(
+                f"{self.folder / layout.RUN} is damaged: stages of the refinement, {error}; restore it."
             ) from error
 
     @property
     def state(self) -> str:
         """``running``, ``finished``, ``interrupted`` or ``failed``; a run whose process died is the third."""
-        state: str = self.description["state"]
+        state: str = self.description.get("state", "running")
         return "interrupted" if state == "running" and not is_locked(self.folder / layout.FRAMES) else state
 
     @cached_property
@@ -118,15 +160,38 @@ def read_records(path: Path) -> Iterator[FrameRecord]:
     """
     if not path.is_file():
         return
-    damage: tuple[int, ValueError] | None = None
-    with path.open("rb") as file:
-        for number, line in enumerate(file, 1):
-            if damage:
-                raise InputError(f"Line {damage[0]} of {path} is damaged ({damage[1]}); remove it.")
+    with _readable(path), path.open("rb") as file:
+        for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE), b""), 1):
             try:
                 yield FrameRecord.from_json(line)
             except ValueError as error:
-                damage = number, error
+                # A kill cuts the last line off; what it leaves has a beginning and no end.
+                if line.startswith(b"{") and len(line) < LONGEST_LINE and not line.endswith(b"\n"):
+                    return
+                raise InputError(f"Line {number} of {path} is damaged ({error}); remove it.") from error
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror or error}); restore it.") from error
+
+
+def _camera_fault(camera: Camera) -> str:
+    """Why there is no such camera, or nothing."""
+    for name in ("width", "height"):
+        value = getattr(camera, name)
+        if not isinstance(value, int) or isinstance(value, bool) or not 0 < value <= LONGEST_SIDE:
+            return f"{name} is {value!r:.40}"
+    for name in ("fx", "fy", "cx", "cy"):
+        value = getattr(camera, name)
+        number = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _FARTHEST
+        if not number or (name in ("fx", "fy") and not value > 0):
+            return f"{name} is {value!r:.40}"
+    told = isinstance(camera.origin, str) and isinstance(camera.assumed, bool)
+    return "" if told else f"origin is {camera.origin!r:.40}, assumed {camera.assumed!r:.40}"
 
 
 def _read_description(folder: Path) -> dict[str, Any]:
@@ -136,13 +201,16 @@ def _read_description(folder: Path) -> dict[str, Any]:
         raise InputError(f"{folder} is not a run folder: it {what}; give what --out of `tracking3d run` was.")
     try:
         description = json.loads(path.read_bytes())
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} is damaged: it cannot be read ({error}).") from error
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{path} is damaged: it cannot be read ({error}); restore it.") from error
     if not isinstance(description, dict) or description.get("format") != layout.FORMAT:
         raise InputError(f"{folder} is not a run folder: its run.json is not one of tracking3d.")
     version = description.get("format_version")
     if not isinstance(version, int):
         raise InputError(f"{path} is damaged: it holds no format version.")
+    for name, kind in _KINDS.items():
+        if name in description and not isinstance(description[name], kind):
+            raise InputError(f"{path} is damaged: {name} is {description[name]!r:.40}; restore it.")
     if version > layout.FORMAT_VERSION:
         raise InputError(
             f"The run {folder} has format version {version}, newer than the "

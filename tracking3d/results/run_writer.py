@@ -23,6 +23,7 @@ from tracking3d.results import description, layout
 from tracking3d.results.files import read_mask, write_atomic, write_image, write_mask, writing
 from tracking3d.results.lock import try_lock
 from tracking3d.results.mesh_export import export_mesh
+from tracking3d.results.notes import notes_of
 from tracking3d.results.pictures import Pictures
 from tracking3d.results.records import FrameRecord, jsonable, latest
 from tracking3d.results.refinement_writer import RefinementWriter
@@ -76,6 +77,7 @@ class RunWriter:
         self._pictures = Pictures(self.folder / layout.OVERLAY, camera, self._fps)
         self._refinement: RefinementWriter | None = None
         self._over = False
+        self._drawing = 0.0
         self._description = description.description_at_start(
             config=config,
             camera=camera,
@@ -120,10 +122,14 @@ class RunWriter:
         Raises:
             OutputError: If it cannot be written; what was written before stays whole.
         """
+        # A picture is drawn when its frame's line is safe; so its time is in the next frame's line.
+        started = time.perf_counter() - self._drawing
         for revised in estimate.revised:
             self._record(revised, "", revision=True)
-        record = self._record(estimate, frame.name, revision=False)
+        record = self._record(estimate, frame.name, revision=False, started=started)
+        drawn = time.perf_counter()
         self._pictures.add(frame, estimate, record)
+        self._drawing = time.perf_counter() - drawn
         return record
 
     def skip(self, skipped: SkippedFrame) -> None:
@@ -218,7 +224,9 @@ class RunWriter:
             ended: FinalState = "failed" if isinstance(error, Exception) else "interrupted"
             self.finish(None, ended, str(error) if isinstance(error, Exception) else None)
 
-    def _record(self, estimate: FrameEstimate, name: str, revision: bool) -> FrameRecord:
+    def _record(
+        self, estimate: FrameEstimate, name: str, revision: bool, started: float | None = None
+    ) -> FrameRecord:
         initial_path = layout.initial_mask_path(self.folder, estimate.index)
         initial = estimate.initial_mask
         if initial is not None:
@@ -227,6 +235,8 @@ class RunWriter:
             initial = read_mask(initial_path)
         record = FrameRecord.of(estimate, name, initial, revision)
         write_mask(layout.mask_path(self.folder, estimate.index), estimate.mask)
+        if started is not None:
+            record = record.and_wrote(time.perf_counter() - started)
         self._append_all([record])
         return record
 
@@ -267,8 +277,8 @@ class RunWriter:
         figures = description.summary(
             latest(records), len(self._description["skipped"]), seconds, latest(records, refined=False)
         )
-        self._description |= figures
-        sheet = self._pictures.contact_sheet(model, figures)
+        self._description |= figures | {"notes": notes_of(self._description["camera"], model)}
+        sheet = self._pictures.contact_sheet(model, self._description)
         if sheet is not None:
             write_image(self.folder / layout.CONTACT_SHEET, sheet)
 

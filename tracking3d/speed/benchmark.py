@@ -21,7 +21,7 @@ from tracking3d.results.description import versions
 from tracking3d.speed.growth import measure_growth
 from tracking3d.speed.memory import peak_memory
 from tracking3d.speed.scene import Problem, default_texture
-from tracking3d.speed.timing import DENSE, Duration, find_device, median, time_backends
+from tracking3d.speed.timing import DENSE, Duration, find_device, left_out, median, time_backends
 
 
 def benchmark(
@@ -55,7 +55,8 @@ def benchmark(
         ``measurements`` and of ``measured_frames``, from which they are scaled up; ``ratio_to_torch``, its
         ``total_ms`` over that of ``torch``; ``speedup_over_dense``, how many times longer ``dense`` takes, None if it
         was not asked for; ``peak_memory_mb``, see `peak_memory`, None for ``dense``. ``speedup_over_dense`` of
-        ``torch`` stands outside, too. With ``growth`` the answer of `measure_growth`.
+        ``torch`` stands outside, too. ``left_out`` has
+        backends that are installed and cannot render, with the reason. With ``growth`` the answer of `measure_growth`.
 
     Raises:
         InputError: If the device is not there.
@@ -77,6 +78,7 @@ def benchmark(
         "threads": threads,
         "machine": machine(),
         "backends": results,
+        "left_out": left_out(place),
         "speedup_over_dense": results["torch"]["speedup_over_dense"],
     }
     if growth:

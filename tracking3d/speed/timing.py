@@ -15,7 +15,7 @@ from tracking3d.errors import InputError
 from tracking3d.rendering import prepare_backend, render
 from tracking3d.rendering.backend import why_no_numba
 from tracking3d.speed.dense import render_dense
-from tracking3d.speed.pytorch3d import can_render, render_pytorch3d
+from tracking3d.speed.pytorch3d import ABSENT, render_pytorch3d, why_no_pytorch3d
 from tracking3d.speed.scene import Backend, Problem, Scene
 
 DENSE = "dense"
@@ -54,9 +54,15 @@ def backends(device: torch.device) -> dict[str, Backend]:
     found: dict[str, Backend] = {"torch": partial(render, backend="torch")}
     if device.type == "cpu" and not why_no_numba():
         found["numba"] = partial(render, backend="numba")
-    if can_render(device):
+    if not why_no_pytorch3d(device):
         found["pytorch3d"] = render_pytorch3d
     return found
+
+
+def left_out(device: torch.device) -> dict[str, str]:
+    """Backends of others that are installed and cannot render on a device, and why."""
+    why = why_no_pytorch3d(device)
+    return {"pytorch3d": why} if why not in ("", ABSENT) else {}
 
 
 @contextmanager

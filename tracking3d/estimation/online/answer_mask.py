@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from tracking3d.estimation.estimate import MaskSource
 from tracking3d.estimation.online.belief import View
 from tracking3d.estimation.online.pose_refinement import Surface, drawn_at
 from tracking3d.geometry.pose import Pose
@@ -28,22 +29,25 @@ def answer_mask(
     rendered: NDArray[np.bool_],
     initial: NDArray[np.bool_] | None,
     support: float,
-) -> NDArray[np.bool_]:
+) -> tuple[NDArray[np.bool_], MaskSource]:
     """The better supported of two masks ``(H, W)``, or the mean of their outlines where they are alike.
 
     Args:
         rendered: The silhouette at the frame's pose.
         initial: The mask tracker's, or None.
         support: How far the pixels support what is rendered beside the initial mask, see `support_beside`.
+
+    Returns:
+        The mask, and where it comes from.
     """
     if initial is None:
-        return rendered
+        return rendered, MaskSource.RENDERED
     overlap = float((rendered & initial).sum()) / max(float((rendered | initial).sum()), 1.0)
     if support < _UNSUPPORTED:
-        return initial
+        return initial, MaskSource.INITIAL
     if support >= _SUPPORTED and overlap < _ALIKE:
-        return rendered
-    return _mean_outline(rendered, initial)
+        return rendered, MaskSource.RENDERED
+    return _mean_outline(rendered, initial), MaskSource.MEAN
 
 
 @torch.no_grad()

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.estimation.assessment import Assessment
-from tracking3d.estimation.estimate import FrameEstimate, Status
+from tracking3d.estimation.estimate import FrameEstimate, MaskSource, Status
 from tracking3d.estimation.online.answer_mask import answer_mask, support_beside
 from tracking3d.estimation.online.belief import Belief, View
 from tracking3d.estimation.online.pose_refinement import PoseFit, PoseWeights
@@ -29,6 +29,7 @@ def unsolved(frame: Frame, mask: NDArray[np.bool_] | None, pose: Pose) -> FrameE
         status=Status.UNCERTAIN,
         reason=WAITING,
         confidence=0.3,
+        mask_source=MaskSource.handed_back(mask),
     )
 
 
@@ -54,17 +55,19 @@ def solved(
     """
     if judgement.status is Status.LOST:
         mask = view.mask if view.mask is not None else np.zeros_like(answer.mask)
+        source = MaskSource.handed_back(view.mask)
     else:
         rendered = state.known.silhouette(fit.pose, state.camera)
         # Without texture everything beside the mask looks like the object.
         support = 0.0 if state.known.pointless else 1.0
         if not state.known.pointless and state.surface is not None and view.mask is not None:
             support = support_beside(state.surface, view, fit.pose, PoseWeights().appearance_scale)
-        mask = answer_mask(rendered, view.mask, support)
+        mask, source = answer_mask(rendered, view.mask, support)
     return replace(
         answer,
         T_cam_obj=fit.pose.matrix().numpy(),
         mask=mask,
+        mask_source=source,
         status=judgement.status,
         reason=judgement.reason,
         confidence=judgement.confidence,

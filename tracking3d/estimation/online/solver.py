@@ -7,7 +7,6 @@ is tracked against the map (`tracking`) and judged (`judgement`), and enters the
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -46,6 +45,7 @@ from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.camera import Camera, Window
 from tracking3d.geometry.pose import Pose, extrapolate, rotation_angle
 from tracking3d.rendering import BackProjection, TexelMap
+from tracking3d.stages import in_stage
 
 _SPARSE = 40  # witnesses below which the map takes a frame for the sake of new points
 _PAUSE = 3  # frames from one keyframe to the next for that sake
@@ -93,7 +93,6 @@ class OnlineSolver:
         Raises:
             InputError: If the first frame's mask is missing or empty, or the prototype cannot be used.
         """
-        started = time.perf_counter()
         binary = first_mask(frame, mask)
         ellipse = mask_ellipse(binary)
         translation = torch.tensor(first_translation(ellipse, self.camera), dtype=torch.float32)
@@ -117,16 +116,14 @@ class OnlineSolver:
         observation = replace(observation, features=space.project(observation.features))
         view = View(observation, binary, pose, FollowedPoints.none())
         known, view = with_points(known, self.camera, view, image)
-        answer = _timed(unsolved(frame, binary, pose), started)
+        answer = unsolved(frame, binary, pose)
         belief = replace(belief, known=known, space=space, followed=view.points, waiting=((view, answer),))
         return belief, answer
 
     def step(self, state: Belief, frame: Frame, mask: MaskEstimate) -> tuple[Belief, FrameEstimate]:
         """Take one more frame."""
-        started = time.perf_counter()
         advance = self._track if state.waiting is None else self._wait
-        belief, answer = advance(state, frame, grey(frame.image), _usable(mask))
-        return belief, _timed(answer, started)
+        return advance(state, frame, grey(frame.image), _usable(mask))
 
     def refine(self, state: Belief) -> Belief:
         """All keyframes together once more."""
@@ -146,11 +143,10 @@ class OnlineSolver:
         self, state: Belief, frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]
     ) -> tuple[Belief, FrameEstimate]:
         """A frame's pose once more, against the final map."""
-        started = time.perf_counter()
         binary, image, known = _usable(mask), grey(frame.image), state.known
         causal = pose_of(T_cam_obj[:3, :3], T_cam_obj[:3, 3], known.vertices)
         if state.surface is None:
-            return state, _timed(replace(unsolved(frame, binary, causal), refined=True), started)
+            return state, replace(unsolved(frame, binary, causal), refined=True)
         starts = {"causal": causal}
         followed = follow(state.grey, image, state.followed)
         own = next((view for view in known.keyframes if view.index == frame.index), None)
@@ -168,7 +164,7 @@ class OnlineSolver:
         belief = replace(belief, before=before, status=judgement.status)
         answer = unsolved(frame, binary, fit.pose)
         answer = solved(belief, answer, view, fit, won, agreed, judgement)
-        return belief, _timed(replace(answer, refined=True), started)
+        return belief, replace(answer, refined=True)
 
     def result(self, state: Belief) -> ObjectModel:
         """The object with its visible texture back-projected from the keyframes."""
@@ -199,7 +195,8 @@ class OnlineSolver:
         known, view = waiting_view(state.known, tuple(v for v, _ in state.waiting), view, image)
         answer = unsolved(frame, mask, pose)
         belief = replace(state, known=known, waiting=(*state.waiting, (view, answer)))
-        belief, start = solved_start(belief.moved(pose, frame.index, image, view.points), self.online)
+        with in_stage("map"):
+            belief, start = solved_start(belief.moved(pose, frame.index, image, view.points), self.online)
         if start is None:
             reason = belief.waits_for or answer.reason
             return belief, replace(answer, reason=reason)
@@ -209,8 +206,11 @@ class OnlineSolver:
         """Answer all waiting frames anew."""
         assert state.waiting is not None
         everything = list(range(len(start.known.keyframes)))
-        known = refined(start.known, state.camera, everything, self.online, bundle_iterations=20, rounds=3)
-        belief = replace(state, known=known, surface=known.surface(), waiting=None)
+        with in_stage("map"):
+            known = refined(
+                start.known, state.camera, everything, self.online, bundle_iterations=20, rounds=3
+            )
+            belief = replace(state, known=known, surface=known.surface(), waiting=None)
         poses = {view.index: view.pose for view in known.keyframes}
         pose, usual, revised, trail = known.keyframes[0].pose, belief.usual, [], []
         for view, earlier in state.waiting:
@@ -255,10 +255,12 @@ class OnlineSolver:
         if judgement.status is Status.TRACKED:
             belief = replace(belief, usual=state.usual.updated(fit))
         if key:
-            known, followed = with_keyframe(state.known, state.camera, view, image, self.online)
+            with in_stage("map"):
+                known, followed = with_keyframe(state.known, state.camera, view, image, self.online)
+                surface = known.surface()
             fit = replace(fit, pose=known.keyframes[-1].pose)
             belief = replace(
-                belief, known=known, surface=known.surface(), last=(fit.pose, frame.index), followed=followed
+                belief, known=known, surface=surface, last=(fit.pose, frame.index), followed=followed
             )
         if lost:
             belief = replace(belief, before=None)
@@ -348,7 +350,3 @@ def _usable(mask: MaskEstimate) -> NDArray[np.bool_] | None:
     """The binary mask; None where there is none or it is empty."""
     binary = mask.binary
     return binary if binary is not None and binary.any() else None
-
-
-def _timed(answer: FrameEstimate, started: float) -> FrameEstimate:
-    return replace(answer, seconds=time.perf_counter() - started)

@@ -7,7 +7,6 @@ default is, so that preset ``paper`` is the pure recipe.
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +17,7 @@ from tracking3d.config.models import PipelineConfig
 from tracking3d.config.solvers import PaperConfig
 from tracking3d.estimation.appearance import visible_texture
 from tracking3d.estimation.assessment import Assessment, assess
-from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
+from tracking3d.estimation.estimate import FrameEstimate, MaskSource, ObjectModel, Status
 from tracking3d.estimation.feature_space import TAU, FeatureSpace, feature_channels
 from tracking3d.estimation.framing import mask_box, projected_box
 from tracking3d.estimation.keyframes import Candidate, is_new_view, select_keyframes
@@ -35,6 +34,7 @@ from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.camera import Camera, Window
 from tracking3d.geometry.pose import Pose
 from tracking3d.rendering import BackProjection, TexelMap
+from tracking3d.stages import in_stage
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,6 @@ class PaperSolver:
         Raises:
             InputError: If the first frame's mask is missing or empty, or the prototype cannot be used.
         """
-        started = time.perf_counter()
         binary = first_mask(frame, mask)
         ellipse = mask_ellipse(binary)
         translation = torch.tensor(first_translation(ellipse, self.camera), dtype=torch.float32)
@@ -109,11 +108,10 @@ class PaperSolver:
             space = FeatureSpace.of(observation.features, observation.mask, self._channels)
             belief = replace(belief, space=space)
             observation = replace(observation, features=space.project(observation.features))
-        return self._solve(belief, frame, binary, Keyframe(observation, pose), started)
+        return self._solve(belief, frame, binary, Keyframe(observation, pose))
 
     def step(self, state: Belief, frame: Frame, mask: MaskEstimate) -> tuple[Belief, FrameEstimate]:
         """Track one more frame."""
-        started = time.perf_counter()
         binary = mask.binary
         if binary is not None and not binary.any():
             binary = None
@@ -122,7 +120,7 @@ class PaperSolver:
             candidates = candidate_poses(state, frame.index, binary)
         observation = self._observe(state, frame, binary, candidates[0])
         pose = self._best_candidate(state, observation, candidates)
-        return self._solve(state, frame, binary, Keyframe(observation, pose), started)
+        return self._solve(state, frame, binary, Keyframe(observation, pose))
 
     def result(self, state: Belief) -> ObjectModel:
         """The object with its visible texture back-projected from the keyframes (section 3.4)."""
@@ -171,7 +169,7 @@ class PaperSolver:
         return Problem(belief.shape, Batch.of([observation]), self.settings, seen, previous, belief.renderer)
 
     def _solve(
-        self, belief: Belief, frame: Frame, mask: NDArray[np.bool_] | None, current: Keyframe, started: float
+        self, belief: Belief, frame: Frame, mask: NDArray[np.bool_] | None, current: Keyframe
     ) -> tuple[Belief, FrameEstimate]:
         """Optimize, judge, choose keyframes, answer."""
         first, iterations = not belief.started, 0
@@ -183,7 +181,8 @@ class PaperSolver:
                 current = Keyframe(current.observation, optimum.parameters.poses[0])
         frames = [current]
         if optimum is None or self._needs_joint(belief, current, optimum):
-            frames, optimum = self._optimize(self._with_new_texture(belief, current), current)
+            with in_stage("map"):
+                frames, optimum = self._optimize(self._with_new_texture(belief, current), current)
             iterations += optimum.iterations
         losses = optimum.losses.of_frame(-1)
         answer = FrameEstimate(
@@ -197,34 +196,37 @@ class PaperSolver:
             confidence=0.0,
             losses=losses,
             iterations=iterations,
+            mask_source=MaskSource.handed_back(mask),
         )
         judgement = self._judge(optimum, -1, mask is not None)
         if judgement.status is Status.LOST and (optimum.reason or not first):
             # What was known before stays; only the pose goes on from where the optimization left it.
             if not optimum.reason:
                 belief = replace(belief, last=(optimum.parameters.poses[-1], frame.index), before=None)
-            return replace(belief, started=True), self._answered(answer, judgement, started)
+            return replace(belief, started=True), self._answered(answer, judgement)
         joint = len(frames) > 1 or first or not belief.keyframes
-        known = (
-            self._updated(belief, frames, optimum) if joint else belief.moved(frames[-1].pose, frame.index)
-        )
+        if joint:
+            with in_stage("map"):
+                known = self._updated(belief, frames, optimum)
+        else:
+            known = belief.moved(frames[-1].pose, frame.index)
         if judgement.status is not Status.LOST:
-            rendered, judgement = self._supported(known.silhouette(known.last[0]), mask, judgement)
-            answer = replace(answer, mask=rendered)
+            rendered, source, judgement = self._supported(known.silhouette(known.last[0]), mask, judgement)
+            answer = replace(answer, mask=rendered, mask_source=source)
         answer = replace(answer, keyframe=any(k.observation.index == frame.index for k in known.keyframes))
-        return self._with_waiting(belief, known, frames, optimum, self._answered(answer, judgement, started))
+        return self._with_waiting(belief, known, frames, optimum, self._answered(answer, judgement))
 
     def _supported(
         self, rendered: NDArray[np.bool_], initial: NDArray[np.bool_] | None, judgement: Assessment
-    ) -> tuple[NDArray[np.bool_], Assessment]:
+    ) -> tuple[NDArray[np.bool_], MaskSource, Assessment]:
         """The rendered mask, or the initial one where the two differ too much (`solver.agreement`)."""
         if initial is None:
-            return rendered, judgement
+            return rendered, MaskSource.RENDERED, judgement
         iou = float(np.sum(rendered & initial)) / max(float(np.sum(rendered | initial)), 1.0)
         if iou >= self.settings.agreement:
-            return rendered, judgement
+            return rendered, MaskSource.RENDERED, judgement
         reason = f"the rendered mask overlaps the initial one by an IoU of {iou:.2f} only, so that one is the answer"
-        return initial, replace(judgement, status=Status.UNCERTAIN, reason=reason)
+        return initial, MaskSource.INITIAL, replace(judgement, status=Status.UNCERTAIN, reason=reason)
 
     def _refine_pose(self, belief: Belief, current: Keyframe) -> Optimum:
         """The new frame's pose alone, against what is known."""
@@ -315,15 +317,16 @@ class PaperSolver:
         for position, (keyframe, earlier) in enumerate(belief.waiting):
             judgement = self._judge(optimum, position, keyframe.observation.has_mask)
             pose = optimum.parameters.poses[position]
-            answered = earlier.mask
+            answered, source = earlier.mask, earlier.mask_source
             if judgement.status is not Status.LOST:
                 rendered = known.silhouette(pose)
-                answered, judgement = self._supported(rendered, earlier.initial_mask, judgement)
+                answered, source, judgement = self._supported(rendered, earlier.initial_mask, judgement)
             revised.append(
                 replace(
                     earlier,
                     T_cam_obj=pose.matrix().numpy(),
                     mask=answered,
+                    mask_source=source,
                     status=judgement.status,
                     reason=judgement.reason,
                     confidence=judgement.confidence,
@@ -335,11 +338,10 @@ class PaperSolver:
         return replace(known, before=before, waiting=None), replace(answer, revised=tuple(revised))
 
     @staticmethod
-    def _answered(answer: FrameEstimate, judgement: Assessment, started: float) -> FrameEstimate:
+    def _answered(answer: FrameEstimate, judgement: Assessment) -> FrameEstimate:
         return replace(
             answer,
             status=judgement.status,
             reason=judgement.reason,
             confidence=judgement.confidence,
-            seconds=time.perf_counter() - started,
         )
