@@ -41,9 +41,9 @@ class Modes:
         L = sparse.csc_matrix(
             (laplacian.values().double().cpu().numpy(), (rows, columns)), shape=laplacian.shape
         )
-        bending, vectors = _lowest((L.T @ L).tocsc(), count)
-        vectors = torch.from_numpy(np.ascontiguousarray(vectors)).to(shape.rest.device)
-        return cls(vectors, torch.from_numpy(bending).to(vectors))
+        values, columns = _lowest((L.T @ L).tocsc(), count)
+        vectors = torch.from_numpy(np.ascontiguousarray(columns)).to(shape.rest.device)
+        return cls(vectors, torch.from_numpy(values).to(vectors))
 
 
 def _lowest(matrix: sparse.csc_matrix, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
