@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 from pydantic import ValidationError
 
-from tracking3d.config.loading import config_schema, list_presets, load_config
+from tracking3d.config.loading import config_schema, list_presets, load_config, ready_files
 from tracking3d.config.models import PipelineConfig
 from tracking3d.config.solvers import OnlineConfig, PaperConfig
 from tracking3d.config.yaml_files import parse_yaml
@@ -236,6 +237,65 @@ def test_bad_yaml_is_one_sentence_with_the_file_and_the_place(yaml_file, tmp_pat
     assert "mine.yaml" in str(caught.value)
     assert "\n" not in str(caught.value)
     assert not marker.exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("solver: null", "'solver' must be a mapping of settings, not null; leave it out"),
+        ("features: ~", "'features' must be a mapping of settings, not null"),
+        ("camera: null", "'camera' must be a mapping of settings, not null"),
+        ("preset: null", "'preset' must be the name of a preset"),
+        ("window: " + "{a: " * 100 + "1" + "}" * 100, "nested too deeply"),
+        ("[" * 10_000, "nested too deeply"),
+        (
+            "a: &a [x, x, x, x, x, x, x, x, x, x]\n"
+            + "".join(f"{b}: &{b} [{', '.join([f'*{a}'] * 10)}]\n" for a, b in pairwise("abcdefgh")),
+            "its aliases stand for more than 100,000 values",
+        ),
+        ("# " + "x" * 300_000, "is longer than 256 KiB"),
+        ("runtime: {seed: 18446744073709551616}", "'runtime.seed' must be less than 18446744073709551616"),
+        ("camera: {intrinsics: [1.0e+308, 1, 1, 1]}", "in pixels, which are from 1 to a million"),
+        ("camera: {intrinsics: [1.0e-300, 1, 1, 1]}", "in pixels, which are from 1 to a million"),
+        ("camera: {intrinsics: [90, 90, 1.0e+300, 1]}", "in pixels, which are from 1 to a million"),
+        ("camera: {fov: .nan}", "'camera.fov' must be a finite number"),
+    ],
+    ids=lambda value: value[:25],
+)
+def test_what_means_nothing_or_has_no_end_is_refused(yaml_file, text, sentence):
+    with pytest.raises(InputError, match=sentence):
+        load_config(yaml_file(text))
+
+
+@pytest.mark.parametrize("text", ["solver:", "preset:\nfeatures:\n  # name: rgb\n", "solver: {name: online}"])
+def test_a_section_with_nothing_behind_its_colon_changes_nothing(yaml_file, text):
+    assert load_config(yaml_file(text)) == load_config()
+    assert load_config(yaml_file("solver:\n  name: paper\n  weights:\n")).solver == PaperConfig()
+
+
+def test_nothing_is_chosen_by_an_empty_value():
+    for given in ({"overrides": ["tracker="]}, {"overrides": ["solver=null"]}, {"solver": None}):
+        with pytest.raises(InputError, match="must be a mapping of settings, not null"):
+            load_config(**given)
+    with pytest.raises(InputError, match="There is no preset ''"):
+        load_config(preset="")
+
+
+@pytest.mark.skipif(not Path("/dev/zero").exists(), reason="this system has no endless file")
+def test_an_endless_file_is_not_read_to_its_end():
+    with pytest.raises(InputError, match=r"^/dev/zero is longer than 256 KiB"):
+        load_config(Path("/dev/zero"))
+
+
+def test_ready_files_are_found_by_name_and_a_file_of_ones_own_comes_first(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert {"csrt-rgb", "flat-object", "precomputed"} == set(ready_files())
+    for name in ("flat-object", "flat-object.yaml", "configs/flat-object.yaml"):
+        assert load_config(Path(name)).object.flat
+    (tmp_path / "flat-object.yaml").write_text("object: {flat: false}")
+    assert not load_config(Path("flat-object.yaml")).object.flat
+    with pytest.raises(InputError, match=r"flat-objct does not exist .*did you mean 'flat-object'\?"):
+        load_config(Path("flat-objct"))
 
 
 def test_absent_file_and_folder_are_named(tmp_path):

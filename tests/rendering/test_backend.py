@@ -264,3 +264,16 @@ def test_both_backends_draw_the_same_closed_form_texture():
     )
     torch.testing.assert_close(numba.total, twin.total)
     torch.testing.assert_close(numba.weight, twin.weight)
+
+
+def test_kernels_that_are_not_compiled_are_not_used_and_that_is_told(monkeypatch, caplog):
+    why_no_numba.cache_clear()
+    monkeypatch.setattr("numba.config.DISABLE_JIT", 1)
+    try:
+        chosen = prepare_backend("auto", "cpu")
+        assert (chosen["backend"], "NUMBA_DISABLE_JIT is set" in str(chosen["reason"])) == ("torch", True)
+        assert "NUMBA_DISABLE_JIT is set" in caplog.text
+        with pytest.raises(ValueError, match="NUMBA_DISABLE_JIT"):
+            prepare_backend("numba", "cpu")
+    finally:
+        why_no_numba.cache_clear()

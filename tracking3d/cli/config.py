@@ -39,6 +39,31 @@ def schema(debug: Debug = False) -> None:
     typer.echo(json.dumps(config_schema(), indent=2))
 
 
+@app.command("list")
+def list_files(debug: Debug = False) -> None:
+    """List the configuration files that come with the program; `--config` takes their names."""
+    from tracking3d.config.loading import ready_files
+
+    for name, file in ready_files().items():
+        typer.echo(f"{name}: {file.read_text(encoding='utf-8').partition(chr(10))[0].lstrip('# ')}")
+
+
+@app.command()
+def path(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of one, as `config list` prints it.")],
+    debug: Debug = False,
+) -> None:
+    """Print where such a file lies, to copy or to read it."""
+    from tracking3d.config.explain import hint
+    from tracking3d.config.loading import ready_files
+    from tracking3d.errors import InputError
+
+    files = ready_files()
+    if name not in files:
+        raise InputError(f"There is no ready configuration '{name}'; {hint(name, files)}")
+    typer.echo(files[name])
+
+
 @app.command()
 def validate(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Configuration file.")], debug: Debug = False

@@ -37,7 +37,8 @@ def load_config(
     """Build the configuration of a run.
 
     Args:
-        file: A YAML file; it may choose its preset by a top-level ``preset: name``.
+        file: A YAML file, or the name of a ready one (`ready_files`); it may choose its preset by a top-level
+            ``preset: name``.
         preset: Name of a preset; wins over the file's.
         overrides: ``section.key=value`` items as ``--set`` takes them; the value is YAML.
         direct: Settings by section, such as ``camera={"fov": 60}`` or ``tracker="csrt"``; they win over all.
@@ -49,7 +50,7 @@ def load_config(
     Raises:
         InputError: A file, preset, key or value that cannot be used.
     """
-    from_file = read_mapping(Path(file), empty={}) if file is not None else {}
+    from_file = read_mapping(_located(Path(file)), empty={}) if file is not None else {}
     file_preset = from_file.pop("preset", {})
     file_preset = DEFAULT_PRESET if file_preset == {} else file_preset
     if not isinstance(file_preset, str):
@@ -77,6 +78,12 @@ def list_presets() -> list[str]:
     return sorted(Path(item.name).stem for item in folder.iterdir() if item.name.endswith(".yaml"))
 
 
+def ready_files() -> dict[str, Path]:
+    """The configuration files that come with the package, those of ``configs/``, by name."""
+    folder = Path(str(resources.files("tracking3d.config"))) / "ready_files"
+    return {file.stem: file for file in sorted(folder.glob("*.yaml"))}
+
+
 def config_schema() -> dict[str, Any]:
     """The JSON schema of a configuration file, for editors and other tools."""
     schema = PipelineConfig.model_json_schema()
@@ -93,6 +100,22 @@ def config_schema() -> dict[str, Any]:
     names = list(solver.pop("discriminator")["mapping"])
     solver["anyOf"] = [{"type": "string", "enum": names}, *solvers]
     return schema
+
+
+def _located(file: Path) -> Path:
+    """The file itself; where there is none, the ready one that is called so, with or without ``configs/``.
+
+    Raises:
+        InputError: If there is neither.
+    """
+    if file.exists():
+        return file
+    ready = ready_files()
+    if file.parent in (Path(), Path("configs")) and file.suffix in ("", ".yaml") and file.stem in ready:
+        return ready[file.stem]
+    raise InputError(
+        f"The configuration file {file} does not exist (ready ones: {', '.join(ready)}); {hint(file.stem, ready)}"
+    )
 
 
 def _preset_layer(name: str) -> Layer:

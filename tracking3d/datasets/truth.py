@@ -21,6 +21,7 @@ from tracking3d.errors import InputError
 from tracking3d.frames import Box
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.gltf_axes import read_mesh_file
+from tracking3d.geometry.mesh_checks import what_is_wrong
 from tracking3d.results.files import read_mask
 
 
@@ -113,8 +114,8 @@ class MeshFile:
             raise InputError(
                 f"The mesh {self.path} cannot be read ({error}); restore or remove it."
             ) from error
-        if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-            raise InputError(f"The mesh {self.path} has no faces; restore or remove it.")
+        if wrong := what_is_wrong(mesh):
+            raise InputError(f"The mesh {self.path} {wrong}; restore or remove it.")
         return mesh.apply_scale(self.scale)
 
 

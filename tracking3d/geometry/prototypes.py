@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from tracking3d.errors import InputError
 from tracking3d.geometry.gltf_axes import read_mesh_file
 from tracking3d.geometry.mesh import Mesh
+from tracking3d.geometry.mesh_checks import what_is_wrong
 
 LONGEST_EDGE = 0.25
 """A user's mesh is refined until its edges are shorter than this, in units of its radius."""
@@ -95,10 +96,8 @@ def from_file(path: Path) -> Mesh:
     except Exception as error:  # trimesh raises whatever its loaders raise
         reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"the prototype '{path}' cannot be read as a mesh ({reason}): {advice}") from error
-    if not isinstance(loaded, trimesh.Trimesh) or len(loaded.faces) == 0:
-        raise InputError(f"the prototype '{path}' holds no triangles: {advice}")
-    if not np.isfinite(loaded.vertices).all():
-        raise InputError(f"the prototype '{path}' has vertices that are not finite: {advice}")
+    if wrong := what_is_wrong(loaded):
+        raise InputError(f"the prototype '{path}' {wrong}: {advice}")
     # Duplicated vertices at texture seams would tear when the shape deforms.
     solid = trimesh.Trimesh(loaded.vertices, loaded.faces, process=False)
     solid.merge_vertices(merge_tex=True, merge_norm=True)

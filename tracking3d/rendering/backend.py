@@ -88,6 +88,6 @@ def why_no_numba() -> str:
         import numba
     except Exception as error:  # an installation that does not fit fails in many ways
         return f"numba cannot be imported ({type(error).__name__}: {error})"
-    if numba.config.DISABLE_JIT:
+    if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
         return "NUMBA_DISABLE_JIT is set, and without being compiled the kernels take hours"
     return ""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tracking3d.errors import InputError
 from tracking3d.geometry.gltf_axes import read_mesh_file
+from tracking3d.geometry.mesh_checks import what_is_wrong
 from tracking3d.synthesis.procedural_texture import plain_colour
 from tracking3d.synthesis.solid import Solid
 from tracking3d.synthesis.spec import SequenceSpec
@@ -32,11 +33,9 @@ def load_solid(path: Path, spec: SequenceSpec) -> Solid:
     except Exception as error:  # trimesh raises whatever its loaders raise
         reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"The mesh '{path}' cannot be read ({reason}); {_ADVICE}.") from error
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise InputError(f"The mesh '{path}' holds no triangles; {_ADVICE}.")
+    if wrong := what_is_wrong(mesh):
+        raise InputError(f"The mesh '{path}' {wrong}; {_ADVICE}.")
     vertices = np.asarray(mesh.vertices, np.float64)
-    if not np.isfinite(vertices).all() or np.ptp(vertices, axis=0).max() <= 0:
-        raise InputError(f"The mesh '{path}' has vertices that are not finite or all one point; repair it.")
     centre = 0.5 * (vertices.min(0) + vertices.max(0))
     texture, uvs = _texture(mesh) if spec.textured else (None, None)
     colours = None

@@ -1,0 +1,95 @@
+"""However a command ends, it says why in a sentence: no place to print, nobody who reads, little memory."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tracking3d.cli import program
+
+PYTHON = [sys.executable, "-m", "tracking3d"]
+
+
+def test_the_package_is_a_program():
+    done = subprocess.run([*PYTHON, "--version"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "") and done.stdout.startswith("tracking3d ")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no full device")
+def test_a_full_device_is_told():
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run([*PYTHON, "config", "schema"], stdout=full, stderr=-1, text=True, check=False)
+    assert done.returncode == 2
+    [line] = done.stderr.splitlines()
+    assert line.startswith("error: what is printed cannot be written (No space left on device)")
+
+
+def test_a_closed_pipe_ends_in_silence():
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run([*PYTHON, "config", "schema"], stdout=writer, stderr=-1, check=False)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (program.UNREAD, b"")
+
+
+def test_letters_that_a_terminal_has_not_are_no_fault(tmp_path):
+    file = tmp_path / "ünïcode.yaml"
+    file.write_text("preset: default")
+    plain = {"LC_ALL": "C", "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    for name, code in ((file, 0), (file.with_name("äbsent.yaml"), 2)):
+        done = subprocess.run(
+            [*PYTHON, "config", "validate", name],
+            env={**os.environ, **plain},
+            capture_output=True,
+            check=False,
+        )
+        assert done.returncode == code
+        assert b"Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        RuntimeError(
+            "[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 bytes."
+        ),
+        RuntimeError("CUDA out of memory. Tried to allocate 2.00 GiB"),
+        RuntimeError("can't start new thread"),
+        OSError(12, "Cannot allocate memory"),
+    ],
+    ids=repr,
+)
+def test_little_memory_is_told_with_what_to_lower(call, clip, script, error):
+    script.faults[2] = error
+    result = call("run", clip, "--box", "20,10,20,20", "--out", "run")
+    assert result.exit_code == 2
+    first, kept = result.stderr.splitlines()[-2:]
+    assert first.startswith("error: there is not enough memory; lower --size (window.size)")
+    assert kept == "What was finished until then is kept in run."
+    assert len(Path("run/frames.jsonl").read_text().splitlines()) == 2
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [(["--out", ""], "--out"), (["--preset="], "--preset"), (["--intrinsics", ""], "--intrinsics")],
+)
+def test_an_empty_option_is_refused_by_its_name(refused, clip, options, name):
+    assert f"{name} is empty; give it a value or leave it out." in refused("run", clip, *options)
+
+
+def test_an_empty_source_is_refused(refused):
+    assert "an argument is empty" in refused("run", "")
+
+
+@pytest.mark.parametrize("name", ["list", "path"])
+def test_ready_configurations_are_named_and_found(call, refused, name):
+    if name == "list":
+        assert "flat-object: A card, a book cover" in call("config", "list").stdout
+    else:
+        assert Path(call("config", "path", "flat-object").stdout.strip()).is_file()
+        assert "did you mean 'flat-object'?" in refused("config", "path", "flat-objct")

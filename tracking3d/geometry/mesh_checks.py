@@ -1,0 +1,35 @@
+"""What a mesh that somebody made has to be before anything is computed with it."""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+
+FARTHEST = 1e9
+"""No vertex lies farther out, in whatever unit; beyond, squares and products of coordinates lose all digits."""
+SMALLEST = 1e-9
+"""No mesh is smaller."""
+MOST_FACES = 5_000_000
+"""And none has more faces."""
+
+
+def what_is_wrong(mesh: object) -> str:
+    """Why a mesh that was read cannot be used, as the end of a sentence that begins with it; empty if it can.
+
+    Args:
+        mesh: What trimesh made of a file.
+    """
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces) or not len(mesh.vertices):
+        return "holds no triangles"
+    if not np.isfinite(mesh.vertices).all():
+        return "has vertices that are not finite"
+    farthest = float(np.abs(mesh.vertices).max())
+    if farthest > FARTHEST:
+        return f"has a vertex at {farthest:.3g}, which is too far out for any object"
+    if np.ptp(mesh.vertices, axis=0).max() < SMALLEST:
+        return "has all its vertices at one point"
+    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
+        return f"has faces of vertices that it has not ({mesh.faces.max() + 1} of {len(mesh.vertices)})"
+    if len(mesh.faces) > MOST_FACES:
+        return f"has {len(mesh.faces):,} faces, and more than {MOST_FACES:,} are too many; simplify it"
+    return ""
