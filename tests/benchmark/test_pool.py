@@ -83,7 +83,7 @@ def test_a_sequence_that_cannot_be_read_is_an_outcome(jobs, scripted):
 def test_equal_jobs_are_done_once(jobs, scripted, monkeypatch):
     done = []
 
-    def call(command, log, stop) -> int:
+    def call(command, *others) -> int:
         """Here instead of in a process of its own."""
         done.append(Job.read(Path(command[-1])))
         job_module.run_job(done[-1])
