@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from pathlib import Path
 
 import pytest
 
 from tracking3d.benchmark import job as job_module
+from tracking3d.benchmark import pool
 from tracking3d.benchmark.job import Job
 from tracking3d.benchmark.pool import run_jobs
 
@@ -78,10 +80,20 @@ def test_a_sequence_that_cannot_be_read_is_an_outcome(jobs, scripted):
     assert outcome.scores is None and "absent" in outcome.error
 
 
-def test_equal_jobs_are_done_once(jobs, scripted):
+def test_equal_jobs_are_done_once(jobs, scripted, monkeypatch):
+    done = []
+
+    def call(command, *others) -> int:
+        """Here instead of in a process of its own."""
+        done.append(Job.read(Path(command[-1])))
+        job_module.run_job(done[-1])
+        return 0
+
+    monkeypatch.setattr(pool, "_call", call)
     first, second = run_jobs(jobs(scripted(), ["narrow"]) + jobs(scripted("another label"), ["narrow"]), 2)
     assert sorted([first.cached, second.cached]) == [False, True]
     assert first.scores == second.scores
+    assert len(done) == 1
 
 
 def test_what_a_result_depends_on_is_in_its_key(jobs, scripted, clips, tmp_path, monkeypatch):

@@ -49,6 +49,12 @@ def quick(request) -> PipelineConfig:
     return load_config(preset=request.param, overrides=QUICK_PRESETS[request.param])
 
 
+@pytest.fixture(scope="module")
+def boxed(clip, quick) -> list[FrameEstimate]:
+    """The answers for all frames, from a box."""
+    return list(track(clip.images, box=clip.box, config=quick))
+
+
 def masks_of(answers: list[FrameEstimate]) -> list[np.ndarray]:
     return [answer.mask for answer in answers]
 
@@ -56,8 +62,8 @@ def masks_of(answers: list[FrameEstimate]) -> list[np.ndarray]:
 # Frames
 
 
-def test_plain_arrays_with_a_box(clip, quick):
-    answers = list(track(clip.images, box=clip.box, config=quick))
+def test_plain_arrays_with_a_box(clip, boxed):
+    answers = boxed
     assert [answer.index for answer in answers] == [0, 1, 2, 3]
     assert all(isinstance(answer, FrameEstimate) for answer in answers)
     assert all(answer.mask.shape == (64, 80) for answer in answers)
@@ -122,7 +128,7 @@ def test_no_frames_no_answers(quick):
     assert list(track([], box=(0, 0, 4, 4), config=quick)) == []
 
 
-def test_a_caller_may_decode_every_frame_into_one_buffer(clip, quick):
+def test_a_caller_may_decode_every_frame_into_one_buffer(clip, quick, boxed):
     buffer = np.empty_like(clip.images[0])
 
     def camera():
@@ -131,15 +137,14 @@ def test_a_caller_may_decode_every_frame_into_one_buffer(clip, quick):
             yield buffer
 
     reused = masks_of(list(track(camera(), box=clip.box, config=quick)))
-    fresh = masks_of(list(track(clip.images, box=clip.box, config=quick)))
-    assert all(np.array_equal(a, b) for a, b in zip(reused, fresh, strict=True))
+    assert all(np.array_equal(a, b) for a, b in zip(reused, masks_of(boxed), strict=True))
 
 
-def test_images_may_be_read_only_or_views(clip, quick):
+def test_images_may_be_read_only_or_views(clip, quick, boxed):
     images = clip.images[:2].copy()
     images.flags.writeable = False
     blue_first = images[..., ::-1].copy()
-    expected = masks_of(list(track(clip.images[:2], box=clip.box, config=quick)))
+    expected = masks_of(boxed[:2])
     for frames in (images, blue_first[..., ::-1]):
         assert np.array_equal(masks_of(list(track(frames, box=clip.box, config=quick))), expected)
 
@@ -337,9 +342,9 @@ def test_the_number_of_threads_is_that_of_the_configuration(clip, quick):
     assert torch.get_num_threads() == quick.runtime.threads == 1
 
 
-def test_the_same_seed_gives_the_same_answers(clip, quick):
-    once, again = (list(track(clip.images, box=clip.box, config=quick)) for _ in range(2))
-    for a, b in zip(once, again, strict=True):
+def test_the_same_seed_gives_the_same_answers(clip, quick, boxed):
+    again = track(clip.images, box=clip.box, config=quick)
+    for a, b in zip(boxed, again, strict=True):
         assert np.array_equal(a.T_cam_obj, b.T_cam_obj)
         assert np.array_equal(a.mask, b.mask)
 

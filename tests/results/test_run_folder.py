@@ -6,7 +6,6 @@ import dataclasses
 import json
 import math
 import os
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -215,10 +214,18 @@ def die(*_):
 
 clip = turning_sphere_of(6)
 about = {"config": {}, "camera": clip.camera, "source": "clip", "seed": 0, "fps": None, "command": None}
-writer = run_writer.RunWriter(Path(sys.argv[1]), **about)
+where = None
+for name in sys.argv[3:]:  # every run has a process of its own, and only this one starts from nothing
+    if child := os.fork():
+        assert os.WTERMSIG(os.waitpid(child, 0)[1]) == signal.SIGKILL
+    else:
+        where = name
+        break
+if where is None:
+    sys.exit(0)
+writer = run_writer.RunWriter(Path(sys.argv[1]) / where, **about)
 for frame, estimate in zip(clip.frames[:4], clip.estimates[:4]):
     writer.write(estimate, frame)
-where = sys.argv[3]
 if where == "masks":  # the fifth frame's masks are there, its line is not
     writer._append = die
 elif where == "line":  # half of its line is there
@@ -233,17 +240,24 @@ writer.write(clip.estimates[4], clip.frames[4])
 """
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL is POSIX")
-@pytest.mark.parametrize(("where", "kept"), [("masks", 4), ("line", 4), ("overlay", 5), ("finish", 4)])
-def test_a_killed_run_loses_at_most_the_current_frame(tmp_path, turning_sphere, where, kept, start_run):
-    folder = tmp_path / "run"
+KEPT = {"masks": 4, "line": 4, "overlay": 5, "finish": 4}
+"""Where a run is killed within its fifth frame, and how many frames it keeps."""
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory) -> Path:
+    """A folder of runs by where each was killed."""
+    folder = tmp_path_factory.mktemp("killed")
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    code = subprocess.run(
-        [sys.executable, "-c", KILLED, str(folder), str(Path(__file__).parent), where],
-        env=environment,
-        check=False,
-    ).returncode
-    assert code == -signal.SIGKILL
+    arguments = [str(folder), str(Path(__file__).parent), *KEPT]
+    subprocess.run([sys.executable, "-c", KILLED, *arguments], env=environment, check=True)
+    return folder
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL is POSIX")
+@pytest.mark.parametrize(("where", "kept"), KEPT.items())
+def test_a_killed_run_loses_at_most_the_current_frame(killed, turning_sphere, where, kept, start_run):
+    folder = killed / where
     run = RunReader(folder)
     assert run.state == "interrupted"
     assert [record.index for record in run.frames] == list(range(kept))

@@ -239,7 +239,7 @@ def test_an_empty_list_of_landmarks_is_none():
 
 # Brute force: one coordinate of one vertex after another, in float64.
 
-EXACT = shape_of(frequency=3)
+EXACT = shape_of(frequency=2)
 VERTICES = EXACT.rest.double()
 
 
