@@ -580,7 +580,7 @@ def test_a_run_of_other_frames_is_refused_with_what_to_do(write_run, clip):
     run = shifted_run(write_run, 8, selection="8:18")
     with pytest.raises(
         InputError,
-        match="has only 2 frames of the clip clip: its 10 frames are 8 to 17, .* 0 to 9; .*--offset",
+        match=r"has only 2 frames of the clip clip: its 10 frames are 8 to 17, .* 0 to 9; .*--offset",
     ):
         score_run(run, clip)
 
