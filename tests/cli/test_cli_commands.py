@@ -172,6 +172,9 @@ def test_evaluate_prints_a_table_or_json_only(call, finished, truth):
     result = call("evaluate", finished, "--truth", truth)
     assert result.exit_code == 0
     assert "IoU" in result.stdout
+    assert "5 of 5 answered frames match frames of the clip, 0 to 4 of its 5." in result.stderr
+    shifted = call("evaluate", finished, "--truth", truth, "--offset", 1)
+    assert "4 of 5 answered frames match frames of the clip, 1 to 4 of its 5." in shifted.stderr
 
 
 def test_evaluate_names_the_folder_that_is_none(refused, finished, truth):

@@ -12,12 +12,12 @@ import pytest
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
-from tracking3d.datasets.clip import write_clip
-from tracking3d.datasets.run_answers import is_refined
+from tracking3d.datasets.clip import read_truth, write_clip
+from tracking3d.datasets.run_answers import answers_of_run, is_refined
 from tracking3d.errors import InputError
 from tracking3d.evaluation.mask_scores import MaskScores
 from tracking3d.evaluation.pose_scores import PoseScores
-from tracking3d.evaluation.score import Scores, score_run
+from tracking3d.evaluation.score import Scores, score, score_run
 from tracking3d.evaluation.score_table import format_scores
 from tracking3d.geometry.camera import Camera
 
@@ -77,6 +77,7 @@ def line(index, T, **changes):
         "iou_initial": None,
         "area": 100,
         "revision": False,
+        "mask_source": "rendered",
     }
     return json.dumps(fields | changes) + "\n"
 
@@ -446,7 +447,7 @@ def test_a_mask_that_is_missing_from_the_run_is_named(write_run, clip):
 
 @pytest.mark.parametrize("selection", ["5:2", "all", 7])
 def test_a_selection_that_makes_no_sense_is_named(write_run, clip, selection):
-    with pytest.raises(InputError, match="Frames"):
+    with pytest.raises(InputError, match=r"Frames|run\.json is damaged: selection is 7"):
         score_run(write_run(selection=selection), clip)
 
 
@@ -468,7 +469,9 @@ def test_a_real_clip_scores_its_own_truth_perfectly(write_run, shared_data, tmp_
     wanted = range(0, 164, 20)
     poses = {n: truth.T_cam_obj.get(n, np.full((4, 4), np.nan)) for n in wanted}
     masks = {n: truth.masks[n].read() for n in wanted if n in truth.masks}
-    run = write_run(wanted, poses, masks=masks, initial=masks, selection="0:164:20")
+    run = write_run(
+        wanted, poses, masks=masks, initial=masks, selection="0:164:20", camera=asdict(truth.camera)
+    )
     scores = score_run(run, shared_data / "cube_in_hand")
     assert scores.iou_mean == scores.iou_initial_mean == 1.0
     assert scores.rotation_error_max_deg == pytest.approx(0, abs=1e-6)
@@ -558,3 +561,90 @@ def test_a_pose_of_neither_rotation_nor_translation_is_refused(write_run, clip):
     edit_poses(clip, lambda entry: (entry.pop("R"), entry.pop("t")))
     with pytest.raises(InputError, match=r"poses\.json: frame 000000 needs R"):
         score_run(write_run(), clip)
+
+
+def shifted_run(write_run, by, count=FRAMES, **description):
+    """A perfect run whose frames are counted from ``by``."""
+    run = write_run(range(count), **description)
+    lines = [json.loads(text) for text in (run / "frames.jsonl").read_text().splitlines()]
+    (run / "frames.jsonl").write_text(
+        "".join(json.dumps(one | {"index": one["index"] + by}) + "\n" for one in lines)
+    )
+    for folder in ("masks", "initial_masks"):
+        for file in sorted((run / folder).iterdir(), reverse=True):
+            file.rename(file.with_name(f"{int(file.stem) + by:06d}.png"))
+    return run
+
+
+def test_a_run_of_other_frames_is_refused_with_what_to_do(write_run, clip):
+    run = shifted_run(write_run, 8, selection="8:18")
+    with pytest.raises(
+        InputError,
+        match=r"has only 2 frames of the clip clip: its 10 frames are 8 to 17, .* 0 to 9; .*--offset",
+    ):
+        score_run(run, clip)
+
+
+def test_a_run_that_shares_no_frame_is_refused(write_run, clip):
+    with pytest.raises(InputError, match="has no frame of the clip clip: its 10 frames are 150 to 159"):
+        score_run(shifted_run(write_run, 150, selection="150:160"), clip)
+
+
+@pytest.mark.parametrize("by", [8, 150])
+def test_an_offset_says_which_frame_is_which(write_run, clip, by):
+    run = shifted_run(write_run, by, selection=f"{by}:{by + FRAMES}")
+    truth = read_truth(clip)
+    answers = answers_of_run(run, truth, offset=-by)
+    assert answers.asked == range(FRAMES)
+    assert (
+        answers.matched(len(truth.frames))
+        == "10 of 10 answered frames match frames of the clip, 0 to 9 of its 10"
+    )
+    scores = score(answers, truth)
+    assert (scores.frames_missing, scores.iou_mean) == (0, 1.0)
+    assert scores.iou_initial_mean == pytest.approx(8 / 12)
+    assert scores.rotation_error_max_deg == pytest.approx(0, abs=1e-6)
+
+
+def test_frames_that_an_offset_moves_out_of_the_clip_are_not_asked_for(write_run, clip):
+    answers = answers_of_run(write_run(range(0, 10, 2), selection="0:10:2"), read_truth(clip), offset=-3)
+    assert list(answers.asked) == [1, 3, 5]
+    assert sorted(answers.answered) == [1, 3, 5]
+
+
+def test_a_run_of_frames_of_another_size_is_refused(write_run, clip):
+    camera = asdict(CAMERA) | {"width": 640, "height": 480}
+    with pytest.raises(InputError, match="frames of 640 x 480 pixels and the clip clip of 60 x 40"):
+        score_run(write_run(camera=camera), clip)
+
+
+def test_an_interrupted_run_is_scored_though_it_has_few_frames_of_the_clip(write_run, clip):
+    assert score_run(write_run(range(2)), clip).frames_missing == 8
+
+
+def test_the_share_of_answers_of_its_own_is_told_beside_the_iou(write_run, clip):
+    sources = {
+        n: {"mask_source": "initial" if n < 7 else "mean" if n < 9 else "rendered"} for n in range(FRAMES)
+    }
+    scores = score_run(write_run(changes=sources), clip)
+    assert scores.share_own_masks == pytest.approx(3 / 9)  # the given frame does not count
+    assert "not the initial mask" in text_of(scores)
+
+
+def test_whose_masks_they_are_is_unknown_in_runs_of_older_versions(write_run, clip):
+    older = {n: {"mask_source": None} for n in range(FRAMES)}
+    assert score_run(write_run(changes=older), clip).share_own_masks is None
+
+
+def test_stages_are_means_and_come_after_the_whole(write_run, clip):
+    stages = {"decode": 0.1, "track": 0.2, "encode": 0.05, "solve": 0.1, "map": 0.0, "write": 0.05}
+    scores = score_run(write_run(changes={n: {"stages": stages} for n in range(FRAMES)}), clip)
+    assert {stage: getattr(scores, f"seconds_{stage}") for stage in stages} == pytest.approx(stages)
+    text = text_of(scores)
+    assert text.index("seconds a frame, mean") < text.index("of it decode") < text.index("of it write")
+
+
+def text_of(scores):
+    console = Console(file=io.StringIO(), width=200)
+    console.print(format_scores(scores))
+    return console.file.getvalue()

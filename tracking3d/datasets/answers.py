@@ -31,6 +31,7 @@ class Answers:
         origin: The folder or file they come from, for messages.
         asked: Indices of the frames that the method was asked for; those it has no answer for count as wrong.
         answered: Indices of the frames with any answer.
+        held: How many frames the method answered, in the clip or not, where known.
         given: Index of the frame whose mask or box the method was given; it is not scored as a mask.
         masks: By frame index.
         initial_masks: What the mask tracker gave, by frame index.
@@ -49,6 +50,7 @@ class Answers:
     origin: Path
     asked: range
     answered: frozenset[int]
+    held: int | None = None
     given: int | None = None
     masks: Mapping[int, MaskReference] | None = None
     initial_masks: Mapping[int, MaskReference] | None = None
@@ -62,3 +64,15 @@ class Answers:
     memory_growth_mb: float | None = None
     mesh: Callable[[], trimesh.Trimesh] | None = None
     points: PointTracker | None = None
+
+    def matched(self, frames: int) -> str:
+        """Which frames are scored, in words.
+
+        Args:
+            frames: How many the clip has.
+        """
+        answered = sorted(self.answered)
+        count = len(answered) if self.held is None else f"{len(answered)} of {self.held}"
+        spread = f", {answered[0]} to {answered[-1]}" if answered else ""
+        asked = f"; asked for were {len(self.asked)}" if len(self.asked) != len(answered) else ""
+        return f"{count} answered frames match frames of the clip{spread} of its {frames}{asked}"

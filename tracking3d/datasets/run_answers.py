@@ -22,8 +22,11 @@ from tracking3d.results.run_reader import RunReader
 from tracking3d.stages import StageTimes
 from tracking3d.video.selection import parse_selection, within
 
+LEAST_SHARED = 0.5
+"""Share of a run's frames that the clip must hold: with fewer, the indices that both have are so by chance."""
 
-def answers_of_run(folder: Path, truth: Truth, *, refined: bool = True) -> Answers:
+
+def answers_of_run(folder: Path, truth: Truth, *, refined: bool = True, offset: int = 0) -> Answers:
     """What a run answered for the clip that ``truth`` is about.
 
     A run's frame index is the position of the frame in the clip. If ``run.json`` holds a ``selection``
@@ -34,27 +37,26 @@ def answers_of_run(folder: Path, truth: Truth, *, refined: bool = True) -> Answe
         truth: The clip.
         refined: Take the answers of the final refinement where there are any, else the causal ones everywhere. A
             refined answer took the time of the causal one and an equal share of the refinement's.
+        offset: Frame ``i`` of the run is frame ``i + offset`` of the clip.
 
     Raises:
-        InputError: If it is not a run folder, or one without any frame of the clip.
+        InputError: If it is not a run folder, or one of something else than the clip: without any frame of it, with
+            few, or of another size.
     """
     run = RunReader(folder, refined)
-    selection = run.description.get("selection")
-    asked = within(parse_selection(selection and str(selection)), len(truth.frames))
-    records = {record.index: record for record in run.frames if record.index in asked}
-    if not records:
-        raise InputError(
-            f"The run {folder} has no frame of the clip {truth.name}; give the clip that this run was made on."
-        )
+    asked = _shifted(parse_selection(run.description.get("selection")), offset, len(truth.frames))
+    records = {record.index + offset: record for record in run.frames if record.index + offset in asked}
+    _check_shared(run, records, truth, offset)
     memory = run.description.get("peak_memory_mb")
     seconds, stages = _times(run, records)
     return Answers(
         origin=folder,
         asked=asked,
         answered=frozenset(records),
+        held=len(run.frames),
         given=min(records),
-        masks={index: MaskFile(run.mask_path(index)) for index in records},
-        initial_masks=_initial_masks(folder, list(records)),
+        masks={index: MaskFile(run.mask_path(one.index)) for index, one in records.items()},
+        initial_masks=_initial_masks(folder, records),
         T_cam_obj={index: one.T_cam_obj for index, one in records.items() if is_rigid(one.T_cam_obj)},
         lost=frozenset(index for index, one in records.items() if one.status is Status.LOST),
         confidence={index: one.confidence for index, one in records.items() if math.isfinite(one.confidence)},
@@ -63,8 +65,41 @@ def answers_of_run(folder: Path, truth: Truth, *, refined: bool = True) -> Answe
         mask_sources={n: one.mask_source for n, one in records.items() if one.mask_source is not None},
         peak_memory_mb=memory if isinstance(memory, int | float) else None,
         mesh=run.mesh if (run.mesh_folder / layout.OBJ).is_file() else None,
-        points=_RunPoints(run, len(truth.frames)) if (run.mesh_folder / layout.OBJ).is_file() else None,
+        points=_RunPoints(run, len(truth.frames), offset)
+        if (run.mesh_folder / layout.OBJ).is_file()
+        else None,
     )
+
+
+def _shifted(selection: range, offset: int, count: int) -> range:
+    """The frames of a clip of ``count`` frames that a selection of the run's means."""
+    start = selection.start + offset
+    if start < 0:
+        start %= selection.step
+    return within(range(start, max(selection.stop + offset, start), selection.step), count)
+
+
+def _check_shared(run: RunReader, records: Mapping[int, FrameRecord], truth: Truth, offset: int) -> None:
+    """Make sure that run and clip are of one video, as far as that shows."""
+    camera, what = run.camera, f"The run {run.folder}"
+    advice = "give the clip that it was made on, or with --offset N say that its frame i is frame i + N of the clip"
+    if truth.camera is not None and (camera.width, camera.height) != (
+        truth.camera.width,
+        truth.camera.height,
+    ):
+        raise InputError(
+            f"{what} is of frames of {camera.width} x {camera.height} pixels and the clip {truth.name} of "
+            f"{truth.camera.width} x {truth.camera.height}; give the clip that it was made on."
+        )
+    if not run.frames:
+        raise InputError(f"{what} has no frame of the clip {truth.name}: it has none at all; track again.")
+    if len(records) < LEAST_SHARED * len(run.frames):
+        first, last = run.frames[0].index + offset, run.frames[-1].index + offset
+        shared = f"only {len(records)} frames" if records else "no frame"
+        raise InputError(
+            f"{what} has {shared} of the clip {truth.name}: its {len(run.frames)} frames are {first} to {last}, the "
+            f"clip's 0 to {len(truth.frames) - 1}; {advice}."
+        )
 
 
 def is_refined(folder: Path) -> bool:
@@ -90,7 +125,7 @@ def _times(
         again = None if of_all is None else of_all * (1 / every)
         total = again.whole * every if again else told.get("seconds")
         for index in refined:
-            before = causal.get(index)
+            before = causal.get(records[index].index)
             share = total / every if isinstance(total, int | float) else spent[index]
             spent[index] = (before.seconds if before else 0.0) + share
             of_causal = before.stages if before else None
@@ -101,8 +136,8 @@ def _times(
     )
 
 
-def _initial_masks(folder: Path, indices: list[int]) -> dict[int, MaskReference]:
-    files = {index: layout.initial_mask_path(folder, index) for index in indices}
+def _initial_masks(folder: Path, records: Mapping[int, FrameRecord]) -> dict[int, MaskReference]:
+    files = {index: layout.initial_mask_path(folder, one.index) for index, one in records.items()}
     return {index: MaskFile(file) for index, file in files.items() if file.is_file()}
 
 
@@ -112,16 +147,19 @@ class _RunPoints:
 
     run: RunReader
     frames: int
+    offset: int = 0
 
     def __call__(self, frame: int, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         count = len(np.asarray(points))
         positions = np.full((self.frames, count, 2), np.nan)
         visible = np.zeros((self.frames, count), bool)
-        record = next((one for one in self.run.frames if one.index == frame), None)
+        own = frame - self.offset
+        record = next((one for one in self.run.frames if one.index == own), None)
         if record is None or record.status is Status.LOST or not is_rigid(record.T_cam_obj):
             return positions, visible  # where the object was not found, its points were not either
-        tracks = track_points(self.run, frame, points)
-        inside = tracks.frames < self.frames
-        positions[tracks.frames[inside]] = tracks.positions[inside]
-        visible[tracks.frames[inside]] = tracks.visible[inside]
+        tracks = track_points(self.run, own, points)
+        frames = tracks.frames + self.offset
+        inside = (frames >= 0) & (frames < self.frames)
+        positions[frames[inside]] = tracks.positions[inside]
+        visible[frames[inside]] = tracks.visible[inside]
         return positions, visible

@@ -16,7 +16,13 @@ RUN_FOLDER = "run"
 
 
 def open_answers(
-    path: Path, truth: Truth, form: str | None = None, *, refined: bool = True, **options: Any
+    path: Path,
+    truth: Truth,
+    form: str | None = None,
+    *,
+    refined: bool = True,
+    offset: int = 0,
+    **options: Any,
 ) -> tuple[Answers, str]:
     """Read answers for the clip that ``truth`` is about.
 
@@ -25,6 +31,7 @@ def open_answers(
         truth: The clip.
         form: ``run`` or a format of `read_answers`; recognised if None.
         refined: Of a run folder: take the answers of the final refinement where there are any, else the causal ones.
+        offset: Of a run folder: its frame ``i`` is frame ``i + offset`` of the clip.
         options: Of that format, such as ``of`` of a trajectory; a run folder has none.
 
     Returns:
@@ -40,7 +47,9 @@ def open_answers(
             raise InputError(
                 f"{path} is a run folder, which has no option {next(iter(options))}; leave it out."
             )
-        return answers_of_run(path, truth, refined=refined), "a run folder"
+        return answers_of_run(path, truth, refined=refined, offset=offset), "a run folder"
     if not refined:
         raise InputError(f"{path} is no run folder, so it has no causal answers; leave --answers out.")
+    if offset:
+        raise InputError(f"{path} is no run folder, whose frames --offset shifts; leave it out.")
     return read_answers(path, truth, form, **options)

@@ -42,6 +42,14 @@ def score_answers(
         Answers,
         typer.Option(help="Of a run with a final refinement: score its final answers, or the causal ones."),
     ] = Answers.final,
+    offset: Annotated[
+        int,
+        typer.Option(
+            metavar="N",
+            help="Of a run: its frame i is frame i + N of the clip; default 0.",
+            show_default=False,
+        ),
+    ] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON only.")] = False,
     debug: Debug = False,
 ) -> None:
@@ -57,9 +65,11 @@ def score_answers(
 
     known = read_truth(truth)
     refined = answers is Answers.final
-    given, kind = open_answers(results, known, form, refined=refined, **_read_options(options))
+    given, kind = open_answers(results, known, form, refined=refined, offset=offset, **_read_options(options))
     if form is None and not as_json:
         typer.echo(f"{results} is read as {kind}.", err=True)
+    if not as_json:
+        typer.echo(f"{given.matched(len(known.frames))}.", err=True)
     scores = score(given, known)
     if as_json:
         typer.echo(json.dumps(asdict(scores), indent=2))

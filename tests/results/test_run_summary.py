@@ -1,0 +1,112 @@
+"""What a run says of itself at its end: whose masks they are, where the time went, what was assumed or never seen."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from tracking3d.cli.progress import print_summary
+from tracking3d.estimation.estimate import MaskSource
+from tracking3d.results.contact_sheet import CROPS, TILE
+from tracking3d.results.notes import notes_of, unseen_share
+from tracking3d.stages import STAGES, StageTimes
+from tracking3d.video.image_file import read_image
+
+TIMES = StageTimes(0.1, 0.2, 0.05, 0.3, 0.15, 0.0)
+
+
+@pytest.fixture
+def summary(tmp_path, turning_sphere, write_run, capsys):
+    """Writes a run with the given sources of its masks; gives the printed rows and the contact sheet."""
+
+    def write(sources, camera=turning_sphere.camera):
+        estimates = [
+            dataclasses.replace(
+                one,
+                mask_source=source,
+                mask=one.initial_mask if source is MaskSource.INITIAL else one.mask,
+                stages=TIMES,
+                seconds=TIMES.whole,
+            )
+            for one, source in zip(turning_sphere.estimates, sources, strict=True)
+        ]
+        clip = dataclasses.replace(turning_sphere, estimates=estimates, camera=camera)
+        write_run(tmp_path / "run", clip)
+        print_summary(tmp_path / "run")
+        lines = [line.split("│")[1:3] for line in capsys.readouterr().out.splitlines() if "│" in line]
+        rows = [(name.strip(), value.strip()) for name, value in lines]
+        return rows, read_image(tmp_path / "run" / "contact_sheet.png"), tmp_path / "run"
+
+    return write
+
+
+def test_answers_that_are_the_initial_masks_get_no_iou_with_them(summary):
+    rows, _, run = summary([MaskSource.INITIAL] * 8)
+    assert dict(rows)["masks of its own"] == "0 of 8: all are the initial masks"
+    assert not any("IoU" in name for name, _ in rows)
+    document = json.loads((run / "run.json").read_text())
+    assert document["iou_initial_mean"] == 1 and document["iou_initial_mean_own"] is None
+    assert document["counts"]["masks"] == {"rendered": 0, "mean": 0, "initial": 8, "none": 0}
+
+
+def test_of_answers_that_are_its_own_the_iou_is_told_of_these(summary):
+    rows, _, run = summary(
+        [MaskSource.INITIAL] * 5 + [MaskSource.RENDERED, MaskSource.MEAN, MaskSource.RENDERED]
+    )
+    assert dict(rows)["masks of its own"] == "3 of 8; the others are the initial masks"
+    document = json.loads((run / "run.json").read_text())
+    assert document["iou_initial_mean_own"] < document["iou_initial_mean"]
+    assert dict(rows)["mean IoU of these with the initial masks"] == f"{document['iou_initial_mean_own']:.3f}"
+
+
+def test_the_whole_time_comes_first_and_the_stages_after_it(summary):
+    rows, _, _ = summary([MaskSource.RENDERED] * 8)
+    names = [name for name, _ in rows]
+    first = names.index("seconds per frame")
+    assert tuple(names[first + 1 : first + 1 + len(STAGES)]) == STAGES
+    assert float(dict(rows)["seconds per frame"]) >= 0.8
+    assert dict(rows)["track"] == "0.200"
+
+
+def test_the_sheet_has_a_line_for_the_time_and_none_for_no_note(summary):
+    tiles = -(-min(8, CROPS) // 6) + 1
+    rows, sheet, run = summary([MaskSource.RENDERED] * 8)
+    assert sheet.shape[0] == tiles * TILE + 16 + 23
+    assert not json.loads((run / "run.json").read_text())["notes"]
+    assert "note" not in dict(rows)
+    band = sheet[tiles * TILE :].astype(int)
+    assert (np.abs(band - band[-1, -1]) > 60).any()  # something is written there
+
+
+def test_an_assumed_lens_is_noted(summary, turning_sphere):
+    rows, sheet, run = summary(
+        [MaskSource.RENDERED] * 8, dataclasses.replace(turning_sphere.camera, assumed=True)
+    )
+    assert "nobody gave the lens: default field of view; give --fov" in dict(rows)["note"]
+    assert len(json.loads((run / "run.json").read_text())["notes"]) == 1
+    assert sheet.shape[0] % TILE == 16 + 2 * 23
+
+
+def test_a_lens_that_was_solved_is_told():
+    camera = {"assumed": True, "origin": "solved field of view of 52.1 degrees"}
+    [note] = notes_of(camera, None)
+    assert (
+        note == "nobody gave the lens: solved field of view of 52.1 degrees; the final refinement solved it"
+    )
+    assert notes_of(camera | {"assumed": False}, None) == []
+
+
+def test_a_surface_that_was_mostly_never_seen_is_noted(turning_sphere):
+    # The texture's weight is 0 below v = 0.8: on a sphere of height 2 that is about a tenth of its surface.
+    assert unseen_share(turning_sphere.model) == pytest.approx((1 - np.cos(0.2 * np.pi)) / 2, abs=0.02)
+    weight = turning_sphere.model.texture_weight.copy()
+    weight[: len(weight) // 2 + 8] = 0  # the upper half and some
+    mostly = dataclasses.replace(turning_sphere.model, texture_weight=weight)
+    share = unseen_share(mostly)
+    assert 0.6 < share < 0.85
+    assert notes_of({"assumed": False, "origin": ""}, mostly) == [
+        f"{100 * share:.0f} % of the mesh's surface was never seen; what is there is a guess"
+    ]
