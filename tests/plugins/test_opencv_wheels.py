@@ -72,7 +72,9 @@ def test_the_list_says_why_a_tracker_does_not_work(wheels, name):
 
 
 def test_all_wheels_at_once_still_fit_into_the_reason(wheels):
-    wheels("opencv-python", "opencv-python-headless", "opencv-contrib-python", "opencv-contrib-python-headless")
+    wheels(
+        "opencv-python", "opencv-python-headless", "opencv-contrib-python", "opencv-contrib-python-headless"
+    )
     [info] = [info for info in list_plugins() if info.name == "csrt"]
     assert info.reason.endswith(INSTALL)
 
