@@ -16,7 +16,7 @@ FLOORS = [
     {"errors", "frames", "geometry", "config", "features", "networks", "process_memory", "stages"},
     {"rendering", "trackers", "video"},
     {"estimation", "plugins", "prompts", "testing"},
-    {"session", "pipeline", "object_recording", "recording", "results"},
+    {"arguments", "object_recording", "pipeline", "process_settings", "recording", "results", "session"},
     {"datasets"},
     {"synthesis", "evaluation", "speed", "viewer"},
     {"benchmark"},

@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tracking3d.arguments import check_frames, checked_config, checked_image
 from tracking3d.config.camera import choose_camera
-from tracking3d.config.loading import load_config
 from tracking3d.config.models import PipelineConfig
-from tracking3d.errors import InputError, PluginError
+from tracking3d.errors import PluginError
 from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.frames import Box, Frame, Image, MaskEstimate, SkippedFrame
-from tracking3d.prompts import damaged_start, make_prompt, make_prompts
+from tracking3d.prompts import check_prompt, check_prompts, damaged_start, make_prompt, make_prompts
 from tracking3d.session import SOLVERS, Session, build_encoder, unanswered
 
 __all__ = ["SOLVERS", "Session", "checked_image", "choose_camera", "track", "track_objects"]
@@ -44,14 +44,27 @@ def track(
         config: The pipeline, or a YAML file of one; the default preset if None.
         skip_damaged: Where the first frame could not be read, take the box or mask for the first one that could.
 
-    Yields:
-        One estimate a frame.
+    Returns:
+        An iterator of one estimate a frame.
 
     Raises:
-        Tracking3dError: If the input or the configuration cannot be used.
+        Tracking3dError: If an argument cannot be used; on the way, if a frame cannot, or the first one does not fit
+            the box or mask.
     """
+    check_frames(frames)
+    config = checked_config(config)
+    check_prompt(box, mask, needed=config.tracker.name != "precomputed")
+    return _track(frames, box, mask, config, skip_damaged)
+
+
+def _track(
+    frames: Iterable[Image | Frame | SkippedFrame],
+    box: Box | None,
+    mask: NDArray[np.bool_] | None,
+    config: PipelineConfig,
+    skip_damaged: bool,
+) -> Iterator[FrameEstimate]:
     session: Session | None = None
-    config = _loaded(config)
     for frame in _checked_frames(frames, skip_damaged or (box is None and mask is None)):
         if session is None:
             prompt = None if box is None and mask is None else make_prompt(frame, box, mask)
@@ -79,13 +92,26 @@ def track_objects(
         config: The pipeline of every object, or a YAML file of one; the default preset if None.
         skip_damaged: See `track`.
 
-    Yields:
-        One estimate an object, in the order in which they were given.
+    Returns:
+        An iterator of one estimate an object, in the order in which they were given, for each frame.
 
     Raises:
-        Tracking3dError: If the input or the configuration cannot be used, or the last object has failed.
+        Tracking3dError: If an argument cannot be used; on the way, if a frame cannot, the first one does not fit a box
+            or mask, or the last object has failed.
     """
-    config = _loaded(config)
+    check_frames(frames)
+    config = checked_config(config)
+    check_prompts(boxes, masks)
+    return _track_objects(frames, boxes, masks, config, skip_damaged)
+
+
+def _track_objects(
+    frames: Iterable[Image | Frame | SkippedFrame],
+    boxes: Sequence[Box],
+    masks: Sequence[NDArray[np.bool_]],
+    config: PipelineConfig,
+    skip_damaged: bool,
+) -> Iterator[tuple[FrameEstimate, ...]]:
     sessions: list[Session] = []
     failures: dict[int, PluginError] = {}
     poses: list[NDArray[np.float64]] = []
@@ -112,16 +138,6 @@ def track_objects(
         yield tuple(answers)
 
 
-def _loaded(config: PipelineConfig | Path | str | None) -> PipelineConfig:
-    if config is not None and not isinstance(config, PipelineConfig | str | Path):
-        raise InputError(
-            f"config is a {type(config).__name__}; give a PipelineConfig (see load_config) or a YAML file."
-        )
-    if isinstance(config, PipelineConfig):
-        return config
-    return load_config(Path(config) if config is not None else None)
-
-
 def _checked_frames(frames: Iterable[Image | Frame | SkippedFrame], skip_damaged: bool) -> Iterator[Frame]:
     """The frames that could be read, counted, their images copied."""
     for position, item in enumerate(frames):
@@ -131,17 +147,3 @@ def _checked_frames(frames: Iterable[Image | Frame | SkippedFrame], skip_damaged
         else:
             frame = item if isinstance(item, Frame) else Frame(position, item)
             yield replace(frame, image=checked_image(frame.image, frame.index))
-
-
-def checked_image(image: Image, position: int) -> Image:
-    """A copy of an image that is ``(H, W, 3)`` uint8; callers like to decode every frame into one buffer.
-
-    Raises:
-        InputError: If it is not.
-    """
-    image = np.array(image, order="C")
-    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or not image.size:
-        raise InputError(
-            f"Frame {position} has shape {image.shape} and type {image.dtype}; give (H, W, 3) arrays of uint8."
-        )
-    return image

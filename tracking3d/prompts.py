@@ -4,18 +4,33 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.errors import InputError
+from tracking3d.config.explain import a_kind, shown
+from tracking3d.errors import InputError, argument
 from tracking3d.frames import Box, Frame, Prompt, SkippedFrame
 from tracking3d.trackers.crops import box_of, clip_box
 from tracking3d.trackers.mask_files import ImageMasks, UnreadableMaskError
 
 _log = logging.getLogger(__name__)
+
+
+BOX = argument("box=", "--box ")
+MASK = argument("mask=", "--mask ")
+"""What sentences call the two, before their values."""
+
+_SKIP = argument("skip_damaged=True", "--skip-damaged")
+_EITHER = "Say what the object is by either a box or a mask of the first frame: {} or {}.".format(
+    argument("box=", "--box"), argument("mask=", "--mask")
+)
+_NO_OBJECTS = "Say what the objects are by boxes or masks of the first frame: {} or {}.".format(
+    argument("boxes=", "--box"), argument("masks=", "--mask")
+)
 
 
 def parse_box(text: str) -> Box:
@@ -28,12 +43,38 @@ def parse_box(text: str) -> Box:
         x, y, width, height = (float(part) for part in text.split(","))
     except ValueError as error:
         raise InputError(
-            f"The box '{text}' is not four numbers; write it as X,Y,WIDTH,HEIGHT in pixels."
+            f"{BOX}'{text}' is not four numbers; write it as X,Y,WIDTH,HEIGHT in pixels."
         ) from error
-    return _checked((x, y, width, height))
+    return checked_box((x, y, width, height))
 
 
-def make_prompt(frame: Frame, box: Box | None = None, mask: NDArray[np.bool_] | Path | None = None) -> Prompt:
+def check_prompt(box: Any, mask: Any, needed: bool = True) -> None:
+    """Make sure of a box or a mask as far as that can be done before the first frame is there.
+
+    Args:
+        box: ``(x, y, width, height)`` in pixels, or None.
+        mask: ``(H, W)``, an image file of one, or None.
+        needed: Whether one of them must be given.
+
+    Raises:
+        InputError: Neither (if needed) or both are given, or what is given cannot be one.
+    """
+    if (box is not None and mask is not None) or (needed and box is None and mask is None):
+        raise InputError(_EITHER)
+    if box is not None:
+        checked_box(box)
+    if mask is not None and not isinstance(mask, Path):
+        checked_mask(mask)
+
+
+def make_prompt(
+    frame: Frame,
+    box: Box | None = None,
+    mask: NDArray[np.bool_] | Path | None = None,
+    *,
+    box_name: str = BOX,
+    mask_name: str = MASK,
+) -> Prompt:
     """Make the prompt for ``frame``.
 
     Args:
@@ -41,21 +82,18 @@ def make_prompt(frame: Frame, box: Box | None = None, mask: NDArray[np.bool_] | 
         box: ``(x, y, width, height)`` in pixels. The part outside the frame is cut off, with a
             warning in the log.
         mask: ``(H, W)``, or an image file of one; what is not zero (in a file: above half) is the object.
+        box_name: What sentences call the box, see `tracking3d.errors.argument`.
+        mask_name: What they call the mask.
 
     Raises:
         InputError: Neither or both are given, the box has no size or lies outside the frame, or the mask
             cannot be read, is empty, covers everything or is not of the frame's size.
     """
-    if (box is None) == (mask is None):
-        raise InputError("Say what the object is by either a box or a mask of the first frame.")
+    check_prompt(box, mask)
     if box is not None:
-        try:
-            x, y, width, height = (float(value) for value in box)
-        except (TypeError, ValueError) as error:
-            raise InputError(f"The box {box!r} is not four numbers x, y, width, height.") from error
-        return Prompt(_inside(_checked((x, y, width, height)), frame))
-    label = f"The mask {mask}" if isinstance(mask, Path) else "The mask"
-    binary = _read(mask) if isinstance(mask, Path) else np.asarray(mask) != 0
+        return Prompt(_inside(checked_box(box, box_name), frame, box_name))
+    label = f"{mask_name}{mask if isinstance(mask, Path) else ''}"
+    binary = _read(mask, label) if isinstance(mask, Path) else checked_mask(mask, mask_name)
     height, width = frame.size
     if binary.shape != frame.size:
         size = " x ".join(str(side) for side in binary.shape[::-1])
@@ -87,9 +125,16 @@ def make_prompts(
     Raises:
         InputError: If there is no object, one cannot be used, or the tracker knows the masks of one object only.
     """
-    prompts = [make_prompt(frame, box) for box in boxes] + [make_prompt(frame, mask=mask) for mask in masks]
+    prompts = [
+        make_prompt(frame, box, box_name=argument(f"boxes[{number}]=", "--box "))
+        for number, box in enumerate(boxes)
+    ]
+    prompts += [
+        make_prompt(frame, mask=mask, mask_name=argument(f"masks[{number}]=", "--mask "))
+        for number, mask in enumerate(masks)
+    ]
     if not prompts:
-        raise InputError("Say what the objects are by boxes or masks of the first frame.")
+        raise InputError(_NO_OBJECTS)
     if len(prompts) > 1 and tracker == "precomputed":
         raise InputError("Precomputed masks are of one object; track several in runs of their own.")
     return prompts
@@ -99,25 +144,108 @@ def damaged_start(frame: SkippedFrame) -> InputError:
     """The first frame cannot be read, and what the object is was said of that frame."""
     return InputError(
         f"The first frame, in which the object is given, cannot be read ({frame.reason.rstrip('.')}); begin with "
-        "another one, or give --skip-damaged (skip_damaged) where the object has not moved until the next."
+        f"another one, or give {_SKIP} where the object has not moved until the next."
     )
 
 
-def _checked(box: Box) -> Box:
-    if not all(math.isfinite(value) for value in box):
-        raise InputError(f"The box {_shown(box)} has a value that is no finite number.")
-    if box[2] <= 0 or box[3] <= 0:
-        raise InputError(f"The box {_shown(box)} has no size; its width and height must be positive.")
-    return box
+def check_prompts(boxes: Any, masks: Any) -> None:
+    """Make sure of the prompts of several objects as far as that can be done before the first frame is there.
+
+    Raises:
+        InputError: If there is none, or one cannot be used.
+    """
+    for name, given in (("boxes", boxes), ("masks", masks)):
+        if not isinstance(given, Sequence | np.ndarray) or isinstance(given, str | bytes):
+            raise InputError(
+                f"{name}={shown(given)} is {a_kind(given)}; give a list with one for each object."
+            )
+    if not len(boxes) and not len(masks):
+        raise InputError(_NO_OBJECTS)
+    for number, box in enumerate(boxes):
+        checked_box(box, argument(f"boxes[{number}]=", "--box "))
+    for number, mask in enumerate(masks):
+        if not isinstance(mask, Path):
+            checked_mask(mask, argument(f"masks[{number}]=", "--mask "))
 
 
-def _inside(box: Box, frame: Frame) -> Box:
+def check_prompt_fits(prompt: Prompt, frame: Frame) -> None:
+    """Make sure that a prompt is one of a frame of this size.
+
+    Raises:
+        InputError: If its mask has another size, or its box lies outside.
+    """
+    height, width = frame.size
+    if prompt.mask is not None and np.shape(prompt.mask) != frame.size:
+        raise InputError(
+            f"prompt.mask= has shape {np.shape(prompt.mask)} but {_name(frame)} ({height}, {width}); make the "
+            "prompt of the first frame."
+        )
+    if clip_box(prompt.box, frame.size) is None:
+        raise InputError(
+            f"prompt.box={_shown(prompt.box)} lies outside {_name(frame)}, which is {width} x {height} pixels."
+        )
+
+
+def checked_box(box: Any, name: str = BOX) -> Box:
+    """Four finite numbers, the last two positive.
+
+    Args:
+        box: ``(x, y, width, height)`` in pixels, of any kind of sequence.
+        name: What sentences call it.
+
+    Raises:
+        InputError: If it is anything else.
+    """
+    try:
+        if isinstance(box, str | bytes | Mapping) or any(isinstance(value, str | bytes) for value in box):
+            raise TypeError
+        x, y, width, height = (float(value) for value in box)
+    except Exception as error:  # iterating over what somebody gave can end in any way
+        raise InputError(f"{name}{shown(box)} is not four numbers x, y, width, height in pixels.") from error
+    if not all(math.isfinite(value) for value in (x, y, width, height)):
+        raise InputError(f"{name}{_shown((x, y, width, height))} has a value that is no finite number.")
+    if width <= 0 or height <= 0:
+        raise InputError(
+            f"{name}{_shown((x, y, width, height))} has no size; its width and height must be positive."
+        )
+    return x, y, width, height
+
+
+def checked_mask(mask: Any, name: str = MASK) -> NDArray[np.bool_]:
+    """``(H, W)`` bool of what is not zero in an array, and is neither all nor nothing of it.
+
+    Args:
+        mask: ``(H, W)`` booleans or numbers.
+        name: What sentences call it.
+
+    Raises:
+        InputError: If it is no such array.
+    """
+    wanted = "give an (H, W) array of booleans, or the image file of one as a pathlib.Path"
+    if isinstance(mask, str | bytes):
+        raise InputError(f"{name}{shown(mask)} is {a_kind(mask)}; {wanted}.")
+    try:
+        values = np.asarray(mask)
+    except Exception as error:  # what a class makes of itself as an array can fail in any way
+        raise InputError(f"{name.rstrip()} is {a_kind(mask)} that numpy cannot read; {wanted}.") from error
+    if values.dtype.kind not in "biuf" or values.ndim != 2 or not values.size:
+        raise InputError(
+            f"{name.rstrip()} is {a_kind(mask)} of shape {values.shape} and type {values.dtype}; {wanted}."
+        )
+    if values.dtype.kind == "f" and not np.isfinite(values).all():
+        raise InputError(f"{name.rstrip()} has values that are no finite numbers; {wanted}.")
+    if not values.any():
+        raise InputError(f"{name.rstrip()} is empty; mark the object in it.")
+    return values != 0
+
+
+def _inside(box: Box, frame: Frame, name: str) -> Box:
     inside = clip_box(box, frame.size)
     if inside is None:
         height, width = frame.size
         raise InputError(
-            f"The box {_shown(box)} lies outside {_name(frame)}, which is {width} x {height} pixels; "
-            "give the object's box as X,Y,WIDTH,HEIGHT."
+            f"{name}{_shown(box)} lies outside {_name(frame)}, which is {width} x {height} pixels; "
+            "give the object's box as left edge, upper edge, width and height."
         )
     if inside != box:
         _log.warning(
@@ -126,13 +254,17 @@ def _inside(box: Box, frame: Frame) -> Box:
     return inside
 
 
-def _read(file: Path) -> NDArray[np.bool_]:
-    if not file.is_file():
-        raise InputError(f"The mask {file} does not exist.")
+def _read(file: Path, label: str) -> NDArray[np.bool_]:
+    try:
+        there = file.is_file()
+    except (OSError, ValueError):  # a loop of links, a name that no file can have
+        there = False
+    if not there:
+        raise InputError(f"{label} does not exist.")
     try:
         mask = ImageMasks(file, [file]).read(0)
     except (InputError, UnreadableMaskError) as error:
-        raise InputError(f"The mask {file} cannot be read as an image.") from error
+        raise InputError(f"{label} cannot be read as an image.") from error
     assert mask is not None  # there is one file
     return mask
 

@@ -11,12 +11,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tracking3d.arguments import check_source, checked_config, checked_folder
 from tracking3d.config.camera import choose_camera
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError
 from tracking3d.frames import Box, Frame, SkippedFrame
 from tracking3d.object_recording import Listener, ObjectRecording, go_through, timed
-from tracking3d.prompts import damaged_start, make_prompt, make_prompts
+from tracking3d.prompts import check_prompt, check_prompts, damaged_start, make_prompt, make_prompts
 from tracking3d.results.layout import object_folders
 from tracking3d.results.run_writer import RunWriter
 from tracking3d.session import Session, build_encoder
@@ -27,8 +28,8 @@ __all__ = ["Listener", "record", "record_objects"]
 
 def record(
     source: FrameSource,
-    config: PipelineConfig,
-    folder: Path,
+    config: PipelineConfig | Path | str | None,
+    folder: Path | str,
     *,
     box: Box | None = None,
     mask: NDArray[np.bool_] | Path | None = None,
@@ -45,7 +46,7 @@ def record(
 
     Args:
         source: The frames.
-        config: The pipeline.
+        config: The pipeline, or a YAML file of one; the default preset if None.
         folder: The run folder.
         box: The object in the first frame, ``(x, y, width, height)``.
         mask: The object in the first frame, as a mask or the image file of one. Without a box and a mask the
@@ -59,6 +60,9 @@ def record(
     Raises:
         Tracking3dError: What was finished until then is kept in the folder, as it is on Ctrl-C.
     """
+    check_source(source)
+    config, folder = checked_config(config), checked_folder(folder)
+    check_prompt(box, mask, needed=config.tracker.name != "precomputed")
     begin = partial(run_writer, source, command=command, selection=selection, overwrite=overwrite)
     with opened(source) as frames:
         skipped, first = first_frame(frames, source.name, skip_damaged or (box is None and mask is None))
@@ -70,8 +74,8 @@ def record(
 
 def record_objects(
     source: FrameSource,
-    config: PipelineConfig,
-    folder: Path,
+    config: PipelineConfig | Path | str | None,
+    folder: Path | str,
     *,
     boxes: Sequence[Box] = (),
     masks: Sequence[NDArray[np.bool_] | Path] = (),
@@ -100,6 +104,9 @@ def record_objects(
     Raises:
         Tracking3dError: What was finished until then is kept in the folders, as it is on Ctrl-C.
     """
+    check_source(source)
+    config, folder = checked_config(config), checked_folder(folder)
+    check_prompts(boxes, masks)
     begin = partial(run_writer, source, command=command, selection=selection, overwrite=overwrite)
     with opened(source) as frames, ExitStack() as writers:
         skipped, first = first_frame(frames, source.name, skip_damaged)

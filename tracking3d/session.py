@@ -10,9 +10,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from tracking3d.arguments import check_frame, check_session
 from tracking3d.config.camera import choose_camera, warn_of_unlikely
 from tracking3d.config.models import PipelineConfig
-from tracking3d.errors import InputError
+from tracking3d.errors import InputError, argument
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource, ObjectModel, Status
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.estimation.paper.solver import PaperSolver
@@ -22,7 +23,9 @@ from tracking3d.frames import Frame, MaskEstimate, Prompt
 from tracking3d.geometry.camera import Camera
 from tracking3d.plugins import FEATURES, TRACKERS, build_plugin, plugin_label
 from tracking3d.plugins.guard import GuardedEncoder, GuardedTracker, PluginFailure
-from tracking3d.rendering import prepare_backend
+from tracking3d.process_settings import OwnSettings, process_kept
+from tracking3d.prompts import check_prompt_fits
+from tracking3d.rendering.backend import choose_backend, threads_kept
 from tracking3d.stages import StageTimes, Stopwatch, measured
 
 SOLVERS: dict[str, Callable[[PipelineConfig, Camera, FeatureEncoder], Solver[Any]]] = {
@@ -35,6 +38,8 @@ SURE = 0.6
 """Confidence from which an answer's mask is handed back to the mask tracker. An answer that is as likely wrong as right
 would teach it as many errors as it mends; the tracker ``onnx`` trusts its own masks from the same score on."""
 
+_CPU = argument("runtime.device 'cpu'", "--device cpu")
+
 WORTH_CORRECTING = (0.5, 0.9)
 """IoU of answer and initial mask between which the latter is corrected. Above, they differ by little more than the
 width of an outline; below, one of them is of something else, and nobody knows which."""
@@ -42,6 +47,8 @@ width of an outline; below, one of them is of something else, and nobody knows w
 
 class Session:
     """One object tracked through one video: ``step`` takes each frame, ``result`` gives the object.
+
+    The process's threads and random numbers are the session's only while it works; in between they are the caller's.
 
     Args:
         config: The pipeline.
@@ -52,13 +59,13 @@ class Session:
 
     Attributes:
         config: The pipeline.
-        renderer: What renders, and why, see `tracking3d.rendering.prepare_backend`.
+        renderer: What renders, and why, see `tracking3d.rendering.backend.choose_backend`.
         initial_mask: What the solver was given for the latest frame: the mask tracker's answer, or what stands in.
         refining: What ``refine`` took.
 
     Raises:
         PluginError: If a plug-in is unknown or broken.
-        InputError: If an option cannot be used on this machine.
+        InputError: If an argument is of the wrong kind, or an option cannot be used on this machine.
     """
 
     def __init__(
@@ -69,21 +76,24 @@ class Session:
         intrinsics_origin: str = "",
         encoder: FeatureEncoder | None = None,
     ) -> None:
+        check_session(config, prompt, intrinsics)
         check_device(config.runtime.device)
         if prompt is None and config.tracker.name != "precomputed":
             raise InputError("Say what the object is by either a box or a mask of the first frame.")
         runtime = config.runtime
         try:
-            self.renderer = prepare_backend(runtime.renderer, runtime.device, runtime.threads)
+            self.renderer = choose_backend(runtime.renderer, runtime.device, runtime.threads)
         except ValueError as error:
             raise InputError(f"runtime.renderer: {error}.") from error
         self.config = config
         self._prompt = prompt
         self._intrinsics = intrinsics, intrinsics_origin
-        self._tracker = GuardedTracker(
-            build_plugin(TRACKERS, config.tracker), plugin_label(TRACKERS, config.tracker.name)
-        )
-        self._encoder = build_encoder(config) if encoder is None else encoder
+        self._settings = OwnSettings(self.renderer, runtime.device, runtime.seed)
+        with self._settings.in_force():
+            self._tracker = GuardedTracker(
+                build_plugin(TRACKERS, config.tracker), plugin_label(TRACKERS, config.tracker.name)
+            )
+            self._encoder = build_encoder(config) if encoder is None else encoder
         self._solver: Solver[Any] | None = None
         self._state: Any = None
         self._camera: Camera | None = None
@@ -104,15 +114,16 @@ class Session:
         """Track the object in the next frame; the first call starts on it.
 
         Raises:
-            InputError: If the first frame has no object, or the frame has another size than the first.
+            InputError: If this is no `Frame` of uint8 RGB, the first one has no object, or another size than the first.
             PluginError: If a plug-in fails: in the first frame, or with ``runtime.on_plugin_failure`` ``stop`` in
                 any. With ``continue`` a later frame is answered with what there is, and ``failure`` says why.
             RuntimeError: After ``refine``.
         """
         if self._refined:
             raise RuntimeError("there is no further step after refine")
+        check_frame(frame)
         try:
-            with measured("solve") as watch:
+            with self._settings.in_force(), measured("solve") as watch:
                 estimate = self._start(frame) if self._solver is None else self._go_on(self._solver, frame)
         except PluginFailure as error:
             raise error.at(_label(frame)) from error.__cause__
@@ -122,7 +133,8 @@ class Session:
         height, width = frame.size
         self._camera = choose_camera(self.config.camera, width, height, *self._intrinsics)
         warn_of_unlikely(self._camera)
-        torch.manual_seed(self.config.runtime.seed)
+        if self._prompt is not None:
+            check_prompt_fits(self._prompt, frame)
         mask = self._tracker.init(frame, self._prompt or Prompt((0.0, 0.0, float(width), float(height))))
         solver: Solver[Any] = SOLVERS[self.config.solver.name](self.config, self._camera, self._encoder)
         self._state, estimate = solver.init(frame, mask)
@@ -181,7 +193,8 @@ class Session:
         """The object as it is known now: one textured mesh."""
         if self._solver is None:
             raise RuntimeError("there is no object before the first step")
-        return self._solver.result(self._state)
+        with self._settings.in_force():
+            return self._solver.result(self._state)
 
     @property
     def can_refine(self) -> bool:
@@ -197,7 +210,7 @@ class Session:
         Raises:
             RuntimeError: If the solver cannot, see ``can_refine``.
         """
-        with measured("map") as watch:
+        with self._settings.in_force(), measured("map") as watch:
             self._state = self._refining().refine(self._state)
         self.refining = watch.times
         self._camera = getattr(self._state, "camera", self._camera)
@@ -219,7 +232,7 @@ class Session:
         if not self._refined:
             raise RuntimeError("frames are revisited after refine")
         try:
-            with measured("solve") as watch:
+            with self._settings.in_force(), measured("solve") as watch:
                 self._state, estimate = solver.revisit(self._state, frame, mask, T_cam_obj)
         except PluginFailure as error:
             raise error.at(_label(frame)) from error.__cause__
@@ -238,7 +251,8 @@ def build_encoder(config: PipelineConfig) -> FeatureEncoder:
         PluginError: If it is unknown or broken.
     """
     label = plugin_label(FEATURES, config.features.name)
-    return cast(FeatureEncoder, GuardedEncoder(build_plugin(FEATURES, config.features), label))
+    with threads_kept(), process_kept(torch.device("cpu")):
+        return cast(FeatureEncoder, GuardedEncoder(build_plugin(FEATURES, config.features), label))
 
 
 def corrects(estimate: FrameEstimate) -> bool:
@@ -277,9 +291,7 @@ def check_device(name: str) -> None:
         device = torch.device(name)
         torch.zeros(1, device=device).item()
     except (RuntimeError, AssertionError) as error:
-        raise InputError(
-            f"The device '{name}' is not available on this machine; use --device cpu."
-        ) from error
+        raise InputError(f"The device '{name}' is not available on this machine; use {_CPU}.") from error
 
 
 def _timed(estimate: FrameEstimate, watch: Stopwatch, frame: Frame) -> FrameEstimate:

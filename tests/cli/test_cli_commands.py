@@ -100,12 +100,22 @@ def test_plugins_alone_lists_them(call):
 def test_plugins_new_writes_a_package_or_says_why_not(call, refused):
     result = call("plugins", "new", "my-colour", "--kind", "tracker", "--out", "here")
     assert (result.exit_code, Path("here/tracking3d-my-colour/pyproject.toml").is_file()) == (0, True)
-    assert "pip install here/tracking3d-my-colour" in result.stdout
+    assert "pip install here/tracking3d-my-colour pytest && pytest here/tracking3d-my-colour" in result.stdout
     assert "exists" in refused("plugins", "new", "my-colour", "--kind", "tracker", "--out", "here")
     assert "is no name" in refused("plugins", "new", "My_Colour", "--kind", "tracker")
     assert "taken by the mask tracker 'csrt'" in refused("plugins", "new", "csrt", "--kind", "tracker")
     assert "--kind" in refused("plugins", "new", "mine")
     assert "--kind" in refused("plugins", "new", "mine", "--kind", "solver")
+
+
+def test_a_new_plugin_in_the_working_directory_is_a_folder_to_pip_and_not_a_name_on_its_index(call):
+    result = call("plugins", "new", "my-colour", "--kind", "tracker")
+    assert "pip install ./tracking3d-my-colour pytest && pytest ./tracking3d-my-colour" in result.stdout
+
+
+def test_a_new_plugin_s_commands_are_quoted_for_the_shell(call):
+    result = call("plugins", "new", "my-colour", "--kind", "tracker", "--out", "my plug-ins")
+    assert "pip install 'my plug-ins/tracking3d-my-colour' pytest" in result.stdout
 
 
 def test_plugins_as_json(call):

@@ -211,7 +211,8 @@ def test_fault_of_the_program_is_no_traceback_unless_asked_for(call, clip, scrip
 def test_folder_with_a_run_is_refused_unless_it_may_be_overwritten(call, refused, clip, script):
     assert call("run", clip, *BOX, "--out", "run").exit_code == 0
     before = Path("run/frames.jsonl").read_bytes()
-    assert "already holds a run" in refused("run", clip, *BOX, "--out", "run", "--frames", "0:2")
+    held = refused("run", clip, *BOX, "--out", "run", "--frames", "0:2")
+    assert held.endswith("already holds a run; choose another --out or pass --overwrite.")
     assert Path("run/frames.jsonl").read_bytes() == before
     assert call("run", clip, *BOX, "--out", "run", "--frames", "0:2", "--overwrite").exit_code == 0
     assert len(RunReader(Path("run")).frames) == 2
@@ -227,14 +228,14 @@ def test_folder_that_cannot_be_written_is_named(refused, clip, script, tmp_path)
     ("options", "words"),
     [
         ("", "--box X,Y,W,H, --mask FILE, or --masks DIR"),
-        ("--box 1,2,3", "'1,2,3' is not four numbers"),
+        ("--box 1,2,3", "error: --box '1,2,3' is not four numbers"),
         ("--box here", "'here' is not four numbers"),
         ("--box a,b,c,d", "'a,b,c,d' is not four numbers"),
         ("--box 1,2,nan,4", "no finite number"),
         ("--box 1,2,0,4", "has no size"),
         ("--box 1,2,3,-4", "has no size"),
-        ("--box 100,100,9,9", "outside 000.png, which is 64 x 48"),
-        ("--mask absent.png", "absent.png does not exist"),
+        ("--box 100,100,9,9", "error: --box 100,100,9,9 lies outside 000.png, which is 64 x 48"),
+        ("--mask absent.png", "error: --mask absent.png does not exist"),
         ("--box 1,1,9,9 --mask m.png", "either --box or --mask"),
         ("--box 1,1,9,9 --box 1,2", "'1,2' is not four numbers"),
         ("--box 1,1,9,9 --box 100,100,9,9", "outside 000.png, which is 64 x 48"),
@@ -255,7 +256,7 @@ def test_folder_that_cannot_be_written_is_named(refused, clip, script, tmp_path)
         ("--box 1,1,9,9 --intrinsics a,b,c,d", "FX,FY,CX,CY"),
         ("--box 1,1,9,9 --intrinsics 1,2,nan,4", "is not 4 numbers"),
         ("--box 1,1,9,9 --seed -1", "'runtime.seed'"),
-        ("--box 1,1,9,9 --frames 3:1", "selects no frame"),
+        ("--box 1,1,9,9 --frames 3:1", "error: --frames '3:1' selects no frame"),
         ("--box 1,1,9,9 --frames x", "START:STOP:STEP"),
         ("--box 1,1,9,9 --frames 90:99", "no"),
         ("--boxx 1,1,9,9", "No such option"),

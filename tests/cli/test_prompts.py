@@ -104,7 +104,7 @@ def test_mask_file_is_any_image(tmp_path: Path, image):
 @pytest.mark.parametrize(
     ("mask", "sentence"),
     [
-        (np.zeros((48, 64), dtype=bool), "The mask .*is empty"),
+        (np.zeros((48, 64), dtype=bool), "mask=.* ?is empty"),
         (np.ones((48, 64), dtype=bool), r"covers the whole of 000\.png"),
         (np.ones((24, 32), dtype=bool), r"is 32 x 24 pixels but 000\.png is 64 x 48"),
         (np.ones((64, 48), dtype=bool), "is 48 x 64 pixels"),

@@ -115,6 +115,7 @@ def test_scanned_household_objects_can_be_prototypes(shared_data, clip):
         ("line.obj", b"v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "without area"),
         ("point.obj", b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "at one point"),
         ("nan.obj", b"v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n", "not finite"),
+        ("not_text.obj", b"v 0 0 0\nv 1 0 0\xff\xfe\n", r"cannot be read as a mesh \(its text is damaged\)"),
         ("beyond.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "no triangles|cannot be read"),
     ],
 )
@@ -126,6 +127,12 @@ def test_what_is_no_mesh_is_refused_in_one_sentence(tmp_path, name, content, sai
         from_file(path)
     assert str(path) in str(refusal.value)
     assert "\n" not in str(refusal.value)
+    assert str(refusal.value).startswith("The prototype ") and str(refusal.value).endswith(".")
+
+
+def test_a_name_that_no_file_can_have_is_one_that_does_not_exist(tmp_path):
+    with pytest.raises(InputError, match="does not exist"):
+        from_file(tmp_path / ("x" * 3000))
 
 
 def test_a_truncated_file_is_refused(tmp_path):

@@ -337,11 +337,6 @@ def test_a_session_gives_the_camera_and_the_object_at_any_time(clip, quick):
     assert before.texture.shape == (16, 16, 3)
 
 
-def test_the_number_of_threads_is_that_of_the_configuration(clip, quick):
-    list(track(clip.images[:1], box=clip.box, config=quick))
-    assert torch.get_num_threads() == quick.runtime.threads == 1
-
-
 def test_the_same_seed_gives_the_same_answers(clip, quick, boxed):
     again = track(clip.images, box=clip.box, config=quick)
     for a, b in zip(boxed, again, strict=True):

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import shlex
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -84,4 +85,6 @@ def new(
     from tracking3d.plugins.template import write_plugin
 
     folder = write_plugin(name, kind.value, out)
-    typer.echo(f"{folder} is written; next: pip install {folder} && pytest {folder}")
+    # Without a separator pip would take the folder's name for one on the package index.
+    place = shlex.quote(str(folder) if len(folder.parts) > 1 else f"./{folder}")
+    typer.echo(f"{folder} is written; next: pip install {place} pytest && pytest {place}")

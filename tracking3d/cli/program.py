@@ -63,7 +63,7 @@ def _report(error: Exception) -> int:
     if _is_unread(error):
         return UNREAD
     if isinstance(error, Tracking3dError):
-        sentence, code = str(error), 2
+        sentence, code = error.at_the_command_line, 2
     elif hasattr(error, "format_message"):  # the command line itself is wrong
         sentence, code = _usage(error), 2
     elif too_little := _too_little(error):

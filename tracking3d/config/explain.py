@@ -35,6 +35,18 @@ def shown(value: Any) -> str:
     return short.repr(value)
 
 
+def a_kind(value: Any) -> str:
+    """What ``value`` is, with its article: ``a list``, ``None``, ``a VideoCapture``."""
+    if value is None:
+        return "None"
+    if isinstance(value, type):
+        return f"the class {value.__name__}"
+    if isinstance(value, str):
+        return "text"
+    name = type(value).__name__.replace("ndarray", "array")
+    return f"{'an' if name[0].lower() in 'aeiou' else 'a'} {name}"
+
+
 def describe(error: ValidationError, model: type[BaseModel], noun: str = "setting") -> str:
     """Say in one sentence what is wrong with the values given for ``model``.
 

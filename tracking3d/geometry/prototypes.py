@@ -89,22 +89,24 @@ def from_file(path: Path) -> Mesh:
         InputError: If the file is missing or holds no triangle mesh.
     """
     advice = "give an OBJ, PLY, STL or GLB file"
-    if not path.is_file():
-        raise InputError(f"the prototype '{path}' does not exist: give sphere, ellipsoid or a mesh file")
+    if not _is_file(path):
+        raise InputError(f"The prototype '{path}' does not exist; give sphere, ellipsoid or a mesh file.")
     try:
         loaded = read_mesh_file(path)
     except Exception as error:  # trimesh raises whatever its loaders raise
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"the prototype '{path}' cannot be read as a mesh ({reason}): {advice}") from error
+        if isinstance(error, ImportError):  # for text in another encoding it would like a further library
+            reason = "its text is damaged"
+        raise InputError(f"The prototype '{path}' cannot be read as a mesh ({reason}); {advice}.") from error
     if wrong := what_is_wrong(loaded):
-        raise InputError(f"the prototype '{path}' {wrong}: {advice}")
+        raise InputError(f"The prototype '{path}' {wrong}; {advice}.")
     # Duplicated vertices at texture seams would tear when the shape deforms.
     solid = trimesh.Trimesh(loaded.vertices, loaded.faces, process=False)
     solid.merge_vertices(merge_tex=True, merge_norm=True)
     solid.update_faces(solid.nondegenerate_faces())
     solid.remove_unreferenced_vertices()
     if len(solid.faces) == 0:
-        raise InputError(f"the prototype '{path}' holds only triangles without area: {advice}")
+        raise InputError(f"The prototype '{path}' holds only triangles without area; {advice}.")
     if solid.is_watertight:
         solid.fix_normals()
     solid.vertices -= solid.bounds.mean(0)
@@ -113,3 +115,10 @@ def from_file(path: Path) -> Mesh:
         solid = solid.subdivide()
     vertices, faces = np.array(solid.vertices, dtype=np.float64), np.array(solid.faces, dtype=np.int64)
     return Mesh(vertices, faces, equirectangular_uvs(vertices, faces))
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # a name that no file can have
+        return False

@@ -78,7 +78,7 @@ def told(error: BaseException) -> str:
     text = " ".join(str(error).split()).rstrip(".")
     if not isinstance(error, Tracking3dError):
         text = f"{type(error).__name__}: {text}"
-    return text if len(text) <= 200 else text[:197] + "..."
+    return text if len(text) <= 300 else text[:297] + "..."
 
 
 def _distribution(point: metadata.EntryPoint) -> tuple[str, str]:
@@ -150,4 +150,5 @@ def _fault(plugin: Registered, cls: Any) -> str:
         return "its Options has a field 'name', which is the plug-in's own name in a configuration"
     if absent := [name for name in _METHODS[plugin.group] if not callable(getattr(cls, name, None))]:
         return f"it has no method {', '.join(absent)}"
-    return ""
+    why_unavailable = getattr(cls, "why_unavailable", None)
+    return str(why_unavailable()) if callable(why_unavailable) else ""

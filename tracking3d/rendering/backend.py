@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import functools
 import logging
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Literal
 
 import torch
@@ -42,11 +45,8 @@ def use_numba(backend: str, *tensors: Tensor) -> bool:
     return True
 
 
-def prepare_backend(backend: str, device: str, threads: int = 1) -> dict[str, str | int]:
-    """Choose what renders float32 on a device, and give it its threads.
-
-    With the Numba kernels torch itself gets one thread: its threads keep their cores busy while they wait for work,
-    which costs the kernels more than torch gains.
+def choose_backend(backend: str, device: str, threads: int = 1) -> dict[str, str | int]:
+    """Choose what renders float32 on a device.
 
     Args:
         backend: See `BackendName`.
@@ -73,12 +73,57 @@ def prepare_backend(backend: str, device: str, threads: int = 1) -> dict[str, st
         reason = why_no_numba() or f"{chosen} is the fastest on {place}"
         if place == "cpu" and why_no_numba():
             _log.warning("Torch renders, several times slower than the compiled kernels: %s.", why_no_numba())
-    torch.set_num_threads(1 if chosen == "numba" else threads)
-    if chosen == "numba":
+    return {"backend": chosen, "reason": reason, "threads": threads}
+
+
+def prepare_backend(backend: str, device: str, threads: int = 1) -> dict[str, str | int]:
+    """Choose what renders float32 on a device, and give it its threads; see `choose_backend`."""
+    renderer = choose_backend(backend, device, threads)
+    give_threads(renderer)
+    return renderer
+
+
+def give_threads(renderer: Mapping[str, str | int]) -> None:
+    """Give what was chosen its threads.
+
+    With the Numba kernels torch itself gets one thread: its threads keep their cores busy while they wait for work,
+    which costs the kernels more than torch gains.
+
+    Args:
+        renderer: What `choose_backend` returned.
+    """
+    threads = int(renderer["threads"])
+    by_kernels = renderer["backend"] == "numba"
+    _set_torch_threads(1 if by_kernels else threads)
+    if by_kernels:
         from tracking3d.rendering.kernels.threads import set_num_threads
 
         set_num_threads(threads)
-    return {"backend": chosen, "reason": reason, "threads": threads}
+
+
+@contextmanager
+def threads_kept() -> Iterator[None]:
+    """Afterwards torch and the kernels have as many threads as before."""
+    of_torch, of_kernels = torch.get_num_threads(), _kernels_threads()
+    try:
+        yield
+    finally:
+        _set_torch_threads(of_torch)
+        if _kernels_threads() != of_kernels:
+            from tracking3d.rendering.kernels.threads import set_num_threads
+
+            set_num_threads(of_kernels)
+
+
+def _kernels_threads() -> int:
+    """Threads of the kernels; the default where nobody has imported them, which takes its time."""
+    module = sys.modules.get("tracking3d.rendering.kernels.threads")
+    return int(module.get_num_threads()) if module else 1
+
+
+def _set_torch_threads(threads: int) -> None:
+    if torch.get_num_threads() != threads:
+        torch.set_num_threads(threads)
 
 
 @functools.cache

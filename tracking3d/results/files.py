@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.errors import OutputError
-from tracking3d.results.layout import partial_path
+from tracking3d.results.layout import OUT, partial_path
 
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _FORBIDDEN = {errno.EACCES, errno.EPERM, errno.EROFS}
@@ -32,11 +32,11 @@ def writing(path: Path) -> Iterator[None]:
         if error.errno in _FULL:
             what = f"The disk is full at {path}; free some space (what was finished is kept)."
         elif error.errno in _FORBIDDEN:
-            what = f"{path} is not writable; choose another --out."
+            what = f"{path} is not writable; choose another {OUT}."
         elif error.errno in _NOT_A_FOLDER:
-            what = f"{path} is not a folder, or lies inside a file; choose another --out."
+            what = f"{path} is not a folder, or lies inside a file; choose another {OUT}."
         else:
-            what = f"{path} cannot be written: {error.strerror or error}; choose another --out."
+            what = f"{path} cannot be written: {error.strerror or error}; choose another {OUT}."
         raise OutputError(what) from error
 
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from tracking3d.errors import OutputError
+from tracking3d.errors import OutputError, argument
 
 FORMAT = "tracking3d-run"
 FORMAT_VERSION = 1
@@ -36,6 +36,10 @@ MTL = "mesh.mtl"
 TEXTURE = "texture.png"
 GLB = "mesh.glb"
 FEATURES = "features.npz"
+
+OUT = argument("folder", "--out")
+OVERWRITE = argument("overwrite=True", "--overwrite")
+"""What sentences call the arguments of `tracking3d.recording.record`, and of ``tracking3d run``."""
 
 CONVENTIONS = {
     "axes": "OpenCV camera axes: x right, y down, z forward.",
@@ -71,9 +75,9 @@ def object_folders(folder: Path, count: int) -> list[Path]:
         OutputError: If ``folder`` is the run folder of one object, or holds more objects.
     """
     if (folder / RUN).exists():
-        raise OutputError(f"{folder} holds a run of one object; choose another --out for several.")
+        raise OutputError(f"{folder} holds a run of one object; choose another {OUT} for several.")
     if (more := folder / f"object_{count}").exists():
-        raise OutputError(f"{folder} holds a run of more objects, such as {more.name}; choose another --out.")
+        raise OutputError(f"{folder} holds a run of more objects, such as {more.name}; choose another {OUT}.")
     return [folder / f"object_{number}" for number in range(count)]
 
 

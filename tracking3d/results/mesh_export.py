@@ -26,7 +26,7 @@ from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.geometry.gltf_axes import OBJECT_NODE, UPRIGHT_NODE, UPRIGHT_ROTATION
 from tracking3d.results.files import write_atomic
-from tracking3d.results.layout import FEATURES, GLB, MTL, OBJ, TEXTURE
+from tracking3d.results.layout import FEATURES, GLB, MTL, OBJ, OUT, TEXTURE
 
 _FARTHEST = 1e12  # of a vertex; float32 can square it
 _REPEAT, _CLAMP, _LINEAR, _MIPMAP = 10497, 33071, 9729, 9987  # glTF's constants
@@ -107,7 +107,7 @@ def load_mesh(folder: Path) -> trimesh.Trimesh:
         fault = _mesh_fault(mesh)
     except Exception as error:  # trimesh raises whatever its loaders raise
         raise InputError(
-            f"The mesh {path} cannot be read ({error}); track again with another --out."
+            f"The mesh {path} cannot be read ({error}); track again into another {OUT}."
         ) from error
     if fault:
         raise InputError(f"The mesh {path} {fault}; track again with another --out.")
@@ -141,7 +141,7 @@ def load_model(folder: Path) -> ObjectModel:
             return ObjectModel(texture=texture, **{name: arrays[name] for name in arrays.files})
     except Exception as error:  # a damaged archive raises almost anything
         raise InputError(
-            f"The model {path} cannot be read ({error}); track again with another --out."
+            f"The model {path} cannot be read ({error}); track again into another {OUT}."
         ) from error
 
 

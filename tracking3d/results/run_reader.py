@@ -13,7 +13,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from tracking3d.errors import InputError
+from tracking3d.errors import InputError, argument
 from tracking3d.geometry.camera import Camera
 from tracking3d.results import layout
 from tracking3d.results.files import read_mask
@@ -38,6 +38,8 @@ _KINDS: dict[str, Any] = {
     "skipped": list,
     "notes": list,
 }
+
+_RUN = argument("the folder that `record` wrote", "what --out of `tracking3d run` was")
 
 
 class RunReader:
@@ -198,7 +200,7 @@ def _read_description(folder: Path) -> dict[str, Any]:
     path = folder / layout.RUN
     if not path.is_file():
         what = "holds no run.json" if folder.is_dir() else "does not exist"
-        raise InputError(f"{folder} is not a run folder: it {what}; give what --out of `tracking3d run` was.")
+        raise InputError(f"{folder} is not a run folder: it {what}; give {_RUN}.")
     try:
         description = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError) as error:

@@ -96,7 +96,7 @@ class RunWriter:
         try:
             if not try_lock(self._lines.fileno()):
                 raise OutputError(
-                    f"{self.folder} is in use by another run; wait for it or choose another --out."
+                    f"{self.folder} is in use by another run; wait for it or choose another {layout.OUT}."
                 )
             _make_room(self.folder, overwrite)
             with writing(self.folder):
@@ -308,10 +308,12 @@ def _make_room(folder: Path, overwrite: bool) -> None:
     except InputError as error:
         raise OutputError(
             f"{folder} is not a readable run folder but holds {there[0].relative_to(folder)}, "
-            "which a run would replace; choose another --out."
+            f"which a run would replace; choose another {layout.OUT}."
         ) from error
     if earlier.frames and not overwrite:
-        raise OutputError(f"{folder} already holds a run; choose another --out or pass --overwrite.")
+        raise OutputError(
+            f"{folder} already holds a run; choose another {layout.OUT} or pass {layout.OVERWRITE}."
+        )
     with writing(folder):
         for path in there:
             # These two are replaced in place, so that a kill in between leaves a run folder.

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -13,7 +11,7 @@ import torch
 
 from tracking3d.errors import InputError
 from tracking3d.rendering import prepare_backend, render
-from tracking3d.rendering.backend import why_no_numba
+from tracking3d.rendering.backend import threads_kept, why_no_numba
 from tracking3d.speed.dense import render_dense
 from tracking3d.speed.pytorch3d import ABSENT, render_pytorch3d, why_no_pytorch3d
 from tracking3d.speed.scene import Backend, Problem, Scene
@@ -63,22 +61,6 @@ def left_out(device: torch.device) -> dict[str, str]:
     """Backends of others that are installed and cannot render on a device, and why."""
     why = why_no_pytorch3d(device)
     return {"pytorch3d": why} if why not in ("", ABSENT) else {}
-
-
-@contextmanager
-def threads_kept() -> Iterator[None]:
-    """Afterwards torch and the kernels have as many threads as before."""
-    of_torch, of_kernels = torch.get_num_threads(), None
-    if not why_no_numba():
-        from tracking3d.rendering.kernels import threads as kernels
-
-        of_kernels = kernels.get_num_threads()
-    try:
-        yield
-    finally:
-        torch.set_num_threads(of_torch)
-        if of_kernels is not None:
-            kernels.set_num_threads(of_kernels)
 
 
 def give_threads(name: str, device: torch.device, threads: int) -> None:

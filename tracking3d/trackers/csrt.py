@@ -16,8 +16,9 @@ from tracking3d.frames import Box, Frame, Image, MaskEstimate, Prompt
 from tracking3d.trackers.box_trackers import OpenCvBoxes
 from tracking3d.trackers.crops import box_iou, box_of, clip_box
 from tracking3d.trackers.cues import Cues
+from tracking3d.trackers.opencv_build import why_no_contrib
 from tracking3d.trackers.protocol import Options
-from tracking3d.trackers.segmentation import ColourSegmentation
+from tracking3d.trackers.segmentation import SMOOTHER, ColourSegmentation
 
 STRAYED = 0.7
 """IoU of a correction's box and the box tracker's below which the latter is off the object and begins anew. Above,
@@ -71,6 +72,11 @@ class CsrtTracker:
             raise PluginError("The tracker csrt was built with options that are not its own.")
         return cls(options)
 
+    @classmethod
+    def why_unavailable(cls) -> str:
+        """What the OpenCV in use lacks for this tracker; empty where it lacks nothing."""
+        return why_no_contrib("TrackerCSRT", SMOOTHER)
+
     def init(self, frame: Frame, prompt: Prompt) -> MaskEstimate:
         """Start from a box or a mask; the prompt's mask is the first answer, else the box's segmentation."""
         if clip_box(prompt.box, frame.image.shape) is None:
@@ -110,9 +116,14 @@ class BoxTracker(OpenCvBoxes):
         options: The options of ``csrt``.
         image: ``(H, W, 3)`` RGB, the first frame.
         box: ``(x, y, w, h)`` in it, in pixels; the part inside the image is tracked.
+
+    Raises:
+        PluginError: If the OpenCV in use lacks CSR-DCF.
     """
 
     def __init__(self, options: CsrtTracker.Options, image: Image, box: Box) -> None:
+        if why := why_no_contrib("TrackerCSRT"):
+            raise PluginError(f"The box tracker CSR-DCF cannot be used: {why}.")
         params = cv2.TrackerCSRT.Params()
         for name in CsrtTracker.Options.model_fields.keys() & set(dir(params)):
             setattr(params, name, getattr(options, name))

@@ -16,10 +16,12 @@ from tracking3d.trackers.box_trackers import OpenCvBoxes
 from tracking3d.trackers.crops import box_iou, box_of, clip_box
 from tracking3d.trackers.csrt import STRAYED, BoxTracker, CsrtTracker
 from tracking3d.trackers.cues import Cues
+from tracking3d.trackers.opencv_build import why_no_contrib
 from tracking3d.trackers.protocol import Options
-from tracking3d.trackers.segmentation import ColourSegmentation
+from tracking3d.trackers.segmentation import SMOOTHER, ColourSegmentation
 
 _CUES = Cues()
+_WITNESSES = {"csrt": "TrackerCSRT", "kcf": "TrackerKCF"}  # in OpenCV's contrib modules
 
 
 class FlowTracker:
@@ -81,7 +83,15 @@ class FlowTracker:
         """Build the tracker from its validated options."""
         if not isinstance(options, FlowTracker.Options):
             raise PluginError("The tracker flow was built with options that are not its own.")
+        witness = _WITNESSES.get(options.witness)
+        if witness and (why := why_no_contrib(witness)):
+            raise PluginError(f"The witness {options.witness} of the tracker flow cannot be used: {why}.")
         return cls(options)
+
+    @classmethod
+    def why_unavailable(cls) -> str:
+        """What the OpenCV in use lacks for this tracker; empty where it lacks nothing."""
+        return why_no_contrib(SMOOTHER)
 
     def init(self, frame: Frame, prompt: Prompt) -> MaskEstimate:
         """Start from a box or a mask; the prompt's mask is the first answer, else the box's segmentation."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from tracking3d.errors import PluginError
 from tracking3d.frames import Box, Image, MaskEstimate
 from tracking3d.geometry.camera import Window
 from tracking3d.trackers.background import BackgroundMemory
@@ -21,8 +22,12 @@ from tracking3d.trackers.crops import box_iou, box_of, clip_box, cut, paste
 from tracking3d.trackers.cues import Cues, View, colour_and_motion, decide, distance_beyond
 from tracking3d.trackers.first_mask import mask_in_box
 from tracking3d.trackers.mask_motion import follow_mask
+from tracking3d.trackers.opencv_build import why_no_contrib
 from tracking3d.trackers.outline import both_sides, tidied, touches_border
 from tracking3d.trackers.search import find_by_colours
+
+SMOOTHER = "ximgproc.fastGlobalSmootherFilter"
+"""What the segmentation needs of OpenCV's contrib modules, see `tracking3d.trackers.opencv_build`."""
 
 _MARGIN = 0.45  # free space around the last box: how far the mask may move or grow in one frame
 _AREA_CHANGE = 0.35  # a larger relative change against the moved mask is not believed
@@ -43,6 +48,9 @@ class ColourSegmentation:
         mask: ``(H, W)`` bool, the object's first mask; segmented from the box if None.
         size: Side of the working crop in pixels.
         cues: The weights of the evidence.
+
+    Raises:
+        PluginError: If the OpenCV in use lacks `SMOOTHER`.
     """
 
     def __init__(
@@ -53,6 +61,8 @@ class ColourSegmentation:
         size: int = 224,
         cues: Cues | None = None,
     ) -> None:
+        if why := why_no_contrib(SMOOTHER):
+            raise PluginError(f"The colour segmentation cannot be used: {why}.")
         self._size, self._cues = size, cues or Cues()
         self._image = image
         self._mask = mask_in_box(image, box) if mask is None else mask.astype(np.float32)

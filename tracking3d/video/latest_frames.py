@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass, replace
+from numbers import Real
 
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, SkippedFrame
@@ -43,9 +44,9 @@ class LatestFrames:
     rate: float | None = None
 
     def __post_init__(self) -> None:
-        if self.rate is not None and not 0 < self.rate < float("inf"):
+        if self.rate is not None and not (isinstance(self.rate, Real) and 0 < self.rate < float("inf")):
             raise InputError(
-                f"A source cannot be played at {self.rate} frames a second; give a positive rate."
+                f"A source cannot be played at {self.rate!r:.60} frames a second; give a positive rate."
             )
 
     @property

@@ -6,7 +6,9 @@ import re
 import sys
 from pathlib import Path
 
-from tracking3d.errors import InputError
+from tracking3d.errors import InputError, argument
+
+_FRAMES = argument("frames=", "--frames ")
 
 EVERY_FRAME = range(0, sys.maxsize, 1)
 """The selection when nothing is asked for."""
@@ -26,17 +28,21 @@ def parse_selection(text: str | None) -> range:
     """
     if text is None:
         return EVERY_FRAME
+    if not isinstance(text, str):
+        raise InputError(
+            f"frames={text!r:.60} is not a text START:STOP:STEP, for example '0:100' or '10::2'."
+        )
     parts = [part.strip() for part in text.split(":")]
     if len(parts) not in (2, 3) or not all(re.fullmatch("[0-9]{0,18}", part) for part in parts):
         raise InputError(
-            f"Frames {text!r} is not START:STOP:STEP with whole numbers from 0, for example 0:100 or 10::2."
+            f"{_FRAMES}{text!r} is not START:STOP:STEP with whole numbers from 0, for example 0:100 or 10::2."
         )
     start, stop, step = (int(part) if part else None for part in (*parts, "")[:3])
     if step == 0:
-        raise InputError(f"Frames {text!r} has a step of 0; the step must be 1 or more.")
+        raise InputError(f"{_FRAMES}{text!r} has a step of 0; the step must be 1 or more.")
     selection = range(start or 0, sys.maxsize if stop is None else stop, step or 1)
     if not selection:
-        raise InputError(f"Frames {text!r} selects no frame because STOP is not greater than START.")
+        raise InputError(f"{_FRAMES}{text!r} selects no frame because STOP is not greater than START.")
     return range(selection.start, selection[-1] + 1, selection.step)
 
 

@@ -12,8 +12,9 @@ from pydantic import BaseModel, Field
 
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, MaskEstimate, Prompt
+from tracking3d.trackers.opencv_build import why_no_contrib
 from tracking3d.trackers.protocol import Options
-from tracking3d.trackers.segmentation import ColourSegmentation
+from tracking3d.trackers.segmentation import SMOOTHER, ColourSegmentation
 
 
 class KcfTracker:
@@ -33,6 +34,11 @@ class KcfTracker:
     def from_options(cls, options: BaseModel) -> Self:
         """Build the tracker from options that tracking3d has checked against ``Options``."""
         return cls(cls.Options.model_validate(options.model_dump()))
+
+    @classmethod
+    def why_unavailable(cls) -> str:
+        """What the OpenCV in use lacks for this tracker; empty where it lacks nothing."""
+        return why_no_contrib("TrackerKCF", SMOOTHER)
 
     def init(self, frame: Frame, prompt: Prompt) -> MaskEstimate:
         """Start on the first frame: the given mask, or the object segmented in the box."""

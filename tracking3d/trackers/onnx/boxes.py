@@ -9,10 +9,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.errors import InputError
+from tracking3d.errors import InputError, PluginError
 from tracking3d.frames import Box, Image
 from tracking3d.trackers.crops import clip_box
 from tracking3d.trackers.csrt import BoxTracker, CsrtTracker
+from tracking3d.trackers.opencv_build import why_no_contrib
 
 _LEAST_SIDE = 4  # pixels that a box tracker needs
 
@@ -30,9 +31,15 @@ class BoxProposer(Protocol):
 
 
 class CsrtBoxes:
-    """OpenCV's CSR-DCF."""
+    """OpenCV's CSR-DCF.
+
+    Raises:
+        PluginError: If the OpenCV in use lacks it.
+    """
 
     def __init__(self, options: CsrtTracker.Options) -> None:
+        if why := why_no_contrib("TrackerCSRT"):
+            raise PluginError(f"The box tracker csrt cannot be used: {why}.")
         self._options = options
         self._tracker: BoxTracker | None = None
 

@@ -1,0 +1,155 @@
+"""What callers of the library give: checked when they give it, in sentences that name the argument."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tracking3d.config.explain import a_kind, shown
+from tracking3d.config.loading import load_config
+from tracking3d.config.models import PipelineConfig
+from tracking3d.errors import InputError
+from tracking3d.frames import Frame, Image, Prompt, SkippedFrame
+from tracking3d.prompts import checked_box, checked_mask
+from tracking3d.video.source import FrameSource
+
+_WANTED = "(H, W, 3) arrays of uint8, RGB"
+
+
+def checked_config(config: Any) -> PipelineConfig:
+    """The configuration itself, that of a YAML file, or the default preset.
+
+    Raises:
+        InputError: If it is anything else, or the file cannot be used.
+    """
+    if isinstance(config, PipelineConfig):
+        return config
+    if config is not None and not isinstance(config, str | Path):
+        raise InputError(
+            f"config= is {a_kind(config)}; give a PipelineConfig (see load_config) or a YAML file."
+        )
+    return load_config(Path(config) if config is not None else None)
+
+
+def check_frames(frames: Any) -> None:
+    """Make sure that frames can be gone through, as far as that can be seen without taking one.
+
+    Args:
+        frames: What `tracking3d.track` was given.
+
+    Raises:
+        InputError: If they cannot.
+    """
+    if isinstance(frames, str | bytes | Path):
+        raise InputError(
+            f"frames={shown(str(frames))} is {a_kind(frames)}; give {_WANTED}, "
+            "or what tracking3d.video.open_source makes of a path."
+        )
+    shape = getattr(frames, "shape", None)
+    if shape is not None and (len(shape) != 4 or shape[3] != 3 or not _is_uint8(frames)):
+        raise InputError(
+            f"frames= is {a_kind(frames)} of shape {tuple(shape)} and type {getattr(frames, 'dtype', '?')}; "
+            f"give {_WANTED}, one after the other or as one array (N, H, W, 3)."
+        )
+    if not isinstance(frames, Iterable) or isinstance(frames, Mapping | type):
+        raise InputError(
+            f"frames= is {a_kind(frames)}; give {_WANTED}, or what tracking3d.video.open_source opens."
+        )
+    if isinstance(frames, Sequence) and frames and not isinstance(frames[0], Frame | SkippedFrame):
+        checked_image(frames[0], 0)
+
+
+def checked_image(image: Any, position: int) -> Image:
+    """A copy of an image that is ``(H, W, 3)`` uint8; callers like to decode every frame into one buffer.
+
+    Raises:
+        InputError: If it is not.
+    """
+    try:
+        copy = np.array(np.asarray(image), order="C")
+    except Exception as error:  # what a class makes of itself as an array can fail in any way
+        raise InputError(f"Frame {position} is {a_kind(image)}; give {_WANTED}.") from error
+    if copy.ndim == 0:
+        raise InputError(f"Frame {position} is {a_kind(image)}; give {_WANTED}.")
+    check_image(copy, f"Frame {position}")
+    return copy
+
+
+def check_image(image: Any, label: str) -> None:
+    """Make sure that an image is ``(H, W, 3)`` uint8.
+
+    Raises:
+        InputError: If it is not.
+    """
+    if not isinstance(image, np.ndarray):
+        raise InputError(f"{label} is {a_kind(image)}; give {_WANTED}.")
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or not image.size:
+        raise InputError(f"{label} has shape {image.shape} and type {image.dtype}; give {_WANTED}.")
+
+
+def check_frame(frame: Any) -> None:
+    """Make sure of what `tracking3d.Session.step` was given.
+
+    Raises:
+        InputError: If it is no `tracking3d.Frame`, or its image is not ``(H, W, 3)`` uint8.
+    """
+    if not isinstance(frame, Frame):
+        raise InputError(f"frame= is {a_kind(frame)}; wrap the image: Frame(index, image).")
+    check_image(frame.image, frame.name or f"Frame {frame.index}")
+
+
+def check_session(config: Any, prompt: Any, intrinsics: Any) -> None:
+    """Make sure of what a `tracking3d.Session` was given.
+
+    Raises:
+        InputError: If something cannot be used.
+    """
+    if not isinstance(config, PipelineConfig):
+        raise InputError(f"config= is {a_kind(config)}; give a PipelineConfig, see load_config.")
+    if prompt is not None:
+        if not isinstance(prompt, Prompt):
+            raise InputError(
+                f"prompt= is {a_kind(prompt)}; make one of the first frame with tracking3d.prompts.make_prompt."
+            )
+        checked_box(prompt.box, "prompt.box=")
+        if prompt.mask is not None:
+            checked_mask(prompt.mask, "prompt.mask=")
+    if intrinsics is not None:
+        try:
+            fx, fy, cx, cy = (float(value) for value in intrinsics)
+            fits = min(fx, fy) > 0 and all(map(math.isfinite, (fx, fy, cx, cy)))
+        except (TypeError, ValueError, OverflowError):
+            fits = False
+        if not fits:
+            raise InputError(
+                f"intrinsics={shown(intrinsics)} is not fx, fy, cx, cy in pixels with positive fx and fy."
+            )
+
+
+def check_source(source: Any) -> None:
+    """Make sure of what `tracking3d.recording.record` was given to read.
+
+    Raises:
+        InputError: If it is no source of frames.
+    """
+    if not isinstance(source, FrameSource):
+        raise InputError(f"source= is {a_kind(source)}; open it with tracking3d.video.open_source.")
+
+
+def checked_folder(folder: Any) -> Path:
+    """The run folder.
+
+    Raises:
+        InputError: If it is no path.
+    """
+    if not isinstance(folder, str | Path):
+        raise InputError(f"folder= is {a_kind(folder)}; give the path of the run folder.")
+    return Path(folder)
+
+
+def _is_uint8(array: Any) -> bool:
+    return str(getattr(array, "dtype", "")).rpartition(".")[2] == "uint8"
