@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import importlib.util
 import os
@@ -50,8 +51,9 @@ class Registered:
 
 def registered_plugins() -> list[Registered]:
     """All registered plug-ins, those first that win over others of the same name; imports none of them."""
+    origin = functools.cache(_origin)  # reading metadata is slow; once for all plug-ins of a package
     packaged = [
-        Registered(point.name, group, point.value, *_distribution(point))
+        Registered(point.name, group, point.value, *origin(point.dist))
         for group in KIND
         for point in metadata.entry_points(group=group)
     ]
@@ -81,11 +83,10 @@ def told(error: BaseException) -> str:
     return text if len(text) <= 300 else text[:297] + "..."
 
 
-def _distribution(point: metadata.EntryPoint) -> tuple[str, str]:
-    """Package and version behind an entry point; its metadata may be damaged or absent."""
+def _origin(package: metadata.Distribution | None) -> tuple[str, str]:
+    """Name and version of a package; its metadata may be damaged or absent."""
     try:
-        dist = point.dist
-        return (dist.name or "unknown", dist.version or "") if dist else ("unknown", "")
+        return (package.name or "unknown", package.version or "") if package else ("unknown", "")
     except Exception:
         return "unknown", ""
 
