@@ -183,7 +183,11 @@ def test_every_object_has_a_run_folder_as_if_it_were_alone(source, tmp_path):
         record(source, settings(), tmp_path / f"alone_{number}", box=box)
         one, alone = RunReader(tmp_path / "run" / f"object_{number}"), RunReader(tmp_path / f"alone_{number}")
         assert one.state == "finished"
-        assert [frame.to_json() for frame in one.frames] == [frame.to_json() for frame in alone.frames]
+        answers, expected = (
+            [replace(frame, seconds=0.0, stages=None).to_json() for frame in run.frames]
+            for run in (one, alone)
+        )
+        assert answers == expected
         assert all(np.array_equal(one.mask(n), alone.mask(n)) for n in range(5))
         files = {path.relative_to(one.folder) for path in one.folder.rglob("*")}
         assert files == {path.relative_to(alone.folder) for path in alone.folder.rglob("*")}
