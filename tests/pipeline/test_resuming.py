@@ -92,6 +92,14 @@ def stopped(monkeypatch, clip, images, folder, owner, name, call, error=None, **
             record(open_source(str(images)), settings(**more), folder, mask=clip.masks[0], resume=True)
 
 
+def let_go(writer: run_writer.RunWriter, *_) -> None:
+    """Close what the system closes with a process, and write nothing."""
+    writer._lines.close()
+    writer._pictures.close()
+    if writer._refinement:
+        writer._refinement.pictures.close()
+
+
 MOMENTS = {
     "in the first frame": (Session, "step", 0),
     "in a later frame": (Session, "step", 3),
@@ -113,7 +121,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_end(
     folder = tmp_path / "run"
     with monkeypatch.context() as patch:
         if killed:  # nothing is written at the end, as little as after SIGKILL
-            patch.setattr(run_writer.RunWriter, "finish", lambda self, *_: self._lines.close())
+            patch.setattr(run_writer.RunWriter, "finish", let_go)
             if moment == "while the mesh is written":
                 pytest.skip("there is no such moment: the end is not written")
         stopped(patch, clip, images, folder, *MOMENTS[moment])
@@ -156,12 +164,12 @@ def test_the_state_of_the_online_solver_is_kept_whole(
 
 
 def test_a_run_may_be_stopped_again_and_again(clip, images, whole, tmp_path, monkeypatch):
-    for _ in range(FRAMES):
+    for _ in range(FRAMES - 1):
         stopped(monkeypatch, clip, images, tmp_path / "run", Session, "step", 1)
     record(open_source(str(images)), settings(), tmp_path / "run", mask=clip.masks[0], resume=True)
     assert_alike(tmp_path / "run", whole["stand_in"])
     resumed = RunReader(tmp_path / "run").description["resumed"]
-    assert [one["frames"] for one in resumed] == [1, 2, 3, 4, 5, 6]
+    assert [one["frames"] for one in resumed] == [1, 2, 3, 4, 5]
 
 
 def test_a_plugin_that_fails_and_is_mended_costs_nothing(clip, images, whole, tmp_path, monkeypatch):
@@ -380,10 +388,11 @@ def test_nothing_but_json_and_arrays_is_kept_and_none_of_it_when_the_run_is_fini
 
 
 def test_a_solver_whose_state_cannot_be_kept_tracks_all_the_same(clip, images, tmp_path, monkeypatch, caplog):
-    step = CausalSolver.step
+    step, result = CausalSolver.step, StandInSolver.result
     monkeypatch.setattr(
         CausalSolver, "step", lambda self, state, *given: (object(), step(self, 0, *given)[1])
     )
+    monkeypatch.setattr(StandInSolver, "result", lambda self, state: result(self, 0))
     config = settings("solver.final_refine=false")
     record(open_source(str(images)), config, tmp_path / "run", mask=clip.masks[0])
     assert RunReader(tmp_path / "run").state == "finished"

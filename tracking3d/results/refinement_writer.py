@@ -64,15 +64,15 @@ class RefinementWriter:
         with writing(self._aside):
             (self._aside / layout.MASKS).mkdir(parents=True, exist_ok=True)
             _undo_taking_over(folder)
-            self._lines = (self._aside / layout.FRAMES).open("ab", buffering=0)
-            self._lines.truncate(kept)
+            with (self._aside / layout.FRAMES).open("ab") as lines:
+                lines.truncate(kept)
         kept_records = read_records(self._aside / layout.FRAMES)
         self._records = {record.index: record for record in kept_records}
 
     @property
     def lines(self) -> int:
         """Bytes of answers that are written."""
-        return self._lines.seek(0, 2)
+        return (self._aside / layout.FRAMES).stat().st_size
 
     @property
     def seconds(self) -> float:
@@ -151,7 +151,6 @@ class RefinementWriter:
         with writing(self._folder):
             if (self._aside / layout.OVERLAY).is_file():
                 (self._aside / layout.OVERLAY).replace(self._folder / layout.OVERLAY)
-            self._lines.close()
 
     def give_up(self, keep: bool) -> None:
         """The causal answers are as they were; what was made is kept for another try, or removed.
@@ -160,7 +159,6 @@ class RefinementWriter:
             OutputError: If it cannot be done.
         """
         self.pictures.close()
-        self._lines.close()
         if not self._taken_over:
             with writing(self._folder):
                 _undo_taking_over(self._folder)
