@@ -33,13 +33,12 @@ class RandomState:
 
     def same(self, other: RandomState) -> bool:
         """Whether what is drawn next is the same."""
-        cuda = other.of_cuda
         return (
             self.of_python == other.of_python
             and self.of_numpy[2:] == other.of_numpy[2:]
             and np.array_equal(self.of_numpy[1], other.of_numpy[1])
             and torch.equal(self.of_torch, other.of_torch)
-            and (self.of_cuda is None if cuda is None else cuda.equal(self.of_cuda))
+            and _same(self.of_cuda, other.of_cuda)
         )
 
     def put(self, device: torch.device) -> None:
@@ -90,6 +89,10 @@ class OwnSettings:
                 now = RandomState.now(self._device)
                 if self.random is None or not now.same(self.random):
                     self.random = now
+
+
+def _same(a: Tensor | None, b: Tensor | None) -> bool:
+    return a is b if a is None or b is None else torch.equal(a, b)
 
 
 @contextmanager
