@@ -1,6 +1,6 @@
 """SIGKILL at random moments of a run, again and again, and what is left in the end.
 
-``TRACKING3D_KILL_SEED`` chooses other moments.
+``TRACKING3D_KILL_SEED`` chooses other moments, ``TRACKING3D_KILLS`` how many of them.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import pytest
+from refining_solver import StandInSolver
 from resumable_runs import assert_alike, finished_frames
 
 from tracking3d import load_config
@@ -22,7 +23,7 @@ from tracking3d.recording import record
 from tracking3d.results.files import write_image
 from tracking3d.results.layout import CAUSAL
 from tracking3d.results.run_reader import RunReader
-from tracking3d.session import Session
+from tracking3d.session import SOLVERS, Session
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.video import open_source
 
@@ -30,13 +31,15 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL is POSI
 
 FRAMES, SIZE = 14, (120, 90)
 SEED = int(os.environ.get("TRACKING3D_KILL_SEED", "13"))
+KILLS = int(os.environ.get("TRACKING3D_KILLS", "100"))
 QUICK = [
     "tracker.name=flow",
     "tracker.segmentation_size=64",
     "window.size=32",
-    "object.frequency=3",
+    "object.frequency=2",
     "object.texture_size=48",
-    "solver.online.window=4",
+    "solver.window=4",
+    "solver.keyframe_rotation=25",
 ]
 
 
@@ -53,14 +56,20 @@ def images(clip, tmp_path_factory) -> Path:
     return folder
 
 
-def track(images: Path, folder: Path, mask, log: Path) -> None:
-    """What the process that is killed does: a run, and a line for every frame that it solves."""
+def track(images: Path, folder: Path, mask, log: Path, quick: bool) -> None:
+    """What the process that is killed does: a run, and a line for every frame that it solves.
+
+    Args:
+        quick: Answer by a solver that takes no time, so that the moments are those in which files are written.
+    """
     os.environ.update(OMP_NUM_THREADS="1")
     import cv2
     import torch
 
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
+    if quick:
+        SOLVERS["online"] = StandInSolver
     with log.open("a") as lines:
         lines.write(json.dumps(["begin", 0]) + "\n")
     for name in ("step", "revisit"):
@@ -80,12 +89,12 @@ class Victims:
 
     def __init__(self, *arguments) -> None:
         self._context = multiprocessing.get_context("forkserver")
-        self._context.set_forkserver_preload(["tracking3d.recording", "tracking3d.video", "kornia"])
+        self._context.set_forkserver_preload(["test_killed_runs"])
         self._arguments = arguments
 
     def start(self, folder: Path, log: Path) -> BaseProcess:
-        images, mask = self._arguments
-        process = self._context.Process(target=track, args=(images, folder, mask, log))
+        images, mask, quick = self._arguments
+        process = self._context.Process(target=track, args=(images, folder, mask, log, quick))
         process.start()
         return process
 
@@ -135,9 +144,9 @@ def assert_little_was_done_twice(log: Path, kills: int) -> None:
     assert again <= kills
 
 
-def kill_runs(clip, images, tmp_path, kills: int) -> int:
+def kill_runs(clip, images, tmp_path, kills: int, quick: bool) -> int:
     whole, log = tmp_path / "whole", tmp_path / "whole.log"
-    victims = Victims(images, clip.masks[0])
+    victims = Victims(images, clip.masks[0], quick)
     process = victims.start(whole, log)
     while not begun(log):
         time.sleep(0.01)
@@ -159,9 +168,10 @@ def kill_runs(clip, images, tmp_path, kills: int) -> int:
 
 
 def test_a_few_kills_cost_no_answer(clip, images, tmp_path):
-    assert kill_runs(clip, images, tmp_path, 3) >= 3
+    assert kill_runs(clip, images, tmp_path, 3, quick=True) >= 3
 
 
 @pytest.mark.slow
-def test_a_hundred_kills_cost_no_answer(clip, images, tmp_path):
-    assert kill_runs(clip, images, tmp_path, 100) >= 100
+@pytest.mark.parametrize("quick", [False, True], ids=["solving", "writing"])
+def test_a_hundred_kills_cost_no_answer(clip, images, tmp_path, quick):
+    assert kill_runs(clip, images, tmp_path, KILLS, quick) >= KILLS

@@ -15,6 +15,7 @@ from resumable_runs import assert_alike, files_of
 from tracking3d import load_config
 from tracking3d.checkpoint.folder import Checkpoint
 from tracking3d.errors import InputError, OutputError
+from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.recording import record, record_objects
 from tracking3d.results import layout, run_writer
 from tracking3d.results.files import write_image
@@ -46,17 +47,23 @@ def images(clip, tmp_path_factory) -> Path:
 
 @pytest.fixture(autouse=True)
 def solvers(monkeypatch):
-    monkeypatch.setitem(SOLVERS, "stand_in", StandInSolver)
+    monkeypatch.setitem(SOLVERS, "online", StandInSolver)
     monkeypatch.setattr(CausalSolver, "faults", {})
     monkeypatch.setattr(StandInSolver, "revisit_faults", {})
     monkeypatch.setattr(StandInSolver, "seen", [])
 
 
-def settings(*overrides: str, solver: str = "stand_in", policy: str = "stop"):
-    quick = ["tracker.name=flow", "tracker.segmentation_size=64", f"solver.name={solver}"]
+@pytest.fixture
+def online(monkeypatch) -> None:
+    """The solver itself."""
+    monkeypatch.setitem(SOLVERS, "online", OnlineSolver)
+
+
+def settings(*overrides: str):
+    quick = ["tracker.name=flow", "tracker.segmentation_size=64"]
     return load_config(
         overrides=[*quick, "window.size=32", "object.frequency=2", "object.texture_size=32", *overrides],
-        runtime={"on_plugin_failure": policy},
+        runtime={"on_plugin_failure": "stop"},
     )
 
 
@@ -65,10 +72,10 @@ def whole(clip, images, tmp_path_factory) -> dict[str, Path]:
     """Runs that nobody stopped, by solver."""
     runs = {}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(SOLVERS, "stand_in", StandInSolver)
-        for solver in ("stand_in", "online"):
-            runs[solver] = tmp_path_factory.mktemp("whole") / solver
-            record(open_source(str(images)), settings(solver=solver), runs[solver], mask=clip.masks[0])
+        for name, solver in (("stand_in", StandInSolver), ("online", OnlineSolver)):
+            patch.setitem(SOLVERS, "online", solver)
+            runs[name] = tmp_path_factory.mktemp("whole") / name
+            record(open_source(str(images)), settings(), runs[name], mask=clip.masks[0])
     return runs
 
 
@@ -85,11 +92,11 @@ def stop_at(monkeypatch, owner, name: str, call: int, error: BaseException | Non
     monkeypatch.setattr(owner, name, stopping)
 
 
-def stopped(monkeypatch, clip, images, folder, owner, name, call, error=None, **more) -> None:
+def stopped(monkeypatch, clip, images, folder, owner, name, call, error=None) -> None:
     with monkeypatch.context() as patch:
         stop_at(patch, owner, name, call, error)
         with pytest.raises((Stopped, Exception)):
-            record(open_source(str(images)), settings(**more), folder, mask=clip.masks[0], resume=True)
+            record(open_source(str(images)), settings(), folder, mask=clip.masks[0], resume=True)
 
 
 def let_go(writer: run_writer.RunWriter, *_) -> None:
@@ -155,11 +162,11 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_end(
     ("owner", "name", "call"), [(Session, "step", 4), (Session, "revisit", 3)], ids=["tracked", "refined"]
 )
 def test_the_state_of_the_online_solver_is_kept_whole(
-    clip, images, whole, tmp_path, monkeypatch, owner, name, call
+    clip, images, whole, tmp_path, monkeypatch, online, owner, name, call
 ):
-    stopped(monkeypatch, clip, images, tmp_path / "run", owner, name, call, solver="online")
+    stopped(monkeypatch, clip, images, tmp_path / "run", owner, name, call)
     source = open_source(str(images))
-    record(source, settings(solver="online"), tmp_path / "run", mask=clip.masks[0], resume=True)
+    record(source, settings(), tmp_path / "run", mask=clip.masks[0], resume=True)
     assert_alike(tmp_path / "run", whole["online"])
 
 
@@ -375,9 +382,9 @@ def test_a_run_whose_state_is_gone_is_refused(clip, images, tmp_path, monkeypatc
 
 
 def test_nothing_but_json_arrays_and_masks_is_kept_and_none_of_it_when_the_run_is_finished(
-    clip, images, whole, tmp_path, monkeypatch
+    clip, images, whole, tmp_path, monkeypatch, online
 ):
-    stopped(monkeypatch, clip, images, tmp_path / "run", Session, "step", 4, solver="online")
+    stopped(monkeypatch, clip, images, tmp_path / "run", Session, "step", 4)
     files = files_of(tmp_path / "run" / layout.STATE)
     assert {file.suffix for file in files} <= {".json", ".jsonl", ".npz", ".png"}
     for file in files:
