@@ -13,12 +13,14 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from enum import Enum
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
 import torch
+from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -192,6 +194,11 @@ class TreeFolder:
         np.savez(self._folder / name, **arrays)  # type: ignore[arg-type]
         return name
 
+    def _opened(self, name: str) -> NpzFile:
+        # From memory: numpy leaves a damaged file open.
+        opened: NpzFile = np.load(BytesIO((self._folder / name).read_bytes()), allow_pickle=False)
+        return opened
+
     def _decoded(self, node: Any, within: _Part) -> Any:
         if isinstance(node, list):
             return [self._decoded(item, within) for item in node]
@@ -227,7 +234,7 @@ class TreeFolder:
 
     def _read_part(self, node: dict[str, Any], inner: dict[str, Any], text: str, file: str | None) -> _Part:
         if "sparse" in node:
-            with np.load(self._folder / str(file)) as arrays:
+            with self._opened(str(file)) as arrays:
                 index, value = torch.from_numpy(arrays["index"]), torch.from_numpy(arrays["value"])
             sparse = torch.sparse_coo_tensor(index, value, node["size"], check_invariants=True)
             return _Part(sparse.coalesce().to(self._device), text, file)
@@ -241,7 +248,7 @@ class TreeFolder:
         kind, shape = np.dtype(node["array"]), tuple(node["shape"])
         if "data" in node:
             return np.frombuffer(base64.b64decode(node["data"]), kind).reshape(shape).copy()
-        with np.load(self._folder / node["file"]) as arrays:
+        with self._opened(node["file"]) as arrays:
             if "bits" in arrays.files:
                 flat = np.unpackbits(arrays["bits"], count=math.prod(shape)).astype(kind)
                 return flat.reshape(shape)
