@@ -86,7 +86,7 @@ class Checkpoint:
             state = json.loads(path.read_bytes())
             if state["version"] != VERSION:
                 raise InputError(
-                    f"{path} was written by another version of tracking3d; start anew with --overwrite."
+                    f"{path} was written by another version of tracking3d; start anew with {layout.OVERWRITE}."
                 )
             self._journal = int(state["journal"])
             journal = self._folder / layout.JOURNAL
@@ -96,7 +96,7 @@ class Checkpoint:
             taken, skipped = read_journal(text)
             kept = Kept(Progress(**state["progress"]), self._trees.read(state["session"]), taken, skipped)
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(f"{path} is damaged ({error}); start anew with --overwrite.") from error
+            raise InputError(f"{path} is damaged ({error}); start anew with {layout.OVERWRITE}.") from error
         return kept
 
     def clear_strangers(self) -> None:
@@ -127,7 +127,7 @@ class Checkpoint:
         """
         mask = read_mask(path := layout.mask_path(self._folder, index))
         if mask is None:
-            raise InputError(f"{path} is missing or damaged; start anew with --overwrite.")
+            raise InputError(f"{path} is missing or damaged; start anew with {layout.OVERWRITE}.")
         return mask
 
     def remove(self) -> None:

@@ -70,18 +70,18 @@ def earlier_run(
         return "none"
     run = RunReader(folder)
     if is_locked(folder / layout.FRAMES):
-        raise OutputError(f"{folder} is in use by another run; wait for it or choose another --out.")
+        raise OutputError(f"{folder} is in use by another run; wait for it or choose another {layout.OUT}.")
     finished = run.state == "finished"
     if not finished and not layout.has_state(folder):
         if len(run.frames) <= 1:  # stopped before the first state was kept
             return "none"
         raise InputError(
-            f"The run {folder} cannot be resumed: its state was not kept; start anew with --overwrite."
+            f"The run {folder} cannot be resumed: its state was not kept; start anew with {layout.OVERWRITE}."
         )
     if what := next(_differences(run.description, config, selection, given), None):
         raise InputError(
             f"The run {folder} cannot be resumed with other settings or another source: {what}; "
-            "give what it was begun with, or start anew with --overwrite."
+            f"give what it was begun with, or start anew with {layout.OVERWRITE}."
         )
     return "finished" if finished else "stopped"
 
