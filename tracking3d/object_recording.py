@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Generator, Iterable
 from contextlib import suppress
@@ -11,14 +12,20 @@ from typing import Any
 
 import numpy as np
 
-from tracking3d.errors import OutputError, PluginError
+from tracking3d.checkpoint.folder import Checkpoint
+from tracking3d.checkpoint.progress import Kept, Progress, TakenFrame, checksum
+from tracking3d.checkpoint.trees import UnkeptError
+from tracking3d.errors import InputError, OutputError, PluginError
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.frames import Frame, MaskEstimate, SkippedFrame
+from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.refinement_writer import RefinementWriter
 from tracking3d.results.run_writer import RunWriter
 from tracking3d.session import Session
 from tracking3d.video.source import FrameSource
+
+_log = logging.getLogger(__name__)
 
 Listener = Callable[[FrameRecord | SkippedFrame], None]
 """Is told of every frame as it is done, or skipped; where there is a final refinement, once more of each."""
@@ -30,25 +37,63 @@ class ObjectRecording:
     Args:
         session: Answers for the frames.
         writer: Keeps the answers.
+        checkpoint: Keeps the state after each; None where that is of no use, since the source cannot be read again.
+        kept: The state of a stopped run that this one goes on with, which ``session`` was given.
     """
 
-    def __init__(self, session: Session, writer: RunWriter) -> None:
-        self._session, self._writer = session, writer
-        self._answered = False
+    def __init__(
+        self,
+        session: Session,
+        writer: RunWriter,
+        checkpoint: Checkpoint | None = None,
+        kept: Kept | None = None,
+    ) -> None:
+        self._session, self._writer, self._checkpoint = session, writer, checkpoint
+        self._kept = kept
+        self._progress = kept.progress if kept else Progress()
+        self._until = self._progress  # what was done before
+        self._answered = kept is not None
+        self._said = False
         self._initial: dict[int, tuple[float, str]] = {}
+        if kept and session.config.solver.final_refine:
+            self._initial = {one.index: (one.score, one.reason) for one in kept.taken.values()}
         self._causal_model: ObjectModel | None = None
         self._refinement: RefinementWriter | None = None
 
-    def take(self, frame: Frame | SkippedFrame) -> FrameRecord | SkippedFrame:
-        """Answer for the next frame and keep the answer."""
+    def take(self, frame: Frame | SkippedFrame) -> FrameRecord | SkippedFrame | None:
+        """Answer for the next frame and keep the answer; what was answered before the run was stopped stands."""
+        if self._kept and frame.index <= self._until.last:
+            return self._take_kept(self._kept, frame)
         if isinstance(frame, SkippedFrame):
             self._writer.skip(frame)
+            if self._checkpoint:
+                self._checkpoint.note(frame)
             return frame
-        answer = self._writer.write(self._session.step(frame), frame)
+        estimate = self._session.step(frame)
+        answer = self._writer.write(estimate, frame)
         self._answered = True
+        initial = self._session.initial_mask
         if self._session.config.solver.final_refine:
-            self._initial[frame.index] = self._session.initial_mask.score, self._session.initial_mask.reason
+            self._initial[frame.index] = initial.score, initial.reason
+        if self._checkpoint:
+            if self._session.corrected:
+                self._checkpoint.keep_correction(frame.index, estimate.mask)
+            taken = TakenFrame(
+                frame.index,
+                checksum(frame.image),
+                initial.score,
+                initial.reason,
+                self._session.corrected,
+                self._session.failure_at(frame.index),
+            )
+            self._progress = replace(self._progress, last=frame.index, lines=self._writer.lines)
+            self._keep(taken)
         return answer
+
+    @property
+    def takes(self) -> bool:
+        """Whether the frames are to come for the first time, or for the mask tracker to see them again."""
+        return not self._until.refining
 
     @property
     def refines(self) -> bool:
@@ -57,6 +102,14 @@ class ObjectRecording:
 
     def begin_refinement(self, source: FrameSource) -> None:
         """All frames were taken: solve everything once more, or record why not though it was asked for."""
+        if self._until.refining:
+            self._refinement = self._writer.begin_refinement(
+                None, self._until.refined_lines, self._until.refinement_seconds
+            )
+            self._causal_model = load_model(self._writer.folder)
+            self._refinement.together = self._session.refining
+            self._writer.refine_camera(self._session.camera)
+            return
         solver = self._session.config.solver
         if not solver.final_refine:
             return
@@ -72,12 +125,18 @@ class ObjectRecording:
         self._session.refine()
         self._refinement.together = self._session.refining
         self._writer.refine_camera(self._session.camera)
+        self._progress = replace(self._progress, refining=True)
+        self._keep()
 
     def take_again(self, frame: Frame) -> FrameRecord | None:
         """Answer for a frame once more; None where it has no causal answer or there is no refinement."""
         refinement = self._refinement
         if refinement is None or frame.index not in refinement.causal:
             return None
+        if self._kept:
+            self._check(self._kept, frame)
+            if frame.index <= self._until.last_refined:
+                return refinement.draw_again(frame)
         mask = refinement.initial_mask(frame.index)
         score, reason = self._initial.get(frame.index, (1.0, ""))
         initial = MaskEstimate(None if mask is None else mask.astype(np.float32), score, reason)
@@ -86,8 +145,12 @@ class ObjectRecording:
         except PluginError:
             if self._session.config.runtime.on_plugin_failure == "stop":
                 raise
-            return refinement.write(None, frame)
-        return refinement.write(estimate, frame)
+            answer = refinement.write(None, frame)
+        else:
+            answer = refinement.write(estimate, frame)
+        self._progress = replace(self._progress, last_refined=frame.index, refined_lines=refinement.lines)
+        self._keep()
+        return answer
 
     def finish(self) -> None:
         """Write what is made at the end."""
@@ -96,6 +159,8 @@ class ObjectRecording:
             self._writer.end_refinement()
             self._causal_model = None
         self._writer.finish(model, "finished")
+        if self._checkpoint:
+            self._checkpoint.remove()
 
     def give_up(self, error: BaseException) -> None:
         """Keep what is finished when ``error`` ends the run, and let ``error`` say so."""
@@ -110,6 +175,63 @@ class ObjectRecording:
         model = self._causal_model or _model(self._session)
         with suppress(OutputError):  # the first error is the one to tell
             self._writer.finish(model, "failed" if failed else "interrupted", str(error) or None)
+
+    def _take_kept(self, kept: Kept, frame: Frame | SkippedFrame) -> FrameRecord | SkippedFrame | None:
+        """Draw a frame that is answered, and show it to a mask tracker that knows no other way to go on."""
+        if isinstance(frame, SkippedFrame) and frame.index not in kept.taken:
+            return frame
+        if frame.index not in kept.taken or self._until.refining:
+            return None
+        self._check(kept, frame)
+        assert isinstance(frame, Frame)
+        if self._session.replays:
+            taken, first = kept.taken[frame.index], frame.index == min(kept.taken)
+            correction = None
+            if taken.corrected and self._checkpoint:
+                correction = self._checkpoint.correction(frame.index)
+            answer = self._session.replay(frame, first, correction)
+            if (
+                not self._said
+                and not taken.failure
+                and answer
+                and not self._writer.is_initial_mask(frame, answer)
+            ):
+                self._said = True
+                _log.warning(
+                    "The mask tracker gives another mask of %s than before the run was stopped; what follows may "
+                    "differ from a run that was not.",
+                    frame.name or f"frame {frame.index}",
+                )
+        return self._writer.draw_again(frame)
+
+    def _check(self, kept: Kept, frame: Frame | SkippedFrame) -> None:
+        """Make sure that a frame is the one that was answered before the run was stopped."""
+        taken = kept.taken.get(frame.index)
+        if isinstance(frame, SkippedFrame):
+            raise InputError(
+                f"Frame {frame.index} was read before the run was stopped, but cannot be now ({frame.reason})."
+            )
+        if taken is not None and taken.picture != checksum(frame.image):
+            raise InputError(
+                f"{frame.name or f'frame {frame.index}'} shows another picture than when it was answered; a run goes "
+                "on with the same source only."
+            )
+
+    def _keep(self, taken: TakenFrame | None = None) -> None:
+        """Keep the state as it is now."""
+        if self._checkpoint is None:
+            return
+        self._progress = replace(
+            self._progress,
+            seconds=self._writer.seconds,
+            refinement_seconds=self._refinement.seconds if self._refinement else 0.0,
+        )
+        try:
+            self._checkpoint.save(self._progress, self._session.kept(), taken)
+        except UnkeptError as error:
+            _log.warning("This run cannot be resumed when it is stopped: %s.", error)
+            self._checkpoint.remove()
+            self._checkpoint = None
 
 
 def go_through(
@@ -147,7 +269,7 @@ def go_through(
             raise errors[0]
 
     try:
-        for frame in frames:
+        for frame in frames if any(recording.takes for recording in going_on) else ():
             each(partial(ObjectRecording.take, frame=_shared(frame, share)))
         each(partial(ObjectRecording.begin_refinement, source=source))
         for frame in timed(source) if any(recording.refines for recording in going_on) else ():

@@ -31,6 +31,16 @@ class RandomState:
         cuda = torch.cuda.get_rng_state(device) if device.type == "cuda" else None
         return cls(random.getstate(), np.random.get_state(), torch.get_rng_state(), cuda)
 
+    def same(self, other: RandomState) -> bool:
+        """Whether what is drawn next is the same."""
+        return (
+            self.of_python == other.of_python
+            and self.of_numpy[2:] == other.of_numpy[2:]
+            and np.array_equal(self.of_numpy[1], other.of_numpy[1])
+            and torch.equal(self.of_torch, other.of_torch)
+            and _same(self.of_cuda, other.of_cuda)
+        )
+
     def put(self, device: torch.device) -> None:
         """Make them so again."""
         random.setstate(self.of_python)
@@ -50,11 +60,14 @@ class OwnSettings:
         renderer: What renders, see `tracking3d.rendering.prepare_backend`.
         device: Where.
         seed: Seed of everything random.
+
+    Attributes:
+        random: Where its random numbers are; None before the first. The same object as long as none is drawn.
     """
 
     def __init__(self, renderer: Mapping[str, str | int], device: str, seed: int) -> None:
         self._renderer, self._device, self._seed = renderer, torch.device(device), seed
-        self._random: RandomState | None = None
+        self.random: RandomState | None = None
 
     @contextmanager
     def in_force(self) -> Iterator[None]:
@@ -64,16 +77,22 @@ class OwnSettings:
         """
         with threads_kept(), process_kept(self._device):
             give_threads(self._renderer)
-            if self._random is None:
+            if self.random is None:
                 random.seed(self._seed)
                 np.random.seed(self._seed % 2**32)
                 torch.manual_seed(self._seed)
             else:
-                self._random.put(self._device)
+                self.random.put(self._device)
             try:
                 yield
             finally:
-                self._random = RandomState.now(self._device)
+                now = RandomState.now(self._device)
+                if self.random is None or not now.same(self.random):
+                    self.random = now
+
+
+def _same(a: Tensor | None, b: Tensor | None) -> bool:
+    return a is b if a is None or b is None else torch.equal(a, b)
 
 
 @contextmanager

@@ -12,14 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.arguments import check_source, checked_config, checked_folder
+from tracking3d.checkpoint.folder import Checkpoint, remove_state
+from tracking3d.checkpoint.resuming import earlier_run, given_of
 from tracking3d.config.camera import choose_camera
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError
-from tracking3d.frames import Box, Frame, SkippedFrame
+from tracking3d.frames import Box, Frame, Prompt, SkippedFrame
 from tracking3d.object_recording import Listener, ObjectRecording, go_through, timed
 from tracking3d.prompts import check_prompt, check_prompts, damaged_start, make_prompt, make_prompts
 from tracking3d.results.layout import object_folders
-from tracking3d.results.run_writer import RunWriter
+from tracking3d.results.run_writer import RunWriter, WrittenSoFar
 from tracking3d.session import Session, build_encoder
 from tracking3d.video.source import FrameSource
 
@@ -37,6 +39,7 @@ def record(
     selection: str | None = None,
     overwrite: bool = False,
     skip_damaged: bool = False,
+    resume: bool = False,
     listener: Listener = lambda frame: None,
 ) -> None:
     """Track the object through ``source`` and write the run folder.
@@ -55,21 +58,25 @@ def record(
         selection: The ``START:STOP:STEP`` that the source was opened with, for the record.
         overwrite: Replace a run that is in the folder.
         skip_damaged: Where the first frame cannot be read, take the box or mask for the first one that can.
-        listener: Is told of every frame.
+        resume: Go on with the run that is in the folder, from the last frame that it finished; begin one where there
+            is none. With a finished run nothing is done.
+        listener: Is told of every frame, those finished before included.
 
     Raises:
+        InputError: If the run in the folder is of other settings or another source; the difference is named.
         Tracking3dError: What was finished until then is kept in the folder, as it is on Ctrl-C.
     """
     check_source(source)
     config, folder = checked_config(config), checked_folder(folder)
     check_prompt(box, mask, needed=config.tracker.name != "precomputed")
-    begin = partial(run_writer, source, command=command, selection=selection, overwrite=overwrite)
-    with opened(source) as frames:
+    begin = partial(begun, source, command=command, selection=selection, overwrite=overwrite, resume=resume)
+    with opened(source) as frames, ExitStack() as writers:
         skipped, first = first_frame(frames, source.name, skip_damaged or (box is None and mask is None))
         prompt = None if box is None and mask is None else make_prompt(first, box, mask)
         session = Session(config, prompt, source.intrinsics, source.intrinsics_origin)
-        with begin(session, first=first, folder=folder) as writer:
-            go_through(source, chain(skipped, [first], frames), [ObjectRecording(session, writer)], listener)
+        recording = begin(session, prompt, first=first, folder=folder, writers=writers)
+        if recording is not None:
+            go_through(source, chain(skipped, [first], frames), [recording], listener)
 
 
 def record_objects(
@@ -83,6 +90,7 @@ def record_objects(
     selection: str | None = None,
     overwrite: bool = False,
     skip_damaged: bool = False,
+    resume: bool = False,
     listener: Listener = lambda frame: None,
 ) -> None:
     """Track several objects through ``source`` in one pass; each has a run folder of its own within ``folder``.
@@ -99,15 +107,17 @@ def record_objects(
         selection: The ``START:STOP:STEP`` that the source was opened with.
         overwrite: Replace runs that are in those folders.
         skip_damaged: Where the first frame cannot be read, take the boxes and masks for the first one that can.
+        resume: Go on with the runs that are in those folders; those that are finished stay as they are.
         listener: Is told of every frame of every object.
 
     Raises:
+        InputError: If a run in those folders is of other settings or another source; the difference is named.
         Tracking3dError: What was finished until then is kept in the folders, as it is on Ctrl-C.
     """
     check_source(source)
     config, folder = checked_config(config), checked_folder(folder)
     check_prompts(boxes, masks)
-    begin = partial(run_writer, source, command=command, selection=selection, overwrite=overwrite)
+    begin = partial(begun, source, command=command, selection=selection, overwrite=overwrite, resume=resume)
     with opened(source) as frames, ExitStack() as writers:
         skipped, first = first_frame(frames, source.name, skip_damaged)
         prompts = make_prompts(first, boxes, masks, config.tracker.name)
@@ -118,10 +128,11 @@ def record_objects(
             for prompt in prompts
         ]
         recordings = [
-            ObjectRecording(session, writers.enter_context(begin(session, first=first, folder=into)))
-            for session, into in zip(sessions, folders, strict=True)
+            begin(session, prompt, first=first, folder=into, writers=writers)
+            for session, prompt, into in zip(sessions, prompts, folders, strict=True)
         ]
-        go_through(source, chain(skipped, [first], frames), recordings, listener)
+        if unfinished := [recording for recording in recordings if recording is not None]:
+            go_through(source, chain(skipped, [first], frames), unfinished, listener)
 
 
 @contextmanager
@@ -134,34 +145,62 @@ def opened(source: FrameSource) -> Iterator[Iterator[Frame | SkippedFrame]]:
         frames.close()
 
 
-def run_writer(
+def begun(
     source: FrameSource,
     session: Session,
+    prompt: Prompt | None,
     *,
     first: Frame,
     folder: Path,
     command: str | None,
     selection: str | None,
     overwrite: bool,
-) -> RunWriter:
-    """The writer of one object's run folder; see `record` for the arguments.
+    resume: bool,
+    writers: ExitStack,
+) -> ObjectRecording | None:
+    """One object's recording, begun or resumed; None where its run is finished. See `record` for the arguments.
 
     Raises:
         OutputError: If the folder is in use, holds a run already, or cannot be written.
+        InputError: If the run there cannot be resumed.
     """
-    config, (height, width) = session.config, first.size
-    return RunWriter(
+    given, config = given_of(first, prompt, source.count), session.config.model_dump(mode="json")
+    if resume and not source.repeatable:
+        raise InputError(
+            f"{source.name} cannot be read again from its start, so that no run of it can be resumed."
+        )
+    earlier = earlier_run(folder, config, selection, given) if resume else "none"
+    if earlier == "finished":
+        remove_state(folder)
+        return None
+    device = session.config.runtime.device
+    checkpoint = kept = None
+    if earlier == "stopped":
+        checkpoint = Checkpoint(folder, session.state_classes, device)
+        kept = checkpoint.read()
+    (height, width), camera = first.size, session.config.camera
+    writer = RunWriter(
         folder,
-        config=config.model_dump(mode="json"),
-        camera=choose_camera(config.camera, width, height, source.intrinsics, source.intrinsics_origin),
+        config=config,
+        camera=choose_camera(camera, width, height, source.intrinsics, source.intrinsics_origin),
         source=source.name,
-        seed=config.runtime.seed,
+        seed=session.config.runtime.seed,
         renderer=session.renderer,
         fps=source.fps,
         command=command,
         selection=selection,
-        overwrite=overwrite,
+        given=given,
+        overwrite=overwrite or resume,
+        resume=WrittenSoFar(kept.progress.lines, kept.progress.seconds, kept.skipped) if kept else None,
     )
+    writers.enter_context(writer)
+    if checkpoint is not None and kept is not None:
+        checkpoint.clear_strangers()
+        failures = {index: frame.failure for index, frame in kept.taken.items() if frame.failure}
+        session.resume(first, kept.session, failures)
+    elif source.repeatable:
+        checkpoint = Checkpoint(folder, session.state_classes, device)
+    return ObjectRecording(session, writer, checkpoint, kept)
 
 
 def first_frame(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, cast
 
@@ -23,7 +23,7 @@ from tracking3d.frames import Frame, MaskEstimate, Prompt
 from tracking3d.geometry.camera import Camera
 from tracking3d.plugins import FEATURES, TRACKERS, build_plugin, plugin_label
 from tracking3d.plugins.guard import GuardedEncoder, GuardedTracker, PluginFailure
-from tracking3d.process_settings import OwnSettings, process_kept
+from tracking3d.process_settings import OwnSettings, RandomState, process_kept
 from tracking3d.prompts import check_prompt_fits
 from tracking3d.rendering.backend import choose_backend, threads_kept
 from tracking3d.stages import StageTimes, Stopwatch, measured
@@ -61,6 +61,7 @@ class Session:
         config: The pipeline.
         renderer: What renders, and why, see `tracking3d.rendering.backend.choose_backend`.
         initial_mask: What the solver was given for the latest frame: the mask tracker's answer, or what stands in.
+        corrected: Whether the latest answer was handed back to the mask tracker.
         refining: What ``refine`` took.
 
     Raises:
@@ -89,6 +90,7 @@ class Session:
         self._prompt = prompt
         self._intrinsics = intrinsics, intrinsics_origin
         self._settings = OwnSettings(self.renderer, runtime.device, runtime.seed)
+        self._replaying = OwnSettings(self.renderer, runtime.device, runtime.seed)
         with self._settings.in_force():
             self._tracker = GuardedTracker(
                 build_plugin(TRACKERS, config.tracker), plugin_label(TRACKERS, config.tracker.name)
@@ -98,6 +100,7 @@ class Session:
         self._state: Any = None
         self._camera: Camera | None = None
         self.initial_mask = MaskEstimate(None)
+        self.corrected = False
         self._last_pose = np.eye(4)
         self._failures: dict[int, str] = {}
         self._refined = False
@@ -130,16 +133,95 @@ class Session:
         return _timed(estimate, watch, frame)
 
     def _start(self, frame: Frame) -> FrameEstimate:
-        height, width = frame.size
-        self._camera = choose_camera(self.config.camera, width, height, *self._intrinsics)
-        warn_of_unlikely(self._camera)
+        solver = self._begun(frame)
         if self._prompt is not None:
             check_prompt_fits(self._prompt, frame)
-        mask = self._tracker.init(frame, self._prompt or Prompt((0.0, 0.0, float(width), float(height))))
-        solver: Solver[Any] = SOLVERS[self.config.solver.name](self.config, self._camera, self._encoder)
+        mask = self._tracker.init(frame, self._prompt_for(frame))
         self._state, estimate = solver.init(frame, mask)
         self._solver, self.initial_mask, self._last_pose = solver, mask, estimate.T_cam_obj
         return estimate
+
+    def _begun(self, first: Frame) -> Solver[Any]:
+        """The solver for a video that begins with ``first``; the camera is set for it, too."""
+        height, width = first.size
+        self._camera = choose_camera(self.config.camera, width, height, *self._intrinsics)
+        warn_of_unlikely(self._camera)
+        return SOLVERS[self.config.solver.name](self.config, self._camera, self._encoder)
+
+    def _prompt_for(self, first: Frame) -> Prompt:
+        height, width = first.size
+        return self._prompt or Prompt((0.0, 0.0, float(width), float(height)))
+
+    @property
+    def state_classes(self) -> tuple[type, ...]:
+        """The classes of what `kept` gives, beside arrays, tensors and plain values."""
+        own: tuple[type, ...] = getattr(SOLVERS[self.config.solver.name], "state_classes", ())
+        return (Camera, MaskEstimate, RandomState, StageTimes, *own)
+
+    def kept(self) -> dict[str, Any]:
+        """All that another session needs to go on after the latest frame, see `resume`; its parts never change."""
+        return {
+            "solver": self._state,
+            "camera": self._camera,
+            "initial_mask": self.initial_mask,
+            "last_pose": self._last_pose,
+            "refined": self._refined,
+            "refining": self.refining,
+            "random": self._settings.random,
+            "tracker": self._tracker.state() if self._tracker.can_resume else None,
+        }
+
+    def resume(self, first: Frame, kept: Mapping[str, Any], failures: Mapping[int, str]) -> None:
+        """Be the session that was `kept`, instead of starting on a first frame.
+
+        Where `replays`, the frames up to the one after which it was kept are to come to `replay` before the next
+        ``step``.
+
+        Args:
+            first: The first frame.
+            kept: What `kept` gave.
+            failures: Which plug-ins failed in which frames.
+
+        Raises:
+            PluginError: If the mask tracker cannot go on.
+        """
+        self._solver = self._begun(first)
+        self._state, self._camera = kept["solver"], kept["camera"]
+        self.initial_mask, self._last_pose = kept["initial_mask"], kept["last_pose"]
+        self._refined, self._failures = kept["refined"], dict(failures)
+        self.refining, self._settings.random = kept["refining"], kept["random"]
+        if self._tracker.can_resume and not self._refined:
+            with self._settings.in_force():
+                self._tracker.restore(first, self._prompt_for(first), kept["tracker"])
+
+    @property
+    def replays(self) -> bool:
+        """Whether the mask tracker has to see the frames again after `resume`."""
+        return not self._tracker.can_resume and not self._refined
+
+    def replay(self, frame: Frame, first: bool, correction: NDArray[np.bool_] | None) -> MaskEstimate | None:
+        """Take the mask tracker alone through a frame that is answered already.
+
+        Args:
+            frame: The frame.
+            first: Whether it is the first one.
+            correction: ``(H, W)`` what was handed back to the tracker after it, if anything was.
+
+        Returns:
+            The tracker's answer; None where it fails.
+        """
+        answer = None
+        try:
+            with self._replaying.in_force():
+                answer = (
+                    self._tracker.init(frame, self._prompt_for(frame)) if first else self._tracker.step(frame)
+                )
+                if correction is not None:
+                    self._tracker.correct(frame, correction)
+        except PluginFailure as error:
+            if first:
+                raise error.at(_label(frame)) from error.__cause__
+        return answer
 
     def _go_on(self, solver: Solver[Any], frame: Frame) -> FrameEstimate:
         if frame.size != (self.camera.height, self.camera.width):
@@ -148,6 +230,7 @@ class Session:
                 f"{_pixels((self.camera.height, self.camera.width))}; all frames must have one size."
             )
         failures = []
+        self.corrected = False
         try:
             mask = self._tracker.step(frame)
         except PluginFailure as error:
@@ -161,6 +244,7 @@ class Session:
             estimate = unanswered(frame, mask, self._last_pose)
         self._last_pose = estimate.T_cam_obj
         if self.config.solver.correct_tracker and self._tracker.can_correct and corrects(estimate):
+            self.corrected = True
             try:
                 self._tracker.correct(frame, estimate.mask)
             except PluginFailure as error:
@@ -175,6 +259,10 @@ class Session:
         if self.config.runtime.on_plugin_failure == "stop":
             raise error
         return error.reason
+
+    def failure_at(self, index: int) -> str:
+        """Which plug-in failed at frame ``index``, and why; empty where none did."""
+        return self._failures.get(index, "")
 
     def _with_failure(self, estimate: FrameEstimate) -> FrameEstimate:
         """The answer for a frame in which plug-ins failed says so, and is not relied on."""

@@ -35,6 +35,8 @@ def script(monkeypatch) -> Script:
 
     class FakeSession:
         renderer: ClassVar = {"backend": "none", "reason": "a test", "threads": 1}
+        state_classes = ()
+        corrected = replays = False
 
         def __init__(self, config, prompt, intrinsics=None, intrinsics_origin="", encoder=None):
             script.built.append((config, prompt))
@@ -51,6 +53,15 @@ def script(monkeypatch) -> Script:
             T = np.eye(4)
             T[2, 3] = 3
             return FrameEstimate(frame.index, frame.time, T, mask, mask, Status.TRACKED, "", 1.0, seconds=0.1)
+
+        def kept(self):
+            return {}
+
+        def resume(self, first, kept, failures):
+            pass
+
+        def failure_at(self, index):
+            return ""
 
         def result(self):
             sphere = trimesh.creation.icosphere(1)

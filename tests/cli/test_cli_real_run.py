@@ -70,7 +70,7 @@ def test_real_run_from_masks_alone(real_clip, tmp_path):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
-@pytest.mark.parametrize(("stop", "code"), [("SIGINT", 130), ("SIGKILL", -signal.SIGKILL)])
+@pytest.mark.parametrize(("stop", "code"), [("SIGINT", 130), ("SIGTERM", 130), ("SIGKILL", -signal.SIGKILL)])
 def test_stopped_run_keeps_every_finished_frame(real_clip, box, tmp_path, stop, code):
     (tmp_path / "stopping.py").write_text(STOPPING_TRACKER)
     result = program(
@@ -91,6 +91,11 @@ def test_stopped_run_keeps_every_finished_frame(real_clip, box, tmp_path, stop, 
     assert result.returncode == code, result.stderr
     assert "Traceback" not in result.stderr
     run = RunReader(tmp_path / "run")
+    killed = stop == "SIGKILL"
     assert run.state == "interrupted"
+    assert run.state_in_words == "interrupted (its process is gone)" if killed else "interrupted"
+    assert run.description["state"] == ("running" if killed else "interrupted")
+    for made in ("mesh.glb", "contact_sheet.png"):
+        assert (tmp_path / "run" / made).is_file() is not killed
     assert [frame.index for frame in run.frames] == [0, 1]
     assert all(run.mask(index).any() for index in (0, 1))

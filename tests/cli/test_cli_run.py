@@ -169,7 +169,11 @@ def test_interrupted_run_keeps_what_was_finished(call, clip, script):
     script.faults[3] = KeyboardInterrupt()
     result = call("run", clip, *BOX, "--out", "run")
     assert result.exit_code == 130
-    assert result.stderr.splitlines() == ["interrupted", "What was finished until then is kept in run."]
+    assert result.stderr.splitlines() == [
+        "interrupted",
+        "What was finished until then is kept in run.",
+        "The same command with --resume goes on from there.",
+    ]
     run = RunReader(Path("run"))
     assert run.state == "interrupted"
     assert [frame.index for frame in run.frames] == [0, 1, 2]
@@ -185,6 +189,32 @@ def test_interrupt_before_the_first_answer_leaves_nothing_in_the_way(call, clip,
     assert call("run", clip, *BOX, "--out", "run").exit_code == 0
 
 
+def test_a_stopped_run_is_resumed_by_the_same_command(call, clip, script):
+    script.faults[3] = KeyboardInterrupt()
+    call("run", clip, *BOX, "--out", "run")
+    script.faults.clear()
+    assert call("run", clip, *BOX, "--out", "run", "--resume").exit_code == 0
+    run = RunReader(Path("run"))
+    assert (run.state, [frame.index for frame in run.frames]) == ("finished", [0, 1, 2, 3, 4])
+    assert [one["frames"] for one in run.description["resumed"]] == [3]
+    again = call("run", clip, *BOX, "--out", "run", "--resume")
+    assert (again.exit_code, again.stdout) == (
+        0,
+        "The run run is finished already; there is nothing to resume.\n",
+    )
+
+
+def test_a_run_of_other_settings_is_not_resumed(call, clip, script):
+    script.faults[3] = KeyboardInterrupt()
+    call("run", clip, *BOX, "--out", "run")
+    result = call("run", clip, *BOX, "--out", "run", "--resume", "--seed", "5")
+    assert result.exit_code == 2
+    assert "runtime.seed was 0 and is 5" in result.stderr
+    both = call("run", clip, *BOX, "--out", "run", "--resume", "--overwrite")
+    assert both.exit_code == 2
+    assert "either --resume or --overwrite" in both.stderr
+
+
 def test_failing_plugin_ends_the_run_with_a_sentence_and_keeps_what_was_finished(call, clip, script):
     script.faults[2] = PluginError("The tracker gave up.")
     result = call("run", clip, *BOX, "--out", "run")
@@ -192,6 +222,7 @@ def test_failing_plugin_ends_the_run_with_a_sentence_and_keeps_what_was_finished
     assert result.stderr.splitlines() == [
         "error: The tracker gave up.",
         "What was finished until then is kept in run.",
+        "The same command with --resume goes on from there.",
     ]
     description = json.loads(Path("run/run.json").read_text())
     assert (description["state"], description["error"]) == ("failed", "The tracker gave up.")

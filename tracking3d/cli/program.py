@@ -1,7 +1,7 @@
 """How every command ends: one sentence instead of a traceback, and an exit code.
 
 0 done, 1 a fault of the program itself, 2 something the user gave cannot be used or the machine has too little of,
-130 interrupted, 141 nobody reads what is printed.
+130 interrupted, by Ctrl-C or SIGTERM, 141 nobody reads what is printed.
 """
 
 from __future__ import annotations
@@ -9,10 +9,13 @@ from __future__ import annotations
 import errno
 import os
 import re
+import signal
 import sys
+import threading
 import traceback
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from types import FrameType
 from typing import Any
 
 import typer
@@ -48,12 +51,34 @@ class Program(TyperGroup):
         sys.exit(code if isinstance(code, int) else 0)
 
     def invoke(self, ctx: Any) -> Any:
-        """Call the command; Ctrl-C ends it with what it has to say about that."""
+        """Call the command; Ctrl-C or SIGTERM ends it with what it has to say about that."""
         try:
-            return super().invoke(ctx)
+            with _ended_as_by_ctrl_c():
+                return super().invoke(ctx)
         except KeyboardInterrupt as error:
             _print("interrupted", error)
             raise typer.Exit(INTERRUPTED) from error
+
+
+@contextmanager
+def _ended_as_by_ctrl_c() -> Iterator[None]:
+    """Let SIGTERM, which containers and batch systems stop with, end the command as Ctrl-C does.
+
+    A second one, which some send at once, does not end what is written at the end.
+    """
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():
+        yield  # where no signal can be handled
+        return
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL if before is None else before)
 
 
 def _report(error: Exception) -> int:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import shlex
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -74,6 +76,10 @@ def run(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace a run in that folder.", rich_help_panel=_RUNNING)
     ] = False,
+    resume: Annotated[
+        bool,
+        typer.Option("--resume", help="Go on with the stopped run in that folder.", rich_help_panel=_RUNNING),
+    ] = False,
     frames: Annotated[
         str | None,
         typer.Option(
@@ -124,6 +130,10 @@ def run(
     folder of its own in the one of the run.
     """
     boxes, object_masks = box or [], mask or []
+    if resume and overwrite:
+        raise InputError(
+            "Give either --resume or --overwrite: one keeps the run that is there, one does not."
+        )
     if boxes and object_masks:
         raise InputError("Give either --box or --mask, not both.")
     chosen: dict[str, str | None] = {"name": tracker}
@@ -155,6 +165,7 @@ def run(
     from tracking3d.prompts import parse_box
     from tracking3d.recording import record, record_objects
     from tracking3d.results.layout import object_folders
+    from tracking3d.results.run_reader import is_finished
     from tracking3d.video import open_source
 
     given = [parse_box(text) for text in boxes]
@@ -169,15 +180,33 @@ def run(
         "selection": frames,
         "overwrite": overwrite,
         "skip_damaged": skip_damaged,
+        "resume": resume,
     }
-    with progress(opened.count, quiet, objects) as about["listener"]:
+    done = {one for one in folders if resume and is_finished(one)}
+    with resumable(folders), progress(opened.count, quiet, objects) as about["listener"]:
         if objects > 1:
             record_objects(opened, settings, folder, boxes=given, masks=object_masks, **about)
         else:
             the_box, the_mask = next(iter(given), None), next(iter(object_masks), None)
             record(opened, settings, folder, box=the_box, mask=the_mask, **about)
     for one in () if quiet else folders:
-        print_summary(one)
+        if one in done:
+            typer.echo(f"The run {one} is finished already; there is nothing to resume.")
+        else:
+            print_summary(one)
+
+
+@contextmanager
+def resumable(folders: list[Path]) -> Iterator[None]:
+    """Whatever stops a run, it says how to go on, where that is possible."""
+    from tracking3d.results.layout import has_state
+
+    try:
+        yield
+    except BaseException as error:
+        if any(has_state(folder) for folder in folders):
+            error.add_note("The same command with --resume goes on from there.")
+        raise
 
 
 def default_folder(source: str) -> Path:

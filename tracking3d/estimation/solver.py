@@ -11,10 +11,32 @@ from typing import Generic, Protocol, TypeVar, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.estimation.estimate import FrameEstimate, ObjectModel
+from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
+from tracking3d.estimation.feature_space import FeatureSpace
+from tracking3d.estimation.observation import Observation
+from tracking3d.estimation.shape import Shape
 from tracking3d.frames import Frame, MaskEstimate
+from tracking3d.geometry.camera import Camera, Window
+from tracking3d.geometry.pose import Pose
+from tracking3d.rendering import BackProjection, TexelMap
+from tracking3d.stages import StageTimes
 
 State = TypeVar("State")
+
+STATE_CLASSES: tuple[type, ...] = (
+    BackProjection,
+    Camera,
+    FeatureSpace,
+    FrameEstimate,
+    Observation,
+    Pose,
+    Shape,
+    StageTimes,
+    Status,
+    TexelMap,
+    Window,
+)
+"""Of what states are made; a solver that names all of its classes in ``state_classes`` can be resumed."""
 
 
 class Solver(Protocol, Generic[State]):

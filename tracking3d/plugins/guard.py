@@ -20,7 +20,7 @@ from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame, MaskEstimate, Prompt
 from tracking3d.plugins.registration import told
 from tracking3d.stages import in_stage
-from tracking3d.trackers.protocol import CorrectableTracker, MaskTracker
+from tracking3d.trackers.protocol import CorrectableTracker, MaskTracker, ResumableTracker
 
 
 class PluginFailure(PluginError):
@@ -94,6 +94,32 @@ class GuardedTracker:
         if isinstance(self._tracker, CorrectableTracker):
             with in_stage("track"), _blamed(self._label):
                 self._tracker.correct(frame, mask.copy())
+
+    @property
+    def can_resume(self) -> bool:
+        """Whether the tracker's memory can be kept; see `tracking3d.trackers.protocol.ResumableTracker`."""
+        return isinstance(self._tracker, ResumableTracker)
+
+    def state(self) -> Any:
+        """The tracker's memory; None where it cannot tell.
+
+        Raises:
+            PluginFailure: If the tracker fails.
+        """
+        if not isinstance(self._tracker, ResumableTracker):
+            return None
+        with _blamed(self._label):
+            return self._tracker.state()
+
+    def restore(self, frame: Frame, prompt: Prompt, state: Any) -> None:
+        """Give the tracker its memory back; nothing where it has none that can be kept.
+
+        Raises:
+            PluginFailure: If the tracker fails.
+        """
+        if isinstance(self._tracker, ResumableTracker):
+            with _blamed(self._label):
+                self._tracker.restore(frame, prompt, state)
 
     def _checked(self, answer: Any, frame: Frame) -> MaskEstimate:
         if fault := mask_fault(answer, frame.size):

@@ -17,6 +17,7 @@ from tracking3d.estimation.estimate import MaskSource, Status
 from tracking3d.geometry.camera import Camera
 from tracking3d.process_memory import resident_memory
 from tracking3d.results.layout import CONVENTIONS, FORMAT, FORMAT_VERSION
+from tracking3d.results.process import this_process
 from tracking3d.results.records import FrameRecord
 from tracking3d.stages import StageTimes
 
@@ -34,8 +35,9 @@ def description_at_start(
     command: str | None,
     selection: str | None,
     renderer: Mapping[str, str | int] | None,
+    given: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """What is known of a run before its first frame."""
+    """What is known of a run before its first frame; ``given`` tells source and object apart from others."""
     return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -43,8 +45,11 @@ def description_at_start(
         "error": None,
         "created": now(),
         "finished": None,
+        "process": this_process(),
+        "resumed": [],
         "source": source,
         "selection": selection,
+        "given": given,
         "fps": fps,
         "command": command,
         "seed": seed,

@@ -16,6 +16,7 @@ from tracking3d.results.layout import OUT, partial_path
 
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _FORBIDDEN = {errno.EACCES, errno.EPERM, errno.EROFS}
+_BLOCK = 4096  # bytes that file systems give out at once
 _NOT_A_FOLDER = {errno.ENOTDIR, errno.EEXIST}
 
 
@@ -54,6 +55,26 @@ def write_atomic(path: Path, data: bytes) -> None:
         except OSError:
             partial.unlink(missing_ok=True)
             raise
+
+
+def write_reserved(path: Path, data: bytes, reserve: int) -> None:
+    """Write text as `write_atomic` does, with ``reserve`` spaces or more after it.
+
+    Where the disk is full it goes over the old file, in whose reserve it has room: it can always be said how a run
+    ended.
+
+    Raises:
+        OutputError: If it cannot be written, or has no room either; ``path`` is then as it was.
+    """
+    blocks = -(-(len(data) + reserve) // _BLOCK)
+    try:
+        write_atomic(path, data[:-1] + b" " * (blocks * _BLOCK - len(data)) + b"\n")
+    except OutputError as error:
+        full = isinstance(error.__cause__, OSError) and error.__cause__.errno in _FULL
+        if not full or not path.is_file() or len(data) > (room := path.stat().st_size):
+            raise
+        with writing(path), path.open("r+b") as file:
+            file.write(data[:-1] + b" " * (room - len(data)) + b"\n")
 
 
 def write_image(path: Path, image: NDArray[np.uint8]) -> None:

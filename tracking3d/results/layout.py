@@ -10,7 +10,8 @@
     contact_sheet.png   the run at a glance
     mesh.obj, mesh.mtl, texture.png, mesh.glb, features.npz
     causal/             masks and mesh as they were before the final refinement
-    .refining/          what the final refinement has made so far, while it goes on
+    .refining/          what the final refinement has made so far, until it has ended
+    .state/             what a stopped run goes on from, until it is finished
 """
 
 from __future__ import annotations
@@ -29,6 +30,9 @@ MASKS = "masks"
 INITIAL_MASKS = "initial_masks"
 CAUSAL = "causal"
 REFINING = ".refining"
+STATE = ".state"
+STATE_FILE = "state.json"
+JOURNAL = "journal.jsonl"
 OVERLAY = "overlay.mp4"
 CONTACT_SHEET = "contact_sheet.png"
 OBJ = "mesh.obj"
@@ -56,6 +60,7 @@ CONVENTIONS = {
 MESH_FILES = (OBJ, MTL, TEXTURE, GLB, FEATURES)
 _FILES = (RUN, FRAMES, OVERLAY, CONTACT_SHEET, *MESH_FILES)
 _MASK_NAME = re.compile(r"\d{6,}\.png")
+_ARRAY_NAME = re.compile(r"\d{8,}\.npz")
 
 
 def mask_path(folder: Path, index: int) -> Path:
@@ -90,7 +95,7 @@ def run_files(folder: Path) -> list[Path]:
     """The files in ``folder`` that bear the names a run writes, unfinished ones included."""
     named = [folder / name for name in _FILES]
     named += [folder / CAUSAL / name for name in MESH_FILES]
-    named.append(folder / REFINING / OVERLAY)
+    named += [folder / REFINING / name for name in (OVERLAY, FRAMES)]
     for masks in (
         folder / MASKS,
         folder / INITIAL_MASKS,
@@ -100,4 +105,25 @@ def run_files(folder: Path) -> list[Path]:
         if masks.is_dir():
             names = {path.name.removeprefix(".").removesuffix(".part") for path in masks.iterdir()}
             named += [masks / name for name in sorted(names) if _MASK_NAME.fullmatch(name)]
-    return [path for file in named for path in (file, partial_path(file)) if path.is_file()]
+    return _with_unfinished(named) + state_files(folder)
+
+
+def has_state(folder: Path) -> bool:
+    """Whether the state of a stopped run is kept in its folder."""
+    return (folder / STATE / STATE_FILE).is_file()
+
+
+def state_files(folder: Path) -> list[Path]:
+    """The files in ``folder`` that hold the state of a run, unfinished ones included."""
+    inner = folder / STATE
+    named = [inner / STATE_FILE, inner / JOURNAL]
+    if inner.is_dir():
+        named += sorted(path for path in inner.iterdir() if _ARRAY_NAME.fullmatch(path.name))
+    if (inner / MASKS).is_dir():
+        names = {path.name.removeprefix(".").removesuffix(".part") for path in (inner / MASKS).iterdir()}
+        named += [inner / MASKS / name for name in sorted(names) if _MASK_NAME.fullmatch(name)]
+    return _with_unfinished(named)
+
+
+def _with_unfinished(files: list[Path]) -> list[Path]:
+    return [path for file in files for path in (file, partial_path(file)) if path.is_file()]

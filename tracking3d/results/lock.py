@@ -27,19 +27,25 @@ def try_lock(descriptor: int, shared: bool = False) -> bool:
 
     A file system without locks counts as free.
     """
+    return _tried(descriptor, shared) is not False
+
+
+def is_locked(path: Path) -> bool | None:
+    """Whether somebody holds the lock on ``path``; None on a file system without locks."""
+    try:
+        with path.open("rb") as file:
+            free = _tried(file.fileno(), shared=True)
+    except OSError:
+        return False
+    return None if free is None else not free
+
+
+def _tried(descriptor: int, shared: bool) -> bool | None:
+    """Whether the lock could be taken; None on a file system without locks."""
     try:
         _lock(descriptor, shared)
     except (BlockingIOError, PermissionError):
         return False
     except OSError:
-        return True
+        return None
     return True
-
-
-def is_locked(path: Path) -> bool:
-    """Whether somebody holds the lock on ``path``."""
-    try:
-        with path.open("rb") as file:
-            return not try_lock(file.fileno(), shared=True)
-    except OSError:
-        return False

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel
 from tracking3d.frames import Frame, Image
@@ -48,6 +49,37 @@ class Pictures:
         if self._video is None:
             self._video = VideoWriter(self._file, self._fps, (size.height, size.width))
         self._video.write(overlay)
+
+    def add_kept(
+        self,
+        frame: Frame,
+        record: FrameRecord,
+        mask: NDArray[np.bool_] | None,
+        initial: NDArray[np.bool_] | None,
+    ) -> None:
+        """Draw the next frame from what was kept of its answer.
+
+        Args:
+            frame: The frame.
+            record: Its answer.
+            mask: ``(H, W)`` the answer's mask, and the initial one; None where there is none.
+            initial: See ``mask``.
+
+        Raises:
+            OutputError: If the video cannot be written.
+        """
+        estimate = FrameEstimate(
+            index=frame.index,
+            time=frame.time,
+            T_cam_obj=record.T_cam_obj,
+            mask=np.zeros(frame.size, dtype=np.bool_) if mask is None else mask,
+            initial_mask=initial,
+            status=record.status,
+            reason=record.reason,
+            confidence=record.confidence,
+            keyframe=record.keyframe,
+        )
+        self.add(frame, estimate, record)
 
     def close(self) -> None:
         """Finish the video.

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from tracking3d.results import description, layout
 from tracking3d.results.files import read_mask, write_mask, writing
 from tracking3d.results.pictures import Pictures
 from tracking3d.results.records import FrameRecord
+from tracking3d.results.run_reader import read_records
 from tracking3d.stages import StageTimes, measured
 
 
@@ -32,6 +34,8 @@ class RefinementWriter:
         camera: The camera of the full frame.
         fps: Speed of the overlay video.
         causal: The causal answer for every frame.
+        kept: Bytes of answers that were kept when the run was stopped.
+        seconds: Wall time that they took.
 
     Attributes:
         causal: The causal answers by frame index.
@@ -42,16 +46,47 @@ class RefinementWriter:
         OutputError: If the folder cannot be written.
     """
 
-    def __init__(self, folder: Path, camera: Camera, fps: float, causal: Sequence[FrameRecord]) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        camera: Camera,
+        fps: float,
+        causal: Sequence[FrameRecord],
+        kept: int = 0,
+        seconds: float = 0.0,
+    ) -> None:
         self._folder, self._aside = folder, folder / layout.REFINING
-        self._started = time.monotonic()
-        self._records: list[FrameRecord] = []
+        self._started = time.monotonic() - seconds
         self._taken_over = False
         self.together = StageTimes()
         self.causal = {record.index: record for record in causal}
         self.pictures = Pictures(self._aside / layout.OVERLAY, camera, fps)
         with writing(self._aside):
             (self._aside / layout.MASKS).mkdir(parents=True, exist_ok=True)
+            _undo_taking_over(folder)
+            with (self._aside / layout.FRAMES).open("ab") as lines:
+                lines.truncate(kept)
+        kept_records = read_records(self._aside / layout.FRAMES)
+        self._records = {record.index: record for record in kept_records}
+
+    @property
+    def lines(self) -> int:
+        """Bytes of answers that are written."""
+        return (self._aside / layout.FRAMES).stat().st_size
+
+    @property
+    def seconds(self) -> float:
+        """Wall time of the refinement so far, pauses left out."""
+        return time.monotonic() - self._started
+
+    def draw_again(self, frame: Frame) -> FrameRecord:
+        """Draw a frame that was looked at again before the run was stopped."""
+        record = self._records.get(frame.index)
+        if record is None:
+            return self._let_stand(frame)
+        mask = read_mask(layout.mask_path(self._aside, frame.index))
+        self.pictures.add_kept(frame, record, mask, self.initial_mask(frame.index))
+        return record
 
     def write(self, estimate: FrameEstimate | None, frame: Frame) -> FrameRecord:
         """Keep the second answer for one frame; None lets the causal one stand.
@@ -62,10 +97,9 @@ class RefinementWriter:
         Raises:
             OutputError: If it cannot be written.
         """
-        causal, initial = self.causal[frame.index], self.initial_mask(frame.index)
         if estimate is None:
-            self.pictures.add(frame, self._causal_estimate(frame, initial), causal)
-            return causal
+            return self._let_stand(frame)
+        causal, initial = self.causal[frame.index], self.initial_mask(frame.index)
         estimate = replace(
             estimate, refined=True, initial_mask=initial, keyframe=estimate.keyframe or causal.keyframe
         )
@@ -74,8 +108,17 @@ class RefinementWriter:
             write_mask(layout.mask_path(self._aside, frame.index), estimate.mask)
             self.pictures.add(frame, estimate, record)
         record = record.and_wrote(watch.times.write)
-        self._records.append(record)
+        with writing(self._aside), (self._aside / layout.FRAMES).open("ab") as lines:
+            lines.write(record.to_json().encode() + b"\n")
+        self._records[record.index] = record
         return record
+
+    def _let_stand(self, frame: Frame) -> FrameRecord:
+        """Draw the causal answer."""
+        causal = self.causal[frame.index]
+        mask = read_mask(layout.mask_path(self._folder, frame.index))
+        self.pictures.add_kept(frame, causal, mask, self.initial_mask(frame.index))
+        return causal
 
     def initial_mask(self, index: int) -> NDArray[np.bool_] | None:
         """What the mask tracker gave for frame ``index``, ``(H, W)`` bool, or None."""
@@ -96,69 +139,71 @@ class RefinementWriter:
         causal = self._folder / layout.CAUSAL
         with writing(self._folder):
             (causal / layout.MASKS).mkdir(parents=True, exist_ok=True)
-            for record in self._records:
+            for record in self._records.values():
                 place = layout.mask_path(self._folder, record.index)
                 place.replace(layout.mask_path(causal, record.index))
                 layout.mask_path(self._aside, record.index).replace(place)
             for name in layout.MESH_FILES:
                 if (self._folder / name).is_file():
                     (self._folder / name).replace(causal / name)
-        append(self._records)
+        append(list(self._records.values()))
         self._taken_over = True
         with writing(self._folder):
             if (self._aside / layout.OVERLAY).is_file():
                 (self._aside / layout.OVERLAY).replace(self._folder / layout.OVERLAY)
-        self._clear()
 
-    def give_up(self) -> None:
-        """Remove what was made; the causal answers are as they were.
+    def give_up(self, keep: bool) -> None:
+        """The causal answers are as they were; what was made is kept for another try, or removed.
 
         Raises:
-            OutputError: If it cannot be removed.
+            OutputError: If it cannot be done.
         """
         self.pictures.close()
-        causal = self._folder / layout.CAUSAL
-        if causal.is_dir() and not self._taken_over:
-            with writing(causal):
-                for file in layout.run_files(self._folder):
-                    if file.is_relative_to(causal):
-                        file.replace(self._folder / file.relative_to(causal))
-                _remove_folders(causal)
-        self._clear()
+        if not self._taken_over:
+            with writing(self._folder):
+                _undo_taking_over(self._folder)
+        if not keep:
+            clear_refinement(self._folder)
 
     def described(self, state: str, reason: str = "") -> dict[str, Any]:
         """What ``run.json`` says of it, see `tracking3d.results.description.refinement`."""
-        seconds = time.monotonic() - self._started
-        refined = self._records if self._taken_over else []
+        refined = list(self._records.values()) if self._taken_over else []
         causal = list(self.causal.values())
-        return description.refinement(state, reason, causal, refined, seconds, self.together)
+        return description.refinement(state, reason, causal, refined, self.seconds, self.together)
 
-    def _causal_estimate(self, frame: Frame, initial: NDArray[np.bool_] | None) -> FrameEstimate:
-        """The causal answer as far as it is kept: enough to draw it."""
-        causal = self.causal[frame.index]
-        mask = read_mask(layout.mask_path(self._folder, frame.index))
-        return FrameEstimate(
-            index=frame.index,
-            time=frame.time,
-            T_cam_obj=causal.T_cam_obj,
-            mask=np.zeros(frame.size, dtype=np.bool_) if mask is None else mask,
-            initial_mask=initial,
-            status=causal.status,
-            reason=causal.reason,
-            confidence=causal.confidence,
-            keyframe=causal.keyframe,
-        )
 
-    def _clear(self) -> None:
-        with writing(self._aside):
-            for file in layout.run_files(self._folder):
-                if file.is_relative_to(self._aside):
-                    file.unlink()
-            if self._aside.is_dir():
-                _remove_folders(self._aside)
+def clear_refinement(folder: Path) -> None:
+    """Remove what the final refinement of a run has made aside, if there is any.
+
+    Raises:
+        OutputError: If it cannot be removed.
+    """
+    aside = folder / layout.REFINING
+    with writing(aside):
+        for file in layout.run_files(folder):
+            if file.is_relative_to(aside):
+                file.unlink()
+        if aside.is_dir():
+            _remove_folders(aside)
+
+
+def _undo_taking_over(folder: Path) -> None:
+    """Put the causal answers back where they were, and the refined masks aside; a kill may have come in between."""
+    causal, aside = folder / layout.CAUSAL, folder / layout.REFINING
+    if not causal.is_dir():
+        return
+    for file in layout.run_files(folder):
+        if file.is_relative_to(causal):
+            place = folder / file.relative_to(causal)
+            refined = aside / file.relative_to(causal)
+            if file.parent.name == layout.MASKS and place.is_file() and not refined.is_file():
+                place.replace(refined)
+            file.replace(place)
+    _remove_folders(causal)
 
 
 def _remove_folders(folder: Path) -> None:
     """Remove the emptied folder and its folder of masks."""
-    (folder / layout.MASKS).rmdir()
+    with suppress(FileNotFoundError):
+        (folder / layout.MASKS).rmdir()
     folder.rmdir()

@@ -19,6 +19,7 @@ from tracking3d.results import layout
 from tracking3d.results.files import read_mask
 from tracking3d.results.lock import is_locked
 from tracking3d.results.mesh_export import load_mesh
+from tracking3d.results.process import is_gone
 from tracking3d.results.records import FrameRecord, latest, read_stages
 from tracking3d.stages import StageTimes
 
@@ -101,8 +102,22 @@ class RunReader:
     @property
     def state(self) -> str:
         """``running``, ``finished``, ``interrupted`` or ``failed``; a run whose process died is the third."""
-        state: str = self.description.get("state", "running")
-        return "interrupted" if state == "running" and not is_locked(self.folder / layout.FRAMES) else state
+        return "interrupted" if self.abandoned else str(self.description.get("state", "running"))
+
+    @property
+    def abandoned(self) -> bool:
+        """Whether the process that wrote the run ended without saying so, as one that is killed does."""
+        if self.description.get("state", "running") != "running":
+            return False
+        locked = is_locked(self.folder / layout.FRAMES)
+        if locked is None:
+            return is_gone(self.description.get("process") or {}) is True
+        return not locked
+
+    @property
+    def state_in_words(self) -> str:
+        """The state, and where the run was abandoned, that it was."""
+        return f"{self.state} (its process is gone)" if self.abandoned else self.state
 
     @cached_property
     def frames(self) -> list[FrameRecord]:
@@ -154,8 +169,21 @@ class RunReader:
         return load_mesh(self.mesh_folder)
 
 
-def read_records(path: Path) -> Iterator[FrameRecord]:
+def is_finished(folder: Path) -> bool:
+    """Whether a folder holds a run that is finished.
+
+    Raises:
+        InputError: If its ``run.json`` cannot be read.
+    """
+    return (folder / layout.RUN).is_file() and RunReader(folder).state == "finished"
+
+
+def read_records(path: Path, end: int | None = None) -> Iterator[FrameRecord]:
     """All lines of a ``frames.jsonl``, revisions included; a last line that was cut off is left out.
+
+    Args:
+        path: The file.
+        end: Bytes of it that are read; None for all.
 
     Raises:
         InputError: If another line is damaged.
@@ -163,7 +191,11 @@ def read_records(path: Path) -> Iterator[FrameRecord]:
     if not path.is_file():
         return
     with _readable(path), path.open("rb") as file:
+        read = 0
         for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE), b""), 1):
+            read += len(line)
+            if end is not None and read > end:
+                return
             try:
                 yield FrameRecord.from_json(line)
             except ValueError as error:

@@ -9,31 +9,50 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
+import numpy as np
+
 from tracking3d.errors import InputError, OutputError
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel
-from tracking3d.frames import Frame, SkippedFrame
+from tracking3d.frames import Frame, MaskEstimate, SkippedFrame
 from tracking3d.geometry.camera import Camera
 from tracking3d.results import description, layout
-from tracking3d.results.files import read_mask, write_atomic, write_image, write_mask, writing
+from tracking3d.results.files import read_mask, write_image, write_mask, write_reserved, writing
 from tracking3d.results.lock import try_lock
 from tracking3d.results.mesh_export import export_mesh
 from tracking3d.results.notes import notes_of
 from tracking3d.results.pictures import Pictures
 from tracking3d.results.records import FrameRecord, jsonable, latest
-from tracking3d.results.refinement_writer import RefinementWriter
+from tracking3d.results.refinement_writer import RefinementWriter, clear_refinement
 from tracking3d.results.run_reader import RunReader, read_records
 
 FinalState = Literal["finished", "interrupted", "failed"]
 SKIPS_EVERY = 1.0
 """Seconds between two writes of ``run.json`` for skipped frames; the last ones are written at the end."""
+RESERVE = 2048
+"""Bytes that ``run.json`` has to spare for saying, on a full disk, how the run ended."""
 DEFAULT_FPS = 10.0
 """Speed of the overlay video where the source has none, such as a folder of images."""
+
+
+@dataclass(frozen=True)
+class WrittenSoFar:
+    """What a stopped run has written.
+
+    Attributes:
+        lines: Bytes of ``frames.jsonl`` that are of finished frames.
+        seconds: Wall time of the run until then.
+        skipped: Frames that were not taken.
+    """
+
+    lines: int = 0
+    seconds: float = 0.0
+    skipped: tuple[SkippedFrame, ...] = ()
 
 
 class RunWriter:
@@ -50,7 +69,10 @@ class RunWriter:
         renderer: What renders, and why.
         fps: Frames per second of the source, where known.
         command: The command line, where there was one.
+        given: What tells source and object apart from others, see `tracking3d.checkpoint.resuming.given_of`.
         overwrite: Replace a run that is there. Only files a run writes are removed, only from a run folder.
+        resume: Go on with the run that is there, of which so much is kept. What is behind that in ``frames.jsonl``
+            stays until something is written in its place.
 
     Raises:
         OutputError: If the folder is in use, holds a run already, or cannot be written.
@@ -68,7 +90,9 @@ class RunWriter:
         command: str | None,
         selection: str | None = None,
         renderer: Mapping[str, str | int] | None = None,
+        given: Mapping[str, Any] | None = None,
         overwrite: bool = False,
+        resume: WrittenSoFar | None = None,
     ) -> None:
         self.folder = Path(folder)
         self._camera = camera
@@ -87,7 +111,10 @@ class RunWriter:
             command=command,
             selection=selection,
             renderer=renderer,
+            given=given,
         )
+        self._end: int | None = None
+        self._kept: dict[int, FrameRecord] = {}
         frames = self.folder / layout.FRAMES
         with writing(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -98,17 +125,40 @@ class RunWriter:
                 raise OutputError(
                     f"{self.folder} is in use by another run; wait for it or choose another {layout.OUT}."
                 )
-            _make_room(self.folder, overwrite)
+            if resume is None:
+                _make_room(self.folder, overwrite)
             with writing(self.folder):
-                self._lines.truncate(0)
+                if resume is None:
+                    self._lines.truncate(0)
                 for inner in (layout.MASKS, layout.INITIAL_MASKS):
                     (self.folder / inner).mkdir(exist_ok=True)
+            if resume is not None:
+                self._go_on(resume)
             self._write_description()
         except BaseException:
             self._lines.close()
             if new:
                 frames.unlink()
             raise
+
+    @property
+    def seconds(self) -> float:
+        """Wall time of the run so far, pauses left out."""
+        return time.monotonic() - self._started
+
+    @property
+    def lines(self) -> int:
+        """Bytes of ``frames.jsonl`` that are written."""
+        return self._lines.seek(0, 2) if self._end is None else self._end
+
+    def draw_again(self, frame: Frame) -> FrameRecord | None:
+        """Draw a frame that was answered before the run was stopped; None where it has no answer."""
+        record = self._kept.get(frame.index)
+        if record is not None:
+            initial = read_mask(layout.initial_mask_path(self.folder, frame.index))
+            mask = read_mask(layout.mask_path(self.folder, frame.index))
+            self._pictures.add_kept(frame, record, mask, initial)
+        return record
 
     def write(self, estimate: FrameEstimate, frame: Frame) -> FrameRecord:
         """Keep the answer for one frame, and those it revises.
@@ -148,19 +198,26 @@ class RunWriter:
         self._description["refinement"] = description.refinement("left out", reason)
         self._write_description()
 
-    def begin_refinement(self, model: ObjectModel) -> RefinementWriter:
+    def begin_refinement(
+        self, model: ObjectModel | None, kept: int = 0, seconds: float = 0.0
+    ) -> RefinementWriter:
         """All frames have their causal answers; whatever comes now, the folder holds them whole.
 
         Args:
-            model: The object as it is now; its mesh is written.
+            model: The object as it is now; its mesh is written. None where that was done before the run was stopped.
+            kept: Bytes of second answers that were kept then.
+            seconds: Wall time that they took.
 
         Raises:
             OutputError: If something cannot be written.
         """
         self._pictures.close()
         self._export(model)
+        if model is None:
+            with writing(self.folder):
+                self._cut_back()
         causal = latest(read_records(self.folder / layout.FRAMES), refined=False)
-        self._refinement = RefinementWriter(self.folder, self._camera, self._fps, causal)
+        self._refinement = RefinementWriter(self.folder, self._camera, self._fps, causal, kept, seconds)
         self._description["refinement"] = self._refinement.described("running")
         self._write_description()
         return self._refinement
@@ -207,8 +264,17 @@ class RunWriter:
             )
             if problem:
                 state, error = "failed", str(problem)
-            self._description |= {"state": state, "error": error, "finished": description.now()}
-            self._write_description()
+            ended = {"state": state, "error": error, "finished": description.now()}
+            self._description |= ended
+            try:
+                self._write_description()
+            except OutputError as full:
+                problem = problem or full
+                ended |= {"state": "failed", "error": error or str(full)}
+                self._description = {**self._written, **ended}
+                self._write_description()
+            if state == "finished":
+                clear_refinement(self.folder)
         finally:
             self._lines.close()
         if problem:
@@ -223,6 +289,26 @@ class RunWriter:
         if not self._over:
             ended: FinalState = "failed" if isinstance(error, Exception) else "interrupted"
             self.finish(None, ended, str(error) if isinstance(error, Exception) else None)
+
+    def is_initial_mask(self, frame: Frame, answer: MaskEstimate) -> bool:
+        """Whether a mask tracker's answer for a frame is the one that is kept of it."""
+        kept, given = read_mask(layout.initial_mask_path(self.folder, frame.index)), answer.binary
+        if kept is None or given is None:
+            return all(mask is None or not mask.any() for mask in (kept, given))
+        return np.array_equal(kept, given)
+
+    def _go_on(self, so_far: WrittenSoFar) -> None:
+        """Be the writer of the run that is there."""
+        earlier = RunReader(self.folder).description
+        known = latest(read_records(self.folder / layout.FRAMES, so_far.lines), refined=False)
+        self._end, self._kept = so_far.lines, {record.index: record for record in known}
+        self._started -= so_far.seconds
+        self._description |= {key: earlier[key] for key in ("created", "refinement") if key in earlier}
+        self._description["resumed"] = [
+            *earlier.get("resumed", ()),
+            {"at": description.now(), "frames": len(known)},
+        ]
+        self._description["skipped"] = [{"index": one.index, "reason": one.reason} for one in so_far.skipped]
 
     def _record(
         self, estimate: FrameEstimate, name: str, revision: bool, started: float | None = None
@@ -247,6 +333,7 @@ class RunWriter:
     def _append(self, line: bytes) -> None:
         """Append a whole line or nothing."""
         with writing(self.folder / layout.FRAMES):
+            self._cut_back()
             end = self._lines.seek(0, 2)
             try:
                 written = 0
@@ -256,15 +343,22 @@ class RunWriter:
                 self._lines.truncate(end)
                 raise
 
+    def _cut_back(self) -> None:
+        """Cut off what a stopped run had begun to write after its last finished frame."""
+        if self._end is not None:
+            self._lines.truncate(self._end)
+            self._end = None
+
     def _write_description(self) -> None:
         self._described = time.monotonic()
         text = json.dumps(jsonable(self._description), indent=2, allow_nan=False)
-        write_atomic(self.folder / layout.RUN, text.encode() + b"\n")
+        write_reserved(self.folder / layout.RUN, text.encode() + b"\n", RESERVE)
+        self._written = dict(self._description)
 
     def _give_up_refinement(self, state: FinalState, error: str | None) -> None:
         """Where a refinement did not come to its end."""
         if self._refinement is not None:
-            self._refinement.give_up()
+            self._refinement.give_up(keep=layout.has_state(self.folder))
             self._description["refinement"] = self._refinement.described(state, error or "")
 
     def _export(self, model: ObjectModel | None) -> None:
@@ -301,6 +395,11 @@ def _make_room(folder: Path, overwrite: bool) -> None:
         OutputError: If there is one and ``overwrite`` is not set, or if files there are not a run's.
     """
     there = [path for path in layout.run_files(folder) if path.name != layout.FRAMES or path.stat().st_size]
+    unfinished = layout.partial_path(folder / layout.RUN)
+    if there == [unfinished]:  # killed before anything was there
+        with writing(folder):
+            unfinished.unlink()
+        return
     if not there:
         return
     try:

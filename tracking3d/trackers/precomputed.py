@@ -90,6 +90,13 @@ class PrecomputedMasks:
         self._check(mask.shape, position, frame)
         return MaskEstimate(_resize(mask, frame.size).astype(np.float32))
 
+    def state(self) -> None:
+        """Nothing: every mask is looked up by its frame."""
+
+    def restore(self, frame: Frame, prompt: Prompt, state: None) -> None:
+        """Decide on the first frame again how masks belong to frames."""
+        self._find = match_masks(self._masks.names, frame)
+
     def _check(self, shape: tuple[int, ...], position: int, frame: Frame) -> None:
         (height, width), (frame_height, frame_width) = shape, frame.size
         if abs(width * frame_height / (height * frame_width) - 1) > _ASPECT_TOLERANCE:

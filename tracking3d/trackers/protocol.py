@@ -6,7 +6,7 @@ masks, never the pipeline.
 
 from __future__ import annotations
 
-from typing import Protocol, Self, runtime_checkable
+from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,4 +49,24 @@ class CorrectableTracker(Protocol):
 
     def correct(self, frame: Frame, mask: NDArray[np.bool_]) -> None:
         """Take ``mask`` ``(H, W)`` as the object's place in ``frame``."""
+        ...
+
+
+@runtime_checkable
+class ResumableTracker(Protocol):
+    """A mask tracker that can be asked for its memory, and be given it again in another process.
+
+    A stopped run goes on without it too: the tracker is then taken through the frames again, which is as good where
+    it gives the same answers, but takes as long as it did.
+    """
+
+    def state(self) -> Any:
+        """All that later answers depend on, beside the first frame: numpy arrays, lists, dicts and plain values.
+
+        What was given out never changes afterwards.
+        """
+        ...
+
+    def restore(self, frame: Frame, prompt: Prompt, state: Any) -> None:
+        """Be what ``state`` tells of; ``frame`` and ``prompt`` are those that ``init`` was given."""
         ...

@@ -167,3 +167,7 @@ class Belief:
     def moved(self, pose: Pose, index: int, grey: NDArray[np.uint8], followed: FollowedPoints) -> Belief:
         """One frame later."""
         return replace(self, last=(pose, index), before=self.last, grey=grey, followed=followed)
+
+
+ONLINE_CLASSES = (Belief, ObjectMap, View, Surface, FollowedPoints, Keypoints, Usual)
+"""What a `Belief` is made of beside `tracking3d.estimation.solver.STATE_CLASSES`."""

@@ -8,6 +8,7 @@ is tracked against the map (`tracking`) and judged (`judgement`), and enters the
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -21,7 +22,7 @@ from tracking3d.estimation.feature_space import FeatureSpace, feature_channels
 from tracking3d.estimation.framing import mask_box, projected_box
 from tracking3d.estimation.observation import Observation, observe
 from tracking3d.estimation.online.answers import solved, unsolved
-from tracking3d.estimation.online.belief import Belief, ObjectMap, View
+from tracking3d.estimation.online.belief import ONLINE_CLASSES, Belief, ObjectMap, View
 from tracking3d.estimation.online.growing import refined, refined_once_more, with_keyframe, with_points
 from tracking3d.estimation.online.judgement import ENOUGH_POINTS, judge, looks_wrong
 from tracking3d.estimation.online.mapping import mask_weight, pose_of, project_points
@@ -39,6 +40,7 @@ from tracking3d.estimation.online.tracking import (
 )
 from tracking3d.estimation.online.waiting import solved_start, waiting_view
 from tracking3d.estimation.shape import Shape
+from tracking3d.estimation.solver import STATE_CLASSES
 from tracking3d.estimation.start import first_mask, first_translation, mask_ellipse, prototype_mesh
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame, MaskEstimate
@@ -69,6 +71,9 @@ class OnlineSolver:
     config: PipelineConfig
     camera: Camera
     encoder: FeatureEncoder
+
+    state_classes: ClassVar[tuple[type, ...]] = (*STATE_CLASSES, *ONLINE_CLASSES)
+    """What a `Belief` is made of, for keeping it."""
 
     @property
     def online(self) -> OnlineConfig:

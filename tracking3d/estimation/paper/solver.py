@@ -8,6 +8,7 @@ default is, so that preset ``paper`` is the pure recipe.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -28,6 +29,7 @@ from tracking3d.estimation.paper.optimize import Optimum, optimize
 from tracking3d.estimation.paper.prediction import candidate_poses
 from tracking3d.estimation.paper.problem import Problem
 from tracking3d.estimation.shape import Shape
+from tracking3d.estimation.solver import STATE_CLASSES
 from tracking3d.estimation.start import first_mask, first_translation, mask_ellipse, prototype_mesh
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame, MaskEstimate
@@ -50,6 +52,9 @@ class PaperSolver:
     config: PipelineConfig
     camera: Camera
     encoder: FeatureEncoder
+
+    state_classes: ClassVar[tuple[type, ...]] = (*STATE_CLASSES, Belief, Keyframe)
+    """What a `Belief` is made of, for keeping it."""
 
     @property
     def settings(self) -> PaperConfig:

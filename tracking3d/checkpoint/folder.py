@@ -1,0 +1,156 @@
+"""The state of a run on disk: one JSON file that is replaced whole, and what it names beside it.
+
+After a kill at any moment it is the state of one finished frame: arrays and the journal are written first, and a file
+that the state names is removed only once another state has taken its place.
+"""
+
+from __future__ import annotations
+
+import json
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.checkpoint.progress import Kept, Progress, TakenFrame, journal_line, read_journal
+from tracking3d.checkpoint.trees import TreeFolder
+from tracking3d.errors import InputError
+from tracking3d.frames import SkippedFrame
+from tracking3d.results import layout
+from tracking3d.results.files import read_mask, write_atomic, write_mask, writing
+
+VERSION = 1
+
+
+class Checkpoint:
+    """Keeps the state of one run, in `layout.STATE` of its folder.
+
+    Args:
+        folder: The run folder.
+        classes: See `TreeFolder`.
+        device: See `TreeFolder`.
+
+    Raises:
+        OutputError: If the folder cannot be written.
+    """
+
+    def __init__(self, folder: Path, classes: tuple[type, ...], device: str = "cpu") -> None:
+        self._folder = folder / layout.STATE
+        with writing(self._folder):
+            self._folder.mkdir(exist_ok=True)
+        self._trees = TreeFolder(self._folder, classes, device)
+        self._journal = 0
+        self._waiting = b""
+
+    def note(self, skipped: SkippedFrame) -> None:
+        """Remember a frame that was not taken; it is kept with the next one that is."""
+        self._waiting += journal_line(skipped)
+
+    def save(self, progress: Progress, session: dict[str, Any], taken: TakenFrame | None = None) -> None:
+        """Keep the state after a frame.
+
+        Args:
+            progress: Where the run stands.
+            session: The session's state.
+            taken: The frame, where it was taken for the first time.
+
+        Raises:
+            OutputError: If it cannot be written; the state before is then still there.
+            UnkeptError: If the session holds what cannot be kept.
+        """
+        lines = self._waiting + (journal_line(taken) if taken else b"")
+        with writing(self._folder):
+            tree = self._trees.text(session)
+            if lines:
+                with (self._folder / layout.JOURNAL).open("ab") as journal:
+                    journal.truncate(self._journal)
+                    journal.write(lines)
+            length = self._journal + len(lines)
+            head = {"version": VERSION, "journal": length, "progress": asdict(progress)}
+            text = f'{json.dumps(head)[:-1]}, "session": {tree}}}\n'
+            write_atomic(self._folder / layout.STATE_FILE, text.encode("ascii"))
+            self._journal, self._waiting = length, b""
+            self._trees.tidy()
+
+    def read(self) -> Kept:
+        """What was kept last.
+
+        Raises:
+            InputError: If it is damaged, or of another version.
+        """
+        path = self._folder / layout.STATE_FILE
+        try:
+            state = json.loads(path.read_bytes())
+            if state["version"] != VERSION:
+                raise InputError(
+                    f"{path} was written by another version of tracking3d; start anew with {layout.OVERWRITE}."
+                )
+            self._journal = int(state["journal"])
+            journal = self._folder / layout.JOURNAL
+            text = journal.read_bytes()[: self._journal] if self._journal else b""
+            if len(text) < self._journal:
+                raise ValueError(f"{journal.name} is too short")
+            taken, skipped = read_journal(text)
+            kept = Kept(Progress(**state["progress"]), self._trees.read(state["session"]), taken, skipped)
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError(f"{path} is damaged ({error}); start anew with {layout.OVERWRITE}.") from error
+        return kept
+
+    def clear_strangers(self) -> None:
+        """Remove the files of a state that was not finished, after `read`.
+
+        Raises:
+            OutputError: If they cannot be removed.
+        """
+        with writing(self._folder):
+            self._trees.clear_strangers()
+
+    def keep_correction(self, index: int, mask: NDArray[np.bool_]) -> None:
+        """Keep the mask ``(H, W)`` that was handed back to the mask tracker in frame ``index``.
+
+        Raises:
+            OutputError: If it cannot be written.
+        """
+        path = layout.mask_path(self._folder, index)
+        with writing(path):
+            path.parent.mkdir(exist_ok=True)
+        write_mask(path, mask)
+
+    def correction(self, index: int) -> NDArray[np.bool_]:
+        """That mask again.
+
+        Raises:
+            InputError: If it is missing or damaged.
+        """
+        mask = read_mask(path := layout.mask_path(self._folder, index))
+        if mask is None:
+            raise InputError(f"{path} is missing or damaged; start anew with {layout.OVERWRITE}.")
+        return mask
+
+    def remove(self) -> None:
+        """Remove what was kept.
+
+        Raises:
+            OutputError: If it cannot be removed.
+        """
+        remove_state(self._folder.parent)
+
+
+def remove_state(folder: Path) -> None:
+    """Remove the state that is kept in a run folder, if there is one.
+
+    Raises:
+        OutputError: If it cannot be removed.
+    """
+    inner = folder / layout.STATE
+    with writing(inner):
+        # The state first: without it nobody looks for the rest.
+        files = sorted(layout.state_files(folder), key=lambda path: path.name != layout.STATE_FILE)
+        for path in files:
+            path.unlink(missing_ok=True)
+        for empty in (inner / layout.MASKS, inner):
+            with suppress(OSError):
+                empty.rmdir()

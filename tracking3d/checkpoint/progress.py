@@ -1,0 +1,106 @@
+"""What a run has done so far: how far each phase is, and what came of every frame that it took."""
+
+from __future__ import annotations
+
+import json
+import zlib
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.frames import SkippedFrame
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a run stands.
+
+    Attributes:
+        last: Index of the last frame that has its causal answer; -1 before the first.
+        lines: Bytes of ``frames.jsonl`` up to there.
+        refining: Whether everything was solved once more.
+        last_refined: Index of the last frame that was looked at again; -1 before the first.
+        refined_lines: Bytes of the second answers up to there.
+        seconds: Wall time of the run up to there, pauses left out.
+        refinement_seconds: The same of the final refinement.
+    """
+
+    last: int = -1
+    lines: int = 0
+    refining: bool = False
+    last_refined: int = -1
+    refined_lines: int = 0
+    seconds: float = 0.0
+    refinement_seconds: float = 0.0
+
+
+@dataclass(frozen=True)
+class TakenFrame:
+    """What the answers do not tell of a frame that was taken.
+
+    Attributes:
+        index: The frame's index in the source.
+        picture: Checksum of its image, see `checksum`.
+        score: Of its initial mask; reason: of the same.
+        corrected: Whether the answer was handed back to the mask tracker.
+        failure: Which plug-in failed at it, and why; empty where none did.
+    """
+
+    index: int
+    picture: int
+    score: float = 1.0
+    reason: str = ""
+    corrected: bool = False
+    failure: str = ""
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A run that was stopped.
+
+    Attributes:
+        progress: Where it stands.
+        session: The session's state, see `tracking3d.session.Session.kept`.
+        taken: The frames that were taken, by index.
+        skipped: Those that were not.
+    """
+
+    progress: Progress
+    session: dict[str, Any]
+    taken: dict[int, TakenFrame] = field(default_factory=dict)
+    skipped: tuple[SkippedFrame, ...] = ()
+
+
+def checksum(image: NDArray[np.uint8]) -> int:
+    """A number that tells one image from another."""
+    return zlib.crc32(np.ascontiguousarray(image).reshape(-1).data)
+
+
+def journal_line(frame: TakenFrame | SkippedFrame) -> bytes:
+    """One frame as a line of the journal."""
+    fields = asdict(frame)
+    if isinstance(frame, SkippedFrame):
+        fields["skipped"] = True
+    return json.dumps(fields).encode("ascii") + b"\n"
+
+
+def read_journal(text: bytes) -> tuple[dict[int, TakenFrame], tuple[SkippedFrame, ...]]:
+    """The frames of a journal.
+
+    Raises:
+        ValueError: If a line is damaged.
+    """
+    taken, skipped = dict[int, TakenFrame](), list[SkippedFrame]()
+    for line in text.splitlines():
+        fields = json.loads(line)
+        try:
+            if fields.pop("skipped", False):
+                skipped.append(SkippedFrame(**fields))
+            else:
+                frame = TakenFrame(**fields)
+                taken[frame.index] = replace(frame, score=float(frame.score))
+        except (TypeError, AttributeError) as error:
+            raise ValueError(f"not a frame of the journal: {error}") from error
+    return taken, tuple(skipped)

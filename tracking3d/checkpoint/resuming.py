@@ -1,0 +1,113 @@
+"""Whether a run folder holds a run that can go on, and with what is asked for now."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from tracking3d.checkpoint.progress import checksum
+from tracking3d.errors import InputError, OutputError
+from tracking3d.frames import Frame, Prompt
+from tracking3d.results import layout
+from tracking3d.results.lock import is_locked
+from tracking3d.results.records import jsonable
+from tracking3d.results.run_reader import RunReader
+
+Earlier = Literal["none", "stopped", "finished"]
+"""What is in a run folder: nothing that could be resumed, a run that was stopped, or one that is done."""
+
+
+def given_of(first: Frame, prompt: Prompt | None, count: int | None) -> dict[str, Any]:
+    """What tells a source and the object in it apart from others, for ``run.json``.
+
+    Args:
+        first: The first frame.
+        prompt: The object in it.
+        count: Number of frames, where known.
+    """
+    height, width = first.size
+    mask = None if prompt is None or prompt.mask is None else checksum(prompt.mask.astype("uint8"))
+    return {
+        "frames": count,
+        "width": width,
+        "height": height,
+        "first_frame": first.index,
+        "first_picture": checksum(first.image),
+        "box": None if prompt is None else [float(value) for value in prompt.box],
+        "mask": mask,
+    }
+
+
+_NAMES = {
+    "frames": "number of frames",
+    "width": "width of the frames",
+    "height": "height of the frames",
+    "first_frame": "index of the first frame",
+    "first_picture": "first picture",
+    "box": "object's box",
+    "mask": "object's mask",
+}
+_CHECKSUMS = ("first_picture", "mask")
+
+
+def earlier_run(
+    folder: Path, config: Mapping[str, Any], selection: str | None, given: Mapping[str, Any]
+) -> Earlier:
+    """What is in a run folder, as far as a run of these settings and this source can go on with it.
+
+    Args:
+        folder: The run folder.
+        config: The configuration, as JSON has it.
+        selection: The ``START:STOP:STEP`` that the source was opened with.
+        given: See `given_of`.
+
+    Raises:
+        InputError: If the run there is of other settings or another source, or its state was not kept.
+        OutputError: If it goes on at this moment.
+    """
+    if not (folder / layout.RUN).is_file():
+        return "none"
+    run = RunReader(folder)
+    if is_locked(folder / layout.FRAMES):
+        raise OutputError(f"{folder} is in use by another run; wait for it or choose another {layout.OUT}.")
+    finished = run.state == "finished"
+    if not finished and not layout.has_state(folder):
+        if len(run.frames) <= 1:  # stopped before the first state was kept
+            return "none"
+        raise InputError(
+            f"The run {folder} cannot be resumed: its state was not kept; start anew with {layout.OVERWRITE}."
+        )
+    if what := next(_differences(run.description, config, selection, given), None):
+        raise InputError(
+            f"The run {folder} cannot be resumed with other settings or another source: {what}; "
+            f"give what it was begun with, or start anew with {layout.OVERWRITE}."
+        )
+    return "finished" if finished else "stopped"
+
+
+def _differences(
+    before: Mapping[str, Any], config: Mapping[str, Any], selection: str | None, given: Mapping[str, Any]
+) -> Iterator[str]:
+    """What is not as it was, in words."""
+    if before.get("selection") != selection:
+        yield f"the selection of frames was {before.get('selection')} and is {selection}"
+    then, now = _flat(before["config"]), _flat(jsonable(config))
+    for key in sorted(then.keys() | now.keys()):
+        if then.get(key) != now.get(key):
+            yield f"{key} was {then.get(key)} and is {now.get(key)}"
+    earlier = before.get("given") or {}
+    for key, name in _NAMES.items():
+        if earlier.get(key) != given[key]:
+            was = "is another one" if key in _CHECKSUMS else f"was {earlier.get(key)} and is {given[key]}"
+            yield f"the {name} {was}"
+
+
+def _flat(tree: Any, prefix: str = "") -> dict[str, Any]:
+    """The leaves of nested mappings by their dotted keys."""
+    if not isinstance(tree, Mapping):
+        return {prefix: tree}
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        flat |= _flat(value, f"{prefix}.{key}" if prefix else str(key))
+    return flat
