@@ -100,7 +100,8 @@ def flat(settings: dict[str, Any], prefix: str = ""):
 
 def test_run_folder_page_names_every_file_and_key():
     page = (ROOT / "docs/run-folder.md").read_text(encoding="utf-8")
-    files = [value for name, value in vars(layout).items() if name.isupper() and isinstance(value, str)]
+    names = [value for name, value in vars(layout).items() if name.isupper() and isinstance(value, str)]
+    files = [value for value in names if value.isprintable()]  # what sentences call arguments is not
     start = description_at_start(
         config={},
         camera=Camera.from_fov(4, 4),
