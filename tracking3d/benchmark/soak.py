@@ -287,7 +287,7 @@ def _moved(
     width = mask.shape[1]
     moved, result = np.zeros_like(mask), background.copy()
     moved[:, pixels:] = mask[:, : width - pixels]
-    result[moved] = image[mask & (np.arange(width) < width - pixels)]
+    result[moved] = image[:, : width - pixels][mask[:, : width - pixels]]
     return result
 
 
