@@ -78,6 +78,13 @@ def test_broken_pipe_ends_quietly():
     program.wait()
 
 
+def test_a_closed_standard_output_is_no_fault():
+    code = "from tracking3d.cli import main; main()"
+    command = ["bash", "-c", 'exec "$@" 0<&- 1>&-', "bash", sys.executable, "-c", code, "config", "schema"]
+    result = subprocess.run(command, stderr=subprocess.PIPE)
+    assert (result.returncode, result.stderr) == (0, b"")
+
+
 def test_plugins_are_listed_with_status_and_reason(call, monkeypatch):
     monkeypatch.setenv("TRACKING3D_PLUGINS", "tracking3d.trackers:bad=no_such_module_at_all:Bad")
     result = call("plugins")

@@ -38,7 +38,8 @@ class Program(TyperGroup):
         try:
             _refuse_empty(arguments)
             code = super().main(arguments, *more, **{**extra, "standalone_mode": False})
-            sys.stdout.flush()
+            if sys.stdout is not None:  # as it is where it was closed before the program began
+                sys.stdout.flush()
         except Exception as error:
             if "--debug" in arguments:
                 traceback.print_exc()
