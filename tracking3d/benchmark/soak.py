@@ -275,8 +275,9 @@ def plot_soak(report: SoakReport, path: Path) -> None:
 def _without_object(images: NDArray[np.uint8], masks: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """The background ``(H, W, 3)``: seen where the object is not, painted over where it always is."""
     always = cv2.dilate(masks.all(0).astype(np.uint8), np.ones((5, 5), np.uint8))
+    always_there: NDArray[np.bool_] = np.logical_and.reduce(masks)
     free = np.where(masks[..., None], np.nan, images.astype(np.float32))
-    seen = np.nan_to_num(np.nanmax(np.where(masks.all(0)[..., None], 0, free), axis=0)).astype(np.uint8)
+    seen = np.nan_to_num(np.nanmax(np.where(always_there[..., None], 0, free), axis=0)).astype(np.uint8)
     return np.asarray(cv2.inpaint(seen, always, 3, cv2.INPAINT_TELEA), dtype=np.uint8)
 
 
