@@ -373,7 +373,11 @@ class Quiet:
 
 
 @pytest.mark.parametrize("protocol", range(6))
-@pytest.mark.parametrize("thing", [Harmful(), Quiet(), Path("x"), {"a": {1, 2}, "f": len}], ids=repr)
+@pytest.mark.parametrize(
+    "thing",
+    [Harmful(), Quiet(), Path("x"), {"a": {1, 2}, "f": len}],
+    ids=["harmful", "quiet", "path", "mapping"],
+)
 def test_pickles_of_anything_but_arrays_and_plain_values_are_refused_unrun(
     truth, tmp_path, capsys, thing, protocol
 ):

@@ -232,7 +232,6 @@ def test_what_was_handed_back_to_the_tracker_is_handed_back_again(clip, images, 
 def test_a_tracker_that_keeps_its_memory_does_not_see_the_frames_again(clip, images, tmp_path, monkeypatch):
     np.save(tmp_path / "masks.npy", clip.masks)
     config = load_config(
-        overrides=["solver.name=stand_in"],
         tracker={"name": "precomputed", "path": str(tmp_path / "masks.npy")},
     )
     record(open_source(str(images)), config, tmp_path / "whole")

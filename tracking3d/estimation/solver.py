@@ -11,7 +11,7 @@ from typing import Generic, Protocol, TypeVar, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
+from tracking3d.estimation.estimate import FrameEstimate, MaskSource, ObjectModel, Status
 from tracking3d.estimation.feature_space import FeatureSpace
 from tracking3d.estimation.observation import Observation
 from tracking3d.estimation.shape import Shape
@@ -28,6 +28,7 @@ STATE_CLASSES: tuple[type, ...] = (
     Camera,
     FeatureSpace,
     FrameEstimate,
+    MaskSource,
     Observation,
     Pose,
     Shape,
