@@ -17,13 +17,14 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
-from tracking3d.errors import InputError, OutputError
+from tracking3d.errors import OutputError
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel
 from tracking3d.frames import Frame, MaskEstimate, SkippedFrame
 from tracking3d.geometry.camera import Camera
 from tracking3d.results import description, layout
 from tracking3d.results.files import read_mask, write_image, write_mask, write_reserved, writing
 from tracking3d.results.lock import try_lock
+from tracking3d.results.making_room import make_room
 from tracking3d.results.mesh_export import export_mesh
 from tracking3d.results.notes import notes_of
 from tracking3d.results.pictures import Pictures
@@ -126,7 +127,7 @@ class RunWriter:
                     f"{self.folder} is in use by another run; wait for it or choose another {layout.OUT}."
                 )
             if resume is None:
-                _make_room(self.folder, overwrite)
+                make_room(self.folder, overwrite)
             with writing(self.folder):
                 if resume is None:
                     self._lines.truncate(0)
@@ -386,35 +387,3 @@ def _first_problem(*steps: Callable[[], None]) -> Exception | None:
         except Exception as error:
             problem = problem or error
     return problem
-
-
-def _make_room(folder: Path, overwrite: bool) -> None:
-    """Remove an earlier run from the folder, or refuse to.
-
-    Raises:
-        OutputError: If there is one and ``overwrite`` is not set, or if files there are not a run's.
-    """
-    there = [path for path in layout.run_files(folder) if path.name != layout.FRAMES or path.stat().st_size]
-    unfinished = layout.partial_path(folder / layout.RUN)
-    if there == [unfinished]:  # killed before anything was there
-        with writing(folder):
-            unfinished.unlink()
-        return
-    if not there:
-        return
-    try:
-        earlier = RunReader(folder)
-    except InputError as error:
-        raise OutputError(
-            f"{folder} is not a readable run folder but holds {there[0].relative_to(folder)}, "
-            f"which a run would replace; choose another {layout.OUT}."
-        ) from error
-    if earlier.frames and not overwrite:
-        raise OutputError(
-            f"{folder} already holds a run; choose another {layout.OUT} or pass {layout.OVERWRITE}."
-        )
-    with writing(folder):
-        for path in there:
-            # These two are replaced in place, so that a kill in between leaves a run folder.
-            if path.name not in (layout.RUN, layout.FRAMES):
-                path.unlink()

@@ -1,0 +1,42 @@
+"""Making room for a run in a folder, where that takes nothing but an earlier run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tracking3d.errors import InputError, OutputError
+from tracking3d.results import layout
+from tracking3d.results.files import writing
+from tracking3d.results.run_reader import RunReader
+
+
+def make_room(folder: Path, overwrite: bool) -> None:
+    """Remove an earlier run from the folder, or refuse to.
+
+    Raises:
+        OutputError: If there is one and ``overwrite`` is not set, or if files there are not a run's.
+    """
+    there = [path for path in layout.run_files(folder) if path.name != layout.FRAMES or path.stat().st_size]
+    unfinished = layout.partial_path(folder / layout.RUN)
+    if there == [unfinished]:  # killed before anything was there
+        with writing(folder):
+            unfinished.unlink()
+        return
+    if not there:
+        return
+    try:
+        earlier = RunReader(folder)
+    except InputError as error:
+        raise OutputError(
+            f"{folder} is not a readable run folder but holds {there[0].relative_to(folder)}, "
+            f"which a run would replace; choose another {layout.OUT}."
+        ) from error
+    if earlier.frames and not overwrite:
+        raise OutputError(
+            f"{folder} already holds a run; choose another {layout.OUT} or pass {layout.OVERWRITE}."
+        )
+    with writing(folder):
+        for path in there:
+            # These two are replaced in place, so that a kill in between leaves a run folder.
+            if path.name not in (layout.RUN, layout.FRAMES):
+                path.unlink()
