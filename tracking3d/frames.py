@@ -80,3 +80,8 @@ class MaskEstimate:
     def binary(self) -> NDArray[np.bool_] | None:
         """The mask thresholded at one half, or None."""
         return None if self.mask is None else self.mask >= 0.5
+
+
+def pixels(size: tuple[int, int]) -> str:
+    """A size ``(height, width)`` as sentences have it, width first."""
+    return f"{size[1]} x {size[0]}"

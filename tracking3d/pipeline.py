@@ -17,10 +17,10 @@ from tracking3d.arguments import check_frames, checked_config, checked_image
 from tracking3d.config.camera import choose_camera
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import PluginError
-from tracking3d.estimation.estimate import FrameEstimate
+from tracking3d.estimation.estimate import FrameEstimate, unanswered
 from tracking3d.frames import Box, Frame, Image, MaskEstimate, SkippedFrame
 from tracking3d.prompts import check_prompt, check_prompts, damaged_start, make_prompt, make_prompts
-from tracking3d.session import SOLVERS, Session, build_encoder, unanswered
+from tracking3d.session import SOLVERS, Session, build_encoder
 
 __all__ = ["SOLVERS", "Session", "checked_image", "choose_camera", "track", "track_objects"]
 

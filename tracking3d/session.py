@@ -14,12 +14,13 @@ from tracking3d.arguments import check_frame, check_session
 from tracking3d.config.camera import choose_camera, warn_of_unlikely
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError, argument
-from tracking3d.estimation.estimate import FrameEstimate, MaskSource, ObjectModel, Status
+from tracking3d.estimation.correction import corrects
+from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status, unanswered
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.estimation.paper.solver import PaperSolver
 from tracking3d.estimation.solver import RefiningSolver, Solver
 from tracking3d.features.protocol import FeatureEncoder
-from tracking3d.frames import Frame, MaskEstimate, Prompt
+from tracking3d.frames import Frame, MaskEstimate, Prompt, pixels
 from tracking3d.geometry.camera import Camera
 from tracking3d.plugins import FEATURES, TRACKERS, build_plugin, plugin_label
 from tracking3d.plugins.guard import GuardedEncoder, GuardedTracker, PluginFailure
@@ -34,15 +35,7 @@ SOLVERS: dict[str, Callable[[PipelineConfig, Camera, FeatureEncoder], Solver[Any
 }
 """Solvers by the name that `solver.name` selects."""
 
-SURE = 0.6
-"""Confidence from which an answer's mask is handed back to the mask tracker. An answer that is as likely wrong as right
-would teach it as many errors as it mends; the tracker ``onnx`` trusts its own masks from the same score on."""
-
 _CPU = argument("runtime.device 'cpu'", "--device cpu")
-
-WORTH_CORRECTING = (0.5, 0.9)
-"""IoU of answer and initial mask between which the latter is corrected. Above, they differ by little more than the
-width of an outline; below, one of them is of something else, and nobody knows which."""
 
 
 class Session:
@@ -226,8 +219,8 @@ class Session:
     def _go_on(self, solver: Solver[Any], frame: Frame) -> FrameEstimate:
         if frame.size != (self.camera.height, self.camera.width):
             raise InputError(
-                f"{_label(frame)} has {_pixels(frame.size)} pixels but the first frame "
-                f"{_pixels((self.camera.height, self.camera.width))}; all frames must have one size."
+                f"{_label(frame)} has {pixels(frame.size)} pixels but the first frame "
+                f"{pixels((self.camera.height, self.camera.width))}; all frames must have one size."
             )
         failures = []
         self.corrected = False
@@ -343,32 +336,6 @@ def build_encoder(config: PipelineConfig) -> FeatureEncoder:
         return cast(FeatureEncoder, GuardedEncoder(build_plugin(FEATURES, config.features), label))
 
 
-def corrects(estimate: FrameEstimate) -> bool:
-    """Whether an answer is sure enough, and unlike the initial mask enough, to be handed back to the mask tracker."""
-    if estimate.status is not Status.TRACKED or estimate.initial_mask is None:
-        return False
-    both = np.count_nonzero(estimate.mask & estimate.initial_mask)
-    either = np.count_nonzero(estimate.mask | estimate.initial_mask)
-    least, most = WORTH_CORRECTING
-    return bool(estimate.confidence >= SURE and least * either <= both <= most * either and both)
-
-
-def unanswered(frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]) -> FrameEstimate:
-    """The answer where the solver could give none: lost, with the initial mask and the pose known before."""
-    initial = mask.binary if mask.binary is not None and mask.binary.any() else None
-    return FrameEstimate(
-        index=frame.index,
-        time=frame.time,
-        T_cam_obj=T_cam_obj,
-        mask=initial if initial is not None else np.zeros(frame.size, dtype=np.bool_),
-        initial_mask=initial,
-        status=Status.LOST,
-        reason="",
-        confidence=0.0,
-        mask_source=MaskSource.handed_back(initial),
-    )
-
-
 def check_device(name: str) -> None:
     """Make sure that a device is there.
 
@@ -389,7 +356,3 @@ def _timed(estimate: FrameEstimate, watch: Stopwatch, frame: Frame) -> FrameEsti
 
 def _label(frame: Frame) -> str:
     return frame.name or f"frame {frame.index}"
-
-
-def _pixels(size: tuple[int, int]) -> str:
-    return f"{size[1]} x {size[0]}"

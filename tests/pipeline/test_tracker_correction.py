@@ -12,9 +12,10 @@ from refining_solver import CausalSolver
 
 from tracking3d import Frame, FrameEstimate, Status, load_config, track
 from tracking3d.errors import PluginError
+from tracking3d.estimation.correction import SURE, WORTH_CORRECTING, corrects
 from tracking3d.frames import MaskEstimate, Prompt
 from tracking3d.plugins import VARIABLE
-from tracking3d.session import SOLVERS, SURE, WORTH_CORRECTING, corrects
+from tracking3d.session import SOLVERS
 from tracking3d.trackers.precomputed import PrecomputedMasks
 from tracking3d.trackers.protocol import CorrectableTracker
 

@@ -12,6 +12,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.stages import StageTimes
 
 
@@ -113,3 +114,19 @@ class ObjectModel:
     texture: NDArray[np.uint8]
     texture_weight: NDArray[np.float32]
     features: NDArray[np.float32]
+
+
+def unanswered(frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]) -> FrameEstimate:
+    """The answer where the solver could give none: lost, with the initial mask and the pose known before."""
+    initial = mask.binary if mask.binary is not None and mask.binary.any() else None
+    return FrameEstimate(
+        index=frame.index,
+        time=frame.time,
+        T_cam_obj=T_cam_obj,
+        mask=initial if initial is not None else np.zeros(frame.size, dtype=np.bool_),
+        initial_mask=initial,
+        status=Status.LOST,
+        reason="",
+        confidence=0.0,
+        mask_source=MaskSource.handed_back(initial),
+    )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,7 @@ from tracking3d.frames import Frame, MaskEstimate, SkippedFrame
 from tracking3d.geometry.camera import Camera
 from tracking3d.results import description, layout
 from tracking3d.results.files import read_mask, write_image, write_mask, write_reserved, writing
-from tracking3d.results.lock import try_lock
+from tracking3d.results.frame_lines import FrameLines
 from tracking3d.results.making_room import make_room
 from tracking3d.results.mesh_export import export_mesh
 from tracking3d.results.notes import notes_of
@@ -114,32 +114,23 @@ class RunWriter:
             renderer=renderer,
             given=given,
         )
-        self._end: int | None = None
         self._kept: dict[int, FrameRecord] = {}
-        frames = self.folder / layout.FRAMES
         with writing(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
-            new = not frames.exists()
-            self._lines = frames.open("ab", buffering=0)
+        self._lines = FrameLines(self.folder)
         try:
-            if not try_lock(self._lines.fileno()):
-                raise OutputError(
-                    f"{self.folder} is in use by another run; wait for it or choose another {layout.OUT}."
-                )
             if resume is None:
                 make_room(self.folder, overwrite)
             with writing(self.folder):
                 if resume is None:
-                    self._lines.truncate(0)
+                    self._lines.begin()
                 for inner in (layout.MASKS, layout.INITIAL_MASKS):
                     (self.folder / inner).mkdir(exist_ok=True)
             if resume is not None:
                 self._go_on(resume)
             self._write_description()
         except BaseException:
-            self._lines.close()
-            if new:
-                frames.unlink()
+            self._lines.discard()
             raise
 
     @property
@@ -150,7 +141,7 @@ class RunWriter:
     @property
     def lines(self) -> int:
         """Bytes of ``frames.jsonl`` that are written."""
-        return self._lines.seek(0, 2) if self._end is None else self._end
+        return self._lines.size
 
     def draw_again(self, frame: Frame) -> FrameRecord | None:
         """Draw a frame that was answered before the run was stopped; None where it has no answer."""
@@ -216,7 +207,7 @@ class RunWriter:
         self._export(model)
         if model is None:
             with writing(self.folder):
-                self._cut_back()
+                self._lines.cut_back()
         causal = latest(read_records(self.folder / layout.FRAMES), refined=False)
         self._refinement = RefinementWriter(self.folder, self._camera, self._fps, causal, kept, seconds)
         self._description["refinement"] = self._refinement.described("running")
@@ -235,7 +226,7 @@ class RunWriter:
             OutputError: If it cannot be done.
         """
         assert self._refinement is not None
-        self._refinement.take_over(self._append_all)
+        self._refinement.take_over(self._lines.append)
         self._description["refinement"] = self._refinement.described("finished")
         self._description["camera"] = asdict(self._camera)
         self._pictures, self._refinement = self._refinement.pictures, None
@@ -302,7 +293,8 @@ class RunWriter:
         """Be the writer of the run that is there."""
         earlier = RunReader(self.folder).description
         known = latest(read_records(self.folder / layout.FRAMES, so_far.lines), refined=False)
-        self._end, self._kept = so_far.lines, {record.index: record for record in known}
+        self._lines.go_on(so_far.lines)
+        self._kept = {record.index: record for record in known}
         self._started -= so_far.seconds
         self._description |= {key: earlier[key] for key in ("created", "refinement") if key in earlier}
         self._description["resumed"] = [
@@ -324,31 +316,8 @@ class RunWriter:
         write_mask(layout.mask_path(self.folder, estimate.index), estimate.mask)
         if started is not None:
             record = record.and_wrote(time.perf_counter() - started)
-        self._append_all([record])
+        self._lines.append([record])
         return record
-
-    def _append_all(self, records: Sequence[FrameRecord]) -> None:
-        """Append the lines of all records, or none of them."""
-        self._append(b"".join(record.to_json().encode() + b"\n" for record in records))
-
-    def _append(self, line: bytes) -> None:
-        """Append a whole line or nothing."""
-        with writing(self.folder / layout.FRAMES):
-            self._cut_back()
-            end = self._lines.seek(0, 2)
-            try:
-                written = 0
-                while written < len(line):
-                    written += self._lines.write(line[written:])
-            except OSError:
-                self._lines.truncate(end)
-                raise
-
-    def _cut_back(self) -> None:
-        """Cut off what a stopped run had begun to write after its last finished frame."""
-        if self._end is not None:
-            self._lines.truncate(self._end)
-            self._end = None
 
     def _write_description(self) -> None:
         self._described = time.monotonic()

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from typing import Protocol, runtime_checkable
 
 from tracking3d.errors import InputError
-from tracking3d.frames import Frame, SkippedFrame
+from tracking3d.frames import Frame, SkippedFrame, pixels
 
 Intrinsics = tuple[float, float, float, float]
 """``(fx, fy, cx, cy)`` in pixels of the full frame; pixel (0, 0) is the centre of the top-left pixel."""
@@ -77,8 +77,8 @@ def checked(frames: Iterable[Frame | SkippedFrame], name: str) -> Iterator[Frame
         else:
             yield SkippedFrame(
                 frame.index,
-                f"{frame.name} has {_pixels(frame.size)} pixels but {first[0]}, the first, "
-                f"has {_pixels(first[1])}; all frames must have one size",
+                f"{frame.name} has {pixels(frame.size)} pixels but {first[0]}, the first, "
+                f"has {pixels(first[1])}; all frames must have one size",
             )
     if first is None:
         raise InputError(
@@ -86,7 +86,3 @@ def checked(frames: Iterable[Frame | SkippedFrame], name: str) -> Iterator[Frame
             if reason is None
             else f"{name} has no frame that can be decoded ({reason})."
         )
-
-
-def _pixels(size: tuple[int, int]) -> str:
-    return f"{size[1]} x {size[0]}"
