@@ -17,12 +17,14 @@ from tracking3d.benchmark.job import Job
 from tracking3d.benchmark.noisy_frames import NoisyFrames
 from tracking3d.benchmark.processors import KERNELS, Kernels, kernels_of
 from tracking3d.benchmark.results import ResultSet
+from tracking3d.benchmark.sequences import Dataset
 from tracking3d.benchmark.spread import (
     AS_IT_IS,
     describe_flips,
     flips,
     format_spreads,
     plan,
+    run_spread,
     spreads,
     to_markdown,
     write_spreads,
@@ -86,6 +88,18 @@ def test_what_is_one_computation_is_run_once_and_what_cannot_be_run_is_named():
 def test_the_renderer_that_is_chosen_anyway_is_no_variant():
     variants, _ = plan(BASE.changed("torch", runtime__renderer="torch"))
     assert [one.label for one in variants if "renderer" in one.label] == ["renderer numba"]
+
+
+@pytest.mark.usefixtures("kernels")
+def test_patterns_choose_variants_and_what_is_compared_with_stays(monkeypatch, tmp_path):
+    dataset = Dataset("smoke", 1, "clip", tmp_path, ("box",))
+    monkeypatch.setattr(spread, "run_suite", lambda variants, *rest: [one.label for one in variants])
+    assert run_spread(BASE, dataset, tmp_path, ["*Nehalem", "renderer*"])[0] == [
+        AS_IT_IS, "OpenBLAS Nehalem", "renderer torch"
+    ]  # fmt: skip
+    assert len(run_spread(BASE, dataset, tmp_path)[0]) == 7
+    with pytest.raises(InputError, match="no variant 'Zen' here; choose from: as it is; OpenBLAS Nehalem"):
+        run_spread(BASE, dataset, tmp_path, ["Zen"])
 
 
 def test_every_variant_has_runs_of_its_own(clips, tmp_path):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from fnmatch import fnmatch
 from pathlib import Path
 
 import numpy as np
@@ -104,15 +105,32 @@ def run_spread(
     base: Variant,
     dataset: Dataset,
     out: Path,
+    patterns: Sequence[str] = (),
     processes: int = 1,
     listener: Listener = lambda outcome: None,
 ) -> tuple[list[ResultSet], dict[str, str]]:
     """Every variant on every sequence; what is left out on this processor, and why, is given beside the results.
 
+    Args:
+        base: The settings and the initial masks.
+        dataset: What to run on.
+        out: Folder of the benchmark.
+        patterns: Only variants that match any of them, beside the one as it is; all if there is none.
+        processes: Jobs at a time.
+        listener: Is told of every job.
+
     Raises:
-        InputError: If the masks of ``base`` cannot be meant.
+        InputError: If a pattern matches nothing, or the masks of ``base`` cannot be meant.
     """
     variants, left_out = plan(base)
+    for pattern in patterns:
+        if not any(fnmatch(one.label, pattern) for one in variants):
+            raise InputError(
+                f"There is no variant '{pattern}' here; choose from: {'; '.join(one.label for one in variants)}."
+            )
+    if patterns:
+        wanted = (AS_IT_IS, *patterns)
+        variants = [one for one in variants if any(fnmatch(one.label, pattern) for pattern in wanted)]
     return run_suite(variants, dataset, out, processes, listener), left_out
 
 

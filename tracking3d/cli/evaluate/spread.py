@@ -16,6 +16,14 @@ def spread(
     data: Data = None,
     masks: Masks = "tracker",
     sequences: Sequences = None,
+    patterns: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--variant",
+            metavar="PATTERN",
+            help="Only variants that match, beside it as it is; may be repeated.",
+        ),
+    ] = None,
     config: ConfigFile = None,
     preset: Preset = None,
     overrides: Overrides = None,
@@ -42,7 +50,7 @@ def spread(
     with making_progress(quiet) as made:
         dataset = open_dataset(name, data, out, jobs, made).only(sequences or [])
     with jobs_progress(None, quiet) as listener:
-        results, left_out = run_spread(base, dataset, out, jobs, listener)
+        results, left_out = run_spread(base, dataset, out, patterns or [], jobs, listener)
     failed = {f"{sequence} ({one.label})": why for one in results for sequence, why in one.errors.items()}
     for what, why in failed.items():
         typer.echo(f"{what} failed: {why}", err=True)
