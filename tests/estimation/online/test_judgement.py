@@ -107,6 +107,13 @@ def test_neither_pixels_nor_points_is_lost_and_says_what_disagreed():
     assert verdict.confidence < 0.1
 
 
+def test_a_guessed_turn_that_explains_nothing_is_lost_whatever_points_agree_with_it():
+    verdict = judge(WRONG, USUAL, MANY, 1.0, True, guessed=True)
+    assert verdict.status is Status.LOST and "guess" in verdict.reason and verdict.confidence < 0.1
+    assert judge(WRONG, USUAL, MANY, 1.0, True).status is Status.UNCERTAIN
+    assert judge(fit(), USUAL, MANY, 1.0, True, guessed=True).status is Status.TRACKED
+
+
 def test_points_against_pixels_is_uncertain():
     verdict = judge(WRONG, USUAL, MANY, 1.0, True)
     assert verdict.status is Status.UNCERTAIN

@@ -59,7 +59,7 @@ def looks_wrong(fit: PoseFit, usual: Usual, points: int, mask_weight: float) -> 
     """
     if points < ENOUGH_POINTS:
         return unusual(fit, usual, mask_weight) > 0
-    return unusual(fit, usual, mask_weight) > 1 or fit.points > 1.0
+    return unexplained(fit, usual, mask_weight) or fit.points > 1.0
 
 
 def unusual(fit: PoseFit, usual: Usual, mask_weight: float) -> float:
@@ -95,20 +95,39 @@ def likelihood(fit: PoseFit) -> float:
     return 1 / (1 + math.exp(-logit))
 
 
-def judge(fit: PoseFit, usual: Usual, points: int, mask_weight: float, has_mask: bool) -> Assessment:
-    """Status, reason and confidence of one frame."""
-    excess = unusual(fit, usual, mask_weight)
+def unexplained(fit: PoseFit, usual: Usual, mask_weight: float) -> bool:
+    """Whether a pose leaves far more of its frame unexplained than is usual."""
+    return unusual(fit, usual, mask_weight) > 1
+
+
+def judge(
+    fit: PoseFit, usual: Usual, points: int, mask_weight: float, has_mask: bool, guessed: bool = False
+) -> Assessment:
+    """Status, reason and confidence of one frame.
+
+    Args:
+        fit: The pose and its losses.
+        usual: What is usual.
+        points: How many landmarks agree with the pose.
+        mask_weight: How far the mask is believed.
+        has_mask: Whether there is one.
+        guessed: Whether the pose is the best of many turns that were tried. Where none of them explains the frame,
+            which is the least bad is up to chance, and points that happen to agree with it are, too.
+    """
+    far = unexplained(fit, usual, mask_weight)
     few = points < ENOUGH_POINTS
     if few and not has_mask:
         return Assessment(Status.LOST, "the object is out of sight: no mask, and no points of it", 0.05)
-    if few and excess > 1:
+    if far and guessed and not few:
+        return Assessment(Status.LOST, "no pose explains the frame; the best of many turns is a guess", 0.05)
+    if few and far:
         reason = (
             f"neither pixels (loss {fit.appearance:.2f}, usually {usual.appearance:.2f}), nor the mask "
             f"(overlap {fit.overlap:.2f}), nor points ({points}) agree with any pose"
         )
         return Assessment(Status.LOST, reason, 0.05)
     confidence = likelihood(fit) if has_mask else min(likelihood(fit), _UNWITNESSED)
-    if excess > 1:
+    if far:
         return Assessment(
             Status.UNCERTAIN, f"points agree, pixels do not (loss {fit.appearance:.2f})", confidence
         )

@@ -24,7 +24,7 @@ from tracking3d.estimation.observation import Observation, observe
 from tracking3d.estimation.online.answers import solved, unsolved
 from tracking3d.estimation.online.belief import ONLINE_CLASSES, Belief, ObjectMap, View
 from tracking3d.estimation.online.growing import refined, refined_once_more, with_keyframe, with_points
-from tracking3d.estimation.online.judgement import ENOUGH_POINTS, judge, looks_wrong
+from tracking3d.estimation.online.judgement import ENOUGH_POINTS, judge, looks_wrong, unexplained
 from tracking3d.estimation.online.mapping import mask_weight, pose_of, project_points
 from tracking3d.estimation.online.points import FollowedPoints, follow, grey
 from tracking3d.estimation.online.pose_refinement import PoseFit, PoseWeights
@@ -163,7 +163,7 @@ class OnlineSolver:
         view = self._view(state, frame, binary, causal, followed)
         won, fit, kept = self._found(state, view, image, starts)
         agreed = witnesses(known, kept)
-        judgement = judge(fit, state.usual, agreed, view.mask_weight, binary is not None)
+        judgement = judge(fit, state.usual, agreed, view.mask_weight, binary is not None, won == "grid")
         belief = state.moved(fit.pose, frame.index, image, kept)
         before = state.last if state.last[1] == frame.index - 1 else None
         belief = replace(belief, before=before, status=judgement.status)
@@ -250,7 +250,7 @@ class OnlineSolver:
         view = self._view(state, frame, mask, predicted, followed)
         won, fit, kept = self._found(state, view, image, starts)
         agreed = witnesses(state.known, kept)
-        judgement = judge(fit, state.usual, agreed, view.mask_weight, mask is not None)
+        judgement = judge(fit, state.usual, agreed, view.mask_weight, mask is not None, won == "grid")
         lost = judgement.status is Status.LOST
         key = not lost and self._is_keyframe(state, view, fit, agreed)
         if lost:
@@ -269,7 +269,7 @@ class OnlineSolver:
             )
         if lost:
             belief = replace(belief, before=None)
-        else:
+        elif not unexplained(fit, state.usual, view.mask_weight):
             belief = replace(belief, trail=(*state.trail, (fit.pose, frame.index))[-_TRAIL:])
         answer = solved(belief, unsolved(frame, mask, fit.pose), view, fit, won, agreed, judgement)
         return belief, replace(answer, keyframe=key)
