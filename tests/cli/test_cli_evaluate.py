@@ -138,6 +138,15 @@ def test_the_answers_of_a_run_that_are_scored_can_be_chosen(call, clips, script,
     assert (lost(), lost("--answers", "final"), lost("--answers", "causal")) == (3, 3, 0)
 
 
+def test_a_run_that_was_interrupted_is_scored_and_called_so(call, clips, script, tmp_path):
+    assert call("run", clips / "one/frames", "--box", "20,10,20,20", "--out", "run").exit_code == 0
+    scored = "evaluate", "run", "--truth", clips / "one"
+    assert "interrupted" not in call(*scored).stderr
+    described = json.loads(Path("run/run.json").read_text())
+    Path("run/run.json").write_text(json.dumps(described | {"state": "interrupted"}))
+    assert "The run in run is interrupted; frames with an answer so far: 3." in call(*scored).stderr
+
+
 def made(clips):
     return sorted(clips.iterdir())
 

@@ -96,6 +96,7 @@ def test_a_run_whose_process_is_gone_is_seen(tmp_path, turning_sphere, start_run
 
         monkeypatch.setattr(lock, "_lock", none)
     assert RunReader(tmp_path).state_in_words == "running"
+    assert "is running; frames with an answer so far: 1" in RunReader(tmp_path).not_finished
     writer._lines.close()
     writer._pictures.close()
     path = tmp_path / layout.RUN
@@ -104,3 +105,4 @@ def test_a_run_whose_process_is_gone_is_seen(tmp_path, turning_sphere, start_run
     path.write_text(json.dumps({**description, "process": ended_process()}))
     run = RunReader(tmp_path)
     assert (run.state, run.state_in_words) == ("interrupted", "interrupted (its process is gone)")
+    assert "interrupted (its process is gone); frames" in run.not_finished

@@ -28,9 +28,11 @@ def points(
     from tracking3d.results.run_reader import RunReader
 
     pixels = [numbers(text, 2, "--xy", "X,Y in pixels") for text in xy]
-    tracks = track_points(run, frame, pixels)
-    if beside := check_asked(tracks, RunReader(run).camera):
-        typer.echo(beside, err=True)
+    reader = RunReader(run)
+    tracks = track_points(reader, frame, pixels)
+    for told in (reader.not_finished, check_asked(tracks, reader.camera)):
+        if told:
+            typer.echo(told, err=True)
     if csv is not None:
         try:
             csv.write_text(points_to_csv(tracks), encoding="utf-8")

@@ -62,9 +62,12 @@ def progress(count: int | None, quiet: bool, objects: int = 1) -> Iterator[Liste
 
 def print_summary(folder: Path) -> None:
     """Print the closing table of the run in ``folder``."""
-    run = RunReader(folder).description
+    reader = RunReader(folder)
+    run = reader.description
     counts, (whole, stages) = run["counts"], time_per_frame(run)
-    table = Table(title=f"{escape(str(folder))} ({run['state']})", show_header=False, title_justify="left")
+    table = Table(
+        title=f"{escape(str(folder))} ({reader.state_in_words})", show_header=False, title_justify="left"
+    )
     table.add_row("frames", str(counts["frames"]))
     for status in ("tracked", "uncertain", "lost", "skipped"):
         if counts[status] or status == "tracked":

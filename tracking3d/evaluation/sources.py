@@ -13,6 +13,8 @@ from tracking3d.errors import InputError
 from tracking3d.results import layout
 
 RUN_FOLDER = "run"
+A_RUN_FOLDER = "a run folder"
+"""What messages call one."""
 
 
 def open_answers(
@@ -47,7 +49,7 @@ def open_answers(
             raise InputError(
                 f"{path} is a run folder, which has no option {next(iter(options))}; leave it out."
             )
-        return answers_of_run(path, truth, refined=refined, offset=offset), "a run folder"
+        return answers_of_run(path, truth, refined=refined, offset=offset), A_RUN_FOLDER
     if not refined:
         raise InputError(f"{path} is no run folder, so it has no causal answers; leave --answers out.")
     if offset:

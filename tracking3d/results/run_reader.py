@@ -119,6 +119,13 @@ class RunReader:
         """The state, and where the run was abandoned, that it was."""
         return f"{self.state} (its process is gone)" if self.abandoned else self.state
 
+    @property
+    def not_finished(self) -> str:
+        """A sentence about a run that did not come to its end, or has not yet; empty for one that did."""
+        if self.state == "finished":
+            return ""
+        return f"The run in {self.folder} is {self.state_in_words}; frames with an answer so far: {len(self.frames)}."
+
     @cached_property
     def frames(self) -> list[FrameRecord]:
         """The answer for every frame, sorted by index.

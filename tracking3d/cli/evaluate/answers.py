@@ -61,7 +61,8 @@ def score_answers(
     from tracking3d.datasets.clip import read_truth
     from tracking3d.evaluation.score import score
     from tracking3d.evaluation.score_table import format_scores
-    from tracking3d.evaluation.sources import open_answers
+    from tracking3d.evaluation.sources import A_RUN_FOLDER, open_answers
+    from tracking3d.results.run_reader import RunReader
 
     known = read_truth(truth)
     refined = answers is Answers.final
@@ -70,6 +71,8 @@ def score_answers(
         typer.echo(f"{results} is read as {kind}.", err=True)
     if not as_json:
         typer.echo(f"{given.matched(len(known.frames))}.", err=True)
+    if kind == A_RUN_FOLDER and (told := RunReader(results).not_finished):
+        typer.echo(told, err=True)
     scores = score(given, known)
     if as_json:
         typer.echo(json.dumps(asdict(scores), indent=2))
