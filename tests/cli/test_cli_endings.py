@@ -68,9 +68,10 @@ def test_little_memory_is_told_with_what_to_lower(call, clip, script, error):
     script.faults[2] = error
     result = call("run", clip, "--box", "20,10,20,20", "--out", "run")
     assert result.exit_code == 2
-    first, kept = result.stderr.splitlines()[-2:]
+    first, kept, advice = result.stderr.splitlines()[-3:]
     assert first.startswith("error: there is not enough memory; lower --size (window.size)")
     assert kept == "What was finished until then is kept in run."
+    assert advice == "The same command with --resume goes on from there."
     assert len(Path("run/frames.jsonl").read_text().splitlines()) == 2
 
 

@@ -19,6 +19,7 @@ from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.recording import record, record_objects
 from tracking3d.results import layout, run_writer
 from tracking3d.results.files import write_image
+from tracking3d.results.frame_lines import FrameLines
 from tracking3d.results.run_reader import RunReader
 from tracking3d.session import SOLVERS, Session
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
@@ -115,7 +116,7 @@ MOMENTS = {
     "while all is solved once more": (Session, "refine", 0),
     "in a second answer": (Session, "revisit", 2),
     "before the second state is kept": (Checkpoint, "save", FRAMES + 3),
-    "while masks are taken over": (run_writer.RunWriter, "_append_all", FRAMES),
+    "while masks are taken over": (FrameLines, "append", FRAMES),
     "while the mesh is written": (run_writer.RunWriter, "_finish", 0),
 }
 

@@ -229,10 +229,11 @@ writer = run_writer.RunWriter(Path(sys.argv[1]) / where, **about)
 for frame, estimate in zip(clip.frames[:4], clip.estimates[:4]):
     writer.write(estimate, frame)
 if where == "masks":  # the fifth frame's masks are there, its line is not
-    writer._append = die
+    writer._lines.append = die
 elif where == "line":  # half of its line is there
-    whole = writer._append
-    writer._append = lambda line: (whole(line[:60]), die())
+    file = writer._lines._file
+    whole = file.write
+    file.write = lambda line: (whole(line[:60]), die())
 elif where == "overlay":  # all of it is there but the overlay
     pictures.draw_overlay = die
 elif where == "finish":

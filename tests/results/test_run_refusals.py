@@ -32,7 +32,7 @@ def test_an_earlier_run_is_replaced_only_when_asked(tmp_path, turning_sphere, st
     (tmp_path / "masks" / "mine.png").write_bytes(b"mine")
     (tmp_path / "masks" / ".000008.png.part").write_bytes(b"left by a kill")
     before = {path: path.read_bytes() for path in sorted(tmp_path.rglob("*")) if path.is_file()}
-    with pytest.raises(OutputError, match="choose another --out or pass --overwrite"):
+    with pytest.raises(OutputError, match="choose another folder or pass overwrite=True"):
         start_run(tmp_path, turning_sphere)
     assert {path: path.read_bytes() for path in sorted(tmp_path.rglob("*")) if path.is_file()} == before
     start_run(tmp_path, turning_sphere, overwrite=True).finish(None, "interrupted")
@@ -47,7 +47,7 @@ def test_files_that_are_not_a_runs_are_never_touched(tmp_path, turning_sphere, n
     mine = tmp_path / name
     mine.parent.mkdir(exist_ok=True)
     mine.write_text("mine")
-    with pytest.raises(OutputError, match=r"not a readable run folder but holds .*; choose another --out"):
+    with pytest.raises(OutputError, match=r"not a readable run folder but holds .*; choose another folder"):
         start_run(tmp_path, turning_sphere, overwrite=overwrite)
     assert mine.read_text() == "mine"
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == [mine]
@@ -63,7 +63,7 @@ def test_a_file_in_place_of_the_folder_is_refused(tmp_path, turning_sphere, star
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write anywhere")
 def test_a_folder_without_write_permission_is_refused(tmp_path, turning_sphere, start_run):
     tmp_path.chmod(0o500)
-    with pytest.raises(OutputError, match="not writable; choose another --out"):
+    with pytest.raises(OutputError, match="not writable; choose another folder"):
         start_run(tmp_path / "run", turning_sphere)
     tmp_path.chmod(0o700)
 

@@ -187,7 +187,7 @@ def test_an_object_that_does_not_exist_is_named_with_the_nearest_one():
         (b"\x00\xff not a mesh", "cannot be read|holds no triangles"),
         (b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "cannot be read|holds no triangles"),
         (b"v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "not finite"),
-        (b"v 0 0 0\nv 0 0 0\nv 0 0 0\nf 1 2 3\n", "all one point"),
+        (b"v 0 0 0\nv 0 0 0\nv 0 0 0\nf 1 2 3\n", "all its vertices at one point"),
     ],
 )
 def test_a_mesh_file_that_cannot_be_used_is_refused_by_name(tmp_path, content, message):

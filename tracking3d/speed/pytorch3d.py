@@ -24,8 +24,10 @@ ABSENT = "it is not installed"
 
 def why_no_pytorch3d(device: torch.device) -> str:
     """Why PyTorch3D cannot render on a device; `ABSENT` where it is not installed, empty where it can."""
-    corners = torch.tensor([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]], device=device)
     try:
+        import pytorch3d  # noqa: F401
+
+        corners = torch.tensor([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]], device=device)
         drawn = render_pytorch3d(
             vertices=corners.requires_grad_(),
             faces=torch.tensor([[0, 1, 2]], device=device),
