@@ -287,6 +287,11 @@ def test_an_endless_file_is_not_read_to_its_end():
         load_config(Path("/dev/zero"))
 
 
+def test_a_name_that_no_file_can_have_is_refused():
+    with pytest.raises(InputError, match=r"cannot be read: File name too long|does not exist"):
+        load_config(Path("x" * 300))
+
+
 def test_ready_files_are_found_by_name_and_a_file_of_ones_own_comes_first(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert {"csrt-rgb", "flat-object", "precomputed"} == set(ready_files())

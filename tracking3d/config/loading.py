@@ -108,7 +108,11 @@ def _located(file: Path) -> Path:
     Raises:
         InputError: If there is neither.
     """
-    if file.exists():
+    try:
+        there = file.exists()
+    except OSError:  # a name that no file can have; opening it tells why
+        there = True
+    if there:
         return file
     ready = ready_files()
     if file.parent in (Path(), Path("configs")) and file.suffix in ("", ".yaml") and file.stem in ready:
