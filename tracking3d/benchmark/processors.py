@@ -28,7 +28,9 @@ import numpy, torch
 a = numpy.random.default_rng(0).normal(size=(96, 96))
 numpy.linalg.eigh(a @ a.T)
 numpy.linalg.svd(a.astype(numpy.float32))
-(torch.ones(4096).exp().sum() + torch.randn(64, 64).mm(torch.randn(64, 64)).sum()).item()
+image, where = torch.rand(1, 3, 64, 64), 2 * torch.rand(1, 32, 32, 2) - 1
+torch.nn.functional.grid_sample(image, where, align_corners=False)
+(torch.rand(4096).exp().log1p().sum() + torch.randn(64, 64).mm(torch.randn(64, 64)).sum()).item()
 print(torch.backends.cpu.get_cpu_capability())
 """
 _CORE = re.compile(r"^Core: *(\S+)", re.MULTILINE)

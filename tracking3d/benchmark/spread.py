@@ -111,6 +111,8 @@ def run_spread(
 ) -> tuple[list[ResultSet], dict[str, str]]:
     """Every variant on every sequence; what is left out on this processor, and why, is given beside the results.
 
+    A variant whose every run failed is left out, too.
+
     Args:
         base: The settings and the initial masks.
         dataset: What to run on.
@@ -131,7 +133,12 @@ def run_spread(
     if patterns:
         wanted = (AS_IT_IS, *patterns)
         variants = [one for one in variants if any(fnmatch(one.label, pattern) for pattern in wanted)]
-    return run_suite(variants, dataset, out, processes, listener), left_out
+    results = run_suite(variants, dataset, out, processes, listener)
+    # Some kernels end a process only when it comes to an operation that this processor has not.
+    for one in results[1:]:
+        if not any(one.scores.values()):
+            left_out[one.label] = f"every run failed: {next(iter(one.errors.values()))}"
+    return [one for one in results if one.label not in left_out], left_out
 
 
 def spreads(results: Sequence[ResultSet]) -> list[Spread]:
