@@ -14,13 +14,24 @@ from tracking3d.errors import InputError
 from tracking3d.frames import Frame, MaskEstimate, Prompt
 
 Frames = tuple[int, ...]
+Fault = str | dict[int, str]
+"""How to fail, in every frame of ``at``, or in each of them."""
+
+
+def fault_in(fault: Fault, place: int) -> str:
+    return fault if isinstance(fault, str) else fault[place]
+
+
+def there_and_back(index: int) -> int:
+    """Of a clip of five frames that is shown again and again."""
+    return min(index % 8, 8 - index % 8)
 
 
 class FailingTracker:
     """Answers with the prompt's mask moved along, but fails in some frames in one way."""
 
     class Options(BaseModel):
-        fault: str
+        fault: Fault
         at: Frames
 
     @classmethod
@@ -34,10 +45,10 @@ class FailingTracker:
         return self.step(frame)
 
     def step(self, frame: Frame) -> Any:
-        mask = np.roll(self.mask, frame.index, axis=1).astype(np.float32)
+        mask = np.roll(self.mask, there_and_back(frame.index), axis=1).astype(np.float32)
         if frame.index not in self.options.at:
             return MaskEstimate(mask)
-        match self.options.fault:
+        match fault_in(self.options.fault, frame.index):
             case "raises":
                 raise ZeroDivisionError("no pixels")
             case "exits":
@@ -67,7 +78,7 @@ class FailingEncoder:
     channels, stride, tau = 3, 1, 2.0
 
     class Options(BaseModel):
-        fault: str
+        fault: Fault
         at: Frames
 
     @classmethod
@@ -82,7 +93,7 @@ class FailingEncoder:
         self.calls += 1
         if self.calls - 1 not in self.options.at:
             return images
-        match self.options.fault:
+        match fault_in(self.options.fault, self.calls - 1):
             case "raises":
                 raise ZeroDivisionError("no channels")
             case "array":

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from failing_plugins import there_and_back
 
 from tracking3d import Session, Status, load_config, track
 from tracking3d.errors import InputError, PluginError
@@ -18,7 +19,8 @@ from tracking3d.results.run_reader import RunReader
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.video import open_source
 
-HERE = Path(__file__).parent
+FILE = Path(__file__).parent / "failing_plugins.py"
+REGISTERED = f"tracking3d.trackers:bad={FILE}:FailingTracker;tracking3d.features:bad={FILE}:FailingEncoder"
 QUICK = [
     "window.size=32",
     "object.frequency=2",
@@ -65,11 +67,7 @@ def clip() -> SyntheticClip:
 
 @pytest.fixture(autouse=True)
 def registered(monkeypatch):
-    file = HERE / "failing_plugins.py"
-    monkeypatch.setenv(
-        VARIABLE,
-        f"tracking3d.trackers:bad={file}:FailingTracker;tracking3d.features:bad={file}:FailingEncoder",
-    )
+    monkeypatch.setenv(VARIABLE, REGISTERED)
 
 
 @pytest.fixture(params=sorted(QUICK_PRESETS))
@@ -99,39 +97,74 @@ def test_going_on_is_the_default():
     assert load_config().runtime.on_plugin_failure == "continue"
 
 
+@pytest.fixture(scope="module", params=sorted(QUICK_PRESETS))
+def failing_run(request, clip):
+    """Make the answers of one run in which every fault of a plug-in has frames of its own, and a good one after."""
+
+    def run_of_faults(section: str, faults: dict[str, str], frames_each: int) -> tuple[dict[str, int], list]:
+        firsts = {fault: 2 + number * (frames_each + 1) for number, fault in enumerate(faults)}
+        at = {first + n: fault for fault, first in firsts.items() for n in range(frames_each)}
+        images = [clip.images[there_and_back(n)] for n in range(max(at) + 2)]
+        config = load_config(
+            preset=request.param,
+            overrides=QUICK_PRESETS[request.param],
+            **{"tracker": bad("raises"), section: {"name": "bad", "fault": at, "at": list(at)}},
+        )
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv(VARIABLE, REGISTERED)
+            return firsts, list(track(images, mask=clip.masks[0], config=config))
+
+    return run_of_faults
+
+
+@pytest.fixture(scope="module")
+def tracker_faults(failing_run):
+    return failing_run("tracker", TRACKER_FAULTS, 2)
+
+
+@pytest.fixture(scope="module")
+def encoder_faults(failing_run):
+    return failing_run("features", ENCODER_FAULTS, 1)
+
+
 @pytest.mark.parametrize(("fault", "told"), TRACKER_FAULTS.items())
-def test_where_the_tracker_fails_its_last_mask_stands_in_and_the_reason_is_told(clip, fault, told, settings):
-    answers = run(clip, settings(tracker=bad(fault, 2, 3)))
-    assert [answer.index for answer in answers] == [0, 1, 2, 3, 4]
-    for index in (2, 3):
+def test_where_the_tracker_fails_its_last_mask_stands_in_and_the_reason_is_told(
+    clip, tracker_faults, fault, told
+):
+    firsts, answers = tracker_faults
+    first = firsts[fault]
+    assert [answer.index for answer in answers] == list(range(len(answers)))
+    for index in (first, first + 1):
         answer = answers[index]
         assert answer.failure.startswith("mask tracker 'bad' (TRACKING3D_PLUGINS ")
         assert told in answer.failure
         assert answer.reason.startswith(answer.failure)
         assert answer.status is not Status.TRACKED
         assert answer.confidence <= 0.5
-        np.testing.assert_array_equal(answer.initial_mask, answers[1].initial_mask)
-    for index in (0, 1, 4):
+        np.testing.assert_array_equal(answer.initial_mask, answers[first - 1].initial_mask)
+    for index in (0, 1, first - 1, first + 2):
         assert answers[index].failure == ""
-        np.testing.assert_array_equal(answers[index].initial_mask, np.roll(clip.masks[0], index, axis=1))
+        expected = np.roll(clip.masks[0], there_and_back(index), axis=1)
+        np.testing.assert_array_equal(answers[index].initial_mask, expected)
 
 
 @pytest.mark.parametrize(("fault", "told"), ENCODER_FAULTS.items())
 def test_where_the_encoder_fails_the_initial_mask_is_the_answer_and_the_frame_is_lost(
-    clip, fault, told, settings
+    clip, encoder_faults, fault, told
 ):
-    answers = run(clip, settings(tracker=bad("raises"), features=bad(fault, 2)))
-    lost = answers[2]
+    firsts, answers = encoder_faults
+    first = firsts[fault]
+    lost = answers[first]
     assert (lost.status, lost.confidence) == (Status.LOST, 0.0)
     assert lost.failure == lost.reason
     assert lost.failure.startswith("feature encoder 'bad' (TRACKING3D_PLUGINS ")
     assert told in lost.failure
     for mask in (lost.mask, lost.initial_mask):
-        np.testing.assert_array_equal(mask, np.roll(clip.masks[0], 2, axis=1))
-    np.testing.assert_array_equal(lost.T_cam_obj, answers[1].T_cam_obj)
+        np.testing.assert_array_equal(mask, np.roll(clip.masks[0], there_and_back(first), axis=1))
+    np.testing.assert_array_equal(lost.T_cam_obj, answers[first - 1].T_cam_obj)
     assert lost.seconds > 0
-    assert [answer.failure for answer in answers if answer.index != 2] == [""] * 4
-    assert answers[3].status is not Status.LOST
+    assert [answers[index].failure for index in (0, 1, first - 1, first + 1)] == [""] * 4
+    assert answers[first + 1].status is not Status.LOST
 
 
 def test_a_frame_in_which_both_fail_tells_both(clip, settings):
