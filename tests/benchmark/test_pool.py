@@ -30,7 +30,7 @@ def test_a_crash_and_a_failure_cost_their_own_sequence_only_and_the_rest_is_foun
     assert wide.scores is None and "signal 11" in wide.error and "log.txt" in wide.error
     assert {outcome.job.sequence for outcome in told} == {"narrow", "wide"}
 
-    again, _ = run_jobs(jobs(scripted(crash=70)), 1)
+    [again] = run_jobs(jobs(scripted(crash=70), ["narrow"]), 1)
     assert again.cached and again.scores == json.loads(json.dumps(narrow.scores))
 
 

@@ -10,7 +10,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from tracking3d.cli import app
 from tracking3d.results.run_reader import RunReader
 from tracking3d.synthesis.convex_clips import make_demo_clip
 
@@ -56,7 +58,7 @@ def test_real_run_from_a_box(real_clip, box, tmp_path):
     run = RunReader(tmp_path / "run")
     assert run.state == "finished"
     assert [frame.index for frame in run.frames] == [0, 1, 2, 3]
-    scores = program("evaluate", tmp_path / "run", "--truth", real_clip, "--json")
+    scores = CliRunner().invoke(app, ["evaluate", str(tmp_path / "run"), "--truth", str(real_clip), "--json"])
     assert json.loads(scores.stdout)["iou_initial_mean"] > 0.5
 
 

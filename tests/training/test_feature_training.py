@@ -180,7 +180,7 @@ def test_a_short_training_writes_a_network_that_the_encoder_can_run(tmp_path):
     pictures.mkdir()
     for seed in range(3):
         cv2.imwrite(str(pictures / f"{seed}.png"), smooth_picture(500, seed))
-    recipe = {"photographs": [str(pictures)], "cutouts": [], "size": 64, "crops": 3, "objects": 1, "points": 60,
+    recipe = {"photographs": [str(pictures)], "cutouts": [], "size": 32, "crops": 3, "objects": 1, "points": 60,
               "steps": 50, "warped_pairs": 1, "rendered_pairs": 1, "warm_up": 5, "checkpoint_every": 25}  # fmt: skip
     (tmp_path / "recipe.yaml").write_text(yaml.safe_dump(recipe), encoding="utf-8")
     threads = torch.get_num_threads()

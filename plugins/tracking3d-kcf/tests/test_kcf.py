@@ -20,7 +20,7 @@ def disc_at(x: int) -> tuple[Frame, np.ndarray]:
 
 
 def test_it_conforms() -> None:
-    check_tracker(KcfTracker)
+    check_tracker(KcfTracker, frames=3)
 
 
 def test_a_moving_disc_is_followed() -> None:
