@@ -49,12 +49,16 @@ class Registered:
         return f"{KIND.get(self.group, 'plug-in')} '{self.name}' ({origin})"
 
 
-def registered_plugins() -> list[Registered]:
-    """All registered plug-ins, those first that win over others of the same name; imports none of them."""
+def registered_plugins(*groups: str) -> list[Registered]:
+    """Registered plug-ins of some groups, of all if none is named; imports none of them.
+
+    Those come first that win over others of the same name. To ask for one group takes half the time.
+    """
+    groups = groups or tuple(KIND)
     origin = functools.cache(_origin)  # reading metadata is slow; once for all plug-ins of a package
     packaged = [
         Registered(point.name, group, point.value, *origin(point.dist))
-        for group in KIND
+        for group in groups
         for point in metadata.entry_points(group=group)
     ]
     packaged.sort(key=lambda plugin: (plugin.package != "tracking3d", plugin.package.lower()))

@@ -100,7 +100,10 @@ def check_options(group: str, choice: PluginChoice) -> BaseModel:
     Raises:
         PluginError: As `load_plugin`; or an option that is unknown, missing or out of range.
     """
-    plugin = _find(group, choice.name)
+    return _checked(_find(group, choice.name), choice)
+
+
+def _checked(plugin: Registered, choice: PluginChoice) -> BaseModel:
     model: type[BaseModel] = _load(plugin).Options
     unknown = [key for key in choice.options if key not in model.model_fields]
     if unknown and model.model_config.get("extra", "ignore") == "ignore":  # in silence, as pydantic would
@@ -120,8 +123,8 @@ def build_plugin(group: str, choice: PluginChoice) -> Any:
     Raises:
         PluginError: As `check_options`; or the plug-in fails while it is built.
     """
-    options = check_options(group, choice)
     plugin = _find(group, choice.name)
+    options = _checked(plugin, choice)
     try:
         instance = _load(plugin).from_options(options)
     except Tracking3dError:
@@ -134,7 +137,7 @@ def build_plugin(group: str, choice: PluginChoice) -> Any:
 
 
 def _find(group: str, name: str) -> Registered:
-    plugins = [plugin for plugin in registered_plugins() if plugin.group == group]
+    plugins = [plugin for plugin in registered_plugins(group) if plugin.group == group]
     for plugin in plugins:
         if plugin.name == name:
             return plugin
