@@ -59,8 +59,10 @@ def tracked(preset: str, spec: SyntheticSpec) -> Tracked:
 
 @pytest.fixture(scope="module", params=PRESETS)
 def run(request) -> Tracked:
-    """Nine frames of a box with cut corners, which turns by 32 degrees."""
-    return tracked(request.param, SyntheticSpec(shape="chamfered_box", frames=9, degrees_per_frame=4.0))
+    """A box with cut corners, which turns by 32 degrees; fewer frames for the solver that takes longer."""
+    frames = 9 if request.param == "default" else 7
+    spec = SyntheticSpec(shape="chamfered_box", frames=frames, degrees_per_frame=32 / (frames - 1))
+    return tracked(request.param, spec)
 
 
 def test_exact_masks_are_kept_and_rotations_found(run):
@@ -78,7 +80,7 @@ def test_the_object_turns_as_far_as_it_does(run):
 
 
 def test_every_frame_is_called_tracked(run):
-    assert [answer.status for answer in run.answers] == [Status.TRACKED] * 9
+    assert [answer.status for answer in run.answers] == [Status.TRACKED] * len(run.clip.images)
 
 
 @pytest.mark.slow
