@@ -8,7 +8,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
-TESTS := OPENBLAS_NUM_THREADS=1 $(BIN)/pytest tests plugins -n logical --maxprocesses 8 --dist loadfile
+TESTS := OPENBLAS_NUM_THREADS=1 $(BIN)/pytest tests plugins -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo test clean
 
