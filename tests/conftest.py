@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from pathlib import Path
 
 import cv2
 import pytest
 import torch
+import typer.testing
 from filelock import FileLock
 
 from tracking3d.rendering.kernels.compilation import Kernel
@@ -38,6 +40,8 @@ def pytest_sessionstart() -> None:
     """Tests that run side by side on few cores wait for each other's threads far longer than they compute."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
+    # Building the command line from its annotations takes longer than most commands; a command keeps no state.
+    typer.testing._get_command = functools.cache(typer.testing._get_command)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from forked import forked_program
 from typer.testing import CliRunner
 
 from tracking3d.cli import app
@@ -64,7 +65,9 @@ def test_real_run_from_a_box(real_clip, box, tmp_path):
 
 def test_real_run_from_masks_alone(real_clip, tmp_path):
     masks = ("--masks", real_clip / "masks")
-    result = program("run", real_clip / "frames", *masks, *QUICK, "--out", tmp_path / "run", "--quiet")
+    result = forked_program(
+        tmp_path, "run", real_clip / "frames", *masks, *QUICK, "--out", tmp_path / "run", "--quiet"
+    )
     assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
     frames = RunReader(tmp_path / "run").frames
     assert len(frames) == 4
@@ -75,18 +78,10 @@ def test_real_run_from_masks_alone(real_clip, tmp_path):
 @pytest.mark.parametrize(("stop", "code"), [("SIGINT", 130), ("SIGTERM", 130), ("SIGKILL", -signal.SIGKILL)])
 def test_stopped_run_keeps_every_finished_frame(real_clip, box, tmp_path, stop, code):
     (tmp_path / "stopping.py").write_text(STOPPING_TRACKER)
-    result = program(
-        *(
-            "run",
-            real_clip / "frames",
-            "--box",
-            box,
-            *QUICK,
-            "--tracker",
-            "stopping",
-            "--out",
-            tmp_path / "run",
-        ),
+    result = forked_program(
+        tmp_path,
+        *("run", real_clip / "frames", "--box", box, *QUICK),
+        *("--tracker", "stopping", "--out", tmp_path / "run"),
         TRACKING3D_PLUGINS=f"tracking3d.trackers:stopping={tmp_path / 'stopping.py'}:Stopping",
         STOP_BY=stop,
     )

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
 import random
 import sys
@@ -15,6 +14,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import pytest
+from forked import forked
 from refining_solver import StandInSolver
 from resumable_runs import assert_alike, finished_frames
 
@@ -62,12 +62,6 @@ def track(images: Path, folder: Path, mask, log: Path, quick: bool) -> None:
     Args:
         quick: Answer by a solver that takes no time, so that the moments are those in which files are written.
     """
-    os.environ.update(OMP_NUM_THREADS="1")
-    import cv2
-    import torch
-
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
     if quick:
         SOLVERS["online"] = StandInSolver
     with log.open("a") as lines:
@@ -87,14 +81,12 @@ def track(images: Path, folder: Path, mask, log: Path, quick: bool) -> None:
 class Victims:
     """Processes that track, forked from one that has imported everything, so that a kill costs no start."""
 
-    def __init__(self, *arguments) -> None:
-        self._context = multiprocessing.get_context("forkserver")
-        self._context.set_forkserver_preload(["test_killed_runs"])
-        self._arguments = arguments
+    def __init__(self, images: Path, mask, quick: bool) -> None:
+        self._given = images, mask, quick
 
     def start(self, folder: Path, log: Path) -> BaseProcess:
-        images, mask, quick = self._arguments
-        process = self._context.Process(target=track, args=(images, folder, mask, log, quick))
+        images, mask, quick = self._given
+        process = forked(track, images, folder, mask, log, quick)
         process.start()
         return process
 

@@ -22,6 +22,7 @@ from tracking3d.plugins import (
     list_plugins,
     load_plugin,
     plugin_label,
+    registration,
 )
 
 
@@ -101,6 +102,8 @@ def register(monkeypatch):
         return [*real(group=group), *(point for point in fakes if point.group == group)]
 
     monkeypatch.setattr(metadata, "entry_points", entry_points)
+    # What was read of the installed packages is kept until their folders change, which they do not do here.
+    monkeypatch.setattr(registration, "_packaged", registration._packaged.__wrapped__)
 
     def add(name: str, cls: object, group: str = TRACKERS, package: str = "acme", value: str = "") -> None:
         if cls is not None:

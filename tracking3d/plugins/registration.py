@@ -55,12 +55,7 @@ def registered_plugins(*groups: str) -> list[Registered]:
     Those come first that win over others of the same name. To ask for one group takes half the time.
     """
     groups = groups or tuple(KIND)
-    origin = functools.cache(_origin)  # reading metadata is slow; once for all plug-ins of a package
-    packaged = [
-        Registered(point.name, group, point.value, *origin(point.dist))
-        for group in groups
-        for point in metadata.entry_points(group=group)
-    ]
+    packaged = [plugin for group in groups for plugin in _packaged(group, _search_path())]
     packaged.sort(key=lambda plugin: (plugin.package != "tracking3d", plugin.package.lower()))
     return _from_environment() + packaged
 
@@ -85,6 +80,23 @@ def told(error: BaseException) -> str:
     if not isinstance(error, Tracking3dError):
         text = f"{type(error).__name__}: {text}"
     return text if len(text) <= 300 else text[:297] + "..."
+
+
+def _search_path() -> tuple[tuple[str, int], ...]:
+    """Where packages are looked for, and when each folder was last changed: installing one changes it."""
+    times = []
+    for folder in sys.path:
+        with suppress(OSError):
+            times.append((folder, os.stat(folder or os.curdir).st_mtime_ns))
+    return tuple(times)
+
+
+@functools.lru_cache(maxsize=8)
+def _packaged(group: str, search_path: tuple[tuple[str, int], ...]) -> tuple[Registered, ...]:
+    """The plug-ins of installed packages; reading all their metadata is slow, so once for a state of the folders."""
+    origin = functools.cache(_origin)
+    points = metadata.entry_points(group=group)
+    return tuple(Registered(point.name, group, point.value, *origin(point.dist)) for point in points)
 
 
 def _origin(package: metadata.Distribution | None) -> tuple[str, str]:

@@ -50,18 +50,18 @@ def render_view(model: ObjectModel, rotation: NDArray[np.float64], size: int) ->
     radius = max(float(np.linalg.norm(centred, axis=1).max()), 1e-12)
     points = centred / radius + (0.0, 0.0, _DISTANCE)
     focal = 0.5 * _FILL * size * math.sqrt(_DISTANCE**2 - 1)
-    screen = torch.tensor(focal * points[:, :2] / points[:, 2:] + (size - 1) / 2)[None]
-    depth = torch.tensor(points[:, 2])[None]
+    screen = torch.tensor(focal * points[:, :2] / points[:, 2:] + (size - 1) / 2, dtype=torch.float32)[None]
+    depth = torch.tensor(points[:, 2], dtype=torch.float32)[None]
     faces = torch.tensor(model.faces)
     face_index = rasterize(screen, depth, faces, (size, size)).face_index
 
     normals = trimesh.Trimesh(centred, model.faces, process=False).vertex_normals
     corners = np.concatenate([model.face_uvs, normals[model.faces], centred[model.faces] / radius], axis=2)
-    uv, normal, at = interpolate(screen, depth, faces, torch.tensor(corners), face_index).split(
-        [2, 3, 3], dim=1
-    )
+    uv, normal, at = interpolate(
+        screen, depth, faces, torch.tensor(corners, dtype=torch.float32), face_index
+    ).split([2, 3, 3], dim=1)
     seen = (model.texture_weight > 0)[..., None]
-    layers = np.concatenate([model.texture * seen, seen], axis=2, dtype=np.float64)
+    layers = np.concatenate([model.texture * seen, seen], axis=2, dtype=np.float32)
     texture = torch.tensor(layers.transpose(2, 0, 1))
     colour, weight = sample_texture(texture, uv).split([3, 1], dim=1)
     colour = colour + (1 - weight) * _UNSEEN

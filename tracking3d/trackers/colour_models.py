@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 _BINS = (16, 12, 12)  # L, a, b
 _LOG_LIMIT = 3.0
@@ -117,8 +118,8 @@ class Palette:
         criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 10, 1.0)
         _, _, centres = cv2.kmeans(samples, size, None, criteria, 1, cv2.KMEANS_PP_CENTERS)
         steps = (np.arange(1 << _LUT_BITS, dtype=np.float32) + 0.5) * (256 >> _LUT_BITS)
-        grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 1, 3)
-        self._table = np.argmin(((grid - centres) ** 2).sum(-1), axis=1).astype(np.uint8)
+        grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
+        self._table = cKDTree(centres).query(grid)[1].astype(np.uint8)
         self.size = size
 
     def label(self, colours: NDArray[np.uint8]) -> NDArray[np.uint8]:

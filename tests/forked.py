@@ -1,0 +1,80 @@
+"""Processes that have imported everything when they start: a fork of one that did it once."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import sys
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Any
+
+_IMPORTED = [
+    "__main__",
+    "cv2",
+    "kornia",
+    "onnxruntime",
+    "torch",
+    "tracking3d.cli.run",
+    "tracking3d.estimation.online.solver",
+    "tracking3d.recording",
+    "tracking3d.rendering.kernels.compilation",
+    "tracking3d.synthesis.convex_clips",
+    "tracking3d.trackers.csrt",
+    "tracking3d.trackers.flow",
+    "tracking3d.trackers.precomputed",
+]
+
+
+@dataclass(frozen=True)
+class Ended:
+    """What a process left behind; the names are those of `subprocess.CompletedProcess`."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+def forked(function: Callable[..., None], *arguments: Any) -> BaseProcess:
+    """A process, not yet started, that calls a function of some module with one thread."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(_IMPORTED)
+    return context.Process(target=_call, args=(function, arguments))
+
+
+def forked_program(folder: Path, *arguments: object, **environment: str) -> Ended:
+    """The command line in a process of its own; what it prints passes through files in ``folder``."""
+    out, err = folder / "stdout", folder / "stderr"
+    process = forked(_program, out, err, list(map(str, arguments)), environment)
+    process.start()
+    process.join()
+    assert process.exitcode is not None
+    return Ended(process.exitcode, out.read_text(), err.read_text())
+
+
+def _call(function: Callable[..., None], arguments: tuple[Any, ...]) -> None:
+    import cv2
+    import torch
+
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    function(*arguments)
+
+
+def _program(out: Path, err: Path, arguments: list[str], environment: dict[str, str]) -> None:
+    from tracking3d.cli import main
+
+    for number, path in ((1, out), (2, err)):
+        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        os.dup2(file, number)
+        os.close(file)
+    os.environ.update(environment)
+    sys.argv = ["tracking3d", *arguments]
+    try:
+        main()
+    except Exception:  # which main ought to have told in a sentence
+        traceback.print_exc()
+        raise
