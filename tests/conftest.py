@@ -11,6 +11,7 @@ import pytest
 import torch
 import typer.testing
 from filelock import FileLock
+from made_once import MadeOnce, make_once
 
 from tracking3d.rendering.kernels.compilation import Kernel
 
@@ -42,6 +43,13 @@ def pytest_sessionstart() -> None:
     cv2.setNumThreads(1)
     # Building the command line from its annotations takes longer than most commands; a command keeps no state.
     typer.testing._get_command = functools.cache(typer.testing._get_command)
+    make_once()
+
+
+@pytest.fixture
+def made_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For tests of whether something is the same when it is made again."""
+    monkeypatch.setattr(MadeOnce, "anew", True)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -337,6 +337,7 @@ def test_a_session_gives_the_camera_and_the_object_at_any_time(clip, quick):
     assert before.texture.shape == (16, 16, 3)
 
 
+@pytest.mark.usefixtures("made_anew")
 def test_the_same_seed_gives_the_same_answers(clip, quick, boxed):
     again = track(clip.images, box=clip.box, config=quick)
     for a, b in zip(boxed, again, strict=True):

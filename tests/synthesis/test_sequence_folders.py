@@ -120,6 +120,7 @@ def test_jpeg_frames_are_jpeg_files(tmp_path):
     assert 1 < difference.mean() < 20
 
 
+@pytest.mark.usefixtures("made_anew")
 def test_the_same_spec_gives_the_same_bytes(written, tmp_path):
     assert content(write_sequence(tmp_path / "again", SPEC)) == content(written)
 

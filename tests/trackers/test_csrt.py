@@ -57,6 +57,7 @@ def test_a_given_mask_is_the_first_answer() -> None:
     np.testing.assert_array_equal(estimate.binary, truth[0])
 
 
+@pytest.mark.usefixtures("made_anew")
 def test_the_same_video_gives_the_same_masks_whatever_the_random_state() -> None:
     frames, truth = moving_shape(5)
     prompt = Prompt(box_around(truth[0]))

@@ -95,9 +95,10 @@ def _draw_stripes(canvas: Image, colour: tuple[int, int, int], rng: np.random.Ge
     """Oblique stripes over a part of the canvas, irregular so that they do not look alike when shifted."""
     size = canvas.shape[0]
     angle = rng.uniform(0, np.pi)
-    y, x = np.mgrid[:size, :size]
-    along = np.cos(angle) * (x - size / 2) + np.sin(angle) * (y - size / 2)
-    across = -np.sin(angle) * (x - size / 2) + np.cos(angle) * (y - size / 2)
+    x = np.arange(size) - size / 2
+    y = x[:, None]
+    along = np.cos(angle) * x + np.sin(angle) * y
+    across = -np.sin(angle) * x + np.cos(angle) * y
     edges = np.cumsum(rng.uniform(0.02, 0.09, 40)) * size - 0.75 * size
     canvas[(np.searchsorted(edges, along) % 2 == 1) & (across > rng.uniform(-0.3, 0.2) * size)] = colour
 

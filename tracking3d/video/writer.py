@@ -12,7 +12,7 @@ from typing import BinaryIO, Self
 import av
 import numpy as np
 from av.error import FFmpegError
-from av.video.reformatter import ColorRange, Colorspace
+from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 from av.video.stream import VideoStream
 
 from tracking3d.errors import OutputError
@@ -54,6 +54,7 @@ class VideoWriter:
         self._closed = False
         self._failed = False
         self._file: BinaryIO | None = None
+        self._reformatter = VideoReformatter()  # one for all frames: to set it up takes longer than to use it
         with self._output_errors():
             # Python's file: FFmpeg forgets a failed write of a fragment, Python does not.
             self._file = self.path.open("wb")
@@ -88,8 +89,11 @@ class VideoWriter:
             raise ValueError(f"image is {image.shape} {image.dtype}, not {(*self.size, 3)} uint8")
         height, width = self.size
         padded = np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-        frame = av.VideoFrame.from_ndarray(padded, format="rgb24").reformat(
-            format="yuv420p", dst_colorspace=Colorspace.ITU601, dst_color_range=ColorRange.MPEG
+        frame = self._reformatter.reformat(
+            av.VideoFrame.from_ndarray(padded, format="rgb24"),
+            format="yuv420p",
+            dst_colorspace=Colorspace.ITU601,
+            dst_color_range=ColorRange.MPEG,
         )
         frame.pts = self._frames
         with self._output_errors():

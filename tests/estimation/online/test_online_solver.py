@@ -129,6 +129,7 @@ def test_a_step_does_not_change_the_state_it_starts_from():
     assert bool((state.known.vertices == vertices).all())
 
 
+@pytest.mark.usefixtures("made_anew")
 def test_the_same_video_gives_the_same_start():
     answers = whole_run()[1]
     _, again = run(with_true_masks(range(started() + 1)))
