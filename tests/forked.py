@@ -47,8 +47,17 @@ def forked(function: Callable[..., None], *arguments: Any) -> BaseProcess:
 
 def forked_program(folder: Path, *arguments: object, **environment: str) -> Ended:
     """The command line in a process of its own; what it prints passes through files in ``folder``."""
+    return _ended(folder, _program, list(map(str, arguments)), environment)
+
+
+def forked_script(folder: Path, script: str, *arguments: object) -> Ended:
+    """Lines of Python in a process of their own, as ``python -c`` would run them."""
+    return _ended(folder, _script, script, list(map(str, arguments)))
+
+
+def _ended(folder: Path, function: Callable[..., None], *arguments: Any) -> Ended:
     out, err = folder / "stdout", folder / "stderr"
-    process = forked(_program, out, err, list(map(str, arguments)), environment)
+    process = forked(_told, out, err, function, arguments)
     process.start()
     process.join()
     assert process.exitcode is not None
@@ -64,17 +73,28 @@ def _call(function: Callable[..., None], arguments: tuple[Any, ...]) -> None:
     function(*arguments)
 
 
-def _program(out: Path, err: Path, arguments: list[str], environment: dict[str, str]) -> None:
-    from tracking3d.cli import main
-
+def _told(out: Path, err: Path, function: Callable[..., None], arguments: tuple[Any, ...]) -> None:
+    """Call a function with what it prints in files."""
     for number, path in ((1, out), (2, err)):
         file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
         os.dup2(file, number)
         os.close(file)
-    os.environ.update(environment)
-    sys.argv = ["tracking3d", *arguments]
     try:
-        main()
-    except Exception:  # which main ought to have told in a sentence
+        function(*arguments)
+    except Exception:
         traceback.print_exc()
         raise
+
+
+def _program(arguments: list[str], environment: dict[str, str]) -> None:
+    from tracking3d.cli import main
+
+    os.environ.update(environment)
+    sys.path[:0] = environment.get("PYTHONPATH", "").split(os.pathsep)
+    sys.argv = ["tracking3d", *arguments]
+    main()
+
+
+def _script(script: str, arguments: list[str]) -> None:
+    sys.argv = ["-c", *arguments]
+    exec(script, {"__name__": "__main__"})

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import os
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from forked import forked_program
 
 from tracking3d.results.run_reader import RunReader
 from tracking3d.synthesis.convex_clips import make_demo_clip
@@ -35,19 +35,13 @@ def installed(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def program(installed: Path):
+def program(installed: Path, tmp_path: Path):
     """Call the command line in a process that finds the installed package."""
 
     def program(*arguments: object) -> str:
-        path = os.pathsep.join([str(installed), str(ROOT)])
-        result = subprocess.run(
-            [sys.executable, "-c", "from tracking3d.cli import main; main()", *map(str, arguments)],
-            capture_output=True,
-            text=True,
-            env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": path},
-        )
-        assert result.returncode == 0, result.stderr
-        return result.stdout
+        ended = forked_program(tmp_path, *arguments, PYTHONPATH=str(installed))
+        assert ended.returncode == 0, ended.stderr
+        return ended.stdout
 
     return program
 

@@ -53,11 +53,11 @@ def test_a_new_package_has_everything_and_nothing_unfilled(tmp_path, kind):
     assert "## Licence" in files["README.md"]
 
 
-@KINDS
-def test_a_new_package_passes_its_own_tests(tmp_path, kind):
-    folder = write_plugin("mine", kind, tmp_path)
-    result = python("-W", "error", "-m", "pytest", "-q", "-p", "no:cacheprovider", cwd=folder, path=folder)
-    assert "2 passed" in result
+def test_new_packages_pass_their_own_tests(tmp_path):
+    folders = [write_plugin(f"my-{kind}", kind, tmp_path) for kind in ("tracker", "features")]
+    path = Path(os.pathsep.join(map(str, folders)))
+    result = python("-W", "error", "-m", "pytest", "-q", "-p", "no:cacheprovider", cwd=tmp_path, path=path)
+    assert "4 passed" in result
 
 
 @KINDS

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import pytest
 
@@ -25,11 +26,17 @@ def read_everything(folder):
     track_points(run, 0, [[50, 60]])
 
 
+@pytest.fixture(scope="module")
+def sound_run(tmp_path_factory, turning_sphere, write_run):
+    folder = tmp_path_factory.mktemp("sound") / "run"
+    write_run(folder, turning_sphere)
+    read_everything(folder)
+    return folder
+
+
 @pytest.fixture
-def run(tmp_path, turning_sphere, write_run):
-    write_run(tmp_path / "run", turning_sphere)
-    read_everything(tmp_path / "run")
-    return tmp_path / "run"
+def run(tmp_path, sound_run):
+    return shutil.copytree(sound_run, tmp_path / "run")
 
 
 def said(folder):

@@ -5,14 +5,13 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import os
-import subprocess
 import sys
 from pathlib import Path
 
 import av
 import numpy as np
 import pytest
+from forked import forked_script
 
 from tracking3d.errors import InputError, OutputError
 from tracking3d.estimation.estimate import Status
@@ -251,9 +250,8 @@ KEPT = {"masks": 4, "line": 4, "overlay": 5, "finish": 4}
 def killed(tmp_path_factory) -> Path:
     """A folder of runs by where each was killed."""
     folder = tmp_path_factory.mktemp("killed")
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    arguments = [str(folder), str(Path(__file__).parent), *KEPT]
-    subprocess.run([sys.executable, "-c", KILLED, *arguments], env=environment, check=True)
+    ended = forked_script(folder, KILLED, folder, Path(__file__).parent, *KEPT)
+    assert ended.returncode == 0, ended.stderr
     return folder
 
 

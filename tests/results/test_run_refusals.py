@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import errno
 import os
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+from forked import forked_script
 
 from tracking3d.errors import OutputError
 from tracking3d.results import layout
@@ -118,13 +118,8 @@ writer.finish(None, "failed", "the disk was full")
 @pytest.mark.skipif(sys.platform == "win32", reason="limits of file size are POSIX")
 def test_a_full_disk_is_said_and_costs_the_current_frame_only(tmp_path):
     folder = tmp_path / "run"
-    done = subprocess.run(
-        [sys.executable, "-c", FULL, str(folder), str(Path(__file__).parent)],
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-        check=True,
-        capture_output=True,
-        text=True,
-    )
+    done = forked_script(tmp_path, FULL, folder, Path(__file__).parent)
+    assert done.returncode == 0, done.stderr
     assert "The disk is full" in done.stdout
     run = RunReader(folder)
     # No half line is left behind for the next one to be appended to.
