@@ -87,7 +87,7 @@ def _search_path() -> tuple[tuple[str, int], ...]:
     times = []
     for folder in sys.path:
         with suppress(OSError):
-            times.append((folder, os.stat(folder or os.curdir).st_mtime_ns))
+            times.append((folder, Path(folder).stat().st_mtime_ns))
     return tuple(times)
 
 
