@@ -15,9 +15,18 @@ WORTH_CORRECTING = (0.5, 0.9)
 width of an outline; below, one of them is of something else, and nobody knows which."""
 
 
+SIGHTED = "sighted"
+"""What `FrameEstimate.hypothesis` says where the object was found by its points alone, anywhere in the frame: the mask
+tracker was elsewhere or had nothing, whatever its mask."""
+
+
 def corrects(estimate: FrameEstimate) -> bool:
     """Whether an answer is sure enough, and unlike the initial mask enough, to be handed back to the mask tracker."""
-    if estimate.status is not Status.TRACKED or estimate.initial_mask is None:
+    if estimate.status is not Status.TRACKED:
+        return False
+    if estimate.hypothesis == SIGHTED:
+        return True
+    if estimate.initial_mask is None:
         return False
     both = np.count_nonzero(estimate.mask & estimate.initial_mask)
     either = np.count_nonzero(estimate.mask | estimate.initial_mask)

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.estimation.assessment import Assessment
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource, Status
 from tracking3d.estimation.online.answer_mask import answer_mask, support_beside
-from tracking3d.estimation.online.belief import Belief, View
-from tracking3d.estimation.online.pose_refinement import PoseFit, PoseWeights
+from tracking3d.estimation.online.attempt import Attempt
+from tracking3d.estimation.online.belief import Belief
+from tracking3d.estimation.online.pose_refinement import PoseWeights
 from tracking3d.frames import Frame
 from tracking3d.geometry.pose import Pose
 
@@ -33,27 +33,16 @@ def unsolved(frame: Frame, mask: NDArray[np.bool_] | None, pose: Pose) -> FrameE
     )
 
 
-def solved(
-    state: Belief,
-    answer: FrameEstimate,
-    view: View,
-    fit: PoseFit,
-    won: str,
-    witnesses: int,
-    judgement: Assessment,
-) -> FrameEstimate:
+def solved(state: Belief, answer: FrameEstimate, found: Attempt) -> FrameEstimate:
     """The answer with a pose, its judgement and the better supported mask; of a lost frame, the initial mask.
 
     Args:
         state: Map and camera.
         answer: What does not depend on the pose.
-        view: The frame.
-        fit: Its pose.
-        won: Which start of the pose won.
-        witnesses: How many landmarks agree.
-        judgement: Of the frame.
+        found: What was found in the frame.
     """
-    if judgement.status is Status.LOST:
+    view, fit, judgement = found.view, found.fit, found.judgement
+    if found.lost:
         mask = view.mask if view.mask is not None else np.zeros_like(answer.mask)
         source = MaskSource.handed_back(view.mask)
     else:
@@ -71,7 +60,7 @@ def solved(
         status=judgement.status,
         reason=judgement.reason,
         confidence=judgement.confidence,
-        hypothesis=won,
+        hypothesis=found.won,
         iterations=fit.iterations,
         losses={
             "features": fit.appearance,
@@ -79,7 +68,7 @@ def solved(
             "points": fit.points,
             "overlap": fit.overlap,
             "unseen": fit.unseen,
-            "witnesses": float(witnesses),
+            "witnesses": float(found.witnesses),
             "mask_weight": view.mask_weight,
         },
     )

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tracking3d.estimation.estimate import FrameEstimate, Status
+from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.estimation.feature_space import FeatureSpace
 from tracking3d.estimation.observation import Observation
 from tracking3d.estimation.online.judgement import Usual
@@ -145,7 +145,7 @@ class Belief:
         due: Motion at which the next start is tried.
         waits_for: Why the start waits, where that is not lack of motion.
         usual: What tracked frames have cost.
-        status: Of the last frame.
+        lost_for: How many frames in a row the object has been lost.
         trail: Poses and indices of the last frames that were believed.
     """
 
@@ -161,7 +161,7 @@ class Belief:
     due: float = 0.0
     waits_for: str = ""
     usual: Usual = field(default_factory=Usual)
-    status: Status = Status.UNCERTAIN
+    lost_for: int = 0
     trail: tuple[tuple[Pose, int], ...] = ()
 
     def moved(self, pose: Pose, index: int, grey: NDArray[np.uint8], followed: FollowedPoints) -> Belief:

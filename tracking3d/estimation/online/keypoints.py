@@ -37,12 +37,16 @@ class Keypoints:
         return len(self.pixel)
 
 
-def detect(image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> Keypoints:
+def detect(
+    image: NDArray[np.uint8], mask: NDArray[np.bool_], length: float | None = None, most: int = _MOST
+) -> Keypoints:
     """The strongest keypoints inside a mask, of the object at one size whatever its size in the frame.
 
     Args:
         image: ``(H, W)`` grey.
         mask: ``(H, W)``.
+        length: Longer side of the object in pixels, where the mask is not that of the object.
+        most: How many keypoints.
     """
     if not mask.any():
         return Keypoints.none()
@@ -50,13 +54,13 @@ def detect(image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> Keypoints:
     corner = np.array([max(x - _BORDER, 0), max(y - _BORDER, 0)])
     box = slice(corner[1], y + height + _BORDER), slice(corner[0], x + width + _BORDER)
     original = np.array(image[box].shape[::-1])
-    scale = float(np.clip(_SIZE / max(width, height), 0.5, 2.0))
+    scale = float(np.clip(_SIZE / (length or max(width, height)), 0.5, 2.0))
     # Given the size and not the factor, OpenCV scales by exactly the ratio of the sizes.
     size = np.rint(scale * original).astype(int).tolist()
     crop = cv2.resize(image[box], size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
     inside = cv2.resize(mask[box].astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
     # Without the precise upscale all places are a quarter of a pixel too far right and down.
-    sift = cv2.SIFT.create(_MOST, contrastThreshold=_CONTRAST, enable_precise_upscale=True)
+    sift = cv2.SIFT.create(most, contrastThreshold=_CONTRAST, enable_precise_upscale=True)
     found, descriptor = sift.detectAndCompute(crop, inside)
     if not len(found):
         return Keypoints.none()

@@ -17,23 +17,27 @@ from numpy.typing import NDArray
 from tracking3d.config.models import PipelineConfig
 from tracking3d.config.solvers import OnlineConfig
 from tracking3d.estimation.appearance import visible_texture
+from tracking3d.estimation.correction import SIGHTED
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.estimation.feature_space import FeatureSpace, feature_channels
 from tracking3d.estimation.framing import mask_box, projected_box
 from tracking3d.estimation.observation import Observation, observe
 from tracking3d.estimation.online.answers import solved, unsolved
+from tracking3d.estimation.online.attempt import Attempt
 from tracking3d.estimation.online.belief import ONLINE_CLASSES, Belief, ObjectMap, View
 from tracking3d.estimation.online.growing import refined, refined_once_more, with_keyframe, with_points
 from tracking3d.estimation.online.judgement import ENOUGH_POINTS, judge, looks_wrong, unexplained
-from tracking3d.estimation.online.mapping import mask_weight, pose_of, project_points
+from tracking3d.estimation.online.mapping import mask_weight, pose_of
+from tracking3d.estimation.online.motion import carried, predicted
 from tracking3d.estimation.online.points import FollowedPoints, follow, grey
 from tracking3d.estimation.online.pose_refinement import PoseFit, PoseWeights
+from tracking3d.estimation.online.sighting import sighted
 from tracking3d.estimation.online.start import Start
 from tracking3d.estimation.online.tracking import (
-    Found,
     agreeing,
     coast,
     fit_pose,
+    pixel_scale,
     pose_of_points,
     searched,
     witnesses,
@@ -45,7 +49,7 @@ from tracking3d.estimation.start import first_mask, first_translation, mask_elli
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.camera import Camera, Window
-from tracking3d.geometry.pose import Pose, extrapolate, rotation_angle
+from tracking3d.geometry.pose import Pose, rotation_angle
 from tracking3d.rendering import BackProjection, TexelMap
 from tracking3d.stages import in_stage
 
@@ -141,6 +145,7 @@ class OnlineSolver:
             known=known,
             surface=known.surface(),
             before=None,
+            lost_for=0,
             followed=FollowedPoints.none(),
         )
 
@@ -159,16 +164,14 @@ class OnlineSolver:
             starts["keyframe"] = own.pose
             followed = own.points.joined(followed)
         if state.before is not None:
-            starts |= self._predicted(state, frame.index)
-        view = self._view(state, frame, binary, causal, followed)
-        won, fit, kept = self._found(state, view, image, starts)
-        agreed = witnesses(known, kept)
-        judgement = judge(fit, state.usual, agreed, view.mask_weight, binary is not None, won == "grid")
-        belief = state.moved(fit.pose, frame.index, image, kept)
+            starts |= predicted(state, frame.index)
+        found = self._found(state, self._view(state, frame, binary, causal, followed), image, starts)
+        if found.lost:
+            found = self._elsewhere(state, frame, image) or found
+        belief = state.moved(found.fit.pose, frame.index, image, found.points)
         before = state.last if state.last[1] == frame.index - 1 else None
-        belief = replace(belief, before=before, status=judgement.status)
-        answer = unsolved(frame, binary, fit.pose)
-        answer = solved(belief, answer, view, fit, won, agreed, judgement)
+        belief = replace(belief, before=before, lost_for=found.lost * (state.lost_for + 1))
+        answer = solved(belief, unsolved(frame, binary, found.fit.pose), found)
         return belief, replace(answer, refined=True)
 
     def result(self, state: Belief) -> ObjectModel:
@@ -230,10 +233,11 @@ class OnlineSolver:
             kept = agreeing(known, state.camera, pose, view.points, view)
             agreed = witnesses(known, kept)
             judgement = judge(fit, usual, agreed, view.mask_weight, view.mask is not None)
-            revised.append(solved(belief, earlier, view, fit, start.origin, agreed, judgement))
+            found = Attempt(view, fit, start.origin, kept, agreed, judgement)
+            revised.append(solved(belief, earlier, found))
         belief = replace(
             belief, last=trail[-1], before=trail[-2], trail=tuple(trail[-_TRAIL:]), usual=usual,
-            status=Status.TRACKED, followed=view.points,
+            followed=view.points,
         )  # fmt: skip
         answer = replace(revised[-1], revised=tuple(revised[:-1]))
         if start.origin == "flat" and not self.config.object.flat and not answer.reason:
@@ -244,53 +248,71 @@ class OnlineSolver:
         self, state: Belief, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
     ) -> tuple[Belief, FrameEstimate]:
         """Find the frame's pose, and take it into the map where it shows something new."""
-        starts = self._predicted(state, frame.index)
-        predicted = next(iter(starts.values()))
-        followed = follow(state.grey, image, state.followed, self._carried(state, predicted))
-        view = self._view(state, frame, mask, predicted, followed)
-        won, fit, kept = self._found(state, view, image, starts)
-        agreed = witnesses(state.known, kept)
-        judgement = judge(fit, state.usual, agreed, view.mask_weight, mask is not None, won == "grid")
-        lost = judgement.status is Status.LOST
-        key = not lost and self._is_keyframe(state, view, fit, agreed)
-        if lost:
-            fit = replace(fit, pose=coast(state.trail, frame.index))
-        view = replace(view, pose=fit.pose, points=kept)
-        belief = replace(state.moved(fit.pose, frame.index, image, kept), status=judgement.status)
-        if judgement.status is Status.TRACKED:
-            belief = replace(belief, usual=state.usual.updated(fit))
+        starts = predicted(state, frame.index)
+        likeliest = next(iter(starts.values()))
+        followed = follow(state.grey, image, state.followed, carried(state, likeliest))
+        found = self._found(state, self._view(state, frame, mask, likeliest, followed), image, starts)
+        if found.lost:
+            found = self._elsewhere(state, frame, image) or found
+        key = not found.lost and self._is_keyframe(state, found)
+        pose = coast(state.trail, frame.index) if found.lost else found.fit.pose
+        belief = state.moved(pose, frame.index, image, found.points)
+        belief = replace(belief, lost_for=found.lost * (state.lost_for + 1))
+        if found.judgement.status is Status.TRACKED:
+            belief = replace(belief, usual=state.usual.updated(found.fit))
         if key:
+            view = replace(found.view, pose=pose, points=found.points)
             with in_stage("map"):
                 known, followed = with_keyframe(state.known, state.camera, view, image, self.online)
                 surface = known.surface()
-            fit = replace(fit, pose=known.keyframes[-1].pose)
+            pose = known.keyframes[-1].pose
             belief = replace(
-                belief, known=known, surface=surface, last=(fit.pose, frame.index), followed=followed
+                belief, known=known, surface=surface, last=(pose, frame.index), followed=followed
             )
-        if lost:
+        if found.lost:
             belief = replace(belief, before=None)
-        elif not unexplained(fit, state.usual, view.mask_weight):
-            belief = replace(belief, trail=(*state.trail, (fit.pose, frame.index))[-_TRAIL:])
-        answer = solved(belief, unsolved(frame, mask, fit.pose), view, fit, won, agreed, judgement)
+        elif not unexplained(found.fit, state.usual, found.view.mask_weight):
+            belief = replace(belief, trail=(*state.trail, (pose, frame.index))[-_TRAIL:])
+        found = replace(found, fit=replace(found.fit, pose=pose))
+        answer = solved(belief, unsolved(frame, mask, pose), found)
         return belief, replace(answer, keyframe=key)
 
-    def _found(self, state: Belief, view: View, image: NDArray[np.uint8], starts: dict[str, Pose]) -> Found:
+    def _found(self, state: Belief, view: View, image: NDArray[np.uint8], starts: dict[str, Pose]) -> Attempt:
         """The pose by cheap starts, and by costly ones where it looks wrong."""
         assert state.surface is not None
         known, camera = state.known, state.camera
         on_object = view.points.only(~known.candidate[view.points.landmark])
-        points = pose_of_points(known, camera, on_object, view)
+        points = pose_of_points(known, camera, on_object, pixel_scale(view))
         if points is not None:
             starts = {**starts, "points": points[0]}
         won, fit = self._fit(state, view, starts, view.points)
-        found = won, fit, agreeing(known, camera, fit.pose, view.points, view)
-        lost = state.status is Status.LOST
-        if not lost and not looks_wrong(fit, state.usual, witnesses(known, found[2]), view.mask_weight):
-            return found
-        return searched(known, state.surface, camera, view, image, found, self.weights, lost)
+        kept = agreeing(known, camera, fit.pose, view.points, view)
+        if state.lost_for or looks_wrong(fit, state.usual, witnesses(known, kept), view.mask_weight):
+            found = won, fit, kept
+            won, fit, kept = searched(
+                known, state.surface, camera, view, image, found, self.weights, state.lost_for
+            )
+        agreed = witnesses(known, kept)
+        judgement = judge(fit, state.usual, agreed, view.mask_weight, view.mask is not None, won == "grid")
+        return Attempt(view, fit, won, kept, agreed, judgement)
 
-    def _is_keyframe(self, state: Belief, view: View, fit: PoseFit, agreed: int) -> bool:
+    def _elsewhere(self, state: Belief, frame: Frame, image: NDArray[np.uint8]) -> Attempt | None:
+        """The object somewhere else in the frame, whatever the mask says; None where it is not seen there either."""
+        where = sighted(state.known, state.camera, image, state.trail[-1][0])
+        if where is None:
+            return None
+        pose, points = where
+        view = self._view(state, frame, None, pose, points)
+        _, fit = self._fit(state, view, {SIGHTED: pose}, points)
+        kept = agreeing(state.known, state.camera, fit.pose, points, view)
+        agreed = witnesses(state.known, kept)
+        judgement = judge(fit, state.usual, agreed, view.mask_weight, False, guessed=True)
+        found = Attempt(view, fit, SIGHTED, kept, agreed, judgement)
+        return None if found.lost else found
+
+    def _is_keyframe(self, state: Belief, found: Attempt) -> bool:
         """Whether the map has something to learn from a frame, and the frame can be relied on."""
+        view, fit, agreed = found.view, found.fit, found.witnesses
         if view.mask is None or (agreed < ENOUGH_POINTS and fit.overlap < _FITS):
             return False
         keyframes = state.known.keyframes
@@ -298,26 +320,6 @@ class OnlineSolver:
             return True
         angles = [float(rotation_angle(other.pose.quaternion, fit.pose.quaternion)) for other in keyframes]
         return bool(np.degrees(min(angles)) > self.online.keyframe_rotation)
-
-    def _predicted(self, state: Belief, index: int) -> dict[str, Pose]:
-        """Poses to start from, by name."""
-        last, last_index = state.last
-        if state.status is Status.LOST and state.trail:
-            return {"coasting": coast(state.trail, index), "last": state.trail[-1][0]}
-        if state.before is None:
-            return {"last": last}
-        before, before_index = state.before
-        steps = (index - last_index) / max(last_index - before_index, 1)
-        return {"velocity": extrapolate(before, last, min(steps, 3.0)), "last": last}
-
-    @staticmethod
-    def _carried(state: Belief, predicted: Pose) -> NDArray[np.float32] | None:
-        """``(N, 2)`` where the points should be at a predicted pose."""
-        if not len(state.followed):
-            return None
-        position = state.known.landmarks[state.followed.landmark]
-        there, here = (project_points(position, pose, state.camera) for pose in (predicted, state.last[0]))
-        return np.asarray(state.followed.pixel + np.nan_to_num(there - here), dtype=np.float32)
 
     def _fit(
         self, state: Belief, view: View, starts: dict[str, Pose], points: FollowedPoints

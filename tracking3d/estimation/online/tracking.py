@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from tracking3d.estimation.observation import halved
 from tracking3d.estimation.online.belief import ObjectMap, View
-from tracking3d.estimation.online.keypoints import detect, match
+from tracking3d.estimation.online.keypoints import Keypoints, detect, match
 from tracking3d.estimation.online.mapping import (
     nearest_views,
     pose_of,
@@ -41,6 +42,7 @@ _STRAY, _STRAY_YOUNG = 4.0, 16.0  # such pixels that a point may be off
 _KEYFRAMES = 6  # that a doubtful frame is matched with
 _GRID_ANGLES = (20.0, 40.0)
 _GRID_FINALISTS = 5
+_OFTEN = 5  # frames after a loss in which turns are tried in every one, and later in one of so many
 _COASTS = 12  # frames
 _WITNESS, _MOST_WITNESSES = 0.005, 30  # what each agreeing landmark takes off the cost, and how many do
 _PLACED = 8  # keyframes whose poses a lost object is looked for at
@@ -86,14 +88,14 @@ def fit_pose(
 
 
 def pose_of_points(
-    known: ObjectMap, camera: Camera, points: FollowedPoints, view: View
+    known: ObjectMap, camera: Camera, points: FollowedPoints, scale: float
 ) -> tuple[Pose, FollowedPoints] | None:
-    """The pose that most points agree with, and those that do."""
+    """The pose that most points agree with, and those that do; for the scale see `pixel_scale`."""
     position = known.landmarks[points.landmark]
     if np.isfinite(position).all(1).sum() < _FEWEST_POINTS:
         return None
     found = pose_from_points(
-        position, points.pixel.astype(np.float64), camera.K, threshold=_INLIER * pixel_scale(view), seed=0
+        position, points.pixel.astype(np.float64), camera.K, threshold=_INLIER * scale, seed=0
     )
     if found is None or found.count < _FEWEST_POINTS:
         return None
@@ -129,19 +131,34 @@ def rematched(
         anywhere: Ask more keyframes than those with the nearest viewing direction.
     """
     region = np.ones(image.shape, bool) if view.mask is None else view.mask
-    keypoints = detect(image, region)
-    found = []
     others = nearest_views(known.keyframes, view.pose, len(known.keyframes) if anywhere else _KEYFRAMES)
-    for other in others[: 4 * _KEYFRAMES]:
+    keypoints = detect(image, region)
+    return matched_poses(known, camera, keypoints, others[: 4 * _KEYFRAMES], pixel_scale(view))[:3]
+
+
+def matched_poses(
+    known: ObjectMap, camera: Camera, keypoints: Keypoints, others: Sequence[View], scale: float
+) -> list[tuple[Pose, FollowedPoints]]:
+    """Poses by the matches with one keyframe each, most agreeing points first.
+
+    Args:
+        known: The map.
+        camera: Of the full frame.
+        keypoints: Of a frame.
+        others: The keyframes.
+        scale: See `pixel_scale`.
+    """
+    found = []
+    for other in others:
         pairs = match(keypoints, other.keypoints)
         names = other.keypoint_landmark[pairs[:, 1]]
         sound = (names >= 0) & ~known.candidate[names]
         points = FollowedPoints(names[sound], keypoints.pixel[pairs[sound, 0]])
-        pose = pose_of_points(known, camera, points, view)
+        pose = pose_of_points(known, camera, points, scale)
         if pose is not None:
             found.append(pose)
     found.sort(key=lambda one: -len(one[1]))
-    return found[:3]
+    return found
 
 
 def placed_keyframes(known: ObjectMap, camera: Camera, view: View) -> list[Pose]:
@@ -191,7 +208,7 @@ def searched(
     image: NDArray[np.uint8],
     best: Found,
     weights: PoseWeights,
-    lost: bool,
+    lost_for: int,
 ) -> Found:
     """The best of what was found so far and of the costly hypotheses, by what re-renders the frame.
 
@@ -202,8 +219,10 @@ def searched(
         image: ``(H, W)`` grey.
         best: What was found so far.
         weights: Of the kinds of evidence.
-        lost: Look at all sides of the object, wherever it was before.
+        lost_for: How many frames the object has been lost before this one: if it was, all sides of it are looked at,
+            wherever it was before, but the longer the less often.
     """
+    lost = lost_for > 0
 
     def fitted(name: str, pose: Pose, points: FollowedPoints, asked: FollowedPoints) -> Found:
         _, fit = fit_pose(known, surface, view, {name: pose}, points, weights)
@@ -212,7 +231,7 @@ def searched(
     tried = [best]
     for pose, points in rematched(known, camera, replace(view, pose=best[1].pose), image, lost):
         tried.append(fitted("keyframe", pose, points, points))
-    if view.mask is not None:
+    if view.mask is not None and (lost_for <= _OFTEN or lost_for % _OFTEN == 0):
         centre = best[1].pose
         if lost:
             placed = {str(n): pose for n, pose in enumerate(placed_keyframes(known, camera, view))}

@@ -1,0 +1,37 @@
+"""A frame with the best pose that was found for it, and how far that is believed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from tracking3d.estimation.assessment import Assessment
+from tracking3d.estimation.estimate import Status
+from tracking3d.estimation.online.belief import View
+from tracking3d.estimation.online.points import FollowedPoints
+from tracking3d.estimation.online.pose_refinement import PoseFit
+
+
+@dataclass(frozen=True, eq=False)
+class Attempt:
+    """What came of looking for the object in a frame.
+
+    Attributes:
+        view: The frame.
+        fit: Its pose.
+        won: Which start of the pose won.
+        points: Those that agree with it.
+        witnesses: How many of these are landmarks that two keyframes have seen.
+        judgement: Of the pose.
+    """
+
+    view: View
+    fit: PoseFit
+    won: str
+    points: FollowedPoints
+    witnesses: int
+    judgement: Assessment
+
+    @property
+    def lost(self) -> bool:
+        """Whether the pose is not believed."""
+        return self.judgement.status is Status.LOST

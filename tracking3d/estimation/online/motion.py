@@ -1,0 +1,32 @@
+"""Where an object should be in the next frame, by how it has moved."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.estimation.online.belief import Belief
+from tracking3d.estimation.online.mapping import project_points
+from tracking3d.estimation.online.tracking import coast
+from tracking3d.geometry.pose import Pose, extrapolate
+
+
+def predicted(state: Belief, index: int) -> dict[str, Pose]:
+    """Poses to start from in frame ``index``, by name, the likeliest first."""
+    last, last_index = state.last
+    if state.lost_for and state.trail:
+        return {"coasting": coast(state.trail, index), "last": state.trail[-1][0]}
+    if state.before is None:
+        return {"last": last}
+    before, before_index = state.before
+    steps = (index - last_index) / max(last_index - before_index, 1)
+    return {"velocity": extrapolate(before, last, min(steps, 3.0)), "last": last}
+
+
+def carried(state: Belief, pose: Pose) -> NDArray[np.float32] | None:
+    """``(N, 2)`` pixels where the points that are followed should be at a pose; None where there are none."""
+    if not len(state.followed):
+        return None
+    position = state.known.landmarks[state.followed.landmark]
+    there, here = (project_points(position, one, state.camera) for one in (pose, state.last[0]))
+    return np.asarray(state.followed.pixel + np.nan_to_num(there - here), dtype=np.float32)
