@@ -12,7 +12,7 @@ from refining_solver import CausalSolver
 
 from tracking3d import Frame, FrameEstimate, Status, load_config, track
 from tracking3d.errors import PluginError
-from tracking3d.estimation.correction import SURE, WORTH_CORRECTING, corrects
+from tracking3d.estimation.correction import SIGHTED, SURE, WORTH_CORRECTING, corrects
 from tracking3d.frames import MaskEstimate, Prompt
 from tracking3d.plugins import VARIABLE
 from tracking3d.session import SOLVERS
@@ -118,6 +118,12 @@ def test_the_bounds_themselves_are_worth_correcting():
     assert corrects(estimate(mask=square(10, 10)))  # half of it
     assert corrects(estimate(mask=square(10, 18)))  # 18 of 20
     assert not corrects(estimate(mask=square(10, 9)))
+
+
+def test_what_was_found_elsewhere_by_its_points_corrects_whatever_the_mask():
+    for initial in (None, square(0, 5), square(10)):
+        assert corrects(estimate(hypothesis=SIGHTED, initial_mask=initial, confidence=0.4))
+    assert not corrects(estimate(hypothesis=SIGHTED, status=Status.UNCERTAIN))
 
 
 def answers(tracker: dict | str, correct: bool = True, policy: str = "continue", **changes) -> list:

@@ -118,7 +118,7 @@ def test_the_pose_of_points_is_theirs_whatever_a_few_say(known):
     pixel = pixels_of(known.landmarks, view)
     pixel[::5] += np.float32([20, -9])
     points = FollowedPoints(np.arange(len(pixel)), pixel)
-    pose, kept = pose_of_points(known, CAMERA, points, view)
+    pose, kept = pose_of_points(known, CAMERA, points, pixel_scale(view))
     assert degrees_apart(pose, turned(8)) < 0.5
     np.testing.assert_allclose(pose.translation, turned(8).translation, atol=0.02)
     assert not np.isin(kept.landmark, np.arange(len(pixel))[::5]).any()
@@ -128,17 +128,17 @@ def test_the_pose_of_points_is_theirs_whatever_a_few_say(known):
 def test_few_points_have_no_pose(known):
     view = known.keyframes[1]
     few = view.points.only(np.arange(len(view.points)) < 5)
-    assert pose_of_points(known, CAMERA, few, view) is None
-    assert pose_of_points(known, CAMERA, FollowedPoints.none(), view) is None
+    assert pose_of_points(known, CAMERA, few, pixel_scale(view)) is None
+    assert pose_of_points(known, CAMERA, FollowedPoints.none(), pixel_scale(view)) is None
     nowhere = replace(known, landmarks=np.full_like(known.landmarks, np.nan))
-    assert pose_of_points(nowhere, CAMERA, view.points, view) is None
+    assert pose_of_points(nowhere, CAMERA, view.points, pixel_scale(view)) is None
     # Five agree, and three others with nobody.
     pixel = view.points.pixel[:8].copy()
     pixel[5:] += np.float32([[25, 0], [0, 25], [-25, -12]])
-    assert pose_of_points(known, CAMERA, FollowedPoints(np.arange(8), pixel), view) is None
+    assert pose_of_points(known, CAMERA, FollowedPoints(np.arange(8), pixel), pixel_scale(view)) is None
     six = view.points.only(np.arange(len(view.points)) % 10 == 0)
     assert len(six) >= 6
-    assert pose_of_points(known, CAMERA, six, view) is not None
+    assert pose_of_points(known, CAMERA, six, pixel_scale(view)) is not None
 
 
 def test_the_better_start_wins_and_is_refined(known, surface):
