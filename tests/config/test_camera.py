@@ -50,3 +50,14 @@ def test_what_hardly_one_has_is_told(intrinsics, told, caplog):
 def test_nothing_is_told_of_a_field_of_view(caplog):
     warn_of_unlikely(choose_camera(CameraConfig(), 4000, 40))
     assert not caplog.text
+
+
+@pytest.mark.parametrize("focal", [1e6, 1.0])
+def test_a_lens_that_no_camera_has_is_left_aside_where_the_source_says_it(caplog, focal):
+    known = (focal, focal, 320.0, 240.0)
+    camera = choose_camera(CameraConfig(), 640, 480, known, "EXIF of 1.jpg")
+    assert camera.assumed and camera == choose_camera(CameraConfig(), 640, 480)
+    [record] = caplog.records
+    assert "EXIF of 1.jpg" in record.message and "left aside" in record.message
+    # Who gives it himself is asked, not overruled.
+    assert choose_camera(CameraConfig(), 640, 480, (500.0, 500.0, 320.0, 240.0), "EXIF").fx == 500

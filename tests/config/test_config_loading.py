@@ -322,7 +322,8 @@ def test_malformed_override_says_how_to_write_it(item):
 def test_bad_override_is_quoted(item):
     with pytest.raises(InputError) as caught:
         load_config(overrides=["window.size=64", item])
-    assert f"--set {item}" in str(caught.value)
+    assert f"overrides: {item}" in str(caught.value)
+    assert f"--set {item}" in caught.value.at_the_command_line
 
 
 def test_unknown_preset_is_answered_with_the_nearest():

@@ -29,7 +29,8 @@ def choose_camera(
     """The camera by what is known best: given intrinsics, given field of view, the source's own, 45 degrees.
 
     Raises:
-        InputError: If the intrinsics that were given cannot be of images of that size.
+        InputError: If the intrinsics that were given cannot be of images of that size. Those that the source has are
+            then left aside, and the log says so.
     """
     if config.intrinsics is not None:
         camera = Camera(*config.intrinsics, width, height, GIVEN)
@@ -38,7 +39,12 @@ def choose_camera(
     if config.fov is not None:
         return Camera.from_fov(width, height, config.fov, f"given field of view of {config.fov:g} degrees")
     if known is not None:
-        return Camera(*known, width, height, known_origin)
+        camera = Camera(*known, width, height, known_origin)
+        if _usual(camera):
+            return camera
+        _log.warning(
+            "%s by the %s; that is hardly a camera's, and is left aside.", _told(camera), known_origin
+        )
     origin = f"default field of view of {DEFAULT_FIELD_OF_VIEW:g} degrees"
     return replace(Camera.from_fov(width, height, DEFAULT_FIELD_OF_VIEW, origin), assumed=True)
 
@@ -47,15 +53,18 @@ def warn_of_unlikely(camera: Camera) -> None:
     """Tell the log where given intrinsics are possible for images of that size, but hardly meant."""
     if camera.origin != GIVEN:
         return
-    least, most = USUAL_ANGLES
-    angles = _angles(camera)
     inside = 0 <= camera.cx < camera.width and 0 <= camera.cy < camera.height
-    if min(angles) < least or max(angles) > most:
+    if not _usual(camera):
         _log.warning(
             "%s; that is hardly a camera's, so look whether they are of images of that size.", _told(camera)
         )
     elif not inside:
         _log.warning("%s, whose centre %g, %g lies outside them.", _told(camera), camera.cx, camera.cy)
+
+
+def _usual(camera: Camera) -> bool:
+    least, most = USUAL_ANGLES
+    return all(least <= angle <= most for angle in _angles(camera))
 
 
 def _check(camera: Camera) -> None:

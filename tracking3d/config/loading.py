@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from tracking3d.config.explain import describe, hint, shown
 from tracking3d.config.models import PipelineConfig, PluginChoice
 from tracking3d.config.yaml_files import parse_yaml, read_mapping
-from tracking3d.errors import InputError
+from tracking3d.errors import InputError, argument
 
 DEFAULT_PRESET = "default"
 """The preset that is used when none is named."""
@@ -60,7 +60,7 @@ def load_config(
     layers: list[Layer] = [_preset_layer(file_preset if preset is None else preset)]
     if file is not None:
         layers.append((str(file), from_file))
-    spoken = [(f"--set {item}", _parse_override(item)) for item in overrides]
+    spoken = [(_called(item), _parse_override(item)) for item in overrides]
     spoken.append(("", direct))
     # What is chosen on the command line comes first, so that the options of a `--set tracker.path=...`
     # beside a `--tracker precomputed` are those of the latter.
@@ -130,13 +130,18 @@ def _preset_layer(name: str) -> Layer:
         return f"preset {name}", read_mapping(path)
 
 
+def _called(override: str) -> str:
+    """What messages call a setting that was spoken."""
+    return argument(f"overrides: {override}", f"--set {override}")
+
+
 def _parse_override(item: str) -> dict[str, Any]:
     """Turn ``a.b.c=value`` into ``{"a": {"b": {"c": value}}}``."""
     path, equals, text = item.partition("=")
     keys = [key.strip() for key in path.split(".")]
     if not equals or not all(keys):
-        raise InputError(f"--set {item} cannot be read; write it as section.key=value.")
-    value: Any = parse_yaml(text, f"--set {item}")
+        raise InputError(f"{_called(item)} cannot be read; write it as section.key=value.")
+    value: Any = parse_yaml(text, _called(item))
     for key in reversed(keys[1:]):
         value = {key: value}
     return {keys[0]: value}
