@@ -69,7 +69,7 @@ def test_growth_is_what_the_second_half_holds_more_at_most():
     assert job_module.memory_growth([10]) is None and job_module.memory_growth([]) is None
 
 
-def test_a_failure_is_told_in_its_own_sentence(jobs, scripted):
+def test_a_failure_is_told_in_its_own_sentence(jobs, scripted, quick_processes):
     [outcome] = run_jobs(jobs(scripted(fail=70), ["wide"]))
     told = r"mask tracker 'scripted' \(TRACKING3D_PLUGINS [0-9a-f]+\) failed at 000000.png: RuntimeError"
     assert re.match(told, outcome.error)
