@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,14 +84,39 @@ def revolved(profile: Array, sectors: int, steps: int = 96) -> list[Patch]:
     return patches
 
 
-def tube(centres: Array, radius: float, side: Array, steps: int = 20) -> Patch:
-    """A round tube along a curve ``(M, 3)`` in the plane whose unit normal is ``side`` ``(3,)``."""
+def rectangle(x: float, y: float) -> Array:
+    """The outline ``(4, 2)`` of a rectangle of these half sides around the origin."""
+    return np.array([(-x, -y), (x, -y), (x, y), (-x, y)])
+
+
+def refined(profile: Array, step: float = 0.04) -> Array:
+    """The same polyline with points at most ``step`` apart."""
+    pieces = []
+    for start, end in pairwise(profile):
+        count = max(math.ceil(np.linalg.norm(end - start) / step), 1)
+        pieces.append(start + np.arange(count)[:, None] / count * (end - start))
+    return np.concatenate([*pieces, profile[-1:]])
+
+
+def tube(
+    centres: Array, radius: float | Array, side: Array, steps: int = 20, sections: int = 1
+) -> list[Patch]:
+    """A round tube along a curve.
+
+    Args:
+        centres: ``(M, 3)`` along the curve, in a plane.
+        radius: Of the whole tube, or ``(M, 1)``; where it ends at 0 the tube is closed.
+        side: ``(3,)`` unit normal of the curve's plane.
+        steps: Divisions around.
+        sections: Patches along the curve.
+    """
     along = np.gradient(centres, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     out = np.cross(side, along)
     angle = np.linspace(0, 2 * math.pi, steps + 1)[:, None, None]
     points = centres + radius * (np.cos(angle) * out + np.sin(angle) * side)
-    return grid(points)
+    ends = np.linspace(0, len(centres) - 1, sections + 1).round().astype(int).tolist()
+    return [grid(points[:, start : end + 1]) for start, end in pairwise(ends)]
 
 
 def cube_sphere(steps: int) -> list[Patch]:

@@ -1,20 +1,30 @@
-"""Procedural objects from a seed: box, bottle, blob, mug, card, wedge and vase.
+"""Procedural objects: box, bottle, blob, mug, card, wedge and vase, and those of `tracking3d.synthesis.random_solids`.
 
-They are about one unit in radius, y is up. Their shape is fixed but for the blob's, which like all textures comes
-from the seed.
+They are about one unit in radius, y is up. The shapes of the former are fixed but for the blob's; the blob's, those of
+the latter and all textures come from the seed.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from itertools import pairwise
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tracking3d.synthesis.patches import Array, Patch, assemble, cube_sphere, prism, revolved, tube
+from tracking3d.synthesis.patches import (
+    Array,
+    Patch,
+    assemble,
+    cube_sphere,
+    prism,
+    rectangle,
+    refined,
+    revolved,
+    tube,
+)
 from tracking3d.synthesis.procedural_texture import paint_bands, paint_panel, paint_plain
+from tracking3d.synthesis.random_solids import assembly, bowl, knob, organic, stick
 from tracking3d.synthesis.solid import Solid
 from tracking3d.synthesis.spec import SequenceSpec
 
@@ -29,12 +39,12 @@ _STEPS_AROUND = 72  # of a continuous symmetry in its list of transforms: every 
 
 def box(rng: np.random.Generator) -> list[Patch]:
     """A cuboid of three different sides."""
-    return prism(_rectangle(0.62, 0.48), 0.56)
+    return prism(rectangle(0.62, 0.48), 0.56)
 
 
 def card(rng: np.random.Generator) -> list[Patch]:
     """A flat card, its two sides different."""
-    return prism(_rectangle(0.78, 0.55), 0.02)
+    return prism(rectangle(0.78, 0.55), 0.02)
 
 
 def wedge(rng: np.random.Generator) -> list[Patch]:
@@ -46,14 +56,14 @@ def bottle(rng: np.random.Generator) -> list[Patch]:
     """A surface of revolution with shoulders, neck and cap."""
     profile = [(0.0, -0.9), (0.33, -0.9), (0.38, -0.84), (0.38, 0.1), (0.36, 0.25), (0.28, 0.4), (0.17, 0.52)]
     profile += [(0.13, 0.62), (0.13, 0.72), (0.18, 0.73), (0.18, 0.93), (0.0, 0.94)]
-    return revolved(_refined(np.array(profile)), sectors=2)
+    return revolved(refined(np.array(profile)), sectors=2)
 
 
 def vase(rng: np.random.Generator) -> list[Patch]:
     """A surface of revolution with a belly; its print of bands does not tell how far it has turned."""
     profile = [(0.0, -0.88), (0.3, -0.88), (0.36, -0.8), (0.5, -0.55), (0.58, -0.25), (0.56, 0.05)]
     profile += [(0.44, 0.32), (0.3, 0.5), (0.26, 0.66), (0.34, 0.85), (0.32, 0.9), (0.0, 0.9)]
-    return revolved(_refined(np.array(profile)), sectors=2)
+    return revolved(refined(np.array(profile)), sectors=2)
 
 
 def blob(rng: np.random.Generator) -> list[Patch]:
@@ -82,11 +92,11 @@ def mug(rng: np.random.Generator) -> list[Patch]:
         (0.45, -0.5),
         (0.0, -0.52),
     ]
-    body = revolved(_refined(np.array(wall)), sectors=2)
+    body = revolved(refined(np.array(wall)), sectors=2)
     angle = np.linspace(-0.58, 0.58, 40) * math.pi
     curve = np.stack([0.5 + 0.32 * np.cos(angle), 0.38 * np.sin(angle), np.zeros_like(angle)], 1)
     handle = tube(curve, 0.075, np.array([0.0, 0.0, 1.0]))
-    return [Patch(patch.vertices - (0.12, 0, 0), patch.faces, patch.uvs) for patch in (*body, handle)]
+    return [Patch(patch.vertices - (0.12, 0, 0), patch.faces, patch.uvs) for patch in (*body, *handle)]
 
 
 PROCEDURAL: dict[str, Callable[[np.random.Generator], list[Patch]]] = {
@@ -97,6 +107,11 @@ PROCEDURAL: dict[str, Callable[[np.random.Generator], list[Patch]]] = {
     "card": card,
     "wedge": wedge,
     "vase": vase,
+    "organic": organic,
+    "assembly": assembly,
+    "stick": stick,
+    "knob": knob,
+    "bowl": bowl,
 }
 """The procedural objects by name."""
 
@@ -114,9 +129,10 @@ def make_procedural_solid(spec: SequenceSpec) -> Solid:
         panels = [paint_plain(rng, PANEL, hue) for _ in patches]
     vertices, faces, uvs, texture = assemble(patches, [panel.round().astype(np.uint8) for panel in panels])
     symmetries, axis = np.eye(4)[None], None
-    if not spec.textured and spec.object in ("box", "card"):
+    plain = not spec.textured or spec.print_strength == 0
+    if plain and spec.object in ("box", "card"):
         symmetries = _turns([np.zeros(3), *(math.pi * np.eye(3))])
-    if spec.object == "vase" or (not spec.textured and spec.object == "bottle"):
+    if spec.object == "vase" or (plain and spec.object in ("bottle", "bowl")):
         axis = np.array([0.0, 1.0, 0.0])
         symmetries = _turns(np.linspace(0, 2 * math.pi, _STEPS_AROUND, endpoint=False)[:, None] * axis)
     frame = "origin in the middle of the body, y up, about one unit in radius"
@@ -128,16 +144,3 @@ def _turns(rotation_vectors: list[Array] | Array) -> Array:
     transforms = np.tile(np.eye(4), (len(rotation_vectors), 1, 1))
     transforms[:, :3, :3] = Rotation.from_rotvec(np.asarray(rotation_vectors)).as_matrix()
     return transforms
-
-
-def _rectangle(x: float, y: float) -> Array:
-    return np.array([(-x, -y), (x, -y), (x, y), (-x, y)])
-
-
-def _refined(profile: Array, step: float = 0.04) -> Array:
-    """The same polyline with points at most ``step`` apart."""
-    pieces = []
-    for start, end in pairwise(profile):
-        count = max(math.ceil(np.linalg.norm(end - start) / step), 1)
-        pieces.append(start + np.arange(count)[:, None] / count * (end - start))
-    return np.concatenate([*pieces, profile[-1:]])

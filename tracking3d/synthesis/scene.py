@@ -20,7 +20,7 @@ from tracking3d.synthesis.motions import Path, make_path
 from tracking3d.synthesis.occluder import Hand, make_hand
 from tracking3d.synthesis.procedural_solids import PROCEDURAL, make_procedural_solid
 from tracking3d.synthesis.ray_casting import Surface
-from tracking3d.synthesis.solid import Solid
+from tracking3d.synthesis.solid import Solid, faded
 from tracking3d.synthesis.spec import SequenceSpec
 
 Array = NDArray[np.float64]
@@ -90,14 +90,14 @@ def make_solid(spec: SequenceSpec) -> Solid:
         InputError: If it is neither a procedural object nor a mesh file with faces.
     """
     if spec.object in PROCEDURAL:
-        return make_procedural_solid(spec)
+        return faded(make_procedural_solid(spec), spec.print_strength)
     file = FilePath(spec.object)
     if not file.suffix and not file.exists():
         raise InputError(
             f"There is no object '{spec.object}' and no such mesh file "
             f"(objects: {', '.join(PROCEDURAL)}); {hint(spec.object, PROCEDURAL)}"
         )
-    return load_solid(file, spec)
+    return faded(load_solid(file, spec), spec.print_strength)
 
 
 def _resolved_texture(

@@ -55,6 +55,9 @@ class SequenceSpec(Section):
     name: str = Field("sequence", pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", description="Name of its folder.")
     object: str = Field("box", min_length=1, description="A procedural object, or a mesh file.")
     textured: bool = Field(True, description="Printed with patterns, or nearly one plain colour.")
+    print_strength: float = Field(
+        1.0, ge=0, le=1, description="How strongly the print shows on its mean colour; 0 is that colour alone."
+    )
     motion: Motion = Field("tumble", description="How the object moves.")
     degrees_per_frame: float = Field(4.0, ge=0, le=60, description="Speed of rotation; the peak for `fast`.")
     frames: int = Field(40, ge=1, le=10_000, description="Number of frames.")
