@@ -15,7 +15,7 @@ from scipy.ndimage import (
 )
 from scipy.spatial import ConvexHull
 
-from tracking3d.synthesis.frame_rendering import bilinear, render_frame
+from tracking3d.synthesis.frame_rendering import render_frame
 from tracking3d.synthesis.scene import make_scene
 from tracking3d.synthesis.sequences import render_sequence
 from tracking3d.synthesis.spec import SequenceSpec

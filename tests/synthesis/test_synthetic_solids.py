@@ -8,7 +8,7 @@ import trimesh
 from PIL import Image
 
 from tracking3d.errors import InputError
-from tracking3d.synthesis.frame_rendering import bilinear
+from tracking3d.synthesis.texture_lookup import bilinear
 from tracking3d.synthesis.procedural_solids import PROCEDURAL
 from tracking3d.synthesis.ray_casting import Surface
 from tracking3d.synthesis.scene import make_solid

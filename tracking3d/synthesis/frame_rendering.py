@@ -7,7 +7,7 @@ The middle one goes through the pixel's centre at the frame's time: it gives mas
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,9 @@ from tracking3d.synthesis.camera_effects import exposed, linear
 from tracking3d.synthesis.lighting import Lamp, lamp_at, shaded
 from tracking3d.synthesis.pixel_rays import pixels_around, ray_directions
 from tracking3d.synthesis.ray_casting import Hits, Surface
+from tracking3d.synthesis.room_rendering import room_light
 from tracking3d.synthesis.scene import Scene
+from tracking3d.synthesis.texture_lookup import bilinear
 
 Array = NDArray[np.float64]
 
@@ -58,8 +60,7 @@ def render_frame(scene: Scene, frame: int) -> RenderedFrame:
     count = spec.supersample**2
     middle = count // 2
     offsets, times = _samples(scene)
-    start = scene.path.T_cam_obj(np.zeros(1))[0, :3, 3]
-    lamp = lamp_at(spec, frame, start, scene.solid.radius)
+    lamp = _lamp(scene, frame)
     light = np.zeros((*scene.background.shape[:2], 3))
     for k, source in enumerate(lamp.points(count)):
         sample, depth, front = _sample(scene, frame + times[k], offsets[k], lamp, source)
@@ -68,6 +69,16 @@ def render_frame(scene: Scene, frame: int) -> RenderedFrame:
             mask, visible, z = np.isfinite(depth), np.isfinite(depth) & (depth < front), depth
     image = exposed((light / count).astype(np.float32), spec.disturbances, spec.random(f"noise {frame}"))
     return RenderedFrame(image, mask, visible, np.where(mask, z, 0).astype(np.float32))
+
+
+def _lamp(scene: Scene, frame: int) -> Lamp:
+    """The lamp of a frame in camera axes: it stays with the camera, or in the room where there is one."""
+    T_start, T_now = scene.path.T_cam_obj(np.array([0.0, frame]))
+    lamp = lamp_at(scene.spec, frame, T_start[:3, 3], scene.solid.radius)
+    if scene.room is None:
+        return lamp
+    T = T_now @ np.linalg.inv(T_start)
+    return replace(lamp, position=T[:3, :3] @ lamp.position + T[:3, 3])
 
 
 def _samples(scene: Scene) -> tuple[Array, Array]:
@@ -100,6 +111,12 @@ def _sample(
         lit &= ~_shadowed(hand.surface, T_cam_hand, seen, source, lift)
     light[seen.pixels] = shaded(_albedo(scene, seen.hits), seen.points, seen.normals, lit, lamp, source)
     depth[seen.pixels] = seen.depth
+    if scene.room is not None:
+        rows, columns = np.nonzero(np.isinf(depth))
+        x, y = columns + offset[0], rows + offset[1]
+        around, far = room_light(scene, scene.room, T_cam_obj, x, y, lamp, source)
+        met = np.isfinite(far)
+        light[rows[met], columns[met]] = around[met]
     if hand is not None:
         over = _look(scene, hand.surface, T_cam_hand, offset)
         nearer = over.depth < depth[over.pixels]
@@ -147,16 +164,3 @@ def _albedo(scene: Scene, hits: Hits) -> Array:
         return linear(np.einsum("nc,ncd->nd", hits.weights, colours)).astype(np.float64)
     uv = np.einsum("nc,ncd->nd", hits.weights, scene.solid.uvs[corners])
     return bilinear(scene.texture, uv)
-
-
-def bilinear(texture: NDArray[np.float32], uv: Array) -> Array:
-    """Colours ``(N, 3)`` of a texture ``(h, w, 3)`` at ``uv`` ``(N, 2)``, v upwards; it repeats beyond its edges."""
-    height, width = texture.shape[:2]
-    x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
-    column, row = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
-    right, below = (x - column)[:, None], (y - row)[:, None]
-    left_, right_ = column % width, (column + 1) % width
-    top_, below_ = row % height, (row + 1) % height
-    upper = texture[top_, left_] * (1 - right) + texture[top_, right_] * right
-    lower = texture[below_, left_] * (1 - right) + texture[below_, right_] * right
-    return upper * (1 - below) + lower * below

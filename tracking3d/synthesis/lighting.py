@@ -23,7 +23,6 @@ AMBIENT, DIFFUSE = 0.38, 0.72
 SHININESS = 35.0
 """Blinn's exponent of the highlights."""
 
-_DIRECTION = np.array([-0.45, -0.6, -0.75])
 _DISTANCE, _SIZE = 7.0, 0.9  # of the lamp from the object, and its radius, in object radii
 
 
@@ -77,7 +76,8 @@ def lamp_at(spec: SequenceSpec, frame: int, centre: Array, radius: float) -> Lam
     tint = rng.uniform(-0.12, 0.12, 3)
     swing = strength * math.sin(2 * math.pi * frame / period)
     fade = 0.5 * strength * side * math.sin(2 * math.pi * frame / (0.7 * period))
-    turned = Rotation.from_rotvec(math.radians(75) * swing * axis / np.linalg.norm(axis)).apply(_DIRECTION)
+    swung = Rotation.from_rotvec(math.radians(75) * swing * axis / np.linalg.norm(axis))
+    turned = swung.apply(np.array(spec.lamp))
     position = centre + _DISTANCE * radius * turned / np.linalg.norm(turned)
     return Lamp(position, _SIZE * radius, np.exp(fade + swing * tint), spec.disturbances.highlights)
 

@@ -1,5 +1,7 @@
 """How objects move: smooth paths of poses, evaluated at any time, so that a shutter can stay open.
 
+Or how a camera moves round an object that stands still, which is told by the same poses.
+
 Time is counted in frames. Rotations turn the object about its centre in camera axes; positions are given
 relative to where the object's enclosing sphere fills the asked share of the image height, in its radii.
 """
@@ -58,13 +60,17 @@ def make_path(spec: SequenceSpec, camera: Camera, radius: float) -> Path:
     times = np.linspace(-1, last + 1, _STEPS * (last + 2) + 1)
     first = _STEPS
     spin = _SPINS[spec.motion](times, last, math.radians(spec.degrees_per_frame), rng)
-    turned = _integrated(spin * (times[1] - times[0]))
-    start = Rotation.from_euler("yxz", _views(spec.motion, rng), degrees=True)
-    rotations = turned * turned[first].inv() * start
+    walk = spec.motion == "walk_round"
+    if walk:
+        rotations = _walked(times, spin, rng)
+    else:
+        turned = _integrated(spin * (times[1] - times[0]))
+        start = Rotation.from_euler("yxz", _views(spec.motion, rng), degrees=True)
+        rotations = turned * turned[first].inv() * start
 
     # A sphere of radius 1 at depth d has an outline of radius f / sqrt(d^2 - 1).
     depth = math.hypot(1.0, 2 * camera.fy / (spec.fill * camera.height))
-    path = _sway(times, rng, depth)
+    path = _hand_shake(times, rng, depth) if walk else _sway(times, rng, depth)
     if spec.motion == "depth_drift":
         path[:, 2] += 1.1 * depth * np.sin(0.5 * math.pi * times / last) ** 2
     if spec.motion == "leave_and_return":
@@ -104,6 +110,32 @@ def _flip(times: Array, last: int, speed: float, rng: np.random.Generator) -> Ar
     return speed * (1 - 0.6 * np.cos(2 * mean))[:, None] * axis
 
 
+def _walk(times: Array, last: int, speed: float, rng: np.random.Generator) -> Array:
+    """Round the object at a pace that is not quite steady; the camera's walk as seen from the camera."""
+    pace = 1 + 0.25 * np.sin(2 * math.pi * times / rng.uniform(18, 30) + rng.uniform(0, 2 * math.pi))
+    return speed * rng.choice([-1.0, 1.0]) * pace[:, None] * (0.0, 1.0, 0.0)
+
+
+def _walked(times: Array, spin: Array, rng: np.random.Generator) -> Rotation:
+    """Rotations of a still object that a camera walks round: upright but for the hand that holds the camera."""
+    azimuth = rng.uniform(0, 360) + np.degrees(np.cumsum(spin[:, 1]) * (times[1] - times[0]))
+    height = rng.uniform(14, 34) + _waves(times, rng, 4.0, (35, 60)) + _waves(times, rng, 0.25, (5, 9))
+    roll = rng.uniform(-2, 2) + _waves(times, rng, 1.2, (15, 30)) + _waves(times, rng, 0.25, (5, 9))
+    return Rotation.from_euler("yxz", np.stack([azimuth, 180 + height, roll], 1), degrees=True)
+
+
+def _hand_shake(times: Array, rng: np.random.Generator, depth: float) -> Array:
+    """How a hand-held camera misses its aim and comes nearer and goes farther ``(M, 3)``."""
+    aim = [_waves(times, rng, size, (20, 45)) + _waves(times, rng, 0.015, (5, 9)) for size in (0.12, 0.08)]
+    return np.stack([*aim, _waves(times, rng, 0.07 * depth, (30, 60))], 1)
+
+
+def _waves(times: Array, rng: np.random.Generator, size: float, periods: tuple[float, float]) -> Array:
+    """``(M,)`` up to ``size`` up and down."""
+    wave: Array = size * np.sin(2 * math.pi * times / rng.uniform(*periods) + rng.uniform(0, 2 * math.pi))
+    return wave
+
+
 _SPINS: dict[str, Callable[[Array, int, float, np.random.Generator], Array]] = {
     "tumble": _tumble,
     "turntable": _turntable,
@@ -112,6 +144,7 @@ _SPINS: dict[str, Callable[[Array, int, float, np.random.Generator], Array]] = {
     "fast": _fast,
     "depth_drift": _tumble,
     "leave_and_return": _tumble,
+    "walk_round": _walk,
 }
 """Angular velocity ``(M, 3)`` in radians a frame by motion."""
 

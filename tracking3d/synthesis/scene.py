@@ -1,4 +1,4 @@
-"""Everything of a sequence that is made once: the object, its path, camera, background and occluder."""
+"""Everything of a sequence that is made once: the object, its path, camera, background or room, and occluder."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from tracking3d.synthesis.motions import Path, make_path
 from tracking3d.synthesis.occluder import Hand, make_hand
 from tracking3d.synthesis.procedural_solids import PROCEDURAL, make_procedural_solid
 from tracking3d.synthesis.ray_casting import Surface
+from tracking3d.synthesis.room import Room, make_room
 from tracking3d.synthesis.solid import Solid, faded
 from tracking3d.synthesis.spec import SequenceSpec
 
@@ -42,6 +43,7 @@ class Scene:
         background: ``(H, W, 3)`` linear light.
         hand: What moves in front of it.
         texture: ``(h, w, 3)`` linear light, no finer than the rays resolve; None where vertices have colours.
+        room: What is around the object instead of the background where the camera walks round it, else None.
     """
 
     spec: SequenceSpec
@@ -53,6 +55,7 @@ class Scene:
     background: NDArray[np.float32]
     hand: Hand | None
     texture: NDArray[np.float32] | None
+    room: Room | None
 
     @property
     def T_cam_obj(self) -> Array:
@@ -73,7 +76,9 @@ def make_scene(spec: SequenceSpec) -> Scene:
     hand = make_hand(spec, path, surface, solid.radius, camera)
     background = linear(make_background(spec))
     texture = _resolved_texture(solid, camera, path, spec.supersample)
-    return Scene(spec, camera, _told_camera(spec, camera), solid, surface, path, background, hand, texture)
+    told = _told_camera(spec, camera)
+    room = make_room(spec, solid, path)
+    return Scene(spec, camera, told, solid, surface, path, background, hand, texture, room)
 
 
 def _told_camera(spec: SequenceSpec, camera: Camera) -> Camera:

@@ -6,6 +6,7 @@ that switching one disturbance on or off leaves all else as it is.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
@@ -19,8 +20,8 @@ from tracking3d.errors import InputError
 Strength = Annotated[float, Field(ge=0, le=1)]
 """0 is off, 1 the strongest."""
 
-Motion = Literal["tumble", "turntable", "turn_and_back", "flip", "fast", "depth_drift", "leave_and_return"]
-"""See `tracking3d.synthesis.motions`."""
+Motion = Literal["tumble", "turntable", "turn_and_back", "flip", "fast", "depth_drift", "leave_and_return", "walk_round"]
+"""See `tracking3d.synthesis.motions`; at ``walk_round`` the camera moves, round a still object in a room."""
 
 PROCEDURAL_BACKGROUND = "procedural"
 
@@ -73,6 +74,10 @@ class SequenceSpec(Section):
     background: str = Field(
         PROCEDURAL_BACKGROUND, min_length=1, description="procedural, or a folder of images to choose from."
     )
+    lamp: tuple[float, float, float] = Field(
+        (-0.45, -0.6, -0.75),
+        description="Direction of the lamp from the object, in the camera's axes of frame 0.",
+    )
     disturbances: Disturbances = Disturbances()
     supersample: int = Field(3, ge=1, le=9, description="Rays per pixel and axis; odd: one meets the centre.")
     seed: int = Field(0, ge=0, lt=2**32, description="Seed of all that is random.")
@@ -90,6 +95,19 @@ class SequenceSpec(Section):
         if supersample % 2 == 0:
             raise ValueError("it must be odd")
         return supersample
+
+    @field_validator("lamp")
+    @classmethod
+    def _the_lamp_is_somewhere(cls, lamp: tuple[float, float, float]) -> tuple[float, float, float]:
+        if not 0 < math.hypot(*lamp) < math.inf:
+            raise ValueError("it must be three numbers that are not all 0")
+        return lamp
+
+    @model_validator(mode="after")
+    def _a_room_has_walls_of_its_own(self) -> SequenceSpec:
+        if self.motion == "walk_round" and self.background != PROCEDURAL_BACKGROUND:
+            raise ValueError("walk_round has a room of its own and no other background; leave background out")
+        return self
 
     @model_validator(mode="after")
     def _blur_has_rays_to_average(self) -> SequenceSpec:
