@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
@@ -67,8 +68,8 @@ def make_room(spec: SequenceSpec, solid: Solid, path: Path) -> Room | None:
     things = [_block((0, 0), rng.uniform(1.9, 2.6, 2), (floor, table))]
     things += _clutter(rng, table, floor, half, *_behind(spec, path, R_obj_room))
 
-    textures = [_wall(rng) for _ in range(6)]
-    textures.append(pyramid(linear(paint_background(rng, _TABLE_TEXELS, _TABLE_TEXELS, rng.uniform(1, 3)))))
+    textures = [_plane(rng, _WALL_TEXELS) for _ in range(6)]
+    textures.append(_plane(rng, _TABLE_TEXELS))
     textures += [pyramid(linear(paint_panel(rng, _CLUTTER_TEXELS))) for _ in things[1:]]
     vertices, faces, uvs, looks = [], [], [], []
     count = 0
@@ -141,8 +142,10 @@ def _block(place: tuple[float, float] | Array, half: Array, heights: tuple[float
     return [Patch(patch.vertices + middle, patch.faces, patch.uvs) for patch in sides]
 
 
-def _wall(rng: np.random.Generator) -> list[NDArray[np.float32]]:
-    return pyramid(linear(paint_background(rng, _WALL_TEXELS, _WALL_TEXELS, rng.uniform(0.5, 2.5))))
+def _plane(rng: np.random.Generator, texels: int) -> list[NDArray[np.float32]]:
+    """What is painted on a wall or the table, with the grain of plaster or wood rather than of a sensor."""
+    painted = paint_background(rng, texels, texels, rng.uniform(0.4, 2.0))
+    return pyramid(linear(cv2.GaussianBlur(painted, (0, 0), texels / 700)))
 
 
 def _density(mesh: trimesh.Trimesh, uvs: Array, texels: NDArray[np.int64]) -> Array:
