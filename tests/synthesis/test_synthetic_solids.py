@@ -10,6 +10,7 @@ from PIL import Image
 from tracking3d.errors import InputError
 from tracking3d.synthesis.texture_lookup import bilinear
 from tracking3d.synthesis.procedural_solids import PROCEDURAL
+from tracking3d.synthesis.random_solids import _ASSEMBLIES
 from tracking3d.synthesis.ray_casting import Surface
 from tracking3d.synthesis.scene import make_solid
 from tracking3d.synthesis.spec import SequenceSpec
@@ -69,12 +70,72 @@ def test_the_sides_of_a_card_differ():
     assert np.abs(sides[0].astype(int) - sides[1]).mean() > 20
 
 
-def test_the_seed_changes_the_texture_and_only_the_blobs_shape():
+SHAPES_OF_THE_SEED = {"blob", "organic", "assembly", "stick", "knob", "bowl"}
+
+
+def test_the_seed_changes_every_texture_and_the_shapes_that_are_drawn():
     for name in PROCEDURAL:
         one, same, other = (solid(name, seed=seed) for seed in (1, 1, 2))
         assert (one.texture == same.texture).all() and (one.vertices == same.vertices).all()
         assert (one.texture != other.texture).any()
-        assert (one.vertices != other.vertices).any() == (name == "blob")
+        same_shape = one.vertices.shape == other.vertices.shape and (one.vertices == other.vertices).all()
+        assert same_shape == (name not in SHAPES_OF_THE_SEED)
+
+
+@pytest.mark.parametrize("name", ["organic", "assembly", "stick", "knob", "bowl"])
+@pytest.mark.parametrize("seed", range(9000, 9012))
+def test_shapes_of_the_seed_are_closed_in_the_middle_and_never_show_their_inside(name, seed):
+    made = solid(name, seed=seed, textured=False)
+    mesh = merged(made)
+    assert mesh.is_watertight and mesh.volume > 0
+    assert made.vertices.min(0) == pytest.approx(-made.vertices.max(0)) and made.radius == pytest.approx(0.95)
+    surface = Surface.of(made.mesh())
+    rng = np.random.default_rng(seed)
+    origins = rng.normal(size=(400, 3))
+    origins *= 4 / np.linalg.norm(origins, axis=1, keepdims=True)
+    directions = rng.uniform(-0.6, 0.6, (400, 3)) - origins
+    face = surface.cast(origins, directions).face
+    seen = face >= 0
+    facing = np.einsum("ij,ij->i", surface.face_normals[face[seen]], directions[seen])
+    assert seen.sum() > 20 and facing.max() < 1e-6
+
+
+def test_every_kind_of_assembly_is_in_one_piece_and_concave():
+    for boxes in _ASSEMBLIES.values():
+        spans = np.array(boxes)
+        for seed in range(20):  # faces move by less than boxes overlap
+            moved = spans + np.random.default_rng(seed).uniform(-0.02, 0.02, spans.shape)
+            low, high = moved[:, :, 0], moved[:, :, 1]
+            touching = (np.minimum(high[:, None], high) - np.maximum(low[:, None], low) > 0.01).all(2)
+            assert np.linalg.matrix_power(touching.astype(int), len(spans)).all()
+    for seed in range(9000, 9010):
+        mesh = merged(solid("assembly", seed=seed))
+        assert mesh.volume < 0.9 * mesh.convex_hull.volume
+
+
+def test_a_faint_print_is_the_same_print_nearer_to_its_mean_colour():
+    strong, faint, none = (solid("box", print_strength=strength).texture for strength in (1.0, 0.25, 0.0))
+    assert (none == none[0, 0]).all()
+    expected = none + 0.25 * (strong.astype(float) - none)
+    assert np.abs(faint - expected).max() <= 1
+    seen = bilinear(strong.astype(np.float32), solid("box").uvs).mean(0)
+    assert np.abs(none[0, 0] - seen).max() < 60
+
+
+def test_without_its_print_an_object_has_the_symmetries_of_a_plain_one():
+    assert len(solid("box", print_strength=0.0).symmetries) == 4
+    assert len(solid("box", print_strength=0.1).symmetries) == 1
+    for made in (solid("bowl", print_strength=0.0), solid("bowl", textured=False)):
+        assert made.axis == pytest.approx([0, 1, 0])
+    assert solid("bowl").axis is None and solid("knob", textured=False).axis is None
+
+
+def test_the_colours_of_a_mesh_file_fade_too(tmp_path):
+    mesh = trimesh.creation.box()
+    mesh.visual.vertex_colors = np.arange(8)[:, None] * [30, 20, 10] + [0, 0, 50]
+    mesh.export(tmp_path / "box.ply")
+    strong, faint = (solid(tmp_path / "box.ply", print_strength=strength).colours for strength in (1.0, 0.5))
+    assert np.ptp(faint, axis=0) == pytest.approx(0.5 * np.ptp(strong, axis=0), abs=1)
 
 
 @pytest.mark.parametrize("name", PROCEDURAL)

@@ -1,7 +1,6 @@
 """Two result sets side by side: is a change an improvement, or chance?
 
-The sequences are the sample. Each contributes one difference, B less A; the interval of their mean is the percentile
-bootstrap over sequences (Efron, "Bootstrap methods: another look at the jackknife", 1979).
+The sequences are the sample. Each contributes one difference, B less A; the interval is that of their mean.
 """
 
 from __future__ import annotations
@@ -11,13 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from rich.markup import escape
 from rich.table import Table
-from scipy.stats import bootstrap
 
+from tracking3d.benchmark.intervals import LEVEL, interval
 from tracking3d.benchmark.results import ResultSet, figure
 from tracking3d.errors import InputError
-
-LEVEL = 0.95
-RESAMPLES = 9999
 
 MEASURES = {
     "iou_mean": ("IoU", True),
@@ -85,23 +81,6 @@ def compare(a: ResultSet, b: ResultSet, seed: int = 0) -> list[Comparison]:
             "The two result sets have no scored sequence in common; compare two of the same data."
         )
     return comparisons
-
-
-def interval(differences: np.ndarray, seed: int = 0) -> tuple[float | None, float | None]:
-    """Percentile bootstrap interval of the mean of ``differences`` ``(N,)``; None for fewer than two."""
-    if len(differences) < 2:
-        return None, None
-    if np.ptp(differences) == 0:
-        return float(differences[0]), float(differences[0])
-    result = bootstrap(
-        (differences,),
-        np.mean,
-        n_resamples=RESAMPLES,
-        confidence_level=LEVEL,
-        method="percentile",
-        rng=np.random.default_rng(seed),
-    )
-    return float(result.confidence_interval.low), float(result.confidence_interval.high)
 
 
 def format_comparison(comparisons: list[Comparison], a: ResultSet, b: ResultSet) -> list[Table]:

@@ -13,6 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from tracking3d.benchmark.fingerprint import code_fingerprint
+from tracking3d.benchmark.intervals import LEVEL, interval
 from tracking3d.benchmark.pool import Outcome
 from tracking3d.benchmark.sequences import Dataset
 from tracking3d.benchmark.variant import Variant
@@ -82,6 +83,11 @@ class ResultSet:
         values = list(self.values(measure).values())
         return float(np.mean(values)) if values else None
 
+    def interval(self, measure: str) -> tuple[float, float] | None:
+        """Bootstrap interval of `mean` over the sequences; None where fewer than two are known."""
+        low, high = interval(np.array(list(self.values(measure).values())))
+        return None if low is None or high is None else (low, high)
+
 
 def collect(variant: Variant, dataset: Dataset, outcomes: Sequence[Outcome]) -> ResultSet:
     """The result set of one variant's outcomes."""
@@ -118,6 +124,7 @@ def write_results(results: ResultSet, file: Path) -> None:
         "dataset": results.dataset,
         **results.about,
         "mean": {measure: results.mean(measure) for measure in measures},
+        "interval": {measure: results.interval(measure) for measure in measures},
         "sequences": results.scores,
         "causal": results.causal,
         "errors": results.errors,
@@ -138,6 +145,7 @@ def read_results(file: Path) -> ResultSet:
         if document.pop("format") != FORMAT:
             raise ValueError("another format")
         document.pop("mean")
+        document.pop("interval", None)
         label, name, scores, errors = (
             document.pop(one) for one in ("label", "dataset", "sequences", "errors")
         )
@@ -150,7 +158,7 @@ def read_results(file: Path) -> ResultSet:
 
 
 def format_results(results: ResultSet) -> Table:
-    """The main measures of every sequence and their means."""
+    """The main measures of every sequence, their means, and how far these would move with other sequences."""
     shown = {name: title for name, title in COLUMNS.items() if results.values(name)}
     table = Table(title=escape(f"{results.dataset}: {results.label}"), title_justify="left")
     table.add_column("sequence")
@@ -160,11 +168,21 @@ def format_results(results: ResultSet) -> Table:
         table.add_row(escape(name), *(figure((scores or {}).get(measure), measure) for measure in shown))
     table.add_section()
     table.add_row("mean", *(figure(results.mean(measure), measure) for measure in shown), style="bold")
+    between = {measure: results.interval(measure) for measure in shown}
+    if any(between.values()):
+        table.add_row(
+            f"{LEVEL:.0%} interval",
+            *("-" if ends is None else _between(ends, measure) for measure, ends in between.items()),
+        )
     if (whole := results.mean("seconds_per_frame")) is not None:
         stages = {stage: results.mean(f"seconds_{stage}") for stage in STAGES}
         parts = ", ".join(f"{stage} {mean:.3f}" for stage, mean in stages.items() if mean is not None)
         table.caption, table.caption_justify = f"{whole:.3f} s a frame{parts and ': '}{parts}", "left"
     return table
+
+
+def _between(ends: tuple[float, float], measure: str) -> str:
+    return " to ".join(figure(end, measure) for end in ends)
 
 
 def figure(value: float | None, measure: str) -> str:

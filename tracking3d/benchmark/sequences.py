@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
@@ -10,6 +10,8 @@ from pathlib import Path
 from tracking3d.datasets.layout import load_layout
 from tracking3d.datasets.reading import list_sequences
 from tracking3d.errors import InputError
+from tracking3d.synthesis.fresh import FRESH, seed_of
+from tracking3d.synthesis.spec import SequenceSpec
 from tracking3d.synthesis.suite import SUITE_VERSION, SUITES, make_suite
 
 REAL = "real"
@@ -36,7 +38,7 @@ class Dataset:
     @property
     def synthetic(self) -> bool:
         """Whether it is one of the suites that this package makes."""
-        return self.name in SUITES
+        return self.version is not None
 
     def only(self, patterns: list[str]) -> Dataset:
         """The sequences that match any of the patterns, all if there is no pattern.
@@ -56,24 +58,30 @@ class Dataset:
 
 
 def open_dataset(
-    name: str, data: Path | None, out: Path, jobs: int, listener: Callable[[str], None] = lambda name: None
+    name: str,
+    data: Path | None,
+    out: Path,
+    jobs: int,
+    listener: Callable[[str], None] = lambda name: None,
+    specs: Sequence[SequenceSpec] | None = None,
 ) -> Dataset:
     """Find a dataset by name; a synthetic suite that is not there yet is made.
 
     Args:
-        name: One of `SUITES`; ``real`` for a folder of clips in our own layout; the name of a dataset's layout; or a
-            YAML file of one.
+        name: One of `SUITES`; ``fresh-SEED``; ``real`` for a folder of clips in our own layout; the name of a
+            dataset's layout; or a YAML file of one.
         data: Where it lies; a synthetic suite's default is ``out/data/NAME``.
         out: Folder of the benchmark.
         jobs: Processes that make a suite.
         listener: Is told of every sequence of a suite as it is made.
+        specs: The sequences of a suite that is none of these but called ``name``.
 
     Raises:
         InputError: If there is no such dataset, or it holds no sequence.
     """
-    if name in SUITES:
+    if specs is not None or name in (*SUITES, FRESH) or seed_of(name) is not None:
         folder = data or out / "data" / name
-        made = make_suite(name, folder, jobs=jobs, listener=listener)
+        made = make_suite(name, folder, specs=specs, jobs=jobs, listener=listener)
         return Dataset(name, SUITE_VERSION, "clip", folder, tuple(path.name for path in made))
     if data is None:
         raise InputError(f"Say where the dataset {name} lies: --data DIR.")

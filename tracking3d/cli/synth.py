@@ -5,12 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from tracking3d.cli.fresh import Count, Meshes, drawn_suite
 from tracking3d.cli.options import Debug, Quiet, numbers
 from tracking3d.errors import InputError
+
+if TYPE_CHECKING:
+    from tracking3d.synthesis.spec import SequenceSpec
 
 _ONE = "One sequence"
 
@@ -20,14 +24,17 @@ def synth(
         Path, typer.Argument(metavar="OUT", help="Folder of the suite, or of the one sequence.")
     ] = Path("synthetic"),
     suite: Annotated[
-        str | None, typer.Option(metavar="NAME", help="A fixed suite: smoke, standard, hard or full.")
+        str | None, typer.Option(metavar="NAME", help="A suite: smoke, standard, hard, full, or fresh with --seed.")
     ] = None,
+    count: Count = None,
+    meshes: Meshes = None,
     object_: Annotated[
         str | None,
         typer.Option(
             "--object",
             metavar="NAME|MESH",
-            help="box, bottle, blob, mug, card, wedge, vase, or a mesh file in metres.",
+            help="box, bottle, blob, mug, card, wedge, vase; organic, assembly, stick, knob, bowl of a shape from the "
+            "seed; or a mesh file in metres.",
             rich_help_panel=_ONE,
         ),
     ] = None,
@@ -35,7 +42,7 @@ def synth(
         str | None,
         typer.Option(
             metavar="NAME",
-            help="tumble, turntable, turn_and_back, flip, fast, depth_drift or leave_and_return.",
+            help="tumble, turntable, turn_and_back, flip, fast, depth_drift, leave_and_return or walk_round.",
             rich_help_panel=_ONE,
         ),
     ] = None,
@@ -84,7 +91,7 @@ def synth(
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Render sequences with exact masks, poses, depth and point tracks: a fixed suite, or one sequence.
+    """Render sequences with exact masks, poses, depth and point tracks: a suite, or one sequence.
 
     They are ray cast, not rendered by the renderer that tracks. What is complete already is not made again.
     """
@@ -101,28 +108,30 @@ def synth(
         "seed": seed,
     }
     settings = {name: value for name, value in given.items() if value is not None}
-    if suite is not None and settings:
-        raise InputError(
-            f"--suite {suite} is fixed and does not go with --{next(iter(settings))}; leave one of them out."
-        )
+    drawn = drawn_suite(suite or "one sequence", seed if suite else None, count, meshes)
+    others = next((name for name in settings if (suite, name) != ("fresh", "seed")), None)
+    if suite is not None and others:
+        raise InputError(f"--suite {suite} is fixed and does not go with --{others}; leave one of them out.")
     if suite is not None:
-        folders = _make_suite(suite, out, jobs, overwrite, quiet)
+        folders = _make_suite(*drawn, out, jobs, overwrite, quiet)
     elif object_ is not None:
         folders = _make_one(settings, out, overwrite, quiet)
     else:
         raise InputError(
-            "Say what to make: --suite smoke, standard, hard or full, or one sequence by --object NAME."
+            "Say what to make: --suite smoke, standard, hard, full or fresh, or one sequence by --object NAME."
         )
     if bop is not None:
         _export(folders, bop, quiet)
 
 
-def _make_suite(name: str, out: Path, jobs: int, overwrite: bool, quiet: bool) -> list[Path]:
+def _make_suite(
+    name: str, drawn: list[SequenceSpec] | None, out: Path, jobs: int, overwrite: bool, quiet: bool
+) -> list[Path]:
     from tracking3d.synthesis.suite import load_suite, make_suite
 
-    specs = load_suite(name)
+    specs = load_suite(name) if drawn is None else drawn
     with _progress(len(specs), "sequences", quiet) as advance:
-        folders = make_suite(name, out, jobs=jobs, overwrite=overwrite, listener=advance)
+        folders = make_suite(name, out, specs=specs, jobs=jobs, overwrite=overwrite, listener=advance)
     if not quiet:
         typer.echo(f"{out}: {len(folders)} sequences")
     return folders

@@ -58,7 +58,7 @@ _STRENGTHS = {
     "highlights": (0.3, 1.0),
     "motion_blur": (0.3, 1.0),
     "noise": (0.1, 0.6),
-    "low_contrast": (0.3, 0.8),
+    "low_contrast": (0.2, 0.6),
     "occluder": (0.4, 1.0),
     "jpeg": (0.3, 0.9),
 }
@@ -137,7 +137,7 @@ def _sequence(seed: int, index: int, called: str, shown: str) -> SequenceSpec:
         degrees_per_frame=round(float(rng.uniform(*_SPEEDS[motion])), 2),
         fov=round(fov, 2),
         camera_told=told,
-        fill=round(float(rng.uniform(0.45, 0.7)), 3),
+        fill=round(float(rng.uniform(0.5, 0.7)), 3),
         lamp=_lamp(rng),
         disturbances=disturbances,
         seed=int(rng.integers(2**32)),

@@ -83,7 +83,8 @@ def assembly(rng: np.random.Generator) -> list[Patch]:
     """A chair, bracket, channel, stairs, cross or hook of overlapping boxes, each of its own proportions."""
     boxes = np.array(_ASSEMBLIES[str(rng.choice(list(_ASSEMBLIES)))])
     boxes += rng.uniform(-0.02, 0.02, boxes.shape)
-    boxes *= rng.uniform(0.6, 1, 3)[:, None] * rng.choice([-1.0, 1.0], 3)[:, None]
+    mirrored = rng.choice([-1.0, 1.0], 3) * (1, 0, 1) + (0, 1, 0)
+    boxes *= (rng.uniform(0.6, 1, 3) * mirrored)[:, None]
     return _fitted([patch for box in np.sort(boxes, axis=2) for patch in _block(box)])
 
 

@@ -1,10 +1,10 @@
-"""The fixed suites of synthetic sequences: the same everywhere, for one version of them."""
+"""The suites of synthetic sequences, fixed or drawn from a seed: the same everywhere, for one version of them."""
 
 from __future__ import annotations
 
 import json
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from importlib import resources
@@ -17,23 +17,29 @@ from tracking3d.config.explain import hint
 from tracking3d.config.yaml_files import read_mapping
 from tracking3d.errors import InputError, OutputError
 from tracking3d.results.files import write_atomic, writing
+from tracking3d.synthesis.fresh import FRESH, fresh_suite, seed_of
 from tracking3d.synthesis.spec import SequenceSpec, check_spec
 from tracking3d.synthesis.writing import SUITE_VERSION, is_complete, write_sequence
 
 __all__ = ["SUITES", "SUITE_VERSION", "load_suite", "make_suite"]
 
 SUITES = ("smoke", "standard", "hard", "full")
-"""The suites by name, in order of size."""
+"""The fixed suites by name, in order of size."""
 
 
 def load_suite(name: str) -> list[SequenceSpec]:
-    """The sequences of a suite.
+    """The sequences of a suite: one of `SUITES`, or ``fresh-SEED``.
 
     Raises:
         InputError: If there is no such suite.
     """
+    if (seed := seed_of(name)) is not None:
+        return fresh_suite(seed)
+    if name == FRESH:
+        raise InputError(f"The suite {FRESH} is drawn from a seed; say --seed N, or name it {FRESH}-N.")
     if name not in SUITES:
-        raise InputError(f"There is no suite '{name}' (available: {', '.join(SUITES)}); {hint(name, SUITES)}")
+        known = (*SUITES, FRESH)
+        raise InputError(f"There is no suite '{name}' (available: {', '.join(known)}); {hint(name, known)}")
     with resources.as_file(resources.files("tracking3d.synthesis") / "suites" / f"{name}.yaml") as file:
         document = read_mapping(file)
     common = document.get("common", {})
@@ -44,6 +50,7 @@ def make_suite(
     name: str,
     folder: Path,
     *,
+    specs: Sequence[SequenceSpec] | None = None,
     jobs: int = 1,
     overwrite: bool = False,
     listener: Callable[[str], None] = lambda name: None,
@@ -51,8 +58,9 @@ def make_suite(
     """Make the sequences of a suite that are not there yet, one folder for each, and ``suite.json``.
 
     Args:
-        name: One of `SUITES`.
+        name: One of `SUITES`, or what a suite with sequences of its own is called.
         folder: Where to write; made if absent.
+        specs: The sequences; those of `load_suite` if left out.
         jobs: Processes.
         overwrite: Make complete sequences too.
         listener: Is told the name of every sequence as it is made.
@@ -64,7 +72,7 @@ def make_suite(
         InputError: If there is no such suite, or Embree is not installed.
         OutputError: If it cannot be written.
     """
-    specs = load_suite(name)
+    specs = load_suite(name) if specs is None else specs
     missing = [spec for spec in specs if overwrite or not is_complete(folder / spec.name, spec)]
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)

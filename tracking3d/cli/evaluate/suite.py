@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from tracking3d.cli.evaluate.options import Data, Jobs, Masks, Out, Sequences, name_of_settings
+from tracking3d.cli.fresh import Count, Meshes, drawn_suite
 from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quiet, configure
 
 
@@ -16,9 +17,15 @@ def suite(
         str,
         typer.Argument(
             metavar="NAME",
-            help="smoke, standard, hard, full (synthetic), real, the layout of a dataset, or a YAML file of one.",
+            help="smoke, standard, hard, full, fresh (synthetic), real, the layout of a dataset, or a YAML file of "
+            "one.",
         ),
     ],
+    seed: Annotated[
+        int | None, typer.Option(metavar="N", help="Of the suite fresh: what its sequences are drawn from.")
+    ] = None,
+    count: Count = None,
+    meshes: Meshes = None,
     data: Data = None,
     masks: Masks = "tracker",
     sequences: Sequences = None,
@@ -45,11 +52,12 @@ def suite(
     from tracking3d.cli.tables import print_table
 
     check_masks(masks)
+    name, specs = drawn_suite(name, seed, count, meshes)
     settings = configure(config, preset, overrides)
     called = label or name_of_settings(config, preset, overrides, masks)
     variant = Variant(label=called, config=settings, masks=masks)
     with making_progress(quiet) as made:
-        dataset = open_dataset(name, data, out, jobs, made).only(sequences or [])
+        dataset = open_dataset(name, data, out, jobs, made, specs).only(sequences or [])
     with jobs_progress(len(dataset.sequences), quiet) as listener:
         [results] = run_suite([variant], dataset, out, jobs, listener)
     file = out / "results" / f"{file_name(called)}-{dataset.name}.json"
