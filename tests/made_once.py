@@ -42,7 +42,8 @@ def make_once() -> None:
     first_mask._grab_cut = MadeOnce(first_mask._grab_cut, _of_bytes)
     convex_clips.synthesize = MadeOnce(convex_clips.synthesize, lambda spec: spec)
     scene.make_procedural_solid = MadeOnce(
-        scene.make_procedural_solid, lambda spec: (spec.object, spec.textured, spec.seed)
+        scene.make_procedural_solid,
+        lambda spec: (spec.object, spec.textured, spec.print_strength == 0, spec.seed),
     )
 
 

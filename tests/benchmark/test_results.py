@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from tracking3d.benchmark.pool import Outcome
@@ -37,6 +38,33 @@ def test_a_file_gives_back_what_was_written(tmp_path):
     assert read_results(tmp_path / "new/results.json") == RESULTS
     document = json.loads((tmp_path / "new/results.json").read_text())
     assert document["mean"] == {"iou_mean": pytest.approx(0.6), "frames_lost": 2}
+    assert document["interval"] == {"iou_mean": pytest.approx([0.5, 0.7]), "frames_lost": None}
+    del document["interval"]  # files from before have none
+    (tmp_path / "old.json").write_text(json.dumps(document))
+    assert read_results(tmp_path / "old.json") == RESULTS
+
+
+def of(values):
+    return ResultSet("mine", "standard", {f"s{n}": {"iou_mean": v} for n, v in enumerate(values)}, {}, {})
+
+
+def test_an_interval_of_coin_tosses_is_the_binomial_distributions():
+    low, high = of([0.0, 1.0] * 12).interval("iou_mean")
+    # Means of 24 tosses: 95 % lie from 7 to 17 heads.
+    assert (low, high) == pytest.approx((7 / 24, 17 / 24), abs=1 / 24)
+    assert of([0.0, 1.0] * 12).interval("iou_mean") == (low, high)
+    assert of([0.5, 0.5]).interval("iou_mean") == (0.5, 0.5)
+
+
+def test_more_sequences_make_an_interval_narrower():
+    widths = [np.ptp(of([0.2, 0.9, 0.4] * count).interval("iou_mean")) for count in (1, 4, 16)]
+    assert widths[0] > 1.5 * widths[1] > 2.2 * widths[2]
+
+
+def test_there_is_no_interval_of_one_sequence_or_of_the_infinite():
+    assert of([0.5]).interval("iou_mean") is None
+    assert of([]).interval("iou_mean") is None
+    assert of([0.5, float("inf")]).interval("iou_mean") is None
 
 
 REFINED = ResultSet(
@@ -95,5 +123,13 @@ def test_another_file_is_refused_by_name(tmp_path, text):
         read_results(tmp_path / "other.json")
 
 
-def test_the_table_has_a_line_for_each_sequence_and_the_mean():
-    assert format_results(RESULTS).row_count == 4
+def test_the_table_has_a_line_for_each_sequence_the_mean_and_its_interval():
+    table = format_results(RESULTS)
+    columns = {column.header: list(column.cells) for column in table.columns}
+    assert columns["sequence"] == ["a", "b", "c", "mean", "95% interval"]
+    assert columns["IoU"][-2:] == ["0.600", "0.500 to 0.700"]
+    assert columns["lost"][-2:] == ["2.0", "-"]
+
+
+def test_a_table_of_one_sequence_has_no_interval():
+    assert format_results(of([0.5])).row_count == 2

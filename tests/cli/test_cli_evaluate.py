@@ -78,6 +78,32 @@ def test_a_sequence_that_fails_is_named_and_the_others_are_kept(call, clips, job
     assert kept["errors"] == {"two": "it crashed"} and kept["sequences"]["one"]["iou_mean"] > 0.9
 
 
+def test_a_fresh_suite_is_drawn_from_its_seed_and_kept_apart(call, clips, jobs, monkeypatch):
+    asked = []
+
+    def make(name, folder, *, specs, **named):
+        asked.append((name, folder, specs and [spec.seed for spec in specs]))
+        return made(clips)
+
+    monkeypatch.setattr("tracking3d.benchmark.sequences.make_suite", make)
+    for seed in (9000, 9001):
+        fresh = ("evaluate", "suite", "fresh", "--seed", seed, "--count", 5, "--label", "mine")
+        result = call(*fresh)
+        assert result.exit_code == 0, result.output
+        assert "95% interval" in result.stdout
+        assert Path(f"benchmark/results/mine-fresh-{seed}.json").is_file()
+    assert [(name, folder) for name, folder, _ in asked] == [
+        (f"fresh-{seed}", Path(f"benchmark/data/fresh-{seed}")) for seed in (9000, 9001)
+    ]
+    assert [len(seeds) for _, _, seeds in asked] == [5, 5] and not set(asked[0][2]) & set(asked[1][2])
+    compared = call(
+        "evaluate", "compare", *[f"benchmark/results/mine-fresh-{seed}.json" for seed in (9000, 9001)]
+    )
+    assert compared.exit_code == 2 and "of different data" in compared.stderr
+    assert call("evaluate", "compare", "paper", "default", "--suite", "fresh-9000").exit_code == 0
+    assert asked[-1] == ("fresh-9000", Path("benchmark/data/fresh-9000"), None)
+
+
 def test_only_the_sequences_that_match_are_run(call, clips, jobs, refused):
     call("evaluate", "suite", "real", "--data", clips, "--sequence", "t*")
     assert [job.sequence for job in jobs.asked] == ["two"]

@@ -57,17 +57,18 @@ def test_a_longer_suite_begins_with_the_shorter_one(meshes):
 @pytest.mark.parametrize("seed", SEEDS)
 def test_any_two_dozen_sequences_hold_every_kind(seed):
     suite = fresh_suite(seed, 48)
-    for first in (0, 5, 24):
+    for first in range(25):
         specs = suite[first : first + 24]
         assert {spec.object for spec in specs} == set(OBJECTS)
         assert {spec.motion for spec in specs} == motions()
+    for specs in (suite[:24], suite[24:]):
         prints = Counter(
             "plain" if not spec.textured else "strong" if spec.print_strength == 1 else "faint"
             for spec in specs
         )
         assert min(prints[kind] for kind in ("strong", "faint", "plain")) >= 3
         assert 11 <= sum(spec.camera_told for spec in specs) <= 13
-        assert 5 <= sum(spec.motion == "walk_round" for spec in specs) <= 7
+        assert sum(spec.motion == "walk_round" for spec in specs) == 6
         disturbed = [sum(value > 0 for _, value in spec.disturbances) for spec in specs]
         assert 8 <= np.count_nonzero(disturbed) <= 12 and set(disturbed) == {0, 1, 2}
     assert len({spec.name for spec in suite}) == 48 == len({spec.seed for spec in suite})
@@ -111,11 +112,12 @@ def test_a_suite_is_called_after_its_seed_and_folder(meshes):
 
 
 def quick(spec: SequenceSpec) -> SequenceSpec:
-    return spec.model_copy(update={"frames": 2, "size": (48, 36), "supersample": 1, "disturbances": {}})
+    return spec.model_copy(update={"frames": 2, "size": (48, 36), "supersample": 1})
 
 
 def test_the_same_seed_gives_the_same_bytes(tmp_path):
-    spec = SequenceSpec.model_validate(quick(fresh_suite(9003)[0]).model_dump())
+    spec = next(spec for spec in fresh_suite(9003) if spec.disturbances.motion_blur == 0)
+    spec = quick(spec)
     one, other = (write_sequence(tmp_path / name, spec) for name in ("one", "other"))
     for file in (path for path in one.rglob("*") if path.is_file()):
         assert file.read_bytes() == (other / file.relative_to(one)).read_bytes(), file

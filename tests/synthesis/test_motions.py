@@ -123,3 +123,33 @@ def test_the_first_view_does_not_depend_on_the_speed(motion):
 def test_one_frame_alone_has_a_pose():
     for motion in MOTIONS:
         assert poses(motion, frames=1).shape == (1, 4, 4)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("fov", [8.0, 75.0])
+def test_a_walking_camera_stays_above_and_upright_and_keeps_the_object_in_the_image(seed, fov):
+    camera = Camera.from_fov(320, 240, fov)
+    T = poses("walk_round", seed=seed, camera=camera, degrees_per_frame=3.0, fill=0.7)
+    cameras = -np.einsum("nij,ni->nj", T[:, :3, :3], T[:, :3, 3])
+    above = np.degrees(np.arcsin(cameras[:, 1] / np.linalg.norm(cameras, axis=1)))
+    assert above.min() > 5 and above.max() < 45 and np.ptp(above) > 0.5
+    round_it = np.degrees(np.unwrap(np.arctan2(cameras[:, 0], cameras[:, 2])))
+    assert abs(round_it[-1] - round_it[0]) == pytest.approx(3.0 * 39, rel=0.1)
+    up = T[:, :3, 1]  # of the object, in camera axes: y is down
+    assert (up[:, 1] < -0.7).all() and (np.abs(up[:, 0]) < 0.1).all()
+
+    centre, depth = T[:, :3, 3] @ camera.K.T, T[:, 2, 3]
+    pixel = centre[:, :2] / centre[:, 2:]
+    outline = camera.fy / np.sqrt(depth**2 - 1)
+    assert (outline + np.abs(pixel[:, 1] - 119.5) < 125).all()  # but for a few pixels of the sphere around it
+    away = np.linalg.norm(pixel - (159.5, 119.5), axis=1)
+    assert away[0] < 1 and away.max() > 5
+    assert 0.02 < np.ptp(depth) / depth[0] < 0.2
+
+
+def test_a_camera_walks_either_way_round():
+    ways = {
+        np.sign(Rotation.from_matrix(T[1, :3, :3] @ T[0, :3, :3].T).as_rotvec()[1])
+        for T in (poses("walk_round", seed=seed) for seed in range(8))
+    }
+    assert ways == {-1, 1}

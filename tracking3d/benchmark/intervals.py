@@ -14,7 +14,10 @@ RESAMPLES = 9999
 
 
 def interval(values: np.ndarray, seed: int = 0) -> tuple[float | None, float | None]:
-    """Percentile bootstrap interval of the mean of ``values`` ``(N,)`` at `LEVEL`; None for fewer than two or infinite ones."""
+    """Percentile bootstrap interval of the mean of ``values`` ``(N,)`` at `LEVEL`.
+
+    None for fewer than two values, and where one is not finite.
+    """
     if len(values) < 2 or not np.isfinite(values).all():
         return None, None
     if np.ptp(values) == 0:

@@ -24,7 +24,8 @@ def synth(
         Path, typer.Argument(metavar="OUT", help="Folder of the suite, or of the one sequence.")
     ] = Path("synthetic"),
     suite: Annotated[
-        str | None, typer.Option(metavar="NAME", help="A suite: smoke, standard, hard, full, or fresh with --seed.")
+        str | None,
+        typer.Option(metavar="NAME", help="A suite: smoke, standard, hard, full, or fresh with --seed."),
     ] = None,
     count: Count = None,
     meshes: Meshes = None,

@@ -11,12 +11,12 @@ import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from tracking3d.errors import InputError
-from tracking3d.synthesis.spec import SequenceSpec
+from tracking3d.synthesis.spec import Disturbances, SequenceSpec
 
 FRESH = "fresh"
 """What the suites are called; with ``-SEED`` it is one of them."""
@@ -119,27 +119,22 @@ def _sequence(seed: int, index: int, called: str, shown: str) -> SequenceSpec:
     stratum = dealt("lens", range(_LENSES))
     fov = NARROWEST * (WIDEST / NARROWEST) ** ((stratum + rng.random()) / _LENSES)
     told = dealt("told", (True, False))
-    look: dict[str, Any] = {
-        "strong": {},
-        "faint": {"print_strength": round(float(rng.uniform(0.12, 0.4)), 3)},
-        "plain": {"textured": False},
-    }[dealt("print", _PRINTS)]
-    disturbances = {
-        name: round(float(rng.uniform(*_STRENGTHS[name])), 2)
-        for name in rng.permutation(list(_STRENGTHS))[: dealt("disturbances", _DISTURBED)].tolist()
-    }
+    printed = dealt("print", _PRINTS)
+    hard = rng.permutation(list(_STRENGTHS))[: dealt("disturbances", _DISTURBED)].tolist()
+    disturbances = {name: round(float(rng.uniform(*_STRENGTHS[name])), 2) for name in hard}
     words = [f"{index:02d}", called, motion, f"fov{fov:.0f}", "told" if told else "untold"]
     return SequenceSpec(
         name="_".join(words),
         object=shown,
-        **look,
+        textured=printed != "plain",
+        print_strength=round(float(rng.uniform(0.12, 0.4)), 3) if printed == "faint" else 1.0,
         motion=motion,
         degrees_per_frame=round(float(rng.uniform(*_SPEEDS[motion])), 2),
         fov=round(fov, 2),
         camera_told=told,
         fill=round(float(rng.uniform(0.5, 0.7)), 3),
         lamp=_lamp(rng),
-        disturbances=disturbances,
+        disturbances=Disturbances(**disturbances),
         seed=int(rng.integers(2**32)),
     )
 
@@ -155,9 +150,7 @@ def _mesh_files(folder: Path) -> list[tuple[str, str]]:
     """Names of their own for the mesh files of a folder, and their paths, in order."""
     if not folder.is_dir():
         raise InputError(f"--meshes {folder} is no folder; give one with mesh files in it.")
-    files = sorted(
-        file for file in folder.rglob("*") if file.suffix.lower() in MESHES and file.is_file()
-    )
+    files = sorted(file for file in folder.rglob("*") if file.suffix.lower() in MESHES and file.is_file())
     if not files:
         raise InputError(f"--meshes {folder} holds no mesh file ({', '.join(MESHES)}); give another folder.")
     return [(_plain("_".join(file.relative_to(folder).with_suffix("").parts)), str(file)) for file in files]

@@ -118,7 +118,8 @@ def _walk(times: Array, last: int, speed: float, rng: np.random.Generator) -> Ar
 
 def _walked(times: Array, spin: Array, rng: np.random.Generator) -> Rotation:
     """Rotations of a still object that a camera walks round: upright but for the hand that holds the camera."""
-    azimuth = rng.uniform(0, 360) + np.degrees(np.cumsum(spin[:, 1]) * (times[1] - times[0]))
+    azimuth = np.degrees(np.cumsum(spin[:, 1]) * (times[1] - times[0]))
+    azimuth += rng.uniform(0, 360) - azimuth[_STEPS]
     height = rng.uniform(14, 34) + _waves(times, rng, 4.0, (35, 60)) + _waves(times, rng, 0.25, (5, 9))
     roll = rng.uniform(-2, 2) + _waves(times, rng, 1.2, (15, 30)) + _waves(times, rng, 0.25, (5, 9))
     return Rotation.from_euler("yxz", np.stack([azimuth, 180 + height, roll], 1), degrees=True)

@@ -80,7 +80,7 @@ def make_room(spec: SequenceSpec, solid: Solid, path: Path) -> Room | None:
         looks.append(np.full(len(patch.faces), look))
         count += len(patch.vertices)
     mesh = trimesh.Trimesh(np.concatenate(vertices), np.concatenate(faces), process=False)
-    look, uv = np.concatenate(looks), np.concatenate(uvs)
+    look_of_face, uv = np.concatenate(looks), np.concatenate(uvs)
     T_obj_room = np.eye(4)
     T_obj_room[:3, :3] = R_obj_room
     return Room(
@@ -89,8 +89,8 @@ def make_room(spec: SequenceSpec, solid: Solid, path: Path) -> Room | None:
         solid.radius * np.array([half[0], table + rng.uniform(7.2, 8.5), half[1]]),
         Surface.of(mesh),
         uv,
-        look,
-        _density(mesh, uv, np.array([levels[0].shape[0] for levels in textures])[look]),
+        look_of_face,
+        _density(mesh, uv, np.array([levels[0].shape[0] for levels in textures])[look_of_face]),
         textures,
     )
 

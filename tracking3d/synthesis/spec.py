@@ -20,7 +20,9 @@ from tracking3d.errors import InputError
 Strength = Annotated[float, Field(ge=0, le=1)]
 """0 is off, 1 the strongest."""
 
-Motion = Literal["tumble", "turntable", "turn_and_back", "flip", "fast", "depth_drift", "leave_and_return", "walk_round"]
+Motion = Literal[
+    "tumble", "turntable", "turn_and_back", "flip", "fast", "depth_drift", "leave_and_return", "walk_round"
+]
 """See `tracking3d.synthesis.motions`; at ``walk_round`` the camera moves, round a still object in a room."""
 
 PROCEDURAL_BACKGROUND = "procedural"
@@ -57,7 +59,10 @@ class SequenceSpec(Section):
     object: str = Field("box", min_length=1, description="A procedural object, or a mesh file.")
     textured: bool = Field(True, description="Printed with patterns, or nearly one plain colour.")
     print_strength: float = Field(
-        1.0, ge=0, le=1, description="How strongly the print shows on its mean colour; 0 is that colour alone."
+        1.0,
+        ge=0,
+        le=1,
+        description="How strongly the print shows on its mean colour; 0 is that colour alone.",
     )
     motion: Motion = Field("tumble", description="How the object moves.")
     degrees_per_frame: float = Field(4.0, ge=0, le=60, description="Speed of rotation; the peak for `fast`.")
