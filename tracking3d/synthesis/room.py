@@ -86,7 +86,7 @@ def make_room(spec: SequenceSpec, solid: Solid, path: Path) -> Room | None:
     return Room(
         T_obj_room,
         solid.radius * np.array([-half[0], floor, -half[1]]),
-        solid.radius * np.array([half[0], table + rng.uniform(7.2, 8.5), half[1]]),
+        solid.radius * np.array([half[0], table + rng.uniform(8.2, 9.5), half[1]]),
         Surface.of(mesh),
         uv,
         look_of_face,
