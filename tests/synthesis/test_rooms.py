@@ -7,7 +7,9 @@ import pytest
 
 from tracking3d.errors import InputError
 from tracking3d.synthesis.frame_rendering import render_frame
+from tracking3d.synthesis.lighting import lamp_at
 from tracking3d.synthesis.pixel_rays import project, ray_directions
+from tracking3d.synthesis.room_rendering import room_light
 from tracking3d.synthesis.scene import make_scene
 from tracking3d.synthesis.spec import SequenceSpec, check_spec
 
@@ -28,10 +30,7 @@ def scenes():
 
 
 def room_depth(scene, T, x, y):
-    """Depth of the room along rays through pixels, by a plain search in its coordinates."""
-    from tracking3d.synthesis.lighting import lamp_at
-    from tracking3d.synthesis.room_rendering import room_light
-
+    """Depth of the room along rays through pixels, as if there were no object."""
     lamp = lamp_at(scene.spec, 0, T[:3, 3], scene.solid.radius)
     return room_light(scene, scene.room, T, x, y, lamp, lamp.position)[1]
 
