@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tracking3d.errors import InputError
+from tracking3d.synthesis import room
 from tracking3d.synthesis.frame_rendering import render_frame
 from tracking3d.synthesis.lighting import lamp_at
 from tracking3d.synthesis.pixel_rays import project, ray_directions
@@ -17,6 +18,15 @@ from tracking3d.synthesis.spec import SequenceSpec, check_spec
 def walk(**settings) -> SequenceSpec:
     quick = {"object": "bowl", "size": (64, 48), "frames": 40, "supersample": 1, "degrees_per_frame": 3.0}
     return SequenceSpec(**{"motion": "walk_round", "seed": 9001, **quick, **settings})
+
+
+@pytest.fixture(scope="module", autouse=True)
+def coarse_walls():
+    """Small images show no more of them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(room, "_WALL_TEXELS", 256)
+        patch.setattr(room, "_TABLE_TEXELS", 128)
+        yield
 
 
 @pytest.fixture(scope="module")
