@@ -9,6 +9,7 @@ from rendered_solids import pose_of
 from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.online.judgement import (
     ENOUGH_POINTS,
+    SETTLED,
     Usual,
     judge,
     likelihood,
@@ -35,6 +36,29 @@ def test_what_is_usual_is_a_running_mean():
     for _ in range(100):
         usual = usual.updated(fit(appearance=0.4, outline=0.1, overlap=0.8))
     assert (usual.appearance, usual.outline, usual.overlap) == pytest.approx((0.4, 0.1, 0.8), abs=1e-4)
+
+
+def test_what_is_usual_does_not_follow_a_decay():
+    usual = USUAL
+    for _ in range(SETTLED):
+        usual = usual.updated(fit())
+    assert usual.sound == pytest.approx((0.2, 0.3, 0.9))
+    slipping = [fit(0.2 + 0.01 * n, 0.3 + 0.05 * n, 0.9 - 0.01 * n) for n in range(50)]
+    for one in slipping:
+        usual = usual.updated(one)
+    assert unusual(slipping[-1], usual, 1.0) > 1
+    # Losses as large from the beginning on are usual.
+    other = Usual()
+    for _ in range(100):
+        other = other.updated(slipping[-1])
+    assert unusual(slipping[-1], other, 1.0) < 0.5
+
+
+def test_what_is_usual_may_become_better():
+    usual = USUAL
+    for _ in range(200):
+        usual = usual.updated(fit(0.05, 0.02, 0.99))
+    assert (usual.appearance, usual.outline, usual.overlap) == pytest.approx((0.05, 0.02, 0.99), abs=1e-3)
 
 
 def test_excess_is_the_largest_of_pixels_outline_and_overlap():

@@ -11,6 +11,7 @@ from tracked_solids import SIZE, degrees_between, scene
 from turned_solid import turned_map
 
 from tracking3d.estimation.online.bundle import Structure, adjust
+from tracking3d.estimation.online import lens
 from tracking3d.estimation.online.lens import solve_lens
 from tracking3d.estimation.online.mapping import pose_arrays, pose_of
 from tracking3d.estimation.online.points import FollowedPoints
@@ -108,6 +109,18 @@ def test_a_small_turn_does_not_tell_the_lens():
     camera = camera_of(45)
     known, _ = solved_with(camera, camera_of(20), 20.0, turn=6, noise=0.5)
     assert solve_lens(known, camera) == (known, camera)
+
+
+def test_what_no_lens_is_is_not_solved(narrow, monkeypatch):
+    known, _, _ = narrow
+    assumed = camera_of(45)
+    absurd = replace(assumed, fy=assumed.fy * 40)  # half a degree
+    monkeypatch.setattr(
+        lens, "adjust", lambda tracks, K, start, **how: replace(
+            start, cost=0.1 if "free_focal" in how else 1.0, focal_factor=absurd.fy / assumed.fy
+        )
+    )  # fmt: skip
+    assert lens.solve_lens(known, assumed) == (known, assumed)
 
 
 def test_few_landmarks_do_not_tell():

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from tracking3d.estimation.assessment import Assessment
 from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.online.belief import View
+from tracking3d.estimation.online.judgement import BELIEVED
 from tracking3d.estimation.online.points import FollowedPoints
 from tracking3d.estimation.online.pose_refinement import PoseFit
 
@@ -35,3 +36,12 @@ class Attempt:
     def lost(self) -> bool:
         """Whether the pose is not believed."""
         return self.judgement.status is Status.LOST
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether it is lost, or hardly believed."""
+        return self.judgement.confidence < BELIEVED
+
+    def better_than(self, other: Attempt) -> bool:
+        """Whether more points agree with it and the pixels fit better; any pose is better than none."""
+        return other.lost or (self.witnesses > other.witnesses and self.fit.appearance < other.fit.appearance)

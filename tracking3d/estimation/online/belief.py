@@ -146,6 +146,7 @@ class Belief:
         waits_for: Why the start waits, where that is not lack of motion.
         usual: What tracked frames have cost.
         lost_for: How many frames in a row the object has been lost.
+        doubted_for: How many frames in a row have been lost or hardly believed.
         trail: Poses and indices of the last frames that were believed.
     """
 
@@ -162,6 +163,7 @@ class Belief:
     waits_for: str = ""
     usual: Usual = field(default_factory=Usual)
     lost_for: int = 0
+    doubted_for: int = 0
     trail: tuple[tuple[Pose, int], ...] = ()
 
     def moved(self, pose: Pose, index: int, grey: NDArray[np.uint8], followed: FollowedPoints) -> Belief:

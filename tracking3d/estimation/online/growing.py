@@ -12,7 +12,6 @@ from tracking3d.estimation.online.belief import ObjectMap, View
 from tracking3d.estimation.online.joint_fit import refine_without_points
 from tracking3d.estimation.online.keeping import compacted, thinned
 from tracking3d.estimation.online.keypoints import detect
-from tracking3d.estimation.online.lens import solve_lens
 from tracking3d.estimation.online.mapping import refine_map, window_of, with_landmarks
 from tracking3d.estimation.online.points import MOST_FOLLOWED, MOST_POINTS, FollowedPoints, new_corners
 from tracking3d.estimation.online.recruits import recruit, with_candidates
@@ -20,8 +19,6 @@ from tracking3d.estimation.online.surface_fit import FitWeights
 from tracking3d.geometry.camera import Camera
 
 _MOST_WITHOUT_POINTS = 15
-_PASSES = 3
-"""Of the final refinement."""
 
 
 def with_points(
@@ -80,13 +77,3 @@ def refined(
         bundle_iterations=bundle_iterations,
         rounds=rounds,
     )
-
-
-def refined_once_more(known: ObjectMap, camera: Camera, config: OnlineConfig) -> tuple[ObjectMap, Camera]:
-    """All keyframes together, until little changes; and the lens, where it was assumed."""
-    if camera.assumed:
-        known, camera = solve_lens(known, camera)
-    everything = list(range(len(known.keyframes)))
-    for _ in range(_PASSES):
-        known = refined(known, camera, everything, config, bundle_iterations=15, rounds=2)
-    return known, camera

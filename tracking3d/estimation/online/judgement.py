@@ -23,29 +23,46 @@ _TERMS = {  # weight, and the range that was seen
 }
 _UNWITNESSED = 0.5  # confidence at most where there is no mask to compare with
 _MEMORY = 0.9  # of the running means
+SETTLED = 15
+"""Tracked frames whose means are what later ones are held against."""
+_WORSE, _OUTLINE_ROOM, _OVERLAP_ROOM = 1.5, 0.1, 0.05  # how far the means may go from there
+BELIEVED = 0.5
+"""Confidence below which a frame is looked at twice."""
 
 
 @dataclass(frozen=True)
 class Usual:
-    """What frames that were tracked have cost so far: running means.
+    """What frames that were tracked have cost so far: running means, which stay near those of the first sound frames.
+
+    What follows a decay does not notice it.
 
     Attributes:
         appearance: Appearance loss.
         outline: Outline loss.
         overlap: IoU with the mask.
+        frames: How many frames are in them.
+        sound: The three of them after the first `SETTLED` frames; None until then.
     """
 
     appearance: float = 0.2
     outline: float = 0.3
     overlap: float = 0.9
+    frames: int = 0
+    sound: tuple[float, float, float] | None = None
 
     def updated(self, fit: PoseFit) -> Usual:
         """With one more frame."""
-        return Usual(
-            _MEMORY * self.appearance + (1 - _MEMORY) * fit.appearance,
-            _MEMORY * self.outline + (1 - _MEMORY) * fit.outline,
-            _MEMORY * self.overlap + (1 - _MEMORY) * fit.overlap,
-        )
+        appearance = _MEMORY * self.appearance + (1 - _MEMORY) * fit.appearance
+        outline = _MEMORY * self.outline + (1 - _MEMORY) * fit.outline
+        overlap = _MEMORY * self.overlap + (1 - _MEMORY) * fit.overlap
+        frames, sound = self.frames + 1, self.sound
+        if frames == SETTLED:
+            sound = appearance, outline, overlap
+        if sound is not None:
+            appearance = min(appearance, _WORSE * sound[0])
+            outline = min(outline, _WORSE * sound[1] + _OUTLINE_ROOM)
+            overlap = max(overlap, sound[2] - _OVERLAP_ROOM)
+        return Usual(appearance, outline, overlap, frames, sound)
 
 
 def looks_wrong(fit: PoseFit, usual: Usual, points: int, mask_weight: float) -> bool:

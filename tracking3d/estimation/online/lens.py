@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from tracking3d.config.camera import USUAL_ANGLES
 from tracking3d.estimation.online.belief import ObjectMap
 from tracking3d.estimation.online.bundle import Structure, adjust
 from tracking3d.estimation.online.mapping import pose_of, shared_landmarks, structure_of, tracks_of
@@ -42,10 +43,17 @@ def solve_lens(known: ObjectMap, camera: Camera) -> tuple[ObjectMap, Camera]:
         lens = Camera.from_fov(camera.width, camera.height, field_of_view).fy / camera.fy
         stretched = replace(start, t=start.t * [1.0, 1.0, lens], focal_factor=lens)
         tried.append(adjust(tracks, camera.K, stretched, iterations=_ITERATIONS, free_focal=True))
-    best = min(tried, key=lambda one: one.cost)
+    tried = [one for one in tried if _is_a_lens(one.focal_factor, camera)]
+    best = min(tried, key=lambda one: one.cost, default=kept)
     if best.cost > _CLEARLY * kept.cost or abs(math.log(best.focal_factor)) < _SAME:
         return known, camera
     return _with_lens(known, camera, names, best)
+
+
+def _is_a_lens(factor: float, camera: Camera) -> bool:
+    least, most = USUAL_ANGLES
+    degrees = 2 * math.degrees(math.atan(camera.height / (2 * factor * camera.fy)))
+    return least <= degrees <= most
 
 
 def _with_lens(

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from tracking3d.config.models import PipelineConfig
 from tracking3d.config.solvers import OnlineConfig
-from tracking3d.estimation.appearance import visible_texture
 from tracking3d.estimation.correction import SIGHTED
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.estimation.feature_space import FeatureSpace, feature_channels
@@ -25,10 +24,12 @@ from tracking3d.estimation.observation import Observation, observe
 from tracking3d.estimation.online.answers import solved, unsolved
 from tracking3d.estimation.online.attempt import Attempt
 from tracking3d.estimation.online.belief import ONLINE_CLASSES, Belief, ObjectMap, View
-from tracking3d.estimation.online.growing import refined, refined_once_more, with_keyframe, with_points
+from tracking3d.estimation.online.final_refinement import refined_once_more
+from tracking3d.estimation.online.growing import refined, with_keyframe, with_points
 from tracking3d.estimation.online.judgement import ENOUGH_POINTS, judge, looks_wrong, unexplained
 from tracking3d.estimation.online.mapping import mask_weight, pose_of
 from tracking3d.estimation.online.motion import carried, predicted
+from tracking3d.estimation.online.object_model import object_model
 from tracking3d.estimation.online.points import FollowedPoints, follow, grey
 from tracking3d.estimation.online.pose_refinement import PoseFit, PoseWeights
 from tracking3d.estimation.online.sighting import sighted
@@ -41,6 +42,7 @@ from tracking3d.estimation.online.tracking import (
     pose_of_points,
     searched,
     witnesses,
+    worth_trying,
 )
 from tracking3d.estimation.online.waiting import solved_start, waiting_view
 from tracking3d.estimation.shape import Shape
@@ -50,7 +52,7 @@ from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.camera import Camera, Window
 from tracking3d.geometry.pose import Pose, rotation_angle
-from tracking3d.rendering import BackProjection, TexelMap
+from tracking3d.rendering import TexelMap
 from tracking3d.stages import in_stage
 
 _SPARSE = 40  # witnesses below which the map takes a frame for the sake of new points
@@ -146,6 +148,7 @@ class OnlineSolver:
             surface=known.surface(),
             before=None,
             lost_for=0,
+            doubted_for=0,
             followed=FollowedPoints.none(),
         )
 
@@ -165,33 +168,19 @@ class OnlineSolver:
             followed = own.points.joined(followed)
         if state.before is not None:
             starts |= predicted(state, frame.index)
-        found = self._found(state, self._view(state, frame, binary, causal, followed), image, starts)
-        if found.lost:
-            found = self._elsewhere(state, frame, image) or found
-        belief = state.moved(found.fit.pose, frame.index, image, found.points)
+        found = self._found(state, self._view(state, frame, binary, causal, followed), frame, image, starts)
+        belief = _moved(state, found, found.fit.pose, image)
         before = state.last if state.last[1] == frame.index - 1 else None
-        belief = replace(belief, before=before, lost_for=found.lost * (state.lost_for + 1))
+        belief = replace(belief, before=before)
         answer = solved(belief, unsolved(frame, binary, found.fit.pose), found)
         return belief, replace(answer, refined=True)
 
     def result(self, state: Belief) -> ObjectModel:
         """The object with its visible texture back-projected from the keyframes."""
         known = state.known
-        keyframes = known.keyframes or tuple(view for view, _ in state.waiting or ())
-        size = known.texels.size
-        seen = BackProjection(known.vertices.new_zeros(3, size, size), known.vertices.new_zeros(size, size))
-        for view in keyframes:
-            seen = seen + known.back_project(view.observation.image, view)
-        texture, weight = visible_texture(seen)
-        surface = state.surface or replace(known, keyframes=keyframes).surface()
-        return ObjectModel(
-            known.vertices.double().cpu().numpy(),
-            known.shape.faces.cpu().numpy(),
-            known.shape.face_uvs.double().cpu().numpy(),
-            texture,
-            weight,
-            surface.texture.permute(1, 2, 0).cpu().numpy(),
-        )
+        if not known.keyframes:
+            known = replace(known, keyframes=tuple(view for view, _ in state.waiting or ()))
+        return object_model(known, state.surface or known.surface())
 
     def _wait(
         self, state: Belief, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
@@ -251,13 +240,10 @@ class OnlineSolver:
         starts = predicted(state, frame.index)
         likeliest = next(iter(starts.values()))
         followed = follow(state.grey, image, state.followed, carried(state, likeliest))
-        found = self._found(state, self._view(state, frame, mask, likeliest, followed), image, starts)
-        if found.lost:
-            found = self._elsewhere(state, frame, image) or found
+        found = self._found(state, self._view(state, frame, mask, likeliest, followed), frame, image, starts)
         key = not found.lost and self._is_keyframe(state, found)
         pose = coast(state.trail, frame.index) if found.lost else found.fit.pose
-        belief = state.moved(pose, frame.index, image, found.points)
-        belief = replace(belief, lost_for=found.lost * (state.lost_for + 1))
+        belief = _moved(state, found, pose, image)
         if found.judgement.status is Status.TRACKED:
             belief = replace(belief, usual=state.usual.updated(found.fit))
         if key:
@@ -277,8 +263,10 @@ class OnlineSolver:
         answer = solved(belief, unsolved(frame, mask, pose), found)
         return belief, replace(answer, keyframe=key)
 
-    def _found(self, state: Belief, view: View, image: NDArray[np.uint8], starts: dict[str, Pose]) -> Attempt:
-        """The pose by cheap starts, and by costly ones where it looks wrong."""
+    def _found(
+        self, state: Belief, view: View, frame: Frame, image: NDArray[np.uint8], starts: dict[str, Pose]
+    ) -> Attempt:
+        """The pose by cheap starts, by costly ones where it looks wrong, and elsewhere where none is believed."""
         assert state.surface is not None
         known, camera = state.known, state.camera
         on_object = view.points.only(~known.candidate[view.points.landmark])
@@ -294,7 +282,11 @@ class OnlineSolver:
             )
         agreed = witnesses(known, kept)
         judgement = judge(fit, state.usual, agreed, view.mask_weight, view.mask is not None, won == "grid")
-        return Attempt(view, fit, won, kept, agreed, judgement)
+        best = Attempt(view, fit, won, kept, agreed, judgement)
+        if best.lost or (best.doubtful and worth_trying(state.doubted_for)):
+            other = self._elsewhere(state, frame, image)
+            return other if other is not None and other.better_than(best) else best
+        return best
 
     def _elsewhere(self, state: Belief, frame: Frame, image: NDArray[np.uint8]) -> Attempt | None:
         """The object somewhere else in the frame, whatever the mask says; None where it is not seen there either."""
@@ -351,6 +343,15 @@ class OnlineSolver:
         if state.space is None:
             return observation
         return replace(observation, features=state.space.project(observation.features))
+
+
+def _moved(state: Belief, found: Attempt, pose: Pose, image: NDArray[np.uint8]) -> Belief:
+    """One frame later, with how long the object has been lost or doubted."""
+    return replace(
+        state.moved(pose, found.view.index, image, found.points),
+        lost_for=found.lost * (state.lost_for + 1),
+        doubted_for=found.doubtful * (state.doubted_for + 1),
+    )
 
 
 def _usable(mask: MaskEstimate) -> NDArray[np.bool_] | None:

@@ -196,6 +196,11 @@ def turned_grid(surface: Surface, view: View, pose: Pose, weights: PoseWeights) 
     return [refine_pose(surface, small, poses[i], None, weights, (4,)).pose for i in best]
 
 
+def worth_trying(frames: int) -> bool:
+    """Whether to try once more what has not helped for so many frames: at first always, and then now and again."""
+    return frames <= _OFTEN or frames % _OFTEN == 0
+
+
 Found = tuple[str, PoseFit, FollowedPoints]
 """Which start won, the pose, and the points that agree with it."""
 
@@ -231,7 +236,7 @@ def searched(
     tried = [best]
     for pose, points in rematched(known, camera, replace(view, pose=best[1].pose), image, lost):
         tried.append(fitted("keyframe", pose, points, points))
-    if view.mask is not None and (lost_for <= _OFTEN or lost_for % _OFTEN == 0):
+    if view.mask is not None and (worth_trying(lost_for)):
         centre = best[1].pose
         if lost:
             placed = {str(n): pose for n, pose in enumerate(placed_keyframes(known, camera, view))}

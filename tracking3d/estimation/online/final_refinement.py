@@ -1,0 +1,58 @@
+"""All keyframes together once more, and the lens where nobody gave it; kept only if that explains them better."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from tracking3d.config.solvers import OnlineConfig
+from tracking3d.estimation.online.belief import ObjectMap
+from tracking3d.estimation.online.growing import refined
+from tracking3d.estimation.online.lens import solve_lens
+from tracking3d.estimation.online.pose_refinement import PoseWeights, refine_pose
+from tracking3d.geometry.camera import Camera
+
+_PASSES = 3
+_LENS_CHARGE = 0.01
+"""Cost by which another lens has to explain the keyframes better than the assumed one."""
+
+
+def refined_once_more(known: ObjectMap, camera: Camera, config: OnlineConfig) -> tuple[ObjectMap, Camera]:
+    """The map and the camera that re-render the keyframes best: as they are, refined, or refined with a solved lens.
+
+    Points fit better with every freedom that they are given; what is drawn does so only where it is true. Without
+    that brake a refinement can end worse than it began.
+
+    Args:
+        known: The map.
+        camera: Of the full frame; another lens is tried where it is assumed.
+        config: Of the solver.
+    """
+    tried = [(unexplained(known), known, camera), _refined(known, camera, config)]
+    if camera.assumed:
+        with_lens, solved = solve_lens(known, camera)
+        if solved != camera:
+            cost, known, camera = _refined(with_lens, solved, config)
+            tried.append((cost + _LENS_CHARGE, known, camera))
+    _, known, camera = min(tried, key=lambda one: one[0])
+    return known, camera
+
+
+def unexplained(known: ObjectMap) -> float:
+    """What the keyframes cost at their poses, in the mean: pixels, outlines, and what is missed of the masks."""
+    surface = known.surface()
+    costs = []
+    for view in known.keyframes:
+        weights = PoseWeights()
+        weights = replace(weights, outline=weights.outline * view.mask_weight)
+        fit = refine_pose(surface, view.observation, view.pose, None, weights, iterations=(0,))
+        costs.append(fit.cost + view.mask_weight * (1 - fit.overlap))
+    return float(np.mean(costs)) if costs else 0.0
+
+
+def _refined(known: ObjectMap, camera: Camera, config: OnlineConfig) -> tuple[float, ObjectMap, Camera]:
+    everything = list(range(len(known.keyframes)))
+    for _ in range(_PASSES):
+        known = refined(known, camera, everything, config, bundle_iterations=15, rounds=2)
+    return unexplained(known), known, camera
