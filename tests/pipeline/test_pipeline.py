@@ -306,8 +306,8 @@ def test_a_given_field_of_view_wins_over_the_source():
 
 
 def test_what_the_source_knows_wins_over_the_default():
-    camera = choose_camera(CameraConfig(), 80, 64, (1.0, 2.0, 3.0, 4.0), "EXIF")
-    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (1, 2, 3, 4)
+    camera = choose_camera(CameraConfig(), 80, 64, (70.0, 72.0, 3.0, 4.0), "EXIF")
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (70, 72, 3, 4)
     assert camera.origin == "EXIF"
 
 
