@@ -164,3 +164,12 @@ def test_a_good_fit_is_likely_right_and_each_loss_makes_it_less_so():
 def test_beyond_the_range_it_was_fitted_on_nothing_changes():
     assert likelihood(fit(outline=2.0)) == likelihood(fit(outline=50.0))
     assert likelihood(fit(overlap=0.5)) == likelihood(fit(overlap=0.0))
+
+
+def test_after_a_loss_what_was_never_seen_is_no_side_of_the_object():
+    unseen = fit(appearance=0.46, unseen=0.9)
+    verdict = judge(unseen, USUAL, FEW, 1.0, True, lost_before=True)
+    assert verdict.status is Status.LOST and "never seen" in verdict.reason
+    # Points that agree, or texture that is known, tell that it is back.
+    assert judge(unseen, USUAL, MANY, 1.0, True, lost_before=True).status is Status.TRACKED
+    assert judge(fit(), USUAL, FEW, 1.0, True, lost_before=True).status is Status.TRACKED

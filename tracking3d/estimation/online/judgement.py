@@ -118,7 +118,13 @@ def unexplained(fit: PoseFit, usual: Usual, mask_weight: float) -> bool:
 
 
 def judge(
-    fit: PoseFit, usual: Usual, points: int, mask_weight: float, has_mask: bool, guessed: bool = False
+    fit: PoseFit,
+    usual: Usual,
+    points: int,
+    mask_weight: float,
+    has_mask: bool,
+    guessed: bool = False,
+    lost_before: bool = False,
 ) -> Assessment:
     """Status, reason and confidence of one frame.
 
@@ -130,6 +136,8 @@ def judge(
         has_mask: Whether there is one.
         guessed: Whether the pose is the best of many turns that were tried. Where none of them explains the frame,
             which is the least bad is up to chance, and points that happen to agree with it are, too.
+        lost_before: Whether the object was lost in the frame before. Then no motion leads to a side that was never
+            seen, and the mask may be of anything.
     """
     far = unexplained(fit, usual, mask_weight)
     few = points < ENOUGH_POINTS
@@ -148,6 +156,9 @@ def judge(
         return Assessment(
             Status.UNCERTAIN, f"points agree, pixels do not (loss {fit.appearance:.2f})", confidence
         )
+    if few and fit.unseen > _MOSTLY and lost_before:
+        reason = "what the mask shows was never seen of the object, and no motion leads to it after a loss"
+        return Assessment(Status.LOST, reason, 0.05)
     if few and fit.unseen > _MOSTLY:
         reason = "a side that was never seen before: only the outline and the motion so far tell the pose"
         return Assessment(Status.UNCERTAIN, reason, 0.5 * confidence)

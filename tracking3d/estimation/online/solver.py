@@ -169,9 +169,8 @@ class OnlineSolver:
         if state.before is not None:
             starts |= predicted(state, frame.index)
         found = self._found(state, self._view(state, frame, binary, causal, followed), frame, image, starts)
-        belief = _moved(state, found, found.fit.pose, image)
         before = state.last if state.last[1] == frame.index - 1 else None
-        belief = replace(belief, before=before)
+        belief = replace(_moved(state, found, found.fit.pose, image), before=before)
         answer = solved(belief, unsolved(frame, binary, found.fit.pose), found)
         return belief, replace(answer, refined=True)
 
@@ -276,12 +275,19 @@ class OnlineSolver:
         won, fit = self._fit(state, view, starts, view.points)
         kept = agreeing(known, camera, fit.pose, view.points, view)
         if state.lost_for or looks_wrong(fit, state.usual, witnesses(known, kept), view.mask_weight):
-            found = won, fit, kept
             won, fit, kept = searched(
-                known, state.surface, camera, view, image, found, self.weights, state.lost_for
+                known, state.surface, camera, view, image, (won, fit, kept), self.weights, state.lost_for
             )
         agreed = witnesses(known, kept)
-        judgement = judge(fit, state.usual, agreed, view.mask_weight, view.mask is not None, won == "grid")
+        judgement = judge(
+            fit,
+            state.usual,
+            agreed,
+            view.mask_weight,
+            view.mask is not None,
+            won == "grid",
+            state.lost_for > 0,
+        )
         best = Attempt(view, fit, won, kept, agreed, judgement)
         if best.lost or (best.doubtful and worth_trying(state.doubted_for)):
             other = self._elsewhere(state, frame, image)
