@@ -1,10 +1,13 @@
-"""Where an object should be in the next frame, by how it has moved."""
+"""Where an object should be in the next frame, by how it has moved; and the belief as it moves on."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tracking3d.estimation.online.attempt import Attempt
 from tracking3d.estimation.online.belief import Belief
 from tracking3d.estimation.online.mapping import project_points
 from tracking3d.estimation.online.tracking import coast
@@ -30,3 +33,19 @@ def carried(state: Belief, pose: Pose) -> NDArray[np.float32] | None:
     position = state.known.landmarks[state.followed.landmark]
     there, here = (project_points(position, one, state.camera) for one in (pose, state.last[0]))
     return np.asarray(state.followed.pixel + np.nan_to_num(there - here), dtype=np.float32)
+
+
+def moved_on(state: Belief, found: Attempt, pose: Pose, grey: NDArray[np.uint8]) -> Belief:
+    """The belief one frame later, with how long the object has been lost or hardly believed.
+
+    Args:
+        state: Before the frame.
+        found: What was found in it.
+        pose: That it is answered with.
+        grey: ``(H, W)`` the frame.
+    """
+    return replace(
+        state.moved(pose, found.view.index, grey, found.points),
+        lost_for=found.lost * (state.lost_for + 1),
+        doubted_for=found.doubtful * (state.doubted_for + 1),
+    )

@@ -28,7 +28,7 @@ from tracking3d.estimation.online.final_refinement import refined_once_more
 from tracking3d.estimation.online.growing import refined, with_keyframe, with_points
 from tracking3d.estimation.online.judgement import ENOUGH_POINTS, judge, looks_wrong, unexplained
 from tracking3d.estimation.online.mapping import mask_weight, pose_of
-from tracking3d.estimation.online.motion import carried, predicted
+from tracking3d.estimation.online.motion import carried, moved_on, predicted
 from tracking3d.estimation.online.object_model import object_model
 from tracking3d.estimation.online.points import FollowedPoints, follow, grey
 from tracking3d.estimation.online.pose_refinement import PoseFit, PoseWeights
@@ -170,7 +170,7 @@ class OnlineSolver:
             starts |= predicted(state, frame.index)
         found = self._found(state, self._view(state, frame, binary, causal, followed), frame, image, starts)
         before = state.last if state.last[1] == frame.index - 1 else None
-        belief = replace(_moved(state, found, found.fit.pose, image), before=before)
+        belief = replace(moved_on(state, found, found.fit.pose, image), before=before)
         answer = solved(belief, unsolved(frame, binary, found.fit.pose), found)
         return belief, replace(answer, refined=True)
 
@@ -242,7 +242,7 @@ class OnlineSolver:
         found = self._found(state, self._view(state, frame, mask, likeliest, followed), frame, image, starts)
         key = not found.lost and self._is_keyframe(state, found)
         pose = coast(state.trail, frame.index) if found.lost else found.fit.pose
-        belief = _moved(state, found, pose, image)
+        belief = moved_on(state, found, pose, image)
         if found.judgement.status is Status.TRACKED:
             belief = replace(belief, usual=state.usual.updated(found.fit))
         if key:
@@ -349,15 +349,6 @@ class OnlineSolver:
         if state.space is None:
             return observation
         return replace(observation, features=state.space.project(observation.features))
-
-
-def _moved(state: Belief, found: Attempt, pose: Pose, image: NDArray[np.uint8]) -> Belief:
-    """One frame later, with how long the object has been lost or doubted."""
-    return replace(
-        state.moved(pose, found.view.index, image, found.points),
-        lost_for=found.lost * (state.lost_for + 1),
-        doubted_for=found.doubtful * (state.doubted_for + 1),
-    )
 
 
 def _usable(mask: MaskEstimate) -> NDArray[np.bool_] | None:
