@@ -9,7 +9,7 @@ from turned_solid import CAMERA, turned_map
 
 from tracking3d.config.solvers import OnlineConfig
 from tracking3d.estimation.online import final_refinement
-from tracking3d.estimation.online.final_refinement import refined_once_more, unexplained
+from tracking3d.estimation.online.final_refinement import keyframe_cost, refined_once_more
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
 
 ANGLES = [0.0, 12.0, 24.0, 36.0]
@@ -32,7 +32,7 @@ def known():
 
 
 def test_what_is_spoilt_explains_the_keyframes_worse_and_the_more_the_worse(known):
-    costs = [unexplained(spoilt(known, degrees)) for degrees in (0.0, 3.0, 8.0)]
+    costs = [keyframe_cost(spoilt(known, degrees)) for degrees in (0.0, 3.0, 8.0)]
     assert costs == sorted(costs) and costs[0] < 0.8 * costs[1]
 
 

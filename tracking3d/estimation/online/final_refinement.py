@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from tracking3d.config.solvers import OnlineConfig
@@ -11,6 +9,7 @@ from tracking3d.estimation.online.belief import ObjectMap
 from tracking3d.estimation.online.growing import refined
 from tracking3d.estimation.online.lens import solve_lens
 from tracking3d.estimation.online.pose_refinement import PoseWeights, refine_pose
+from tracking3d.estimation.online.tracking import evidence
 from tracking3d.geometry.camera import Camera
 
 _PASSES = 3
@@ -29,7 +28,7 @@ def refined_once_more(known: ObjectMap, camera: Camera, config: OnlineConfig) ->
         camera: Of the full frame; another lens is tried where it is assumed.
         config: Of the solver.
     """
-    tried = [(unexplained(known), known, camera), _refined(known, camera, config)]
+    tried = [(keyframe_cost(known), known, camera), _refined(known, camera, config)]
     if camera.assumed:
         with_lens, solved = solve_lens(known, camera)
         if solved != camera:
@@ -39,15 +38,13 @@ def refined_once_more(known: ObjectMap, camera: Camera, config: OnlineConfig) ->
     return known, camera
 
 
-def unexplained(known: ObjectMap) -> float:
+def keyframe_cost(known: ObjectMap) -> float:
     """What the keyframes cost at their poses, in the mean: pixels, outlines, and what is missed of the masks."""
     surface = known.surface()
     costs = []
     for view in known.keyframes:
-        weights = PoseWeights()
-        weights = replace(weights, outline=weights.outline * view.mask_weight)
-        fit = refine_pose(surface, view.observation, view.pose, None, weights, iterations=(0,))
-        costs.append(fit.cost + view.mask_weight * (1 - fit.overlap))
+        fit = refine_pose(surface, view.observation, view.pose, iterations=(0,))
+        costs.append(evidence(fit, PoseWeights(), view.mask_weight))
     return float(np.mean(costs)) if costs else 0.0
 
 
@@ -55,4 +52,4 @@ def _refined(known: ObjectMap, camera: Camera, config: OnlineConfig) -> tuple[fl
     everything = list(range(len(known.keyframes)))
     for _ in range(_PASSES):
         known = refined(known, camera, everything, config, bundle_iterations=15, rounds=2)
-    return unexplained(known), known, camera
+    return keyframe_cost(known), known, camera

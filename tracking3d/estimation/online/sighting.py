@@ -18,9 +18,7 @@ from tracking3d.geometry.pose import Pose
 
 _MOST = 1500  # keypoints of a whole frame
 _KEYFRAMES = 24  # that they are matched with
-_FEWEST = (
-    10  # agreeing points of one keyframe; so many matches of something else hardly ever agree with one pose
-)
+_FEWEST = 10  # agreeing points of one keyframe; matches of something else hardly ever agree with one pose
 
 
 def sighted(
