@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -11,10 +12,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from tracking3d.estimation.outline import outline_distance
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera, Window
-from tracking3d.rendering import channels_last
+from tracking3d.rendering import PoseTarget, channels_last
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +44,29 @@ class Observation:
     mask: Tensor
     distance: Tensor
     has_mask: bool
+
+    @cached_property
+    def half(self) -> Observation:
+        """At half the working resolution."""
+        return halved(self)
+
+    @cached_property
+    def outline_distance(self) -> Tensor:
+        """``(S, S)`` see `tracking3d.estimation.outline.outline_distance`."""
+        return outline_distance(self.mask, self.valid)
+
+    @cached_property
+    def target(self) -> PoseTarget:
+        """What poses are fitted to."""
+        # What covers the object, or lies beside it, is left out of the comparison: the mask is to show it.
+        return PoseTarget(
+            self.K,
+            channels_last(self.features[None])[0],
+            self.valid * self.mask if self.has_mask else self.valid,
+            self.valid > 0.5,
+            self.mask > 0.5 if self.has_mask else None,
+            self.outline_distance if self.has_mask else None,
+        )
 
 
 @dataclass(frozen=True, eq=False)

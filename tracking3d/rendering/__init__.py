@@ -11,8 +11,10 @@ from tracking3d.rendering.contour import (
 )
 from tracking3d.rendering.interpolation import interpolate
 from tracking3d.rendering.normal_equations import NormalEquations, pose_normal_equations
+from tracking3d.rendering.pose_terms import MatchedPoints, PoseTarget, PoseTerms, Scales, pose_terms
 from tracking3d.rendering.renderer import Rendering, SoftBand, project, render
 from tracking3d.rendering.silhouette import soft_silhouette
+from tracking3d.rendering.surface import Surface
 from tracking3d.rendering.surface_visibility import visible_texels, visible_vertices
 from tracking3d.rendering.texture import sample_texture
 from tracking3d.rendering.texture_losses import channels_last, texture_losses
@@ -22,9 +24,14 @@ __all__ = [
     "BackProjection",
     "BackendName",
     "Contour",
+    "MatchedPoints",
     "NormalEquations",
+    "PoseTarget",
+    "PoseTerms",
     "Rendering",
+    "Scales",
     "SoftBand",
+    "Surface",
     "TexelMap",
     "Visibility",
     "back_project",
@@ -34,6 +41,7 @@ __all__ = [
     "find_contour",
     "interpolate",
     "pose_normal_equations",
+    "pose_terms",
     "prepare_backend",
     "project",
     "rasterize",

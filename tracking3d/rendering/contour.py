@@ -18,12 +18,15 @@ from torch.nn import functional
 from tracking3d.rendering.normal_equations import NormalEquations, screen_motion
 from tracking3d.rendering.renderer import Rendering
 from tracking3d.rendering.shapes import check_shapes
+from tracking3d.rendering.surface import edges_of
 from tracking3d.rendering.surface_visibility import front_faces
 from tracking3d.rendering.texture_losses import cauchy
 from tracking3d.rendering.visibility import NEAR, expand_ranges
 
-_MOST = 256  # points on one edge, however large it seems
-_PROBE = 1.0  # pixels beyond an edge where the mesh must have ended
+MOST_ON_AN_EDGE = 256
+"""Points on one edge, however large it seems."""
+PROBE = 1.0
+"""Pixels beyond an edge where the mesh must have ended."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +59,7 @@ def find_contour(drawn: Rendering) -> Contour:
     view, begin, end = _contour_edges(drawn)
     along = drawn.screen[view, end] - drawn.screen[view, begin]
     length = along.detach().norm(dim=1)
-    count = length.ceil().clamp(1, _MOST).long()
+    count = length.ceil().clamp(1, MOST_ON_AN_EDGE).long()
     owner, number = expand_ranges(torch.zeros_like(count), count)
     fraction = (number.to(length) + 0.5) / count[owner]
     view, begin, end, along = view[owner], begin[owner], end[owner], along[owner]
@@ -66,7 +69,7 @@ def find_contour(drawn: Rendering) -> Contour:
         normal = torch.stack([-direction[:, 1], direction[:, 0]], 1)
         _, height, width = drawn.face_index.shape
         inside = _nearest_pixel(position, height, width)[1]
-        beyond, in_window = _nearest_pixel(position + _PROBE * normal, height, width)
+        beyond, in_window = _nearest_pixel(position + PROBE * normal, height, width)
         covered = drawn.face_index.flatten()[view * height * width + beyond] >= 0
         kept = torch.nonzero(inside & ~(covered & in_window))[:, 0]
         vertices = torch.stack([begin, end], 1)[kept]
@@ -154,10 +157,10 @@ def signed_distance(mask: Tensor) -> Tensor:
 @torch.no_grad()
 def _contour_edges(drawn: Rendering) -> tuple[Tensor, Tensor, Tensor]:
     """View, first and second vertex of the edges between front and back, as front faces go around them."""
-    faces, vertices = drawn.faces, drawn.screen.shape[1]
+    faces = drawn.faces
     start, end = faces.reshape(-1), faces.roll(-1, 1).reshape(-1)
-    key = torch.minimum(start, end) * vertices + torch.maximum(start, end)
-    _, edge, shared = torch.unique(key, return_inverse=True, return_counts=True)
+    edge, shared = edges_of(faces)
+    edge = edge.reshape(-1)
     in_front = (drawn.x_cam[..., 2] > NEAR)[:, faces].all(2)
     front = front_faces(drawn.screen, faces) & in_front
     sides = front.repeat_interleave(3, 1)  # (B, 3 F), in the order of `edge`

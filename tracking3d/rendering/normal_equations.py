@@ -45,16 +45,20 @@ class NormalEquations:
             self.matrix + other.matrix, self.gradient + other.gradient, self.cost + other.cost
         )
 
-    def __mul__(self, weight: float) -> NormalEquations:
-        """The model of ``weight`` times the cost."""
-        return NormalEquations(weight * self.matrix, weight * self.gradient, weight * self.cost)
+    def __mul__(self, weight: float | Tensor) -> NormalEquations:
+        """The model of ``weight`` times the cost; one weight, or ``(B,)`` of them."""
+        each = torch.as_tensor(weight).to(self.cost).expand_as(self.cost)
+        return NormalEquations(
+            each[:, None, None] * self.matrix, each[:, None] * self.gradient, each * self.cost
+        )
 
-    def step(self, damping: float = 0.0) -> Tensor:
+    def step(self, damping: float | Tensor = 0.0) -> Tensor:
         """``(B, 6)`` step (v, w) to the model's minimum; zero where there is none.
 
         Args:
-            damping: Levenberg-Marquardt's: added to the diagonal, as a share of each entry.
+            damping: Levenberg-Marquardt's: added to the diagonal, as a share of each entry; one, or ``(B,)`` of them.
         """
+        damping = torch.as_tensor(damping).to(self.cost).expand_as(self.cost)[:, None]
         diagonal = self.matrix.diagonal(dim1=1, dim2=2)
         floor = 1e-9 * diagonal.amax(1, keepdim=True) + torch.finfo(diagonal.dtype).tiny
         damped = self.matrix + torch.diag_embed(damping * diagonal + floor)

@@ -10,12 +10,11 @@ import trimesh
 from torch import Tensor
 
 from tracking3d.estimation.observation import Observation, mask_distance
-from tracking3d.estimation.online.pose_refinement import Surface
 from tracking3d.estimation.shape import Shape
 from tracking3d.geometry.camera import Window
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
 from tracking3d.geometry.prototypes import ellipsoid
-from tracking3d.rendering import Rendering, render
+from tracking3d.rendering import Rendering, Surface, render
 
 SIZE = 64
 AXES = (0.9, 0.7, 0.6)

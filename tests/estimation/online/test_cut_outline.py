@@ -8,7 +8,6 @@ import torch
 from turned_solid import turned_map
 
 from tracking3d.estimation.observation import Observation
-from tracking3d.estimation.online.outline import outline_distance
 from tracking3d.rendering import signed_distance
 
 BORDER = 40  # columns from here on are beyond the frame
@@ -23,19 +22,19 @@ def bar(cut: bool) -> Observation:
 
 
 def test_the_cut_is_no_outline():
-    distance = outline_distance(bar(cut=True))
+    distance = bar(cut=True).outline_distance
     assert float(distance[30, BORDER - 1]) == -10.5  # to the lower edge, rows 40 and 41
     assert float(distance[45, BORDER - 1]) == 4.5
     assert float(distance[30, 10]) == -0.5  # the left end is one
 
 
 def test_beyond_the_border_nothing_pulls():
-    assert float(outline_distance(bar(cut=True))[:, BORDER:].abs().max()) == 0
+    assert float(bar(cut=True).outline_distance[:, BORDER:].abs().max()) == 0
 
 
 def test_a_mask_away_from_the_border_keeps_its_outline():
     whole = bar(cut=False)
-    inside = outline_distance(whole)[:, :BORDER]
+    inside = whole.outline_distance[:, :BORDER]
     torch.testing.assert_close(inside, signed_distance(whole.mask[None])[0][:, :BORDER])
     assert float(inside[30, 29]) == -0.5
     assert float(inside[30, 30]) == 0.5
@@ -43,11 +42,11 @@ def test_a_mask_away_from_the_border_keeps_its_outline():
 
 def test_where_all_is_inside_the_frame_it_is_the_plain_distance():
     observation = replace(bar(cut=True), valid=torch.ones(64, 64))
-    torch.testing.assert_close(outline_distance(observation), signed_distance(observation.mask[None])[0])
+    torch.testing.assert_close(observation.outline_distance, signed_distance(observation.mask[None])[0])
 
 
 def test_a_frame_that_is_filled_or_empty_has_no_outline():
     for value in (0.0, 1.0):
         observation = bar(cut=True)
         filled = replace(observation, mask=torch.full((64, 64), value) * observation.valid)
-        assert float(outline_distance(filled).abs().max()) == 0
+        assert float(filled.outline_distance.abs().max()) == 0

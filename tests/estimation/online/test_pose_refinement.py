@@ -10,16 +10,10 @@ import torch
 from rendered_solids import SIZE, observed, pose_of, shape_of, surface_of
 from torch import Tensor
 
-from tracking3d.estimation.online.pose_refinement import (
-    MatchedPoints,
-    PoseWeights,
-    Surface,
-    _halved,
-    _moved,
-    _points_model,
-    refine_pose,
-)
-from tracking3d.geometry.pose import Pose, rotation_angle
+from tracking3d.estimation.online.pose_refinement import PoseWeights, _Evidence, refine_pose, refine_poses
+from tracking3d.estimation.online.reprojection import moved
+from tracking3d.geometry.pose import Pose, from_matrix, rotation_angle
+from tracking3d.rendering import MatchedPoints, Surface
 
 TRUTH = pose_of(20)
 SURFACE = surface_of(shape_of())
@@ -29,6 +23,13 @@ FLAT = replace(SURFACE, texture=torch.full_like(SURFACE.texture, 0.4))
 AXES = [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, -1.0, 0.5)]
 
 
+def moved_by(pose: Pose, step: Tensor) -> Pose:
+    """The pose after a step (v, w)."""
+    R, t = (part.double().numpy()[None] for part in (pose.R, pose.translation))
+    turned, shifted = moved(R, t, step.double().numpy()[None])
+    return from_matrix(torch.from_numpy(turned[0]).to(step), torch.from_numpy(shifted[0]).to(step))
+
+
 def off(
     axis: tuple[float, float, float] = (1.0, -1.0, 0.5), degrees: float = 5.0, depth: float = 1.05
 ) -> Pose:
@@ -36,7 +37,7 @@ def off(
     length = math.sqrt(sum(part**2 for part in axis))
     turn = torch.tensor(axis) / length * math.radians(degrees)
     away = (depth - 1) * TRUTH.translation
-    return _moved(TRUTH, torch.cat([away, turn]))
+    return moved_by(TRUTH, torch.cat([away, turn]))
 
 
 def degrees(pose: Pose) -> float:
@@ -95,7 +96,7 @@ def test_wrong_points_are_outvoted():
 
 def test_the_outline_alone_finds_where_a_plain_object_is():
     """Not how it is turned: other ellipsoids have the same outline."""
-    start = _moved(TRUTH, torch.tensor([0.2, -0.15, 0.0, 0, 0, 0]))
+    start = moved_by(TRUTH, torch.tensor([0.2, -0.15, 0.0, 0, 0, 0]))
     fits = [refine_pose(FLAT, observed(FLAT, TRUTH), start, iterations=steps) for steps in ((0, 0), (10, 10))]
     assert fits[0].overlap < 0.85 and fits[1].overlap > 0.98
     assert fits[1].outline < 0.05 * fits[0].outline
@@ -242,7 +243,7 @@ def test_points_at_half_the_resolution_are_the_same_points():
 
 
 def test_at_half_the_resolution_scales_are_half_as_many_pixels():
-    half = _halved(FRAME, matched(), PoseWeights(outline_scale=3.0, points_scale=5.0), 1)
+    half = _Evidence(FRAME, matched(), PoseWeights(outline_scale=3.0, points_scale=5.0)).half()
     assert (half.weights.outline_scale, half.weights.points_scale) == (1.5, 2.5)
     assert half.observation.window.size == SIZE // 2
     assert half.matched is not None
@@ -255,34 +256,23 @@ def test_evaluations_of_all_resolutions_are_counted():
     assert counts == [4, 5, 7]
 
 
-def test_normal_equations_of_the_points_are_those_of_finite_differences():
-    """In float64: the gradient is the cost's, the matrix the sum of weighted products of the pixels' Jacobians."""
-    generator = torch.Generator().manual_seed(0)
-    points = torch.randn(9, 3, generator=generator).double() * 0.5
-    pose = Pose(TRUTH.translation.double(), TRUTH.quaternion.double())
-    K = FRAME.K.double()
-    seen = MatchedPoints(
-        points, pixels_of(points, pose, K) + 3 * torch.randn(9, 2, generator=generator).double()
-    )
-    model = _points_model(seen, K, pose, 1.5)
-    step = 1e-5 * torch.eye(6).double()
-
-    def residual(d: Tensor) -> Tensor:
-        return pixels_of(points, _moved(pose, d), K) - seen.pixels
-
-    def cost(d: Tensor) -> Tensor:
-        return torch.log1p(residual(d).square().sum(1) / 1.5**2).mean()
-
-    gradient = torch.stack([(cost(d) - cost(-d)) / 2e-5 for d in step])
-    jacobian = torch.stack([(residual(d) - residual(-d)) / 2e-5 for d in step], -1)
-    weight = 2 / (1.5**2 + residual(torch.zeros(6).double()).square().sum(1)) / 9
-    matrix = torch.einsum("nia,n,nib->ab", jacobian, weight, jacobian)
-    torch.testing.assert_close(model.cost[0], cost(torch.zeros(6).double()))
-    torch.testing.assert_close(model.gradient[0], gradient, atol=1e-6, rtol=1e-6)
-    torch.testing.assert_close(model.matrix[0], matrix, atol=1e-5, rtol=1e-6)
+@pytest.mark.parametrize("iterations", [(0,), (0, 0), (3, 4)])
+def test_several_starts_are_fitted_as_if_each_were_alone(iterations):
+    starts = [
+        off(),
+        TRUTH,
+        off((0, 0, 1), 25.0, 1.0),
+        replace(TRUTH, translation=torch.tensor([30.0, 0, 3.5])),
+    ]
+    together = refine_poses(SURFACE, FRAME, starts, matched(), iterations=iterations)
+    for start, fit in zip(starts, together, strict=True):
+        alone = refine_pose(SURFACE, FRAME, start, matched(), iterations=iterations)
+        assert (fit.cost, fit.iterations, fit.overlap) == (alone.cost, alone.iterations, alone.overlap)
+        assert torch.equal(fit.pose.quaternion, alone.pose.quaternion)
+    assert refine_poses(SURFACE, FRAME, []) == []
 
 
 def test_a_step_turns_the_object_about_its_own_origin():
-    moved = _moved(TRUTH, torch.tensor([0.0, 0, 0, 0.1, 0.2, 0.3]))
-    assert torch.equal(moved.translation, TRUTH.translation)
-    assert degrees(moved) == pytest.approx(math.degrees(math.sqrt(0.14)), rel=1e-3)
+    turned = moved_by(TRUTH, torch.tensor([0.0, 0, 0, 0.1, 0.2, 0.3]))
+    assert torch.equal(turned.translation, TRUTH.translation)
+    assert degrees(turned) == pytest.approx(math.degrees(math.sqrt(0.14)), rel=1e-3)

@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import MaskSource
 from tracking3d.estimation.online.belief import View
-from tracking3d.estimation.online.pose_refinement import Surface, drawn_at
 from tracking3d.geometry.pose import Pose
-from tracking3d.rendering import sample_texture
+from tracking3d.rendering import Surface, render, sample_texture
 from tracking3d.rendering.texture_losses import cauchy
 
 _ALIKE = 0.85  # IoU of two masks that differ along their outlines only
@@ -64,7 +63,11 @@ def support_beside(surface: Surface, view: View, pose: Pose, scale: float) -> fl
         scale: Of the Cauchy loss.
     """
     observation = view.observation
-    drawn = drawn_at(surface, observation, pose)
+    size = (observation.window.size, observation.window.size)
+    drawn = render(
+        surface.vertices, surface.faces, surface.face_uvs, surface.texture, pose.R[None], pose.translation[None],
+        observation.K[None], size, backend=surface.renderer,
+    )  # fmt: skip
     inside = observation.valid.reshape(-1)[drawn.pixels] > 0.5
     masked = observation.mask.reshape(-1)[drawn.pixels] > 0.5
     beside = inside & ~masked

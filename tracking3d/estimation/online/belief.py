@@ -16,11 +16,10 @@ from tracking3d.estimation.observation import Observation
 from tracking3d.estimation.online.judgement import Usual
 from tracking3d.estimation.online.keypoints import Keypoints
 from tracking3d.estimation.online.points import FollowedPoints
-from tracking3d.estimation.online.pose_refinement import Surface
 from tracking3d.estimation.shape import Shape
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose
-from tracking3d.rendering import BackProjection, TexelMap, back_project, project, rasterize
+from tracking3d.rendering import BackProjection, Surface, TexelMap, back_project, project, rasterize
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from tracking3d.estimation.online.belief import ObjectMap
-from tracking3d.estimation.online.outline import outline_distance
 from tracking3d.estimation.online.shaded_appearance import face_equations, layers_of
 from tracking3d.estimation.online.shape_modes import Modes, in_modes
 from tracking3d.estimation.online.surface_fit import FitWeights
@@ -133,7 +132,7 @@ def _problem(known: ObjectMap, modes: Modes, weights: FitWeights) -> _Problem:
         weights,
         torch.stack([o.K for o in observations]),
         layers_of(torch.stack([o.features for o in observations]), valid),
-        torch.stack([outline_distance(o) for o in observations]),
+        torch.stack([o.outline_distance for o in observations]),
         torch.tensor(believed).to(known.vertices),
     )
 

@@ -13,7 +13,6 @@ from torch import Tensor
 from tracking3d.estimation.online.belief import ObjectMap, View
 from tracking3d.estimation.online.bundle import Structure, Tracks, adjust
 from tracking3d.estimation.online.keypoints import Keypoints, match
-from tracking3d.estimation.online.outline import outline_distance
 from tracking3d.estimation.online.points import FollowedPoints
 from tracking3d.estimation.online.surface_fit import FitWeights, Landmarks, Views, fit_surface
 from tracking3d.estimation.shape import flatten
@@ -302,7 +301,7 @@ def fit_shape(known: ObjectMap, positions: list[int], weights: FitWeights, round
         poses.R,
         poses.translation,
         torch.stack([o.K for o in observations]),
-        torch.stack([outline_distance(o) for o in observations]),
+        torch.stack([o.outline_distance for o in observations]),
         torch.tensor([v.mask_weight * v.observation.has_mask for v in views]).to(known.vertices),
     )
     names, number = np.unique(np.concatenate([v.points.landmark for v in views]), return_counts=True)

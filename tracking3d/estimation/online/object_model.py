@@ -5,8 +5,7 @@ from __future__ import annotations
 from tracking3d.estimation.appearance import visible_texture
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.estimation.online.belief import ObjectMap
-from tracking3d.estimation.online.pose_refinement import Surface
-from tracking3d.rendering import BackProjection
+from tracking3d.rendering import BackProjection, Surface
 
 
 def object_model(known: ObjectMap, surface: Surface) -> ObjectModel:

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tracking3d.estimation.observation import halved
 from tracking3d.estimation.online.belief import ObjectMap, View
 from tracking3d.estimation.online.keypoints import Keypoints, detect, match
 from tracking3d.estimation.online.mapping import (
@@ -23,15 +22,10 @@ from tracking3d.estimation.online.mapping import (
 )
 from tracking3d.estimation.online.points import FollowedPoints
 from tracking3d.estimation.online.pose_from_points import pose_from_points
-from tracking3d.estimation.online.pose_refinement import (
-    MatchedPoints,
-    PoseFit,
-    PoseWeights,
-    Surface,
-    refine_pose,
-)
+from tracking3d.estimation.online.pose_refinement import PoseFit, PoseWeights, refine_pose, refine_poses
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, extrapolate, from_matrix, rotation_about
+from tracking3d.rendering import MatchedPoints, Surface
 
 ENOUGH_MATURE = 30
 """With so many landmarks of two keyframes or more, those of one alone are not asked."""
@@ -79,11 +73,8 @@ def fit_pose(
     matched = _matched(known, surface, view, points)
     name = next(iter(starts))
     if len(starts) > 1:
-        costs = {
-            other: refine_pose(surface, view.observation, start, matched, weights, (0, 0)).cost
-            for other, start in starts.items()
-        }
-        name = min(costs, key=lambda other: costs[other])
+        fits = refine_poses(surface, view.observation, list(starts.values()), matched, weights, (0,))
+        name, _ = min(zip(starts, fits, strict=True), key=lambda one: one[1].cost)
     return name, refine_pose(surface, view.observation, starts[name], matched, weights)
 
 
@@ -179,7 +170,7 @@ def placed_keyframes(known: ObjectMap, camera: Camera, view: View) -> list[Pose]
 
 def turned_grid(surface: Surface, view: View, pose: Pose, weights: PoseWeights) -> list[Pose]:
     """The best of many rotations around a pose, by appearance and outline at half the resolution."""
-    small = halved(view.observation)
+    small = view.observation.half
     weights = replace(weights, outline=weights.outline * view.mask_weight)
     directions = [
         torch.tensor(axis, dtype=pose.translation.dtype)
@@ -191,9 +182,10 @@ def turned_grid(surface: Surface, view: View, pose: Pose, weights: PoseWeights) 
         for axis in directions
         for angle in _GRID_ANGLES
     ]
-    costs = [refine_pose(surface, small, one, None, weights, (0,)).cost for one in poses]
+    costs = [fit.cost for fit in refine_poses(surface, small, poses, None, weights, (0,))]
     best = np.argsort(np.nan_to_num(costs, nan=math.inf))[:_GRID_FINALISTS]
-    return [refine_pose(surface, small, poses[i], None, weights, (4,)).pose for i in best]
+    finalists = [poses[place] for place in best]
+    return [fit.pose for fit in refine_poses(surface, small, finalists, None, weights, (4,))]
 
 
 def worth_trying(frames: int) -> bool:

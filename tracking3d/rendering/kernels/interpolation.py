@@ -85,7 +85,7 @@ def slopes_of_face(corners, z, a, b, c):
 
 
 @numba.njit(inline="always", **OPTIONS)
-def _barycentrics(place, by_x, by_y, x, y):
+def barycentrics(place, by_x, by_y, x, y):
     """Screen barycentrics of a pixel, each measured from the corner that follows."""
     ax, ay, bx, by, cx, cy = place
     return (
@@ -127,7 +127,7 @@ def _forward(screen, depth, faces, attributes, face_index, ends, values, first, 
                     screen[view], depth[view], faces[face, 0], faces[face, 1], faces[face, 2]
                 )
                 while x < width and face_index[view, y, x] == face:
-                    w = _barycentrics(place, by_x, by_y, np.float32(x), np.float32(y))
+                    w = barycentrics(place, by_x, by_y, np.float32(x), np.float32(y))
                     wa, wb, wc = w[0] * inverse[0], w[1] * inverse[1], w[2] * inverse[2]
                     s = np.float32(1) / (wa + wb + wc)
                     if channels == 2:  # texture coordinates: a loop of known length is not a loop any more
@@ -176,7 +176,7 @@ def _backward(
                 place, by_x, by_y, inverse = slopes_of_face(screen[view], depth[view], a, b, c)
                 ax = ay = bx = by = cx = cy = az = bz = cz = np.float32(0)
                 while x < width and face_index[view, y, x] == face:
-                    w = _barycentrics(place, by_x, by_y, np.float32(x), np.float32(y))
+                    w = barycentrics(place, by_x, by_y, np.float32(x), np.float32(y))
                     wa, wb, wc = w[0] * inverse[0], w[1] * inverse[1], w[2] * inverse[2]
                     s = np.float32(1) / (wa + wb + wc)
                     if channels == 2:

@@ -40,7 +40,7 @@ def accumulate(
 
 
 @numba.njit(inline="always", **OPTIONS)
-def _of_channels(texture, taps, target, channels, sharpness, by_x, by_y):
+def of_channels(texture, taps, target, channels, sharpness, by_x, by_y):
     """Of one pixel, summed over the channels: the 2 x 2 matrix, the two slopes of half the loss, and the loss.
 
     ``by_x`` and ``by_y`` are the derivatives of the place in the texture, in texels, by the pixel's x and y.
@@ -70,6 +70,17 @@ def _of_channels(texture, taps, target, channels, sharpness, by_x, by_y):
             loss += math.log(product)
             product = 1.0
     return xx, xy, yy, x, y, loss + math.log(product)
+
+
+@numba.njit(inline="always", **OPTIONS)
+def point_motion(ray_x, ray_y, z, fx, fy, pivot, motion):
+    """Motion on the screen ``(2, 6)`` by (v, w) of the surface point at ``z`` times ``(ray_x, ray_y, 1)``."""
+    px, py, pz = ray_x * z - pivot[0], ray_y * z - pivot[1], z - pivot[2]
+    sx, sy = fx / z, fy / z
+    motion[0, 0], motion[0, 2] = sx, -sx * ray_x
+    motion[1, 1], motion[1, 2] = sy, -sy * ray_y
+    motion[0, 3], motion[0, 4], motion[0, 5] = -sx * ray_x * py, sx * (pz + ray_x * px), -sx * py
+    motion[1, 3], motion[1, 4], motion[1, 5] = -sy * (pz + ray_y * py), sy * ray_y * px, sy * px
 
 
 @kernel(
@@ -111,18 +122,13 @@ def _accumulate(
             by_x = (xa * ua + xb * ub + xc * uc) * texels_u, (xa * va + xb * vb + xc * vc) * texels_v
             by_y = (ya * ua + yb * ub + yc * uc) * texels_u, (ya * va + yb * vb + yc * vc) * texels_v
             taps = taps_of(u, v, height, width)
-            xx, xy, yy, gx, gy, loss = _of_channels(
+            xx, xy, yy, gx, gy, loss = of_channels(
                 texture, taps, observed[pixels[place]], channels, sharpness, by_x, by_y
             )
             # Half the loss has these; two in front of everything makes it the loss.
             share_of_pixel = weight[place] / max(total, 1.0) / channels
             ray_x, ray_y = (np.float32(x) - cx) / fx, (np.float32(y) - cy) / fy
-            px, py, pz = ray_x * z - pivot[view, 0], ray_y * z - pivot[view, 1], z - pivot[view, 2]
-            sx, sy = fx / z, fy / z
-            motion[0, 0], motion[0, 2] = sx, -sx * ray_x
-            motion[1, 1], motion[1, 2] = sy, -sy * ray_y
-            motion[0, 3], motion[0, 4], motion[0, 5] = -sx * ray_x * py, sx * (pz + ray_x * px), -sx * py
-            motion[1, 3], motion[1, 4], motion[1, 5] = -sy * (pz + ray_y * py), sy * ray_y * px, sy * px
+            point_motion(ray_x, ray_y, z, fx, fy, pivot[view], motion)
             for i in range(6):
                 left_x = 2 * share_of_pixel * (xx * motion[0, i] + xy * motion[1, i])
                 left_y = 2 * share_of_pixel * (xy * motion[0, i] + yy * motion[1, i])

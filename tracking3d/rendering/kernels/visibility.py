@@ -49,56 +49,63 @@ def _edge(corners, start, end):
     )
 
 
+@numba.njit(**OPTIONS)
+def draw_view(corners, z, faces, plane, winner, nearest):
+    """The nearest front face of every pixel and its inverse depth, into -1 and 0."""
+    height, width = winner.shape
+    one = np.float32(1)
+    for face in range(len(faces)):
+        a, b, c = faces[face]
+        za, zb, zc = z[a], z[b], z[c]
+        if not (za > plane and zb > plane and zc > plane):
+            continue
+        ax, ay, bx, by, cx, cy = (
+            corners[a, 0], corners[a, 1], corners[b, 0], corners[b, 1], corners[c, 0], corners[c, 1]
+        )  # fmt: skip
+        area = (by - ay) * (cx - ax) - (bx - ax) * (cy - ay)
+        if not 0 < area < np.inf:
+            continue
+        x0 = math.ceil(min(max(min(ax, bx, cx), np.float32(0)), np.float32(width)))
+        y0 = math.ceil(min(max(min(ay, by, cy), np.float32(0)), np.float32(height)))
+        x1 = math.floor(max(min(max(ax, bx, cx), np.float32(width - 1)), np.float32(-1)))
+        y1 = math.floor(max(min(max(ay, by, cy), np.float32(height - 1)), np.float32(-1)))
+        if x0 > x1 or y0 > y1:
+            continue
+        by_a, by_b, by_c = (
+            (one / za) * (one / area), (one / zb) * (one / area), (one / zc) * (one / area)
+        )  # fmt: skip
+        oxa, oya, exa, eya = _edge(corners, b, c)
+        oxb, oyb, exb, eyb = _edge(corners, c, a)
+        oxc, oyc, exc, eyc = _edge(corners, a, b)
+        for y in range(y0, y1 + 1):
+            fy = np.float32(y)
+            along_a, along_b, along_c = exa * (fy - oya), exb * (fy - oyb), exc * (fy - oyc)
+            entered = False
+            for x in range(x0, x1 + 1):
+                fx = np.float32(x)
+                wa = along_a - eya * (fx - oxa)
+                wb = along_b - eyb * (fx - oxb)
+                wc = along_c - eyc * (fx - oxc)
+                if min(wa, wb, wc) >= 0:
+                    inverse_depth = wa * by_a + wb * by_b + wc * by_c
+                    if inverse_depth > nearest[y, x]:
+                        nearest[y, x] = inverse_depth
+                        winner[y, x] = face
+                    entered = True
+                elif entered:
+                    break  # a triangle is left once only
+
+
 @kernel(
     "void(float32[:,:,::1], float32[:,::1], int64[:,::1], float64,"
     " int64[:,:,::1], float32[:,:,::1], int64[:,::1], int64[::1], int64, int64)"
 )
 def _rasterize(screen, depth, faces, near, face_index, drawn, listed, counts, first, last):
     height, width = face_index.shape[1:]
-    one, plane = np.float32(1), np.float32(near)
+    one = np.float32(1)
     for view in range(first, last):
-        corners, z = screen[view], depth[view]
-        nearest, winner = drawn[view], face_index[view]  # inverse depths until the end
-        for face in range(len(faces)):
-            a, b, c = faces[face]
-            za, zb, zc = z[a], z[b], z[c]
-            if not (za > plane and zb > plane and zc > plane):
-                continue
-            ax, ay, bx, by, cx, cy = (
-                corners[a, 0], corners[a, 1], corners[b, 0], corners[b, 1], corners[c, 0], corners[c, 1]
-            )  # fmt: skip
-            area = (by - ay) * (cx - ax) - (bx - ax) * (cy - ay)
-            if not 0 < area < np.inf:
-                continue
-            x0 = math.ceil(min(max(min(ax, bx, cx), np.float32(0)), np.float32(width)))
-            y0 = math.ceil(min(max(min(ay, by, cy), np.float32(0)), np.float32(height)))
-            x1 = math.floor(max(min(max(ax, bx, cx), np.float32(width - 1)), np.float32(-1)))
-            y1 = math.floor(max(min(max(ay, by, cy), np.float32(height - 1)), np.float32(-1)))
-            if x0 > x1 or y0 > y1:
-                continue
-            by_a, by_b, by_c = (
-                (one / za) * (one / area), (one / zb) * (one / area), (one / zc) * (one / area)
-            )  # fmt: skip
-            oxa, oya, exa, eya = _edge(corners, b, c)
-            oxb, oyb, exb, eyb = _edge(corners, c, a)
-            oxc, oyc, exc, eyc = _edge(corners, a, b)
-            for y in range(y0, y1 + 1):
-                fy = np.float32(y)
-                along_a, along_b, along_c = exa * (fy - oya), exb * (fy - oyb), exc * (fy - oyc)
-                entered = False
-                for x in range(x0, x1 + 1):
-                    fx = np.float32(x)
-                    wa = along_a - eya * (fx - oxa)
-                    wb = along_b - eyb * (fx - oxb)
-                    wc = along_c - eyc * (fx - oxc)
-                    if min(wa, wb, wc) >= 0:
-                        inverse_depth = wa * by_a + wb * by_b + wc * by_c
-                        if inverse_depth > nearest[y, x]:
-                            nearest[y, x] = inverse_depth
-                            winner[y, x] = face
-                        entered = True
-                    elif entered:
-                        break  # a triangle is left once only
+        nearest = drawn[view]  # inverse depths until the end
+        draw_view(screen[view], depth[view], faces, np.float32(near), face_index[view], nearest)
         # Without branches: the place after the last one is written again and again.
         flat, line = nearest.reshape(-1), listed[view]
         covered = 0

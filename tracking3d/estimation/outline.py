@@ -1,4 +1,4 @@
-"""The outline of an observation's mask as a distance, honest at the border of the frame."""
+"""The outline of a window's mask as a distance, honest at the border of the frame."""
 
 from __future__ import annotations
 
@@ -7,19 +7,21 @@ import torch
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from tracking3d.estimation.observation import Observation
 from tracking3d.rendering import signed_distance
 
 
-def outline_distance(observation: Observation) -> Tensor:
+def outline_distance(mask: Tensor, valid: Tensor) -> Tensor:
     """``(S, S)`` signed distance in pixels to the mask's outline, negative inside, zero beyond the frame's border.
 
     A mask that the border cuts off goes on beyond it: the cut is no outline of the object.
+
+    Args:
+        mask: ``(S, S)`` in [0, 1].
+        valid: ``(S, S)`` 1 inside the frame, 0 beyond its border.
     """
-    valid = observation.valid > 0.5
-    mask = observation.mask
-    if bool(valid.all()) or not bool(valid.any()):
+    inside = valid > 0.5
+    if bool(inside.all()) or not bool(inside.any()):
         return signed_distance(mask[None])[0]
-    _, nearest = distance_transform_edt(~valid.cpu().numpy(), return_indices=True)
+    _, nearest = distance_transform_edt(~inside.cpu().numpy(), return_indices=True)
     row, column = (torch.from_numpy(np.ascontiguousarray(axis)).to(mask.device) for axis in nearest)
-    return torch.where(valid, signed_distance(mask[row.long(), column.long()][None])[0], 0.0)
+    return torch.where(inside, signed_distance(mask[row.long(), column.long()][None])[0], 0.0)

@@ -1,0 +1,291 @@
+"""Kernel of `tracking3d.rendering.pose_terms`: a pose is projected, drawn and compared in one pass."""
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor
+
+from tracking3d.rendering.contour import MOST_ON_AN_EDGE, PROBE
+from tracking3d.rendering.kernels.compilation import OPTIONS, REORDER, array, check_corners, kernel
+from tracking3d.rendering.kernels.interpolation import barycentrics, slopes_of_face
+from tracking3d.rendering.kernels.normal_equations import of_channels, point_motion
+from tracking3d.rendering.kernels.texture_losses import bilinear_weights, taps_of, texels_at
+from tracking3d.rendering.kernels.threads import share
+from tracking3d.rendering.kernels.visibility import draw_view
+from tracking3d.rendering.normal_equations import NormalEquations
+from tracking3d.rendering.pose_terms import MatchedPoints, PoseTarget, PoseTerms, Scales
+from tracking3d.rendering.surface import Surface
+from tracking3d.rendering.visibility import NEAR
+
+_APPEARANCE, _OUTLINE, _POINTS = range(3)
+_COMPARABLE, _KNOWN, _BOTH, _EITHER = range(4)
+
+
+def pose_terms(
+    surface: Surface,
+    target: PoseTarget,
+    R: Tensor,
+    t: Tensor,
+    matched: MatchedPoints | None,
+    scales: Scales,
+    nearest: float,
+) -> PoseTerms:
+    """See `tracking3d.rendering.pose_terms`; ``nearest`` is the least depth of matched points."""
+    check_corners(surface.faces, surface.vertices[None])
+    none = target.comparable.new_zeros(0, 0)
+    mesh = surface.vertices, surface.faces, surface.face_uvs, *surface.edges, surface.layers
+    frame = (
+        target.features.permute(1, 2, 0),
+        target.comparable,
+        target.inside,
+        none.bool() if target.mask is None else target.mask,
+        none if target.distance is None else target.distance,
+        target.K,
+    )
+    points = (none, none) if matched is None else (matched.points, matched.pixels)
+    sums, counts = np.zeros((len(R), 3, 7, 7)), np.zeros((len(R), 4))
+    share(
+        _pose_terms, len(R), 2, *map(array, (*mesh, *frame, *points, R, t)),
+        scales.appearance, scales.outline, scales.points, nearest, sums, counts,
+    )  # fmt: skip
+    models = (
+        NormalEquations(term[:, :6, :6], term[:, 6, :6], term[:, 6, 6])
+        for term in torch.from_numpy(sums).unbind(1)
+    )
+    appearance, outline, by_points = models
+    of_pixels = torch.from_numpy(counts)
+    overlap = of_pixels[:, _BOTH] / of_pixels[:, _EITHER].clamp_min(1)
+    if target.mask is None:
+        overlap = torch.ones_like(overlap)
+    return PoseTerms(appearance, outline, by_points, of_pixels[:, _COMPARABLE], of_pixels[:, _KNOWN], overlap)
+
+
+@kernel(
+    "void(float32[:,::1], int64[:,::1], float32[:,:,::1], int64[:,::1], int64[::1], float32[:,:,::1],"
+    " float32[:,:,::1], float32[:,::1], boolean[:,::1], boolean[:,::1], float32[:,::1], float32[:,::1],"
+    " float32[:,::1], float32[:,::1], float32[:,:,::1], float32[:,::1],"
+    " float64, float64, float64, float64, float64[:,:,:,::1], float64[:,::1], int64, int64)"
+)
+def _pose_terms(
+    vertices, faces, face_uvs, edges, shared, layers, features, comparable, inside, mask, distance, K,
+    points, pixels, R, t, appearance, outline, by_points, nearest, sums, counts, first, last,
+):  # fmt: skip
+    height, width = comparable.shape
+    x_cam, screen = np.empty_like(vertices), np.empty((len(vertices), 2), np.float32)
+    face_index = np.empty((height, width), np.int64)
+    inverse_depth = np.empty((height, width), np.float32)
+    for pose in range(first, last):
+        _project(vertices, R[pose], t[pose], K, np.float32(NEAR), x_cam, screen)
+        depth = np.ascontiguousarray(x_cam[:, 2])
+        face_index[:] = -1
+        inverse_depth[:] = 0
+        draw_view(screen, depth, faces, np.float32(NEAR), face_index, inverse_depth)
+        _of_pixels(
+            screen, depth, faces, face_uvs, layers, face_index, inverse_depth, features, comparable, K, t[pose],
+            appearance, sums[pose, _APPEARANCE], counts[pose],
+        )  # fmt: skip
+        if mask.size:
+            _count_overlap(face_index, inside, mask, counts[pose])
+        if distance.size:
+            _of_outline(
+                screen, x_cam, faces, edges, shared, face_index, distance, K, t[pose], outline,
+                sums[pose, _OUTLINE],
+            )  # fmt: skip
+        if points.size:
+            _of_points(points, pixels, R[pose], t[pose], K, by_points, nearest, sums[pose, _POINTS])
+
+
+@numba.njit(**OPTIONS)
+def _project(vertices, R, t, K, near, x_cam, screen):
+    for v in range(len(vertices)):
+        x, y, z = vertices[v]
+        for row in range(3):
+            x_cam[v, row] = R[row, 0] * x + R[row, 1] * y + R[row, 2] * z + t[row]
+        depth = max(x_cam[v, 2], near)
+        screen[v, 0] = x_cam[v, 0] / depth * K[0, 0] + K[0, 2]
+        screen[v, 1] = x_cam[v, 1] / depth * K[1, 1] + K[1, 2]
+
+
+@numba.njit(**OPTIONS)
+def _count_overlap(face_index, inside, mask, counts):
+    for y in range(len(mask)):
+        for x in range(mask.shape[1]):
+            if inside[y, x]:
+                covered = face_index[y, x] >= 0
+                counts[_BOTH] += covered and mask[y, x]
+                counts[_EITHER] += covered or mask[y, x]
+
+
+@numba.njit(fastmath=REORDER, **OPTIONS)
+def _of_pixels(
+    screen, depth, faces, face_uvs, layers, face_index, inverse_depth, features, comparable, K, pivot, scale, sums,
+    counts,
+):  # fmt: skip
+    """Mean loss of the features over the covered pixels; see `tracking3d.rendering.kernels.normal_equations`."""
+    height, width, channels = layers.shape[0], layers.shape[1], layers.shape[2] - 1
+    rows, columns = face_index.shape
+    one = np.float32(1)
+    sharpness = np.float32(1 / scale**2)
+    fx, cx, fy, cy = K[0, 0], K[0, 2], K[1, 1], K[1, 2]
+    motion = np.zeros((2, 6), np.float32)
+    total = 0.0
+    for y in range(rows):
+        x = 0
+        while x < columns:
+            face = face_index[y, x]
+            if face < 0:
+                x += 1
+                continue
+            a, b, c = faces[face]
+            place, slope_x, slope_y, inverse = slopes_of_face(screen, depth, a, b, c)
+            uv = face_uvs[face]
+            while x < columns and face_index[y, x] == face:
+                column = x
+                x += 1
+                counts[_COMPARABLE] += comparable[y, column]
+                if comparable[y, column] == 0:
+                    continue
+                wa, wb, wc = barycentrics(place, slope_x, slope_y, np.float32(column), np.float32(y))
+                wa, wb, wc = wa * inverse[0], wb * inverse[1], wc * inverse[2]
+                s = one / (wa + wb + wc)
+                u = (wa * uv[0, 0] + wb * uv[1, 0] + wc * uv[2, 0]) * s
+                v = (wa * uv[0, 1] + wb * uv[1, 1] + wc * uv[2, 1]) * s
+                taps = taps_of(u, v, height, width)
+                w00, w01, w10, w11 = bilinear_weights(taps)
+                t00, t01, t10, t11 = texels_at(layers, taps)
+                seen = w00 * t00[channels] + w01 * t01[channels] + w10 * t10[channels] + w11 * t11[channels]
+                weight = np.float64(seen * comparable[y, column])
+                if weight == 0:
+                    continue
+                total += weight
+                ua, va, ub, vb = uv[0, 0] - u, uv[0, 1] - v, uv[1, 0] - u, uv[1, 1] - v
+                uc, vc = uv[2, 0] - u, uv[2, 1] - v
+                xa, xb, xc = slope_x[0] * inverse[0], slope_x[1] * inverse[1], slope_x[2] * inverse[2]
+                ya, yb, yc = slope_y[0] * inverse[0], slope_y[1] * inverse[1], slope_y[2] * inverse[2]
+                z = one / inverse_depth[y, column]
+                texels_u, texels_v = z * np.float32(width), z * np.float32(height)
+                by_x = (xa * ua + xb * ub + xc * uc) * texels_u, (xa * va + xb * vb + xc * vc) * texels_v
+                by_y = (ya * ua + yb * ub + yc * uc) * texels_u, (ya * va + yb * vb + yc * vc) * texels_v
+                xx, xy, yy, gx, gy, loss = of_channels(
+                    layers, taps, features[y, column], channels, sharpness, by_x, by_y
+                )
+                ray_x, ray_y = (np.float32(column) - cx) / fx, (np.float32(y) - cy) / fy
+                point_motion(ray_x, ray_y, z, fx, fy, pivot, motion)
+                for i in range(6):
+                    left_x = weight * (xx * motion[0, i] + xy * motion[1, i])
+                    left_y = weight * (xy * motion[0, i] + yy * motion[1, i])
+                    for j in range(i, 6):
+                        sums[i, j] += left_x * motion[0, j] + left_y * motion[1, j]
+                    # At a fixed pixel the rendered image moves against the surface.
+                    sums[6, i] -= weight * (gx * motion[0, i] + gy * motion[1, i])
+                sums[6, 6] += weight * loss
+    counts[_KNOWN] = total
+    _finish(sums, max(total, 1.0) * channels)
+
+
+@numba.njit(**OPTIONS)
+def _finish(sums, total):
+    """Means of sums: the upper triangle and the gradient are halves of what they stand for."""
+    for i in range(6):
+        sums[6, i] *= 2 / total
+        for j in range(i, 6):
+            sums[i, j] *= 2 / total
+            sums[j, i] = sums[i, j]
+    sums[6, 6] /= total
+
+
+@numba.njit(inline="always", **OPTIONS)
+def _add(sums, slope_x, slope_y, motion, weight, residual):
+    """What a residual with these slopes by the screen's x and y adds: ``weight`` times its square's half."""
+    for i in range(6):
+        by_i = slope_x * motion[0, i] + slope_y * motion[1, i]
+        for j in range(i, 6):
+            sums[i, j] += weight * by_i * (slope_x * motion[0, j] + slope_y * motion[1, j])
+        sums[6, i] += weight * by_i * residual
+
+
+@numba.njit(**OPTIONS)
+def _of_outline(screen, x_cam, faces, edges, shared, face_index, distance, K, pivot, scale, sums):
+    """Mean loss of the contour's distances; see `tracking3d.rendering.contour`."""
+    height, width = distance.shape
+    near, one = np.float32(NEAR), np.float32(1)
+    motion = np.zeros((2, 6), np.float32)
+    front, fronts = np.zeros(len(faces), np.bool_), np.zeros(len(shared), np.int64)
+    for face in range(len(faces)):
+        a, b, c = faces[face]
+        ab_x, ab_y = screen[b, 0] - screen[a, 0], screen[b, 1] - screen[a, 1]
+        ac_x, ac_y = screen[c, 0] - screen[a, 0], screen[c, 1] - screen[a, 1]
+        front[face] = (
+            ab_y * ac_x > ab_x * ac_y and x_cam[a, 2] > near and x_cam[b, 2] > near and x_cam[c, 2] > near
+        )
+        if front[face]:
+            for side in range(3):
+                fronts[edges[face, side]] += 1
+    whole = 0.0
+    for face in range(len(faces)):
+        for side in range(3):
+            edge = edges[face, side]
+            if not front[face] or (fronts[edge] == shared[edge] and shared[edge] > 1):
+                continue
+            begin, end = faces[face, side], faces[face, (side + 1) % 3]
+            along_x, along_y = screen[end, 0] - screen[begin, 0], screen[end, 1] - screen[begin, 1]
+            length = math.sqrt(along_x * along_x + along_y * along_y)
+            if not length < np.inf:
+                continue
+            count = min(max(math.ceil(length), 1), MOST_ON_AN_EDGE)
+            across = PROBE / max(length, 1e-12)
+            for number in range(count):
+                fraction = np.float32((number + 0.5) / count)
+                x, y = screen[begin, 0] + fraction * along_x, screen[begin, 1] + fraction * along_y
+                column, row = round(x), round(y)
+                if not (0 <= column < width and 0 <= row < height):
+                    continue
+                column, row = round(x - along_y * across), round(y + along_x * across)
+                if 0 <= column < width and 0 <= row < height and face_index[row, column] >= 0:
+                    continue  # the mesh goes on there
+                left = min(max(math.floor(x), 0), max(width - 2, 0))
+                top = min(max(math.floor(y), 0), max(height - 2, 0))
+                right, bottom = min(left + 1, width - 1), min(top + 1, height - 1)
+                fx, fy = x - np.float32(left), y - np.float32(top)
+                d00, d01 = distance[top, left], distance[top, right]
+                d10, d11 = distance[bottom, left], distance[bottom, right]
+                twist = d11 - d10 - d01 + d00
+                residual = d00 + fx * (d01 - d00) + fy * (d10 - d00) + fx * fy * twist
+                # Perspective: on the screen it is the inverse depth that is mixed.
+                at_begin, at_end = (one - fraction) / x_cam[begin, 2], fraction / x_cam[end, 2]
+                z = one / (at_begin + at_end)
+                ray_x = at_begin * x_cam[begin, 0] + at_end * x_cam[end, 0]
+                ray_y = at_begin * x_cam[begin, 1] + at_end * x_cam[end, 1]
+                point_motion(ray_x, ray_y, z, K[0, 0], K[1, 1], pivot, motion)
+                each = length / count
+                whole += each
+                squared = np.float64(residual) * residual
+                weight = each / (scale**2 + squared)
+                _add(sums, d01 - d00 + fy * twist, d10 - d00 + fx * twist, motion, weight, residual)
+                sums[6, 6] += each * math.log1p(squared / scale**2)
+    _finish(sums, max(whole, 1.0))
+
+
+@numba.njit(**OPTIONS)
+def _of_points(points, pixels, R, t, K, scale, nearest, sums):
+    """Mean loss of the distances between projected points and pixels."""
+    motion = np.zeros((2, 6), np.float32)
+    for n in range(len(points)):
+        px, py, pz = points[n]
+        x = R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz + t[0]
+        y = R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz + t[1]
+        z = max(R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz + t[2], np.float32(nearest))
+        gap_x = x / z * K[0, 0] + K[0, 2] - pixels[n, 0]
+        gap_y = y / z * K[1, 1] + K[1, 2] - pixels[n, 1]
+        squared = np.float64(gap_x) ** 2 + np.float64(gap_y) ** 2
+        weight = 1 / (scale**2 + squared)
+        point_motion(x / z, y / z, z, K[0, 0], K[1, 1], t, motion)
+        _add(sums, 1.0, 0.0, motion, weight, gap_x)
+        _add(sums, 0.0, 1.0, motion, weight, gap_y)
+        sums[6, 6] += math.log1p(squared / scale**2)
+    _finish(sums, len(points))
