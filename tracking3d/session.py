@@ -235,7 +235,7 @@ class Session:
         except PluginFailure as error:
             failures.append(self._excused(error))
             estimate = unanswered(frame, mask, self._last_pose)
-        self._last_pose = estimate.T_cam_obj
+        self._last_pose, self._camera = estimate.T_cam_obj, estimate.camera or self._camera
         if self.config.solver.correct_tracker and self._tracker.can_correct and corrects(estimate):
             self.corrected = True
             try:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.frames import Frame, MaskEstimate
+from tracking3d.geometry.camera import Camera
 from tracking3d.stages import StageTimes
 
 
@@ -72,6 +73,8 @@ class FrameEstimate:
         refined: Whether this is the answer of the final refinement, which looks at the whole video, and not the
             causal one.
         revised: Better answers for earlier frames that this frame made possible; they replace those given before.
+        camera: The camera of the full frame that the pose is of. Where nobody gave the lens it changes with what is
+            known. None where the answer does not say: the camera that was known from the first frame on.
     """
 
     index: int
@@ -92,6 +95,7 @@ class FrameEstimate:
     stages: StageTimes | None = None
     mask_source: MaskSource | None = None
     revised: tuple[FrameEstimate, ...] = ()
+    camera: Camera | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ comparable from frame to frame.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +49,15 @@ class Camera:
         """A centred camera with square pixels and a vertical field of view of ``fov`` degrees."""
         focal = 0.5 * height / math.tan(math.radians(fov) / 2)
         return cls(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height, origin)
+
+    @property
+    def fov(self) -> float:
+        """Vertical field of view in degrees."""
+        return 2 * math.degrees(math.atan2(self.height / 2, self.fy))
+
+    def zoomed(self, factor: float, origin: str) -> Camera:
+        """With ``factor`` times the focal lengths; ``origin`` says in words where that came from."""
+        return replace(self, fx=factor * self.fx, fy=factor * self.fy, origin=origin)
 
     @property
     def K(self) -> NDArray[np.float64]:

@@ -70,7 +70,7 @@ def track_points(run: RunReader | Path, frame: int, xy: ArrayLike) -> PointTrack
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     tolerance = DEPTH_TOLERANCE * float(np.linalg.norm(np.ptp(vertices, axis=0))) / 2
 
-    screen, depth = project(run.camera, asked.T_cam_obj, vertices)
+    screen, depth = project(run.camera_of(asked), asked.T_cam_obj, vertices)
     face, barycentric = surface_under(screen, depth, faces, query)
     on_object = (face >= 0) & _in_frame(run.camera, query)
     face, barycentric = np.where(on_object, face, -1), np.where(on_object[:, None], barycentric, np.nan)
@@ -83,13 +83,14 @@ def track_points(run: RunReader | Path, frame: int, xy: ArrayLike) -> PointTrack
     for row, record in enumerate(run.frames):
         if not np.isfinite(record.T_cam_obj).all():
             continue
-        positions[row], distance = project(run.camera, record.T_cam_obj, points)
+        camera = run.camera_of(record)
+        positions[row], distance = project(camera, record.T_cam_obj, points)
         if record.status == Status.LOST or record.area == 0:
             continue
         eye = -record.T_cam_obj[:3, :3].T @ record.T_cam_obj[:3, 3]
         facing = ((eye - points) * normals).sum(1) > 0
-        screen, depth = project(run.camera, record.T_cam_obj, vertices)
-        behind = _deepest_around(run.camera, screen, depth, faces, positions[row])
+        screen, depth = project(camera, record.T_cam_obj, vertices)
+        behind = _deepest_around(camera, screen, depth, faces, positions[row])
         visible[row] = on_object & facing & (distance > NEAR) & (distance <= behind + tolerance)
     indices = np.array([record.index for record in run.frames], dtype=np.int64)
     return PointTracks(frame, query, indices, positions, visible, on_object, face, barycentric)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -94,3 +94,14 @@ def read_mask(path: Path) -> NDArray[np.bool_] | None:
         return None
     image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE) if path.stat().st_size else None
     return None if image is None else image >= 128
+
+
+def first_problem(*steps: Callable[[], None]) -> Exception | None:
+    """Take every step; give the first error any of them raised."""
+    problem: Exception | None = None
+    for step in steps:
+        try:
+            step()
+        except Exception as error:
+            problem = problem or error
+    return problem

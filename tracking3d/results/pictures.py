@@ -42,9 +42,9 @@ class Pictures:
         if self._first is None:
             self._first = estimate
         if self._axes is None:
-            self._axes = ObjectAxes.of(estimate, self.camera)
+            self._axes = ObjectAxes.of(estimate, estimate.camera or self.camera)
         size = OverlaySize.of(self.camera)
-        overlay = draw_overlay(frame, estimate, record, self.camera, self._axes)
+        overlay = draw_overlay(frame, estimate, record, estimate.camera or self.camera, self._axes)
         self._thumbnails.add(overlay[: size.picture], size.scale, estimate)
         if self._video is None:
             self._video = VideoWriter(self._file, self._fps, (size.height, size.width))
@@ -78,6 +78,7 @@ class Pictures:
             reason=record.reason,
             confidence=record.confidence,
             keyframe=record.keyframe,
+            camera=record.through(self.camera),
         )
         self.add(frame, estimate, record)
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource, Status
+from tracking3d.geometry.camera import Camera
 from tracking3d.stages import StageTimes
 
 _KINDS: dict[str, Any] = {
@@ -35,6 +36,7 @@ _KINDS: dict[str, Any] = {
     "refined": bool,
     "stages": dict | None,
     "mask_source": str | None,
+    "camera": list | None,
 }
 _MOST = 2**53  # the largest count that every reader of JSON knows exactly
 
@@ -63,6 +65,7 @@ class FrameRecord:
         refined: Whether this is the answer of the final refinement, not the causal one.
         stages: The same time stage by stage; None where it is not known, as in runs of older versions.
         mask_source: Where the answer's mask comes from; None where it is not known.
+        camera: fx, fy, cx, cy of the camera that the pose is of; None where it is the run's.
     """
 
     index: int
@@ -84,6 +87,7 @@ class FrameRecord:
     refined: bool = False
     stages: StageTimes | None = None
     mask_source: MaskSource | None = None
+    camera: tuple[float, float, float, float] | None = None
 
     @classmethod
     def of(
@@ -114,7 +118,15 @@ class FrameRecord:
             refined=bool(estimate.refined),
             stages=estimate.stages,
             mask_source=estimate.mask_source,
+            camera=None if (c := estimate.camera) is None else (c.fx, c.fy, c.cx, c.cy),
         )
+
+    def through(self, camera: Camera) -> Camera:
+        """The camera that the pose is of; ``camera`` is the run's."""
+        if self.camera is None:
+            return camera
+        fx, fy, cx, cy = self.camera
+        return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy)
 
     def and_wrote(self, seconds: float) -> Self:
         """The record, with the time that writing masks and pictures took."""
@@ -140,6 +152,9 @@ class FrameRecord:
                 fields["stages"] = read_stages(stages)
             if (source := fields.get("mask_source")) is not None:
                 fields["mask_source"] = MaskSource(source)
+            if (camera := fields.get("camera")) is not None:
+                fx, fy, cx, cy = (float(value) for value in camera)
+                fields["camera"] = fx, fy, cx, cy
             return cls(**{key: value for key, value in fields.items() if key in cls.__dataclass_fields__})
         except KeyError as error:
             raise ValueError(f"there is no {error.args[0]}") from error

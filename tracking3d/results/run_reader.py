@@ -84,6 +84,19 @@ class RunReader:
             )
         return camera
 
+    def camera_of(self, record: FrameRecord) -> Camera:
+        """The camera that a frame's pose is of: where nobody gave the lens it can be another one than in the end.
+
+        Raises:
+            InputError: If there is none that can be.
+        """
+        camera = record.through(self.camera)
+        if fault := _camera_fault(camera):
+            raise InputError(
+                f"{self.folder / layout.FRAMES} is damaged: frame {record.index} names no camera ({fault}); restore it."
+            )
+        return camera
+
     @property
     def refinement_stages(self) -> StageTimes | None:
         """What the final refinement took, stage by stage; None where that is not known.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -22,7 +22,14 @@ from tracking3d.estimation.estimate import FrameEstimate, ObjectModel
 from tracking3d.frames import Frame, MaskEstimate, SkippedFrame
 from tracking3d.geometry.camera import Camera
 from tracking3d.results import description, layout
-from tracking3d.results.files import read_mask, write_image, write_mask, write_reserved, writing
+from tracking3d.results.files import (
+    first_problem,
+    read_mask,
+    write_image,
+    write_mask,
+    write_reserved,
+    writing,
+)
 from tracking3d.results.frame_lines import FrameLines
 from tracking3d.results.making_room import make_room
 from tracking3d.results.mesh_export import export_mesh
@@ -169,6 +176,7 @@ class RunWriter:
         for revised in estimate.revised:
             self._record(revised, "", revision=True)
         record = self._record(estimate, frame.name, revision=False, started=started)
+        self._use(estimate.camera or self._camera)
         drawn = time.perf_counter()
         self._pictures.add(frame, estimate, record)
         self._drawing = time.perf_counter() - drawn
@@ -219,6 +227,13 @@ class RunWriter:
         assert self._refinement is not None
         self._camera = self._refinement.pictures.camera = camera
 
+    def _use(self, camera: Camera) -> None:
+        """From here on causal answers are those of ``camera``."""
+        if camera != self._camera:
+            self._camera = self._pictures.camera = camera
+            self._description["camera"] = asdict(camera)
+            self._write_description()
+
     def end_refinement(self) -> None:
         """Put the refined answers in the place of the causal ones, which go to ``causal/``.
 
@@ -248,12 +263,10 @@ class RunWriter:
             return
         self._over = True
         try:
-            problem = _first_problem(
-                self._pictures.close,
-                partial(self._give_up_refinement, state, error),
-                partial(self._export, model),
-                partial(self._finish, model),
-            )
+            steps = [self._pictures.close, partial(self._give_up_refinement, state, error)]
+            if model is not None:
+                steps.append(partial(export_mesh, self.folder, model))
+            problem = first_problem(*steps, partial(self._finish, model))
             if problem:
                 state, error = "failed", str(problem)
             ended = {"state": state, "error": error, "finished": description.now()}
@@ -331,10 +344,6 @@ class RunWriter:
             self._refinement.give_up(keep=layout.has_state(self.folder))
             self._description["refinement"] = self._refinement.described(state, error or "")
 
-    def _export(self, model: ObjectModel | None) -> None:
-        if model is not None:
-            export_mesh(self.folder, model)
-
     def _finish(self, model: ObjectModel | None) -> None:
         records = list(read_records(self.folder / layout.FRAMES))
         seconds = time.monotonic() - self._started
@@ -345,14 +354,3 @@ class RunWriter:
         sheet = self._pictures.contact_sheet(model, self._description)
         if sheet is not None:
             write_image(self.folder / layout.CONTACT_SHEET, sheet)
-
-
-def _first_problem(*steps: Callable[[], None]) -> Exception | None:
-    """Take every step; give the first error any of them raised."""
-    problem: Exception | None = None
-    for step in steps:
-        try:
-            step()
-        except Exception as error:
-            problem = problem or error
-    return problem

@@ -29,13 +29,15 @@ def asked(monkeypatch):
     """Which views a start was asked for, by kind; what it costs can be set."""
     calls: dict = {"points": [], "turning": [], "bundle": 0.05}
 
-    def solve_start(known, camera, views, weights, prior):
+    def solve_start(known, cameras, views, weights, prior):
         calls["points"].append(len(views))
-        return [Start(known, 1.0, calls["bundle"], "points")] if calls["bundle"] is not None else []
+        return (
+            [Start(known, 1.0, calls["bundle"], "points", cameras[0])] if calls["bundle"] is not None else []
+        )
 
     def by_turning(known, camera, views, weights):
         calls["turning"].append(len(views))
-        return [Start(known, 0.5, 0.0, "turning")]
+        return [Start(known, 0.5, 0.0, "turning", camera)]
 
     monkeypatch.setattr(waiting, "solve_start", solve_start)
     monkeypatch.setattr(waiting, "by_turning", by_turning)
@@ -50,7 +52,7 @@ def belief_of(angles, without_mask=()) -> Belief:
         frame = Frame(view.index, np.zeros((SIZE, SIZE, 3), np.uint8))
         if view.index // 2 in without_mask:
             view = replace(view, mask=None)
-        held.append((view, unsolved(frame, view.mask, view.pose)))
+        held.append((view, unsolved(frame, view.mask, view.pose, CAMERA)))
     nothing = replace(known, keyframes=())
     grey = np.zeros((SIZE, SIZE), np.uint8)
     return Belief(CAMERA, nothing, None, (turned(0), 0), None, grey, FollowedPoints.none(), tuple(held))

@@ -13,12 +13,13 @@ from tracking3d.estimation.online.attempt import Attempt
 from tracking3d.estimation.online.belief import Belief
 from tracking3d.estimation.online.pose_refinement import PoseWeights
 from tracking3d.frames import Frame
+from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose
 
 WAITING = "the object has not moved enough yet to tell its shape"
 
 
-def unsolved(frame: Frame, mask: NDArray[np.bool_] | None, pose: Pose) -> FrameEstimate:
+def unsolved(frame: Frame, mask: NDArray[np.bool_] | None, pose: Pose, camera: Camera) -> FrameEstimate:
     """The answer while nothing is known: the initial mask."""
     return FrameEstimate(
         index=frame.index,
@@ -30,6 +31,7 @@ def unsolved(frame: Frame, mask: NDArray[np.bool_] | None, pose: Pose) -> FrameE
         reason=WAITING,
         confidence=0.3,
         mask_source=MaskSource.handed_back(mask),
+        camera=camera,
     )
 
 
@@ -55,6 +57,7 @@ def solved(state: Belief, answer: FrameEstimate, found: Attempt) -> FrameEstimat
     return replace(
         answer,
         T_cam_obj=fit.pose.matrix().numpy(),
+        camera=state.camera,
         mask=mask,
         mask_source=source,
         status=judgement.status,

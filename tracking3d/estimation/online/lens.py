@@ -1,7 +1,7 @@
-"""The focal length, where nobody gave it: solved with poses and points when the whole video has been seen.
+"""The focal length, where nobody gave it: hypotheses for the start, and solved with poses and points later on.
 
 A wrong lens makes the object turn too little or too much. Several lenses are tried, since the cost has a valley at
-each, and the assumed one stays unless another explains the points clearly better.
+each, and the one at hand stays unless another explains the points clearly better.
 """
 
 from __future__ import annotations
@@ -10,19 +10,46 @@ import math
 from dataclasses import replace
 
 import numpy as np
+import torch
 
 from tracking3d.config.camera import USUAL_ANGLES
-from tracking3d.estimation.online.belief import ObjectMap
+from tracking3d.estimation.online.belief import ObjectMap, View
 from tracking3d.estimation.online.bundle import Structure, adjust
 from tracking3d.estimation.online.mapping import pose_of, shared_landmarks, structure_of, tracks_of
 from tracking3d.geometry.camera import Camera
+from tracking3d.geometry.pose import Pose
 
 CANDIDATES = (10.0, 25.0, 45.0, 65.0)
 """Vertical fields of view in degrees."""
+_AT_THE_START = (9.0, 16.0, 27.0, 65.0)  # beside the assumed one
 _CLEARLY = 0.92  # of the assumed lens's cost
 _SAME = math.log(1.05)  # focal lengths so near are one
 _ITERATIONS = 25
 _FEWEST = 30  # landmarks
+
+
+def lens_hypotheses(camera: Camera) -> tuple[Camera, ...]:
+    """The cameras that a start is solved with, the assumed one first: only it where somebody gave the lens."""
+    if not camera.assumed:
+        return (camera,)
+    others = [
+        camera.zoomed(
+            Camera.from_fov(camera.width, camera.height, degrees).fy / camera.fy,
+            f"field of view of {degrees:g} degrees, the likeliest of those tried",
+        )
+        for degrees in _AT_THE_START
+    ]
+    return (camera, *others)
+
+
+def through(view: View, before: Camera, after: Camera) -> View:
+    """A view as another lens would have taken it: the image stays, the object's depth goes with the focal length."""
+    factor = after.fy / before.fy
+    K = view.observation.K.clone()
+    K[0, 0], K[1, 1] = factor * K[0, 0], factor * K[1, 1]
+    x, y, z = view.pose.translation.unbind(-1)
+    pose = Pose(torch.stack([x, y, factor * z], -1), view.pose.quaternion)
+    return replace(view, pose=pose, observation=replace(view.observation, K=K), texture=None)
 
 
 def solve_lens(known: ObjectMap, camera: Camera) -> tuple[ObjectMap, Camera]:
@@ -52,7 +79,7 @@ def solve_lens(known: ObjectMap, camera: Camera) -> tuple[ObjectMap, Camera]:
 
 def _is_a_lens(factor: float, camera: Camera) -> bool:
     least, most = USUAL_ANGLES
-    degrees = 2 * math.degrees(math.atan(camera.height / (2 * factor * camera.fy)))
+    degrees = camera.zoomed(factor, "").fov
     return least <= degrees <= most
 
 
@@ -63,13 +90,10 @@ def _with_lens(
     landmarks = known.landmarks.copy()
     sound = np.isfinite(found.points).all(1)
     landmarks[names[sound]] = found.points[sound]
-    keyframes = []
-    for n, view in enumerate(known.keyframes):
-        K = view.observation.K.clone()
-        K[0, 0], K[1, 1] = factor * K[0, 0], factor * K[1, 1]
-        pose = pose_of(found.R[n], found.t[n], known.vertices)
-        keyframes.append(replace(view, pose=pose, observation=replace(view.observation, K=K), texture=None))
-    degrees = 2 * math.degrees(math.atan(camera.height / (2 * factor * camera.fy)))
-    origin = f"solved field of view of {degrees:.1f} degrees"
-    camera = replace(camera, fx=factor * camera.fx, fy=factor * camera.fy, origin=origin)
-    return replace(known, landmarks=landmarks, keyframes=tuple(keyframes)), camera
+    solved = camera.zoomed(factor, "")
+    solved = replace(solved, origin=f"solved field of view of {solved.fov:.1f} degrees")
+    keyframes = [
+        replace(through(view, camera, solved), pose=pose_of(found.R[n], found.t[n], known.vertices))
+        for n, view in enumerate(known.keyframes)
+    ]
+    return replace(known, landmarks=landmarks, keyframes=tuple(keyframes)), solved

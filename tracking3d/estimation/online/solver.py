@@ -27,6 +27,7 @@ from tracking3d.estimation.online.belief import ONLINE_CLASSES, Belief, ObjectMa
 from tracking3d.estimation.online.final_refinement import refined_once_more
 from tracking3d.estimation.online.growing import refined, with_keyframe, with_points
 from tracking3d.estimation.online.judgement import ENOUGH_POINTS, judge, looks_wrong, unexplained
+from tracking3d.estimation.online.lens import through
 from tracking3d.estimation.online.mapping import mask_weight, pose_of
 from tracking3d.estimation.online.motion import carried, moved_on, predicted
 from tracking3d.estimation.online.object_model import object_model
@@ -127,7 +128,7 @@ class OnlineSolver:
         observation = replace(observation, features=space.project(observation.features))
         view = View(observation, binary, pose, FollowedPoints.none())
         known, view = with_points(known, self.camera, view, image)
-        answer = unsolved(frame, binary, pose)
+        answer = unsolved(frame, binary, pose, self.camera)
         belief = replace(belief, known=known, space=space, followed=view.points, waiting=((view, answer),))
         return belief, answer
 
@@ -159,7 +160,7 @@ class OnlineSolver:
         binary, image, known = _usable(mask), grey(frame.image), state.known
         causal = pose_of(T_cam_obj[:3, :3], T_cam_obj[:3, 3], known.vertices)
         if state.surface is None:
-            return state, replace(unsolved(frame, binary, causal), refined=True)
+            return state, replace(unsolved(frame, binary, causal, state.camera), refined=True)
         starts = {"causal": causal}
         followed = follow(state.grey, image, state.followed)
         own = next((view for view in known.keyframes if view.index == frame.index), None)
@@ -171,7 +172,7 @@ class OnlineSolver:
         found = self._found(state, self._view(state, frame, binary, causal, followed), frame, image, starts)
         before = state.last if state.last[1] == frame.index - 1 else None
         belief = replace(moved_on(state, found, found.fit.pose, image), before=before)
-        answer = solved(belief, unsolved(frame, binary, found.fit.pose), found)
+        answer = solved(belief, unsolved(frame, binary, found.fit.pose, state.camera), found)
         return belief, replace(answer, refined=True)
 
     def result(self, state: Belief) -> ObjectModel:
@@ -189,7 +190,7 @@ class OnlineSolver:
         pose = state.last[0]
         view = self._view(state, frame, mask, pose, follow(state.grey, image, state.followed))
         known, view = waiting_view(state.known, tuple(v for v, _ in state.waiting), view, image)
-        answer = unsolved(frame, mask, pose)
+        answer = unsolved(frame, mask, pose, state.camera)
         belief = replace(state, known=known, waiting=(*state.waiting, (view, answer)))
         with in_stage("map"):
             belief, start = solved_start(belief.moved(pose, frame.index, image, view.points), self.online)
@@ -202,14 +203,14 @@ class OnlineSolver:
         """Answer all waiting frames anew."""
         assert state.waiting is not None
         everything = list(range(len(start.known.keyframes)))
+        waiting, before, camera = state.waiting, state.camera, start.camera
         with in_stage("map"):
-            known = refined(
-                start.known, state.camera, everything, self.online, bundle_iterations=20, rounds=3
-            )
-            belief = replace(state, known=known, surface=known.surface(), waiting=None)
+            known = refined(start.known, camera, everything, self.online, bundle_iterations=20, rounds=3)
+            belief = replace(state, camera=camera, known=known, surface=known.surface(), waiting=None)
         poses = {view.index: view.pose for view in known.keyframes}
         pose, usual, revised, trail = known.keyframes[0].pose, belief.usual, [], []
-        for view, earlier in state.waiting:
+        for seen, earlier in waiting:
+            view = through(seen, before, camera)
             start_pose = poses.get(view.index, pose)
             if known.pointless:
                 view = replace(view, points=FollowedPoints.none(), mask_weight=1.0)
@@ -218,7 +219,7 @@ class OnlineSolver:
                 fit = replace(fit, pose=start_pose)
             pose, usual = fit.pose, usual.updated(fit)
             trail.append((pose, view.index))
-            kept = agreeing(known, state.camera, pose, view.points, view)
+            kept = agreeing(known, camera, pose, view.points, view)
             agreed = witnesses(known, kept)
             judgement = judge(fit, usual, agreed, view.mask_weight, view.mask is not None)
             found = Attempt(view, fit, start.origin, kept, agreed, judgement)
@@ -259,7 +260,7 @@ class OnlineSolver:
         elif not unexplained(found.fit, state.usual, found.view.mask_weight):
             belief = replace(belief, trail=(*state.trail, (pose, frame.index))[-_TRAIL:])
         found = replace(found, fit=replace(found.fit, pose=pose))
-        answer = solved(belief, unsolved(frame, mask, pose), found)
+        answer = solved(belief, unsolved(frame, mask, pose, state.camera), found)
         return belief, replace(answer, keyframe=key)
 
     def _found(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from tracking3d.estimation.online.belief import ObjectMap, View
 from tracking3d.estimation.online.bundle import Structure
 from tracking3d.estimation.online.joint_fit import fit_jointly
 from tracking3d.estimation.online.keypoints import Keypoints
+from tracking3d.estimation.online.lens import through
 from tracking3d.estimation.online.mapping import (
     fit_shape,
     pose_arrays,
@@ -32,6 +34,10 @@ _VIEWS = 8
 _TURNING_FRAMES = 12  # after the first, for a start without points: a turn of 30 to 60 degrees, mostly
 _TURNING_VIEWS = 7
 _FEWEST_TURNING = 4
+_MOST_LIKELY, _AS_LIKELY = (
+    6,
+    2.0,
+)  # structures under several lenses whose shape is fitted: how many, and how costly
 # Hypotheses that go on, evaluations, half resolution.
 _STAGES = ((99, 5, True), (5, 12, True), (3, 10, False))
 
@@ -45,17 +51,19 @@ class Start:
         cost: How badly it re-renders the views.
         bundle: How badly its points fit their tracks.
         origin: Which hypothesis it came from.
+        camera: The camera that it was solved with.
     """
 
     known: ObjectMap
     cost: float
     bundle: float
     origin: str
+    camera: Camera
 
 
 def solve_start(
     known: ObjectMap,
-    camera: Camera,
+    cameras: Sequence[Camera],
     views: list[View],
     weights: FitWeights,
     prior: float,
@@ -64,7 +72,7 @@ def solve_start(
 
     Args:
         known: Prototype and landmarks; its keyframes are not looked at.
-        camera: Of the full frame.
+        cameras: Of the full frame: the one that the views are of, and other lenses that it might have had.
         views: The first frames, the first one's pose is kept.
         weights: Of the shape's terms.
         prior: See `refine_map`.
@@ -76,22 +84,36 @@ def solve_start(
     names, counts = np.unique(seen, return_counts=True)
     names = names[(counts >= min(3, len(chosen))) & ~known.candidate[names]]
     if len(names) < 8:
-        return by_turning(known, camera, views, weights)
+        return by_turning(known, cameras[0], views, weights)
     tracks = tracks_of(chosen, names)
-    _, t0 = pose_arrays(chosen[0].pose)
+    solved = []
+    for camera in cameras:
+        posed = [through(view, cameras[0], camera) for view in chosen]
+        _, t0 = pose_arrays(posed[0].pose)
+        structures = structure_hypotheses(tracks, camera.K, t0, RADIUS)
+        solved += [(structure, camera, posed) for structure in structures]
     starts = []
-    for structure in structure_hypotheses(tracks, camera.K, t0, RADIUS):
-        hypothesis = _with_structure(known, chosen, names, structure)
-        hypothesis = fit_shape(hypothesis, list(range(len(chosen))), weights, 4)
+    for structure, camera, posed in _likely(solved) if len(cameras) > 1 else solved:
+        hypothesis = _with_structure(known, posed, names, structure)
+        hypothesis = fit_shape(hypothesis, list(range(len(posed))), weights, 4)
         surface = hypothesis.surface()
         fits = [
             refine_pose(surface, view.observation, view.pose, None, PoseWeights(), iterations=(0, 0))
             for view in hypothesis.keyframes
         ]
         cost = float(np.mean([fit.cost for fit in fits])) + structure.cost
-        starts.append(Start(hypothesis, cost, structure.cost, structure.origin))
+        starts.append(Start(hypothesis, cost, structure.cost, structure.origin, camera))
     starts.sort(key=lambda start: start.cost)
     return starts
+
+
+_Solved = tuple[Structure, Camera, list[View]]
+
+
+def _likely(solved: list[_Solved]) -> list[_Solved]:
+    """Those whose points fit best; a wrong lens bends the points more than the noise does."""
+    solved = sorted(solved, key=lambda one: one[0].cost)
+    return [one for one in solved if one[0].cost < _AS_LIKELY * solved[0][0].cost][:_MOST_LIKELY]
 
 
 def with_observations(known: ObjectMap, views: list[View], coarse: bool) -> ObjectMap:
@@ -136,7 +158,7 @@ def by_turning(known: ObjectMap, camera: Camera, views: list[View], weights: Fit
         refine_pose(surface, view.observation, view.pose, None, PoseWeights(), iterations=(0,))
         for view in found.keyframes
     ]
-    return [Start(found, float(np.mean([fit.cost for fit in fits])), 0.0, name)]
+    return [Start(found, float(np.mean([fit.cost for fit in fits])), 0.0, name, camera)]
 
 
 def _spread(views: list[View], most: int) -> list[View]:

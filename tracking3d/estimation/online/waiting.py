@@ -12,6 +12,7 @@ from tracking3d.config.solvers import OnlineConfig
 from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.estimation.online.belief import Belief, ObjectMap, View
 from tracking3d.estimation.online.keypoints import detect, match
+from tracking3d.estimation.online.lens import lens_hypotheses
 from tracking3d.estimation.online.mapping import tracks_of
 from tracking3d.estimation.online.points import MOST_POINTS, FollowedPoints, new_corners
 from tracking3d.estimation.online.start import Start, by_turning, solve_start
@@ -96,7 +97,8 @@ def solved_start(state: Belief, config: OnlineConfig) -> tuple[Belief, Start | N
     # Without motion any shape explains the points.
     starts: list[Start] = []
     if motion >= MOTION:
-        starts = solve_start(state.known, state.camera, views, weights, config.surface_prior)
+        cameras = lens_hypotheses(state.camera)
+        starts = solve_start(state.known, cameras, views, weights, config.surface_prior)
     if not starts or starts[0].bundle > _DOUBTFUL:
         if not waited and (shared > _LASTING or len(views) < _FEWEST_BY_TURNING):
             return state, None
