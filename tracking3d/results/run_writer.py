@@ -212,8 +212,9 @@ class RunWriter:
             OutputError: If something cannot be written.
         """
         self._pictures.close()
-        self._export(model)
-        if model is None:
+        if model is not None:
+            export_mesh(self.folder, model)
+        else:
             with writing(self.folder):
                 self._lines.cut_back()
         causal = latest(read_records(self.folder / layout.FRAMES), refined=False)
@@ -263,10 +264,12 @@ class RunWriter:
             return
         self._over = True
         try:
-            steps = [self._pictures.close, partial(self._give_up_refinement, state, error)]
-            if model is not None:
-                steps.append(partial(export_mesh, self.folder, model))
-            problem = first_problem(*steps, partial(self._finish, model))
+            problem = first_problem(
+                self._pictures.close,
+                partial(self._give_up_refinement, state, error),
+                *([] if model is None else [partial(export_mesh, self.folder, model)]),
+                partial(self._finish, model),
+            )
             if problem:
                 state, error = "failed", str(problem)
             ended = {"state": state, "error": error, "finished": description.now()}
