@@ -12,6 +12,7 @@ from tracking3d.estimation.online.answer_mask import answer_mask, support_beside
 from tracking3d.estimation.online.attempt import Attempt
 from tracking3d.estimation.online.belief import Belief
 from tracking3d.estimation.online.pose_refinement import PoseWeights
+from tracking3d.estimation.online.tracking import straying
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose
@@ -72,6 +73,7 @@ def solved(state: Belief, answer: FrameEstimate, found: Attempt) -> FrameEstimat
             "overlap": fit.overlap,
             "unseen": fit.unseen,
             "witnesses": float(found.witnesses),
+            "strays": straying(state.known, state.camera, fit.pose, view),
             "mask_weight": view.mask_weight,
         },
     )

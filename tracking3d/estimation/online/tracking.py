@@ -109,6 +109,16 @@ def agreeing(
     return points.only(in_place & (inside | known.candidate[points.landmark]))
 
 
+def straying(known: ObjectMap, camera: Camera, pose: Pose, view: View) -> float:
+    """Share of a view's points on the object that are not where a pose says; 0 where there are none."""
+    names = view.points.landmark
+    told = np.isfinite(known.landmarks[names]).all(1) & (known.sightings[names] >= 2) & ~known.candidate[names]
+    if not told.any():
+        return 0.0
+    gap = project_points(known.landmarks[names[told]], pose, camera) - view.points.pixel[told]
+    return float((np.linalg.norm(gap, axis=1) > _STRAY * pixel_scale(view)).mean())
+
+
 def rematched(
     known: ObjectMap, camera: Camera, view: View, image: NDArray[np.uint8], anywhere: bool
 ) -> list[tuple[Pose, FollowedPoints]]:
