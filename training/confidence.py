@@ -20,6 +20,7 @@ import numpy as np
 from tracking3d.benchmark.job import JOB, RUN, Job
 from tracking3d.datasets.run_answers import answers_of_run
 from tracking3d.errors import InputError
+from tracking3d.estimation.online.judgement import weighed
 from tracking3d.evaluation.calibration import area_under_roc, expected_calibration_error, reliability
 from tracking3d.evaluation.confidence_fit import PENALTY, LogisticConfidence, fit_confidence, halves, paste
 from tracking3d.evaluation.confidence_scores import right_frames
@@ -62,6 +63,7 @@ def judged_frames(benchmark: Path, solver: str | None, refined: bool) -> Iterato
                 known = record.iou_initial is not None
                 evidence = {
                     **record.losses,
+                    **weighed(record.losses),
                     "has_mask": float(known),
                     "iou_initial": record.iou_initial if record.iou_initial is not None else np.nan,
                     "recorded": record.confidence,

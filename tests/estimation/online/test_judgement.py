@@ -10,6 +10,7 @@ from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.online.judgement import (
     ENOUGH_POINTS,
     SETTLED,
+    Support,
     Usual,
     judge,
     likelihood,
@@ -77,7 +78,7 @@ def test_texture_that_was_never_seen_is_no_evidence_against_a_pose():
     for unseen in (0.3, 0.6, 0.9, 1.0):
         mixed = fit(appearance=(1 - unseen) * 0.2 + unseen * charge, unseen=unseen)
         assert unusual(mixed, USUAL, 1.0) <= 0
-        assert not looks_wrong(mixed, USUAL, FEW, 1.0)
+        assert not looks_wrong(mixed, USUAL, Support(FEW))
     # What is known of it still speaks.
     half_wrong = fit(appearance=0.5 * 0.9 + 0.5 * charge, unseen=0.5)
     assert unusual(half_wrong, USUAL, 1.0) > 1
@@ -87,43 +88,43 @@ def test_texture_that_was_never_seen_is_no_evidence_against_a_pose():
 
 
 def test_without_points_any_excess_looks_wrong():
-    assert not looks_wrong(fit(), USUAL, FEW, 1.0)
-    assert looks_wrong(DOUBTFUL, USUAL, FEW, 1.0)
+    assert not looks_wrong(fit(), USUAL, Support(FEW))
+    assert looks_wrong(DOUBTFUL, USUAL, Support(FEW))
 
 
 def test_with_points_only_a_large_excess_or_points_off_place_do():
-    assert not looks_wrong(DOUBTFUL, USUAL, MANY, 1.0)
-    assert looks_wrong(WRONG, USUAL, MANY, 1.0)
-    assert looks_wrong(fit(points=1.1), USUAL, MANY, 1.0)
-    assert not looks_wrong(fit(points=1.1), USUAL, FEW, 1.0)
+    assert not looks_wrong(DOUBTFUL, USUAL, Support(MANY))
+    assert looks_wrong(WRONG, USUAL, Support(MANY))
+    assert looks_wrong(fit(points=1.1), USUAL, Support(MANY))
+    assert not looks_wrong(fit(points=1.1), USUAL, Support(FEW))
 
 
 def test_what_is_usual_is_tracked_with_confidence_whatever_the_number_of_points():
-    verdicts = [judge(fit(), USUAL, points, 1.0, True) for points in (0, MANY, 400)]
+    verdicts = [judge(fit(), USUAL, Support(points)) for points in (0, MANY, 400)]
     assert all(one.status is Status.TRACKED and one.reason == "" for one in verdicts)
     assert all(one.confidence > 0.7 for one in verdicts)
 
 
 def test_without_a_mask_confidence_is_even_at_most():
-    assert judge(fit(), USUAL, MANY, 1.0, False).confidence <= 0.5
+    assert judge(fit(), USUAL, Support(MANY, has_mask=False)).confidence <= 0.5
 
 
 def test_confidence_falls_as_losses_rise():
-    rising = [judge(fit(appearance=loss), USUAL, 40, 1.0, True).confidence for loss in (0.2, 0.4, 0.5, 0.8)]
+    rising = [judge(fit(appearance=loss), USUAL, Support(40)).confidence for loss in (0.2, 0.4, 0.5, 0.8)]
     assert rising == sorted(rising, reverse=True)
     assert len(set(rising)) == 4
     assert rising[-1] > 0
 
 
 def test_no_mask_and_no_points_is_lost():
-    verdict = judge(fit(), USUAL, FEW, 1.0, False)
+    verdict = judge(fit(), USUAL, Support(FEW, has_mask=False))
     assert verdict.status is Status.LOST
     assert "no mask" in verdict.reason
-    assert judge(fit(), USUAL, MANY, 1.0, False).status is Status.TRACKED
+    assert judge(fit(), USUAL, Support(MANY, has_mask=False)).status is Status.TRACKED
 
 
 def test_neither_pixels_nor_points_is_lost_and_says_what_disagreed():
-    verdict = judge(WRONG, USUAL, FEW, 1.0, True)
+    verdict = judge(WRONG, USUAL, Support(FEW))
     assert verdict.status is Status.LOST
     assert "0.70" in verdict.reason
     assert "0.90" in verdict.reason
@@ -132,25 +133,25 @@ def test_neither_pixels_nor_points_is_lost_and_says_what_disagreed():
 
 
 def test_a_guessed_turn_that_explains_nothing_is_lost_whatever_points_agree_with_it():
-    verdict = judge(WRONG, USUAL, MANY, 1.0, True, guessed=True)
+    verdict = judge(WRONG, USUAL, Support(MANY), guessed=True)
     assert verdict.status is Status.LOST and "guess" in verdict.reason and verdict.confidence < 0.1
-    assert judge(WRONG, USUAL, MANY, 1.0, True).status is Status.UNCERTAIN
-    assert judge(fit(), USUAL, MANY, 1.0, True, guessed=True).status is Status.TRACKED
+    assert judge(WRONG, USUAL, Support(MANY)).status is Status.UNCERTAIN
+    assert judge(fit(), USUAL, Support(MANY), guessed=True).status is Status.TRACKED
 
 
 def test_points_against_pixels_is_uncertain():
-    verdict = judge(WRONG, USUAL, MANY, 1.0, True)
+    verdict = judge(WRONG, USUAL, Support(MANY))
     assert verdict.status is Status.UNCERTAIN
     assert "points agree, pixels do not" in verdict.reason
-    assert verdict.confidence < judge(fit(), USUAL, MANY, 1.0, True).confidence
+    assert verdict.confidence < judge(fit(), USUAL, Support(MANY)).confidence
 
 
 def test_a_side_that_was_never_seen_is_uncertain_without_points():
     unseen = fit(appearance=0.46, unseen=0.9)
-    verdict = judge(unseen, USUAL, FEW, 1.0, True)
+    verdict = judge(unseen, USUAL, Support(FEW))
     assert verdict.status is Status.UNCERTAIN
     assert "never seen" in verdict.reason
-    assert judge(unseen, USUAL, MANY, 1.0, True).status is Status.TRACKED
+    assert judge(unseen, USUAL, Support(MANY)).status is Status.TRACKED
 
 
 def test_a_good_fit_is_likely_right_and_each_loss_makes_it_less_so():
@@ -168,8 +169,8 @@ def test_beyond_the_range_it_was_fitted_on_nothing_changes():
 
 def test_after_a_loss_what_was_never_seen_is_no_side_of_the_object():
     unseen = fit(appearance=0.46, unseen=0.9)
-    verdict = judge(unseen, USUAL, FEW, 1.0, True, lost_before=True)
+    verdict = judge(unseen, USUAL, Support(FEW), lost_before=True)
     assert verdict.status is Status.LOST and "never seen" in verdict.reason
     # Points that agree, or texture that is known, tell that it is back.
-    assert judge(unseen, USUAL, MANY, 1.0, True, lost_before=True).status is Status.TRACKED
-    assert judge(fit(), USUAL, FEW, 1.0, True, lost_before=True).status is Status.TRACKED
+    assert judge(unseen, USUAL, Support(MANY), lost_before=True).status is Status.TRACKED
+    assert judge(fit(), USUAL, Support(FEW), lost_before=True).status is Status.TRACKED

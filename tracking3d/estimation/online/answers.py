@@ -12,7 +12,6 @@ from tracking3d.estimation.online.answer_mask import answer_mask, support_beside
 from tracking3d.estimation.online.attempt import Attempt
 from tracking3d.estimation.online.belief import Belief
 from tracking3d.estimation.online.pose_refinement import PoseWeights
-from tracking3d.estimation.online.tracking import straying
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose
@@ -72,8 +71,8 @@ def solved(state: Belief, answer: FrameEstimate, found: Attempt) -> FrameEstimat
             "points": fit.points,
             "overlap": fit.overlap,
             "unseen": fit.unseen,
-            "witnesses": float(found.witnesses),
-            "strays": straying(state.known, state.camera, fit.pose, view),
+            "witnesses": float(found.support.witnesses),
+            "strays": found.support.strays,
             "mask_weight": view.mask_weight,
         },
     )

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from tracking3d.estimation.assessment import Assessment
 from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.online.belief import View
-from tracking3d.estimation.online.judgement import BELIEVED
+from tracking3d.estimation.online.judgement import BELIEVED, Support
 from tracking3d.estimation.online.points import FollowedPoints
 from tracking3d.estimation.online.pose_refinement import PoseFit
 
@@ -21,7 +21,7 @@ class Attempt:
         fit: Its pose.
         won: Which start of the pose won.
         points: Those that agree with it.
-        witnesses: How many of these are landmarks that two keyframes have seen.
+        support: What speaks for the pose beside its losses.
         judgement: Of the pose.
     """
 
@@ -29,7 +29,7 @@ class Attempt:
     fit: PoseFit
     won: str
     points: FollowedPoints
-    witnesses: int
+    support: Support
     judgement: Assessment
 
     @property
@@ -44,4 +44,6 @@ class Attempt:
 
     def better_than(self, other: Attempt) -> bool:
         """Whether more points agree with it and the pixels fit better; any pose is better than none."""
-        return other.lost or (self.witnesses > other.witnesses and self.fit.appearance < other.fit.appearance)
+        return other.lost or (
+            self.support.witnesses > other.support.witnesses and self.fit.appearance < other.fit.appearance
+        )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from tracking3d.estimation.assessment import Assessment
@@ -28,6 +29,28 @@ SETTLED = 15
 _WORSE, _OUTLINE_ROOM, _OVERLAP_ROOM = 1.5, 0.1, 0.05  # how far the means may go from there
 BELIEVED = 0.5
 """Confidence below which a frame is looked at twice."""
+
+
+@dataclass(frozen=True)
+class Support:
+    """What speaks for a pose beside what it costs.
+
+    Attributes:
+        witnesses: How many landmarks that two keyframes have seen agree with it.
+        strays: Share of such landmarks in the frame that are elsewhere, in [0, 1].
+        mask_weight: How far the mask is believed, in [0, 1].
+        has_mask: Whether there is one.
+    """
+
+    witnesses: int
+    strays: float = 0.0
+    mask_weight: float = 1.0
+    has_mask: bool = True
+
+    @property
+    def settles(self) -> bool:
+        """Whether so many points agree that pixels alone do not contradict them."""
+        return self.witnesses >= ENOUGH_POINTS
 
 
 @dataclass(frozen=True)
@@ -65,18 +88,29 @@ class Usual:
         return Usual(appearance, outline, overlap, frames, sound)
 
 
-def looks_wrong(fit: PoseFit, usual: Usual, points: int, mask_weight: float) -> bool:
-    """Whether costly hypotheses should be tried.
+def weighed(losses: Mapping[str, float]) -> dict[str, float]:
+    """The evidence that a confidence is made of, by name, from what answers record as ``losses``.
 
-    Args:
-        fit: The pose and its losses.
-        usual: What is usual.
-        points: How many landmarks agree with the pose.
-        mask_weight: How far the mask is believed.
+    What contradicts the mask is no evidence against a pose where points tell that the mask is wrong.
     """
-    if points < ENOUGH_POINTS:
-        return unusual(fit, usual, mask_weight) > 0
-    return unexplained(fit, usual, mask_weight) or fit.points > 1.0
+    known = 1 - losses["unseen"]
+    compared = (losses["features"] - _UNSEEN_CHARGE * losses["unseen"]) / max(known, 0.05)
+    return {
+        "appearance": min(max(compared, 0.0), 2.0),
+        "outline": losses["mask_weight"] * losses["outline"],
+        "missed": losses["mask_weight"] * (1 - losses["overlap"]),
+        "unseen": losses["unseen"],
+        "witnesses": math.log1p(losses["witnesses"]),
+        "strays": losses.get("strays", 0.0),
+        "points": losses["points"],
+    }
+
+
+def looks_wrong(fit: PoseFit, usual: Usual, support: Support) -> bool:
+    """Whether costly hypotheses should be tried."""
+    if not support.settles:
+        return unusual(fit, usual, support.mask_weight) > 0
+    return unexplained(fit, usual, support.mask_weight) or fit.points > 1.0
 
 
 def unusual(fit: PoseFit, usual: Usual, mask_weight: float) -> float:
@@ -118,40 +152,31 @@ def unexplained(fit: PoseFit, usual: Usual, mask_weight: float) -> bool:
 
 
 def judge(
-    fit: PoseFit,
-    usual: Usual,
-    points: int,
-    mask_weight: float,
-    has_mask: bool,
-    guessed: bool = False,
-    lost_before: bool = False,
+    fit: PoseFit, usual: Usual, support: Support, guessed: bool = False, lost_before: bool = False
 ) -> Assessment:
     """Status, reason and confidence of one frame.
 
     Args:
         fit: The pose and its losses.
         usual: What is usual.
-        points: How many landmarks agree with the pose.
-        mask_weight: How far the mask is believed.
-        has_mask: Whether there is one.
+        support: What speaks for the pose beside its losses.
         guessed: Whether the pose is the best of many turns that were tried. Where none of them explains the frame,
             which is the least bad is up to chance, and points that happen to agree with it are, too.
         lost_before: Whether the object was lost in the frame before. Then no motion leads to a side that was never
             seen, and the mask may be of anything.
     """
-    far = unexplained(fit, usual, mask_weight)
-    few = points < ENOUGH_POINTS
-    if few and not has_mask:
+    far, few = unexplained(fit, usual, support.mask_weight), not support.settles
+    if few and not support.has_mask:
         return Assessment(Status.LOST, "the object is out of sight: no mask, and no points of it", 0.05)
     if far and guessed and not few:
         return Assessment(Status.LOST, "no pose explains the frame; the best of many turns is a guess", 0.05)
     if few and far:
         reason = (
             f"neither pixels (loss {fit.appearance:.2f}, usually {usual.appearance:.2f}), nor the mask "
-            f"(overlap {fit.overlap:.2f}), nor points ({points}) agree with any pose"
+            f"(overlap {fit.overlap:.2f}), nor points ({support.witnesses}) agree with any pose"
         )
         return Assessment(Status.LOST, reason, 0.05)
-    confidence = likelihood(fit) if has_mask else min(likelihood(fit), _UNWITNESSED)
+    confidence = likelihood(fit) if support.has_mask else min(likelihood(fit), _UNWITNESSED)
     if far:
         return Assessment(
             Status.UNCERTAIN, f"points agree, pixels do not (loss {fit.appearance:.2f})", confidence

@@ -42,7 +42,7 @@ from tracking3d.estimation.online.tracking import (
     pixel_scale,
     pose_of_points,
     searched,
-    witnesses,
+    supported,
     worth_trying,
 )
 from tracking3d.estimation.online.waiting import solved_start, waiting_view
@@ -220,9 +220,8 @@ class OnlineSolver:
             pose, usual = fit.pose, usual.updated(fit)
             trail.append((pose, view.index))
             kept = agreeing(known, camera, pose, view.points, view)
-            agreed = witnesses(known, kept)
-            judgement = judge(fit, usual, agreed, view.mask_weight, view.mask is not None)
-            found = Attempt(view, fit, start.origin, kept, agreed, judgement)
+            support = supported(known, camera, pose, kept, view)
+            found = Attempt(view, fit, start.origin, kept, support, judge(fit, usual, support))
             revised.append(solved(belief, earlier, found))
         belief = replace(
             belief, last=trail[-1], before=trail[-2], trail=tuple(trail[-_TRAIL:]), usual=usual,
@@ -275,21 +274,14 @@ class OnlineSolver:
             starts = {**starts, "points": points[0]}
         won, fit = self._fit(state, view, starts, view.points)
         kept = agreeing(known, camera, fit.pose, view.points, view)
-        if state.lost_for or looks_wrong(fit, state.usual, witnesses(known, kept), view.mask_weight):
+        support = supported(known, camera, fit.pose, kept, view)
+        if state.lost_for or looks_wrong(fit, state.usual, support):
             won, fit, kept = searched(
                 known, state.surface, camera, view, image, (won, fit, kept), self.weights, state.lost_for
             )
-        agreed = witnesses(known, kept)
-        judgement = judge(
-            fit,
-            state.usual,
-            agreed,
-            view.mask_weight,
-            view.mask is not None,
-            won == "grid",
-            state.lost_for > 0,
-        )
-        best = Attempt(view, fit, won, kept, agreed, judgement)
+            support = supported(known, camera, fit.pose, kept, view)
+        judgement = judge(fit, state.usual, support, won == "grid", state.lost_for > 0)
+        best = Attempt(view, fit, won, kept, support, judgement)
         if best.lost or (best.doubtful and worth_trying(state.doubted_for)):
             other = self._elsewhere(state, frame, image)
             return other if other is not None and other.better_than(best) else best
@@ -304,14 +296,13 @@ class OnlineSolver:
         view = self._view(state, frame, None, pose, points)
         _, fit = self._fit(state, view, {SIGHTED: pose}, points)
         kept = agreeing(state.known, state.camera, fit.pose, points, view)
-        agreed = witnesses(state.known, kept)
-        judgement = judge(fit, state.usual, agreed, view.mask_weight, False, guessed=True)
-        found = Attempt(view, fit, SIGHTED, kept, agreed, judgement)
+        support = supported(state.known, state.camera, fit.pose, kept, view)
+        found = Attempt(view, fit, SIGHTED, kept, support, judge(fit, state.usual, support, guessed=True))
         return None if found.lost else found
 
     def _is_keyframe(self, state: Belief, found: Attempt) -> bool:
         """Whether the map has something to learn from a frame, and the frame can be relied on."""
-        view, fit, agreed = found.view, found.fit, found.witnesses
+        view, fit, agreed = found.view, found.fit, found.support.witnesses
         if view.mask is None or (agreed < ENOUGH_POINTS and fit.overlap < _FITS):
             return False
         keyframes = state.known.keyframes

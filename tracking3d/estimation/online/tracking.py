@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from tracking3d.estimation.online.belief import ObjectMap, View
+from tracking3d.estimation.online.judgement import Support
 from tracking3d.estimation.online.keypoints import Keypoints, detect, match
 from tracking3d.estimation.online.mapping import (
     nearest_views,
@@ -109,14 +110,16 @@ def agreeing(
     return points.only(in_place & (inside | known.candidate[points.landmark]))
 
 
-def straying(known: ObjectMap, camera: Camera, pose: Pose, view: View) -> float:
-    """Share of a view's points on the object that are not where a pose says; 0 where there are none."""
+def supported(known: ObjectMap, camera: Camera, pose: Pose, agree: FollowedPoints, view: View) -> Support:
+    """What speaks for a pose beside its losses; ``agree`` are the points that do."""
     names = view.points.landmark
-    told = np.isfinite(known.landmarks[names]).all(1) & (known.sightings[names] >= 2) & ~known.candidate[names]
-    if not told.any():
-        return 0.0
+    told = (
+        np.isfinite(known.landmarks[names]).all(1) & (known.sightings[names] >= 2) & ~known.candidate[names]
+    )
     gap = project_points(known.landmarks[names[told]], pose, camera) - view.points.pixel[told]
-    return float((np.linalg.norm(gap, axis=1) > _STRAY * pixel_scale(view)).mean())
+    stray = np.linalg.norm(gap, axis=1) > _STRAY * pixel_scale(view)
+    strays = float(stray.mean()) if len(stray) else 0.0
+    return Support(witnesses(known, agree), strays, view.mask_weight, view.mask is not None)
 
 
 def rematched(
