@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from rendered_solids import pose_of
 
 from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.online.judgement import (
+    BELIEVED,
     ENOUGH_POINTS,
     SETTLED,
     Support,
     Usual,
+    _doubt,
     judge,
     likelihood,
     looks_wrong,
@@ -24,7 +28,7 @@ USUAL = Usual(appearance=0.2, outline=0.3, overlap=0.9)
 
 
 def fit(appearance=0.2, outline=0.3, overlap=0.9, unseen=0.0, points=0.1) -> PoseFit:
-    return PoseFit(pose_of(), 1.0, appearance, outline, points, overlap, unseen, torch.eye(6), 5)
+    return PoseFit(pose_of(), 1.0, appearance, outline, points, overlap, unseen, 100 * torch.eye(6), 5)
 
 
 DOUBTFUL = fit(appearance=0.4)  # (0.4 - 0.26 - 0.05) / 0.2 = 0.45 above what is usual
@@ -99,21 +103,38 @@ def test_with_points_only_a_large_excess_or_points_off_place_do():
     assert not looks_wrong(fit(points=1.1), USUAL, Support(FEW))
 
 
-def test_what_is_usual_is_tracked_with_confidence_whatever_the_number_of_points():
-    verdicts = [judge(fit(), USUAL, Support(points)) for points in (0, MANY, 400)]
-    assert all(one.status is Status.TRACKED and one.reason == "" for one in verdicts)
-    assert all(one.confidence > 0.7 for one in verdicts)
+def test_confidence_rises_with_the_points_that_agree_and_status_goes_with_it():
+    verdicts = [judge(fit(), USUAL, Support(points)) for points in (0, MANY, 60, 400)]
+    said = [one.confidence for one in verdicts]
+    assert said == sorted(said) and said[0] < BELIEVED < 0.7 < said[-1]
+    for verdict in verdicts:
+        tracked = verdict.confidence >= BELIEVED
+        assert verdict.status is (Status.TRACKED if tracked else Status.UNCERTAIN)
+        assert bool(verdict.reason) == (not tracked)
+    assert "few points" in verdicts[0].reason
 
 
 def test_without_a_mask_confidence_is_even_at_most():
     assert judge(fit(), USUAL, Support(MANY, has_mask=False)).confidence <= 0.5
 
 
-def test_confidence_falls_as_losses_rise():
-    rising = [judge(fit(appearance=loss), USUAL, Support(40)).confidence for loss in (0.2, 0.4, 0.5, 0.8)]
-    assert rising == sorted(rising, reverse=True)
-    assert len(set(rising)) == 4
-    assert rising[-1] > 0
+def test_the_reason_names_what_speaks_most_against_the_pose():
+    firm = replace(fit(), information=1e4 * torch.eye(6))
+    loose = replace(fit(), information=torch.diag(torch.tensor([1e4, 1e4, 1e4, 1e4, 1e-3, 1e4])))
+    against = {
+        "overlap too little": (replace(firm, overlap=0.5), Support(400)),
+        "never seen before": (replace(firm, unseen=0.6), Support(400)),
+        "too few points": (firm, Support(0)),
+        "too loosely": (replace(firm, points=0.9, overlap=0.8), Support(100)),
+        "turning about the camera's axis (0.0, 1.0, 0.0)": (replace(loose, overlap=0.8), Support(200)),
+    }
+    for words, (one, support) in against.items():
+        assert words.replace("overlap too little", "overlap") in _doubt(one, support), words
+
+
+def test_a_wrong_mask_is_no_evidence_where_points_tell_that_it_is_wrong():
+    missed = fit(overlap=0.4, outline=2.0)
+    assert likelihood(missed, Support(150, mask_weight=0.02)) > likelihood(missed, Support(150)) + 0.3
 
 
 def test_no_mask_and_no_points_is_lost():
@@ -151,26 +172,33 @@ def test_a_side_that_was_never_seen_is_uncertain_without_points():
     verdict = judge(unseen, USUAL, Support(FEW))
     assert verdict.status is Status.UNCERTAIN
     assert "never seen" in verdict.reason
-    assert judge(unseen, USUAL, Support(MANY)).status is Status.TRACKED
+    assert judge(unseen, USUAL, Support(MANY)).confidence > verdict.confidence
 
 
-def test_a_good_fit_is_likely_right_and_each_loss_makes_it_less_so():
-    good = likelihood(fit())
-    assert good > 0.8
-    worse = [fit(appearance=0.8), fit(outline=1.8), fit(overlap=0.6), fit(unseen=0.2)]
-    assert all(likelihood(one) < good for one in worse)
-    assert likelihood(fit(appearance=0.9, outline=2.0, overlap=0.5, unseen=0.3)) < 0.1
+def test_a_good_fit_is_likely_right_and_each_contradiction_makes_it_less_so():
+    many = Support(200)
+    good = likelihood(fit(), many)
+    assert good > 0.6
+    worse = [fit(overlap=0.6), fit(unseen=0.2), fit(points=0.8)]
+    assert all(likelihood(one, many) < good for one in worse)
+    assert likelihood(fit(), Support(200, strays=0.3)) < good
+    assert likelihood(fit(overlap=0.5, unseen=0.3), Support(0)) < 0.1
 
 
 def test_beyond_the_range_it_was_fitted_on_nothing_changes():
-    assert likelihood(fit(outline=2.0)) == likelihood(fit(outline=50.0))
-    assert likelihood(fit(overlap=0.5)) == likelihood(fit(overlap=0.0))
+    assert likelihood(fit(overlap=0.4), Support(9)) == likelihood(fit(overlap=0.0), Support(9))
+    assert likelihood(fit(), Support(400)) == likelihood(fit(), Support(4000))
+
+
+def test_after_a_loss_only_what_is_believed_is_the_object():
+    verdict = judge(fit(), USUAL, Support(3), lost_before=True)
+    assert verdict.status is Status.LOST and "after the loss" in verdict.reason
+    assert judge(fit(), USUAL, Support(100), lost_before=True).status is Status.TRACKED
 
 
 def test_after_a_loss_what_was_never_seen_is_no_side_of_the_object():
     unseen = fit(appearance=0.46, unseen=0.9)
     verdict = judge(unseen, USUAL, Support(FEW), lost_before=True)
-    assert verdict.status is Status.LOST and "never seen" in verdict.reason
-    # Points that agree, or texture that is known, tell that it is back.
-    assert judge(unseen, USUAL, Support(MANY), lost_before=True).status is Status.TRACKED
-    assert judge(fit(), USUAL, Support(FEW), lost_before=True).status is Status.TRACKED
+    assert verdict.status is Status.LOST and verdict.confidence < 0.3
+    # Points that agree tell that it is back.
+    assert judge(unseen, USUAL, Support(MANY), lost_before=True).status is not Status.LOST

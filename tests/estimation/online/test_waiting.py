@@ -87,7 +87,7 @@ def test_frames_without_a_mask_are_not_solved_with_the_others(asked):
 
 
 def test_a_doubtful_start_is_tried_again_only_after_more_motion(asked):
-    asked["bundle"] = 0.5
+    asked["bundle"] = 0.6
     state, start = solved_start(belief_of(STEADY), CONFIG)
     assert start is None
     assert asked["points"] == [6]
@@ -191,3 +191,13 @@ def test_names_are_unique_and_followed_points_keep_theirs(first):
     assert len(np.unique(found.points.landmark)) == len(found.points)
     np.testing.assert_array_equal(found.points.landmark[: len(followed)], followed.landmark)
     np.testing.assert_array_equal(found.points.pixel[: len(followed)], followed.pixel)
+
+
+def test_points_that_run_wild_give_way_to_turning_without_more_motion(asked):
+    """They show as much change of form as half a turn and fit no start: waiting for more of it is in vain."""
+    asked["bundle"] = 0.6
+    given = belief_of(list(np.linspace(0, 80, 15)))
+    assert solved_start(replace(given, waiting=given.waiting[:12]), CONFIG)[1] is None
+    _, start = solved_start(replace(given, due=9.0), CONFIG)
+    assert start is not None and start.origin == "turning"
+    assert asked["turning"] == [15]

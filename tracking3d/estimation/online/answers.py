@@ -12,6 +12,7 @@ from tracking3d.estimation.online.answer_mask import answer_mask, support_beside
 from tracking3d.estimation.online.attempt import Attempt
 from tracking3d.estimation.online.belief import Belief
 from tracking3d.estimation.online.pose_refinement import PoseWeights
+from tracking3d.estimation.online.stiffness import least_held
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose
@@ -73,6 +74,7 @@ def solved(state: Belief, answer: FrameEstimate, found: Attempt) -> FrameEstimat
             "unseen": fit.unseen,
             "witnesses": float(found.support.witnesses),
             "strays": found.support.strays,
+            "stiffness": least_held(fit)[0],
             "mask_weight": view.mask_weight,
         },
     )

@@ -7,14 +7,14 @@ import numpy as np
 from tracking3d.config.solvers import OnlineConfig
 from tracking3d.estimation.online.belief import ObjectMap
 from tracking3d.estimation.online.growing import refined
-from tracking3d.estimation.online.lens import solve_lens
+from tracking3d.estimation.online.lens import lens_change, solve_lens
 from tracking3d.estimation.online.pose_refinement import PoseWeights, refine_pose
 from tracking3d.estimation.online.tracking import evidence
 from tracking3d.geometry.camera import Camera
 
 _PASSES = 3
 _LENS_CHARGE = 0.01
-"""Cost by which another lens has to explain the keyframes better than the assumed one."""
+"""Cost by which a lens twice as long or short has to explain the keyframes better than the one at hand."""
 
 
 def refined_once_more(known: ObjectMap, camera: Camera, config: OnlineConfig) -> tuple[ObjectMap, Camera]:
@@ -32,8 +32,8 @@ def refined_once_more(known: ObjectMap, camera: Camera, config: OnlineConfig) ->
     if camera.assumed:
         with_lens, solved = solve_lens(known, camera)
         if solved != camera:
-            cost, known, camera = _refined(with_lens, solved, config)
-            tried.append((cost + _LENS_CHARGE, known, camera))
+            cost, better, _ = _refined(with_lens, solved, config)
+            tried.append((cost + _LENS_CHARGE * lens_change(solved.fy / camera.fy), better, solved))
     _, known, camera = min(tried, key=lambda one: one[0])
     return known, camera
 

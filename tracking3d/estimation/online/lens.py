@@ -22,7 +22,7 @@ from tracking3d.geometry.pose import Pose
 CANDIDATES = (10.0, 25.0, 45.0, 65.0)
 """Vertical fields of view in degrees."""
 _AT_THE_START = (9.0, 16.0, 27.0, 65.0)  # beside the assumed one
-_CLEARLY = 0.92  # of the assumed lens's cost
+_CLEARLY = 0.08  # share of the cost that a lens twice as long or short has to take off; nearer ones less
 _SAME = math.log(1.05)  # focal lengths so near are one
 _ITERATIONS = 25
 _FEWEST = 30  # landmarks
@@ -52,6 +52,11 @@ def through(view: View, before: Camera, after: Camera) -> View:
     return replace(view, pose=pose, observation=replace(view.observation, K=K), texture=None)
 
 
+def lens_change(factor: float) -> float:
+    """How far another focal length is, in [0, 1]: 1 is twice as long or short, or more."""
+    return min(abs(math.log2(factor)), 1.0)
+
+
 def solve_lens(known: ObjectMap, camera: Camera) -> tuple[ObjectMap, Camera]:
     """The map and the camera with the focal length that explains the landmarks best.
 
@@ -66,13 +71,14 @@ def solve_lens(known: ObjectMap, camera: Camera) -> tuple[ObjectMap, Camera]:
     tracks, start = tracks_of(views, names), structure_of(known, views, names)
     kept = adjust(tracks, camera.K, start, iterations=_ITERATIONS)
     tried = []
-    for field_of_view in CANDIDATES:
-        lens = Camera.from_fov(camera.width, camera.height, field_of_view).fy / camera.fy
+    candidates = [Camera.from_fov(camera.width, camera.height, angle).fy for angle in CANDIDATES]
+    for lens in (1.0, *(focal / camera.fy for focal in candidates)):
         stretched = replace(start, t=start.t * [1.0, 1.0, lens], focal_factor=lens)
         tried.append(adjust(tracks, camera.K, stretched, iterations=_ITERATIONS, free_focal=True))
     tried = [one for one in tried if _is_a_lens(one.focal_factor, camera)]
     best = min(tried, key=lambda one: one.cost, default=kept)
-    if best.cost > _CLEARLY * kept.cost or abs(math.log(best.focal_factor)) < _SAME:
+    change = lens_change(best.focal_factor)
+    if abs(math.log(best.focal_factor)) < _SAME or best.cost > (1 - _CLEARLY * change) * kept.cost:
         return known, camera
     return _with_lens(known, camera, names, best)
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tracking3d.config.models import PipelineConfig
 from tracking3d.config.solvers import OnlineConfig
 from tracking3d.estimation.correction import SIGHTED
-from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
+from tracking3d.estimation.estimate import FrameEstimate, ObjectModel
 from tracking3d.estimation.feature_space import FeatureSpace, feature_channels
 from tracking3d.estimation.framing import mask_box, projected_box
 from tracking3d.estimation.observation import Observation, observe
@@ -243,7 +243,8 @@ class OnlineSolver:
         key = not found.lost and self._is_keyframe(state, found)
         pose = coast(state.trail, frame.index) if found.lost else found.fit.pose
         belief = moved_on(state, found, pose, image)
-        if found.judgement.status is Status.TRACKED:
+        usual = not unexplained(found.fit, state.usual, found.view.mask_weight)
+        if usual and not found.lost:
             belief = replace(belief, usual=state.usual.updated(found.fit))
         if key:
             view = replace(found.view, pose=pose, points=found.points)
@@ -256,7 +257,7 @@ class OnlineSolver:
             )
         if found.lost:
             belief = replace(belief, before=None)
-        elif not unexplained(found.fit, state.usual, found.view.mask_weight):
+        elif usual:
             belief = replace(belief, trail=(*state.trail, (pose, frame.index))[-_TRAIL:])
         found = replace(found, fit=replace(found.fit, pose=pose))
         answer = solved(belief, unsolved(frame, mask, pose, state.camera), found)

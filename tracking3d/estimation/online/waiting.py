@@ -22,10 +22,12 @@ from tracking3d.estimation.online.surface_fit import FitWeights
 MOTION = 0.03
 """Change of form at which a start is tried first, see `motion_enough`."""
 _MORE_MOTION = 1.3  # times as much before it is tried again
-_DOUBTFUL = 0.33  # bundle cost above which the points do not tell
+_DOUBTFUL = 0.5  # bundle cost above which the points do not tell: they are 0.8 pixels off
 _MOST = 40  # frames that wait for a better one
 _FEWEST = 4  # frames that are solved together
 _FEWEST_BY_TURNING = 13
+_WILD = 0.15  # change of form that no start explains, though the object can have turned by half a turn since
+_AGAIN = 5  # frames after which pixels and outlines are asked once more
 _LASTING = 0.4  # share of the first frame's points that are still there where they can be relied on
 _LEAST_SHARED = 0.1  # share below which nothing more will be learned of the first frame
 _SPARSE = 0.6  # of `MOST_POINTS`, below which new points are looked for
@@ -90,7 +92,10 @@ def solved_start(state: Belief, config: OnlineConfig) -> tuple[Belief, Start | N
     still_there = np.isin(views[0].points.landmark, views[-1].points.landmark)
     shared = float(still_there.mean()) if len(still_there) else 0.0
     waited = len(views) >= _MOST
-    if motion < max(state.due, MOTION) and not waited and shared > _LEAST_SHARED:
+    # Points that run wild show no more motion when there is more of it: then pixels and outlines are asked.
+    wild = motion > _WILD and len(views) >= _FEWEST_BY_TURNING
+    due = max(state.due, MOTION)
+    if motion < due and not waited and shared > _LEAST_SHARED and not (wild and len(views) % _AGAIN == 0):
         return state, None
     state = replace(state, due=motion * _MORE_MOTION)
     weights = FitWeights(smoothness=config.smoothness)
@@ -100,7 +105,7 @@ def solved_start(state: Belief, config: OnlineConfig) -> tuple[Belief, Start | N
         cameras = lens_hypotheses(state.camera)
         starts = solve_start(state.known, cameras, views, weights, config.surface_prior)
     if not starts or starts[0].bundle > _DOUBTFUL:
-        if not waited and (shared > _LASTING or len(views) < _FEWEST_BY_TURNING):
+        if not waited and not wild and (shared > _LASTING or len(views) < _FEWEST_BY_TURNING):
             return state, None
         if not _changed(views):
             kept = _fewer(waiting) if waited else waiting
