@@ -2,7 +2,8 @@
 
 ``python training/confidence.py BENCHMARK ... --evidence silhouette,features,matching`` reads every run in the folders
 ``--out`` of ``tracking3d evaluate suite``. Evidence are names of losses in ``frames.jsonl``, and ``has_mask``,
-``iou_initial`` and ``recorded`` (the confidence that the run said itself). Without ``--evidence`` all losses count. A
+``iou_initial`` and ``recorded`` (the confidence that the run said itself), and of the online solver's runs what its
+confidence is made of (`tracking3d.estimation.online.judgement.weighed`). Without ``--evidence`` all losses count. A
 name with a sign, ``--evidence=-silhouette,+matching``, can only speak against an answer, or for it.
 """
 
@@ -63,7 +64,7 @@ def judged_frames(benchmark: Path, solver: str | None, refined: bool) -> Iterato
                 known = record.iou_initial is not None
                 evidence = {
                     **record.losses,
-                    **weighed(record.losses),
+                    **(weighed(record.losses) if "witnesses" in record.losses else {}),
                     "has_mask": float(known),
                     "iou_initial": record.iou_initial if record.iou_initial is not None else np.nan,
                     "recorded": record.confidence,
