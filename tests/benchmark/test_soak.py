@@ -8,6 +8,7 @@ import pytest
 from tracking3d.benchmark import soak as module
 from tracking3d.benchmark.soak import Sample, SoakReport, format_soak, looped_clip, plot_soak, soak, trends
 from tracking3d.config.loading import load_config
+from tracking3d.frames import SkippedFrame
 from tracking3d.process_memory import resident_memory
 from tracking3d.results.run_reader import RunReader
 
@@ -72,6 +73,22 @@ def test_every_frame_is_measured_and_drawn(tmp_path, monkeypatch):
     assert all(sample.seconds > 0 for sample in report.samples)
     plot_soak(report, tmp_path / "plot.png")
     assert (tmp_path / "plot.png").stat().st_size > 5000
+
+
+@pytest.mark.parametrize("taken", [0, 3])
+def test_stopped_by_hand_it_tells_what_it_measured(tmp_path, monkeypatch, taken):
+    def record(source, config, folder, mask, listener):
+        for index in range(taken):
+            listener(SkippedFrame(index, "none"))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(module, "record", record)
+    if not taken:
+        with pytest.raises(KeyboardInterrupt):
+            soak(load_config(overrides=QUICK), tmp_path / "run", frames=10, size=(80, 60))
+        return
+    report = soak(load_config(overrides=QUICK), tmp_path / "run", frames=10, size=(80, 60))
+    assert report.frames == taken and report.counts == {"skipped": taken}
 
 
 @pytest.mark.slow

@@ -161,7 +161,7 @@ def soak(
     hours: float | None = None,
     size: tuple[int, int] = (160, 120),
 ) -> SoakReport:
-    """Track the looped clip and measure after every frame.
+    """Track the looped clip and measure after every frame; Ctrl-C ends it with what was measured until then.
 
     Args:
         config: The pipeline; its final refinement is left out.
@@ -188,7 +188,11 @@ def soak(
         before = time.perf_counter()
 
     solver = config.solver.model_copy(update={"final_refine": False})
-    record(source, config.model_copy(update={"solver": solver}), folder, mask=mask, listener=measure)
+    try:
+        record(source, config.model_copy(update={"solver": solver}), folder, mask=mask, listener=measure)
+    except KeyboardInterrupt:
+        if not samples:
+            raise
     counts: dict[str, int] = {}
     for sample in samples:
         counts[sample.status] = counts.get(sample.status, 0) + 1
