@@ -34,6 +34,9 @@ _VIEWS = 8
 _TURNING_FRAMES = 12  # after the first, for a start without points: a turn of 30 to 60 degrees, mostly
 _TURNING_VIEWS = 7
 _FEWEST_TURNING = 4
+_UNUSUAL_LENS = (
+    0.1  # of its cost, what a start is charged for a lens twice as long or short as the assumed one
+)
 _MOST_LIKELY, _AS_LIKELY = (
     6,
     2.0,
@@ -48,7 +51,7 @@ class Start:
 
     Attributes:
         known: The map, whose keyframes are the chosen views.
-        cost: How badly it re-renders the views.
+        cost: How badly it re-renders the views; more for a lens that is far from the assumed one.
         bundle: How badly its points fit their tracks.
         origin: Which hypothesis it came from.
         camera: The camera that it was solved with.
@@ -102,6 +105,7 @@ def solve_start(
             for view in hypothesis.keyframes
         ]
         cost = float(np.mean([fit.cost for fit in fits])) + structure.cost
+        cost *= 1 + _UNUSUAL_LENS * abs(math.log2(camera.fy / cameras[0].fy))
         starts.append(Start(hypothesis, cost, structure.cost, structure.origin, camera))
     starts.sort(key=lambda start: start.cost)
     return starts
