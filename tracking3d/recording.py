@@ -182,7 +182,9 @@ def begun(
     writer = RunWriter(
         folder,
         config=config,
-        camera=choose_camera(camera, width, height, source.intrinsics, source.intrinsics_origin),
+        camera=kept.session["camera"]
+        if kept  # the lens may have been solved since
+        else choose_camera(camera, width, height, source.intrinsics, source.intrinsics_origin),
         source=source.name,
         seed=session.config.runtime.seed,
         renderer=session.renderer,

@@ -40,7 +40,7 @@ SETTLED = 15
 """Tracked frames whose means are what later ones are held against."""
 _WORSE, _OUTLINE_ROOM, _OVERLAP_ROOM = 1.5, 0.1, 0.05  # how far the means may go from there
 BELIEVED = 0.5
-"""Confidence below which a frame is looked at twice."""
+"""Confidence from which on a frame is tracked; one of less is looked at twice."""
 
 
 @dataclass(frozen=True)
