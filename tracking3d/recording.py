@@ -182,9 +182,7 @@ def begun(
     writer = RunWriter(
         folder,
         config=config,
-        camera=kept.session["camera"]
-        if kept  # the lens may have been solved since
-        else choose_camera(camera, width, height, source.intrinsics, source.intrinsics_origin),
+        camera=choose_camera(camera, width, height, source.intrinsics, source.intrinsics_origin),
         source=source.name,
         seed=session.config.runtime.seed,
         renderer=session.renderer,
@@ -200,6 +198,7 @@ def begun(
         checkpoint.clear_strangers()
         failures = {index: frame.failure for index, frame in kept.taken.items() if frame.failure}
         session.resume(first, kept.session, failures)
+        writer.use_camera(session.camera)
     elif source.repeatable:
         checkpoint = Checkpoint(folder, session.state_classes, device)
     return ObjectRecording(session, writer, checkpoint, kept)

@@ -58,7 +58,7 @@ def script(monkeypatch) -> Script:
             return {}
 
         def resume(self, first, kept, failures):
-            pass
+            self.camera = Camera.from_fov(first.size[1], first.size[0])
 
         def failure_at(self, index):
             return ""

@@ -21,7 +21,7 @@ from resumable_runs import assert_alike, finished_frames
 from tracking3d import load_config
 from tracking3d.recording import record
 from tracking3d.results.files import write_image
-from tracking3d.results.layout import CAUSAL
+from tracking3d.results.layout import CAUSAL, has_state
 from tracking3d.results.run_reader import RunReader
 from tracking3d.session import SOLVERS, Session
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
@@ -112,7 +112,7 @@ def kill_and_resume(
             kills += 1
             now = finished_frames(folder)
             assert now >= answered, "a frame that was finished is lost"
-            answered = now
+            answered = now if has_state(folder) else 0  # a run without any state begins anew
             continue
         assert process.exitcode == 0
         return kills

@@ -176,7 +176,7 @@ class RunWriter:
         for revised in estimate.revised:
             self._record(revised, "", revision=True)
         record = self._record(estimate, frame.name, revision=False, started=started)
-        self._use(estimate.camera or self._camera)
+        self.use_camera(estimate.camera or self._camera)
         drawn = time.perf_counter()
         self._pictures.add(frame, estimate, record)
         self._drawing = time.perf_counter() - drawn
@@ -228,7 +228,7 @@ class RunWriter:
         assert self._refinement is not None
         self._camera = self._refinement.pictures.camera = camera
 
-    def _use(self, camera: Camera) -> None:
+    def use_camera(self, camera: Camera) -> None:
         """From here on causal answers are those of ``camera``."""
         if camera != self._camera:
             self._camera = self._pictures.camera = camera
