@@ -126,6 +126,11 @@ def _set_torch_threads(threads: int) -> None:
         torch.set_num_threads(threads)
 
 
+def compiled() -> bool:
+    """Whether kernels that have no other backend than NumPy can be used on this machine."""
+    return not why_no_numba()
+
+
 @functools.cache
 def why_no_numba() -> str:
     """Why the kernels cannot be used on this machine; empty if they can."""

@@ -8,8 +8,14 @@ import numpy as np
 import pytest
 from tracked_solids import degrees_between, disturbed, scene
 
+from tracking3d.estimation.online import bundle
 from tracking3d.estimation.online.bundle import Structure, Tracks, _damped, _Problem, adjust
 from tracking3d.estimation.online.reprojection import to_camera
+
+
+@pytest.fixture(autouse=True, params=[True, False], ids=["compiled", "numpy"])
+def implementation(request, monkeypatch):
+    monkeypatch.setattr(bundle, "compiled", lambda: request.param)
 
 
 def problem(given, fixed=1, free_focal=False, prior_weight=0.0):
@@ -95,7 +101,7 @@ def test_the_matrix_is_gauss_newtons_at_small_residuals():
         finite = (ahead.poses_gradient - back.poses_gradient) / 2e-6
         assert np.allclose(system.poses[k], finite, rtol=1e-3, atol=1e-3 * np.abs(system.poses).max())
         finite = (ahead.points_gradient - back.points_gradient) / 2e-6
-        assert np.allclose(system.coupling[:, k], finite, rtol=1e-3, atol=1e-3 * np.abs(system.poses).max())
+        assert np.allclose(system.coupling[..., k], finite, rtol=1e-3, atol=1e-3 * np.abs(system.poses).max())
 
 
 def test_eliminating_the_points_gives_the_step_of_the_whole_system():
@@ -107,8 +113,8 @@ def test_eliminating_the_points_gives_the_step_of_the_whole_system():
     for n, block in enumerate(_damped(system.points, 0.01)):
         rows = slice(size + 3 * n, size + 3 * n + 3)
         whole[rows, rows] = block
-        whole[:size, rows] = system.coupling[n]
-        whole[rows, :size] = system.coupling[n].T
+        whole[:size, rows] = system.coupling[n].T
+        whole[rows, :size] = system.coupling[n]
     gradient = np.concatenate([system.poses_gradient, system.points_gradient.ravel()])
     step = system.step(0.01)
     assert step is not None

@@ -8,6 +8,7 @@ import pytest
 import torch
 from tracked_solids import degrees_between, scene
 
+from tracking3d.estimation.online import pose_from_points as module
 from tracking3d.estimation.online.pose_from_points import (
     point_equations,
     pose_from_points,
@@ -17,6 +18,11 @@ from tracking3d.estimation.online.reprojection import moved
 from tracking3d.rendering.normal_equations import NormalEquations
 
 THRESHOLD = 1.5
+
+
+@pytest.fixture(autouse=True, params=[True, False], ids=["compiled", "numpy"])
+def implementation(request, monkeypatch):
+    monkeypatch.setattr(module, "compiled", lambda: request.param)
 
 
 def seen(turn: float = 40.0, noise: float = 0.0, **settings):

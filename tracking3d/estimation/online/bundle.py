@@ -26,6 +26,7 @@ from tracking3d.estimation.online.reprojection import (
     project,
     to_camera,
 )
+from tracking3d.rendering.backend import compiled
 
 _FIRST_DAMPING = 1e-3
 _LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e9
@@ -89,25 +90,26 @@ class _System:
 
     poses: FloatArray  # (C, C)
     points: FloatArray  # (N, 3, 3)
-    coupling: FloatArray  # (N, C, 3)
+    coupling: FloatArray  # (N, 3, C)
     poses_gradient: FloatArray  # (C,)
     points_gradient: FloatArray  # (N, 3)
 
     def step(self, damping: float) -> tuple[FloatArray, FloatArray] | None:
         """Damped step of poses ``(C,)`` and points ``(N, 3)``; None where there is none."""
-        size, width = len(self.poses), 3 * len(self.points)
-        points = _damped(self.points, damping)
-        by_points = self.coupling @ np.linalg.inv(points)
-        flat = by_points.transpose(1, 0, 2).reshape(size, width)
-        transposed = self.coupling.transpose(0, 2, 1).reshape(width, size)
-        reduced = _damped(self.poses, damping) - flat @ transposed
-        gradient = self.poses_gradient - flat @ self.points_gradient.ravel()
+        poses, points = _damped(self.poses, damping), _damped(self.points, damping)
+        if compiled():
+            from tracking3d.estimation.online.kernels import bundle
+
+            return bundle.step(poses, points, self.coupling, self.poses_gradient, self.points_gradient)
+        flat = self.coupling.reshape(3 * len(points), len(poses))
+        by_points = (np.linalg.inv(points) @ self.coupling).reshape(flat.shape)
+        gradient = self.poses_gradient - by_points.T @ self.points_gradient.ravel()
         try:
-            factor = np.linalg.cholesky(reduced)
+            factor = np.linalg.cholesky(poses - flat.T @ by_points)
         except np.linalg.LinAlgError:
             return None
         d_poses = -np.linalg.solve(factor.T, np.linalg.solve(factor, gradient))
-        right = self.points_gradient + np.einsum("nci,c->ni", self.coupling, d_poses)
+        right = self.points_gradient + self.coupling @ d_poses
         d_points = -np.linalg.solve(points, right[..., None])[..., 0]
         sound = np.isfinite(d_poses).all() and np.isfinite(d_points).all()
         return (d_poses, d_points) if sound else None
@@ -134,16 +136,36 @@ class _Problem:
 
     def evaluated(self, at: Structure) -> Structure:
         """With its cost and its residuals."""
-        seen = self.weight > 0
-        difference = project(to_camera(at.R, at.t, at.points), self.intrinsics(at.focal_factor)) - self.pixels
-        residual = np.where(seen, np.hypot(difference[..., 0], difference[..., 1]), np.nan)
-        relative = np.where(np.isfinite(residual), residual / self.scale, BEHIND)
-        total = np.sum(self.weight * np.log1p(relative**2))
-        total += np.sum(self.prior_weight * np.sum((at.points - self.prior) ** 2, 1))
+        K = self.intrinsics(at.focal_factor)
+        if compiled():
+            from tracking3d.estimation.online.kernels import bundle
+
+            given = self.pixels, self.weight, K, at.R, at.t, at.points
+            total, residual = bundle.evaluated(*given, self.scale)
+        else:
+            difference = project(to_camera(at.R, at.t, at.points), K) - self.pixels
+            distance = np.hypot(difference[..., 0], difference[..., 1])
+            residual = np.where(self.weight > 0, distance, np.nan)
+            relative = np.where(np.isfinite(residual), residual / self.scale, BEHIND)
+            total = float(np.sum(self.weight * np.log1p(relative**2)))
+        total += float(np.sum(self.prior_weight * np.sum((at.points - self.prior) ** 2, 1)))
         return replace(at, cost=float(total / max(self.weight.sum(), 1e-12)), residual=residual)
 
     def linearised(self, at: Structure) -> _System:
         """The quadratic model of the weighted sum of losses."""
+        given = self.pixels, self.weight, self.intrinsics(at.focal_factor), at.R, at.t, at.points
+        if compiled():
+            from tracking3d.estimation.online.kernels import bundle
+
+            system = _System(*bundle.linearised(*given, self.scale, self.fixed, self.free_focal))
+        else:
+            system = self._linearised(at)
+        points = system.points + 2 * self.prior_weight[:, None, None] * np.eye(3)
+        points_gradient = system.points_gradient + 2 * self.prior_weight[:, None] * (at.points - self.prior)
+        return replace(system, points=points, points_gradient=points_gradient)
+
+    def _linearised(self, at: Structure) -> _System:
+        """The same without the prior."""
         K = self.intrinsics(at.focal_factor)
         x_cam = to_camera(at.R, at.t, at.points)
         difference = project(x_cam, K) - self.pixels
@@ -159,7 +181,7 @@ class _Problem:
         count = 6 * free
         size = count + self.free_focal
         poses, gradient = np.zeros((size, size)), np.zeros(size)
-        coupling = np.zeros((many, size, 3))
+        coupling = np.zeros((many, 3, size))
         rows = by_pose.reshape(free, 2 * many, 6)
         blocks = rows.transpose(0, 2, 1) @ rows
         for n in range(free):
@@ -167,8 +189,8 @@ class _Problem:
         gradient[:count] = np.einsum(
             "fki,fk->fi", rows, residual[self.fixed :].reshape(free, 2 * many)
         ).ravel()
-        coupling[:, :count] = np.einsum("fnki,fnkj->nfij", by_pose, by_point_obj[self.fixed :]).reshape(
-            many, count, 3
+        coupling[..., :count] = np.einsum("fnki,fnkj->njfi", by_pose, by_point_obj[self.fixed :]).reshape(
+            many, 3, count
         )
         if self.free_focal:
             # Depths go with the focal length: to first order the image of the object's origin plane stays.
@@ -179,11 +201,9 @@ class _Problem:
             gradient[count] = np.sum(by_focal * residual)
             border = np.einsum("fnki,fnk->fi", by_pose, by_focal[self.fixed :]).ravel()
             poses[count, :count] = poses[:count, count] = border
-            coupling[:, count] = np.einsum("fnki,fnk->ni", by_point_obj, by_focal)
+            coupling[..., count] = np.einsum("fnki,fnk->ni", by_point_obj, by_focal)
         points = np.einsum("fnki,fnkj->nij", by_point_obj, by_point_obj)
-        points += 2 * self.prior_weight[:, None, None] * np.eye(3)
         points_gradient = np.einsum("fnki,fnk->ni", by_point_obj, residual)
-        points_gradient += 2 * self.prior_weight[:, None] * (at.points - self.prior)
         return _System(poses, points, coupling, gradient, points_gradient)
 
     def stepped(self, at: Structure, d_poses: FloatArray, d_points: FloatArray) -> Structure:

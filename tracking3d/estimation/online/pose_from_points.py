@@ -24,13 +24,14 @@ from tracking3d.estimation.online.reprojection import (
     project,
     to_camera,
 )
+from tracking3d.rendering.backend import compiled
 
 _FEWEST = 4
 _SAMPLES = 500
 _CONFIDENCE = 0.999
 _REFINEMENTS = 2
-_FIRST_DAMPING = 1e-4
-_CONVERGED = 1e-6
+FIRST_DAMPING, MOST_DAMPING = 1e-4, 1e9
+CONVERGED = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,8 +146,13 @@ def pose_of_tracks(
         scale: Residual in pixels at which the loss is ``log 2``.
         iterations: The most steps that are tried.
     """
+    if compiled():
+        from tracking3d.estimation.online.kernels import pose_from_points
+
+        share = _shares(points, pixels, weight)
+        return pose_from_points.pose_of_tracks(points, pixels, share, K, R, t, scale, iterations)
     at = point_equations(points, pixels, weight, K, R, t, scale)
-    damping = _FIRST_DAMPING
+    damping = FIRST_DAMPING
     for _ in range(iterations):
         diagonal = at.matrix.diagonal()
         floor = 1e-9 * diagonal.max() + 1e-12
@@ -154,9 +160,9 @@ def pose_of_tracks(
         R_new, t_new = (part[0] for part in moved(R[None], t[None], np.asarray(step[None], np.float64)))
         new = point_equations(points, pixels, weight, K, R_new, t_new, scale)
         if not new.cost < at.cost:
-            damping = min(10 * damping, 1e9)
+            damping = min(10 * damping, MOST_DAMPING)
             continue
-        settled = at.cost - new.cost < _CONVERGED * at.cost
+        settled = at.cost - new.cost < CONVERGED * at.cost
         R, t, at, damping = R_new, t_new, new, damping / 10
         if settled:
             break
@@ -173,14 +179,8 @@ def point_equations(
     scale: float,
 ) -> PointEquations:
     """The points' normal equations at a pose; all zero if there is no point. Arguments as of `pose_of_tracks`."""
-    usable = finite_rows(points) & finite_rows(pixels)
-    share = (
-        usable.astype(np.float64)
-        if weight is None
-        else np.where(usable, np.nan_to_num(weight), 0.0).clip(0.0)
-    )
-    share /= max(share.sum(), 1e-12)
-    x_cam = to_camera(R, t, np.where(usable[:, None], points, 0.0))
+    share = _shares(points, pixels, weight)
+    x_cam = to_camera(R, t, np.where(finite_rows(points)[:, None], points, 0.0))
     difference = project(x_cam, K) - pixels
     residual = np.where(share > 0, np.hypot(difference[:, 0], difference[:, 1]), np.nan)
     used = np.isfinite(residual)
@@ -193,6 +193,14 @@ def point_equations(
     rows = motion.reshape(-1, 6)
     weighted = (robust[:, None, None] * motion).reshape(-1, 6)
     return PointEquations(rows.T @ weighted, weighted.T @ difference.ravel(), cost, residual)
+
+
+def _shares(points: FloatArray, pixels: FloatArray, weight: FloatArray | None) -> FloatArray:
+    """``(N,)`` shares of the weight; 0 for rows that are not finite."""
+    usable = finite_rows(points) & finite_rows(pixels)
+    given = 1.0 if weight is None else np.nan_to_num(weight).clip(0.0)
+    share = np.where(usable, given, 0.0)
+    return share / max(float(share.sum()), 1e-12)
 
 
 def _sampled(

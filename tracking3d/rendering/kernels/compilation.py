@@ -71,7 +71,7 @@ class Kernel:
         folder = dispatcher.stats.cache_path
         for _ in range(2):
             try:
-                _drop_stale(folder, self._function.__name__)
+                _drop_stale(folder, self._function)
                 with event.install_listener("numba:compile", _Announcer(folder)):
                     dispatcher.compile(self._signature)
                 return dispatcher
@@ -106,11 +106,12 @@ def check_corners(faces: Tensor, screen: Tensor) -> None:
         )
 
 
-def _drop_stale(folder: str, name: str) -> None:
+def _drop_stale(folder: str, function: Callable[..., Any]) -> None:
     """Forget a compiled kernel that is older than any kernel's source: Numba looks at its own file only."""
-    newest = max(source.stat().st_mtime for source in Path(__file__).parent.glob("*.py"))
-    if any(index.stat().st_mtime < newest for index in Path(folder).glob(f"*.{name}-*.nbi")):
-        _forget(folder, name)
+    rooms = {Path(__file__).parent, Path(function.__code__.co_filename).parent}
+    newest = max(source.stat().st_mtime for room in rooms for source in room.glob("*.py"))
+    if any(index.stat().st_mtime < newest for index in Path(folder).glob(f"*.{function.__name__}-*.nbi")):
+        _forget(folder, function.__name__)
 
 
 def _forget(folder: str, name: str) -> None:

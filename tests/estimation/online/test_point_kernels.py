@@ -1,0 +1,108 @@
+"""The compiled kernels of points and poses against their NumPy twins."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from tracked_solids import disturbed, scene
+
+from tracking3d.estimation.online import bundle, pose_from_points
+from tracking3d.estimation.online.bundle import _Problem, adjust
+from tracking3d.estimation.online.pose_from_points import pose_of_tracks
+
+SCENES = {
+    "a few points": {"frames": 4, "count": 9, "noise": 0.5},
+    "many": {"frames": 12, "count": 150, "noise": 0.3, "outliers": 0.2},
+    "flat": {"frames": 5, "count": 40, "shape": "plane", "noise": 0.1},
+}
+every_scene = pytest.mark.parametrize("settings", SCENES.values(), ids=SCENES)
+
+
+@pytest.fixture
+def both(monkeypatch):
+    """Call a function with the kernels and without."""
+
+    def both(function):
+        answers = []
+        for chosen in (True, False):
+            monkeypatch.setattr(bundle, "compiled", lambda chosen=chosen: chosen)
+            monkeypatch.setattr(pose_from_points, "compiled", lambda chosen=chosen: chosen)
+            answers.append(function())
+        return answers
+
+    return both
+
+
+def posed(given, fixed, free_focal):
+    """A problem with a weight of its own for each observation, a prior, and a point behind the camera."""
+    random = np.random.default_rng(3)
+    weight = given.tracks.weights() * random.uniform(0.1, 2, given.tracks.visible.shape)
+    at = disturbed(given.truth)
+    at.points[1] = [0, 0, -50]
+    prior = given.truth.points + 0.1
+    weights = random.uniform(0, 0.3, len(prior))
+    pixels = np.nan_to_num(given.tracks.pixels)
+    return _Problem(pixels, weight, given.K, fixed, 2.0, free_focal, prior, weights), replace(
+        at, focal_factor=1.1
+    )
+
+
+@every_scene
+@pytest.mark.parametrize(("fixed", "free_focal"), [(0, False), (1, False), (1, True), (2, True)])
+def test_cost_residuals_equations_and_step_of_a_bundle(both, settings, fixed, free_focal):
+    problem, at = posed(scene(**settings), fixed, free_focal)
+    mine, expected = both(lambda: problem.evaluated(at))
+    assert mine.cost == pytest.approx(expected.cost, rel=1e-12)
+    np.testing.assert_allclose(mine.residual, expected.residual, rtol=1e-9, atol=1e-9)
+    mine, expected = both(lambda: problem.linearised(at))
+    for field in fields(mine):
+        values = getattr(expected, field.name)
+        np.testing.assert_allclose(
+            getattr(mine, field.name), values, rtol=1e-9, atol=1e-9 * np.abs(values).max(), err_msg=field.name
+        )
+    for damping in (1e-3, 10.0):
+        mine, wanted = both(lambda damping=damping: expected.step(damping))
+        for part, values in zip(mine, wanted, strict=True):
+            np.testing.assert_allclose(part, values, rtol=1e-6, atol=1e-6 * np.abs(values).max())
+
+
+@every_scene
+def test_an_adjustment_ends_in_the_same_place(both, settings):
+    given = scene(**settings)
+    mine, expected = both(lambda: adjust(given.tracks, given.K, disturbed(given.truth), iterations=40))
+    assert mine.cost == pytest.approx(expected.cost, rel=1e-5)
+    np.testing.assert_allclose(mine.R, expected.R, atol=2e-3)
+
+
+def test_equations_that_are_not_finite_give_no_step(both):
+    problem, at = posed(scene(), 1, False)
+    system = problem.linearised(at)
+    for broken in (
+        replace(system, poses=np.full_like(system.poses, np.nan)),
+        replace(system, points_gradient=np.full_like(system.points_gradient, np.inf)),
+    ):
+        with np.errstate(invalid="ignore"):
+            assert both(lambda broken=broken: broken.step(1e-3)) == [None, None]
+
+
+@every_scene
+def test_the_pose_of_tracks(both, settings):
+    given = scene(**settings)
+    points, pixels = given.truth.points.copy(), given.tracks.pixels[2].copy()
+    points[0], pixels[1], points[2] = np.nan, np.inf, [0, 0, -90]
+    weight = np.random.default_rng(0).uniform(0, 1, len(points))
+    weight[3], weight[4] = 0, np.nan
+    start = given.truth.R[0], given.truth.t[0]
+    for iterations in (0, 1, 30):
+        mine, expected = both(
+            lambda n=iterations: pose_of_tracks(points, pixels, weight, given.K, *start, 2.0, n)
+        )
+        np.testing.assert_allclose(mine.R, expected.R, atol=1e-5)
+        np.testing.assert_allclose(mine.t, expected.t, atol=1e-5)
+        assert mine.equations.cost == pytest.approx(expected.equations.cost, rel=1e-6)
+        for name in ("matrix", "gradient", "residual"):
+            values = getattr(expected.equations, name)
+            near = 1e-4 * np.nanmax(np.abs(expected.equations.matrix))
+            np.testing.assert_allclose(getattr(mine.equations, name), values, atol=near, err_msg=name)

@@ -1,0 +1,220 @@
+"""Kernels of `tracking3d.estimation.online.bundle`: residuals, normal equations and a step without the points."""
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from tracking3d.estimation.online.kernels.reprojection import (
+    factorised,
+    pixel_motion,
+    shared,
+    solve_factorised,
+    to_camera,
+)
+from tracking3d.estimation.online.reprojection import BEHIND, NEAREST, FloatArray
+from tracking3d.rendering.kernels.compilation import kernel
+
+
+def evaluated(
+    pixels: FloatArray,
+    weight: FloatArray,
+    K: FloatArray,
+    R: FloatArray,
+    t: FloatArray,
+    points: FloatArray,
+    scale: float,
+) -> tuple[float, FloatArray]:
+    """The sum of weighted losses, and ``(F, N)`` residuals; nan where nothing is seen."""
+    residual = np.empty(weight.shape)
+    return float(_evaluate(*_packed(pixels, weight, K, R, t, points), float(scale), residual)), residual
+
+
+def linearised(
+    pixels: FloatArray,
+    weight: FloatArray,
+    K: FloatArray,
+    R: FloatArray,
+    t: FloatArray,
+    points: FloatArray,
+    scale: float,
+    fixed: int,
+    free_focal: bool,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Blocks of the normal equations as `tracking3d.estimation.online.bundle` has them, without the prior's."""
+    many, size = len(points), 6 * (len(R) - fixed) + free_focal
+    poses, blocks, coupling = np.zeros((size, size)), np.zeros((many, 3, 3)), np.zeros((many, 3, size))
+    poses_gradient, points_gradient = np.zeros(size), np.zeros((many, 3))
+    _linearise(
+        *_packed(pixels, weight, K, R, t, points), float(scale), fixed, free_focal,
+        poses, blocks, coupling, poses_gradient, points_gradient,
+    )  # fmt: skip
+    return poses, blocks, coupling, poses_gradient, points_gradient
+
+
+def step(
+    poses: FloatArray,
+    points: FloatArray,
+    coupling: FloatArray,
+    poses_gradient: FloatArray,
+    points_gradient: FloatArray,
+) -> tuple[FloatArray, FloatArray] | None:
+    """Step of poses ``(C,)`` and points ``(N, 3)`` by damped blocks; None where there is none."""
+    d_poses, d_points = np.empty(len(poses)), np.empty(points_gradient.shape)
+    there = _step(poses.copy(), points.copy(), coupling, poses_gradient, points_gradient, d_poses, d_points)
+    return (d_poses, d_points) if there else None
+
+
+def _packed(*arrays: FloatArray) -> list[FloatArray]:
+    return [np.ascontiguousarray(array, np.float64) for array in arrays]
+
+
+@kernel(
+    "float64(float64[:,:,::1], float64[:,::1], float64[:,::1], float64[:,:,::1], float64[:,::1],"
+    " float64[:,::1], float64, float64[:,::1])"
+)
+def _evaluate(pixels, weight, K, R, t, points, scale, residual):
+    total, x_cam, difference = 0.0, np.empty(3), np.empty(2)
+    for f in range(len(R)):
+        for n in range(len(points)):
+            residual[f, n] = math.nan
+            if weight[f, n] == 0:
+                continue
+            to_camera(R[f], t[f], points[n], x_cam)
+            squared = _difference(x_cam, K, pixels[f, n], difference)
+            if math.isfinite(squared):
+                residual[f, n] = math.sqrt(squared)
+                total += weight[f, n] * math.log1p(squared / scale**2)
+            else:
+                total += weight[f, n] * math.log1p(BEHIND**2)
+    return total
+
+
+@shared
+def _difference(x_cam, K, pixel, difference):
+    """Write projection less pixel; its square, infinite for a point that has no image."""
+    if not x_cam[2] > NEAREST:
+        return math.inf
+    for row in range(2):
+        difference[row] = x_cam[row] / x_cam[2] * K[row, row] + K[row, 2] - pixel[row]
+    return difference[0] ** 2 + difference[1] ** 2
+
+
+@kernel(
+    "void(float64[:,:,::1], float64[:,::1], float64[:,::1], float64[:,:,::1], float64[:,::1],"
+    " float64[:,::1], float64, int64, boolean, float64[:,::1], float64[:,:,::1], float64[:,:,::1],"
+    " float64[::1], float64[:,::1])"
+)
+def _linearise(
+    pixels, weight, K, R, t, points, scale, fixed, free_focal, poses, blocks, coupling, poses_gradient, points_gradient
+):  # fmt: skip
+    x_cam, difference, focal = np.empty(3), np.empty(2), np.array((K[0, 0], K[1, 1]))
+    by_point, by_pose, by_point_obj = np.empty((2, 3)), np.empty((2, 6)), np.empty((2, 3))
+    last = len(poses) - 1
+    for f in range(len(R)):
+        first = 6 * (f - fixed)
+        for n in range(len(points)):
+            if weight[f, n] == 0:
+                continue
+            to_camera(R[f], t[f], points[n], x_cam)
+            squared = _difference(x_cam, K, pixels[f, n], difference)
+            if not math.isfinite(squared):
+                continue
+            # The Cauchy loss as weights of least squares: its derivative is 2 r / (scale^2 + r^2).
+            root = math.sqrt(2 * weight[f, n] / (scale**2 + squared))
+            pixel_motion(x_cam, t[f], focal, root, by_point, by_pose)
+            for row in range(2):
+                residual = root * difference[row]
+                for i in range(3):
+                    by_point_obj[row, i] = (
+                        by_point[row, 0] * R[f, 0, i]
+                        + by_point[row, 1] * R[f, 1, i]
+                        + by_point[row, 2] * R[f, 2, i]
+                    )
+                for i in range(3):
+                    points_gradient[n, i] += by_point_obj[row, i] * residual
+                    for j in range(3):
+                        blocks[n, i, j] += by_point_obj[row, i] * by_point_obj[row, j]
+                if f >= fixed:
+                    for i in range(6):
+                        poses_gradient[first + i] += by_pose[row, i] * residual
+                        for j in range(6):
+                            poses[first + i, first + j] += by_pose[row, i] * by_pose[row, j]
+                        for j in range(3):
+                            coupling[n, j, first + i] += by_pose[row, i] * by_point_obj[row, j]
+                if free_focal:
+                    # Depths go with the focal length: to first order the image of the object's origin plane stays.
+                    by_focal = root * x_cam[row] / x_cam[2] * focal[row] + by_point[row, 2] * t[f, 2]
+                    poses[last, last] += by_focal * by_focal
+                    poses_gradient[last] += by_focal * residual
+                    for j in range(3):
+                        coupling[n, j, last] += by_point_obj[row, j] * by_focal
+                    if f >= fixed:
+                        for i in range(6):
+                            poses[last, first + i] += by_pose[row, i] * by_focal
+                            poses[first + i, last] += by_pose[row, i] * by_focal
+
+
+@kernel(
+    "boolean(float64[:,::1], float64[:,:,::1], float64[:,:,::1], float64[::1], float64[:,::1], float64[::1],"
+    " float64[:,::1])"
+)
+def _step(poses, points, coupling, poses_gradient, points_gradient, d_poses, d_points):
+    size, by_points, along = len(poses), np.empty((3, len(poses))), np.empty(3)
+    for i in range(size):
+        d_poses[i] = poses_gradient[i]
+    for n in range(len(points)):
+        if not factorised(points[n]):
+            return False
+        first, last = _coupled(coupling[n])
+        for row in range(3):
+            along[row] = points_gradient[n, row]
+        _solve_columns(points[n], coupling[n], by_points, first, last)
+        solve_factorised(points[n], along)
+        for i in range(first, last):
+            a, b, c = coupling[n, 0, i], coupling[n, 1, i], coupling[n, 2, i]
+            d_poses[i] -= a * along[0] + b * along[1] + c * along[2]
+            for j in range(first, i + 1):
+                poses[i, j] -= a * by_points[0, j] + b * by_points[1, j] + c * by_points[2, j]
+    if not factorised(poses):
+        return False
+    solve_factorised(poses, d_poses)
+    sound = True
+    for i in range(size):
+        d_poses[i] = -d_poses[i]
+        sound = sound and math.isfinite(d_poses[i])
+    for n in range(len(points)):
+        for row in range(3):
+            total = points_gradient[n, row]
+            for i in range(size):
+                total += coupling[n, row, i] * d_poses[i]
+            d_points[n, row] = -total
+        solve_factorised(points[n], d_points[n])
+        for row in range(3):
+            sound = sound and math.isfinite(d_points[n, row])
+    return sound
+
+
+@shared
+def _coupled(coupling):
+    """The range of pose unknowns that a point is coupled with."""
+    first, last = coupling.shape[1], 0
+    for i in range(coupling.shape[1]):
+        if coupling[0, i] != 0 or coupling[1, i] != 0 or coupling[2, i] != 0:
+            first, last = min(first, i), i + 1
+    return first, last
+
+
+@shared
+def _solve_columns(factor, right, solved, first, last):
+    """Write the solutions ``(3, C)`` of a system whose matrix was `factorised`."""
+    for i in range(first, last):
+        x = right[0, i] / factor[0, 0]
+        y = (right[1, i] - factor[1, 0] * x) / factor[1, 1]
+        z = (right[2, i] - factor[2, 0] * x - factor[2, 1] * y) / factor[2, 2]
+        z /= factor[2, 2]
+        y = (y - factor[2, 1] * z) / factor[1, 1]
+        solved[0, i] = (x - factor[1, 0] * y - factor[2, 0] * z) / factor[0, 0]
+        solved[1, i], solved[2, i] = y, z
