@@ -9,7 +9,7 @@ import pytest
 from tracked_solids import disturbed, scene
 
 from tracking3d.estimation.online import bundle, pose_from_points
-from tracking3d.estimation.online.bundle import _Problem, adjust
+from tracking3d.estimation.online.bundle import Problem, adjust
 from tracking3d.estimation.online.pose_from_points import pose_of_tracks
 
 SCENES = {
@@ -44,7 +44,7 @@ def posed(given, fixed, free_focal):
     prior = given.truth.points + 0.1
     weights = random.uniform(0, 0.3, len(prior))
     pixels = np.nan_to_num(given.tracks.pixels)
-    return _Problem(pixels, weight, given.K, fixed, 2.0, free_focal, prior, weights), replace(
+    return Problem(pixels, weight, given.K, fixed, 2.0, free_focal, prior, weights), replace(
         at, focal_factor=1.1
     )
 
@@ -94,7 +94,7 @@ def test_the_pose_of_tracks(both, settings):
     points[0], pixels[1], points[2] = np.nan, np.inf, [0, 0, -90]
     weight = np.random.default_rng(0).uniform(0, 1, len(points))
     weight[3], weight[4] = 0, np.nan
-    start = given.truth.R[0], given.truth.t[0]
+    start = given.truth.R[0].copy(), given.truth.t[0].copy()
     for iterations in (0, 1, 30):
         mine, expected = both(
             lambda n=iterations: pose_of_tracks(points, pixels, weight, given.K, *start, 2.0, n)
@@ -106,3 +106,5 @@ def test_the_pose_of_tracks(both, settings):
             values = getattr(expected.equations, name)
             near = 1e-4 * np.nanmax(np.abs(expected.equations.matrix))
             np.testing.assert_allclose(getattr(mine.equations, name), values, atol=near, err_msg=name)
+    np.testing.assert_array_equal(start[0], given.truth.R[0])
+    np.testing.assert_array_equal(start[1], given.truth.t[0])

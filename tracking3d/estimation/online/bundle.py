@@ -85,7 +85,7 @@ class Structure:
 
 
 @dataclass(frozen=True, eq=False)
-class _System:
+class System:
     """Normal equations: poses (and focal length) C, points N, and what couples them."""
 
     poses: FloatArray  # (C, C)
@@ -108,16 +108,16 @@ class _System:
             factor = np.linalg.cholesky(poses - flat.T @ by_points)
         except np.linalg.LinAlgError:
             return None
-        d_poses = -np.linalg.solve(factor.T, np.linalg.solve(factor, gradient))
+        d_poses = np.asarray(-np.linalg.solve(factor.T, np.linalg.solve(factor, gradient)), np.float64)
         right = self.points_gradient + self.coupling @ d_poses
-        d_points = -np.linalg.solve(points, right[..., None])[..., 0]
+        d_points = np.asarray(-np.linalg.solve(points, right[..., None])[..., 0], np.float64)
         sound = np.isfinite(d_poses).all() and np.isfinite(d_points).all()
         return (d_poses, d_points) if sound else None
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem:
-    """What stays the same during one adjustment."""
+class Problem:
+    """What stays the same during one adjustment; arguments of `adjust`, with nothing in them that is not finite."""
 
     pixels: FloatArray
     weight: FloatArray
@@ -129,6 +129,7 @@ class _Problem:
     prior_weight: FloatArray
 
     def intrinsics(self, focal_factor: float) -> FloatArray:
+        """``K`` of other focal lengths."""
         K = self.K.copy()
         K[0, 0] *= focal_factor
         K[1, 1] *= focal_factor
@@ -151,20 +152,20 @@ class _Problem:
         total += float(np.sum(self.prior_weight * np.sum((at.points - self.prior) ** 2, 1)))
         return replace(at, cost=float(total / max(self.weight.sum(), 1e-12)), residual=residual)
 
-    def linearised(self, at: Structure) -> _System:
+    def linearised(self, at: Structure) -> System:
         """The quadratic model of the weighted sum of losses."""
         given = self.pixels, self.weight, self.intrinsics(at.focal_factor), at.R, at.t, at.points
         if compiled():
             from tracking3d.estimation.online.kernels import bundle
 
-            system = _System(*bundle.linearised(*given, self.scale, self.fixed, self.free_focal))
+            system = System(*bundle.linearised(*given, self.scale, self.fixed, self.free_focal))
         else:
             system = self._linearised(at)
         points = system.points + 2 * self.prior_weight[:, None, None] * np.eye(3)
         points_gradient = system.points_gradient + 2 * self.prior_weight[:, None] * (at.points - self.prior)
         return replace(system, points=points, points_gradient=points_gradient)
 
-    def _linearised(self, at: Structure) -> _System:
+    def _linearised(self, at: Structure) -> System:
         """The same without the prior."""
         K = self.intrinsics(at.focal_factor)
         x_cam = to_camera(at.R, at.t, at.points)
@@ -204,7 +205,7 @@ class _Problem:
             coupling[..., count] = np.einsum("fnki,fnk->ni", by_point_obj, by_focal)
         points = np.einsum("fnki,fnkj->nij", by_point_obj, by_point_obj)
         points_gradient = np.einsum("fnki,fnk->ni", by_point_obj, residual)
-        return _System(poses, points, coupling, gradient, points_gradient)
+        return System(poses, points, coupling, gradient, points_gradient)
 
     def stepped(self, at: Structure, d_poses: FloatArray, d_points: FloatArray) -> Structure:
         """After a step."""
@@ -261,7 +262,7 @@ def adjust(
     known = finite_rows(start.points)
     prior = np.full((count, 3), np.nan) if point_prior is None else point_prior
     held = known & finite_rows(prior)
-    problem = _Problem(
+    problem = Problem(
         pixels=np.where(tracks.visible[..., None], np.nan_to_num(tracks.pixels), 0.0),
         weight=tracks.weights() * known,
         K=np.asarray(K, np.float64),

@@ -12,16 +12,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from tracking3d.estimation.online.bundle import Structure, Tracks, adjust
+from tracking3d.estimation.online.bundle import Problem, Structure, System, Tracks, adjust
 from tracking3d.estimation.online.pose_from_points import pose_of_tracks
-from tracking3d.estimation.online.reprojection import (
-    FloatArray,
-    moved,
-    pixel_by_point,
-    pixel_by_pose,
-    project,
-    to_camera,
-)
+from tracking3d.estimation.online.reprojection import FloatArray
 
 SLANTS = (25.0, 50.0)
 """Degrees by which planes are tried to be tilted, in eight directions."""
@@ -128,32 +121,16 @@ def _fitted(
     offset = (rays - np.median(rays, 0))[:, :2]
     points = _on_plane(rays, tilt, z0)
     assert points is not None
-    best = adjust(tracks, K, resected(tracks, K, points - t0, t0, scale), scale=scale, iterations=0)
-    frames, damping = len(best.R) - 1, 1e-3
+    free = np.zeros(len(points))
+    problem = Problem(tracks.pixels, tracks.weights(), K, 1, scale, False, np.zeros_like(points), free)
+    best, damping = problem.evaluated(resected(tracks, K, points - t0, t0, scale)), 1e-3
     for _ in range(_ITERATIONS):
-        x_cam = to_camera(best.R[1:], best.t[1:], best.points)
-        difference = np.nan_to_num(project(x_cam, K) - tracks.pixels[1:])
-        root = np.sqrt(2 / (scale**2 + np.sum(difference**2, -1)))[..., None]
-        by_point = root[..., None] * pixel_by_point(x_cam, K)
-        by_pose = pixel_by_pose(by_point, x_cam - best.t[1:, None])
-        place = best.points + t0
-        by_tilt = place[:, :, None] * (place[:, 2:] * offset / z0)[:, None]  # (N, 3, 2)
-        jacobian = np.zeros((frames, len(rays), 2, 6 * frames + 2))
-        for n in range(frames):
-            jacobian[n, :, :, 6 * n : 6 * n + 6] = by_pose[n]
-        jacobian[..., -2:] = by_point @ best.R[1:, None] @ by_tilt
-        rows = jacobian.reshape(-1, 6 * frames + 2)
-        matrix, gradient = rows.T @ rows, rows.T @ (root * difference).ravel()
-        diagonal = matrix.diagonal()
-        matrix = matrix + np.diag(damping * diagonal + 1e-9 * diagonal.max() + 1e-12)
-        step = -np.linalg.solve(matrix, gradient)
+        step = -_plane_step(problem.linearised(best), best.points + t0, offset / z0, damping)
         moved_points = _on_plane(rays, tilt + step[-2:], z0)
         if moved_points is None:
             damping *= 10
             continue
-        R, t = moved(best.R[1:], best.t[1:], step[:-2].reshape(-1, 6))
-        new = replace(best, R=np.concatenate([best.R[:1], R]), t=np.concatenate([best.t[:1], t]))
-        new = adjust(tracks, K, replace(new, points=moved_points - t0), scale=scale, iterations=0)
+        new = problem.evaluated(problem.stepped(best, step[:-2], moved_points - t0 - best.points))
         if not new.cost < best.cost:
             damping *= 10
             continue
@@ -161,4 +138,25 @@ def _fitted(
         best, tilt, damping = new, tilt + step[-2:], damping / 10
         if settled:
             break
-    return replace(best, origin="flat")
+    return adjust(tracks, K, replace(best, origin="flat"), scale=scale, iterations=0)
+
+
+def _plane_step(system: System, place: FloatArray, offset: FloatArray, damping: float) -> FloatArray:
+    """``(C + 2,)`` damped step against the gradient, of poses and tilt.
+
+    Args:
+        system: Of poses and free points.
+        place: ``(N, 3)`` points in frame 0's camera coordinates.
+        offset: ``(N, 2)`` of `_on_plane`, over ``z0``.
+        damping: Of Levenberg and Marquardt.
+    """
+    by_tilt = place[:, :, None] * (place[:, 2:] * offset)[:, None]  # (N, 3, 2)
+    border = np.einsum("njc,njk->ck", system.coupling, by_tilt)
+    corner = np.einsum("nik,nij,njl->kl", by_tilt, system.points, by_tilt)
+    matrix = np.block([[system.poses, border], [border.T, corner]])
+    gradient = np.append(system.poses_gradient, np.einsum("njk,nj->k", by_tilt, system.points_gradient))
+    diagonal = matrix.diagonal()
+    step: FloatArray = np.linalg.solve(
+        matrix + np.diag(damping * diagonal + 1e-9 * diagonal.max() + 1e-12), gradient
+    )
+    return step

@@ -37,8 +37,9 @@ def pose_of_tracks(
     iterations: int,
 ) -> PoseFit:
     """See `tracking3d.estimation.online.pose_from_points`; ``share`` sums to 1 and is 0 for rows without use."""
-    given = (np.ascontiguousarray(part, np.float64) for part in (points, pixels, share, K, R, t))
-    R, t, *equations = _pose_of_tracks(*given, float(scale), iterations)
+    given = (np.ascontiguousarray(part, np.float64) for part in (points, pixels, share, K))
+    start = (np.array(part, np.float64, order="C") for part in (R, t))  # written to
+    R, t, *equations = _pose_of_tracks(*given, *start, float(scale), iterations)
     return PoseFit(R, t, PointEquations(*equations))
 
 
