@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from tracking3d.rendering.backend import compiled
+
 _BINS = (16, 12, 12)  # L, a, b
 _LOG_LIMIT = 3.0
 _LUT_BITS = 5  # bits a channel of the table that maps a colour to its palette entry
@@ -142,13 +144,37 @@ class Palette:
             last_mask: ``(S, S)`` in [0, 1], the last mask, warped alike.
             radius: Half the side of the neighbourhood in pixels.
         """
-        side = (2 * radius + 1,) * 2
-        ratio = np.zeros(labels.shape, np.float32)
-        floor = 0.002
+        side, floor = (2 * radius + 1,) * 2, 0.002
         total = np.maximum(np.stack([cv2.blur(m, side) for m in (last_mask, 1 - last_mask)]), 0.02)
-        for entry in np.unique(labels):
-            here, where = last_labels == entry, labels == entry
-            object_ = cv2.blur(here * last_mask, side)[where] / total[0][where]
-            rest = cv2.blur(here * (1 - last_mask), side)[where] / total[1][where]
-            ratio[where] = np.log((object_ + floor) / (rest + floor))
+        shares = local_shares(labels, last_labels, last_mask, radius, self.size) / total
+        ratio = np.log((shares[0] + floor) / (shares[1] + floor))
         return np.clip(ratio, -_LOG_LIMIT, _LOG_LIMIT)
+
+
+def local_shares(
+    labels: NDArray[np.uint8],
+    last_labels: NDArray[np.uint8],
+    last_mask: NDArray[np.float32],
+    radius: int,
+    size: int,
+) -> NDArray[np.float32]:
+    """``(2, S, S)``: the shares of a pixel's neighbourhood that had its label in the mask, and beside it.
+
+    Args:
+        labels: See `Palette.local_log_ratio`.
+        last_labels: Likewise.
+        last_mask: Likewise.
+        radius: Likewise.
+        size: More than any label.
+    """
+    if compiled():
+        from tracking3d.trackers.kernels import colour_models
+
+        return colour_models.local_shares(labels, last_labels, last_mask, radius, size)
+    side = (2 * radius + 1,) * 2
+    shares = np.zeros((2, *labels.shape), np.float32)
+    for entry in np.unique(labels):
+        here, where = last_labels == entry, labels == entry
+        for share, part in zip(shares, (last_mask, 1 - last_mask), strict=True):
+            share[where] = cv2.blur(here * part, side)[where]
+    return shares
