@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import logging
 import os
 from pathlib import Path
 
@@ -44,6 +45,10 @@ def pytest_sessionstart() -> None:
     # Building the command line from its annotations takes longer than most commands; a command keeps no state.
     typer.testing._get_command = functools.cache(typer.testing._get_command)
     make_once()
+    # Around every test pytest listens to every logger that keeps its messages to itself; torch has forty.
+    for logger in logging.root.manager.loggerDict.values():
+        if isinstance(logger, logging.Logger) and logger.name.startswith("torch"):
+            logger.propagate = True
 
 
 @pytest.fixture
