@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import av
@@ -16,6 +17,7 @@ from tracking3d import load_config
 from tracking3d.checkpoint.folder import Checkpoint
 from tracking3d.errors import InputError, OutputError
 from tracking3d.estimation.online.solver import OnlineSolver
+from tracking3d.geometry.camera import Camera
 from tracking3d.recording import record, record_objects
 from tracking3d.results import layout, run_writer
 from tracking3d.results.files import write_image
@@ -206,6 +208,30 @@ def test_several_objects_go_on_from_where_each_is(clip, images, tmp_path, monkey
     run(tmp_path / "run")
     for number in (0, 1):
         assert_alike(tmp_path / "run" / f"object_{number}", tmp_path / "whole" / f"object_{number}")
+
+
+def test_a_resumed_run_names_the_lens_that_the_stopped_one_had_come_to(clip, images, tmp_path, monkeypatch):
+    class FindsTheLens(CausalSolver):
+        def step(self, state, frame, mask):
+            state, answer = super().step(state, frame, mask)
+            return state, replace(
+                answer, camera=Camera.from_fov(80, 64, 20.0)
+            ) if frame.index == 2 else answer
+
+    monkeypatch.setitem(SOLVERS, "online", FindsTheLens)
+    stopped(monkeypatch, clip, images, tmp_path / "run", Session, "step", 4)
+    assert RunReader(tmp_path / "run").camera == Camera.from_fov(80, 64, 20.0)
+    named = []
+    with monkeypatch.context() as patch:
+        step = Session.step
+        patch.setattr(
+            Session,
+            "step",
+            lambda *given: (named.append(RunReader(tmp_path / "run").camera), step(*given))[1],
+        )
+        record(open_source(str(images)), settings(), tmp_path / "run", mask=clip.masks[0], resume=True)
+    assert named and all(camera == Camera.from_fov(80, 64, 20.0) for camera in named)
+    assert RunReader(tmp_path / "run").camera == Camera.from_fov(80, 64, 20.0)
 
 
 def test_what_was_handed_back_to_the_tracker_is_handed_back_again(clip, images, tmp_path, monkeypatch):
