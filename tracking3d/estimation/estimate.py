@@ -30,8 +30,10 @@ class MaskSource(StrEnum):
 
     RENDERED = "rendered"
     """The silhouette of the object at the frame's pose."""
+    WEIGHED = "weighed"
+    """What the image shows between that silhouette and the initial mask."""
     MEAN = "mean"
-    """The mean of that silhouette's outline and the initial mask's."""
+    """The mean of their outlines, as versions before 0.2 answered."""
     INITIAL = "initial"
     """The initial mask, handed back as it was."""
     NONE = "none"
@@ -45,7 +47,7 @@ class MaskSource(StrEnum):
     @property
     def is_own(self) -> bool:
         """Whether the answer is more than the input handed back."""
-        return self in (MaskSource.RENDERED, MaskSource.MEAN)
+        return self in (MaskSource.RENDERED, MaskSource.WEIGHED, MaskSource.MEAN)
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,18 +39,18 @@ class GlobalColours:
         rate: float = 0.1,
     ) -> None:
         self._memory, self._rate = memory, rate
-        self._first = _histograms(colours, mask, background)
+        self._first = histograms(colours, mask, background)
         self._running = self._first
 
     def update(
         self, colours: NDArray[np.uint8], mask: NDArray[np.bool_], background: NDArray[np.bool_]
     ) -> None:
         """Let the running histograms follow a mask that is trusted."""
-        self._running = (1 - self._rate) * self._running + self._rate * _histograms(colours, mask, background)
+        self._running = (1 - self._rate) * self._running + self._rate * histograms(colours, mask, background)
 
     def log_ratio(self, colours: NDArray[np.uint8]) -> NDArray[np.float32]:
         """``(S, S)``: log of object over background likelihood of each pixel, clipped at 3."""
-        return _log_ratio(self._memory * self._first + (1 - self._memory) * self._running, colours)
+        return log_ratio(self._memory * self._first + (1 - self._memory) * self._running, colours)
 
     def rarity(self, colours: NDArray[np.uint8], image: NDArray[np.uint8]) -> NDArray[np.float32]:
         """``(S, S)``: log of the first object's likelihood of each pixel over its share of a whole ``image``.
@@ -60,7 +60,7 @@ class GlobalColours:
             image: ``(H, W, 3)`` Lab.
         """
         everywhere = np.ones(image.shape[:2], bool)
-        return _log_ratio(np.stack([self._first[0], _histograms(image, everywhere, everywhere)[0]]), colours)
+        return log_ratio(np.stack([self._first[0], histograms(image, everywhere, everywhere)[0]]), colours)
 
     def separation(
         self, colours: NDArray[np.uint8], mask: NDArray[np.bool_], background: NDArray[np.bool_]
@@ -68,7 +68,7 @@ class GlobalColours:
         """How much more the mask looks like the first frame's object than its surroundings do, in [-1, 1]."""
         if not mask.any() or not background.any():
             return 0.0
-        likeness = np.tanh(_log_ratio(self._first, colours))
+        likeness = np.tanh(log_ratio(self._first, colours))
         return float(likeness[mask].mean() - likeness[background].mean()) / 2
 
 
@@ -79,9 +79,10 @@ def _bin(colours: NDArray[np.uint8]) -> NDArray[np.int32]:
     return index
 
 
-def _histograms(
+def histograms(
     colours: NDArray[np.uint8], mask: NDArray[np.bool_], background: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
+    """``(2, B)`` shares of the colours of a Lab crop ``(S, S, 3)`` in the mask, and in the background."""
     index, size = _bin(colours), int(np.prod(_BINS))
     counts = np.stack([np.bincount(index[where], minlength=size) for where in (mask, background)]).astype(
         float
@@ -99,7 +100,8 @@ def _smooth(cube: NDArray[np.float64]) -> NDArray[np.float64]:
     return cube
 
 
-def _log_ratio(histograms: NDArray[np.float64], colours: NDArray[np.uint8]) -> NDArray[np.float32]:
+def log_ratio(histograms: NDArray[np.float64], colours: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """``(S, S)`` log of the first over the second likelihood of each pixel of a Lab crop, clipped at 3."""
     floor = 1e-4  # about five pixels of a crop: rarer colours are evidence for neither side
     table = np.log((histograms[0] + floor) / (histograms[1] + floor))
     return np.clip(table, -_LOG_LIMIT, _LOG_LIMIT).astype(np.float32)[_bin(colours)]

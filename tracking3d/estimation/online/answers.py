@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource, Status
-from tracking3d.estimation.online.answer_mask import answer_mask, support_beside
+from tracking3d.estimation.online.answer_mask import answer_mask, learnt
 from tracking3d.estimation.online.attempt import Attempt
 from tracking3d.estimation.online.belief import Belief
-from tracking3d.estimation.online.pose_refinement import PoseWeights
 from tracking3d.estimation.online.stiffness import least_held
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
@@ -36,11 +35,18 @@ def unsolved(frame: Frame, mask: NDArray[np.bool_] | None, pose: Pose, camera: C
     )
 
 
+def with_colours(state: Belief, answer: FrameEstimate, found: Attempt) -> Belief:
+    """The belief with what a frame that is believed shows of the colours."""
+    if found.doubtful or found.view.mask is None:
+        return state
+    return replace(state, colours=learnt(state.colours, found.view.observation, answer.mask))
+
+
 def solved(state: Belief, answer: FrameEstimate, found: Attempt) -> FrameEstimate:
-    """The answer with a pose, its judgement and the better supported mask; of a lost frame, the initial mask.
+    """The answer with a pose, its judgement and the mask that the image shows; of a lost frame, the initial mask.
 
     Args:
-        state: Map and camera.
+        state: Map, camera and colours.
         answer: What does not depend on the pose.
         found: What was found in the frame.
     """
@@ -49,12 +55,13 @@ def solved(state: Belief, answer: FrameEstimate, found: Attempt) -> FrameEstimat
         mask = view.mask if view.mask is not None else np.zeros_like(answer.mask)
         source = MaskSource.handed_back(view.mask)
     else:
-        rendered = state.known.silhouette(fit.pose, state.camera)
-        # Without texture everything beside the mask looks like the object.
-        support = 0.0 if state.known.pointless else 1.0
-        if not state.known.pointless and state.surface is not None and view.mask is not None:
-            support = support_beside(state.surface, view, fit.pose, PoseWeights().appearance_scale)
-        mask, source = answer_mask(rendered, view.mask, support)
+        mask, source = answer_mask(
+            state.known.silhouette(fit.pose, state.camera),
+            view.mask,
+            view.observation,
+            judgement.confidence,
+            state.colours,
+        )
     return replace(
         answer,
         T_cam_obj=fit.pose.matrix().numpy(),

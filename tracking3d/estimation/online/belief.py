@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tracking3d.estimation.estimate import FrameEstimate
+from tracking3d.estimation.evidence import Colours
 from tracking3d.estimation.feature_space import FeatureSpace
 from tracking3d.estimation.observation import Observation
 from tracking3d.estimation.online.judgement import Usual
@@ -147,6 +148,7 @@ class Belief:
         lost_for: How many frames in a row the object has been lost.
         doubted_for: How many frames in a row have been lost or hardly believed.
         trail: Poses and indices of the last frames that were believed.
+        colours: Of object and surroundings in frames that were believed.
     """
 
     camera: Camera
@@ -164,11 +166,12 @@ class Belief:
     lost_for: int = 0
     doubted_for: int = 0
     trail: tuple[tuple[Pose, int], ...] = ()
+    colours: Colours | None = None
 
     def moved(self, pose: Pose, index: int, grey: NDArray[np.uint8], followed: FollowedPoints) -> Belief:
         """One frame later."""
         return replace(self, last=(pose, index), before=self.last, grey=grey, followed=followed)
 
 
-ONLINE_CLASSES = (Belief, ObjectMap, View, Surface, FollowedPoints, Keypoints, Usual)
+ONLINE_CLASSES = (Belief, Colours, ObjectMap, View, Surface, FollowedPoints, Keypoints, Usual)
 """What a `Belief` is made of beside `tracking3d.estimation.solver.STATE_CLASSES`."""

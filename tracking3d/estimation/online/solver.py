@@ -21,7 +21,7 @@ from tracking3d.estimation.estimate import FrameEstimate, ObjectModel
 from tracking3d.estimation.feature_space import FeatureSpace, feature_channels
 from tracking3d.estimation.framing import mask_box, projected_box
 from tracking3d.estimation.observation import Observation, observe
-from tracking3d.estimation.online.answers import solved, unsolved
+from tracking3d.estimation.online.answers import solved, unsolved, with_colours
 from tracking3d.estimation.online.attempt import Attempt
 from tracking3d.estimation.online.belief import ONLINE_CLASSES, Belief, ObjectMap, View
 from tracking3d.estimation.online.final_refinement import refined_once_more
@@ -223,6 +223,7 @@ class OnlineSolver:
             support = supported(known, camera, pose, kept, view)
             found = Attempt(view, fit, start.origin, kept, support, judge(fit, usual, support))
             revised.append(solved(belief, earlier, found))
+            belief = with_colours(belief, revised[-1], found)
         belief = replace(
             belief, last=trail[-1], before=trail[-2], trail=tuple(trail[-_TRAIL:]), usual=usual,
             followed=view.points,
@@ -261,7 +262,7 @@ class OnlineSolver:
             belief = replace(belief, trail=(*state.trail, (pose, frame.index))[-_TRAIL:])
         found = replace(found, fit=replace(found.fit, pose=pose))
         answer = solved(belief, unsolved(frame, mask, pose, state.camera), found)
-        return belief, replace(answer, keyframe=key)
+        return with_colours(belief, answer, found), replace(answer, keyframe=key)
 
     def _found(
         self, state: Belief, view: View, frame: Frame, image: NDArray[np.uint8], starts: dict[str, Pose]

@@ -1,0 +1,80 @@
+"""Colours of object and surroundings: those that earlier frames showed, and those on either side of an outline."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.trackers.colour_models import Palette, histograms, log_ratio
+from tracking3d.trackers.outline import signed_distance
+
+_RATE = 0.1
+_INSIDE, _BESIDE = 0.03, (0.06, 0.4)
+"""Distances from an outline, relative to the root of the area, from and within which a pixel surely is on its side."""
+_NEIGHBOURHOOD = 0.4
+"""Half the side of the neighbourhood in which colours are compared, relative to the root of the area."""
+
+
+@dataclass(frozen=True, eq=False)
+class Colours:
+    """What earlier frames showed.
+
+    Attributes:
+        histograms: ``(2, B)`` of the object and of its surroundings, see `tracking3d.trackers.colour_models`.
+    """
+
+    histograms: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, lab: NDArray[np.uint8], mask: NDArray[np.bool_], before: Self | None = None) -> Self | None:
+        """What is known after one more frame.
+
+        Args:
+            lab: ``(S, S, 3)`` crop in 8-bit Lab.
+            mask: ``(S, S)`` the object in it.
+            before: What was known before.
+
+        Returns:
+            The same as before where the crop does not show both sides.
+        """
+        distance = relative_distance(mask)
+        inside, beside = distance > _INSIDE, (distance < -_BESIDE[0]) & (distance > -_BESIDE[1])
+        if not inside.any() or not beside.any():
+            return before
+        found = histograms(lab, inside, beside)
+        return cls(found if before is None else (1 - _RATE) * before.histograms + _RATE * found)
+
+    def log_ratio(self, lab: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """``(S, S)`` log of the object's over the surroundings' likelihood of each pixel's colour, within 3."""
+        return log_ratio(self.histograms, lab)
+
+
+def beside_outline(lab: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """``(S, S)`` log of how often a pixel's colour lies around it in the mask over how often beside it, within 3.
+
+    Localised statistics as of Tjaden et al., "A region-based Gauss-Newton approach to real-time monocular multiple
+    object tracking", 2018, over a few colours in place of fine histograms.
+
+    Args:
+        lab: ``(S, S, 3)`` crop in 8-bit Lab.
+        mask: ``(S, S)`` where the object seems to be.
+    """
+    palette = Palette(lab)
+    labels = palette.label(lab)
+    radius = max(round(_NEIGHBOURHOOD * math.sqrt(np.count_nonzero(mask))), 2)
+    return palette.local_log_ratio(labels, labels, mask.astype(np.float32), radius)
+
+
+def relative_distance(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """``(S, S)`` distance to the outline over the root of the area: positive inside, negative outside."""
+    return signed_distance(mask) / math.sqrt(max(np.count_nonzero(mask), 1))
+
+
+def as_lab(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """``(S, S, 3)`` RGB to 8-bit CIE Lab."""
+    return cv2.cvtColor(image, cv2.COLOR_RGB2LAB)
