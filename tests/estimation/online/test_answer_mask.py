@@ -1,101 +1,91 @@
-"""The answered mask: rendered, initial, or what lies between both, by what the pixels beside the mask look like."""
+"""The answered mask: what the image shows between the silhouette and the initial mask, in the pixels of the frame."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from patterns import disc
-from rendered_solids import observed, pose_of, shape_of, surface_of
 
 from tracking3d.estimation.estimate import MaskSource
-from tracking3d.estimation.online.answer_mask import answer_mask, support_beside
-from tracking3d.estimation.online.belief import View
-from tracking3d.estimation.online.points import FollowedPoints
+from tracking3d.estimation.observation import observe
+from tracking3d.estimation.online.answer_mask import answer_mask, finer, learnt
+from tracking3d.features.rgb import RgbEncoder
+from tracking3d.frames import Frame
+from tracking3d.geometry.camera import Camera, Window
 
 SIZE = (160, 240)
-RENDERED, NEAR, FAR = disc(SIZE, (106, 80), 50), disc(SIZE, (100, 80), 50), disc(SIZE, (140, 80), 50)
+TRUTH = disc(SIZE, (106, 80), 50)
+CAMERA = Camera.from_fov(SIZE[1], SIZE[0])
 
 
-def right_edge(mask) -> int:
-    return int(np.flatnonzero(mask.any(0)).max())
+def observed(truth, initial, window=None):
+    """A warm object before a cool background."""
+    random = np.random.default_rng(0)
+    colours = np.where(truth[..., None], (200, 120, 60), (60, 110, 170)) + random.normal(0, 5, (*SIZE, 3))
+    frame = Frame(0, np.clip(colours, 0, 255).astype(np.uint8))
+    window = window or Window.around((56.0, 30.0, 100.0, 100.0), 0.3, 128)
+    return observe(frame, initial, window, CAMERA, RgbEncoder(), torch.device("cpu"))
+
+
+def iou(a, b):
+    return float((a & b).sum() / (a | b).sum())
+
+
+def answer(truth, rendered, initial, window=None, confidence=0.8):
+    return answer_mask(rendered, initial, observed(truth, initial, window), confidence, None)
 
 
 def test_without_an_initial_mask_it_is_the_silhouette():
-    np.testing.assert_array_equal(answer_mask(RENDERED, None, 0.0)[0], RENDERED)
+    mask, source = answer(TRUTH, TRUTH, None)
+    np.testing.assert_array_equal(mask, TRUTH)
+    assert source is MaskSource.RENDERED
 
 
-@pytest.mark.parametrize("support", [0.0, 0.5, 1.0])
-def test_two_masks_that_are_the_same_are_the_answer(support):
-    np.testing.assert_array_equal(answer_mask(RENDERED, RENDERED, support)[0], RENDERED)
+def test_two_masks_that_are_right_are_kept():
+    mask, source = answer(TRUTH, TRUTH, TRUTH)
+    assert iou(mask, TRUTH) > 0.97
+    assert source is MaskSource.WEIGHED
 
 
-def test_outlines_of_masks_that_are_alike_are_averaged_unless_the_rendered_one_has_no_support():
-    # Six pixels apart: 0.6 of the way to the rendered outline.
-    assert right_edge(NEAR) == 150
-    assert right_edge(answer_mask(RENDERED, NEAR, 1.0)[0]) == 153
-    np.testing.assert_array_equal(answer_mask(RENDERED, NEAR, 0.0)[0], NEAR)
+@pytest.mark.parametrize("shift", [-8, 8])
+def test_of_two_masks_the_image_tells_which_is_right(shift):
+    aside = disc(SIZE, (106 + shift, 80), 50)
+    for rendered, initial in ((TRUTH, aside), (aside, TRUTH)):
+        assert iou(answer(TRUTH, rendered, initial)[0], TRUTH) > 0.95 > iou(aside, TRUTH)
 
 
-def test_where_masks_differ_the_supported_one_is_the_answer():
-    np.testing.assert_array_equal(answer_mask(RENDERED, FAR, 0.7)[0], RENDERED)
-    np.testing.assert_array_equal(answer_mask(RENDERED, FAR, 0.2)[0], FAR)
-
-
-def test_where_neither_is_clearly_right_it_lies_between():
-    between = answer_mask(RENDERED, FAR, 0.45)[0]
-    assert (between & ~(RENDERED | FAR)).sum() == 0
-    assert (RENDERED & FAR & ~between).sum() == 0
-    assert not (between == RENDERED).all()
-    assert not (between == FAR).all()
-
-
-def test_the_answer_says_where_it_comes_from():
-    assert answer_mask(RENDERED, None, 0.0)[1] is MaskSource.RENDERED
-    assert answer_mask(RENDERED, FAR, 0.7)[1] is MaskSource.RENDERED
-    assert answer_mask(RENDERED, NEAR, 1.0)[1] is answer_mask(RENDERED, FAR, 0.45)[1] is MaskSource.MEAN
-    assert answer_mask(RENDERED, NEAR, 0.0)[1] is MaskSource.INITIAL
-    assert [source for source in MaskSource if source.is_own] == [MaskSource.RENDERED, MaskSource.MEAN]
+def test_an_object_that_leaves_the_frame_is_answered_within_it():
+    truth = disc(SIZE, (225, 80), 40)
+    window = Window.around((185.0, 40.0, 55.0, 80.0), 0.5, 128)
+    assert window.left + window.side > SIZE[1]
+    mask, _ = answer(truth, truth, truth, window)
+    assert mask.shape == SIZE
+    assert iou(mask, truth) > 0.95
 
 
 def test_an_empty_silhouette_beside_a_mask_is_no_traceback():
     nothing = np.zeros(SIZE, bool)
-    assert answer_mask(nothing, NEAR, 0.0)[0].sum() == NEAR.sum()
-    assert not answer_mask(nothing, nothing, 1.0)[0].any()
+    assert answer(TRUTH, nothing, TRUTH)[0].any()
+    mask, source = answer(TRUTH, nothing, nothing)
+    assert not mask.any()
+    assert source is MaskSource.INITIAL
 
 
-SHAPE = shape_of()
-SURFACE, POSE = surface_of(SHAPE), pose_of(20)
+def test_the_window_is_seen_at_twice_its_pixels():
+    observation = observed(TRUTH, TRUTH)
+    window, image = finer(observation)
+    assert image.shape == (256, 256, 3)
+    assert (window.size, window.side) == (256, observation.window.side)
+    assert image[128, 128, 0] > 150 > image[2, 128, 0]
 
 
-def half_masked(features=None) -> View:
-    """The mask covers the left half of the object; beside it the pixels may differ."""
-    whole = observed(SURFACE, POSE)
-    mask = whole.mask.clone()
-    mask[:, 32:] = 0
-    shown = whole.features if features is None else torch.where(mask > 0, whole.features, features)
-    return View(replace(whole, mask=mask, features=shown), mask.numpy() > 0.5, POSE, FollowedPoints.none())
+def test_colours_of_a_frame_are_learnt():
+    colours = learnt(None, observed(TRUTH, TRUTH), TRUTH)
+    assert colours is not None
+    assert learnt(colours, observed(TRUTH, TRUTH), np.zeros(SIZE, bool)) is colours
 
 
-def test_what_looks_like_the_object_beside_the_mask_supports_the_silhouette():
-    assert support_beside(SURFACE, half_masked(), POSE, 0.25) > 0.9
-
-
-def test_what_looks_otherwise_does_not():
-    other = torch.full((3, 64, 64), -2.0)
-    assert support_beside(SURFACE, half_masked(other), POSE, 0.25) == 0
-
-
-def test_texture_that_was_never_seen_supports_nothing():
-    unseen = replace(SURFACE, seen=torch.zeros_like(SURFACE.seen))
-    assert support_beside(unseen, half_masked(), POSE, 0.25) == 0
-
-
-def test_with_nothing_beside_the_mask_nothing_contradicts():
-    view = half_masked()
-    everywhere = replace(view, observation=replace(view.observation, mask=torch.ones(64, 64)))
-    assert support_beside(SURFACE, everywhere, POSE, 0.25) == 1
-    nowhere = replace(view, observation=replace(view.observation, mask=torch.zeros(64, 64)))
-    assert support_beside(SURFACE, nowhere, POSE, 0.25) == 1
+def test_the_answer_says_whether_it_is_more_than_the_input_handed_back():
+    own = [source for source in MaskSource if source.is_own]
+    assert own == [MaskSource.RENDERED, MaskSource.WEIGHED, MaskSource.MEAN]

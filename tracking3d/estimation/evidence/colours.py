@@ -72,7 +72,10 @@ def beside_outline(lab: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[n
 
 def relative_distance(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
     """``(S, S)`` distance to the outline over the root of the area: positive inside, negative outside."""
-    return signed_distance(mask) / math.sqrt(max(np.count_nonzero(mask), 1))
+    area = int(np.count_nonzero(mask))
+    if area in (0, mask.size):  # without an outline everything is far on one side of it
+        return np.full(mask.shape, 1.0 if area else -1.0, np.float32)
+    return signed_distance(mask) / math.sqrt(area)
 
 
 def as_lab(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
