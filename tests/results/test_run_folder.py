@@ -58,7 +58,13 @@ def test_run_json_says_how_the_run_was_made_and_what_came_of_it(tmp_path, turnin
         "keyframes": 1,
         "skipped": 1,
         "failed": 0,
-        "masks": {"rendered": 0, "weighed": 0, "mean": 0, "initial": 0, "none": 0},  # these estimates do not say
+        "masks": {
+            "rendered": 0,
+            "weighed": 0,
+            "mean": 0,
+            "initial": 0,
+            "none": 0,
+        },  # these estimates do not say
     }
     assert run["skipped"] == [{"index": 1, "reason": "cannot be decoded"}]
     assert run["timings"]["seconds_per_frame_mean"] == run["timings"]["seconds_per_frame_median"]

@@ -37,7 +37,9 @@ def answer_mask(
     if initial is None:
         return rendered, MaskSource.RENDERED
     window, image = finer(observation)
-    sources = features(as_lab(image), _seen(initial, window), _seen(rendered, window), confidence, colours)
+    sources = features(
+        as_lab(image), seen_through(initial, window), seen_through(rendered, window), confidence, colours
+    )
     support = along_edges(image, log_odds(sources))
     support[~inside_frame(initial.shape, window)] = -1
     mask = _pasted(support, window, initial.shape) > 0
@@ -48,7 +50,7 @@ def answer_mask(
 def learnt(colours: Colours | None, observation: Observation, mask: NDArray[np.bool_]) -> Colours | None:
     """What is known of the colours after a frame with ``mask`` ``(H, W)``."""
     window, image = finer(observation)
-    return Colours.of(as_lab(image), _seen(mask, window), colours)
+    return Colours.of(as_lab(image), seen_through(mask, window), colours)
 
 
 def finer(observation: Observation) -> tuple[Window, NDArray[np.uint8]]:
@@ -58,7 +60,8 @@ def finer(observation: Observation) -> tuple[Window, NDArray[np.uint8]]:
     return window, np.ascontiguousarray(image.astype(np.uint8))
 
 
-def _seen(mask: NDArray[np.bool_], window: Window) -> NDArray[np.bool_]:
+def seen_through(mask: NDArray[np.bool_], window: Window) -> NDArray[np.bool_]:
+    """``(S, S)`` what a window shows of a mask ``(H, W)``."""
     # What is beyond the frame is not the object, although `cut` repeats the border.
     seen = cut(mask.astype(np.float32), window) > 0.5
     return np.asarray(seen & inside_frame(mask.shape, window))
