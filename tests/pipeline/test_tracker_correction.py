@@ -120,9 +120,11 @@ def test_the_bounds_themselves_are_worth_correcting():
     assert not corrects(estimate(mask=square(10, 9)))
 
 
-def test_what_was_found_elsewhere_by_its_points_corrects_whatever_the_mask():
-    for initial in (None, square(0, 5), square(10)):
+def test_what_was_found_elsewhere_by_its_points_corrects_a_mask_of_something_else():
+    for initial in (None, square(0, 5), square(35, 10)):
         assert corrects(estimate(hypothesis=SIGHTED, initial_mask=initial, confidence=0.4))
+    for initial in (square(10), square(12)):  # the mask is there, too: then the usual bounds hold
+        assert not corrects(estimate(hypothesis=SIGHTED, initial_mask=initial, confidence=0.4))
     assert not corrects(estimate(hypothesis=SIGHTED, status=Status.UNCERTAIN))
 
 

@@ -16,19 +16,23 @@ width of an outline; below, one of them is of something else, and nobody knows w
 
 
 SIGHTED = "sighted"
-"""What `FrameEstimate.hypothesis` says where the object was found by its points alone, anywhere in the frame: the mask
-tracker was elsewhere or had nothing, whatever its mask."""
+"""What `FrameEstimate.hypothesis` says where the object was found by its points alone, anywhere in the frame; where the
+mask tracker was elsewhere or had nothing, it is set on what was found, however sure that is."""
+
+
+ELSEWHERE = 0.2
+"""IoU of the object's silhouette, or mask, with the initial mask up to which that is of something else."""
 
 
 def corrects(estimate: FrameEstimate) -> bool:
     """Whether an answer is sure enough, and unlike the initial mask enough, to be handed back to the mask tracker."""
     if estimate.status is not Status.TRACKED:
         return False
-    if estimate.hypothesis == SIGHTED:
-        return True
     if estimate.initial_mask is None:
-        return False
-    both = np.count_nonzero(estimate.mask & estimate.initial_mask)
-    either = np.count_nonzero(estimate.mask | estimate.initial_mask)
+        return estimate.hypothesis == SIGHTED
+    both = int(np.count_nonzero(estimate.mask & estimate.initial_mask))
+    either = int(np.count_nonzero(estimate.mask | estimate.initial_mask))
+    if estimate.hypothesis == SIGHTED and both <= ELSEWHERE * either:
+        return True
     least, most = WORTH_CORRECTING
-    return bool(estimate.confidence >= SURE and least * either <= both <= most * either and both)
+    return estimate.confidence >= SURE and both > 0 and least * either <= both <= most * either

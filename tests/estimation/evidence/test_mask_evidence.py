@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tracking3d.estimation.evidence import SOURCES, Colours, along_edges, as_lab, features, log_odds
+from tracking3d.estimation.evidence import SOURCES, Colours, along_edges, as_lab, features, log_odds, tidied
 
 SIZE = 128
 
@@ -107,6 +107,20 @@ def test_the_outline_is_carried_to_the_edge_of_the_image():
     odds = np.tanh(cv2.GaussianBlur((disc(64, radius=33) * 2.0 - 1).astype(np.float32), (0, 0), 6))
     image = picture(truth, noise=2)
     assert iou(along_edges(image, odds) > 0, truth) > iou(odds > 0, truth)
+
+
+def test_hairs_and_crumbs_are_no_part_of_the_object():
+    truth = disc(64)
+    frayed = truth.copy()
+    frayed[64, 90:120] = frayed[20:24, 20:24] = True
+    support = np.where(frayed, 0.7, -0.4).astype(np.float32)
+    clean = tidied(support)
+    assert iou(clean > 0, truth) > 0.98
+    assert not (clean > 0)[64, 100] and not (clean > 0)[22, 22]
+    np.testing.assert_array_equal(clean[~frayed], support[~frayed])
+    two = disc(35, radius=20) | disc(95, radius=15)
+    assert iou(tidied(np.where(two, 1.0, -1.0).astype(np.float32)) > 0, two) > 0.95
+    assert not (tidied(np.full((SIZE, SIZE), -1.0, np.float32)) > 0).any()
 
 
 def test_masks_of_nothing_are_survived():

@@ -1,10 +1,10 @@
 """How likely each pixel is the object's, from sources that see different things, for any solver.
 
-`features` says what the sources see, `log_odds` weighs it, `along_edges` decides.
+`features` says what the sources see, `log_odds` weighs it, `along_edges` and `tidied` decide.
 """
 
 from tracking3d.estimation.evidence.colours import Colours, as_lab
-from tracking3d.estimation.evidence.decision import along_edges
+from tracking3d.estimation.evidence.decision import along_edges, tidied
 from tracking3d.estimation.evidence.weighing import SOURCES, features, log_odds
 
-__all__ = ["SOURCES", "Colours", "along_edges", "as_lab", "features", "log_odds"]
+__all__ = ["SOURCES", "Colours", "along_edges", "as_lab", "features", "log_odds", "tidied"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +12,8 @@ from tracking3d.trackers.opencv_build import why_no_contrib
 from tracking3d.trackers.segmentation import SMOOTHER
 
 _SMOOTHNESS, _EDGES = 100.0, 12.0
+_THIN = 0.03  # of the root of the area: what is thinner is no part of the object
+_LEAST_PART = 0.1  # of the largest part's area
 
 
 def along_edges(image: NDArray[np.uint8], log_odds: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -26,3 +30,18 @@ def along_edges(image: NDArray[np.uint8], log_odds: NDArray[np.float32]) -> NDAr
     if why_no_contrib(SMOOTHER):
         return support
     return np.asarray(cv2.ximgproc.fastGlobalSmootherFilter(image, support, _SMOOTHNESS, _EDGES), np.float32)
+
+
+def tidied(support: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The same without hairs and crumbs: where the background has the object's colours, outlines fray."""
+    mask = (support > 0).astype(np.uint8)
+    side = 2 * round(_THIN / 2 * math.sqrt(np.count_nonzero(mask))) + 1
+    if side > 1:
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+        mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, disc)
+    count, part, statistics, _ = cv2.connectedComponentsWithStats(mask)
+    if count > 1:
+        area = statistics[1:, cv2.CC_STAT_AREA]
+        kept = np.isin(part, 1 + np.flatnonzero(area >= _LEAST_PART * area.max()))
+        return np.where(kept, support, -np.abs(support)).astype(np.float32)
+    return np.where(mask > 0, support, -np.abs(support)).astype(np.float32)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from tracking3d.estimation.correction import ELSEWHERE
 from tracking3d.estimation.framing import projected_box
 from tracking3d.estimation.online.belief import ObjectMap
 from tracking3d.estimation.online.keypoints import detect
@@ -42,3 +43,9 @@ def sighted(
     views = [known.keyframes[position] for position in chosen]
     found = matched_poses(known, camera, keypoints, views, max(1.0, length / 200))
     return found[0] if found and len(found[0][1]) >= _FEWEST else None
+
+
+def meets(silhouette: NDArray[np.bool_], mask: NDArray[np.bool_]) -> bool:
+    """Whether a mask is where the object was sighted: then it counts there as it does anywhere."""
+    either = int(np.count_nonzero(silhouette | mask))
+    return int(np.count_nonzero(silhouette & mask)) > ELSEWHERE * either

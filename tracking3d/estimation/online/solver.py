@@ -33,7 +33,7 @@ from tracking3d.estimation.online.motion import carried, moved_on, predicted
 from tracking3d.estimation.online.object_model import object_model
 from tracking3d.estimation.online.points import FollowedPoints, follow, grey
 from tracking3d.estimation.online.pose_refinement import PoseFit, PoseWeights
-from tracking3d.estimation.online.sighting import sighted
+from tracking3d.estimation.online.sighting import meets, sighted
 from tracking3d.estimation.online.start import Start
 from tracking3d.estimation.online.tracking import (
     agreeing,
@@ -285,17 +285,20 @@ class OnlineSolver:
         judgement = judge(fit, state.usual, support, won == "grid", state.lost_for > 0)
         best = Attempt(view, fit, won, kept, support, judgement)
         if best.lost or (best.doubtful and worth_trying(state.doubted_for)):
-            other = self._elsewhere(state, frame, image)
+            other = self._elsewhere(state, frame, image, view.mask)
             return other if other is not None and other.better_than(best) else best
         return best
 
-    def _elsewhere(self, state: Belief, frame: Frame, image: NDArray[np.uint8]) -> Attempt | None:
-        """The object somewhere else in the frame, whatever the mask says; None where it is not seen there either."""
+    def _elsewhere(
+        self, state: Belief, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
+    ) -> Attempt | None:
+        """The object somewhere else in the frame than the mask; None where it is not seen there either."""
         where = sighted(state.known, state.camera, image, state.trail[-1][0])
         if where is None:
             return None
         pose, points = where
-        view = self._view(state, frame, None, pose, points)
+        elsewhere = mask is None or not meets(state.known.silhouette(pose, state.camera), mask)
+        view = self._view(state, frame, None if elsewhere else mask, pose, points)
         _, fit = self._fit(state, view, {SIGHTED: pose}, points)
         kept = agreeing(state.known, state.camera, fit.pose, points, view)
         support = supported(state.known, state.camera, fit.pose, kept, view)
