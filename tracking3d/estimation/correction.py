@@ -6,9 +6,9 @@ import numpy as np
 
 from tracking3d.estimation.estimate import FrameEstimate, Status
 
-SURE = 0.6
+SURE = 0.7
 """Confidence from which an answer's mask is handed back to the mask tracker. An answer that is as likely wrong as right
-would teach it as many errors as it mends; the tracker ``onnx`` trusts its own masks from the same score on."""
+would teach it as many errors as it mends, and what it was taught wrongly comes back as evidence."""
 
 WORTH_CORRECTING = (0.5, 0.9)
 """IoU of answer and initial mask between which the latter is corrected. Above, they differ by little more than the
