@@ -191,14 +191,14 @@ def test_beyond_the_range_it_was_fitted_on_nothing_changes():
 
 
 def test_after_a_loss_only_what_is_believed_is_the_object():
-    verdict = judge(fit(), USUAL, Support(3), lost_before=True)
+    verdict = judge(fit(), USUAL, Support(3), astray=True)
     assert verdict.status is Status.LOST and "after the loss" in verdict.reason
-    assert judge(fit(), USUAL, Support(100), lost_before=True).status is Status.TRACKED
+    assert judge(fit(), USUAL, Support(100), astray=True).status is Status.TRACKED
 
 
 def test_after_a_loss_what_was_never_seen_is_no_side_of_the_object():
     unseen = fit(appearance=0.46, unseen=0.9)
-    verdict = judge(unseen, USUAL, Support(FEW), lost_before=True)
+    verdict = judge(unseen, USUAL, Support(FEW), astray=True)
     assert verdict.status is Status.LOST and verdict.confidence < 0.3
     # Points that agree tell that it is back.
-    assert judge(unseen, USUAL, Support(MANY), lost_before=True).status is not Status.LOST
+    assert judge(unseen, USUAL, Support(MANY), astray=True).status is not Status.LOST

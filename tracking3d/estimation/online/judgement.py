@@ -175,7 +175,7 @@ def unexplained(fit: PoseFit, usual: Usual, mask_weight: float) -> bool:
 
 
 def judge(
-    fit: PoseFit, usual: Usual, support: Support, guessed: bool = False, lost_before: bool = False
+    fit: PoseFit, usual: Usual, support: Support, guessed: bool = False, astray: bool = False
 ) -> Assessment:
     """Status, reason and confidence of one frame.
 
@@ -185,8 +185,8 @@ def judge(
         support: What speaks for the pose beside its losses.
         guessed: Whether the pose is the best of many turns that were tried. Where none of them explains the frame,
             which is the least bad is up to chance, and points that happen to agree with it are, too.
-        lost_before: Whether the object was lost in the frame before. Then no motion leads to a side that was never
-            seen, and the mask may be of anything.
+        astray: Whether the object was lost in the frame before, and no motion leads to the pose. Then it is no side
+            that was never seen, and the mask may be of anything.
     """
     far, few = unexplained(fit, usual, support.mask_weight), not support.settles
     if few and not support.has_mask:
@@ -204,7 +204,7 @@ def judge(
         confidence = min(confidence, _UNWITNESSED)
     if few and fit.unseen > _MOSTLY:
         confidence *= 0.5
-    if lost_before and few and confidence < BELIEVED:
+    if astray and few and confidence < BELIEVED:
         return Assessment(
             Status.LOST, "what was found after the loss may be something else", min(confidence, 0.2)
         )

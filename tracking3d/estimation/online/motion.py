@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,10 @@ from tracking3d.estimation.online.attempt import Attempt
 from tracking3d.estimation.online.belief import Belief
 from tracking3d.estimation.online.mapping import project_points
 from tracking3d.estimation.online.tracking import coast
-from tracking3d.geometry.pose import Pose, extrapolate
+from tracking3d.geometry.pose import Pose, extrapolate, rotation_angle
+
+_BRIEF, _NEAR = 5, 30.0
+"""Frames of a loss, and degrees, within which motion still tells a side that was never seen: a thin view of a card."""
 
 
 def predicted(state: Belief, index: int) -> dict[str, Pose]:
@@ -33,6 +37,14 @@ def carried(state: Belief, pose: Pose) -> NDArray[np.float32] | None:
     position = state.known.landmarks[state.followed.landmark]
     there, here = (project_points(position, one, state.camera) for one in (pose, state.last[0]))
     return np.asarray(state.followed.pixel + np.nan_to_num(there - here), dtype=np.float32)
+
+
+def led_to(state: Belief, pose: Pose, index: int) -> bool:
+    """Whether the motion from before a loss leads to a pose: only a while, and only near where it goes on."""
+    if not state.trail or state.lost_for > _BRIEF:
+        return False
+    away = float(rotation_angle(coast(state.trail, index).quaternion, pose.quaternion))
+    return math.degrees(away) < _NEAR
 
 
 def moved_on(state: Belief, found: Attempt, pose: Pose, grey: NDArray[np.uint8]) -> Belief:

@@ -29,7 +29,7 @@ from tracking3d.estimation.online.growing import refined, with_keyframe, with_po
 from tracking3d.estimation.online.judgement import ENOUGH_POINTS, judge, looks_wrong, unexplained
 from tracking3d.estimation.online.lens import through
 from tracking3d.estimation.online.mapping import mask_weight, pose_of
-from tracking3d.estimation.online.motion import carried, moved_on, predicted
+from tracking3d.estimation.online.motion import carried, led_to, moved_on, predicted
 from tracking3d.estimation.online.object_model import object_model
 from tracking3d.estimation.online.points import FollowedPoints, follow, grey
 from tracking3d.estimation.online.pose_refinement import PoseFit, PoseWeights
@@ -282,7 +282,8 @@ class OnlineSolver:
                 known, state.surface, camera, view, image, (won, fit, kept), self.weights, state.lost_for
             )
             support = supported(known, camera, fit.pose, kept, view)
-        judgement = judge(fit, state.usual, support, won == "grid", state.lost_for > 0)
+        astray = state.lost_for > 0 and not led_to(state, fit.pose, frame.index)
+        judgement = judge(fit, state.usual, support, won == "grid", astray)
         best = Attempt(view, fit, won, kept, support, judgement)
         if best.lost or (best.doubtful and worth_trying(state.doubted_for)):
             other = self._elsewhere(state, frame, image, view.mask)
