@@ -11,7 +11,7 @@ from online_runs import FRAMES, empty_frame, estimate_of, frame, solver, true_ma
 from tracking3d.estimation.correction import SIGHTED, corrects
 from tracking3d.estimation.estimate import MaskSource, Status
 from tracking3d.estimation.online.points import grey
-from tracking3d.estimation.online.sighting import sighted
+from tracking3d.estimation.online.sighting import meets, sighted
 from tracking3d.evaluation.metrics import mask_iou
 from tracking3d.frames import Frame
 
@@ -71,3 +71,13 @@ def test_a_map_without_keyframes_sees_nothing():
     state, _ = whole_run()
     nothing = replace(state.known, keyframes=())
     assert sighted(nothing, state.camera, grey(frame(0).image), state.trail[-1][0]) is None
+
+
+def test_a_mask_is_elsewhere_if_hardly_any_of_it_is_at_the_silhouette():
+    silhouette, half, far = (np.zeros((40, 60), bool) for _ in range(3))
+    silhouette[10:30, 10:30] = True
+    half[10:30, 20:40] = True  # a third of both together
+    far[10:30, 28:48] = True
+    assert meets(silhouette, silhouette) and meets(silhouette, half)
+    assert not meets(silhouette, far)
+    assert not meets(silhouette, np.zeros((40, 60), bool))
