@@ -6,7 +6,16 @@ import cv2
 import numpy as np
 import pytest
 
-from tracking3d.estimation.evidence import SOURCES, Colours, along_edges, as_lab, features, log_odds, tidied
+from tracking3d.estimation.evidence import (
+    SOURCES,
+    Colours,
+    along_edges,
+    as_lab,
+    features,
+    in_question,
+    log_odds,
+    tidied,
+)
 
 SIZE = 128
 
@@ -28,13 +37,23 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def decided(image, initial, rendered, confidence=0.8, colours=None) -> np.ndarray:
-    return along_edges(image, log_odds(features(as_lab(image), initial, rendered, confidence, colours))) > 0
+    found = features(as_lab(image), initial, rendered, confidence, colours)
+    return along_edges(image, log_odds(found), in_question(found)) > 0
+
+
+def test_where_both_outlines_agree_the_image_is_hardly_asked():
+    """An exact mask of a small object in a soft picture: edges to the next colour would only pull the outline aside."""
+    truth = disc(64)
+    soft = cv2.GaussianBlur(picture(truth), (0, 0), 4)
+    asked = [in_question(features(as_lab(soft), truth, disc(64 + off), 0.8, None)) for off in (0, 1, 3, 30)]
+    assert asked == sorted(asked) and asked[0] == 0 and asked[-1] == 1
+    assert iou(decided(soft, truth, disc(64.5)), truth) > 0.97
 
 
 def test_there_is_a_weight_for_each_source_and_each_speaks_for_what_it_shows():
     image, mask = picture(disc(64)), disc(64)
     colours = Colours.of(as_lab(image), mask)
-    seen = features(as_lab(image), mask, mask, 0.8, colours)
+    seen = features(as_lab(image), mask, disc(65, radius=34), 0.8, colours)
     assert seen.shape == (SIZE, SIZE, len(SOURCES))
     assert (seen[64, 64] > 0).all()
     assert (seen[64, 8] < 0).all()

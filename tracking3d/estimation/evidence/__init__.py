@@ -5,6 +5,6 @@
 
 from tracking3d.estimation.evidence.colours import Colours, as_lab
 from tracking3d.estimation.evidence.decision import along_edges, tidied
-from tracking3d.estimation.evidence.weighing import SOURCES, features, log_odds
+from tracking3d.estimation.evidence.weighing import SOURCES, features, in_question, log_odds
 
-__all__ = ["SOURCES", "Colours", "along_edges", "as_lab", "features", "log_odds", "tidied"]
+__all__ = ["SOURCES", "Colours", "along_edges", "as_lab", "features", "in_question", "log_odds", "tidied"]

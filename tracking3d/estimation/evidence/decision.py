@@ -16,7 +16,9 @@ _THIN = 0.03  # of the root of the area: what is thinner is no part of the objec
 _LEAST_PART = 0.1  # of the largest part's area
 
 
-def along_edges(image: NDArray[np.uint8], log_odds: NDArray[np.float32]) -> NDArray[np.float32]:
+def along_edges(
+    image: NDArray[np.uint8], log_odds: NDArray[np.float32], share: float = 1.0
+) -> NDArray[np.float32]:
     """``(S, S)`` in [-1, 1], positive inside the object: log-odds carried along where the image has no edges.
 
     Weighted least squares by Min et al., "Fast global image smoothing based on weighted least squares", 2014, in
@@ -25,11 +27,13 @@ def along_edges(image: NDArray[np.uint8], log_odds: NDArray[np.float32]) -> NDAr
     Args:
         image: ``(S, S, 3)`` RGB.
         log_odds: ``(S, S)``.
+        share: How far the image has to be asked, see `tracking3d.estimation.evidence.in_question`.
     """
     support = np.tanh(log_odds / 2).astype(np.float32)
     if why_no_contrib(SMOOTHER):
         return support
-    return np.asarray(cv2.ximgproc.fastGlobalSmootherFilter(image, support, _SMOOTHNESS, _EDGES), np.float32)
+    smoothness = share**2 * _SMOOTHNESS
+    return np.asarray(cv2.ximgproc.fastGlobalSmootherFilter(image, support, smoothness, _EDGES), np.float32)
 
 
 def tidied(support: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -26,6 +26,10 @@ There is no constant: one would say that trackers' masks are too large, as those
 
 _NEAR, _AT_OUTLINE = 0.08, 0.02  # relative to the root of the area
 _MOST = 1.5  # times "near"
+_BAND = 0.5  # likewise
+_SETTLED = 0.03
+"""Mean distance of the outlines from each other, relative to the root of the area, from which on the image decides: an
+exact mask and a fitted shape agree within a pixel, a tracker's mask and a shape do not."""
 _INITIAL, _RENDERED = (list(SOURCES).index(f"{mask}, near") for mask in ("initial", "rendered"))
 _BY_SHAPE = np.array([0.251, 1.108, 0.104, 0.253, -0.277, -0.089, 0.463, 0.607])
 """Of the first eight, where colours are not asked; fitted likewise."""
@@ -56,7 +60,19 @@ def features(
     likely = np.tensordot(_BY_SHAPE, np.stack(shapes), 1) > 0
     nearby = beside_outline(lab, likely) if likely.any() else np.zeros(likely.shape, np.float32)
     remembered = np.zeros_like(nearby) if colours is None else colours.log_ratio(lab)
-    return np.stack([*shapes, nearby, remembered], -1).astype(np.float32)
+    asked = _asked(shapes[_INITIAL], shapes[_RENDERED])
+    return np.stack([*shapes, asked * nearby, asked * remembered], -1).astype(np.float32)
+
+
+def in_question(features: NDArray[np.float32]) -> float:
+    """How far the image has to be asked, in [0, 1]: little where both outlines agree, for they are more exact then."""
+    return _asked(features[..., _INITIAL], features[..., _RENDERED])
+
+
+def _asked(initial: NDArray[np.float32], rendered: NDArray[np.float32]) -> float:
+    band = np.minimum(np.abs(initial), np.abs(rendered)) < _BAND
+    apart = _NEAR * float(np.abs(initial - rendered)[band].mean()) if band.any() else _NEAR * _MOST
+    return min(apart / _SETTLED, 1.0)
 
 
 def log_odds(features: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -9,7 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import MaskSource
-from tracking3d.estimation.evidence import Colours, along_edges, as_lab, features, log_odds, tidied
+from tracking3d.estimation.evidence import (
+    Colours,
+    along_edges,
+    as_lab,
+    features,
+    in_question,
+    log_odds,
+    tidied,
+)
 from tracking3d.estimation.observation import Observation
 from tracking3d.geometry.camera import Window
 from tracking3d.trackers.crops import cut, inside_frame
@@ -40,7 +48,7 @@ def answer_mask(
     sources = features(
         as_lab(image), seen_through(initial, window), seen_through(rendered, window), confidence, colours
     )
-    support = tidied(along_edges(image, log_odds(sources)))
+    support = tidied(along_edges(image, log_odds(sources), in_question(sources)))
     support[~inside_frame(initial.shape, window)] = -1
     mask = _pasted(support, window, initial.shape) > 0
     # A mask of nothing says that the evidence is for neither.
