@@ -64,6 +64,13 @@ def test_an_object_that_leaves_the_frame_is_answered_within_it():
     assert iou(mask, truth) > 0.95
 
 
+def test_what_of_the_silhouette_is_beyond_the_window_of_a_fragment_is_answered():
+    fragment = disc(SIZE, (80, 60), 12)
+    window = Window.around((68.0, 48.0, 24.0, 24.0), 0.3, 128)
+    mask, _ = answer(TRUTH, TRUTH, fragment, window)
+    assert iou(mask, TRUTH) > 0.9 > iou(fragment, TRUTH)
+
+
 def test_an_empty_silhouette_beside_a_mask_is_no_traceback():
     nothing = np.zeros(SIZE, bool)
     assert answer(TRUTH, nothing, TRUTH)[0].any()

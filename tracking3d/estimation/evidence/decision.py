@@ -43,9 +43,7 @@ def tidied(support: NDArray[np.float32]) -> NDArray[np.float32]:
     if side > 1:
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
         mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, disc)
-    count, part, statistics, _ = cv2.connectedComponentsWithStats(mask)
-    if count > 1:
-        area = statistics[1:, cv2.CC_STAT_AREA]
-        kept = np.isin(part, 1 + np.flatnonzero(area >= _LEAST_PART * area.max()))
-        return np.where(kept, support, -np.abs(support)).astype(np.float32)
-    return np.where(mask > 0, support, -np.abs(support)).astype(np.float32)
+    _, part, statistics, _ = cv2.connectedComponentsWithStats(mask)
+    area = statistics[1:, cv2.CC_STAT_AREA]
+    large = 1 + np.flatnonzero(area >= _LEAST_PART * area.max(initial=0))
+    return np.where(np.isin(part, large), support, -np.abs(support)).astype(np.float32)

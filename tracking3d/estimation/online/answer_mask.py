@@ -50,7 +50,8 @@ def answer_mask(
     )
     support = tidied(along_edges(image, log_odds(sources), in_question(sources)))
     support[~inside_frame(initial.shape, window)] = -1
-    mask = _pasted(support, window, initial.shape) > 0
+    # The window is the initial mask's: beyond it the silhouette alone says where the object is.
+    mask = _pasted(support, window, np.where(rendered, 1.0, -1.0).astype(np.float32)) > 0
     # A mask of nothing says that the evidence is for neither.
     return (mask, MaskSource.WEIGHED) if mask.any() else (initial, MaskSource.INITIAL)
 
@@ -75,10 +76,10 @@ def seen_through(mask: NDArray[np.bool_], window: Window) -> NDArray[np.bool_]:
     return np.asarray(seen & inside_frame(mask.shape, window))
 
 
-def _pasted(support: NDArray[np.float32], window: Window, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """``(H, W)`` support in the frame; -1 beyond the window."""
+def _pasted(support: NDArray[np.float32], window: Window, beyond: NDArray[np.float32]) -> NDArray[np.float32]:
+    """``(H, W)`` support in the frame: the window's ``(S, S)``, and that ``beyond`` it ``(H, W)``."""
+    shape, full = beyond.shape, beyond.copy()
     region = cv2.resize(support, (window.side, window.side), interpolation=cv2.INTER_LINEAR)
-    full = np.full(shape, -1.0, np.float32)
     x0, y0 = max(window.left, 0), max(window.top, 0)
     x1, y1 = min(window.left + window.side, shape[1]), min(window.top + window.side, shape[0])
     if x1 > x0 and y1 > y0:
