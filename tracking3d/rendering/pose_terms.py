@@ -108,9 +108,22 @@ def pose_terms(
     Raises:
         ValueError: If a shape does not fit. If the surface's renderer cannot render these tensors.
     """
+    check_shapes(R=(R, "B 3 3"), t=(t, "B 3"))
+    check_comparison(surface, target, matched)
+    if use_numba(surface.renderer, surface.vertices, surface.texture, target.features, R, t):
+        from tracking3d.rendering.kernels.pose_terms import pose_terms as by_kernel
+
+        return by_kernel(surface, target, R, t, matched, scales, NEAREST_POINT)
+    return _composed(surface, target, R, t, matched, scales)
+
+
+def check_comparison(surface: Surface, target: PoseTarget, matched: MatchedPoints | None) -> None:
+    """Make sure that everything has the shape it is said to have.
+
+    Raises:
+        ValueError: If a shape does not fit.
+    """
     check_shapes(
-        R=(R, "B 3 3"),
-        t=(t, "B 3"),
         K=(target.K, "3 3"),
         texture=(surface.texture, "C T T"),
         features=(target.features, "C S S"),
@@ -121,11 +134,6 @@ def pose_terms(
     )
     if matched is not None:
         check_shapes(points=(matched.points, "N 3"), pixels=(matched.pixels, "N 2"))
-    if use_numba(surface.renderer, surface.vertices, surface.texture, target.features, R, t):
-        from tracking3d.rendering.kernels.pose_terms import pose_terms as by_kernel
-
-        return by_kernel(surface, target, R, t, matched, scales, NEAREST_POINT)
-    return _composed(surface, target, R, t, matched, scales)
 
 
 def _composed(

@@ -11,7 +11,8 @@ from tracking3d.rendering.backend import compiled
 
 _BINS = (16, 12, 12)  # L, a, b
 _LOG_LIMIT = 3.0
-_LUT_BITS = 5  # bits a channel of the table that maps a colour to its palette entry
+_CELL_BITS = 5  # bits a channel of the cells whose colours share a palette entry
+_PACKED = 256 ** np.arange(3)  # one number for a colour
 
 
 def lab(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -113,23 +114,27 @@ class Palette:
     Args:
         colours: ``(S, S, 3)`` Lab crop to take the colours from.
         size: Number of colours.
+        stride: Every how many pixels of the crop one is asked, along both sides.
     """
 
-    def __init__(self, colours: NDArray[np.uint8], size: int = 40) -> None:
-        samples = colours[::3, ::3].reshape(-1, 3).astype(np.float32)
-        size = min(size, len(np.unique(samples, axis=0)))
+    def __init__(self, colours: NDArray[np.uint8], size: int = 40, stride: int = 3) -> None:
+        samples = colours[::stride, ::stride].reshape(-1, 3)
+        size = min(size, len(np.unique(samples.astype(np.int32) @ _PACKED)))
         cv2.setRNGSeed(0)  # k-means++ draws from OpenCV's generator
         criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 10, 1.0)
-        _, _, centres = cv2.kmeans(samples, size, None, criteria, 1, cv2.KMEANS_PP_CENTERS)
-        steps = (np.arange(1 << _LUT_BITS, dtype=np.float32) + 0.5) * (256 >> _LUT_BITS)
-        grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
-        self._table = cKDTree(centres).query(grid)[1].astype(np.uint8)
+        _, _, centres = cv2.kmeans(samples.astype(np.float32), size, None, criteria, 1, cv2.KMEANS_PP_CENTERS)
+        self._nearest = cKDTree(centres)
         self.size = size
 
     def label(self, colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """``(S, S)``: the palette entry nearest to each pixel."""
-        short = colours.astype(np.int32) >> (8 - _LUT_BITS)
-        return self._table[(short[..., 0] << 2 * _LUT_BITS) + (short[..., 1] << _LUT_BITS) + short[..., 2]]
+        """``(S, S)``: the palette entry nearest to each pixel, up to `_CELL_BITS`."""
+        short = colours.astype(np.int32) >> (8 - _CELL_BITS)
+        cells = (short[..., 0] << 2 * _CELL_BITS) + (short[..., 1] << _CELL_BITS) + short[..., 2]
+        present = np.flatnonzero(np.bincount(cells.ravel()))  # a crop shows few of all the colours
+        middles = np.stack(np.unravel_index(present, (1 << _CELL_BITS,) * 3), -1) + 0.5
+        table = np.zeros(int(present[-1]) + 1, np.uint8)
+        table[present] = self._nearest.query(middles * (256 >> _CELL_BITS))[1]
+        return table[cells]
 
     def local_log_ratio(
         self,

@@ -10,6 +10,7 @@ import torch
 from rendered_solids import SIZE, observed, pose_of, shape_of, surface_of
 from torch import Tensor
 
+from tracking3d.estimation.observation import Observation
 from tracking3d.estimation.online.pose_refinement import PoseWeights, _Evidence, refine_pose, refine_poses
 from tracking3d.estimation.online.reprojection import moved
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_angle
@@ -121,6 +122,50 @@ def test_steps_that_fail_are_damped_until_they_succeed():
     costs = [refine_pose(FLAT, plain, start, matched(), iterations=(n,)).cost for n in (0, 1, 2, 14)]
     assert costs[0] == costs[1] == costs[2] > 4
     assert costs[3] < 1e-3
+
+
+STARTS = [
+    off(),
+    off((0.0, 1.0, 0.0), 60.0, 1.3),
+    off((1.0, 0.0, 0.0), 60.0, 2.0),
+    moved_by(TRUTH, torch.tensor([9.0, 0, 0, 0, 0, 0])),  # nothing of it in the window
+]
+
+
+def by_both(frame: Observation, starts: list[Pose], points: MatchedPoints | None, steps: tuple[int, ...]):
+    """Pairs of fits, by the kernel and by torch."""
+    return zip(
+        *(
+            refine_poses(replace(SURFACE, renderer=name), frame, starts, points, iterations=steps)
+            for name in ("numba", "torch")
+        ),
+        strict=True,
+    )
+
+
+@pytest.mark.parametrize("frame", [FRAME, NO_MASK], ids=["mask", "no mask"])
+@pytest.mark.parametrize("points", [matched(), None], ids=["points", "no points"])
+def test_the_kernel_says_of_poses_what_torch_says(frame, points):
+    for ours, twins in by_both(frame, STARTS, points, (0,)):
+        numbers = [
+            [fit.cost, fit.appearance, fit.outline, fit.points, fit.overlap, fit.unseen]
+            for fit in (ours, twins)
+        ]
+        assert numbers[0] == pytest.approx(numbers[1], rel=1e-3, abs=1e-5)
+        size = twins.information.abs().max()
+        assert (ours.information - twins.information).abs().max() <= 1e-3 * size
+
+
+@pytest.mark.parametrize("frame", [FRAME, NO_MASK], ids=["mask", "no mask"])
+@pytest.mark.parametrize("points", [matched(), None], ids=["points", "no points"])
+@pytest.mark.parametrize("steps", [(1,), (8, 8)])
+def test_the_kernel_goes_where_torch_goes(frame, points, steps):
+    """From a start far off a pixel's rounding can lead elsewhere."""
+    for ours, twins in by_both(frame, STARTS[:1], points, steps):
+        assert ours.cost == pytest.approx(twins.cost, rel=0.02, abs=1e-4)
+        assert abs(ours.iterations - twins.iterations) <= 2
+        assert rotation_angle(ours.pose.quaternion, twins.pose.quaternion) < 2e-3
+        assert (ours.pose.translation - twins.pose.translation).norm() < 5e-3
 
 
 def test_no_steps_only_evaluate():

@@ -19,6 +19,9 @@ _INSIDE, _BESIDE = 0.03, (0.06, 0.4)
 _NEIGHBOURHOOD = 0.4
 """Half the side of the neighbourhood in which colours are compared, relative to the root of the area."""
 
+_SAMPLES = 44
+"""Along either side of a crop, from which its few colours are taken."""
+
 
 @dataclass(frozen=True, eq=False)
 class Colours:
@@ -64,7 +67,7 @@ def beside_outline(lab: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[n
         lab: ``(S, S, 3)`` crop in 8-bit Lab.
         mask: ``(S, S)`` where the object seems to be.
     """
-    palette = Palette(lab)
+    palette = Palette(lab, stride=max(round(len(lab) / _SAMPLES), 1))
     labels = palette.label(lab)
     radius = max(round(_NEIGHBOURHOOD * math.sqrt(np.count_nonzero(mask))), 2)
     return palette.local_log_ratio(labels, labels, mask.astype(np.float32), radius)

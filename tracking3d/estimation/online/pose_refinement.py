@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tracking3d.estimation.observation import Observation
-from tracking3d.estimation.online.reprojection import moved
+from tracking3d.estimation.online.reprojection import FloatArray, moved
 from tracking3d.geometry.pose import Pose, from_matrix
 from tracking3d.rendering import MatchedPoints, NormalEquations, Scales, Surface, pose_terms
+from tracking3d.rendering.backend import use_numba
 
-_DAMPING = 1e-3  # at first; then between the limits
-_LEAST_DAMPING, _MOST_DAMPING = 1e-6, 1e3
-_ENOUGH = 1e-4  # share of the cost below which a gain ends the search
-_NOTHING_SEEN = (
-    1.0  # what a pose costs that shows nothing comparable, above one that shows unseen texture only
-)
+FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-6, 1e3
+ENOUGH = 1e-4
+"""Share of the cost below which a gain ends the search."""
+NOTHING_SEEN = 1.0
+"""What a pose costs that shows nothing comparable, above one that shows unseen texture only."""
 
 
 @dataclass(frozen=True)
@@ -103,33 +103,40 @@ class _Evidence:
 
 
 @dataclass(frozen=True, eq=False)
-class _Poses:
-    """B poses with what they cost, see `PoseFit`: float64 arrays, each ``(B, ...)``."""
+class EvaluatedPoses:
+    """B poses with what they cost, see `PoseFit`: float64 arrays, each ``(B, ...)``.
 
-    R: NDArray[np.float64]
-    t: NDArray[np.float64]
-    cost: NDArray[np.float64]
-    appearance: NDArray[np.float64]
-    outline: NDArray[np.float64]
-    points: NDArray[np.float64]
-    overlap: NDArray[np.float64]
-    unseen: NDArray[np.float64]
-    matrix: NDArray[np.float64]
-    gradient: NDArray[np.float64]
+    Attributes:
+        spent: Evaluations that led to them, int64.
+        moved: Whether they are elsewhere than where they started, bool.
+    """
 
-    def __getitem__(self, places: NDArray[Any]) -> _Poses:
+    R: FloatArray
+    t: FloatArray
+    cost: FloatArray
+    appearance: FloatArray
+    outline: FloatArray
+    points: FloatArray
+    overlap: FloatArray
+    unseen: FloatArray
+    matrix: FloatArray
+    gradient: FloatArray
+    spent: NDArray[np.int64]
+    moved: NDArray[np.bool_]
+
+    def __getitem__(self, places: NDArray[Any]) -> EvaluatedPoses:
         """Some of them."""
-        return _Poses(*(values[places] for values in vars(self).values()))
+        return EvaluatedPoses(*(values[places] for values in vars(self).values()))
 
-    def __setitem__(self, places: NDArray[Any], others: _Poses) -> None:
+    def __setitem__(self, places: NDArray[Any], others: EvaluatedPoses) -> None:
         """Put others in their place."""
         for mine, theirs in zip(vars(self).values(), vars(others).values(), strict=True):
             mine[places] = theirs
 
-    def steps(self, damping: NDArray[np.float64]) -> NDArray[np.float64]:
+    def steps(self, damping: FloatArray) -> FloatArray:
         """``(B, 6)`` of Levenberg-Marquardt, see `tracking3d.rendering.NormalEquations.step`."""
         parts = (torch.from_numpy(part) for part in (self.matrix, self.gradient, self.cost))
-        taken: NDArray[np.float64] = NormalEquations(*parts).step(torch.from_numpy(damping)).numpy()
+        taken: FloatArray = NormalEquations(*parts).step(torch.from_numpy(damping)).numpy()
         return taken
 
     def fit(self, n: int, pose: Pose, iterations: int) -> PoseFit:
@@ -181,8 +188,8 @@ def refine_poses(
     spent, moving = np.zeros(len(starts), np.int64), np.zeros(len(starts), bool)
     for level, steps in zip(levels[::-1], iterations, strict=True):
         if steps or level is levels[0]:
-            found, evaluations, moves = _minimized(surface, level, R, t, steps)
-            R, t, spent, moving = found.R, found.t, spent + evaluations, moving | moves
+            found = _minimized(surface, level, R, t, steps)
+            R, t, spent, moving = found.R, found.t, spent + found.spent, moving | found.moved
     return [
         found.fit(n, _pose(surface, R[n], t[n]) if moving[n] else start, int(spent[n]))
         for n, start in enumerate(starts)
@@ -190,36 +197,34 @@ def refine_poses(
 
 
 def _minimized(
-    surface: Surface,
-    evidence: _Evidence,
-    R: NDArray[np.float64],
-    t: NDArray[np.float64],
-    steps: int,
-) -> tuple[_Poses, NDArray[np.int64], NDArray[np.bool_]]:
-    """Levenberg-Marquardt at one resolution, in which no cost ever rises; evaluations spent, and which poses moved."""
+    surface: Surface, evidence: _Evidence, R: FloatArray, t: FloatArray, steps: int
+) -> EvaluatedPoses:
+    """Levenberg-Marquardt at one resolution, in which no cost ever rises."""
+    target, weights = evidence.observation.target, evidence.weights
+    if use_numba(surface.renderer, surface.vertices, surface.texture, target.features):
+        from tracking3d.estimation.online.kernels import pose_refinement
+
+        return pose_refinement.minimized(surface, target, evidence.matched, weights, R, t, steps)
     best = _evaluated(surface, evidence, R, t)
-    going, damping = np.arange(len(R)), np.full(len(R), _DAMPING)
-    spent, moves = np.ones(len(R), np.int64), np.zeros(len(R), bool)
+    going, damping = np.arange(len(R)), np.full(len(R), FIRST_DAMPING)
     for _ in range(steps):
         present = best[going]
-        step = present.steps(damping[going])
-        trial = _evaluated(surface, evidence, *moved(present.R, present.t, step))
-        spent[going] += 1
+        trial = _evaluated(surface, evidence, *moved(present.R, present.t, present.steps(damping[going])))
+        trial.moved[:] = True
         gain = present.cost - trial.cost
         better = gain > 0
+        spent = best.spent[going] + 1
         best[going[better]] = trial[better]
-        moves[going[better]] = True
-        damping[going] = np.where(better, np.maximum(damping[going] / 4, _LEAST_DAMPING), damping[going] * 8)
-        ends = np.where(better, gain < _ENOUGH * present.cost, damping[going] > _MOST_DAMPING)
+        best.spent[going] = spent
+        damping[going] = np.where(better, np.maximum(damping[going] / 4, LEAST_DAMPING), damping[going] * 8)
+        ends = np.where(better, gain < ENOUGH * present.cost, damping[going] > MOST_DAMPING)
         going = going[~ends]
         if not len(going):
             break
-    return best, spent, moves
+    return best
 
 
-def _evaluated(
-    surface: Surface, evidence: _Evidence, R: NDArray[np.float64], t: NDArray[np.float64]
-) -> _Poses:
+def _evaluated(surface: Surface, evidence: _Evidence, R: FloatArray, t: FloatArray) -> EvaluatedPoses:
     """Poses with their costs and normal equations."""
     weights = evidence.weights
     scales = Scales(weights.appearance_scale, weights.outline_scale, weights.points_scale)
@@ -231,7 +236,7 @@ def _evaluated(
     unseen = np.where(nothing, 1.0, 1 - terms.known.numpy() / np.where(nothing, 1.0, comparable))
     outline, points = terms.outline.cost.numpy(), terms.points.cost.numpy()
     appearance = (
-        terms.appearance.cost.numpy() * (1 - unseen) + weights.unseen * unseen + _NOTHING_SEEN * nothing
+        terms.appearance.cost.numpy() * (1 - unseen) + weights.unseen * unseen + NOTHING_SEEN * nothing
     )
     # The equations are of the mean over what is known, the cost is of all that can be compared.
     model = (
@@ -240,15 +245,15 @@ def _evaluated(
         + terms.points * weights.points
     )
     cost = weights.appearance * appearance + weights.outline * outline + weights.points * points
-    return _Poses(
+    return EvaluatedPoses(
         R, t, cost, appearance, outline, points, terms.overlap.numpy(), unseen, model.matrix.numpy(),
-        model.gradient.numpy(),
+        model.gradient.numpy(), np.ones(len(R), np.int64), np.zeros(len(R), bool),
     )  # fmt: skip
 
 
-def _pose(surface: Surface, R: NDArray[np.float64], t: NDArray[np.float64]) -> Pose:
+def _pose(surface: Surface, R: FloatArray, t: FloatArray) -> Pose:
     return from_matrix(*_on_device(surface, R, t))
 
 
-def _on_device(surface: Surface, R: NDArray[np.float64], t: NDArray[np.float64]) -> tuple[Tensor, Tensor]:
+def _on_device(surface: Surface, R: FloatArray, t: FloatArray) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(R).to(surface.vertices), torch.from_numpy(t).to(surface.vertices)

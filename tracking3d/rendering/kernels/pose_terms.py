@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numba
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from tracking3d.rendering.contour import MOST_ON_AN_EDGE, PROBE
@@ -22,8 +24,10 @@ from tracking3d.rendering.pose_terms import MatchedPoints, PoseTarget, PoseTerms
 from tracking3d.rendering.surface import Surface
 from tracking3d.rendering.visibility import NEAR
 
-_APPEARANCE, _OUTLINE, _POINTS = range(3)
-_COMPARABLE, _KNOWN, _BOTH, _EITHER = range(4)
+APPEARANCE, OUTLINE, POINTS = range(3)
+"""Places of the terms in the sums: each has its matrix, below it its gradient, and in the corner its cost."""
+COMPARABLE, KNOWN, BOTH, EITHER = range(4)
+"""Places of what is counted: see `PoseTerms`; pixels in the silhouette and the mask, and in either."""
 
 
 def pose_terms(
@@ -36,6 +40,29 @@ def pose_terms(
     nearest: float,
 ) -> PoseTerms:
     """See `tracking3d.rendering.pose_terms`; ``nearest`` is the least depth of matched points."""
+    sums, counts = np.zeros((len(R), 3, 7, 7)), np.zeros((len(R), 4))
+    share(
+        _pose_terms, len(R), 2, *packed(surface, target, matched), array(R), array(t),
+        scales.appearance, scales.outline, scales.points, nearest, sums, counts,
+    )  # fmt: skip
+    models = (
+        NormalEquations(term[:, :6, :6], term[:, 6, :6], term[:, 6, 6])
+        for term in torch.from_numpy(sums).unbind(1)
+    )
+    appearance, outline, by_points = models
+    of_pixels = torch.from_numpy(counts)
+    overlap = of_pixels[:, BOTH] / of_pixels[:, EITHER].clamp_min(1)
+    if target.mask is None:
+        overlap = torch.ones_like(overlap)
+    return PoseTerms(appearance, outline, by_points, of_pixels[:, COMPARABLE], of_pixels[:, KNOWN], overlap)
+
+
+def packed(surface: Surface, target: PoseTarget, matched: MatchedPoints | None) -> list[NDArray[Any]]:
+    """The arrays that `terms_of_pose` takes first; what a frame does not have is empty.
+
+    Raises:
+        IndexError: If faces name vertices that are not there.
+    """
     check_corners(surface.faces, surface.vertices[None])
     none = target.comparable.new_zeros(0, 0)
     mesh = surface.vertices, surface.faces, surface.face_uvs, *surface.edges, surface.layers
@@ -48,56 +75,67 @@ def pose_terms(
         target.K,
     )
     points = (none, none) if matched is None else (matched.points, matched.pixels)
-    sums, counts = np.zeros((len(R), 3, 7, 7)), np.zeros((len(R), 4))
-    share(
-        _pose_terms, len(R), 2, *map(array, (*mesh, *frame, *points, R, t)),
-        scales.appearance, scales.outline, scales.points, nearest, sums, counts,
-    )  # fmt: skip
-    models = (
-        NormalEquations(term[:, :6, :6], term[:, 6, :6], term[:, 6, 6])
-        for term in torch.from_numpy(sums).unbind(1)
-    )
-    appearance, outline, by_points = models
-    of_pixels = torch.from_numpy(counts)
-    overlap = of_pixels[:, _BOTH] / of_pixels[:, _EITHER].clamp_min(1)
-    if target.mask is None:
-        overlap = torch.ones_like(overlap)
-    return PoseTerms(appearance, outline, by_points, of_pixels[:, _COMPARABLE], of_pixels[:, _KNOWN], overlap)
+    return [array(part) for part in (*mesh, *frame, *points)]
+
+
+PACKED = (
+    "float32[:,::1], int64[:,::1], float32[:,:,::1], int64[:,::1], int64[::1], float32[:,:,::1],"
+    " float32[:,:,::1], float32[:,::1], boolean[:,::1], boolean[:,::1], float32[:,::1], float32[:,::1],"
+    " float32[:,::1], float32[:,::1]"
+)
+"""Numba's types of what `packed` returns."""
 
 
 @kernel(
-    "void(float32[:,::1], int64[:,::1], float32[:,:,::1], int64[:,::1], int64[::1], float32[:,:,::1],"
-    " float32[:,:,::1], float32[:,::1], boolean[:,::1], boolean[:,::1], float32[:,::1], float32[:,::1],"
-    " float32[:,::1], float32[:,::1], float32[:,:,::1], float32[:,::1],"
+    f"void({PACKED}, float32[:,:,::1], float32[:,::1],"
     " float64, float64, float64, float64, float64[:,:,:,::1], float64[:,::1], int64, int64)"
 )
 def _pose_terms(
     vertices, faces, face_uvs, edges, shared, layers, features, comparable, inside, mask, distance, K,
     points, pixels, R, t, appearance, outline, by_points, nearest, sums, counts, first, last,
 ):  # fmt: skip
-    height, width = comparable.shape
-    x_cam, screen = np.empty_like(vertices), np.empty((len(vertices), 2), np.float32)
-    face_index = np.empty((height, width), np.int64)
-    inverse_depth = np.empty((height, width), np.float32)
+    buffers = drawing_buffers(vertices, comparable)
     for pose in range(first, last):
-        _project(vertices, R[pose], t[pose], K, np.float32(NEAR), x_cam, screen)
-        depth = np.ascontiguousarray(x_cam[:, 2])
-        face_index[:] = -1
-        inverse_depth[:] = 0
-        draw_view(screen, depth, faces, np.float32(NEAR), face_index, inverse_depth)
-        _of_pixels(
-            screen, depth, faces, face_uvs, layers, face_index, inverse_depth, features, comparable, K, t[pose],
-            appearance, sums[pose, _APPEARANCE], counts[pose],
+        terms_of_pose(
+            vertices, faces, face_uvs, edges, shared, layers, features, comparable, inside, mask, distance, K,
+            points, pixels, R[pose], t[pose], appearance, outline, by_points, nearest, buffers, sums[pose],
+            counts[pose],
         )  # fmt: skip
-        if mask.size:
-            _count_overlap(face_index, inside, mask, counts[pose])
-        if distance.size:
-            _of_outline(
-                screen, x_cam, faces, edges, shared, face_index, distance, K, t[pose], outline,
-                sums[pose, _OUTLINE],
-            )  # fmt: skip
-        if points.size:
-            _of_points(points, pixels, R[pose], t[pose], K, by_points, nearest, sums[pose, _POINTS])
+
+
+@numba.njit(**OPTIONS)
+def drawing_buffers(vertices, comparable):
+    """What `terms_of_pose` writes on its way, to be used again: corners in the camera, on the screen; faces, depths."""
+    return (
+        np.empty_like(vertices),
+        np.empty((len(vertices), 2), np.float32),
+        np.empty(comparable.shape, np.int64),
+        np.empty(comparable.shape, np.float32),
+    )
+
+
+@numba.njit(**OPTIONS)
+def terms_of_pose(
+    vertices, faces, face_uvs, edges, shared, layers, features, comparable, inside, mask, distance, K,
+    points, pixels, R, t, appearance, outline, by_points, nearest, buffers, sums, counts,
+):  # fmt: skip
+    """Add one pose's terms to zeros: ``sums`` ``(3, 7, 7)`` and ``counts`` ``(4,)``, by the places above."""
+    x_cam, screen, face_index, inverse_depth = buffers
+    _project(vertices, R, t, K, np.float32(NEAR), x_cam, screen)
+    depth = np.ascontiguousarray(x_cam[:, 2])
+    face_index[:] = -1
+    inverse_depth[:] = 0
+    draw_view(screen, depth, faces, np.float32(NEAR), face_index, inverse_depth)
+    _of_pixels(
+        screen, depth, faces, face_uvs, layers, face_index, inverse_depth, features, comparable, K, t, appearance,
+        sums[APPEARANCE], counts,
+    )  # fmt: skip
+    if mask.size:
+        _count_overlap(face_index, inside, mask, counts)
+    if distance.size:
+        _of_outline(screen, x_cam, faces, edges, shared, face_index, distance, K, t, outline, sums[OUTLINE])
+    if points.size:
+        _of_points(points, pixels, R, t, K, by_points, nearest, sums[POINTS])
 
 
 @numba.njit(**OPTIONS)
@@ -117,8 +155,8 @@ def _count_overlap(face_index, inside, mask, counts):
         for x in range(mask.shape[1]):
             if inside[y, x]:
                 covered = face_index[y, x] >= 0
-                counts[_BOTH] += covered and mask[y, x]
-                counts[_EITHER] += covered or mask[y, x]
+                counts[BOTH] += covered and mask[y, x]
+                counts[EITHER] += covered or mask[y, x]
 
 
 @numba.njit(fastmath=REORDER, **OPTIONS)
@@ -147,7 +185,7 @@ def _of_pixels(
             while x < columns and face_index[y, x] == face:
                 column = x
                 x += 1
-                counts[_COMPARABLE] += comparable[y, column]
+                counts[COMPARABLE] += comparable[y, column]
                 if comparable[y, column] == 0:
                     continue
                 wa, wb, wc = barycentrics(place, slope_x, slope_y, np.float32(column), np.float32(y))
@@ -184,7 +222,7 @@ def _of_pixels(
                     # At a fixed pixel the rendered image moves against the surface.
                     sums[6, i] -= weight * (gx * motion[0, i] + gy * motion[1, i])
                 sums[6, 6] += weight * loss
-    counts[_KNOWN] = total
+    counts[KNOWN] = total
     _finish(sums, max(total, 1.0) * channels)
 
 
