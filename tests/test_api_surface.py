@@ -20,9 +20,9 @@ EXACT = {
         load_plugin plugin_label""",
     "tracking3d.testing": "check_encoder check_tracker",
     "tracking3d.rendering": """BackProjection BackendName Contour MatchedPoints NormalEquations PoseTarget PoseTerms
-        Rendering Scales SoftBand Surface TexelMap Visibility back_project channels_last contour_loss
+        Rendering Scales SeenTexels SoftBand Surface TexelMap Visibility back_project channels_last contour_loss
         contour_normal_equations find_contour interpolate pose_normal_equations pose_terms prepare_backend project
-        rasterize render sample_texture signed_distance soft_silhouette texture_losses visible_texels
+        rasterize render sample_texture seen_texels signed_distance soft_silhouette texture_losses visible_texels
         visible_vertices""",
     "tracking3d.video": """FrameSource Intrinsics LatestFrames VideoWriter natural_order open_source parse_selection
         read_image""",

@@ -24,6 +24,7 @@ FLOORS = [
         "object_recording",
         "pipeline",
         "process_settings",
+        "reconstruction",
         "recording",
         "results",
         "session",

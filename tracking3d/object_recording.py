@@ -16,8 +16,9 @@ from tracking3d.checkpoint.folder import Checkpoint
 from tracking3d.checkpoint.progress import Kept, Progress, TakenFrame, checksum
 from tracking3d.checkpoint.trees import UnkeptError
 from tracking3d.errors import InputError, OutputError, PluginError
-from tracking3d.estimation.estimate import ObjectModel
+from tracking3d.estimation.estimate import ObjectModel, Status
 from tracking3d.frames import Frame, MaskEstimate, SkippedFrame
+from tracking3d.reconstruction import BELIEVED, TextureView, kept_views, texture_view, textured
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.refinement_writer import RefinementWriter
@@ -59,6 +60,7 @@ class ObjectRecording:
             self._initial = {one.index: (one.score, one.reason) for one in kept.taken.values()}
         self._causal_model: ObjectModel | None = None
         self._refinement: RefinementWriter | None = None
+        self._views: tuple[TextureView, ...] = ()
 
     def take(self, frame: Frame | SkippedFrame) -> FrameRecord | SkippedFrame | None:
         """Answer for the next frame and keep the answer; what was answered before the run was stopped stands."""
@@ -136,7 +138,7 @@ class ObjectRecording:
         if self._kept:
             self._check(self._kept, frame)
             if frame.index <= self._until.last_refined:
-                return refinement.draw_again(frame)
+                return self._seen_again(refinement, refinement.draw_again(frame), frame)
         mask = refinement.initial_mask(frame.index)
         score, reason = self._initial.get(frame.index, (1.0, ""))
         initial = MaskEstimate(None if mask is None else mask.astype(np.float32), score, reason)
@@ -150,11 +152,20 @@ class ObjectRecording:
             answer = refinement.write(estimate, frame)
         self._progress = replace(self._progress, last_refined=frame.index, refined_lines=refinement.lines)
         self._keep()
+        return self._seen_again(refinement, answer, frame)
+
+    def _seen_again(self, refinement: RefinementWriter, answer: FrameRecord, frame: Frame) -> FrameRecord:
+        """Keep what the texture of the final model can be taken from; the answer as it is."""
+        most = self._session.config.object.texture_views
+        if most and answer.status is Status.TRACKED and answer.confidence >= BELIEVED:
+            mask, camera = refinement.mask(answer), answer.through(self._session.camera)
+            view = texture_view(frame.index, frame.image, mask, camera, answer.T_cam_obj)
+            self._views = self._views if view is None else kept_views(self._views, view, most)
         return answer
 
     def finish(self) -> None:
         """Write what is made at the end."""
-        model = self._session.result()
+        model = textured(self._session.result(), self._views, self._session.config.object.largest_texture)
         if self._refinement is not None:
             self._writer.end_refinement()
             self._causal_model = None

@@ -70,6 +70,18 @@ class ObjectConfig(Section):
             "first mask, and given one spread; empty keeps them as they are (paper)."
         ),
     )
+    texture_views: int = Field(
+        24,
+        ge=0,
+        le=500,
+        description=(
+            "Frames that the mesh's texture is taken from at the video's resolution, after the final refinement; "
+            "0 leaves the solver's, of texture_size."
+        ),
+    )
+    largest_texture: int = Field(
+        2048, ge=64, le=8192, description="Most texels along a side of the mesh's texture."
+    )
     flat: bool = Field(
         False, description="Flat prior: project all vertices onto one plane after each iteration."
     )

@@ -1,7 +1,13 @@
 """The differentiable renderer (DIB-R). Knows nothing of video or tracking."""
 
 from tracking3d.rendering.backend import BackendName, prepare_backend
-from tracking3d.rendering.backprojection import BackProjection, TexelMap, back_project
+from tracking3d.rendering.backprojection import (
+    BackProjection,
+    SeenTexels,
+    TexelMap,
+    back_project,
+    seen_texels,
+)
 from tracking3d.rendering.contour import (
     Contour,
     contour_loss,
@@ -30,6 +36,7 @@ __all__ = [
     "PoseTerms",
     "Rendering",
     "Scales",
+    "SeenTexels",
     "SoftBand",
     "Surface",
     "TexelMap",
@@ -47,6 +54,7 @@ __all__ = [
     "rasterize",
     "render",
     "sample_texture",
+    "seen_texels",
     "signed_distance",
     "soft_silhouette",
     "texture_losses",

@@ -77,7 +77,21 @@ class BackProjection:
         return self.total / self.weight.clamp_min(1e-8)
 
 
-@torch.no_grad()
+@dataclass(frozen=True, eq=False)
+class SeenTexels:
+    """What a frame shows of some texels.
+
+    Attributes:
+        texel: ``(N,)`` flat indices, each once.
+        values: ``(C, N)`` the frame's values there.
+        weight: ``(N,)`` squared cosine of the viewing angle, times how far the frame is believed there; above 0.
+    """
+
+    texel: Tensor
+    values: Tensor
+    weight: Tensor
+
+
 def back_project(
     values: Tensor,
     valid: Tensor,
@@ -89,7 +103,29 @@ def back_project(
     K: Tensor,
     backend: str = "auto",
 ) -> BackProjection:
-    """What one frame shows of the texture.
+    """What one frame shows of the texture; see `seen_texels` for the arguments."""
+    seen = seen_texels(values, valid, vertices, faces, texels, R, t, K, backend)
+    size = texels.size
+    total = values.new_zeros(values.shape[0], size * size)
+    total[:, seen.texel] = seen.values * seen.weight
+    count = values.new_zeros(size * size)
+    count[seen.texel] = seen.weight
+    return BackProjection(total.reshape(-1, size, size), count.reshape(size, size))
+
+
+@torch.no_grad()
+def seen_texels(
+    values: Tensor,
+    valid: Tensor,
+    vertices: Tensor,
+    faces: Tensor,
+    texels: TexelMap,
+    R: Tensor,
+    t: Tensor,
+    K: Tensor,
+    backend: str = "auto",
+) -> SeenTexels:
+    """The texels that one frame shows.
 
     Args:
         values: ``(C, H, W)`` colours or features of the frame.
@@ -109,10 +145,14 @@ def back_project(
     normal = functional.normalize(
         torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), dim=1
     )
-    point = (x_cam[faces[texels.face]] * texels.barycentric[..., None]).sum(1)
-    cosine = -(normal[texels.face] * functional.normalize(point, dim=1)).sum(1)
+    # A face that turns away from all of its corners shows no texel: most of a large atlas is left out so.
+    facing = ((corner * normal[:, None]).sum(2) < 0).any(1)
+    front = torch.nonzero(facing[texels.face])[:, 0]
+    face, texel = texels.face[front], texels.texel[front]
+    point = (corner[face] * texels.barycentric[front, :, None]).sum(1)
+    cosine = -(normal[face] * functional.normalize(point, dim=1)).sum(1)
     front = torch.nonzero((cosine > _GRAZING) & (point[:, 2] > 0))[:, 0]
-    point, cosine, texel = point[front], cosine[front], texels.texel[front]
+    point, cosine, texel = point[front], cosine[front], texel[front]
 
     pixel = torch.stack([K[0, 0], K[1, 1]]) * point[:, :2] / point[:, 2:] + K[:2, 2]
     grid = ((2 * pixel + 1) / pixel.new_tensor([width, height]) - 1)[None, None]
@@ -124,9 +164,5 @@ def back_project(
     layers = torch.cat([values, valid[None]])
     sampled = functional.grid_sample(layers[None], grid, mode="bilinear", align_corners=False)[0, :, 0]
     weight = cosine.square() * visible * sampled[-1]
-    size = texels.size
-    total = values.new_zeros(values.shape[0], size * size)
-    total[:, texel] = sampled[:-1] * weight
-    count = values.new_zeros(size * size)
-    count[texel] = weight
-    return BackProjection(total.reshape(-1, size, size), count.reshape(size, size))
+    known = torch.nonzero(weight > 0)[:, 0]
+    return SeenTexels(texel[known], sampled[:-1, known], weight[known])

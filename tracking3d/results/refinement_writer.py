@@ -113,6 +113,15 @@ class RefinementWriter:
         self._records[record.index] = record
         return record
 
+    def mask(self, record: FrameRecord) -> NDArray[np.bool_]:
+        """The mask ``(H, W)`` of an answer, empty where it cannot be read."""
+        mask = read_mask(layout.mask_path(self._aside if record.refined else self._folder, record.index))
+        return (
+            np.zeros((self.pictures.camera.height, self.pictures.camera.width), bool)
+            if mask is None
+            else mask
+        )
+
     def _let_stand(self, frame: Frame) -> FrameRecord:
         """Draw the causal answer."""
         causal = self.causal[frame.index]

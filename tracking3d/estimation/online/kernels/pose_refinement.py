@@ -65,7 +65,10 @@ def minimized(
         np.array([weights.appearance, weights.outline, weights.points, weights.unseen]),
         NEAREST_POINT, steps, R, t, numbers, matrix, gradient, spent, moved,
     )  # fmt: skip
-    return EvaluatedPoses(R, t, *numbers.T, matrix, gradient, spent, moved)
+    cost, appearance, outline, points, overlap, unseen = np.ascontiguousarray(numbers.T)
+    return EvaluatedPoses(
+        R, t, cost, appearance, outline, points, overlap, unseen, matrix, gradient, spent, moved
+    )
 
 
 @kernel(

@@ -1,0 +1,95 @@
+"""A run that exists gets the texture of its video; what cannot be is said, and its mesh stays."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rendered_views import CAMERA, SIDE, ball, pattern, pose, seen
+from typer.testing import CliRunner
+
+from tracking3d.checkpoint.progress import checksum
+from tracking3d.cli import app
+from tracking3d.errors import InputError
+from tracking3d.estimation.estimate import FrameEstimate, Status
+from tracking3d.frames import Frame
+from tracking3d.reconstruction.of_run import texture_run
+from tracking3d.results.files import write_image
+from tracking3d.results.mesh_export import load_model
+from tracking3d.results.run_writer import RunWriter
+
+YAWS = (0, 15, 30)
+
+
+def written(folder: Path, **changes) -> Path:
+    """A finished run of three frames, and its frames beside it."""
+    images = folder / "frames"
+    images.mkdir(parents=True)
+    estimates, frames = [], []
+    for index, yaw in enumerate(YAWS):
+        image, mask = seen(pose(yaw), pattern())
+        write_image(images / f"{index:03d}.png", image)
+        frames.append(Frame(index, image, index / 30, f"{index:03d}.png"))
+        one = FrameEstimate(index, index / 30, pose(yaw), mask, mask, Status.TRACKED, "", 0.9)
+        estimates.append(replace(one, **changes))
+    given = {"first_frame": 0, "first_picture": checksum(frames[0].image)}
+    run = folder / "run"
+    with RunWriter(
+        run, config={}, camera=CAMERA, source=str(images), seed=0, fps=None, command=None, given=given
+    ) as writer:
+        for frame, estimate in zip(frames, estimates, strict=True):
+            writer.write(estimate, frame)
+        writer.finish(ball(), "finished")
+    return run
+
+
+def test_the_mesh_has_the_texture_of_the_video(tmp_path):
+    run = written(tmp_path)
+    before = load_model(run)
+    made, taken = texture_run(run)
+    after = load_model(run)
+    assert taken == len(YAWS)
+    assert len(before.texture) == 16 < len(after.texture) == len(made.texture)
+    assert (after.texture == made.texture).all() and (after.texture_weight == made.texture_weight).all()
+    assert after.texture[after.texture_weight > 0.3].std() > 20
+    assert (after.vertices == before.vertices).all()
+
+
+def test_the_video_may_have_moved(tmp_path):
+    run = written(tmp_path)
+    (tmp_path / "frames").rename(tmp_path / "elsewhere")
+    with pytest.raises(InputError, match="frames"):
+        texture_run(run)
+    assert texture_run(run, str(tmp_path / "elsewhere"), most=2)[1] == 2
+
+
+def test_another_video_is_refused(tmp_path):
+    run = written(tmp_path)
+    for name, image, words in [
+        ("other", np.zeros((SIDE, SIDE, 3), np.uint8), "does not begin as the video"),
+        ("small", np.zeros((20, 30, 3), np.uint8), "30 x 20 pixels"),
+    ]:
+        (tmp_path / name).mkdir()
+        write_image(tmp_path / name / "000.png", image)
+        with pytest.raises(InputError, match=words):
+            texture_run(run, str(tmp_path / name))
+    assert len(load_model(run).texture) == 16
+
+
+@pytest.mark.parametrize("changes", [{"confidence": 0.2}, {"status": Status.LOST}])
+def test_where_no_frame_is_believed_the_mesh_stays(tmp_path, changes):
+    run = written(tmp_path, **changes)
+    with pytest.raises(InputError, match="its mesh stays as it is"):
+        texture_run(run)
+    assert len(load_model(run).texture) == 16
+
+
+def test_the_command_says_what_it_did(tmp_path):
+    run = written(tmp_path)
+    result = CliRunner().invoke(app, ["model", str(run), "--largest", "128"])
+    assert result.exit_code == 0
+    assert "texture of 128 x 128 texels from 3 frames" in result.output.replace("\n", "")
+    assert len(load_model(run).texture) == 128
+    assert CliRunner().invoke(app, ["model", str(tmp_path / "absent")]).exit_code == 2

@@ -1,0 +1,141 @@
+"""The texture at the resolution of the video, from the sharpest and most frontal views.
+
+Every view says what it shows of every texel. The views' exposures are brought to one level, and each texel takes the
+mean of what they show, weighted so steeply by how frontally and how sharply a view shows it that one or two decide:
+a mean of many would blur by what poses and shape are off. A view whose colour is far from the others' has little say
+there: a highlight, a hand, something in front.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from tracking3d.estimation.estimate import ObjectModel
+from tracking3d.reconstruction.views import TextureView
+from tracking3d.rendering import TexelMap, seen_texels
+
+_SMALLEST = 256
+_STEEPNESS = 3
+"""Power of the weights, which are the squared cosine of the viewing angle already."""
+_COARSE = 4  # times fewer texels along a side for exposures and votes
+_EXPOSURE = 1.25  # factor up to which a view may be brighter or darker than the others
+_VOTED_DOWN = 0.12  # difference of colours, in [0, 1], at which a view loses most of its say
+
+FloatArray = NDArray[np.float32]
+
+
+def textured(model: ObjectModel, views: Sequence[TextureView], largest: int = 2048) -> ObjectModel:
+    """The model with a texture at the views' resolution; the same where no view shows it.
+
+    Args:
+        model: With shape and texture coordinates; its features stay.
+        views: Frames with poses of this model.
+        largest: Most texels along a side.
+
+    Returns:
+        The same surface. `ObjectModel.texture_weight` is 0 where no view shows it; there the texture continues its
+        surroundings.
+    """
+    if not views:
+        return model
+    size = texture_size(views, largest)
+    gains, coarse = _levelled(model, views, max(size // _COARSE, 64))
+    expected = cv2.resize(coarse, (size, size), interpolation=cv2.INTER_LINEAR).reshape(-1, 3)
+    texels = TexelMap.of(torch.from_numpy(model.face_uvs).float(), size)
+    total, weight = np.zeros((size * size, 3), np.float32), np.zeros(size * size, np.float32)
+    sharpest = max(view.sharpness for view in views) or 1.0
+    for view, gain in zip(views, gains, strict=True):
+        texel, colours, seen = _seen(model, texels, view)
+        colours *= gain
+        apart = np.square(colours - expected[texel]).sum(1) / _VOTED_DOWN**2
+        say = (seen * view.sharpness / sharpest) ** _STEEPNESS / (1 + apart)
+        total[texel] += say[:, None] * colours
+        weight[texel] += say
+    if not weight.any():
+        return model
+    texture = filled(_per(total, weight).reshape(size, size, 3), (weight > 0).reshape(size, size))
+    return replace(
+        model,
+        texture=np.clip(np.round(255 * texture), 0, 255).astype(np.uint8),
+        texture_weight=weight.reshape(size, size),
+    )
+
+
+def texture_size(views: Sequence[TextureView], largest: int) -> int:
+    """Texels along a side, a power of two: about one a pixel of the views, where the atlas goes once around."""
+    wanted = math.pi * max(min(view.extent, len(view.image)) for view in views)
+    return min(max(1 << round(math.log2(wanted)), _SMALLEST), largest)
+
+
+def filled(texture: FloatArray, known: NDArray[np.bool_]) -> FloatArray:
+    """``(T, T, 3)`` where texels that are not known continue those that are, smoothly and around the seam in u."""
+    if known.all() or not known.any():
+        return texture
+    height, width = known.shape
+    if min(height, width) <= 2:
+        mean = texture[known].mean(0)
+        return np.where(known[..., None], texture, mean).astype(np.float32)
+    # Mean over blocks of what is known, filled itself, and back: push and pull.
+    half = (math.ceil(width / 2), math.ceil(height / 2))
+    share = cv2.resize(known.astype(np.float32), half, interpolation=cv2.INTER_AREA)
+    mean = cv2.resize(texture * known[..., None].astype(np.float32), half, interpolation=cv2.INTER_AREA)
+    coarse = filled(mean / np.maximum(share, 1e-6)[..., None], share > 0)
+    wrapped = np.concatenate([coarse[:, -1:], coarse, coarse[:, :1]], 1)
+    columns = (np.arange(width, dtype=np.float32) + 0.5) * half[0] / width - 0.5 + 1
+    rows = (np.arange(height, dtype=np.float32) + 0.5) * half[1] / height - 0.5
+    x, y = np.meshgrid(columns, rows)
+    beyond = cv2.remap(wrapped, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.where(known[..., None], texture, beyond).astype(np.float32)
+
+
+def _levelled(
+    model: ObjectModel, views: Sequence[TextureView], size: int
+) -> tuple[list[FloatArray], FloatArray]:
+    """Factors ``(3,)`` that bring each view's colours to one level, and the texture ``(T, T, 3)`` that they give."""
+    texels = TexelMap.of(torch.from_numpy(model.face_uvs).float(), size)
+    seen = [_seen(model, texels, view) for view in views]
+
+    def mean(gains: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        total, weight = np.zeros((size * size, 3), np.float32), np.zeros(size * size, np.float32)
+        for (texel, colours, say), gain in zip(seen, gains, strict=True):
+            total[texel] += say[:, None] * gain * colours
+            weight[texel] += say
+        return _per(total, weight), weight
+
+    gains = [np.ones(3, np.float32) for _ in views]
+    level, _ = mean(gains)
+    for n, (texel, colours, say) in enumerate(seen):
+        if len(texel):
+            ours = (say[:, None] * colours**2).sum(0)
+            both = (say[:, None] * colours * level[texel]).sum(0)
+            gains[n] = np.clip(both / np.maximum(ours, 1e-12), 1 / _EXPOSURE, _EXPOSURE).astype(np.float32)
+    level, weight = mean(gains)
+    return gains, filled(level.reshape(size, size, 3), (weight > 0).reshape(size, size))
+
+
+def _per(total: FloatArray, weight: FloatArray) -> FloatArray:
+    return np.asarray(total / np.maximum(weight, 1e-20)[:, None], np.float32)
+
+
+def _seen(
+    model: ObjectModel, texels: TexelMap, view: TextureView
+) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
+    """The texels ``(N,)`` that a view shows, their colours ``(N, 3)`` in [0, 1], and how well each is seen ``(N,)``."""
+    seen = seen_texels(
+        torch.from_numpy(view.image).permute(2, 0, 1).float() / 255,
+        torch.from_numpy(view.valid),
+        torch.from_numpy(model.vertices).float(),
+        torch.from_numpy(model.faces),
+        texels,
+        torch.from_numpy(view.T_cam_obj[:3, :3]).float(),
+        torch.from_numpy(view.T_cam_obj[:3, 3]).float(),
+        torch.from_numpy(view.K).float(),
+    )
+    return seen.texel.numpy(), seen.values.T.contiguous().numpy(), seen.weight.numpy()
