@@ -21,7 +21,7 @@ from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.reconstruction.views import TextureView
 from tracking3d.rendering import TexelMap, seen_texels
 
-_SMALLEST = 256
+_SMALLEST = 64
 _STEEPNESS = 3
 """Power of the weights, which are the squared cosine of the viewing angle already."""
 _COARSE = 4  # times fewer texels along a side for exposures and votes
