@@ -11,13 +11,16 @@ from mathutils import Matrix
 
 
 def build(folder: Path) -> None:
-    """Add object and camera to the present scene, and set its size, rate and frames."""
+    """Make a scene of its own with object, camera and light, and show it."""
     numbers = json.loads((folder / "scene.json").read_text(encoding="ascii"))
-    scene = bpy.context.scene
+    scene = bpy.data.scenes.new("tracking3d")
     prepare(scene, numbers)
     scene.camera = add_camera(scene, numbers)
     add_object(scene, numbers, folder)
+    add_light(scene)
     scene.frame_set(numbers["first"])
+    if bpy.context.window is not None:
+        bpy.context.window.scene = scene
 
 
 def prepare(scene, numbers):  # type: ignore[no-untyped-def]
@@ -81,10 +84,19 @@ def add_object(scene, numbers, folder):  # type: ignore[no-untyped-def]
             thing.keyframe_insert("hide_viewport", frame=frame)
 
 
+def add_light(scene):  # type: ignore[no-untyped-def]
+    """Add a sun that shines the way the camera looks."""
+    light = bpy.data.objects.new("tracking3d_light", bpy.data.lights.new("tracking3d_light", "SUN"))
+    light.matrix_world = scene.camera.matrix_world
+    light.data.energy = 3.0
+    scene.collection.objects.link(light)
+
+
 def textured(path):  # type: ignore[no-untyped-def]
     """A material with the colours of the picture at ``path``."""
     material = bpy.data.materials.new("tracking3d_texture")
-    material.use_nodes = True
+    if bpy.app.version < (5, 0):  # later ones always do
+        material.use_nodes = True
     nodes = material.node_tree.nodes
     surface = nodes.get("Principled BSDF")
     surface.inputs["Roughness"].default_value = 1.0

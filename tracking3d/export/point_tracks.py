@@ -56,6 +56,8 @@ def write_tapvid(run: ExportedRun, path: Path) -> None:
 
 def _tracks(run: ExportedRun) -> PointTracks:
     frame = run.poses[0].index if run.options.frame is None else run.options.frame
+    if frame not in run.records:
+        raise InputError(f"The run {run.reader.folder} has no frame {frame}; choose one that it holds.")
     asked = run.options.xy or None
     xy = np.array(asked, dtype=float) if asked else _grid(run, frame)
     tracks = track_points(run.reader, frame, xy)
