@@ -31,7 +31,10 @@ SHIFTED = replace(CENTRED, fx=160.0, cx=50.0, cy=58.0)
 
 
 def silhouette(
-    K: NDArray[np.float64], T_cam_obj: NDArray[np.float64], vertices: NDArray[np.float64], faces: NDArray[np.int64]
+    K: NDArray[np.float64],
+    T_cam_obj: NDArray[np.float64],
+    vertices: NDArray[np.float64],
+    faces: NDArray[np.int64],
 ) -> NDArray[np.bool_]:
     """Drawn by OpenCV, which shares nothing with our renderer; pixel (0, 0) is the centre of the first one."""
     points = (vertices @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3]) @ K.T
@@ -55,7 +58,8 @@ def make_model() -> ObjectModel:
     texture = np.stack([255 * (u < 0.5), 255 * v, 200 * u], axis=2).astype(np.uint8)
     weight = np.ones((side, side), np.float32)
     features = np.zeros((side, side, 3), np.float32)
-    return ObjectModel(mesh.vertices + (0.1, 0.2, -0.1), mesh.faces, mesh.face_uvs, texture, weight, features)
+    vertices = mesh.vertices + np.array([0.1, 0.2, -0.1])
+    return ObjectModel(vertices, mesh.faces, mesh.face_uvs, texture, weight, features)
 
 
 def pose(index: int) -> NDArray[np.float64]:

@@ -22,7 +22,12 @@ def names(folder: Path) -> list[str]:
 def test_without_a_place_it_goes_into_the_run(run):
     assert export_run(run, "tum").path == run / "export" / "tum.txt"
     done = export_run(run, "kitti", overwrite=True)
-    assert (done.path, done.frames, done.without, done.unit) == (run / "export" / "kitti", 5, (2, 4), "arbitrary")
+    assert (done.path, done.frames, done.without, done.unit) == (
+        run / "export" / "kitti",
+        5,
+        (2, 4),
+        "arbitrary",
+    )
     assert export_run(run, "bop").path.name == "tracking3d_run-test.csv"
     assert export_run(run, "davis").without == (4,)  # a lost frame has a mask
 

@@ -49,7 +49,9 @@ def test_pycocotools_reads_the_masks(export, run, capsys):
         assert annotation["area"] == mask.sum()
         x, y, width, height = annotation["bbox"]
         assert mask[y : y + height, x : x + width].sum() == mask.sum()
-        assert mask[y].any() and mask[y + height - 1].any() and mask[:, x].any() and mask[:, x + width - 1].any()
+        assert (
+            mask[y].any() and mask[y + height - 1].any() and mask[:, x].any() and mask[:, x + width - 1].any()
+        )
 
 
 @pytest.mark.parametrize("mask", [[[0, 0], [0, 0]], [[1, 1], [1, 1]], [[1, 0], [0, 1]], [[0, 1], [0, 0]]])
@@ -93,7 +95,10 @@ def test_videos_have_the_masks_as_alpha(export, run, to, suffix, decoder):
         codec.extradata = stream.codec_context.extradata
         alphas = []
         for packet in file.demux(stream):
-            alphas += [frame.to_ndarray(format="rgba")[..., 3] for frame in codec.decode(packet if packet.size else None)]
+            alphas += [
+                frame.to_ndarray(format="rgba")[..., 3]
+                for frame in codec.decode(packet if packet.size else None)
+            ]
     assert len(alphas) == 7
     for index, alpha in enumerate(alphas):
         mask = true_mask(run, index)

@@ -94,7 +94,9 @@ def test_animated_glb_moves_the_object_before_the_camera(export, run, silhouette
 @pytest.mark.parametrize("to", ["glb", "animated-glb"])
 def test_the_khronos_validator_finds_nothing_wrong(export, run, to):
     node = shutil.which("node")
-    found = node and subprocess.run([node, "-e", "require('gltf-validator')"], capture_output=True, check=False)
+    found = node and subprocess.run(
+        [node, "-e", "require('gltf-validator')"], capture_output=True, check=False
+    )
     if not found or found.returncode:
         pytest.skip("node with the package gltf-validator is not installed")
     path = export(run, to, "out.glb")

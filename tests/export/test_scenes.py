@@ -1,4 +1,4 @@
-"""Scenes for Blender, After Effects, Nuke, rerun and ROS: what they say of cameras and poses gives the masks of the run."""
+"""Scenes for Blender, After Effects, Nuke, rerun and ROS: what they say of poses gives the masks of the run."""
 
 from __future__ import annotations
 
@@ -130,10 +130,15 @@ def test_after_effects_is_told_where_the_null_is(export, run, silhouettes):
     positions, angles = told["object"]["Position"], told["object"]["Orientation"]
     mesh = RunReader(run).mesh()
     for time, zoom, position, (a, b, c) in zip(
-        positions["times"], told["camera"]["Zoom"]["values"], positions["values"], angles["values"], strict=True
+        positions["times"],
+        told["camera"]["Zoom"]["values"],
+        positions["values"],
+        angles["values"],
+        strict=True,
     ):
         turns = [
-            Rotation.from_euler(axis, angle, degrees=True) for axis, angle in zip("xyz", (a, b, c), strict=True)
+            Rotation.from_euler(axis, angle, degrees=True)
+            for axis, angle in zip("xyz", (a, b, c), strict=True)
         ]
         R = (turns[0] * turns[1] * turns[2]).as_matrix()
         K = np.array([[zoom, 0, 63.5], [0, zoom, 47.5], [0, 0, 1]])
@@ -145,8 +150,13 @@ def test_nuke_has_either_a_moving_camera_or_a_moving_object(export, run, silhoue
     folder = export(run, "nuke")
     camera, moving = (np.loadtxt(folder / f"{name}.chan") for name in ("camera", "object"))
     mesh = trimesh.load_mesh(folder / "object.obj")
-    for row, of_camera in ((row, of_camera) for of_camera, rows in ((0, moving), (1, camera)) for row in rows):
-        x, y, z = (Rotation.from_euler(axis, angle, degrees=True) for axis, angle in zip("xyz", row[4:7], strict=True))
+    for row, of_camera in (
+        (row, of_camera) for of_camera, rows in ((0, moving), (1, camera)) for row in rows
+    ):
+        x, y, z = (
+            Rotation.from_euler(axis, angle, degrees=True)
+            for axis, angle in zip("xyz", row[4:7], strict=True)
+        )
         T = rigid((y * x * z).as_matrix(), row[1:4])  # ZXY: z is turned about first
         T_view_mesh = np.linalg.inv(T) if of_camera else T
         focal = 48 / np.tan(np.radians(camera[0, 7]) / 2)

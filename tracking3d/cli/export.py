@@ -26,13 +26,17 @@ def export(
         typer.Option(metavar="METRES", help="The object's longest side; lengths are then in metres."),
     ] = None,
     of: Annotated[
-        str, typer.Option(metavar="object|camera", help="Whose poses: the object's, or those of the camera about it.")
+        str,
+        typer.Option(
+            metavar="object|camera", help="Whose poses: the object's, or those of the camera about it."
+        ),
     ] = "object",
     fps: Annotated[
         float | None, typer.Option(metavar="NUMBER", help="Frames per second of the source.")
     ] = None,
     source: Annotated[
-        str | None, typer.Option(metavar="PATH", help="The video, where it is no longer where the run found it.")
+        str | None,
+        typer.Option(metavar="PATH", help="The video, where it is no longer where the run found it."),
     ] = None,
     cut_out: Annotated[
         bool, typer.Option("--cut-out", help="Pictures as PNG, transparent around the object.")
@@ -42,7 +46,9 @@ def export(
     ] = True,
     xy: Annotated[
         list[str] | None,
-        typer.Option(metavar="X,Y", help="A pixel on the object to follow; may be repeated. A grid if left out."),
+        typer.Option(
+            metavar="X,Y", help="A pixel on the object to follow; may be repeated. A grid if left out."
+        ),
     ] = None,
     frame: Annotated[int | None, typer.Option(help="Index of the frame those pixels are in.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier export.")] = False,
@@ -92,8 +98,15 @@ def _print_formats(as_json: bool) -> None:
 
     if as_json:
         rows = [
-            {"name": one.name, "kind": one.kind, "writes": one.writes, "suffix": one.suffix}
-            | {"extra": one.extra or None, "available": one.is_available, "options": sorted(one.options)}
+            {
+                "name": one.name,
+                "kind": one.kind,
+                "writes": one.writes,
+                "suffix": one.suffix,
+                "extra": one.extra or None,
+                "available": one.is_available,
+                "options": sorted(one.options),
+            }
             for one in FORMATS.values()
         ]
         typer.echo(json.dumps(rows, indent=2))

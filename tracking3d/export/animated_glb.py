@@ -1,8 +1,8 @@
 """One GLB with the object moving before the camera, as glTF animation.
 
-glTF's axes: y up, the camera at the origin looks along -z. Nodes: ``tracking3d_object``, whose translation and rotation
-are animated, with the mesh in object coordinates; ``tracking3d_camera``, still. Between frames, and over those without a
-pose, viewers interpolate. glTF knows no shifted principal point, so the camera's is in the middle.
+glTF's axes: y up, the camera at the origin looks along -z. Nodes: ``tracking3d_object``, whose translation and
+rotation are animated, with the mesh in object coordinates; ``tracking3d_camera``, still. Between frames, and over
+those without a pose, viewers interpolate. glTF knows no shifted principal point, so the camera's is in the middle.
 """
 
 from __future__ import annotations
@@ -35,7 +35,9 @@ def write_animated_glb(run: ExportedRun, path: Path) -> None:
         "time": np.array(seconds, "<f4"),
         "translation": np.array([T[:3, 3] for T in T_view_obj], "<f4"),
         # glTF's quaternions are x, y, z, w.
-        "rotation": np.roll(continuous(np.array([quaternion(T) for T in T_view_obj])), -1, axis=1).astype("<f4"),
+        "rotation": np.roll(continuous(np.array([quaternion(T) for T in T_view_obj])), -1, axis=1).astype(
+            "<f4"
+        ),
     }
 
     def append(buffers: MutableMapping[str, bytes], tree: dict[str, Any]) -> None:

@@ -1,8 +1,8 @@
 """A folder for Blender: ``scene.py`` builds the scene from the numbers in ``scene.json`` and from ``texture.png``.
 
-Blender's world: z up. The camera is at the origin and looks along y; the object moves before it, with its mesh in object
-coordinates. Frame numbers are frame indices. In frames without a pose the object is hidden. The lens follows the one
-that each pose is of.
+Blender's world: z up. The camera is at the origin and looks along y; the object moves before it, with its mesh in
+object coordinates. Frame numbers are frame indices. In frames without a pose the object is hidden. The lens follows
+the one that each pose is of.
 """
 
 from __future__ import annotations

@@ -21,7 +21,8 @@ from tracking3d.export.exported_run import ExportedRun
 def write_coco(run: ExportedRun, path: Path) -> None:
     """Write images, annotations and the one category ``object``; numbers of images are frame indices."""
     height, width = run.camera.height, run.camera.width
-    images, annotations = [], []
+    images: list[dict[str, Any]] = []
+    annotations: list[dict[str, Any]] = []
     for index, record in run.records.items():
         name = record.name if "." in record.name else f"{index:06d}.jpg"
         images.append({"id": index, "file_name": name, "width": width, "height": height})

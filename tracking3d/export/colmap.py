@@ -138,7 +138,9 @@ def _write_text(folder: Path, model: _Model) -> None:
         + " ".join(map(str, one.track.ravel()))
         for one in model.points
     )
-    _write_lines(folder / "points3D.txt", "POINT3D_ID X Y Z R G B ERROR TRACK[] as IMAGE_ID POINT2D_IDX", points)
+    _write_lines(
+        folder / "points3D.txt", "POINT3D_ID X Y Z R G B ERROR TRACK[] as IMAGE_ID POINT2D_IDX", points
+    )
 
 
 def _write_lines(path: Path, titles: str, lines: Iterable[str]) -> None:

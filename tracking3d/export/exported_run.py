@@ -53,7 +53,9 @@ class PosedFrame:
         if (self.camera.fx, self.camera.cx, self.camera.cy) == (camera.fx, camera.cx, camera.cy):
             return self.T_cam_obj
         x, y, z = self.T_cam_obj[:3, 3]
-        pixel = np.array([self.camera.fx * x / z + self.camera.cx, self.camera.fy * y / z + self.camera.cy, 1.0])
+        pixel = np.array(
+            [self.camera.fx * x / z + self.camera.cx, self.camera.fy * y / z + self.camera.cy, 1.0]
+        )
         T = self.T_cam_obj.copy()
         T[:3, 3] = z * camera.fx / self.camera.fx * np.linalg.solve(camera.K, pixel)
         return T
@@ -111,7 +113,9 @@ class ExportedRun:
             if one.status is not Status.LOST and is_rigid(one.T_cam_obj)
         ]
         if not posed:
-            raise InputError(f"The run {self.reader.folder} has no frame with a pose; there is nothing to export.")
+            raise InputError(
+                f"The run {self.reader.folder} has no frame with a pose; there is nothing to export."
+            )
         return posed
 
     @property

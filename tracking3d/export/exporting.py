@@ -144,7 +144,9 @@ def _check_place(path: Path, exporter: Exporter, overwrite: bool) -> None:
         return
     if is_folder != (not exporter.suffix):
         kinds = ("file", "folder") if exporter.suffix else ("folder", "file")
-        raise OutputError(f"{path} is a {kinds[1]}, and {exporter.name} is a {kinds[0]}; choose another {_OUT}.")
+        raise OutputError(
+            f"{path} is a {kinds[1]}, and {exporter.name} is a {kinds[0]}; choose another {_OUT}."
+        )
     if not overwrite:
         raise OutputError(f"{path} exists already; choose another {_OUT} or pass {OVERWRITE}.")
     if is_folder and not _is_export(path):

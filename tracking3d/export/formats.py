@@ -61,15 +61,21 @@ _ALL = (
         modules=("rosbags",),
         extra="ros",
     ),
-    Exporter("colmap", "cameras", "COLMAP model as text, pictures, masks", write_colmap_text, options=_TRAINING),
+    Exporter(
+        "colmap", "cameras", "COLMAP model as text, pictures, masks", write_colmap_text, options=_TRAINING
+    ),
     Exporter("colmap-binary", "cameras", "the same, binary", write_colmap_binary, options=_TRAINING),
-    Exporter("nerfstudio", "cameras", "transforms.json, pictures, masks", write_nerfstudio, options=_TRAINING),
+    Exporter(
+        "nerfstudio", "cameras", "transforms.json, pictures, masks", write_nerfstudio, options=_TRAINING
+    ),
     Exporter("davis", "masks", "indexed PNG as DAVIS has them", write_davis),
     Exporter("youtube-vos", "masks", "indexed PNG and meta.json of YouTube-VOS", write_youtube_vos),
     Exporter("coco", "masks", "COCO's JSON, run-length encoded", write_coco, ".json"),
     Exporter("vot", "masks", "regions of the VOT toolkit", write_vot, ".txt"),
     Exporter("cut-outs", "masks", "the object as PNG with alpha", write_cut_outs, options=_PICTURES),
-    Exporter("vp9", "masks", "the object as WebM with alpha", write_vp9, ".webm", options=_PICTURES | {"fps"}),
+    Exporter(
+        "vp9", "masks", "the object as WebM with alpha", write_vp9, ".webm", options=_PICTURES | {"fps"}
+    ),
     Exporter(
         "prores",
         "masks",
@@ -101,8 +107,12 @@ _ALL = (
         modules=("pxr",),
         extra="usd",
     ),
-    Exporter("blender", "scene", "Python script that builds the scene", write_blender, options=_TIMED | _PICTURES),
-    Exporter("after-effects", "scene", "script with camera and null", write_after_effects, ".jsx", options=_TIMED),
+    Exporter(
+        "blender", "scene", "Python script that builds the scene", write_blender, options=_TIMED | _PICTURES
+    ),
+    Exporter(
+        "after-effects", "scene", "script with camera and null", write_after_effects, ".jsx", options=_TIMED
+    ),
     Exporter("nuke", "scene", "camera and axis as .chan, mesh as OBJ", write_nuke, options=_LENGTHS),
     Exporter(
         "rerun",

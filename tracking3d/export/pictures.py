@@ -26,7 +26,9 @@ def read_pictures(run: RunReader, source: str | None, wanted: Container[int]) ->
     """
     name = source if source is not None else run.description.get("source")
     if not isinstance(name, str) or name.isdigit():
-        raise InputError(f"The run {run.folder} is of no video that can be read again; give one as {_SOURCE}.")
+        raise InputError(
+            f"The run {run.folder} is of no video that can be read again; give one as {_SOURCE}."
+        )
     try:
         opened = open_source(name, run.description.get("selection"))
     except InputError as error:

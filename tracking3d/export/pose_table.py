@@ -1,8 +1,8 @@
 """Poses as a table, CSV or Parquet: one row a frame, with everything that the run says of it in one number.
 
-Columns: ``index``, ``seconds``, ``name``, ``status``, ``confidence``; ``tx``, ``ty``, ``tz`` and ``qw``, ``qx``, ``qy``,
-``qz`` of ``T_cam_obj``; ``fx``, ``fy``, ``cx``, ``cy`` of the camera that the pose is of; ``area`` of the mask. Frames
-that are lost have a row with an empty pose; frames that were skipped have none.
+Columns: ``index``, ``seconds``, ``name``, ``status``, ``confidence``; ``tx``, ``ty``, ``tz`` and ``qw``, ``qx``,
+``qy``, ``qz`` of ``T_cam_obj``; ``fx``, ``fy``, ``cx``, ``cy`` of the camera that the pose is of; ``area`` of the
+mask. Frames that are lost have a row with an empty pose; frames that were skipped have none.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """A recording for the viewer rerun: pictures, masks, mesh, poses, and what the run says of each frame.
 
 Entities: ``camera`` (pinhole, OpenCV's axes), ``camera/image``, ``camera/mask``, ``camera/object`` (pose and mesh),
-``status`` and ``confidence``. Timelines: ``frame``, and ``time`` where the run knows it. Where there is no pose, the last
-one stays and ``status`` says so.
+``status`` and ``confidence``. Timelines: ``frame``, and ``time`` where the run knows it. Where there is no pose,
+the last one stays and ``status`` says so.
 """
 
 from __future__ import annotations

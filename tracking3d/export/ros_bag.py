@@ -1,9 +1,10 @@
 """A ROS 2 bag, written without ROS.
 
-Topics: ``/tracking3d/pose`` (``geometry_msgs/PoseStamped``), ``/tracking3d/camera_info`` (``sensor_msgs/CameraInfo``) and
-``/tf`` (``tf2_msgs/TFMessage``). All are in the frame ``tracking3d_camera_optical``, whose axes are those of ROS's optical
-frames and ours: x right, y down, z forward. Stamps count from the start of the source. Frames without a pose have a
-camera and no pose. Lengths are in metres, or in the run's unit taken for one.
+Topics: ``/tracking3d/pose`` (``geometry_msgs/PoseStamped``), ``/tracking3d/camera_info``
+(``sensor_msgs/CameraInfo``) and ``/tf`` (``tf2_msgs/TFMessage``). All are in the frame
+``tracking3d_camera_optical``, whose axes are those of ROS's optical frames and ours: x right, y down, z forward.
+Stamps count from the start of the source. Frames without a pose have a camera and no pose. Lengths are in metres,
+or in the run's unit taken for one.
 """
 
 from __future__ import annotations

@@ -59,17 +59,19 @@ def vertex_colours(model: ObjectModel) -> NDArray[np.uint8]:
 def _look(run: ExportedRun, one: PosedFrame) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Where the vertices are in a frame ``(V, 2)``, and whether they are seen ``(V,)``."""
     model, camera = run.model, one.camera
-    tensors = {
-        "vertices": torch.tensor(model.vertices, dtype=torch.float32),
-        "faces": torch.tensor(model.faces),
-        "face_uvs": torch.tensor(model.face_uvs, dtype=torch.float32),
-        "texture": torch.zeros((1, 1, 1)),
-        "R": torch.tensor(one.T_cam_obj[None, :3, :3], dtype=torch.float32),
-        "t": torch.tensor(one.T_cam_obj[None, :3, 3], dtype=torch.float32),
-        "K": torch.tensor(camera.K[None], dtype=torch.float32),
-    }
-    drawn = render(**tensors, size=(camera.height, camera.width))
+    drawn = render(
+        torch.tensor(model.vertices, dtype=torch.float32),
+        torch.tensor(model.faces),
+        torch.tensor(model.face_uvs, dtype=torch.float32),
+        torch.zeros((1, 1, 1)),
+        torch.tensor(one.T_cam_obj[None, :3, :3], dtype=torch.float32),
+        torch.tensor(one.T_cam_obj[None, :3, 3], dtype=torch.float32),
+        torch.tensor(camera.K[None], dtype=torch.float32),
+        size=(camera.height, camera.width),
+    )
     pixels = drawn.screen[0].double().numpy()
     seen: NDArray[np.bool_] = visible_vertices(drawn)[0].numpy()
     column, row = np.where(seen[:, None], pixels, 0.0).round().astype(int).T
-    return pixels, seen & run.mask(one.index)[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)]
+    return pixels, seen & run.mask(one.index)[
+        row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)
+    ]

@@ -16,8 +16,9 @@ if TYPE_CHECKING:
 def detections(run: RunReader, index: int) -> Detections:
     """The object in one frame: mask, box, confidence, and its pose in ``data["T_cam_obj"]`` ``(1, 4, 4)``.
 
-    Needs the extra ``supervision``. Boxes are x and y of the first pixel's corner and of the last one's, as that library
-    makes them from masks. Class and tracker id are 0. Without an answer, or with an empty mask, there are no detections.
+    Needs the extra ``supervision``. Boxes are x and y of the first pixel's corner and of the last one's, as that
+    library makes them from masks. Class and tracker id are 0. Without an answer, or with an empty mask, there are
+    no detections.
 
     Raises:
         InputError: If the mask of the frame is missing.

@@ -80,7 +80,9 @@ def obj_files(model: ObjectModel, header: str) -> dict[str, bytes]:
     return {OBJ: text.encode(), **files}
 
 
-def glb_file(model: ObjectModel, finish: Callable[[dict[str, Any]], None] | None = None, **more: Any) -> bytes:
+def glb_file(
+    model: ObjectModel, finish: Callable[[dict[str, Any]], None] | None = None, **more: Any
+) -> bytes:
     """The model as GLB, turned upright.
 
     Args:
