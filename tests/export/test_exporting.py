@@ -99,6 +99,41 @@ def test_what_a_killed_export_left_is_cleared_away(run, tmp_path):
     assert names(tmp_path) == ["out"]
 
 
+def test_an_export_that_was_killed_while_it_was_put_in_place_is_given_back(run, tmp_path):
+    export_run(run, "kitti", tmp_path / "out")
+    (tmp_path / ".out.part").mkdir()
+    (tmp_path / "out").rename(tmp_path / ".out.part" / "earlier")
+    with pytest.raises(InputError):
+        # Whatever comes next, here one that fails.
+        export_run(run, "kitti", tmp_path / "out", options=ExportOptions(of="hand"))
+    export_run(run, "kitti", tmp_path / "out", overwrite=True)
+    assert "poses.txt" in names(tmp_path / "out")
+    assert names(tmp_path) == ["out"]
+
+
+def test_files_of_the_run_are_not_replaced(run):
+    before = (run / "run.json").read_bytes()
+    with pytest.raises(OutputError, match="is a file of the run itself"):
+        export_run(run, "coco", run / "run.json", overwrite=True)
+    with pytest.raises(OutputError, match="was not exported"):
+        export_run(run, "davis", run / "masks", overwrite=True)
+    assert (run / "run.json").read_bytes() == before
+
+
+def test_an_earlier_export_survives_where_the_new_one_cannot_be_put_in_place(run, tmp_path, monkeypatch):
+    export_run(run, "kitti", tmp_path / "out")
+    before = (tmp_path / "out" / "poses.txt").read_bytes()
+
+    def write_nothing(exported, path):
+        pass
+
+    monkeypatch.setitem(FORMATS, "kitti", replace(FORMATS["kitti"], write=write_nothing))
+    with pytest.raises(OutputError, match="cannot be written"):
+        export_run(run, "kitti", tmp_path / "out", overwrite=True)
+    assert (tmp_path / "out" / "poses.txt").read_bytes() == before
+    assert names(tmp_path) == ["out"]
+
+
 def test_every_format_can_be_written_or_says_what_it_needs(run, tmp_path):
     for name, exporter in FORMATS.items():
         assert exporter.name == name
@@ -107,6 +142,14 @@ def test_every_format_can_be_written_or_says_what_it_needs(run, tmp_path):
     missing = replace(FORMATS["usdz"], modules=("no_such_module",))
     with pytest.raises(InputError, match=r"needs no_such_module.*pip install 'tracking3d\[usd\]'"):
         missing.check_available()
+
+
+def test_the_page_names_every_format_and_extra():
+    page = (Path(__file__).resolve().parents[2] / "docs/export.md").read_text(encoding="utf-8")
+    rows = [line.split("|")[1] for line in page.splitlines() if line.startswith("| `")]
+    for name, exporter in FORMATS.items():
+        assert sum(f"`{name}`" in row for row in rows) == 2, name  # what it is, and what checked it
+        assert f"tracking3d[{exporter.extra}]" in page or not exporter.extra
 
 
 def test_extras_are_declared():

@@ -148,8 +148,8 @@ def test_after_effects_is_told_where_the_null_is(export, run, silhouettes):
 
 def test_nuke_has_either_a_moving_camera_or_a_moving_object(export, run, silhouettes):
     folder = export(run, "nuke")
-    camera, moving = (np.loadtxt(folder / f"{name}.chan") for name in ("camera", "object"))
-    mesh = trimesh.load_mesh(folder / "object.obj")
+    camera, moving = (np.loadtxt(folder / f"{name}_moves.chan") for name in ("camera", "object"))
+    mesh = trimesh.load_mesh(folder / "mesh.obj")
     for row, of_camera in (
         (row, of_camera) for of_camera, rows in ((0, moving), (1, camera)) for row in rows
     ):

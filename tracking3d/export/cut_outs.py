@@ -1,7 +1,7 @@
 """The object cut out of the video: PNG with alpha, or a video with alpha, VP9 in WebM and ProRes 4444 in QuickTime.
 
 Alpha is straight, not premultiplied: colours are the video's up to a few pixels beyond the outline and black elsewhere.
-Frames that were skipped, or whose mask is empty, are wholly transparent. The videos run at the source's frame rate.
+Frames that were skipped, or whose mask is empty, are wholly transparent. The videos run as fast as the source.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def write_alpha_video(
         )
     # Chroma of half the width needs even sizes; the added row or column is transparent.
     height, width = (side + side % 2 for side in (run.camera.height, run.camera.width))
-    rate = Fraction(run.fps).limit_denominator(1001)
+    rate = Fraction(run.fps / run.span.step).limit_denominator(1001)
     reformatter = VideoReformatter()
     with av.open(str(path), "w", format=container) as file:
         stream = file.add_stream(encoder, rate=rate, options=options)

@@ -14,7 +14,7 @@ from tracking3d.export.exported_run import ExportedRun
 from tracking3d.export.exporter import Exporter, ExportOptions
 from tracking3d.export.formats import FORMATS
 from tracking3d.results.files import writing
-from tracking3d.results.layout import OVERWRITE, partial_path
+from tracking3d.results.layout import OVERWRITE, partial_path, run_files
 from tracking3d.results.run_reader import RunReader
 
 FOLDER = "export"
@@ -99,8 +99,10 @@ def export_run(
     reader = RunReader(Path(run), refined=options.answers == "final")
     exported = ExportedRun(reader, options)
     name = exporter.file_name.format(run=exported.name) or f"{exporter.name}{exporter.suffix}"
-    path = reader.folder / FOLDER / name if out is None else Path(out)
+    path = reader.folder / FOLDER / name if out is None else Path(out).resolve()
     _check_place(path, exporter, overwrite)
+    if path in (file.resolve() for file in run_files(reader.folder)):
+        raise OutputError(f"{path} is a file of the run itself; choose another {_OUT}.")
     needs_poses = exporter.kind not in ("masks", "model")
     answered = {one.index for one in exported.poses} if needs_poses else set(exported.records)
     without = tuple(index for index in exported.span if index not in answered)
@@ -109,7 +111,7 @@ def export_run(
         if place.is_dir():
             label = _label(exporter, exported, without)
             (place / LABEL).write_text(json.dumps(label, indent=1) + "\n", encoding="utf-8")
-    return Export(path, exported.unit, len(answered), without)
+    return Export(path if out is None else Path(out), exported.unit, len(answered), without)
 
 
 def _check(options: ExportOptions) -> None:
@@ -137,9 +139,9 @@ def _label(exporter: Exporter, run: ExportedRun, without: tuple[int, ...]) -> di
 
 def _check_place(path: Path, exporter: Exporter, overwrite: bool) -> None:
     """Make sure that nothing is lost at ``path``."""
-    if not path.exists() and not path.is_symlink():
+    if not path.exists():
         return
-    is_folder = path.is_dir() and not path.is_symlink()
+    is_folder = path.is_dir()
     if is_folder and not any(path.iterdir()) and not exporter.suffix:
         return
     if is_folder != (not exporter.suffix):
@@ -169,13 +171,17 @@ def _placed(path: Path) -> Iterator[Path]:
     with writing(path):
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
+            if earlier.is_dir() and not path.exists():  # killed at the worst moment
+                earlier.rename(path)
             _remove(workshop)
             workshop.mkdir()
             yield made
-            if path.is_dir() and not path.is_symlink():  # a rename does not replace a folder
+            if path.is_dir():  # a rename does not replace a folder
                 path.rename(earlier)
             made.replace(path)
         finally:
+            if earlier.is_dir() and not path.exists():
+                earlier.rename(path)
             _remove(workshop)
 
 

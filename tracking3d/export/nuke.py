@@ -1,9 +1,9 @@
-"""A folder for Nuke: ``camera.chan``, ``object.chan``, and the mesh as ``object.obj``.
+"""A folder for Nuke: ``camera_moves.chan``, ``object_moves.chan``, and the mesh as ``mesh.obj``.
 
 A line of a ``.chan`` is ``frame tx ty tz rx ry rz``, and of the camera's the vertical field of view after them.
 Axes are Nuke's: y up, the camera looks along -z; angles are degrees in the order ZXY, Nuke's default, whose matrix
-is Ry Rx Rz. Either the camera moves about the still mesh (``camera.chan``), or a mesh under an axis with
-``object.chan`` moves before a camera at the origin; not both. The mesh stands upright, y up. Frames without a pose
+is Ry Rx Rz. Either the camera moves about the still mesh (``camera_moves.chan``), or a mesh under an axis with
+``object_moves.chan`` moves before a camera at the origin; not both. The mesh stands upright, y up. Frames without a pose
 have no line. A shifted principal point has no column: it goes into the camera's ``win_translate``.
 """
 
@@ -19,7 +19,6 @@ from scipy.spatial.transform import Rotation
 
 from tracking3d.export.axes import HALF_TURN, inverse
 from tracking3d.export.exported_run import ExportedRun
-from tracking3d.results.layout import OBJ
 from tracking3d.results.mesh_export import obj_files
 
 
@@ -32,11 +31,11 @@ def write_nuke(run: ExportedRun, folder: Path) -> None:
         angle = 2 * math.degrees(math.atan2(one.camera.height / 2, one.camera.fy))
         moving.append(f"{one.index} {_channels(T_view_mesh)}")
         camera.append(f"{one.index} {_channels(inverse(T_view_mesh))} {angle:.6f}")
-    (folder / "object.chan").write_text("\n".join(moving) + "\n", encoding="ascii")
-    (folder / "camera.chan").write_text("\n".join(camera) + "\n", encoding="ascii")
+    (folder / "object_moves.chan").write_text("\n".join(moving) + "\n", encoding="ascii")
+    (folder / "camera_moves.chan").write_text("\n".join(camera) + "\n", encoding="ascii")
     upright = replace(run.model, vertices=run.model.vertices @ HALF_TURN[:3, :3])
     for name, data in obj_files(upright, f"y up, unit: {run.unit}").items():
-        (folder / ("object.obj" if name == OBJ else name)).write_bytes(data)
+        (folder / name).write_bytes(data)
 
 
 def _channels(T: NDArray[np.float64]) -> str:
