@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -196,9 +197,16 @@ def test_the_video_of_another_run_is_refused(run, tmp_path):
             )
 
 
-def test_a_run_without_a_pose_has_no_trajectory_but_masks(run, tmp_path):
-    import shutil
+def test_a_camera_cannot_be_looked_through_again(run, tmp_path):
+    shutil.copytree(run, tmp_path / "live")
+    file = tmp_path / "live" / "run.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"source": "0"}))
+    with pytest.raises(InputError, match="no video that can be read again"):
+        export_run(tmp_path / "live", "colmap", tmp_path / "out")
+    export_run(tmp_path / "live", "colmap", tmp_path / "out", options=ExportOptions(images=False))
 
+
+def test_a_run_without_a_pose_has_no_trajectory_but_masks(run, tmp_path):
     shutil.copytree(run, tmp_path / "lost")
     lines = (run / "frames.jsonl").read_text().replace('"status": "tracked"', '"status": "lost"')
     (tmp_path / "lost" / "frames.jsonl").write_text(lines)
@@ -208,8 +216,6 @@ def test_a_run_without_a_pose_has_no_trajectory_but_masks(run, tmp_path):
 
 
 def test_causal_answers_are_those_before_the_refinement(run, tmp_path):
-    import shutil
-
     shutil.copytree(run, tmp_path / "refined")
     file = tmp_path / "refined" / "frames.jsonl"
     first = json.loads(file.read_text().splitlines()[0])

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import json
+import shutil
 
 import numpy as np
 import pytest
@@ -112,12 +114,26 @@ def test_a_known_size_makes_lengths_metres(export, run):
         np.testing.assert_allclose(T[:3, :3], plain[time][:3, :3], atol=1e-8)
 
 
-def test_for_one_lens_a_pose_of_another_lens_keeps_place_and_size(run):
-    exported = ExportedRun(RunReader(run), ExportOptions())
-    one = exported.poses[0]
-    longer = exported.camera.zoomed(1.3, "a test")
-    x, y, z = one.T_through(longer)[:3, 3]
-    before = one.T_cam_obj[:3, 3]
-    assert z == pytest.approx(1.3 * before[2])
-    np.testing.assert_allclose([x, y], before[:2])
-    assert one.T_through(one.camera) is one.T_cam_obj
+def test_for_one_lens_a_pose_of_another_keeps_the_place_and_size_of_the_object(
+    export, zooming_run, silhouettes
+):
+    poses = read_matrix_lines(export(zooming_run, "kitti") / "poses.txt")
+    reader = RunReader(zooming_run)
+    mesh = reader.mesh()
+    for index, T in poses.items():
+        silhouettes(zooming_run).agree(index, reader.camera.K, T, mesh.vertices, mesh.faces, least=0.94)
+    before = reader.frames[0].T_cam_obj
+    np.testing.assert_allclose(poses[0][:3, 3], before[:3, 3] * (1, 1, 1 / 0.8), rtol=1e-6)
+    np.testing.assert_allclose(poses[5], reader.frames[4].T_cam_obj, atol=1e-6)
+
+
+def test_a_rate_is_the_one_of_the_source_where_frames_were_selected(run, tmp_path):
+    shutil.copytree(run, tmp_path / "every_second")
+    file = tmp_path / "every_second" / "run.json"
+    described = json.loads(file.read_text())
+    file.write_text(json.dumps(described | {"selection": "0:7:2", "fps": 12.5}))
+    exported = ExportedRun(RunReader(file.parent), ExportOptions())
+    assert exported.known_fps == 25
+    assert list(exported.span) == [0, 2, 4, 6]
+    file.write_text(json.dumps(described | {"fps": None}))
+    assert ExportedRun(RunReader(file.parent), ExportOptions()).fps == 30

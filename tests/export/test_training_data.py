@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from importlib.util import find_spec
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -38,19 +39,18 @@ HALF_A_PIXEL = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
 """From pixels counted from the corner of the first one to pixels counted from its centre."""
 
 
-@pytest.mark.parametrize("to", ["colmap", "colmap-binary"])
-def test_colmap_itself_reads_the_model(export, shifted_run, silhouettes, to):
+def read_model(folder: Path) -> dict:
+    """What COLMAP reads, in a process of its own: its libraries and torch's do not get on in every installation."""
     if find_spec("pycolmap") is None:
         pytest.skip("pycolmap is not installed")
+    command = [sys.executable, "-c", READ_MODEL, str(folder / "sparse" / "0")]
+    return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+
+
+@pytest.mark.parametrize("to", ["colmap", "colmap-binary"])
+def test_colmap_itself_reads_the_model(export, shifted_run, silhouettes, to):
     folder = export(shifted_run, to)
-    # In a process of its own: its libraries and torch's do not get on in every installation.
-    read = subprocess.run(
-        [sys.executable, "-c", READ_MODEL, str(folder / "sparse" / "0")],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    model = json.loads(read.stdout)
+    model = read_model(folder)
     mesh = RunReader(shifted_run).mesh()
     assert sorted(model["images"]) == [f"{name}.jpg" for name in NAMES]
     for name, image in model["images"].items():
@@ -64,6 +64,15 @@ def test_colmap_itself_reads_the_model(export, shifted_run, silhouettes, to):
     assert points[:, 6].min() >= 2
     np.testing.assert_allclose(cKDTree(mesh.vertices).query(points[:, :3])[0], 0, atol=1e-5)
     assert len(np.unique(points[:, 3:6], axis=0)) > 10
+
+
+def test_colmap_has_a_camera_for_every_lens(export, zooming_run, silhouettes):
+    images = read_model(export(zooming_run, "colmap-binary", images=False))["images"]
+    assert sorted({round(image["K"][0][0]) for image in images.values()}) == [120, 150]
+    mesh = RunReader(zooming_run).mesh()
+    for name, image in images.items():
+        K = HALF_A_PIXEL @ np.array(image["K"])
+        silhouettes(zooming_run).agree(int(name[:6]), K, np.array(image["T"]), mesh.vertices, mesh.faces)
 
 
 def test_points_are_those_that_are_seen(export, run):

@@ -3,8 +3,8 @@
 A line of a ``.chan`` is ``frame tx ty tz rx ry rz``, and of the camera's the vertical field of view after them.
 Axes are Nuke's: y up, the camera looks along -z; angles are degrees in the order ZXY, Nuke's default, whose matrix
 is Ry Rx Rz. Either the camera moves about the still mesh (``camera_moves.chan``), or a mesh under an axis with
-``object_moves.chan`` moves before a camera at the origin; not both. The mesh stands upright, y up. Frames without a pose
-have no line. A shifted principal point has no column: it goes into the camera's ``win_translate``.
+``object_moves.chan`` moves before a camera at the origin; not both. The mesh stands upright, y up. Frames without a
+pose have no line. A shifted principal point has no column: it goes into the camera's ``win_translate``.
 """
 
 from __future__ import annotations
