@@ -27,13 +27,25 @@ def test_the_formats_are_listed(call):
 
 def test_an_export_says_where_it_is(call, finished):
     result = call("export", finished, "--to", "tum", "--out", "poses.txt")
-    assert (result.exit_code, result.stdout) == (0, "poses.txt is written, 5 frames.\n")
+    said = "poses.txt is written, 5 frames, lengths in the run's own unit.\n"
+    assert (result.exit_code, result.stdout, result.stderr) == (0, said, "")
+    metric = call("export", finished, "--to", "tum", "--out", "metric.txt", "--object-size", "0.2")
+    assert metric.stdout == "metric.txt is written, 5 frames.\n"
+    assert call("export", finished, "--to", "vot", "--out", "m.txt").stdout == "m.txt is written, 5 frames.\n"
     lines = Path("poses.txt").read_text().splitlines()
     assert lines[3].split()[:4] == ["0", "0.000000000", "0.000000000", "3.000000000"]
     told = json.loads(call("export", finished, "--to", "kitti", "--out", "kitti", "--json").stdout)
     assert told == {"path": "kitti", "unit": "arbitrary", "frames": 5, "without": []}
     assert call("export", finished, "--to", "csv", "--quiet").stdout == ""
     assert (finished / "export" / "csv.csv").is_file()
+
+
+def test_a_run_that_has_not_ended_is_exported_as_far_as_it_is(call, finished):
+    file = finished / "run.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"state": "interrupted"}))
+    result = call("export", finished, "--to", "vot", "--out", "masks.txt")
+    assert result.exit_code == 0
+    assert "is interrupted; frames with an answer so far: 5" in result.stderr
 
 
 def test_pixels_are_followed(call, finished):

@@ -107,9 +107,11 @@ def test_the_khronos_validator_finds_nothing_wrong(export, run, to):
 
 def test_usd_reads_the_scene_back(export, shifted_run, silhouettes):
     pxr = pytest.importorskip("pxr.Usd")
-    from pxr import Gf, UsdGeom
+    from pxr import UsdGeom, UsdValidation
 
     stage = pxr.Stage.Open(str(export(shifted_run, "usdz", "out.usdz", object_size=1.0)))
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    assert UsdValidation.ValidationContext(validators).Validate(stage) == []
     assert UsdGeom.GetStageUpAxis(stage) == "Y"
     assert UsdGeom.GetStageMetersPerUnit(stage) == 1
     assert (stage.GetTimeCodesPerSecond(), stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (25, 0, 6)
@@ -125,11 +127,11 @@ def test_usd_reads_the_scene_back(export, shifted_run, silhouettes):
             # USD's matrices act on rows.
             T_view_obj = np.array(moving.GetLocalTransformation(index)).T
             T_cam_obj = np.diag([1, -1, -1, 1]) @ T_view_obj
-            K = lens_of(UsdGeom.Camera(stage.GetPrimAtPath("/tracking3d/camera")).GetCamera(index), Gf)
+            K = lens_of(UsdGeom.Camera(stage.GetPrimAtPath("/tracking3d/camera")).GetCamera(index))
             silhouettes(shifted_run).agree(index, K, T_cam_obj, vertices, faces)
 
 
-def lens_of(camera, Gf) -> np.ndarray:
+def lens_of(camera) -> np.ndarray:
     """The lens as USD's own projection has it."""
     P = np.array(camera.frustum.ComputeProjectionMatrix()).T  # to x and y from -1 to 1
     to_pixels = np.array([[64, 0, 63.5], [0, -48, 47.5], [0, 0, 1]])

@@ -91,12 +91,11 @@ const fs = require('fs');
 const told = {};
 const layer = name => {
     told[name] = {};
-    return {
-        property: key => ({
-            setValue: value => { told[name][key] = value; },
-            setValuesAtTimes: (times, values) => { told[name][key] = {times, values}; },
-        }),
-    };
+    const property = key => ({
+        setValue: value => { told[name][key] = value; },
+        setValuesAtTimes: (times, values) => { told[name][key] = {times, values}; },
+    });
+    return {property: group => ({property: key => property(`${group}/${key}`)})};
 };
 global.AutoOrientType = {NO_AUTO_ORIENT: 'none'};
 const comp = {
@@ -126,12 +125,13 @@ def test_after_effects_is_told_where_the_null_is(export, run, silhouettes):
     )
     assert told["comp"]["fps"] == 25
     assert told["comp"]["duration"] == pytest.approx(7 / 25)
-    assert told["camera"]["Position"] == told["object"]["Anchor Point"] == [0, 0, 0]
-    positions, angles = told["object"]["Position"], told["object"]["Orientation"]
+    place, zooms = "ADBE Transform Group/ADBE", told["camera"]["ADBE Camera Options Group/ADBE Camera Zoom"]
+    assert told["camera"][f"{place} Position"] == told["object"][f"{place} Anchor Point"] == [0, 0, 0]
+    positions, angles = told["object"][f"{place} Position"], told["object"][f"{place} Orientation"]
     mesh = RunReader(run).mesh()
     for time, zoom, position, (a, b, c) in zip(
         positions["times"],
-        told["camera"]["Zoom"]["values"],
+        zooms["values"],
         positions["values"],
         angles["values"],
         strict=True,

@@ -82,6 +82,8 @@ def export(
         xy=pixels,  # type: ignore[arg-type]
     )
     done = export_run(run, to, out, options=options, overwrite=overwrite)
+    if done.not_finished:
+        typer.echo(done.not_finished, err=True)
     if as_json:
         import json
 

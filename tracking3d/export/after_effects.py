@@ -22,20 +22,26 @@ _SCRIPT = """\
 // tracking3d: run it by File > Scripts > Run Script File.
 (function () {
     var numbers = %s;
+    // Names of properties are translated in other languages' versions; these are not.
+    function transform(layer, name) {
+        return layer.property("ADBE Transform Group").property("ADBE " + name);
+    }
     app.beginUndoGroup("tracking3d");
     var comp = app.project.items.addComp(
         numbers.name, numbers.width, numbers.height, 1, numbers.duration, numbers.fps
     );
     var camera = comp.layers.addCamera("tracking3d_camera", [numbers.width / 2, numbers.height / 2]);
     camera.autoOrient = AutoOrientType.NO_AUTO_ORIENT;
-    camera.property("Position").setValue([0, 0, 0]);
-    camera.property("Zoom").setValuesAtTimes(numbers.times, numbers.zoom);
+    transform(camera, "Position").setValue([0, 0, 0]);
+    camera.property("ADBE Camera Options Group").property("ADBE Camera Zoom").setValuesAtTimes(
+        numbers.times, numbers.zoom
+    );
     var object = comp.layers.addNull(numbers.duration);
     object.name = "tracking3d_object";
     object.threeDLayer = true;
-    object.property("Anchor Point").setValue([0, 0, 0]);
-    object.property("Position").setValuesAtTimes(numbers.times, numbers.position);
-    object.property("Orientation").setValuesAtTimes(numbers.times, numbers.orientation);
+    transform(object, "Anchor Point").setValue([0, 0, 0]);
+    transform(object, "Position").setValuesAtTimes(numbers.times, numbers.position);
+    transform(object, "Orientation").setValuesAtTimes(numbers.times, numbers.orientation);
     comp.openInViewer();
     app.endUndoGroup();
 })();

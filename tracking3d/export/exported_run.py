@@ -25,6 +25,9 @@ from tracking3d.video.selection import parse_selection
 FRAMES_PER_SECOND = 30.0
 """Taken by formats that cannot do without, where nobody knows."""
 
+ARBITRARY = "arbitrary"
+"""What the unit of a run is called whose object nobody measured."""
+
 
 @dataclass(frozen=True, eq=False)
 class PosedFrame:
@@ -161,7 +164,7 @@ class ExportedRun:
     @property
     def unit(self) -> str:
         """The unit of lengths, in words."""
-        return "metre" if self.options.object_size is not None else "arbitrary"
+        return "metre" if self.options.object_size is not None else ARBITRARY
 
     @cached_property
     def model(self) -> ObjectModel:

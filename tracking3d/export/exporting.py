@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tracking3d.errors import InputError, OutputError, argument
-from tracking3d.export.exported_run import ExportedRun
+from tracking3d.export.exported_run import ARBITRARY, ExportedRun
 from tracking3d.export.exporter import Exporter, ExportOptions
 from tracking3d.export.formats import FORMATS
 from tracking3d.results.files import writing
@@ -42,21 +42,24 @@ class Export:
 
     Attributes:
         path: The file or folder.
-        unit: The unit of lengths, in words.
+        unit: The unit of lengths, in words; None where the format has none.
         frames: How many frames have what the format is about, a pose or a mask.
         without: Frames between the first and the last that have none: skipped, and of poses, lost.
+        not_finished: A sentence about a run that has not come to its end; empty for one that has.
     """
 
     path: Path
-    unit: str
+    unit: str | None
     frames: int
     without: tuple[int, ...]
+    not_finished: str = ""
 
     @property
     def in_words(self) -> str:
         """How many frames there are, and the unit where it is arbitrary."""
         left_out = f", {len(self.without)} without an answer" if self.without else ""
-        return f"{self.frames} frames{left_out}"
+        unit = ", lengths in the run's own unit" if self.unit == ARBITRARY else ""
+        return f"{self.frames} frames{left_out}{unit}"
 
 
 def find_format(name: str) -> Exporter:
@@ -111,7 +114,9 @@ def export_run(
         if place.is_dir():
             label = _label(exporter, exported, without)
             (place / LABEL).write_text(json.dumps(label, indent=1) + "\n", encoding="utf-8")
-    return Export(path if out is None else Path(out), exported.unit, len(answered), without)
+    unit = exported.unit if "object_size" in exporter.options else None
+    given = path if out is None else Path(out)
+    return Export(given, unit, len(answered), without, reader.not_finished)
 
 
 def _check(options: ExportOptions) -> None:
