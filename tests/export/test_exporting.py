@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -135,14 +136,20 @@ def test_an_earlier_export_survives_where_the_new_one_cannot_be_put_in_place(run
     assert names(tmp_path) == ["out"]
 
 
-def test_every_format_can_be_written_or_says_what_it_needs(run, tmp_path):
+def test_every_format_is_listed_by_its_name_with_options_that_there_are():
     for name, exporter in FORMATS.items():
         assert exporter.name == name
         assert bool(exporter.modules) == bool(exporter.extra)
         assert exporter.options <= set(ExportOptions.__dataclass_fields__)
-    missing = replace(FORMATS["usdz"], modules=("no_such_module",))
-    with pytest.raises(InputError, match=r"needs no_such_module.*pip install 'tracking3d\[usd\]'"):
-        missing.check_available()
+
+
+@pytest.mark.parametrize("to", [name for name, exporter in FORMATS.items() if exporter.modules])
+def test_without_its_extra_a_format_says_what_to_install(run, tmp_path, monkeypatch, to):
+    (module,) = FORMATS[to].modules
+    monkeypatch.setitem(sys.modules, module, None)  # as if it were not installed
+    with pytest.raises(InputError, match=rf"needs {module}.*pip install 'tracking3d\[{FORMATS[to].extra}\]'"):
+        export_run(run, to, tmp_path / "out")
+    assert not FORMATS[to].is_available
 
 
 def test_the_page_names_every_format_and_extra():

@@ -209,7 +209,7 @@ print(json.dumps(told))
 
 
 def test_rerun_reads_its_recording(export, run, silhouettes):
-    pytest.importorskip("rerun")
+    pytest.importorskip("rerun.chunk")
     path = export(run, "rerun", "out.rrd")
     # In a process of its own: the recorder starts threads.
     read = subprocess.run(

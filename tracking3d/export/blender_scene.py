@@ -23,7 +23,7 @@ def build(folder: Path) -> None:
         bpy.context.window.scene = scene
 
 
-def prepare(scene, numbers):  # type: ignore[no-untyped-def]
+def prepare(scene, numbers):
     """Set what the video has: its size, rate and frames."""
     render = scene.render
     render.resolution_x, render.resolution_y = numbers["width"], numbers["height"]
@@ -35,7 +35,7 @@ def prepare(scene, numbers):  # type: ignore[no-untyped-def]
     scene.frame_start, scene.frame_end = numbers["first"], numbers["last"]
 
 
-def add_camera(scene, numbers):  # type: ignore[no-untyped-def]
+def add_camera(scene, numbers):
     """Add a camera at the origin that looks along y, with the lens of every frame."""
     data = bpy.data.cameras.new("tracking3d_camera")
     data.sensor_fit, data.sensor_width = "HORIZONTAL", numbers["sensor_width"]
@@ -55,7 +55,7 @@ def add_camera(scene, numbers):  # type: ignore[no-untyped-def]
     return camera
 
 
-def add_object(scene, numbers, folder):  # type: ignore[no-untyped-def]
+def add_object(scene, numbers, folder):
     """Add the textured mesh, its pose in every frame, and hide it where it has none."""
     mesh = bpy.data.meshes.new("tracking3d_object")
     mesh.from_pydata(numbers["vertices"], [], numbers["faces"])
@@ -84,7 +84,7 @@ def add_object(scene, numbers, folder):  # type: ignore[no-untyped-def]
             thing.keyframe_insert("hide_viewport", frame=frame)
 
 
-def add_light(scene):  # type: ignore[no-untyped-def]
+def add_light(scene):
     """Add a sun that shines the way the camera looks."""
     light = bpy.data.objects.new("tracking3d_light", bpy.data.lights.new("tracking3d_light", "SUN"))
     light.matrix_world = scene.camera.matrix_world
@@ -92,7 +92,7 @@ def add_light(scene):  # type: ignore[no-untyped-def]
     scene.collection.objects.link(light)
 
 
-def textured(path):  # type: ignore[no-untyped-def]
+def textured(path):
     """A material with the colours of the picture at ``path``."""
     material = bpy.data.materials.new("tracking3d_texture")
     if bpy.app.version < (5, 0):  # later ones always do

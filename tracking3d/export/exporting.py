@@ -101,7 +101,8 @@ def export_run(
     exporter.check_available()
     reader = RunReader(Path(run), refined=options.answers == "final")
     exported = ExportedRun(reader, options)
-    name = exporter.file_name.format(run=exported.name) or f"{exporter.name}{exporter.suffix}"
+    compact = exported.name.replace("-", "")
+    name = exporter.file_name.format(run=compact) or f"{exporter.name}{exporter.suffix}"
     path = reader.folder / FOLDER / name if out is None else Path(out).resolve()
     _check_place(path, exporter, overwrite)
     if path in (file.resolve() for file in run_files(reader.folder)):
