@@ -25,6 +25,8 @@ CAMERA_NODE = "tracking3d_camera"
 _FLOAT = 5126  # glTF's constant
 _NEAREST = 0.01
 """Of the near plane, in depths of the object's origin in its nearest frame."""
+_LEAST_NEAR = 1e-6
+"""glTF wants it above 0, wherever a damaged run has the object."""
 
 
 def write_animated_glb(run: ExportedRun, path: Path) -> None:
@@ -46,7 +48,8 @@ def write_animated_glb(run: ExportedRun, path: Path) -> None:
 
     def animate(tree: dict[str, Any]) -> None:
         accessors = _add_accessors(tree, tracks)
-        _add_scene(tree, run.camera, _NEAREST * float(-tracks["translation"][:, 2].max()), tracks)
+        depth = float(-tracks["translation"][:, 2].max())
+        _add_scene(tree, run.camera, max(_NEAREST * depth, _LEAST_NEAR), tracks)
         paths = ("translation", "rotation")
         tree["animations"] = [
             {
