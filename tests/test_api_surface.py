@@ -14,8 +14,8 @@ import tracking3d
 from tracking3d.evaluation.score import Scores
 
 EXACT = {
-    "tracking3d": """Frame FrameEstimate ObjectModel PipelineConfig Prompt Session Status __version__ load_config
-        track track_objects""",
+    "tracking3d": """Frame FrameEstimate ObjectModel PipelineConfig Prompt Session Status __version__ export_run
+        load_config track track_objects""",
     "tracking3d.plugins": """FEATURES PluginInfo TRACKERS VARIABLE build_plugin check_options list_plugins
         load_plugin plugin_label""",
     "tracking3d.testing": "check_encoder check_tracker",
@@ -68,6 +68,10 @@ AT_LEAST = {
     "tracking3d.synthesis.suite": "SUITES SUITE_VERSION load_suite make_suite",
     "tracking3d.synthesis.convex_clips": """SyntheticClip SyntheticSpec degrade_masks make_demo_clip
         synthesize""",
+    "tracking3d.export.exporter": "Exporter ExportOptions",
+    "tracking3d.export.exporting": "Export export_run find_format",
+    "tracking3d.export.formats": "FORMATS",
+    "tracking3d.export.supervision_detections": "detections",
     "tracking3d.features.protocol": "FeatureEncoder",
     "tracking3d.features.rgb": "RgbEncoder",
     "tracking3d.frames": "Box Frame Image MaskEstimate Prompt SkippedFrame",

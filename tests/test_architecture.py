@@ -30,7 +30,7 @@ FLOORS = [
         "session",
     },
     {"datasets"},
-    {"synthesis", "evaluation", "speed", "viewer"},
+    {"synthesis", "evaluation", "export", "speed", "viewer"},
     {"benchmark"},
     {"cli", "vot", "__main__"},
 ]

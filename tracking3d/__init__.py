@@ -19,6 +19,7 @@ __all__ = [
     "Session",
     "Status",
     "__version__",
+    "export_run",
     "load_config",
     "track",
     "track_objects",
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from tracking3d.config.loading import load_config
     from tracking3d.config.models import PipelineConfig
     from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
+    from tracking3d.export.exporting import export_run
     from tracking3d.frames import Frame, Prompt
     from tracking3d.pipeline import Session, track, track_objects
 
@@ -39,6 +41,7 @@ _HOME = {
     "Prompt": "tracking3d.frames",
     "Session": "tracking3d.pipeline",
     "Status": "tracking3d.estimation.estimate",
+    "export_run": "tracking3d.export.exporting",
     "load_config": "tracking3d.config.loading",
     "track": "tracking3d.pipeline",
     "track_objects": "tracking3d.pipeline",

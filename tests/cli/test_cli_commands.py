@@ -20,7 +20,7 @@ from tracking3d.config.loading import load_config
 from tracking3d.synthesis import convex_clips
 
 BOX = ("--box", "20,10,20,20")
-COMMANDS = ["run", "demo", "synth", "points", "config show", "config schema", "config validate"]
+COMMANDS = ["run", "demo", "synth", "points", "export", "config show", "config schema", "config validate"]
 COMMANDS += ["plugins list", "plugins new", "models list", "models get", "models verify"]
 COMMANDS += [f"evaluate {command}" for command in ("answers", "suite", "table", "compare", "spread", "peer")]
 GROUPS = ["config", "bench", "bench render", "evaluate", "models", "plugins"]

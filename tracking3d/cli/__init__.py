@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import typer
 
-from tracking3d.cli import bench, config, demo, evaluate, model, models, plugins, points, run, synth
+from tracking3d.cli import bench, config, demo, evaluate, export, model, models, plugins, points, run, synth
 from tracking3d.cli.options import Debug
 from tracking3d.cli.program import Program
 
@@ -23,6 +23,7 @@ app.command(name="demo")(demo.demo)
 app.command(name="synth")(synth.synth)
 app.command(name="points")(points.points)
 app.command(name="model")(model.model)
+app.command(name="export")(export.export)
 app.add_typer(evaluate.app, name="evaluate")
 app.add_typer(models.app, name="models")
 app.add_typer(plugins.app, name="plugins")

@@ -12,6 +12,7 @@ texel at the two poles mixes with the opposite edge.
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -39,26 +40,9 @@ def export_mesh(folder: Path, model: ObjectModel) -> None:
     Raises:
         OutputError: If one cannot be written.
     """
-    image = PillowImage.fromarray(model.texture)
-    simple = trimesh.visual.material.SimpleMaterial(
-        image, diffuse=(255, 255, 255), ambient=(255, 255, 255), specular=(0, 0, 0), name=Path(TEXTURE).stem
-    )
-    text, files = export_obj(
-        split_mesh(model, simple),
-        include_normals=True,
-        return_texture=True,
-        digits=9,
-        mtl_name=MTL,
-        header="tracking3d: object coordinates, OpenCV axes, arbitrary unit",
-    )
-    write_atomic(folder / OBJ, text.encode())
-    for name, data in files.items():
+    for name, data in obj_files(model, "object coordinates, OpenCV axes, arbitrary unit").items():
         write_atomic(folder / name, data)
-    pbr = trimesh.visual.material.PBRMaterial(
-        name=Path(TEXTURE).stem, baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0
-    )
-    glb = export_glb(split_mesh(model, pbr), include_normals=True, tree_postprocessor=_finish_gltf)
-    write_atomic(folder / GLB, glb)
+    write_atomic(folder / GLB, glb_file(model))
     exact = io.BytesIO()
     np.savez_compressed(
         exact,
@@ -69,6 +53,59 @@ def export_mesh(folder: Path, model: ObjectModel) -> None:
         features=model.features,
     )
     write_atomic(folder / FEATURES, exact.getvalue())
+
+
+def obj_files(model: ObjectModel, header: str) -> dict[str, bytes]:
+    """The model as OBJ with MTL and texture: contents by file name.
+
+    Args:
+        model: The object.
+        header: Which coordinates these are, for who opens the file.
+    """
+    simple = trimesh.visual.material.SimpleMaterial(
+        PillowImage.fromarray(model.texture),
+        diffuse=(255, 255, 255),
+        ambient=(255, 255, 255),
+        specular=(0, 0, 0),
+        name=Path(TEXTURE).stem,
+    )
+    text, files = export_obj(
+        split_mesh(model, simple),
+        include_normals=True,
+        return_texture=True,
+        digits=9,
+        mtl_name=MTL,
+        header=f"tracking3d: {header}",
+    )
+    return {OBJ: text.encode(), **files}
+
+
+def glb_file(
+    model: ObjectModel, finish: Callable[[dict[str, Any]], None] | None = None, **more: Any
+) -> bytes:
+    """The model as GLB, turned upright.
+
+    Args:
+        model: The object.
+        finish: Changes the glTF tree once this module is done with it; see trimesh's ``tree_postprocessor``.
+        more: Further arguments of trimesh's ``export_glb``.
+    """
+    pbr = trimesh.visual.material.PBRMaterial(
+        name=Path(TEXTURE).stem,
+        baseColorTexture=PillowImage.fromarray(model.texture),
+        metallicFactor=0.0,
+        roughnessFactor=1.0,
+    )
+
+    def finish_all(tree: dict[str, Any]) -> None:
+        _finish_gltf(tree)
+        if finish is not None:
+            finish(tree)
+
+    data: bytes = export_glb(
+        split_mesh(model, pbr), include_normals=True, tree_postprocessor=finish_all, **more
+    )
+    return data
 
 
 def split_mesh(model: ObjectModel, material: trimesh.visual.material.Material) -> trimesh.Trimesh:

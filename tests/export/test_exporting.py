@@ -1,0 +1,237 @@
+"""Where an export goes: whole or not at all, over nothing that was not meant, and refusals in one sentence."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tracking3d.errors import InputError, OutputError
+from tracking3d.export.exporter import ExportOptions
+from tracking3d.export.exporting import export_run
+from tracking3d.export.formats import FORMATS
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_without_a_place_it_goes_into_the_run(run):
+    assert export_run(run, "tum").path == run / "export" / "tum.txt"
+    done = export_run(run, "kitti", overwrite=True)
+    assert (done.path, done.frames, done.without, done.unit) == (
+        run / "export" / "kitti",
+        5,
+        (2, 4),
+        "arbitrary",
+    )
+    assert export_run(run, "bop").path.name == "tracking3d_run-test.csv"
+    assert export_run(run, "davis").without == (4,)  # a lost frame has a mask
+
+
+def test_a_folder_says_what_it_is(run, tmp_path):
+    export_run(run, "kitti", tmp_path / "out", options=ExportOptions(object_size=0.2))
+    label = json.loads((tmp_path / "out" / "export.json").read_text())
+    assert label["to"] == "kitti"
+    assert label["run"] == str(run)
+    assert label["unit"] == "metre"
+    assert label["frames_without_answer"] == [2, 4]
+
+
+@pytest.mark.parametrize("to", ["tum", "kitti"])
+def test_nothing_is_replaced_unless_that_was_asked(run, tmp_path, to):
+    place = tmp_path / "out"
+    export_run(run, to, place)
+    with pytest.raises(OutputError, match="exists already"):
+        export_run(run, to, place)
+    export_run(run, to, place, options=ExportOptions(of="camera"), overwrite=True)
+    text = (place if to == "tum" else place / "poses.txt").read_text()
+    export_run(run, to, place, overwrite=True)
+    assert (place if to == "tum" else place / "poses.txt").read_text() != text
+    assert names(tmp_path) == ["out"]
+
+
+def test_a_folder_of_somebody_elses_is_never_replaced(run, tmp_path):
+    (tmp_path / "letters").mkdir()
+    (tmp_path / "letters" / "dear.txt").write_text("dear")
+    with pytest.raises(OutputError, match="was not exported"):
+        export_run(run, "kitti", tmp_path / "letters", overwrite=True)
+    assert names(tmp_path / "letters") == ["dear.txt"]
+    with pytest.raises(OutputError, match="is a folder, and tum is a file"):
+        export_run(run, "tum", tmp_path / "letters", overwrite=True)
+    with pytest.raises(OutputError, match="is a file, and kitti is a folder"):
+        export_run(run, "kitti", tmp_path / "letters" / "dear.txt", overwrite=True)
+
+
+def test_an_empty_folder_is_a_place(run, tmp_path):
+    (tmp_path / "out").mkdir()
+    export_run(run, "kitti", tmp_path / "out")
+    assert "poses.txt" in names(tmp_path / "out")
+
+
+@pytest.mark.parametrize("to", ["tum", "kitti"])
+@pytest.mark.parametrize("earlier", [False, True])
+def test_an_export_that_fails_leaves_what_was_there(run, tmp_path, monkeypatch, to, earlier):
+    place = tmp_path / "out"
+    if earlier:
+        export_run(run, to, place)
+    write = FORMATS[to].write
+
+    def fail(exported, path):
+        write(exported, path)
+        raise InputError("half of it is there")
+
+    monkeypatch.setitem(FORMATS, to, replace(FORMATS[to], write=fail))
+    with pytest.raises(InputError, match="half of it"):
+        export_run(run, to, place, overwrite=True)
+    assert names(tmp_path) == (["out"] if earlier else [])
+    if earlier and to == "kitti":
+        assert "export.json" in names(place)
+
+
+def test_what_a_killed_export_left_is_cleared_away(run, tmp_path):
+    (tmp_path / ".out.part").mkdir()
+    (tmp_path / ".out.part" / "half").write_text("")
+    export_run(run, "tum", tmp_path / "out")
+    assert names(tmp_path) == ["out"]
+
+
+def test_an_export_that_was_killed_while_it_was_put_in_place_is_given_back(run, tmp_path):
+    export_run(run, "kitti", tmp_path / "out")
+    (tmp_path / ".out.part").mkdir()
+    (tmp_path / "out").rename(tmp_path / ".out.part" / "earlier")
+    with pytest.raises(InputError):
+        # Whatever comes next, here one that fails.
+        export_run(run, "kitti", tmp_path / "out", options=ExportOptions(of="hand"))
+    export_run(run, "kitti", tmp_path / "out", overwrite=True)
+    assert "poses.txt" in names(tmp_path / "out")
+    assert names(tmp_path) == ["out"]
+
+
+def test_files_of_the_run_are_not_replaced(run):
+    before = (run / "run.json").read_bytes()
+    with pytest.raises(OutputError, match="is a file of the run itself"):
+        export_run(run, "coco", run / "run.json", overwrite=True)
+    with pytest.raises(OutputError, match="was not exported"):
+        export_run(run, "davis", run / "masks", overwrite=True)
+    assert (run / "run.json").read_bytes() == before
+
+
+def test_an_earlier_export_survives_where_the_new_one_cannot_be_put_in_place(run, tmp_path, monkeypatch):
+    export_run(run, "kitti", tmp_path / "out")
+    before = (tmp_path / "out" / "poses.txt").read_bytes()
+
+    def write_nothing(exported, path):
+        pass
+
+    monkeypatch.setitem(FORMATS, "kitti", replace(FORMATS["kitti"], write=write_nothing))
+    with pytest.raises(OutputError, match="cannot be written"):
+        export_run(run, "kitti", tmp_path / "out", overwrite=True)
+    assert (tmp_path / "out" / "poses.txt").read_bytes() == before
+    assert names(tmp_path) == ["out"]
+
+
+def test_every_format_is_listed_by_its_name_with_options_that_there_are():
+    for name, exporter in FORMATS.items():
+        assert exporter.name == name
+        assert bool(exporter.modules) == bool(exporter.extra)
+        assert exporter.options <= set(ExportOptions.__dataclass_fields__)
+
+
+@pytest.mark.parametrize("to", [name for name, exporter in FORMATS.items() if exporter.modules])
+def test_without_its_extra_a_format_says_what_to_install(run, tmp_path, monkeypatch, to):
+    (module,) = FORMATS[to].modules
+    monkeypatch.setitem(sys.modules, module, None)  # as if it were not installed
+    with pytest.raises(InputError, match=rf"needs {module}.*pip install 'tracking3d\[{FORMATS[to].extra}\]'"):
+        export_run(run, to, tmp_path / "out")
+    assert not FORMATS[to].is_available
+
+
+def test_the_page_names_every_format_and_extra():
+    page = (Path(__file__).resolve().parents[2] / "docs/export.md").read_text(encoding="utf-8")
+    rows = [line.split("|")[1] for line in page.splitlines() if line.startswith("| `")]
+    for name, exporter in FORMATS.items():
+        assert sum(f"`{name}`" in row for row in rows) == 2, name  # what it is, and what checked it
+        assert f"tracking3d[{exporter.extra}]" in page or not exporter.extra
+
+
+def test_extras_are_declared():
+    import tomllib
+
+    file = Path(__file__).resolve().parents[2] / "pyproject.toml"
+    extras = tomllib.loads(file.read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    assert {exporter.extra for exporter in FORMATS.values() if exporter.extra} <= set(extras)
+
+
+@pytest.mark.parametrize(
+    ("to", "options", "words"),
+    [
+        ("gltf", {}, "There is no format gltf; to= takes tum, kitti"),
+        ("tum", {"cut_out": True}, "no use for cut_out="),
+        ("vot", {"object_size": 1.0}, "no use for object_size="),
+        ("tum", {"fps": 0.0}, "fps= is 0"),
+        ("tum", {"object_size": float("nan")}, "object_size= is nan"),
+        ("tum", {"of": "hand"}, "Poses cannot be of 'hand'"),
+        ("tum", {"answers": "best"}, "There are no answers 'best'"),
+        ("tapvid", {"xy": ((500.0, 3.0),)}, "There is no pixel 500,3"),
+        ("tapvid", {"frame": 2}, "lost in frame 2"),
+        ("tapvid", {"frame": 99}, "no frame 99"),
+        ("cut-outs", {"source": "absent.mp4"}, "say with source= where"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_in_a_sentence(run, tmp_path, to, options, words):
+    with pytest.raises(InputError) as told:
+        export_run(run, to, tmp_path / "out", options=ExportOptions(**options))
+    assert words in str(told.value)
+    assert names(tmp_path) == []
+
+
+def test_the_video_of_another_run_is_refused(run, tmp_path):
+    from PIL import Image
+
+    for folder, size in (("other", (128, 96)), ("larger", (130, 96))):
+        (tmp_path / folder).mkdir()
+        Image.fromarray(np.zeros((size[1], size[0], 3), np.uint8)).save(tmp_path / folder / "000.png")
+    for folder, words in (("other", "not the video of the run"), ("larger", "130 x 96 pixels")):
+        with pytest.raises(InputError, match=words):
+            export_run(
+                run, "cut-outs", tmp_path / "out", options=ExportOptions(source=str(tmp_path / folder))
+            )
+
+
+def test_a_camera_cannot_be_looked_through_again(run, tmp_path):
+    shutil.copytree(run, tmp_path / "live")
+    file = tmp_path / "live" / "run.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"source": "0"}))
+    with pytest.raises(InputError, match="no video that can be read again"):
+        export_run(tmp_path / "live", "colmap", tmp_path / "out")
+    export_run(tmp_path / "live", "colmap", tmp_path / "out", options=ExportOptions(images=False))
+
+
+def test_a_run_without_a_pose_has_no_trajectory_but_masks(run, tmp_path):
+    shutil.copytree(run, tmp_path / "lost")
+    lines = (run / "frames.jsonl").read_text().replace('"status": "tracked"', '"status": "lost"')
+    (tmp_path / "lost" / "frames.jsonl").write_text(lines)
+    with pytest.raises(InputError, match="no frame with a pose"):
+        export_run(tmp_path / "lost", "tum", tmp_path / "out.txt")
+    assert export_run(tmp_path / "lost", "davis", tmp_path / "out").frames == 6
+
+
+def test_causal_answers_are_those_before_the_refinement(run, tmp_path):
+    shutil.copytree(run, tmp_path / "refined")
+    file = tmp_path / "refined" / "frames.jsonl"
+    first = json.loads(file.read_text().splitlines()[0])
+    first["T_cam_obj"][2][3] = 9.0
+    with file.open("a") as lines:
+        lines.write(json.dumps(first | {"refined": True}) + "\n")
+    depths = []
+    for answers in ("final", "causal"):
+        options = ExportOptions(answers=answers)
+        path = export_run(tmp_path / "refined", "tum", tmp_path / answers, options=options).path
+        depths.append(np.loadtxt(path)[0, 3])
+    assert depths == [9.0, 4.0]

@@ -1,0 +1,215 @@
+"""What a format is given of a run: poses, masks, mesh and pictures, with lengths in metres where these are known."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from tracking3d.datasets.clip import is_rigid
+from tracking3d.errors import InputError, argument
+from tracking3d.estimation.estimate import ObjectModel, Status
+from tracking3d.export.exporter import ExportOptions
+from tracking3d.frames import Frame
+from tracking3d.geometry.camera import Camera
+from tracking3d.results.mesh_export import load_model
+from tracking3d.results.records import FrameRecord
+from tracking3d.results.run_reader import RunReader
+from tracking3d.video.selection import parse_selection
+
+FRAMES_PER_SECOND = 30.0
+"""Taken by formats that cannot do without, where nobody knows."""
+
+ARBITRARY = "arbitrary"
+"""What the unit of a run is called whose object nobody measured."""
+
+
+@dataclass(frozen=True, eq=False)
+class PosedFrame:
+    """A frame whose pose can be relied on.
+
+    Attributes:
+        index: Its index in the source.
+        seconds: Time since the source's start, None where not known.
+        T_cam_obj: ``(4, 4)`` float64, with the translation in the unit of the export.
+        camera: The camera that the pose is of.
+        record: Everything else that the run knows of it; lengths there are in the run's unit.
+    """
+
+    index: int
+    seconds: float | None
+    T_cam_obj: NDArray[np.float64]
+    camera: Camera
+    record: FrameRecord
+
+    def T_through(self, camera: Camera) -> NDArray[np.float64]:
+        """The pose for a format that has one lens for all frames, ``camera``.
+
+        Where the frame was solved with another focal length, the object is moved along the axis until it is seen at
+        its place and in its size again; what remains is the perspective within the object.
+        """
+        if (self.camera.fx, self.camera.cx, self.camera.cy) == (camera.fx, camera.cx, camera.cy):
+            return self.T_cam_obj
+        x, y, z = self.T_cam_obj[:3, 3]
+        pixel = np.array(
+            [self.camera.fx * x / z + self.camera.cx, self.camera.fy * y / z + self.camera.cy, 1.0]
+        )
+        T = self.T_cam_obj.copy()
+        T[:3, 3] = z * camera.fx / self.camera.fx * np.linalg.solve(camera.K, pixel)
+        return T
+
+
+class ExportedRun:
+    """A run, as its export was asked for.
+
+    Args:
+        reader: The run with the answers that were asked for.
+        options: What was asked.
+    """
+
+    def __init__(self, reader: RunReader, options: ExportOptions) -> None:
+        self.reader = reader
+        self.options = options
+
+    @property
+    def name(self) -> str:
+        """The run folder's name, of letters, digits and hyphens alone."""
+        return re.sub("[^A-Za-z0-9]+", "-", self.reader.folder.resolve().name).strip("-") or "run"
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of the full frame."""
+        return self.reader.camera
+
+    @cached_property
+    def records(self) -> dict[int, FrameRecord]:
+        """The answers by frame index, in order."""
+        return {record.index: record for record in self.reader.frames}
+
+    @cached_property
+    def span(self) -> range:
+        """The frames from the first to the last answer, those that were skipped in between too.
+
+        Raises:
+            InputError: If the run has no answer.
+        """
+        if not self.records:
+            raise InputError(f"The run {self.reader.folder} has no frame yet; there is nothing to export.")
+        step = parse_selection(self.reader.description.get("selection")).step
+        return range(min(self.records), max(self.records) + 1, step)
+
+    @cached_property
+    def poses(self) -> list[PosedFrame]:
+        """The frames that have a pose; those that are lost have none.
+
+        Raises:
+            InputError: If there is no such frame.
+        """
+        posed = [
+            PosedFrame(n, self.seconds(n), self._scaled(one.T_cam_obj), self.reader.camera_of(one), one)
+            for n, one in self.records.items()
+            if one.status is not Status.LOST and is_rigid(one.T_cam_obj)
+        ]
+        if not posed:
+            raise InputError(
+                f"The run {self.reader.folder} has no frame with a pose; there is nothing to export."
+            )
+        return posed
+
+    @property
+    def without_pose(self) -> list[int]:
+        """Frames of `span` that have no pose, since they are lost or were skipped."""
+        posed = {one.index for one in self.poses}
+        return [index for index in self.span if index not in posed]
+
+    @property
+    def known_fps(self) -> float | None:
+        """Frames of the source per second, counted by index; None where nobody knows."""
+        if self.options.fps is not None:
+            return self.options.fps
+        fps = self.reader.description.get("fps")
+        if not isinstance(fps, int | float) or not 0 < fps < np.inf:
+            return None
+        # A run on every second frame has half the rate, and its indices are still the source's.
+        return float(fps) * parse_selection(self.reader.description.get("selection")).step
+
+    @property
+    def fps(self) -> float:
+        """Frames of the source per second; `FRAMES_PER_SECOND` where nobody knows."""
+        return self.known_fps or FRAMES_PER_SECOND
+
+    def seconds(self, index: int) -> float | None:
+        """Time of a frame since the start of the source; None where nobody knows."""
+        record = self.records.get(index)
+        if self.options.fps is None and record is not None and record.time is not None:
+            return record.time
+        return None if self.known_fps is None else index / self.known_fps
+
+    @cached_property
+    def scale(self) -> float:
+        """Units of the export per unit of the run.
+
+        Raises:
+            InputError: If the run has no mesh to measure.
+        """
+        if self.options.object_size is None:
+            return 1.0
+        return self.options.object_size / longest_side(load_model(self.reader.mesh_folder).vertices)
+
+    @property
+    def unit(self) -> str:
+        """The unit of lengths, in words."""
+        return "metre" if self.options.object_size is not None else ARBITRARY
+
+    @cached_property
+    def model(self) -> ObjectModel:
+        """The mesh in object coordinates, in the unit of the export.
+
+        Raises:
+            InputError: If the run has none.
+        """
+        model = load_model(self.reader.mesh_folder)
+        return replace(model, vertices=model.vertices * self.scale)
+
+    def mask(self, index: int) -> NDArray[np.bool_]:
+        """``(H, W)``: the answer's mask of a frame of `span`; empty where the frame was skipped."""
+        if index not in self.records:
+            return np.zeros((self.camera.height, self.camera.width), bool)
+        return self.reader.mask(index)
+
+    def pictures(self) -> Iterator[Frame]:
+        """The pictures of all frames that have an answer, read from the source once more.
+
+        Raises:
+            InputError: If the source is not there any more, or is another one.
+        """
+        from tracking3d.export.pictures import read_pictures
+
+        return read_pictures(self.reader, self.options.source, self.records)
+
+    def _scaled(self, T_cam_obj: NDArray[np.float64]) -> NDArray[np.float64]:
+        scaled = T_cam_obj.copy()
+        scaled[:3, 3] *= self.scale
+        return scaled
+
+
+def longest_side(vertices: NDArray[np.float64]) -> float:
+    """The longest side of the smallest box, turned as it likes, around ``(V, 3)``: what a ruler would give.
+
+    Raises:
+        InputError: If the vertices have no extent.
+    """
+    try:
+        longest = float(max(trimesh.bounds.oriented_bounds(vertices)[1]))
+    except Exception:  # a flat or otherwise degenerate hull
+        longest = float(np.ptp(vertices, axis=0).max())
+    if not 0 < longest < np.inf:
+        raise InputError(
+            f"The mesh of the run has no size; leave out {argument('object_size=', '--object-size')}."
+        )
+    return longest

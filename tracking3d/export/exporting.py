@@ -1,0 +1,196 @@
+"""Exporting a run: which answers, where to, and that it appears whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from tracking3d.errors import InputError, OutputError, argument
+from tracking3d.export.exported_run import ARBITRARY, ExportedRun
+from tracking3d.export.exporter import Exporter, ExportOptions
+from tracking3d.export.formats import FORMATS
+from tracking3d.results.files import writing
+from tracking3d.results.layout import OVERWRITE, partial_path, run_files
+from tracking3d.results.run_reader import RunReader
+
+FOLDER = "export"
+"""In the run folder, where exports go if nothing else is said."""
+LABEL = "export.json"
+"""In every folder that is exported: what it is; and that it may be replaced."""
+_FORMAT = "tracking3d-export"
+_OUT = argument("out=", "--out")
+_TO = argument("to=", "--to")
+_NAMED = {
+    "object_size": argument("object_size=", "--object-size"),
+    "fps": argument("fps=", "--fps"),
+    "source": argument("source=", "--source"),
+    "of": argument("of=", "--of"),
+    "cut_out": argument("cut_out=", "--cut-out"),
+    "images": argument("images=", "--no-images"),
+    "frame": argument("frame=", "--frame"),
+    "xy": argument("xy=", "--xy"),
+}
+
+
+@dataclass(frozen=True)
+class Export:
+    """What was exported.
+
+    Attributes:
+        path: The file or folder.
+        unit: The unit of lengths, in words; None where the format has none.
+        frames: How many frames have what the format is about, a pose or a mask.
+        without: Frames between the first and the last that have none: skipped, and of poses, lost.
+        not_finished: A sentence about a run that has not come to its end; empty for one that has.
+    """
+
+    path: Path
+    unit: str | None
+    frames: int
+    without: tuple[int, ...]
+    not_finished: str = ""
+
+    @property
+    def in_words(self) -> str:
+        """How many frames there are, and the unit where it is arbitrary."""
+        left_out = f", {len(self.without)} without an answer" if self.without else ""
+        unit = ", lengths in the run's own unit" if self.unit == ARBITRARY else ""
+        return f"{self.frames} frames{left_out}{unit}"
+
+
+def find_format(name: str) -> Exporter:
+    """The format of that name.
+
+    Raises:
+        InputError: If there is none; names those that there are.
+    """
+    if name not in FORMATS:
+        raise InputError(f"There is no format {name}; {_TO} takes {', '.join(FORMATS)}.")
+    return FORMATS[name]
+
+
+def export_run(
+    run: Path | str,
+    to: str,
+    out: Path | str | None = None,
+    *,
+    options: ExportOptions | None = None,
+    overwrite: bool = False,
+) -> Export:
+    """Write a run in the format of another tool.
+
+    Args:
+        run: The run folder.
+        to: Name of the format, see `tracking3d.export.formats.FORMATS`.
+        out: The file or folder to write; None takes one in the folder ``export`` of the run.
+        options: What else is asked; None asks nothing.
+        overwrite: Whether an earlier file, or folder that was exported, is replaced.
+
+    Raises:
+        InputError: If the run, the format or an option cannot be used.
+        OutputError: If something is there already, or cannot be written.
+    """
+    options = options or ExportOptions()
+    exporter = find_format(to)
+    exporter.check_options(options, _NAMED)
+    _check(options)
+    exporter.check_available()
+    reader = RunReader(Path(run), refined=options.answers == "final")
+    exported = ExportedRun(reader, options)
+    compact = exported.name.replace("-", "")
+    name = exporter.file_name.format(run=compact) or f"{exporter.name}{exporter.suffix}"
+    path = reader.folder / FOLDER / name if out is None else Path(out).resolve()
+    _check_place(path, exporter, overwrite)
+    if path in (file.resolve() for file in run_files(reader.folder)):
+        raise OutputError(f"{path} is a file of the run itself; choose another {_OUT}.")
+    needs_poses = exporter.kind not in ("masks", "model")
+    answered = {one.index for one in exported.poses} if needs_poses else set(exported.records)
+    without = tuple(index for index in exported.span if index not in answered)
+    with _placed(path) as place:
+        exporter.write(exported, place)
+        if place.is_dir():
+            label = _label(exporter, exported, without)
+            (place / LABEL).write_text(json.dumps(label, indent=1) + "\n", encoding="utf-8")
+    unit = exported.unit if "object_size" in exporter.options else None
+    given = path if out is None else Path(out)
+    return Export(given, unit, len(answered), without, reader.not_finished)
+
+
+def _check(options: ExportOptions) -> None:
+    for name in ("object_size", "fps"):
+        value = getattr(options, name)
+        if value is not None and not 0 < value < float("inf"):
+            raise InputError(f"{_NAMED[name]} is {value:g}; give a number above 0.")
+    if options.answers not in ("final", "causal"):
+        raise InputError(f"There are no answers '{options.answers}'; say final or causal.")
+    if options.of not in ("object", "camera"):
+        raise InputError(f"Poses cannot be of '{options.of}'; {_NAMED['of']} is object or camera.")
+
+
+def _label(exporter: Exporter, run: ExportedRun, without: tuple[int, ...]) -> dict[str, object]:
+    """What somebody who finds the folder alone should know."""
+    return {
+        "format": _FORMAT,
+        "to": exporter.name,
+        "run": str(run.reader.folder.resolve()),
+        "answers": run.options.answers,
+        "unit": run.unit,
+        "frames_without_answer": without,
+    }
+
+
+def _check_place(path: Path, exporter: Exporter, overwrite: bool) -> None:
+    """Make sure that nothing is lost at ``path``."""
+    if not path.exists():
+        return
+    is_folder = path.is_dir()
+    if is_folder and not any(path.iterdir()) and not exporter.suffix:
+        return
+    if is_folder != (not exporter.suffix):
+        kinds = ("file", "folder") if exporter.suffix else ("folder", "file")
+        raise OutputError(
+            f"{path} is a {kinds[1]}, and {exporter.name} is a {kinds[0]}; choose another {_OUT}."
+        )
+    if not overwrite:
+        raise OutputError(f"{path} exists already; choose another {_OUT} or pass {OVERWRITE}.")
+    if is_folder and not _is_export(path):
+        raise OutputError(f"{path} holds something that was not exported; choose another {_OUT}.")
+
+
+def _is_export(folder: Path) -> bool:
+    try:
+        label = json.loads((folder / LABEL).read_bytes())
+    except (OSError, ValueError):
+        return False
+    return isinstance(label, dict) and label.get("format") == _FORMAT
+
+
+@contextmanager
+def _placed(path: Path) -> Iterator[Path]:
+    """A place of the same name in a folder beside ``path``; what is there at a good end takes the place of ``path``."""
+    workshop = partial_path(path)
+    made, earlier = workshop / path.name, workshop / "earlier"
+    with writing(path):
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if earlier.is_dir() and not path.exists():  # killed at the worst moment
+                earlier.rename(path)
+            _remove(workshop)
+            workshop.mkdir()
+            yield made
+            if path.is_dir():  # a rename does not replace a folder
+                path.rename(earlier)
+            made.replace(path)
+        finally:
+            if earlier.is_dir() and not path.exists():
+                earlier.rename(path)
+            _remove(workshop)
+
+
+def _remove(folder: Path) -> None:
+    if folder.is_dir():
+        shutil.rmtree(folder)

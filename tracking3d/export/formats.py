@@ -1,0 +1,129 @@
+"""All formats, by the names that select them."""
+
+from __future__ import annotations
+
+from tracking3d.export.after_effects import write_after_effects
+from tracking3d.export.animated_glb import write_animated_glb
+from tracking3d.export.blender import write_blender
+from tracking3d.export.bop_poses import write_bop_poses
+from tracking3d.export.coco import write_coco
+from tracking3d.export.colmap import write_colmap_binary, write_colmap_text
+from tracking3d.export.cut_outs import write_cut_outs, write_prores, write_vp9
+from tracking3d.export.exporter import Exporter
+from tracking3d.export.indexed_masks import write_davis, write_youtube_vos
+from tracking3d.export.kitti import write_kitti
+from tracking3d.export.model_files import write_glb, write_ply, write_stl
+from tracking3d.export.nerfstudio import write_nerfstudio
+from tracking3d.export.nuke import write_nuke
+from tracking3d.export.point_tracks import write_points_csv, write_tapvid
+from tracking3d.export.pose_table import write_csv, write_parquet
+from tracking3d.export.rerun_recording import write_rerun
+from tracking3d.export.ros_bag import write_ros_bag
+from tracking3d.export.tum import write_tum
+from tracking3d.export.usdz import write_usdz
+from tracking3d.export.vot_masks import write_vot
+
+_LENGTHS = frozenset({"object_size"})
+_TIMED = _LENGTHS | {"fps"}
+_PICTURES = frozenset({"source"})
+_TRAINING = _LENGTHS | _PICTURES | {"cut_out", "images"}
+_POINTS = frozenset({"frame", "xy"})
+
+_ALL = (
+    Exporter("tum", "poses", "trajectory in the TUM format", write_tum, ".txt", options=_TIMED | {"of"}),
+    Exporter("kitti", "poses", "poses, calibration and times of KITTI", write_kitti, options=_TIMED | {"of"}),
+    Exporter("csv", "poses", "table of poses", write_csv, ".csv", options=_TIMED),
+    Exporter(
+        "parquet",
+        "poses",
+        "the same table as Parquet",
+        write_parquet,
+        ".parquet",
+        options=_TIMED,
+        modules=("pyarrow",),
+        extra="export",
+    ),
+    Exporter(
+        "bop",
+        "poses",
+        "results of the BOP Challenge",
+        write_bop_poses,
+        ".csv",
+        "tracking3d_{run}-test.csv",
+        options=_LENGTHS,
+    ),
+    Exporter(
+        "ros-bag",
+        "poses",
+        "ROS 2 bag: poses, camera, TF",
+        write_ros_bag,
+        options=_TIMED,
+        modules=("rosbags",),
+        extra="ros",
+    ),
+    Exporter(
+        "colmap", "cameras", "COLMAP model as text, pictures, masks", write_colmap_text, options=_TRAINING
+    ),
+    Exporter("colmap-binary", "cameras", "the same, binary", write_colmap_binary, options=_TRAINING),
+    Exporter(
+        "nerfstudio", "cameras", "transforms.json, pictures, masks", write_nerfstudio, options=_TRAINING
+    ),
+    Exporter("davis", "masks", "indexed PNG as DAVIS has them", write_davis),
+    Exporter("youtube-vos", "masks", "indexed PNG and meta.json of YouTube-VOS", write_youtube_vos),
+    Exporter("coco", "masks", "COCO's JSON, run-length encoded", write_coco, ".json"),
+    Exporter("vot", "masks", "regions of the VOT toolkit", write_vot, ".txt"),
+    Exporter("cut-outs", "masks", "the object as PNG with alpha", write_cut_outs, options=_PICTURES),
+    Exporter(
+        "vp9", "masks", "the object as WebM with alpha", write_vp9, ".webm", options=_PICTURES | {"fps"}
+    ),
+    Exporter(
+        "prores",
+        "masks",
+        "the object as ProRes 4444 with alpha",
+        write_prores,
+        ".mov",
+        options=_PICTURES | {"fps"},
+    ),
+    Exporter("tapvid", "points", "point tracks as TAP-Vid's arrays", write_tapvid, ".npz", options=_POINTS),
+    Exporter("points-csv", "points", "point tracks as a table", write_points_csv, ".csv", options=_POINTS),
+    Exporter("glb", "model", "textured mesh, y up", write_glb, ".glb", options=_LENGTHS),
+    Exporter("ply", "model", "mesh with colours, object coordinates", write_ply, ".ply", options=_LENGTHS),
+    Exporter("stl", "model", "mesh without colours, object coordinates", write_stl, ".stl", options=_LENGTHS),
+    Exporter(
+        "animated-glb",
+        "scene",
+        "the object moving before the camera",
+        write_animated_glb,
+        ".glb",
+        options=_TIMED,
+    ),
+    Exporter(
+        "usdz",
+        "scene",
+        "the same as USDZ",
+        write_usdz,
+        ".usdz",
+        options=_TIMED,
+        modules=("pxr",),
+        extra="usd",
+    ),
+    Exporter(
+        "blender", "scene", "Python script that builds the scene", write_blender, options=_TIMED | _PICTURES
+    ),
+    Exporter(
+        "after-effects", "scene", "script with camera and null", write_after_effects, ".jsx", options=_TIMED
+    ),
+    Exporter("nuke", "scene", "camera and axis as .chan, mesh as OBJ", write_nuke, options=_LENGTHS),
+    Exporter(
+        "rerun",
+        "scene",
+        "recording with pictures, masks, mesh and poses",
+        write_rerun,
+        ".rrd",
+        options=_TIMED | _PICTURES | {"images"},
+        modules=("rerun",),
+        extra="rerun",
+    ),
+)
+
+FORMATS = {exporter.name: exporter for exporter in _ALL}

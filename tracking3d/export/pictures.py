@@ -1,0 +1,58 @@
+"""The pictures of a run, read from its source once more."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Iterator
+
+from tracking3d.checkpoint.progress import checksum
+from tracking3d.errors import InputError, argument
+from tracking3d.frames import Frame, SkippedFrame, pixels
+from tracking3d.results.run_reader import RunReader
+from tracking3d.video import open_source
+
+_SOURCE = argument("source=", "--source")
+
+
+def read_pictures(run: RunReader, source: str | None, wanted: Container[int]) -> Iterator[Frame]:
+    """The pictures of the ``wanted`` frames, in order.
+
+    Args:
+        run: The run.
+        source: Where the video is; None where the run found it.
+        wanted: Frame indices.
+
+    Raises:
+        InputError: If the video is not there, is a camera, or is another one than the run's.
+    """
+    name = source if source is not None else run.description.get("source")
+    if not isinstance(name, str) or name.isdigit():
+        raise InputError(
+            f"The run {run.folder} is of no video that can be read again; give one as {_SOURCE}."
+        )
+    try:
+        opened = open_source(name, run.description.get("selection"))
+    except InputError as error:
+        raise InputError(
+            f"The pictures of the run {run.folder} cannot be read: {str(error).rstrip('.')}; say with {_SOURCE} where "
+            f"its video is now."
+        ) from error
+    first = (run.description.get("given") or {}).get("first_picture")
+    size = run.camera.height, run.camera.width
+    begun = False
+    for frame in opened:
+        if isinstance(frame, SkippedFrame) or frame.index not in wanted:
+            continue
+        if frame.size != size:
+            raise InputError(
+                f"Frame {frame.index} of {name} has {pixels(frame.size)} pixels, those of the run {run.folder} have "
+                f"{pixels(size)}; give the video of the run as {_SOURCE}."
+            )
+        if not begun and first is not None and checksum(frame.image) != first:
+            raise InputError(
+                f"{name} is not the video of the run {run.folder}: frame {frame.index} is another picture; give the "
+                f"right one as {_SOURCE}."
+            )
+        begun = True
+        yield frame
+    if not begun:
+        raise InputError(f"{name} has no frame of the run {run.folder}; give its video as {_SOURCE}.")
