@@ -29,7 +29,7 @@ FLOORS = [
         "session",
     },
     {"datasets"},
-    {"synthesis", "evaluation", "speed", "viewer"},
+    {"synthesis", "evaluation", "report", "speed", "viewer"},
     {"benchmark"},
     {"cli", "vot", "__main__"},
 ]

@@ -73,7 +73,8 @@ def _write(folders: Sequence[Path]) -> None:
     except Exception as error:
         sentence = error.at_the_command_line if isinstance(error, Tracking3dError) else f"{error}."
         typer.echo(
-            f"There is no report: {' '.join(sentence.split())} `tracking3d report` tries again.", err=True
+            f"The report could not be written: {' '.join(sentence.split())} `tracking3d report` tries again.",
+            err=True,
         )
     except KeyboardInterrupt:
-        typer.echo("There is no report: interrupted. `tracking3d report` tries again.", err=True)
+        typer.echo("The report was not finished: interrupted. `tracking3d report` tries again.", err=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -160,7 +161,7 @@ def stretches(indices: Sequence[int], statuses: Sequence[str], reasons: Sequence
             x=first * unit,
             width=(following - first) * unit,
         )
-        for first, following in zip(begins, [*begins[1:], len(kinds)], strict=True)
+        for first, following in pairwise([*begins, len(kinds)])
     ]
 
 

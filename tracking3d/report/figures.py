@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from tracking3d.datasets.clip import is_rigid
 from tracking3d.estimation.estimate import Status
 from tracking3d.results.description import stages_of
 from tracking3d.results.records import FrameRecord
@@ -30,10 +32,10 @@ def status_counts(records: Sequence[FrameRecord]) -> dict[str, int]:
 
 
 def believed_poses(records: Sequence[FrameRecord]) -> NDArray[np.float64]:
-    """``(N, 4, 4)`` poses; NaN where the object was lost or the pose is no number."""
+    """``(N, 4, 4)`` poses; NaN where the object was lost or that is no pose."""
     poses = np.full((len(records), 4, 4), np.nan)
     for number, record in enumerate(records):
-        if record.status is not Status.LOST and np.isfinite(record.T_cam_obj).all():
+        if record.status is not Status.LOST and is_rigid(record.T_cam_obj):
             poses[number] = record.T_cam_obj
     return poses
 
@@ -55,10 +57,14 @@ def turns(T_cam_obj: NDArray[np.float64]) -> NDArray[np.float64]:
     angles = np.full(len(T_cam_obj), np.nan)
     known = np.flatnonzero(np.isfinite(T_cam_obj).all((1, 2)))
     if len(known):
-        relative = T_cam_obj[known, :3, :3] @ T_cam_obj[known[0], :3, :3].T
-        traces = np.trace(relative, axis1=1, axis2=2)
-        angles[known] = np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1)))
+        first = np.broadcast_to(T_cam_obj[known[0], :3, :3], (len(known), 3, 3))
+        angles[known] = angles_between(T_cam_obj[known, :3, :3], first)
     return angles
+
+
+def angles_between(R_a: NDArray[np.float64], R_b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """``(N,)`` degrees between ``(N, 3, 3)`` rotations."""
+    return np.degrees(Rotation.from_matrix(R_a @ R_b.transpose(0, 2, 1)).magnitude())
 
 
 @dataclass(frozen=True)

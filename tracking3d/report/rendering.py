@@ -5,11 +5,13 @@ from __future__ import annotations
 import base64
 import hashlib
 from functools import cache
-from importlib import metadata, resources
+from importlib import resources
 from typing import Any
 
 import jinja2
 from markupsafe import Markup
+
+from tracking3d.results.description import versions
 
 
 def render_page(template: str, scripts: tuple[str, ...] = (), **values: Any) -> bytes:
@@ -29,9 +31,8 @@ def render_page(template: str, scripts: tuple[str, ...] = (), **values: Any) -> 
         f"style-src '{_hash(style)}'; script-src '{_hash(script)}'"
     )
     page = _environment().get_template(template)
-    text = page.render(
-        style=Markup(style), script=Markup(script), policy=policy, version=metadata.version("tracking3d"), **values
-    )
+    version = versions()["tracking3d"] or ""
+    text = page.render(style=Markup(style), script=Markup(script), policy=policy, version=version, **values)
     return text.encode("utf-8", "replace")
 
 

@@ -13,9 +13,9 @@ from tracking3d.results.layout import partial_path
 from tracking3d.results.mesh_view import render_view
 from tracking3d.video.writer import VideoWriter
 
-VIEWS = 60
-FPS = 15.0
-SIDE = 400
+VIEWS = 48
+FPS = 12.0
+SIDE = 320
 PITCH = 20.0
 """Degrees by which the views look down on the object."""
 

@@ -98,6 +98,7 @@ def draw_contact_sheet(
         views = _views(thumbnails, model)
         tiles += views + [_blank() for _ in range(VIEWS - len(views))]
     tiles.append(_legend(run))
+    tiles += [_blank() for _ in range(-len(tiles) % COLUMNS)]
     rows = [np.concatenate(tiles[i : i + COLUMNS], 1) for i in range(0, len(tiles), COLUMNS)]
     return np.concatenate([*rows, _footer(run)], 0)
 
@@ -155,8 +156,8 @@ def _legend(run: dict[str, Any]) -> Image:
         (f"{counts['frames']} frames", drawing.INK),
         *((f"{counts[status.value]} {status.value}", drawing.STATUS[status]) for status in Status),
         (f"{counts['keyframes']} keyframes", drawing.KEYFRAME),
-        ("of the mask tracker", drawing.INITIAL),
         ("outline of the answer", drawing.REFINED),
+        ("of the mask tracker", drawing.INITIAL),
         *((text, drawing.INK) for text in _of_masks(run)),
     ]
     for row, (text, colour) in enumerate(lines):
