@@ -65,7 +65,9 @@ def browser() -> Iterator[Any]:
     path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if path is None:
         pytest.skip("there is no Chromium on this machine")
-    driver = pytest.importorskip("playwright.sync_api", reason="pip install 'tracking3d[browser]' drives Chromium")
+    driver = pytest.importorskip(
+        "playwright.sync_api", reason="pip install 'tracking3d[browser]' drives Chromium"
+    )
     with driver.sync_playwright() as playwright:
         opened = playwright.chromium.launch(
             executable_path=path, args=["--no-sandbox", "--enable-unsafe-swiftshader"]

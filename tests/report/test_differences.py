@@ -131,7 +131,7 @@ def test_what_cannot_be_of_one_video_is_refused(run_of, tmp_path):
     folder = run_of("a", frames=3)
     clip = turning_sphere_of(2, 80, 60)
     written_run(tmp_path / "small", clip)
-    with pytest.raises(InputError, match="frames of 160 x 120 pixels and .* of 80 x 60"):
+    with pytest.raises(InputError, match=r"frames of 160 x 120 pixels and .* of 80 x 60"):
         compare_runs([folder, tmp_path / "small"])
     later = run_of("b", lambda estimate: dataclasses.replace(estimate, index=estimate.index + 100), frames=3)
     with pytest.raises(InputError, match="no frame in common"):

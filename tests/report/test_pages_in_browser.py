@@ -55,7 +55,9 @@ def test_the_slider_moves_picture_words_plots_and_model(browser, report):
         assert page.inner_text("#said") == "Frame 5: lost, confidence 0, keyframe, 0.17 s\nout of sight"
         assert page.get_attribute("#picture", "src") != first
         assert page.get_attribute("#slider", "aria-valuetext") == "frame 5, lost"
-        assert {line.get_attribute("x1") for line in page.query_selector_all(".cursor")} == {str(1000 * 5.5 / 12)}
+        assert {line.get_attribute("x1") for line in page.query_selector_all(".cursor")} == {
+            str(1000 * 5.5 / 12)
+        }
         page.wait_for_selector("#model.unknown")  # the model is dimmed where nothing is known of its pose
         page.keyboard.press("Home")
         page.wait_for_selector("#model:not(.unknown)")
@@ -156,7 +158,9 @@ def test_a_hostile_run_is_shown_and_does_nothing(browser, run_folder, described,
 
 def test_the_policy_of_a_page_holds_even_if_something_got_into_it(browser, report, tmp_path):
     """Markup that no escaping would let through: neither its script runs, nor is its picture asked for."""
-    injected = "<img src='http://localhost:9/x.png' onerror='window.taken = 1'><script>window.taken = 2</script>"
+    injected = (
+        "<img src='http://localhost:9/x.png' onerror='window.taken = 1'><script>window.taken = 2</script>"
+    )
     file = tmp_path / "injected.html"
     file.write_text(report.read_text(encoding="utf-8").replace("<h1>", f"{injected}<h1>"), encoding="utf-8")
     page = browser.new_page()

@@ -6,6 +6,7 @@ import base64
 import json
 import re
 from html.parser import HTMLParser
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -248,7 +249,7 @@ def test_the_turntable_shows_the_model_once_around(run_folder):
     write_report(run_folder)
     images = [frame.image for frame in open_source(str(run_folder / "turntable.mp4"))]
     assert len(images) >= 36
-    steps = [np.abs(a.astype(int) - b).mean() for a, b in zip(images, images[1:], strict=False)]
+    steps = [np.abs(a.astype(int) - b).mean() for a, b in pairwise(images)]
     closing = np.abs(images[-1].astype(int) - images[0]).mean()
     assert min(steps) > 0
     assert closing < 2 * max(steps)

@@ -15,10 +15,12 @@ if TYPE_CHECKING:
 
 def compare(
     runs: Annotated[
-        list[Path], typer.Argument(metavar="RUN RUN...", help="Run folders; the others are held against the first.")
+        list[Path],
+        typer.Argument(metavar="RUN RUN...", help="Run folders; the others are held against the first."),
     ],
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE.html", help="Write a page too, with the frames that differ most.")
+        Path | None,
+        typer.Option(metavar="FILE.html", help="Write a page too, with the frames that differ most."),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON only.")] = False,
     debug: Debug = False,
@@ -78,7 +80,9 @@ def _print(comparison: Comparison) -> None:
 
 def _at(one: Any, index: int) -> str | None:
     for place in (one.indices == index).nonzero()[0]:
-        return f"IoU {one.iou[place]:.3f}, rotation {one.rotation[place]:.1f}°".replace("nan°", "-").replace("nan", "-")
+        return f"IoU {one.iou[place]:.3f}, rotation {one.rotation[place]:.1f}°".replace("nan°", "-").replace(
+            "nan", "-"
+        )
     return None
 
 

@@ -36,7 +36,9 @@ def write_comparison(comparison: Comparison, path: Path) -> None:
     figures = [run_figures(run) for run in comparison.runs]
     page = render_page(
         "comparison.html",
-        title=" and ".join(comparison.names) if len(comparison.names) == 2 else f"{len(comparison.names)} runs",
+        title=" and ".join(comparison.names)
+        if len(comparison.names) == 2
+        else f"{len(comparison.names)} runs",
         names=comparison.names,
         facts=[("Source", str(first.description.get("source", ""))), ("Held against", comparison.names[0])],
         notes=comparison.notes,
@@ -90,7 +92,9 @@ def _strips(comparison: Comparison) -> list[dict[str, Any]]:
         status = {record.index: record.status.value for record in run.frames}
         told = [status.get(index, "no answer") for index in frames]
         counts = ", ".join(f"{told.count(kind)} {kind}" for kind in dict.fromkeys(told))
-        strips.append({"name": name, "stretches": stretches(frames, told, [""] * len(told)), "summary": counts})
+        strips.append(
+            {"name": name, "stretches": stretches(frames, told, [""] * len(told)), "summary": counts}
+        )
     return strips
 
 
@@ -121,7 +125,7 @@ def _around(comparison: Comparison, index: int, size: OverlaySize) -> tuple[slic
     if not boxes:
         return slice(0, size.picture), slice(0, size.width)
     edges = np.array([(x, y, x + width, y + height) for x, y, width, height in boxes])
-    left, top, right, bottom = *edges[:, :2].min(0), *edges[:, 2:].max(0)
+    (left, top), (right, bottom) = edges[:, :2].min(0).tolist(), edges[:, 2:].max(0).tolist()
     margin = _MARGIN * max(right - left, bottom - top)
     rows = np.clip(size.scale * np.array([top - margin, bottom + margin]), 0, size.picture).astype(int)
     columns = np.clip(size.scale * np.array([left - margin, right + margin]), 0, size.width).astype(int)

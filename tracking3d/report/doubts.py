@@ -13,7 +13,13 @@ def doubts_of(run: RunReader) -> list[str]:
     Args:
         run: The run, finished or not.
     """
-    return [*_about_its_end(run), *_about_frames(run), *_about_masks(run), *_notes(run), *_about_pictures(run)]
+    return [
+        *_about_its_end(run),
+        *_about_frames(run),
+        *_about_masks(run),
+        *_notes(run),
+        *_about_pictures(run),
+    ]
 
 
 def _about_its_end(run: RunReader) -> list[str]:
@@ -46,7 +52,9 @@ def _about_frames(run: RunReader) -> list[str]:
             "have any, are the mask tracker's."
         )
     if uncertain:
-        told.append(f"{_of(uncertain, count).capitalize()} {_are(uncertain)} uncertain; the pose may be wrong.")
+        told.append(
+            f"{_of(uncertain, count).capitalize()} {_are(uncertain)} uncertain; the pose may be wrong."
+        )
     if failed:
         told.append(f"A plug-in failed in {_of(failed, count)}.")
     if skipped:
@@ -73,7 +81,9 @@ def _about_masks(run: RunReader) -> list[str]:
 
 
 def _notes(run: RunReader) -> list[str]:
-    return [f"{text[:1].upper()}{text[1:]}." for note in run.description.get("notes") or [] if (text := str(note))]
+    return [
+        f"{text[:1].upper()}{text[1:]}." for note in run.description.get("notes") or [] if (text := str(note))
+    ]
 
 
 def _about_pictures(run: RunReader) -> list[str]:

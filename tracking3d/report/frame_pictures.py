@@ -125,5 +125,6 @@ def _height(width: int, ratio: float) -> int:
 
 
 def _decode(jpeg: bytes) -> Image:
-    image: Image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
-    return image
+    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None  # we encoded it
+    return image[..., ::-1].astype(np.uint8)

@@ -53,6 +53,7 @@ def model_data(model: ObjectModel) -> dict[str, Any]:
     mesh = split_mesh(model, plain)
     centred = mesh.vertices - middle_of(model)
     radius = max(float(np.linalg.norm(centred, axis=1).max()), 1e-12)
+    assert isinstance(mesh.visual, trimesh.visual.TextureVisuals)
     uv = np.asarray(mesh.visual.uv) * (1, -1) + (0, 1)
     seen = np.repeat(255 * (model.texture_weight > 0)[..., None].astype(np.uint8), 3, axis=2)
     picture = np.concatenate([model.texture, seen])[..., ::-1]

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import base64
-import json
 import math
-from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -154,8 +152,7 @@ def _rotations(
     """For every picture the side of the model that it shows; None where that is not known."""
     shown = [records[position] for position in pictures.positions] or records[:1]
     found = [
-        None if record.status is Status.LOST else side_shown(record.T_cam_obj, middle)
-        for record in shown
+        None if record.status is Status.LOST else side_shown(record.T_cam_obj, middle) for record in shown
     ]
     return [None if rotation is None else rotation.ravel().round(4).tolist() for rotation in found]
 

@@ -96,7 +96,9 @@ def runs_in(folder: Path) -> list[Path]:
     """The run folders of a video's objects, in their order; of a run of one object the folder itself."""
     if (folder / RUN).exists():
         return [folder]
-    found = {int(path.name.removeprefix("object_")): path for path in folder.glob("object_*") if _is_object(path)}
+    found = {
+        int(path.name.removeprefix("object_")): path for path in folder.glob("object_*") if _is_object(path)
+    }
     return [found[number] for number in sorted(found)] or [folder]
 
 

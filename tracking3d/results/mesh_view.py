@@ -23,9 +23,7 @@ _DISTANCE = 4.0  # of the camera, in radii of the object
 _FILL = 0.8  # of the picture's side
 
 
-def side_shown(
-    T_cam_obj: NDArray[np.float64], middle: NDArray[np.float64]
-) -> NDArray[np.float64] | None:
+def side_shown(T_cam_obj: NDArray[np.float64], middle: NDArray[np.float64]) -> NDArray[np.float64] | None:
     """``(3, 3)`` rotation that shows the object, moved to the middle of the picture, from the side a frame shows.
 
     Args:
