@@ -1,4 +1,4 @@
-"""Makes the picture of docs/report.md: the upper part of a run's report, as Chromium shows it.
+"""Makes the picture of docs/report.md: a run's report from its doubts to its plots, as Chromium shows it.
 
 The run that is shown is of a synthetic mug that leaves the picture and returns; its box is that of
 clip/masks/000000.png.
@@ -16,7 +16,8 @@ from pathlib import Path
 
 from playwright.sync_api import sync_playwright
 
-WIDTH, HEIGHT = 1180, 1180
+WIDTH, HEIGHT = 1180, 1000
+MARGIN = 28
 FRAME = 12
 QUALITY = 84
 
@@ -38,7 +39,10 @@ def main() -> None:
             page.keyboard.press("ArrowRight")
         page.evaluate("document.activeElement.blur()")
         page.wait_for_timeout(500)
-        page.screenshot(path=arguments.out, type="jpeg", quality=QUALITY)
+        top = page.locator("#doubt-title").bounding_box()["y"] - MARGIN
+        last = page.locator(".scale").last.bounding_box()
+        clip = {"x": 0, "y": top, "width": WIDTH, "height": last["y"] + last["height"] + MARGIN - top}
+        page.screenshot(path=arguments.out, type="jpeg", quality=QUALITY, full_page=True, clip=clip)
         browser.close()
 
 

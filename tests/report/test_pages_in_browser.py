@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import HOSTILE
+from hostile import HOSTILE
 
 from tracking3d.report import run_report
 from tracking3d.report.comparison import write_comparison
@@ -82,7 +82,7 @@ def test_all_that_can_be_used_is_reached_by_keyboard_and_its_focus_is_seen(brows
             assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") in ("solid", "auto")
             if reached[-1] == "SUMMARY":
                 break
-        assert reached[:7] == ["model", "follow", "spin", "slider", "play", "before", "after"]
+        assert reached[:7] == ["slider", "play", "before", "after", "model", "follow", "spin"]
         assert "SUMMARY" in reached
 
 
@@ -134,6 +134,12 @@ def test_pages_fit_a_phone_and_follow_its_colours(browser, report, written, tmp_
                 summary.click()
             assert page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
             assert page.evaluate("getComputedStyle(document.body).backgroundColor") == colour
+
+
+def test_on_a_phone_the_picture_is_seen_while_the_slider_moves_it(browser, report):
+    with opened(browser, report, viewport=PHONE) as page:
+        boxes = [page.locator(name).bounding_box() for name in ("#picture", "#slider", "#said")]
+        assert boxes[2]["y"] + boxes[2]["height"] - boxes[0]["y"] < PHONE["height"]
 
 
 def test_without_javascript_the_first_frame_and_the_model_are_there(browser, report):

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import HOSTILE
+from hostile import HOSTILE
 
 from tracking3d.errors import InputError, OutputError
 from tracking3d.estimation.estimate import Status
@@ -149,7 +149,7 @@ def test_doubts_name_the_lost_the_uncertain_and_what_was_handed_back(run_folder)
     told = " ".join(doubts_of(RunReader(run_folder)))
     assert "The object was lost in 3 of 12 frames" in told
     assert "2 of 12 frames are uncertain" in told
-    assert "In 3 of 12 frames the mask is the mask tracker's" in told
+    assert "In 1 of 12 frames that is not lost the mask is the mask tracker's" in told
 
 
 @pytest.mark.parametrize(
@@ -172,6 +172,15 @@ def test_doubts_name_what_did_not_come_to_its_end(run_folder, described, changes
 def test_a_run_without_fault_has_few_doubts(make_turning_run):
     folder = make_turning_run(4)
     assert doubts_of(RunReader(folder)) == []
+
+
+def test_a_run_that_added_nothing_to_its_masks_says_so(run_folder):
+    lines = [json.loads(line) for line in (run_folder / "frames.jsonl").read_text().splitlines()]
+    changed = [json.dumps(line | {"mask_source": "initial"}) for line in lines]
+    (run_folder / "frames.jsonl").write_text("\n".join(changed) + "\n")
+    assert any(
+        doubt.startswith("All masks are the mask tracker's") for doubt in doubts_of(RunReader(run_folder))
+    )
 
 
 def test_the_notes_of_a_run_are_doubts(run_folder, described):

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from tracking3d.estimation.estimate import Status
-from tracking3d.results.description import own_masks
+from tracking3d.estimation.estimate import MaskSource, Status
 from tracking3d.results.run_reader import RunReader
 
 
@@ -66,18 +65,20 @@ def _about_frames(run: RunReader) -> list[str]:
 
 
 def _about_masks(run: RunReader) -> list[str]:
-    if "counts" not in run.description or not run.frames:
+    sources = [record.mask_source for record in run.frames]
+    if not run.frames or None in sources:
         return []
-    try:
-        own = own_masks(run.description)
-    except (KeyError, TypeError, AttributeError):  # a run.json that somebody wrote by hand
-        return []
-    count = len(run.frames)
-    if own is None or own >= count:
-        return []
-    if own == 0:
+    if not any(source is not None and source.is_own for source in sources):
         return ["All masks are the mask tracker's, handed back as they were: nothing was added to them."]
-    return [f"In {_of(count - own, count)} the mask is the mask tracker's, handed back as it was."]
+    handed_back = sum(
+        record.mask_source is MaskSource.INITIAL and record.status is not Status.LOST for record in run.frames
+    )
+    if not handed_back:
+        return []
+    return [
+        f"In {_of(handed_back, len(sources))} that {_are(handed_back)} not lost the mask is the mask tracker's, "
+        "handed back as it was."
+    ]
 
 
 def _notes(run: RunReader) -> list[str]:

@@ -17,8 +17,8 @@ from tracking3d.rendering.texture import sample_texture
 from tracking3d.rendering.visibility import rasterize
 
 _BACKGROUND = 40.0
-_UNSEEN = 128.0
-_AMBIENT = 0.45
+_UNSEEN = 165.0
+_AMBIENT, _AMBIENT_UNSEEN = 0.45, 0.75  # what was never seen stays pale where it turns away
 _DISTANCE = 4.0  # of the camera, in radii of the object
 _FILL = 0.8  # of the picture's side
 
@@ -61,7 +61,7 @@ def most_different(rotations: NDArray[np.float64], count: int) -> list[int]:
 def render_view(model: ObjectModel, rotation: NDArray[np.float64], size: int) -> Image:
     """Draw the whole object, lit from the camera, into a square picture ``(size, size, 3)``.
 
-    Texels that were never seen are grey.
+    Texels that were never seen are of a pale grey.
 
     Args:
         model: The object.
@@ -87,12 +87,13 @@ def render_view(model: ObjectModel, rotation: NDArray[np.float64], size: int) ->
     layers = np.concatenate([model.texture * seen, seen], axis=2, dtype=np.float32)
     texture = torch.tensor(layers.transpose(2, 0, 1))
     colour, weight = sample_texture(texture, uv).split([3, 1], dim=1)
+    ambient = weight * _AMBIENT + (1 - weight) * _AMBIENT_UNSEEN
     colour = colour + (1 - weight) * _UNSEEN
     to_camera = torch.nn.functional.normalize(
         torch.tensor([0.0, 0.0, -_DISTANCE], dtype=at.dtype) - at, dim=1
     )
     facing = (torch.nn.functional.normalize(normal, dim=1) * to_camera).sum(1, keepdim=True).clamp(0, 1)
     picture = torch.full((size, size, 3), _BACKGROUND, dtype=colour.dtype)
-    picture[face_index[0] >= 0] = colour * (_AMBIENT + (1 - _AMBIENT) * facing)
+    picture[face_index[0] >= 0] = colour * (ambient + (1 - ambient) * facing)
     result: Image = picture.round().clamp(0, 255).to(torch.uint8).numpy()
     return result

@@ -26,7 +26,7 @@ function showModel(canvas, model) {
       vec3 seen = texture(surface, vec2(texel.x, v)).rgb;
       float known = smoothstep(0.35, 0.65, texture(surface, vec2(texel.x, v + 0.5)).r);
       float light = max(dot(normalize(facing), normalize(-place)), 0.0);
-      colour = vec4(mix(pale, seen, known) * (0.45 + 0.55 * light), 1.0);
+      colour = vec4(mix(pale * (0.75 + 0.25 * light), seen * (0.45 + 0.55 * light), known), 1.0);
     }`;
 
   const program = gl.createProgram();
