@@ -108,9 +108,9 @@ def started_run(folder: Path, clip: TurningSphere, **changes: Any) -> RunWriter:
     return RunWriter(folder, **(arguments | changes))
 
 
-def written_run(folder: Path, clip: TurningSphere, **changes: Any) -> None:
-    """Write the whole run of the clip."""
+def written_run(folder: Path, clip: TurningSphere, *, with_model: bool = True, **changes: Any) -> None:
+    """Write the whole run of the clip; its model takes most of the time."""
     with started_run(folder, clip, **changes) as writer:
         for frame, estimate in zip(clip.frames, clip.estimates, strict=True):
             writer.write(estimate, frame)
-        writer.finish(clip.model, "finished")
+        writer.finish(clip.model if with_model else None, "finished")

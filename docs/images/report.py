@@ -37,11 +37,11 @@ def main() -> None:
         page.focus("#slider")
         for _ in range(FRAME):
             page.keyboard.press("ArrowRight")
-        page.evaluate("document.activeElement.blur()")
+        page.evaluate("document.activeElement.blur(); scrollTo(0, 0)")
         page.wait_for_timeout(500)
         top = page.locator("#doubt-title").bounding_box()["y"] - MARGIN
         last = page.locator(".scale").last.bounding_box()
-        clip = {"x": 0, "y": top, "width": WIDTH, "height": last["y"] + last["height"] + MARGIN - top}
+        clip = {"x": 0, "y": top, "width": WIDTH, "height": last["y"] + last["height"] + 8 - top}
         page.screenshot(path=arguments.out, type="jpeg", quality=QUALITY, full_page=True, clip=clip)
         browser.close()
 

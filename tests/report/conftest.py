@@ -75,11 +75,11 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture
 def make_turning_run(tmp_path) -> Callable[..., Path]:
-    """Writes a run in which all is well: ``make_turning_run(frames, folder, **changes_of_the_writer)``."""
+    """Writes a run in which all is well, without a mesh: ``make_turning_run(frames, folder, **changes_of_the_writer)``."""
 
     def make(frames: int, folder: Path | None = None, **changes: Any) -> Path:
         folder = folder or tmp_path / f"turning_{frames}"
-        written_run(folder, turning_sphere_of(frames), **changes)
+        written_run(folder, turning_sphere_of(frames), with_model=False, **changes)
         return folder
 
     return make

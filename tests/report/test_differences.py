@@ -33,7 +33,7 @@ def run_of(tmp_path, clip):
         changed = dataclasses.replace(
             clip, frames=clip.frames[:frames], estimates=[change(one) for one in clip.estimates[:frames]]
         )
-        written_run(tmp_path / name, changed, **about)
+        written_run(tmp_path / name, changed, with_model=False, **about)
         return tmp_path / name
 
     return write
@@ -130,7 +130,7 @@ def test_runs_of_different_lengths_are_compared_where_both_have_answers(run_of):
 def test_what_cannot_be_of_one_video_is_refused(run_of, tmp_path):
     folder = run_of("a", frames=3)
     clip = turning_sphere_of(2, 80, 60)
-    written_run(tmp_path / "small", clip)
+    written_run(tmp_path / "small", clip, with_model=False)
     with pytest.raises(InputError, match=r"frames of 160 x 120 pixels and .* of 80 x 60"):
         compare_runs([folder, tmp_path / "small"])
     later = run_of("b", lambda estimate: dataclasses.replace(estimate, index=estimate.index + 100), frames=3)
