@@ -75,7 +75,7 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture
 def make_turning_run(tmp_path) -> Callable[..., Path]:
-    """Writes a run in which all is well, without a mesh: ``make_turning_run(frames, folder, **changes_of_the_writer)``."""
+    """Writes a run in which all is well, without a mesh: ``make_turning_run(frames, folder, **changes)``."""
 
     def make(frames: int, folder: Path | None = None, **changes: Any) -> Path:
         folder = folder or tmp_path / f"turning_{frames}"

@@ -252,10 +252,13 @@ def _notes(runs: list[RunReader], names: list[str], differences: list[Difference
                 f"{names[0]} has answers for {len(first.frames)} frames and {name} for {len(run.frames)}; they are "
                 f"compared in the {len(one.indices)} that both have."
             )
-        given = [run_.description.get("given") or {} for run_ in (first, run)]
-        pictures = [one_.get("first_picture") for one_ in given if isinstance(one_, dict)]
-        starts = [one_.get("first_frame") for one_ in given if isinstance(one_, dict)]
-        if len(set(starts)) == 1 and None not in pictures and len(set(pictures)) > 1:
+        given = [
+            told if isinstance(told := each.description.get("given"), dict) else {} for each in (first, run)
+        ]
+        (start, start_too), (picture, picture_too) = (
+            [about.get(key) for about in given] for key in ("first_frame", "first_picture")
+        )
+        if start == start_too and None not in (picture, picture_too) and picture != picture_too:
             notes.append(f"The first pictures of {names[0]} and {name} are not the same: is it one video?")
         if abs(first.camera.fx - run.camera.fx) > 1e-3 * first.camera.fx:
             notes.append(

@@ -34,7 +34,9 @@ def read_model(folder: Path) -> ObjectModel:
     model = load_model(folder)
     fault = _fault(model)
     if fault:
-        raise InputError(f"The model {folder / layout.FEATURES} {fault}; track again with another --out.")
+        raise InputError(
+            f"The model {folder / layout.FEATURES} {fault}; track again into another {layout.OUT}."
+        )
     return model
 
 

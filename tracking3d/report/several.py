@@ -43,9 +43,9 @@ def _write_index(folders: Sequence[Path]) -> Path:
 
 def _card(folder: Path) -> dict[str, Any]:
     run = RunReader(folder)
-    middle = len(run.frames) // 2
+    # The first frame: there the object was pointed out.
     rows = OverlaySize.of(run.camera).picture
-    pictures = [jpeg_of(image[:rows]) for image in overlay_frames(run, [middle])]
+    pictures = [jpeg_of(image[:rows]) for image in overlay_frames(run, [0])]
     return {
         "name": folder.name,
         "link": f"{folder.name}/{layout.REPORT}",
