@@ -100,26 +100,38 @@ def test_doubts_plots_and_play_lead_to_frames(browser, report):
         box = plot.bounding_box()
         plot.click(position={"x": box["width"] * 0.99, "y": 20})
         assert page.inner_text("#said").startswith("Frame 11:")
+        page.evaluate(
+            "window.shown = []; const said = document.getElementById('said');"
+            "new MutationObserver(() => shown.push(said.textContent)).observe(said, {childList: true})"
+        )
         page.click("#play")  # from the end it begins anew
-        page.wait_for_selector("#said:has-text('Frame 3')")
+        page.wait_for_selector("#play[aria-pressed=false]")
+        shown = list(dict.fromkeys(text.partition(":")[0] for text in page.evaluate("window.shown")))
+        assert shown == [f"Frame {number}" for number in range(12)]
+
+
+def at_rest(page: Any, selector: str) -> bytes:
+    """The picture of an element once it no longer changes."""
+    before, now = b"", page.locator(selector).screenshot()
+    while now != before:
+        page.wait_for_timeout(200)
+        before, now = now, page.locator(selector).screenshot()
+    return now
 
 
 def test_the_model_is_drawn_and_turns(browser, report):
     with opened(browser, report) as page:
         page.wait_for_selector("#model:visible")
         assert page.is_hidden("#still")
-        before = page.locator("#model").screenshot()
+        before = at_rest(page, "#model")
         box = page.locator("#model").bounding_box()
         page.mouse.move(box["x"] + 100, box["y"] + 100)
         page.mouse.down()
         page.mouse.move(box["x"] + 220, box["y"] + 130)
         page.mouse.up()
-        page.wait_for_timeout(100)
-        turned = page.locator("#model").screenshot()
+        assert at_rest(page, "#model") != before
         page.click("#follow")
-        page.wait_for_timeout(100)
-        assert turned != before
-        assert page.locator("#model").screenshot() == before
+        assert at_rest(page, "#model") == before
 
 
 @pytest.mark.parametrize("kind", ["report", "comparison"])
