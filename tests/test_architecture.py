@@ -30,7 +30,7 @@ FLOORS = [
         "session",
     },
     {"datasets"},
-    {"synthesis", "evaluation", "export", "speed", "viewer"},
+    {"evaluation", "export", "report", "speed", "synthesis", "viewer"},
     {"benchmark"},
     {"cli", "vot", "__main__"},
 ]

@@ -28,6 +28,12 @@ class Script:
     built: list[tuple] = field(default_factory=list)
 
 
+@pytest.fixture(autouse=True)
+def no_turntable(monkeypatch) -> None:
+    """The movie takes longer than everything else that these runs write."""
+    monkeypatch.setattr("tracking3d.report.run_report.write_turntable", lambda *_: None)
+
+
 @pytest.fixture
 def script(monkeypatch) -> Script:
     """Replace the estimator by one that answers with the prompt's box at once."""

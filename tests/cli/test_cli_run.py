@@ -111,7 +111,11 @@ def test_several_masks_are_several_objects_too(call, clip, script, mask_file):
     files = [mask_file(mask, f"{number}.png") for number, mask in enumerate(masks)]
     assert call("run", clip, "--mask", files[0], "--mask", files[1], "--quiet").output == ""
     assert [prompt.box for _, prompt in script.built] == [(30, 10, 20, 10), (5, 5, 10, 10)]
-    assert sorted(path.name for path in Path("runs/clip").iterdir()) == ["object_0", "object_1"]
+    assert sorted(path.name for path in Path("runs/clip").iterdir()) == [
+        "index.html",
+        "object_0",
+        "object_1",
+    ]
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ def run_folders(case: Case) -> None:
     (folder / "untouched").touch()
     for _ in range(int(case.random.integers(1, 3))):
         pick(case.random, [_file, _file, _description, _description, _line, _line, _features])(case, folder)
-    pick(case.random, [_points, _points, _score, _score, _over])(case, folder)
+    pick(case.random, [_points, _points, _score, _score, _report, _compare, _over])(case, folder)
 
 
 def _file(case: Case, folder: Path) -> None:
@@ -115,6 +115,14 @@ def _points(case: Case, folder: Path) -> None:
 
 def _score(case: Case, folder: Path) -> None:
     case.command("evaluate", "answers", folder, "--truth", case.material.folder / "truth")
+
+
+def _report(case: Case, folder: Path) -> None:
+    case.command("report", folder)
+
+
+def _compare(case: Case, folder: Path) -> None:
+    case.command("compare", case.material.copy("run", case.folder / "whole"), folder, "--out", "differ.html")
 
 
 def _over(case: Case, folder: Path) -> None:

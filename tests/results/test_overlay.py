@@ -86,6 +86,29 @@ def test_a_pose_that_cannot_be_drawn_is_left_out(turning_sphere, T):
     assert np.array_equal(overlay_of(turning_sphere, 0, axes, T_cam_obj=T), overlay_of(turning_sphere, 0))
 
 
+@pytest.mark.parametrize("status", [Status.UNCERTAIN, Status.LOST])
+def test_a_pose_that_is_not_believed_has_no_axes(turning_sphere, status):
+    axes = ObjectAxes.of(turning_sphere.estimates[0], turning_sphere.camera)
+    without = overlay_of(turning_sphere, 0, None, status=status)
+    assert np.array_equal(overlay_of(turning_sphere, 0, axes, status=status), without)
+    assert not np.array_equal(overlay_of(turning_sphere, 0, axes), overlay_of(turning_sphere, 0))
+
+
+@pytest.mark.parametrize("shift", [(40, 0), (0, -40)])
+def test_axes_that_begin_beside_the_mask_are_left_out(turning_sphere, shift):
+    axes = ObjectAxes.of(turning_sphere.estimates[0], turning_sphere.camera)
+    elsewhere = np.roll(turning_sphere.estimates[0].mask, shift, (1, 0))
+    assert np.array_equal(
+        overlay_of(turning_sphere, 0, axes, mask=elsewhere), overlay_of(turning_sphere, 0, mask=elsewhere)
+    )
+
+
+def test_axes_of_a_pose_far_outside_of_the_frame_are_left_out(turning_sphere):
+    axes, T = ObjectAxes(np.zeros(3), 1.0), np.eye(4)
+    T[:3, 3] = 1e9, 0, 1
+    assert np.array_equal(overlay_of(turning_sphere, 0, axes, T_cam_obj=T), overlay_of(turning_sphere, 0))
+
+
 @pytest.mark.parametrize("status", list(Status))
 def test_the_status_bar_shows_status_by_colour_and_survives_any_reason(turning_sphere, status):
     bar = overlay_of(turning_sphere, 0, status=status, reason="ünsehr lang " * 60, confidence=float("nan"))[
@@ -130,16 +153,45 @@ def test_the_sheet_has_crops_texture_mesh_and_figures(turning_sphere, count, row
         estimate = dataclasses.replace(turning_sphere.estimates[0], index=index, keyframe=index == 1)
         thumbnails.add(overlay_of(turning_sphere, 0)[:240], 2.0, estimate)
     figures = summary([], 0, 0.0)
-    sheet = draw_contact_sheet(thumbnails.spread(CROPS), turning_sphere.model, np.eye(3), figures)
+    sheet = draw_contact_sheet(thumbnails.spread(CROPS), turning_sphere.model, figures)
     assert sheet.shape == (rows * TILE, COLUMNS * TILE, 3)
     framed = [tuple(sheet[1, column * TILE + 1]) == drawing.KEYFRAME for column in range(COLUMNS)]
     assert framed == [count > 1 and column == 1 for column in range(COLUMNS)]
 
 
+def test_the_sheet_shows_the_model_from_sides_of_tracked_frames_only(turning_sphere):
+    def model_tiles(statuses):
+        thumbnails = Thumbnails()
+        for number, status in enumerate(statuses):
+            estimate = dataclasses.replace(turning_sphere.estimates[number], status=status)
+            thumbnails.add(overlay_of(turning_sphere, number)[:240], 2.0, estimate)
+        sheet = draw_contact_sheet(thumbnails.spread(CROPS), turning_sphere.model, summary([], 0, 0.0))
+        row = sheet[-TILE:, TILE:-TILE]
+        return [row[:, n * TILE : (n + 1) * TILE] for n in range(COLUMNS - 2)]
+
+    drawn = [(tile != drawing.PAPER).any(2).mean() > 0.5 for tile in model_tiles([Status.TRACKED] * 2)]
+    assert drawn == [True, True, False, False]
+    drawn = [(tile != drawing.PAPER).any(2).mean() > 0.5 for tile in model_tiles([Status.LOST] * 4)]
+    assert drawn == [True, False, False, False]  # from the front, since no side is known
+
+
+def test_the_sheet_says_which_crops_show_an_answer_that_was_replaced(turning_sphere):
+    thumbnails = Thumbnails()
+    thumbnails.add(overlay_of(turning_sphere, 0)[:240], 2.0, turning_sphere.estimates[0])
+    sheets = [
+        draw_contact_sheet(thumbnails.spread(CROPS), None, summary([], 0, 0.0), replaced)
+        for replaced in ({0}, {1}, set())
+    ]
+    assert np.array_equal(sheets[1], sheets[2])
+    changed = (sheets[0] != sheets[2]).any(2)
+    assert changed[:24, 100:TILE].any()
+    assert not changed[24:].any()
+
+
 def test_the_sheet_of_a_run_without_a_mesh_has_no_mesh(turning_sphere):
     thumbnails = Thumbnails()
     thumbnails.add(overlay_of(turning_sphere, 0)[:240], 2.0, turning_sphere.estimates[0])
-    sheet = draw_contact_sheet(thumbnails.spread(CROPS), None, np.eye(3), summary([], 0, 0.0))
+    sheet = draw_contact_sheet(thumbnails.spread(CROPS), None, summary([], 0, 0.0))
     assert sheet.shape[0] == 2 * TILE
     assert (sheet[TILE:, TILE:] == drawing.PAPER).all()
 

@@ -213,7 +213,7 @@ KILLED = """
 import os, signal, sys
 sys.path.insert(0, sys.argv[2])
 from pathlib import Path
-from conftest import turning_sphere_of
+from turning_sphere import turning_sphere_of
 from tracking3d.results import pictures, run_writer
 
 def die(*_):
@@ -256,7 +256,7 @@ KEPT = {"masks": 4, "line": 4, "overlay": 5, "finish": 4}
 def killed(tmp_path_factory) -> Path:
     """A folder of runs by where each was killed."""
     folder = tmp_path_factory.mktemp("killed")
-    ended = forked_script(folder, KILLED, folder, Path(__file__).parent, *KEPT)
+    ended = forked_script(folder, KILLED, folder, Path(__file__).parents[1], *KEPT)
     assert ended.returncode == 0, ended.stderr
     return folder
 

@@ -93,7 +93,7 @@ import resource, sys
 sys.path.insert(0, sys.argv[2])
 from dataclasses import replace
 from pathlib import Path
-from conftest import turning_sphere_of
+from turning_sphere import turning_sphere_of
 from tracking3d.errors import OutputError
 from tracking3d.results.run_writer import RunWriter
 
@@ -118,7 +118,7 @@ writer.finish(None, "failed", "the disk was full")
 @pytest.mark.skipif(sys.platform == "win32", reason="limits of file size are POSIX")
 def test_a_full_disk_is_said_and_costs_the_current_frame_only(tmp_path):
     folder = tmp_path / "run"
-    done = forked_script(tmp_path, FULL, folder, Path(__file__).parent)
+    done = forked_script(tmp_path, FULL, folder, Path(__file__).parents[1])
     assert done.returncode == 0, done.stderr
     assert "The disk is full" in done.stdout
     run = RunReader(folder)

@@ -7,7 +7,21 @@ from __future__ import annotations
 
 import typer
 
-from tracking3d.cli import bench, config, demo, evaluate, export, model, models, plugins, points, run, synth
+from tracking3d.cli import (
+    bench,
+    compare,
+    config,
+    demo,
+    evaluate,
+    export,
+    model,
+    models,
+    plugins,
+    points,
+    report,
+    run,
+    synth,
+)
 from tracking3d.cli.options import Debug
 from tracking3d.cli.program import Program
 
@@ -24,6 +38,8 @@ app.command(name="synth")(synth.synth)
 app.command(name="points")(points.points)
 app.command(name="model")(model.model)
 app.command(name="export")(export.export)
+app.command(name="report")(report.report)
+app.command(name="compare")(compare.compare)
 app.add_typer(evaluate.app, name="evaluate")
 app.add_typer(models.app, name="models")
 app.add_typer(plugins.app, name="plugins")

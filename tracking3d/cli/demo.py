@@ -25,6 +25,7 @@ def demo(
     import json
 
     from tracking3d.cli.progress import print_summary, progress
+    from tracking3d.cli.report import reported
     from tracking3d.cli.tables import print_figures
     from tracking3d.datasets.clip import read_truth
     from tracking3d.evaluation.score import score_run
@@ -38,8 +39,8 @@ def demo(
     source = open_source(clip / "frames")
     box = read_truth(clip).box
     command = f"tracking3d demo --seed {seed}"
-    with progress(source.count, quiet) as listener:
-        record(source, settings, folder, box=box, command=command, overwrite=True, listener=listener)
+    with reported([folder]) as told, progress(source.count, quiet) as listener:
+        record(source, settings, folder, box=box, command=command, overwrite=True, listener=told(listener))
 
     scores = score_run(folder, clip)
     summary = {

@@ -110,6 +110,7 @@ _OUTPUTS = {
     "mesh": (layout.OBJ, layout.GLB),
     "video": (layout.OVERLAY,),
     "contact sheet": (layout.CONTACT_SHEET,),
+    "report": (layout.REPORT,),
 }
 
 

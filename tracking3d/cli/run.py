@@ -121,6 +121,15 @@ def run(
             rich_help_panel=_RUNNING,
         ),
     ] = None,
+    report: Annotated[
+        bool,
+        typer.Option(
+            "--report/--no-report",
+            help="When the run has ended in whatever way, write report.html and turntable.mp4.",
+            show_default=False,
+            rich_help_panel=_RUNNING,
+        ),
+    ] = True,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
@@ -162,6 +171,7 @@ def run(
         )
 
     from tracking3d.cli.progress import print_summary, progress
+    from tracking3d.cli.report import reported
     from tracking3d.prompts import parse_box
     from tracking3d.recording import record, record_objects
     from tracking3d.results.layout import object_folders
@@ -183,7 +193,12 @@ def run(
         "resume": resume,
     }
     done = {one for one in folders if resume and is_finished(one)}
-    with resumable(folders), progress(opened.count, quiet, objects) as about["listener"]:
+    with (
+        resumable(folders),
+        reported(folders if report else []) as told,
+        progress(opened.count, quiet, objects) as listener,
+    ):
+        about["listener"] = told(listener)
         if objects > 1:
             record_objects(opened, settings, folder, boxes=given, masks=object_masks, **about)
         else:

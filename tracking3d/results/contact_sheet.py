@@ -1,8 +1,8 @@
-"""One picture of a whole run: crops spread over the clip, the texture and the mesh from new sides."""
+"""One picture of a whole run: crops spread over the clip, the texture and the model from sides that were seen."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,25 +14,28 @@ from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.frames import Image
 from tracking3d.results import drawing
 from tracking3d.results.description import own_masks, time_per_frame
-from tracking3d.results.mesh_view import render_view, turned_views
+from tracking3d.results.mesh_view import most_different, render_view, side_shown
 from tracking3d.stages import STAGES
 
 TILE = 240
 COLUMNS = 6
 CROPS = 12
 MOST = 2 * CROPS
+VIEWS = COLUMNS - 2
+"""Of the model."""
 _MARGIN = 0.35  # of the object's longer side, around it
 _LETTERS = 11
 
 
 @dataclass(frozen=True, eq=False)
 class Thumbnail:
-    """One crop of the overlay, ``(TILE, TILE, 3)``, and what is written on it."""
+    """One crop of the overlay, ``(TILE, TILE, 3)``, the answer's pose, and what is written on it."""
 
     index: int
     image: Image
     status: Status
     keyframe: bool
+    T_cam_obj: NDArray[np.float64]
 
 
 class Thumbnails:
@@ -56,7 +59,9 @@ class Thumbnails:
         """
         if self._frames % self._step == 0:
             crop = drawing.fit(_around(picture, estimate.mask, scale), TILE)
-            self.kept.append(Thumbnail(estimate.index, crop, estimate.status, estimate.keyframe))
+            self.kept.append(
+                Thumbnail(estimate.index, crop, estimate.status, estimate.keyframe, estimate.T_cam_obj)
+            )
         self._frames += 1
         if len(self.kept) > MOST:
             self.kept = self.kept[::2]
@@ -71,28 +76,27 @@ class Thumbnails:
 def draw_contact_sheet(
     thumbnails: Sequence[Thumbnail],
     model: ObjectModel | None,
-    first_rotation: NDArray[np.float64],
     run: dict[str, Any],
+    replaced: Set[int] = frozenset(),
 ) -> Image:
     """Draw the sheet.
 
     Args:
         thumbnails: Crops in the order of the clip.
         model: The object; None leaves texture and mesh out.
-        first_rotation: ``(3, 3)`` object to camera in the first frame; the mesh is turned away from it.
         run: ``run.json`` of the run, as it is at the end.
+        replaced: Frames whose crop shows an answer that is not the last one.
 
     Returns:
         ``(H, COLUMNS * TILE, 3)``.
     """
-    tiles = [_labelled(thumbnail) for thumbnail in thumbnails]
+    tiles = [_labelled(thumbnail, thumbnail.index in replaced) for thumbnail in thumbnails]
     tiles += [_blank() for _ in range(-len(tiles) % COLUMNS)]
     if model is not None:
         texture = np.where((model.texture_weight > 0)[..., None], model.texture, model.texture // 3 + 40)
         tiles.append(_titled(drawing.fit(texture.astype(np.uint8), TILE), "texture (pale: never seen)"))
-        for view, rotation in enumerate(turned_views(first_rotation, COLUMNS - 2)):
-            yaw = round((view + 0.5) * 360 / (COLUMNS - 2))
-            tiles.append(_titled(render_view(model, rotation, TILE), f"mesh, turned {yaw} degrees"))
+        views = _views(thumbnails, model)
+        tiles += views + [_blank() for _ in range(VIEWS - len(views))]
     tiles.append(_legend(run))
     tiles += [_blank() for _ in range(-len(tiles) % COLUMNS)]
     rows = [np.concatenate(tiles[i : i + COLUMNS], 1) for i in range(0, len(tiles), COLUMNS)]
@@ -111,8 +115,28 @@ def _around(picture: Image, mask: NDArray[np.bool_], scale: float) -> Image:
     return picture[top:bottom, left:right] if bottom > top and right > left else picture
 
 
-def _labelled(thumbnail: Thumbnail) -> Image:
+def _views(thumbnails: Sequence[Thumbnail], model: ObjectModel) -> list[Image]:
+    """The model from the sides that tracked frames show, as different as they are; blank tiles beyond those."""
+    middle = (model.vertices.min(0) + model.vertices.max(0)) / 2
+    sides = {
+        thumbnail.index: rotation
+        for thumbnail in thumbnails
+        if thumbnail.status is Status.TRACKED
+        and (rotation := side_shown(thumbnail.T_cam_obj, middle)) is not None
+    }
+    if not sides:
+        return [_titled(render_view(model, np.eye(3), TILE), "model")]
+    indices = list(sides)
+    chosen = most_different(np.stack(list(sides.values())), VIEWS)
+    return [
+        _titled(render_view(model, sides[index], TILE), f"model as in #{index}")
+        for index in sorted(indices[one] for one in chosen)
+    ]
+
+
+def _labelled(thumbnail: Thumbnail, replaced: bool) -> Image:
     title = f"#{thumbnail.index} {thumbnail.status.value}" + (", keyframe" if thumbnail.keyframe else "")
+    title += ", first answer" if replaced else ""
     tile = _titled(thumbnail.image, title, drawing.STATUS[thumbnail.status])
     if thumbnail.keyframe:
         cv2.rectangle(tile, (1, 1), (TILE - 2, TILE - 2), drawing.KEYFRAME, 3)
@@ -132,8 +156,8 @@ def _legend(run: dict[str, Any]) -> Image:
         (f"{counts['frames']} frames", drawing.INK),
         *((f"{counts[status.value]} {status.value}", drawing.STATUS[status]) for status in Status),
         (f"{counts['keyframes']} keyframes", drawing.KEYFRAME),
-        ("initial outline", drawing.INITIAL),
-        ("refined outline", drawing.REFINED),
+        ("outline of the answer", drawing.REFINED),
+        ("of the mask tracker", drawing.INITIAL),
         *((text, drawing.INK) for text in _of_masks(run)),
     ]
     for row, (text, colour) in enumerate(lines):

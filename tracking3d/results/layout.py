@@ -8,6 +8,8 @@
     initial_masks/      what the mask tracker gave
     overlay.mp4         the video with outlines and axes
     contact_sheet.png   the run at a glance
+    report.html         the run to look at, in one file
+    turntable.mp4       the model, turned once around
     mesh.obj, mesh.mtl, texture.png, mesh.glb, features.npz
     causal/             masks and mesh as they were before the final refinement
     .refining/          what the final refinement has made so far, until it has ended
@@ -35,6 +37,10 @@ STATE_FILE = "state.json"
 JOURNAL = "journal.jsonl"
 OVERLAY = "overlay.mp4"
 CONTACT_SHEET = "contact_sheet.png"
+REPORT = "report.html"
+TURNTABLE = "turntable.mp4"
+INDEX = "index.html"
+"""Beside the folders of several objects: links to the report of each."""
 OBJ = "mesh.obj"
 MTL = "mesh.mtl"
 TEXTURE = "texture.png"
@@ -58,7 +64,7 @@ CONVENTIONS = {
 }
 
 MESH_FILES = (OBJ, MTL, TEXTURE, GLB, FEATURES)
-_FILES = (RUN, FRAMES, OVERLAY, CONTACT_SHEET, *MESH_FILES)
+_FILES = (RUN, FRAMES, OVERLAY, CONTACT_SHEET, REPORT, TURNTABLE, *MESH_FILES)
 _MASK_NAME = re.compile(r"\d{6,}\.png")
 _ARRAY_NAME = re.compile(r"\d{8,}\.npz")
 
@@ -84,6 +90,20 @@ def object_folders(folder: Path, count: int) -> list[Path]:
     if (more := folder / f"object_{count}").exists():
         raise OutputError(f"{folder} holds a run of more objects, such as {more.name}; choose another {OUT}.")
     return [folder / f"object_{number}" for number in range(count)]
+
+
+def runs_in(folder: Path) -> list[Path]:
+    """The run folders of a video's objects, in their order; of a run of one object the folder itself."""
+    if (folder / RUN).exists():
+        return [folder]
+    found = {
+        int(path.name.removeprefix("object_")): path for path in folder.glob("object_*") if _is_object(path)
+    }
+    return [found[number] for number in sorted(found)] or [folder]
+
+
+def _is_object(folder: Path) -> bool:
+    return folder.name.removeprefix("object_").isdecimal() and (folder / RUN).is_file()
 
 
 def partial_path(path: Path) -> Path:

@@ -17,28 +17,51 @@ from tracking3d.rendering.texture import sample_texture
 from tracking3d.rendering.visibility import rasterize
 
 _BACKGROUND = 40.0
-_UNSEEN = 128.0
-_AMBIENT = 0.45
+_UNSEEN = 165.0
+_AMBIENT, _AMBIENT_UNSEEN = 0.45, 0.75  # what was never seen stays pale where it turns away
 _DISTANCE = 4.0  # of the camera, in radii of the object
 _FILL = 0.8  # of the picture's side
 
 
-def turned_views(rotation: NDArray[np.float64], count: int, pitch: float = 20.0) -> list[NDArray[np.float64]]:
-    """Rotations ``(3, 3)`` that show the object from ``count`` sides a first view did not.
+def side_shown(T_cam_obj: NDArray[np.float64], middle: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """``(3, 3)`` rotation that shows the object, moved to the middle of the picture, from the side a frame shows.
 
     Args:
-        rotation: ``(3, 3)`` object to camera of the first view; its upright stays upright.
-        count: Number of views, evenly spread around the vertical, the first half a step off the first view.
-        pitch: Degrees by which each view looks down on the object.
+        T_cam_obj: ``(4, 4)``; the ray to the object is turned to the camera's axis.
+        middle: ``(3,)`` the object's middle.
+
+    Returns:
+        None where the pose is no number, or the object not before the camera.
     """
-    steps = (np.arange(count) + 0.5) * 360.0 / count
-    return [Rotation.from_euler("yx", [yaw, pitch], degrees=True).as_matrix() @ rotation for yaw in steps]
+    if not np.isfinite(T_cam_obj).all():
+        return None
+    ray = T_cam_obj[:3, :3] @ middle + T_cam_obj[:3, 3]
+    if not ray[2] > 0:
+        return None
+    axis = np.array([ray[1], -ray[0], 0.0])  # the ray's cross product with the camera's axis
+    sine = float(np.linalg.norm(axis))
+    if sine > 0:
+        axis *= math.atan2(sine, ray[2]) / sine
+    rotation: NDArray[np.float64] = Rotation.from_rotvec(axis).as_matrix() @ T_cam_obj[:3, :3]
+    return rotation
+
+
+def most_different(rotations: NDArray[np.float64], count: int) -> list[int]:
+    """Which of ``(N, 3, 3)`` rotations to show: the first, and always the one that is the furthest from all before."""
+    chosen = [0]
+    nearness = np.full(len(rotations), -np.inf)
+    while len(chosen) < min(count, len(rotations)):
+        # The trace of the relative rotation falls as the angle grows.
+        nearness = np.maximum(nearness, np.einsum("nij,ij->n", rotations, rotations[chosen[-1]]))
+        nearness[chosen] = np.inf
+        chosen.append(int(nearness.argmin()))
+    return chosen
 
 
 def render_view(model: ObjectModel, rotation: NDArray[np.float64], size: int) -> Image:
     """Draw the whole object, lit from the camera, into a square picture ``(size, size, 3)``.
 
-    Texels that were never seen are grey.
+    Texels that were never seen are of a pale grey.
 
     Args:
         model: The object.
@@ -64,12 +87,13 @@ def render_view(model: ObjectModel, rotation: NDArray[np.float64], size: int) ->
     layers = np.concatenate([model.texture * seen, seen], axis=2, dtype=np.float32)
     texture = torch.tensor(layers.transpose(2, 0, 1))
     colour, weight = sample_texture(texture, uv).split([3, 1], dim=1)
+    ambient = weight * _AMBIENT + (1 - weight) * _AMBIENT_UNSEEN
     colour = colour + (1 - weight) * _UNSEEN
     to_camera = torch.nn.functional.normalize(
         torch.tensor([0.0, 0.0, -_DISTANCE], dtype=at.dtype) - at, dim=1
     )
     facing = (torch.nn.functional.normalize(normal, dim=1) * to_camera).sum(1, keepdim=True).clamp(0, 1)
     picture = torch.full((size, size, 3), _BACKGROUND, dtype=colour.dtype)
-    picture[face_index[0] >= 0] = colour * (_AMBIENT + (1 - _AMBIENT) * facing)
+    picture[face_index[0] >= 0] = colour * (ambient + (1 - ambient) * facing)
     result: Image = picture.round().clamp(0, 255).to(torch.uint8).numpy()
     return result

@@ -1,7 +1,8 @@
 """One frame with everything the tracker said about it drawn in.
 
 The picture has the outline of the initial mask (thin, orange) and of the answer (thicker, cyan), the object's
-axes (x red, y green, z blue) and below it a status bar.
+axes (x red, y green, z blue) and below it a status bar. Axes are drawn where the pose is believed only: in frames that
+are tracked, and where they begin on the object.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.estimation.estimate import FrameEstimate
+from tracking3d.estimation.estimate import FrameEstimate, Status
 from tracking3d.frames import Frame, Image
 from tracking3d.geometry.camera import Camera
 from tracking3d.results import drawing
@@ -90,7 +91,8 @@ def draw_overlay(
         estimate: The answer for it.
         record: The same answer as it is recorded.
         camera: The camera of the full frame.
-        axes: The object's axes; None leaves them out.
+        axes: The object's axes; None leaves them out. So does a frame that is not tracked, and a pose that puts
+            them beside the answer's mask.
 
     Returns:
         ``(height, width, 3)`` as `OverlaySize.of` gives them.
@@ -105,8 +107,8 @@ def draw_overlay(
     drawing.draw_outline(picture, _scaled(estimate.mask, shape), drawing.REFINED, thin + 1)
     if estimate.initial_mask is not None:
         drawing.draw_outline(picture, _scaled(estimate.initial_mask, shape), drawing.INITIAL, thin)
-    if axes is not None:
-        _draw_axes(picture, estimate.T_cam_obj, camera, axes, size.scale, thin + 1)
+    if axes is not None and estimate.status is Status.TRACKED:
+        _draw_axes(picture, estimate, camera, axes, size.scale, thin + 1)
     _draw_bar(canvas[size.picture :], record)
     return canvas
 
@@ -117,20 +119,29 @@ def _scaled(mask: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np.bool_
 
 def _draw_axes(
     picture: Image,
-    T_cam_obj: NDArray[np.float64],
+    estimate: FrameEstimate,
     camera: Camera,
     axes: ObjectAxes,
     scale: float,
     thickness: int,
 ) -> None:
     ends = np.concatenate([axes.origin[None], axes.origin + axes.length * np.eye(3)])
-    points = ends @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3]
+    points = ends @ estimate.T_cam_obj[:3, :3].T + estimate.T_cam_obj[:3, 3]
     if not np.isfinite(points).all() or points[:, 2].min() <= 0:
         return
     pixels = (points @ camera.K.T)[:, :2] / points[:, 2:]
+    if not _is_on(estimate.mask, pixels[0]):
+        return
     pixels = np.clip((pixels + 0.5) * scale - 0.5, -1e5, 1e5).round().astype(int)
     for axis in np.argsort(-points[1:, 2]):  # the nearest last, on top
         cv2.line(picture, pixels[0], pixels[axis + 1], _AXIS_COLOURS[axis], thickness, cv2.LINE_AA)
+
+
+def _is_on(mask: NDArray[np.bool_], pixel: NDArray[np.float64]) -> bool:
+    """Whether the pixel ``(2,)`` x and y is one of the mask's."""
+    column, row = np.clip(pixel, -1, max(mask.shape)).round().astype(int)
+    inside = 0 <= row < mask.shape[0] and 0 <= column < mask.shape[1]
+    return bool(inside and mask[row, column])
 
 
 def _draw_bar(bar: Image, record: FrameRecord) -> None:
@@ -148,10 +159,10 @@ def _draw_bar(bar: Image, record: FrameRecord) -> None:
         left = drawing.draw_text(bar, text, left + gap, base, letters, drawing.INK)
     if record.keyframe:
         left = drawing.draw_text(bar, "key", left + gap, base, letters, drawing.KEYFRAME)
-    legend = width - drawing.text_width("initial refined", letters) - gap
+    legend = width - drawing.text_width("initial answer", letters) - gap
     if legend > left + gap:
         after = drawing.draw_text(bar, "initial ", legend, base, letters, drawing.INITIAL)
-        drawing.draw_text(bar, "refined", after, base, letters, drawing.REFINED)
+        drawing.draw_text(bar, "answer", after, base, letters, drawing.REFINED)
     reason = drawing.shorten(
         record.reason, letters, (legend if legend > left + gap else width) - left - 2 * gap
     )

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Set
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.estimation.estimate import FrameEstimate, ObjectModel
+from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.frames import Frame, Image
 from tracking3d.geometry.camera import Camera
 from tracking3d.results.contact_sheet import CROPS, Thumbnails, draw_contact_sheet
@@ -29,7 +30,6 @@ class Pictures:
     def __init__(self, video: Path, camera: Camera, fps: float) -> None:
         self._file, self.camera, self._fps = video, camera, fps
         self._video: VideoWriter | None = None
-        self._first: FrameEstimate | None = None
         self._axes: ObjectAxes | None = None
         self._thumbnails = Thumbnails()
 
@@ -39,9 +39,7 @@ class Pictures:
         Raises:
             OutputError: If the video cannot be written.
         """
-        if self._first is None:
-            self._first = estimate
-        if self._axes is None:
+        if self._axes is None and estimate.status is Status.TRACKED:
             self._axes = ObjectAxes.of(estimate, estimate.camera or self.camera)
         size = OverlaySize.of(self.camera)
         overlay = draw_overlay(frame, estimate, record, estimate.camera or self.camera, self._axes)
@@ -91,14 +89,15 @@ class Pictures:
         if self._video is not None:
             self._video.close()
 
-    def contact_sheet(self, model: ObjectModel | None, run: dict[str, Any]) -> Image | None:
+    def contact_sheet(
+        self, model: ObjectModel | None, run: dict[str, Any], replaced: Set[int] = frozenset()
+    ) -> Image | None:
         """The contact sheet, ``(H, W, 3)``; None before the first frame.
 
         Args:
             model: The object; None leaves texture and mesh out.
             run: ``run.json`` of the run, as it is at the end.
+            replaced: Frames that were answered anew after they were drawn.
         """
-        if self._first is None:
-            return None
-        rotation = np.asarray(self._first.T_cam_obj, dtype=np.float64)[:3, :3]
-        return draw_contact_sheet(self._thumbnails.spread(CROPS), model, rotation, run)
+        thumbnails = self._thumbnails.spread(CROPS)
+        return draw_contact_sheet(thumbnails, model, run, replaced) if thumbnails else None

@@ -354,6 +354,7 @@ class RunWriter:
             latest(records), len(self._description["skipped"]), seconds, latest(records, refined=False)
         )
         self._description |= figures | {"notes": notes_of(self._description["camera"], model)}
-        sheet = self._pictures.contact_sheet(model, self._description)
+        replaced = {record.index for record in latest(records) if record.revision and not record.refined}
+        sheet = self._pictures.contact_sheet(model, self._description, replaced)
         if sheet is not None:
             write_image(self.folder / layout.CONTACT_SHEET, sheet)

@@ -1,0 +1,287 @@
+"""``report.html``: one file that holds all of a run, says what to doubt, and lets nothing in that runs."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from html.parser import HTMLParser
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hostile import HOSTILE
+
+from tracking3d.errors import InputError, OutputError
+from tracking3d.estimation.estimate import Status
+from tracking3d.report import run_report
+from tracking3d.report.doubts import doubts_of
+from tracking3d.report.run_report import write_report
+from tracking3d.report.several import write_reports
+from tracking3d.results.layout import runs_in
+from tracking3d.results.run_reader import RunReader
+from tracking3d.video import open_source
+
+
+@pytest.fixture(autouse=True)
+def no_turntable(monkeypatch, request):
+    if "turntable" not in request.function.__name__:
+        monkeypatch.setattr(run_report, "write_turntable", lambda *_: None)
+
+
+class Page(HTMLParser):
+    """What a browser would make of the file: its tags, their attributes, its text."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.text = ""
+        self.source = path.read_text(encoding="utf-8")
+        self.feed(self.source)
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+
+    def handle_data(self, data):
+        self.text += data
+
+    @property
+    def data(self) -> dict:
+        [found] = re.findall(r'<script type="application/json" id="data">(.*?)</script>', self.source, re.S)
+        return json.loads(found)
+
+
+def report_of(folder: Path) -> Page:
+    return Page(write_report(folder))
+
+
+def test_the_report_holds_every_frame_with_its_status_and_reason(run_folder):
+    data = report_of(run_folder).data
+    assert data["indices"] == list(range(12))
+    assert data["statuses"] == "tttt" + "lll" + "uu" + "ttt"
+    assert data["reasons"][data["reason"][5]] == "out of sight"
+    assert data["doubts"] == [4, 7]
+    assert data["keyframes"] == [0, 5, 10]
+    assert len(data["pictures"]) == 12
+    assert base64.b64decode(data["pictures"][3])[:2] == b"\xff\xd8"
+    assert [rotation is None for rotation in data["rotations"]] == [n in (4, 5, 6) for n in range(12)]
+
+
+def test_the_model_in_the_page_is_that_of_the_run(run_folder):
+    model = report_of(run_folder).data["model"]
+    mesh = RunReader(run_folder).mesh()
+    positions = np.frombuffer(base64.b64decode(model["positions"]), "<f4").reshape(-1, 3)
+    faces = np.frombuffer(base64.b64decode(model["faces"]), "<u4").reshape(-1, 3)
+    drawn, truly = positions[faces], mesh.vertices[mesh.faces]
+    assert len(faces) == len(mesh.faces)
+    assert np.allclose(drawn, truly - (mesh.vertices.max(0) + mesh.vertices.min(0)) / 2, atol=1e-2)
+    assert np.linalg.norm(positions, axis=1).max() == pytest.approx(1)
+
+
+def test_the_page_is_one_file_that_asks_for_nothing(run_folder):
+    page = report_of(run_folder)
+    for tag, attributes in page.tags:
+        for name in ("src", "href", "data", "action"):
+            value = attributes.get(name) or ""
+            assert value.startswith("data:") or not value, (tag, value[:40])
+    assert not re.search(r"https?://(?!www\.w3\.org)", page.source)
+    [policy] = [one["content"] for _, one in page.tags if one.get("http-equiv") == "Content-Security-Policy"]
+    assert policy.startswith("default-src 'none'; img-src data:;")
+    assert "unsafe" not in policy
+
+
+def test_every_picture_and_control_has_a_name(run_folder):
+    page = report_of(run_folder)
+    labels = {attributes["for"] for tag, attributes in page.tags if tag == "label"}
+    for tag, attributes in page.tags:
+        if tag == "img":
+            assert attributes.get("alt")
+        if tag == "input":
+            assert attributes["id"] in labels
+        if tag == "svg":
+            assert attributes.get("aria-label") or attributes.get("aria-hidden")
+    levels = [int(tag[1]) for tag, _ in page.tags if re.fullmatch(r"h\d", tag)]
+    assert levels[0] == 1
+    assert levels.count(1) == 1
+    assert max(np.diff(levels)) <= 1
+
+
+def test_what_a_run_says_of_itself_cannot_become_part_of_the_page(run_folder, described):
+    plain = [tag for tag, _ in report_of(run_folder).tags]
+    lines = [json.loads(line) for line in (run_folder / "frames.jsonl").read_text().splitlines()]
+    for line in lines:
+        line["reason"] = line["name"] = HOSTILE
+    (run_folder / "frames.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    about = RunReader(run_folder).description
+    described(
+        run_folder,
+        source=HOSTILE,
+        command=HOSTILE,
+        notes=[HOSTILE],
+        error=HOSTILE,
+        state="failed",
+        config={"tracker": {"name": HOSTILE}, HOSTILE: HOSTILE},
+        versions={HOSTILE: HOSTILE},
+        conventions={HOSTILE: HOSTILE},
+        camera=about["camera"] | {"origin": HOSTILE},
+        created=HOSTILE,
+    )
+    page = report_of(run_folder)
+    more = {tag for tag, _ in page.tags} - set(plain)
+    assert more == set()
+    assert [tag for tag, _ in page.tags].count("script") == plain.count("script")
+    assert [tag for tag, _ in page.tags].count("img") == plain.count("img")
+    assert not any("onerror" in attributes for _, attributes in page.tags)
+    assert HOSTILE in page.text  # it is shown as it is
+    assert "49" not in re.findall(r"\{\{.*?\}\}|amp;(\d+)", page.text)
+    assert page.data["reasons"] == [HOSTILE]
+
+
+def test_the_name_of_a_folder_is_escaped_too(run_folder):
+    folder = run_folder.rename(run_folder.with_name("<script>alert(1)<"))
+    page = report_of(folder)
+    assert "<script>alert(1)<" in page.text
+    assert [tag for tag, _ in page.tags].count("script") == 2
+
+
+def test_doubts_name_the_lost_the_uncertain_and_what_was_handed_back(run_folder):
+    told = " ".join(doubts_of(RunReader(run_folder)))
+    assert "The object was lost in 3 of 12 frames" in told
+    assert "2 of 12 frames are uncertain" in told
+    assert "In 1 of 12 frames that is not lost the mask is the mask tracker's" in told
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"state": "interrupted"}, "The run is interrupted."),
+        ({"state": "failed", "error": "the disk was full"}, "The run is failed: the disk was full."),
+        ({"skipped": [{"index": 3, "reason": "damaged"}]}, "1 frame was not taken"),
+        (
+            {"refinement": {"state": "left out", "reason": "a camera cannot be read a second time"}},
+            "The final refinement is left out (a camera cannot be read a second time)",
+        ),
+    ],
+)
+def test_doubts_name_what_did_not_come_to_its_end(run_folder, described, changes, sentence):
+    described(run_folder, **changes)
+    assert sentence in " ".join(doubts_of(RunReader(run_folder)))
+
+
+def test_a_run_without_fault_has_few_doubts(make_turning_run):
+    folder = make_turning_run(4)
+    assert doubts_of(RunReader(folder)) == []
+
+
+def test_a_run_that_added_nothing_to_its_masks_says_so(run_folder):
+    lines = [json.loads(line) for line in (run_folder / "frames.jsonl").read_text().splitlines()]
+    changed = [json.dumps(line | {"mask_source": "initial"}) for line in lines]
+    (run_folder / "frames.jsonl").write_text("\n".join(changed) + "\n")
+    assert any(
+        doubt.startswith("All masks are the mask tracker's") for doubt in doubts_of(RunReader(run_folder))
+    )
+
+
+def test_the_notes_of_a_run_are_doubts(run_folder, described):
+    described(run_folder, notes=["nobody gave the lens: 45 degrees"])
+    assert "Nobody gave the lens: 45 degrees." in doubts_of(RunReader(run_folder))
+
+
+def test_a_killed_run_has_a_report(run_folder):
+    """As `kill -9` leaves it: no mesh, no sheet, half a line at the end."""
+    for name in ("mesh.obj", "features.npz", "contact_sheet.png", "texture.png"):
+        (run_folder / name).unlink()
+    run = json.loads((run_folder / "run.json").read_text())
+    left = {"state": "running"} | {key: run[key] for key in ("format", "format_version", "camera", "config")}
+    (run_folder / "run.json").write_text(json.dumps(left))
+    lines = (run_folder / "frames.jsonl").read_text()
+    (run_folder / "frames.jsonl").write_text(lines[: len(lines) * 2 // 3])
+    page = report_of(run_folder)
+    assert page.data["model"] is None
+    assert 0 < len(page.data["indices"]) < 12
+    assert "holds no features.npz" in page.text
+    assert "interrupted" in page.text
+
+
+def test_a_run_without_any_frame_has_a_report(run_folder):
+    (run_folder / "frames.jsonl").write_text("")
+    page = report_of(run_folder)
+    assert page.data["indices"] == []
+    assert not [tag for tag, _ in page.tags if tag == "input"]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"config": {"tracker": "csrt"}},
+        {"camera": {}},
+        {"renderer": 3},
+        {"versions": [1]},
+        {"conventions": "none"},
+    ],
+)
+def test_a_damaged_run_is_refused_in_a_sentence(run_folder, described, changes):
+    described(run_folder, **changes)
+    with pytest.raises(InputError, match=r"run\.json is damaged") as error:
+        write_report(run_folder)
+    assert "\n" not in str(error.value)
+    assert not (run_folder / "report.html").exists()
+
+
+@pytest.mark.parametrize("damage", ["vertices", "faces", "shapes"])
+def test_a_damaged_model_is_left_out_with_a_sentence(run_folder, damage):
+    with np.load(run_folder / "features.npz") as file:
+        arrays = dict(file)
+    if damage == "vertices":
+        arrays["vertices"][3] = np.nan
+    elif damage == "faces":
+        arrays["faces"][3] = len(arrays["vertices"])
+    else:
+        arrays["face_uvs"] = arrays["face_uvs"][:-1]
+    np.savez(run_folder / "features.npz", **arrays)
+    page = report_of(run_folder)
+    assert page.data["model"] is None
+    assert "features.npz has" in page.text
+
+
+def test_a_report_that_cannot_be_written_leaves_the_run_as_it_was(run_folder, monkeypatch):
+    before = {path: path.read_bytes() for path in run_folder.rglob("*") if path.is_file()}
+    monkeypatch.setattr(Path, "write_bytes", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left")))
+    with pytest.raises(OutputError, match="disk is full"):
+        write_report(run_folder)
+    monkeypatch.undo()
+    assert {path: path.read_bytes() for path in run_folder.rglob("*") if path.is_file()} == before
+
+
+def test_the_turntable_shows_the_model_once_around(run_folder):
+    write_report(run_folder)
+    images = [frame.image for frame in open_source(str(run_folder / "turntable.mp4"))]
+    assert len(images) >= 36
+    steps = [np.abs(a.astype(int) - b).mean() for a, b in pairwise(images)]
+    closing = np.abs(images[-1].astype(int) - images[0]).mean()
+    assert min(steps) > 0
+    assert closing < 2 * max(steps)
+    assert not list(run_folder.glob(".*"))
+
+
+def test_several_objects_have_a_page_that_links_to_their_reports(make_turning_run, tmp_path):
+    parent = tmp_path / "both"
+    for number in (0, 1, 10):
+        make_turning_run(3, parent / f"object_{number}")
+    written = write_reports(runs_in(parent))
+    assert [path.relative_to(parent).as_posix() for path in written] == [
+        "index.html",
+        "object_0/report.html",
+        "object_1/report.html",
+        "object_10/report.html",
+    ]
+    page = Page(parent / "index.html")
+    links = [attributes["href"] for tag, attributes in page.tags if tag == "a"]
+    assert links == ["object_0/report.html", "object_1/report.html", "object_10/report.html"]
+    assert all((parent / link).is_file() for link in links)
+    assert 'href="../index.html"' in (parent / "object_1/report.html").read_text()
+
+
+def test_statuses_that_the_page_knows_are_all_that_there_are():
+    assert {status.value[0] for status in Status} == {"t", "u", "l"}

@@ -1,0 +1,98 @@
+"""``tracking3d compare``: what differs between runs over one video."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tracking3d.cli.options import Debug
+
+if TYPE_CHECKING:
+    from tracking3d.report.differences import Comparison
+
+
+def compare(
+    runs: Annotated[
+        list[Path],
+        typer.Argument(metavar="RUN RUN...", help="Run folders; the others are held against the first."),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.html", help="Write a page too, with the frames that differ most."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON only.")] = False,
+    debug: Debug = False,
+) -> None:
+    """Print what differs between runs over one video: settings, masks, poses, statuses, time."""
+    import json
+
+    from tracking3d.report.differences import compare_runs
+
+    comparison = compare_runs(runs)
+    if out is not None:
+        from tracking3d.report.comparison import write_comparison
+
+        write_comparison(comparison, out)
+    if as_json:
+        typer.echo(json.dumps(comparison.as_json()))
+        return
+    for note in comparison.notes:
+        typer.echo(note, err=True)
+    _print(comparison)
+    if out is not None:
+        typer.echo(out)
+
+
+def _print(comparison: Comparison) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    from tracking3d.cli.tables import print_table, shown
+    from tracking3d.report.differences import run_figures
+    from tracking3d.stages import STAGES
+
+    names = [escape(name) for name in comparison.names]
+
+    def table(title: str, rows: dict[str, list[Any]], columns: list[str]) -> None:
+        drawn = Table("", *columns, title=title, title_justify="left")
+        for name, values in rows.items():
+            drawn.add_row(escape(name), *(escape(shown(value)) for value in values))
+        print_table(drawn)
+
+    figures = [run_figures(run) for run in comparison.runs]
+    stages = [one.pop("stages") or {} for one in figures]
+    rows = {name.replace("_", " "): [one[name] for one in figures] for name in figures[0]}
+    rows |= {f"  {stage}": [one.get(stage) for one in stages] for stage in STAGES}
+    table("runs", rows, names)
+    if comparison.settings:
+        table("settings that differ", dict(comparison.settings), names)
+    summaries = [one.summary for one in comparison.differences]
+    apart = {_LABELS[key]: [one[key] for one in summaries] for key in summaries[0]}
+    table(f"against {names[0]}", apart, names[1:])
+    worst = {
+        f"frame {index}": [_at(one, index) for one in comparison.differences] for index in comparison.worst
+    }
+    if worst:
+        table("frames that differ most", worst, names[1:])
+
+
+def _at(one: Any, index: int) -> str | None:
+    for place in (one.indices == index).nonzero()[0]:
+        return f"IoU {one.iou[place]:.3f}, rotation {one.rotation[place]:.1f}°".replace("nan°", "-").replace(
+            "nan", "-"
+        )
+    return None
+
+
+_LABELS = {
+    "frames": "frames that both have",
+    "iou_mean": "IoU of masks, mean",
+    "iou_least": "IoU of masks, least",
+    "rotation_median_deg": "rotation, median (degrees)",
+    "rotation_greatest_deg": "rotation, greatest",
+    "translation_median_percent": "translation, median (% of distance)",
+    "translation_greatest_percent": "translation, greatest",
+    "scale": "unit of length, over the first's",
+}

@@ -1,0 +1,169 @@
+"""Figures over the frames of a run, as paths of an SVG picture that is as wide as the page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tracking3d.estimation.estimate import Status
+
+WIDTH, HEIGHT = 1000.0, 100.0
+"""The picture's own units: it is stretched to the page."""
+MOST_POINTS = 2000
+"""Of a curve; of more frames every n-th is drawn."""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One figure over the frames.
+
+    Attributes:
+        title: What it is.
+        path: The curve as the ``d`` of an SVG path; it is broken where there is no figure. Figures that stand alone
+            are short dashes.
+        low: The figure at the lower edge, with its unit.
+        high: That at the upper edge.
+        summary: The curve in words, for who does not see it.
+    """
+
+    title: str
+    path: str
+    low: str
+    high: str
+    summary: str
+
+
+def curve(
+    title: str, values: ArrayLike, unit: str, limits: tuple[float, float] | None = None, digits: int = 2
+) -> Curve | None:
+    """Draw one figure a frame.
+
+    Args:
+        title: What it is.
+        values: ``(N,)``; not finite where there is none.
+        unit: Written behind the figures, with a space before it where it needs one.
+        limits: Figures at the lower and the upper edge; the least and the greatest if None.
+        digits: After the decimal point.
+
+    Returns:
+        The curve; None where there is not one figure.
+    """
+    y = np.asarray(values, dtype=np.float64)
+    known = y[np.isfinite(y)]
+    if not len(known):
+        return None
+    low, high = limits or (float(known.min()), float(known.max()))
+    if high - low < 10.0**-digits:  # nothing to see but noise, which would fill the picture
+        low, high = low - 10.0**-digits, high + 10.0**-digits
+
+    def told(value: float) -> str:
+        return f"{value:.{digits}f}{unit}"
+
+    return Curve(
+        title=title,
+        path=path_of((y - low) / (high - low)),
+        low=told(low),
+        high=told(high),
+        summary=f"{title}: from {told(known.min())} to {told(known.max())}, {told(known[-1])} at the end",
+    )
+
+
+def path_of(heights: NDArray[np.float64]) -> str:
+    """The ``d`` of a path through ``(N,)`` heights, 0 at the lower and 1 at the upper edge; NaN breaks it."""
+    step = max(len(heights) // MOST_POINTS, 1)
+    parts: list[str] = []
+    drawing = False
+    for position in range(0, len(heights), step):
+        height = heights[position]
+        if not math.isfinite(height):
+            drawing = False
+            continue
+        x = across(position, len(heights))
+        y = HEIGHT * (1 - min(max(float(height), 0.0), 1.0))
+        following = position + step
+        alone = following >= len(heights) or not math.isfinite(heights[following])
+        if drawing:
+            parts.append(f"L{x:.1f} {y:.1f}")
+        elif alone:
+            parts.append(f"M{x - 1:.1f} {y:.1f}h2")
+        else:
+            parts.append(f"M{x:.1f} {y:.1f}")
+        drawing = True
+    return "".join(parts)
+
+
+def across(position: int, count: int) -> float:
+    """Where the middle of a frame is in the picture's width."""
+    return WIDTH * (position + 0.5) / max(count, 1)
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Frames in a row that share status and reason.
+
+    Attributes:
+        status: What they share.
+        reason: Why; empty where nothing was said.
+        first: Position of the first one.
+        last: Position of the last one.
+        first_index: Index of the first frame in the source, and of the last one.
+        last_index: See ``first_index``.
+        x: Left edge in the picture.
+        width: Width there.
+    """
+
+    status: str
+    reason: str
+    first: int
+    last: int
+    first_index: int
+    last_index: int
+    x: float
+    width: float
+
+    @property
+    def frames(self) -> str:
+        """Which frames, in words."""
+        if self.first == self.last:
+            return f"frame {self.first_index}"
+        return f"frames {self.first_index} to {self.last_index}"
+
+
+def stretches(indices: Sequence[int], statuses: Sequence[str], reasons: Sequence[str]) -> list[Stretch]:
+    """Frames in a row with one status and one reason, in order.
+
+    Figures within a reason do not part them, nor do the reasons of frames that are tracked.
+
+    Args:
+        indices: Of the frames in the source.
+        statuses: One a frame.
+        reasons: One a frame.
+    """
+    kinds = [
+        (status, "" if status == Status.TRACKED else _kind(reason))
+        for status, reason in zip(statuses, reasons, strict=True)
+    ]
+    begins = [n for n in range(len(kinds)) if n == 0 or kinds[n] != kinds[n - 1]]
+    unit = WIDTH / max(len(kinds), 1)
+    return [
+        Stretch(
+            status=statuses[first],
+            reason=reasons[first],
+            first=first,
+            last=following - 1,
+            first_index=indices[first],
+            last_index=indices[following - 1],
+            x=first * unit,
+            width=(following - first) * unit,
+        )
+        for first, following in pairwise([*begins, len(kinds)])
+    ]
+
+
+def _kind(reason: str) -> str:
+    return "".join(letter for letter in reason if not letter.isdigit())

@@ -1,0 +1,284 @@
+"""What differs between runs over one video: settings, masks, poses, statuses, time.
+
+The first run is the one that the others are held against; none of them is the truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.errors import InputError
+from tracking3d.evaluation.alignment import align_object_frame
+from tracking3d.report.figures import angles_between, believed_poses, stage_times, status_counts
+from tracking3d.report.settings import flat
+from tracking3d.results.files import read_mask
+from tracking3d.results.records import jsonable, mask_iou
+from tracking3d.results.run_reader import RunReader
+from tracking3d.stages import STAGES
+
+MOST_FRAMES = 6
+"""Frames that differ most, which are shown."""
+
+
+@dataclass(frozen=True, eq=False)
+class Difference:
+    """One run against the first one, over the ``N`` frames that both have answered.
+
+    Attributes:
+        name: The run.
+        indices: ``(N,)`` of the frames in the source.
+        iou: ``(N,)`` of both masks; NaN where one is missing or both are empty.
+        rotation: ``(N,)`` degrees between both poses; NaN where one is lost.
+        translation: ``(N,)`` between both, in percent of the object's distance in the first run; NaN likewise.
+        scale: Length of the run's unit in that of the first one's; NaN where no frame has both poses.
+    """
+
+    name: str
+    indices: NDArray[np.int64]
+    iou: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+    translation: NDArray[np.float64]
+    scale: float
+
+    @property
+    def summary(self) -> dict[str, float | None]:
+        """Mean, median and worst of each; None where there is none."""
+        return {
+            "frames": len(self.indices),
+            "iou_mean": _figure(np.mean, self.iou),
+            "iou_least": _figure(np.min, self.iou),
+            "rotation_median_deg": _figure(np.median, self.rotation),
+            "rotation_greatest_deg": _figure(np.max, self.rotation),
+            "translation_median_percent": _figure(np.median, self.translation),
+            "translation_greatest_percent": _figure(np.max, self.translation),
+            "scale": self.scale if np.isfinite(self.scale) else None,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Runs over one video.
+
+    Attributes:
+        runs: The runs; the first one is what the others are held against.
+        names: What to call them; no two alike.
+        settings: By name, the value in each run as text, of those that differ; None where a run has none such.
+        differences: Of each run but the first.
+        worst: Indices of the frames that differ most, in order of time.
+        notes: What to know, in sentences.
+    """
+
+    runs: list[RunReader]
+    names: list[str]
+    settings: dict[str, list[str | None]]
+    differences: list[Difference]
+    worst: list[int]
+    notes: list[str]
+
+    def as_json(self) -> dict[str, Any]:
+        """All of it in JSON's types, frame by frame too."""
+        told: dict[str, Any] = jsonable(
+            {
+                "runs": [
+                    {"name": name, "folder": run.folder, "state": run.state, **run_figures(run)}
+                    for name, run in zip(self.names, self.runs, strict=True)
+                ],
+                "settings": self.settings,
+                "differences": [
+                    {
+                        "run": one.name,
+                        "against": self.names[0],
+                        **one.summary,
+                        "by_frame": {
+                            "index": one.indices,
+                            "iou": one.iou,
+                            "rotation_deg": one.rotation,
+                            "translation_percent": one.translation,
+                        },
+                    }
+                    for one in self.differences
+                ],
+                "worst_frames": self.worst,
+                "notes": self.notes,
+            }
+        )
+        return told
+
+
+def compare_runs(folders: Sequence[Path]) -> Comparison:
+    """Hold runs against the first of them.
+
+    Poses are compared after the similarity that fits best, since object frame and unit of a run are its own.
+
+    Args:
+        folders: Two run folders or more.
+
+    Raises:
+        InputError: If one is no run folder, or damaged; if there are fewer than two; if they are of different videos,
+            as far as their sizes and frames tell.
+    """
+    if len(folders) < 2:
+        raise InputError("There is nothing to compare one run with; give two run folders or more.")
+    runs = [RunReader(folder) for folder in folders]
+    first, *others = runs
+    for other in others:
+        _check_same_video(first, other)
+    names = _names([run.folder for run in runs])
+    differences = [_difference(name, first, other) for name, other in zip(names[1:], others, strict=True)]
+    configs = [flat(run.config) for run in runs]
+    keys = dict.fromkeys(key for config in configs for key in config)
+    values = {key: [config.get(key) for config in configs] for key in keys}
+    return Comparison(
+        runs=runs,
+        names=names,
+        settings={key: told for key, told in values.items() if len(set(told)) > 1},
+        differences=differences,
+        worst=worst_frames(differences),
+        notes=_notes(runs, names, differences),
+    )
+
+
+def run_figures(run: RunReader) -> dict[str, Any]:
+    """Statuses and time of one run; seconds are those of a frame, its share of the final refinement included."""
+    causal, refined = stage_times(run)
+    stages = None if causal is None else (causal + refined) * (1 / len(run.frames))
+    return {
+        "frames": len(run.frames),
+        **status_counts(run.frames),
+        "seconds_per_frame": None if stages is None else stages.whole,
+        "stages": None if stages is None else {stage: getattr(stages, stage) for stage in STAGES},
+    }
+
+
+def worst_frames(differences: Sequence[Difference], most: int = MOST_FRAMES) -> list[int]:
+    """Indices of the frames that differ most, in order of time: two thirds by masks, the others by rotation.
+
+    They keep some distance, since what goes wrong in one frame does so in its neighbours.
+    """
+    chosen: list[int] = []
+    by_mask: dict[int, float] = {}
+    by_turn: dict[int, float] = {}
+    for one in differences:
+        for index, iou, turn in zip(one.indices.tolist(), one.iou, one.rotation, strict=True):
+            by_mask[index] = max(by_mask.get(index, 0.0), 1 - np.nan_to_num(iou, nan=1.0))
+            by_turn[index] = max(by_turn.get(index, 0.0), np.nan_to_num(turn))
+    apart = max(len(by_mask) // (2 * most), 1)
+    for found, until in ((by_mask, most - most // 3), (by_turn, most)):
+        for index in sorted(found, key=lambda index: -found[index]):
+            if len(chosen) >= until or not found[index] > 0:
+                break
+            if all(abs(index - other) >= apart for other in chosen):
+                chosen.append(index)
+    return sorted(chosen)
+
+
+def _difference(name: str, first: RunReader, other: RunReader) -> Difference:
+    records = {record.index: record for record in first.frames}
+    shared = [record.index for record in other.frames if record.index in records]
+    others = {record.index: record for record in other.frames}
+    T_first = believed_poses([records[index] for index in shared])
+    T_other = believed_poses([others[index] for index in shared])
+    rotation, translation, scale = _pose_differences(T_first, T_other)
+    return Difference(
+        name=name,
+        indices=np.array(shared, dtype=np.int64),
+        iou=np.array([_iou(first, other, index) for index in shared], dtype=np.float64),
+        rotation=rotation,
+        translation=translation,
+        scale=scale,
+    )
+
+
+def _iou(first: RunReader, other: RunReader, index: int) -> float:
+    a, b = read_mask(first.mask_path(index)), read_mask(other.mask_path(index))
+    if a is None or b is None or a.shape != b.shape:
+        return np.nan
+    iou = mask_iou(a, b)
+    return np.nan if iou is None else iou
+
+
+def _pose_differences(
+    T_first: NDArray[np.float64], T_other: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Degrees, percent of the distance, and the scale between them; NaN where a pose is missing."""
+    rotation, translation = np.full(len(T_first), np.nan), np.full(len(T_first), np.nan)
+    both = np.isfinite(T_first).all((1, 2)) & np.isfinite(T_other).all((1, 2))
+    if not both.any():
+        return rotation, translation, np.nan
+    alignment = align_object_frame(T_other[both], T_first[both])
+    aligned = alignment.poses(T_other[both])
+    rotation[both] = angles_between(aligned[:, :3, :3], T_first[both, :3, :3])
+    away = np.linalg.norm(T_first[both, :3, 3], axis=1)
+    apart = np.linalg.norm(aligned[:, :3, 3] - T_first[both, :3, 3], axis=1)
+    translation[both] = 100 * apart / np.maximum(away, 1e-12)
+    return rotation, translation, alignment.scale
+
+
+def _check_same_video(first: RunReader, other: RunReader) -> None:
+    """Refuse what cannot be of one video.
+
+    Raises:
+        InputError: Says in what they differ.
+    """
+    sizes = [f"{run.camera.width} x {run.camera.height}" for run in (first, other)]
+    if sizes[0] != sizes[1]:
+        raise InputError(
+            f"{first.folder} is of frames of {sizes[0]} pixels and {other.folder} of {sizes[1]}; compare runs of one "
+            "video."
+        )
+    if not {record.index for record in first.frames} & {record.index for record in other.frames}:
+        raise InputError(
+            f"{first.folder} and {other.folder} have no frame in common that both have answered; compare runs of "
+            "the same frames."
+        )
+
+
+def _notes(runs: list[RunReader], names: list[str], differences: list[Difference]) -> list[str]:
+    notes = [
+        f"{name} is {run.state_in_words}: {len(run.frames)} frames have an answer."
+        for name, run in zip(names, runs, strict=True)
+        if run.state != "finished"
+    ]
+    first = runs[0]
+    for name, run, one in zip(names[1:], runs[1:], differences, strict=True):
+        if len(one.indices) < max(len(first.frames), len(run.frames)):
+            notes.append(
+                f"{names[0]} has answers for {len(first.frames)} frames and {name} for {len(run.frames)}; they are "
+                f"compared in the {len(one.indices)} that both have."
+            )
+        given = [
+            told if isinstance(told := each.description.get("given"), dict) else {} for each in (first, run)
+        ]
+        (start, start_too), (picture, picture_too) = (
+            [about.get(key) for about in given] for key in ("first_frame", "first_picture")
+        )
+        if start == start_too and None not in (picture, picture_too) and picture != picture_too:
+            notes.append(f"The first pictures of {names[0]} and {name} are not the same: is it one video?")
+        if abs(first.camera.fx - run.camera.fx) > 1e-3 * first.camera.fx:
+            notes.append(
+                f"{names[0]} and {name} see through different lenses (focal lengths {first.camera.fx:.0f} and "
+                f"{run.camera.fx:.0f} pixels), which alone makes poses differ."
+            )
+        if not np.isfinite(one.rotation).any():
+            notes.append(f"No frame has a pose in both {names[0]} and {name}.")
+    return notes
+
+
+def _names(folders: list[Path]) -> list[str]:
+    """Their last part where that tells them apart, else all of it; a run that is given twice is numbered."""
+    short = [folder.resolve().name for folder in folders]
+    names = short if len(set(short)) == len(short) else [str(folder) for folder in folders]
+    if len(set(names)) < len(names):
+        names = [f"{name} ({number})" for number, name in enumerate(names, 1)]
+    return names
+
+
+def _figure(kind: Any, values: NDArray[np.float64]) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(kind(known)) if len(known) else None

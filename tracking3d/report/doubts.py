@@ -1,0 +1,108 @@
+"""What to doubt about a run, in sentences: the most serious first."""
+
+from __future__ import annotations
+
+from tracking3d.estimation.estimate import MaskSource, Status
+from tracking3d.results.run_reader import RunReader
+
+
+def doubts_of(run: RunReader) -> list[str]:
+    """Sentences about what of a run cannot be relied on, and why; empty where there is nothing to say.
+
+    Args:
+        run: The run, finished or not.
+    """
+    return [
+        *_about_its_end(run),
+        *_about_frames(run),
+        *_about_masks(run),
+        *_notes(run),
+        *_about_pictures(run),
+    ]
+
+
+def _about_its_end(run: RunReader) -> list[str]:
+    told = []
+    if run.state != "finished":
+        why = run.description.get("error")
+        told.append(
+            f"The run is {run.state_in_words}{f': {why}' if why else ''}. "
+            f"What is here are the {len(run.frames)} frames that it had answered until then."
+        )
+    refinement = run.description.get("refinement") or {}
+    if run.frames and refinement.get("state") not in (None, "finished"):
+        reason = refinement.get("reason")
+        told.append(
+            f"The final refinement is {refinement['state']}{f' ({reason})' if reason else ''}: answers are those "
+            "given frame by frame, from what was seen until then."
+        )
+    return told
+
+
+def _about_frames(run: RunReader) -> list[str]:
+    told, count = [], len(run.frames)
+    lost = sum(record.status is Status.LOST for record in run.frames)
+    uncertain = sum(record.status is Status.UNCERTAIN for record in run.frames)
+    failed = sum(bool(record.failure) for record in run.frames)
+    skipped = len(run.description.get("skipped") or [])
+    if lost:
+        told.append(
+            f"The object was lost in {_of(lost, count)}: their poses mean nothing, and their masks, if they "
+            "have any, are the mask tracker's."
+        )
+    if uncertain:
+        told.append(
+            f"{_of(uncertain, count).capitalize()} {_are(uncertain)} uncertain; the pose may be wrong."
+        )
+    if failed:
+        told.append(f"A plug-in failed in {_of(failed, count)}.")
+    if skipped:
+        told.append(
+            f"{skipped} {'frame was' if skipped == 1 else 'frames were'} not taken: unreadable, of another size, or "
+            "dropped to keep up with a camera."
+        )
+    return told
+
+
+def _about_masks(run: RunReader) -> list[str]:
+    sources = [record.mask_source for record in run.frames]
+    if not run.frames or None in sources:
+        return []
+    if not any(source is not None and source.is_own for source in sources):
+        return ["All masks are the mask tracker's, handed back as they were: nothing was added to them."]
+    handed_back = sum(
+        record.mask_source is MaskSource.INITIAL and record.status is not Status.LOST for record in run.frames
+    )
+    if not handed_back:
+        return []
+    return [
+        f"In {_of(handed_back, len(sources))} that {_are(handed_back)} not lost the mask is the mask tracker's, "
+        "handed back as it was."
+    ]
+
+
+def _notes(run: RunReader) -> list[str]:
+    return [
+        f"{text[:1].upper()}{text[1:]}." for note in run.description.get("notes") or [] if (text := str(note))
+    ]
+
+
+def _about_pictures(run: RunReader) -> list[str]:
+    revised = sum(record.revision and not record.refined for record in run.frames)
+    if not revised:
+        return []
+    return [
+        f"Pictures show the first answer for each frame; {_of(revised, len(run.frames))} "
+        f"{'was' if revised == 1 else 'were'} answered anew later, and all figures are those of the later answer."
+    ]
+
+
+def _of(some: int, count: int) -> str:
+    """So many of the frames."""
+    if some == count:
+        return "the only frame" if count == 1 else f"all {count} frames"
+    return f"{some} of {count} frames"
+
+
+def _are(some: int) -> str:
+    return "is" if some == 1 else "are"
