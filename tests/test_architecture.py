@@ -17,12 +17,15 @@ SHARED_BY_SOLVERS = {"evidence"}
 FLOORS = [
     {"errors", "frames", "geometry", "config", "features", "networks", "process_memory", "stages"},
     {"rendering", "trackers", "video"},
-    {"estimation", "plugins", "prompts", "testing"},
+    {"corrections", "estimation", "plugins", "point_prompts", "prompts", "testing"},
     {
         "arguments",
         "checkpoint",
+        "mask_tracking",
         "object_recording",
+        "parts",
         "pipeline",
+        "presented",
         "process_settings",
         "recording",
         "results",

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -30,7 +30,7 @@ from tracking3d.results.files import (
     write_reserved,
     writing,
 )
-from tracking3d.results.frame_lines import FrameLines
+from tracking3d.results.frame_lines import FrameLines, WrittenSoFar
 from tracking3d.results.making_room import make_room
 from tracking3d.results.mesh_export import export_mesh
 from tracking3d.results.notes import notes_of
@@ -46,21 +46,6 @@ RESERVE = 2048
 """Bytes that ``run.json`` has to spare for saying, on a full disk, how the run ended."""
 DEFAULT_FPS = 10.0
 """Speed of the overlay video where the source has none, such as a folder of images."""
-
-
-@dataclass(frozen=True)
-class WrittenSoFar:
-    """What a stopped run has written.
-
-    Attributes:
-        lines: Bytes of ``frames.jsonl`` that are of finished frames.
-        seconds: Wall time of the run until then.
-        skipped: Frames that were not taken.
-    """
-
-    lines: int = 0
-    seconds: float = 0.0
-    skipped: tuple[SkippedFrame, ...] = ()
 
 
 class RunWriter:
@@ -158,6 +143,16 @@ class RunWriter:
             mask = read_mask(layout.mask_path(self.folder, frame.index))
             self._pictures.add_kept(frame, record, mask, initial)
         return record
+
+    def begin_drawing_anew(self) -> None:
+        """All frames are answered: from here on `draw_again` draws them, in the order in which they come.
+
+        Raises:
+            OutputError: If the video that was drawn so far cannot be finished.
+        """
+        self._pictures.close()
+        self._pictures = Pictures(self.folder / layout.OVERLAY, self._camera, self._fps)
+        self._kept = {record.index: record for record in latest(read_records(self.folder / layout.FRAMES))}
 
     def write(self, estimate: FrameEstimate, frame: Frame) -> FrameRecord:
         """Keep the answer for one frame, and those it revises.
