@@ -30,6 +30,7 @@ FLOORS = [
         "recording",
         "results",
         "session",
+        "tracker_choice",
     },
     {"datasets"},
     {"synthesis", "evaluation", "speed", "viewer"},

@@ -76,6 +76,12 @@ class Correction:
             check_points_inside(self.points, size, label, self.name)
 
 
+def prompts_in(frame: Frame, corrections: Mapping[int, Correction]) -> list[Prompt]:
+    """What `tracking3d.Session.step` is given with a frame: the correction of it, where there is one."""
+    correction = corrections.get(frame.index)
+    return [] if correction is None else [correction.prompt(frame)]
+
+
 def parse_correction(text: str) -> Correction:
     """Read ``FRAME:X,Y,W,H``, ``FRAME:MASK.png`` or ``FRAME:X,Y+ X,Y-``, FRAME with ``@OBJECT`` behind it or without.
 

@@ -15,10 +15,10 @@ import numpy as np
 from tracking3d.checkpoint.folder import Checkpoint
 from tracking3d.checkpoint.progress import Kept, Progress, TakenFrame, checksum
 from tracking3d.checkpoint.trees import UnkeptError
-from tracking3d.corrections import Correction
+from tracking3d.corrections import Correction, prompts_in
 from tracking3d.errors import InputError, OutputError, PluginError
 from tracking3d.estimation.estimate import ObjectModel
-from tracking3d.frames import Frame, MaskEstimate, Prompt, SkippedFrame
+from tracking3d.frames import Frame, MaskEstimate, SkippedFrame
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.refinement_writer import RefinementWriter
@@ -78,7 +78,7 @@ class ObjectRecording:
             if self._checkpoint:
                 self._checkpoint.note(frame)
             return frame
-        estimate = self._session.step(frame, *self._prompts(frame))
+        estimate = self._session.step(frame, *prompts_in(frame, self._corrections))
         answer = self._writer.write(estimate, frame)
         self._answered = True
         initial = self._session.initial_mask
@@ -210,7 +210,7 @@ class ObjectRecording:
             correction = None
             if taken.corrected and self._checkpoint:
                 correction = self._checkpoint.correction(frame.index)
-            answer = self._session.replay(frame, first, correction, *self._prompts(frame))
+            answer = self._session.replay(frame, first, correction, *prompts_in(frame, self._corrections))
             if (
                 not self._said
                 and not taken.failure
@@ -224,11 +224,6 @@ class ObjectRecording:
                     frame.name or f"frame {frame.index}",
                 )
         return self._writer.draw_again(frame)
-
-    def _prompts(self, frame: Frame) -> list[Prompt]:
-        """What the user has said of the object in this frame, if anything."""
-        correction = self._corrections.get(frame.index)
-        return [] if correction is None else [correction.prompt(frame)]
 
     def _check(self, kept: Kept, frame: Frame | SkippedFrame) -> None:
         """Make sure that a frame is the one that was answered before the run was stopped."""

@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,13 +18,14 @@ from numpy.typing import NDArray
 from tracking3d.arguments import check_frames, checked_config, checked_image
 from tracking3d.config.camera import choose_camera
 from tracking3d.config.models import PipelineConfig
-from tracking3d.corrections import Correction, check_corrections_fit, checked_corrections
+from tracking3d.corrections import Correction, check_corrections_fit, checked_corrections, prompts_in
 from tracking3d.errors import PluginError
 from tracking3d.estimation.estimate import FrameEstimate, unanswered
 from tracking3d.frames import Box, Frame, Image, MaskEstimate, Prompt, SkippedFrame
 from tracking3d.parts import SOLVERS, build_encoder, check_turns
 from tracking3d.prompts import check_prompt, check_prompts, damaged_start, make_prompt, make_prompts
 from tracking3d.session import Session
+from tracking3d.tracker_choice import choose_tracker
 from tracking3d.video.both_ways import both_ways, check_start_frame
 
 __all__ = ["SOLVERS", "Session", "checked_image", "choose_camera", "track", "track_objects"]
@@ -68,9 +69,9 @@ def track(
     check_prompt(box, mask, needed=config.tracker.name != "precomputed", points=points)
     [told] = checked_corrections(corrections)
     if box is None and mask is None and points is None:
-        return _track(_in_order(frames, start_frame, config, True), None, told, config)
+        return _track(_in_order(frames, start_frame, config, True), None, told, config, _count(frames))
     prompt = partial(make_prompt, box=box, mask=mask, points=points)
-    return _track(_in_order(frames, start_frame, config, skip_damaged), prompt, told, config)
+    return _track(_in_order(frames, start_frame, config, skip_damaged), prompt, told, config, _count(frames))
 
 
 def _track(
@@ -78,13 +79,15 @@ def _track(
     prompt: Callable[[Frame], Prompt] | None,
     corrections: Mapping[int, Correction],
     config: PipelineConfig,
+    count: int | None,
 ) -> Iterator[FrameEstimate]:
     session: Session | None = None
     for frame in frames:
         if session is None:
-            session = Session(config, prompt and prompt(frame))
+            its_prompt = prompt and prompt(frame)
+            session = Session(_with_tracker(config, count, frame, its_prompt), its_prompt)
             check_corrections_fit(corrections.values(), frame, config.tracker.name)
-        yield session.step(frame, _told(corrections, frame))
+        yield session.step(frame, *prompts_in(frame, corrections))
 
 
 def track_objects(
@@ -125,7 +128,9 @@ def track_objects(
     check_prompts(boxes, masks, points)
     told = checked_corrections(corrections, len(boxes) + len(masks) + len(points))
     prompts = partial(make_prompts, boxes=boxes, masks=masks, tracker=config.tracker.name, points=points)
-    return _track_objects(_in_order(frames, start_frame, config, skip_damaged), prompts, told, config)
+    return _track_objects(
+        _in_order(frames, start_frame, config, skip_damaged), prompts, told, config, _count(frames)
+    )
 
 
 def _track_objects(
@@ -133,6 +138,7 @@ def _track_objects(
     prompts: Callable[[Frame], list[Prompt]],
     corrections: Sequence[Mapping[int, Correction]],
     config: PipelineConfig,
+    count: int | None,
 ) -> Iterator[tuple[FrameEstimate, ...]]:
     sessions: list[Session] = []
     failures: dict[int, PluginError] = {}
@@ -140,7 +146,9 @@ def _track_objects(
     for frame in frames:
         if not sessions:
             encoder = build_encoder(config)
-            sessions = [Session(config, prompt, encoder=encoder) for prompt in prompts(frame)]
+            given = prompts(frame)
+            config = _with_tracker(config, count, frame, given[0])
+            sessions = [Session(config, prompt, encoder=encoder) for prompt in given]
             for theirs in corrections:
                 check_corrections_fit(theirs.values(), frame, config.tracker.name)
             poses = [np.eye(4) for _ in sessions]
@@ -148,7 +156,7 @@ def _track_objects(
         for number, session in enumerate(sessions):
             if number not in failures:
                 try:
-                    answers.append(session.step(frame, _told(corrections[number], frame)))
+                    answers.append(session.step(frame, *prompts_in(frame, corrections[number])))
                     poses[number] = answers[-1].T_cam_obj
                     continue
                 except PluginError as error:
@@ -161,10 +169,15 @@ def _track_objects(
         yield tuple(answers)
 
 
-def _told(corrections: Mapping[int, Correction], frame: Frame) -> Prompt | None:
-    """What was said of the object in this frame, if anything."""
-    correction = corrections.get(frame.index)
-    return None if correction is None else correction.prompt(frame)
+def _with_tracker(
+    config: PipelineConfig, count: int | None, first: Frame, prompt: Prompt | None
+) -> PipelineConfig:
+    return config if prompt is None else choose_tracker(config, count, False, first, prompt)[0]
+
+
+def _count(frames: Any) -> int | None:
+    """How many frames there are, where that is known."""
+    return len(frames) if isinstance(frames, Sized) else getattr(frames, "count", None)
 
 
 def _in_order(

@@ -47,12 +47,11 @@ def parse_points(text: str, name: str = POINTS) -> NDArray[np.float32]:
     for word in text.split():
         found = _TOKEN.fullmatch(word)
         try:
-            x, y = (float(value) for value in found.groups()[:2]) if found else ()
-        except ValueError:
-            found = None
-        if found is None:
-            raise InputError(f"{name}'{text}': '{word}' is no point; write them as {_FORM}.")
-        rows.append((x, y, 1.0 if found[3] == "+" else 0.0))
+            if found is None:
+                raise ValueError
+            rows.append((float(found[1]), float(found[2]), 1.0 if found[3] == "+" else 0.0))
+        except ValueError as error:
+            raise InputError(f"{name}'{text}': '{word}' is no point; write them as {_FORM}.") from error
     if not rows:
         raise InputError(f"{name}'{text}' names no point; write them as {_FORM}.")
     return _checked(rows, f"{name}'{text}'")

@@ -17,16 +17,18 @@ from tracking3d.arguments import check_source, checked_config, checked_folder
 from tracking3d.checkpoint.folder import Checkpoint, remove_state
 from tracking3d.checkpoint.resuming import earlier_run, given_of
 from tracking3d.config.camera import choose_camera
-from tracking3d.config.models import PipelineConfig
+from tracking3d.config.models import PipelineConfig, PluginChoice
 from tracking3d.corrections import Correction, check_corrections_fit, checked_corrections
 from tracking3d.errors import InputError
 from tracking3d.frames import Box, Frame, Prompt, SkippedFrame
 from tracking3d.object_recording import Listener, ObjectRecording, go_through, timed
 from tracking3d.parts import build_encoder, check_turns
 from tracking3d.prompts import check_prompt, check_prompts, damaged_start, make_prompt, make_prompts
-from tracking3d.results.layout import object_folders
+from tracking3d.results.layout import RUN, object_folders
+from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_writer import RunWriter, WrittenSoFar
 from tracking3d.session import Session
+from tracking3d.tracker_choice import AUTO, choose_tracker
 from tracking3d.video.both_ways import both_ways, check_start_frame
 from tracking3d.video.source import FrameSource
 
@@ -94,8 +96,11 @@ def record(
     with opened(source, config, start_frame) as frames, ExitStack() as writers:
         skipped, first = first_frame(frames, source.name, skip_damaged or untold)
         prompt = None if untold else make_prompt(first, box, mask, points=points)
+        config, choice = with_tracker(config, source, first, prompt, folder, resume)
         session = Session(config, prompt, source.intrinsics, source.intrinsics_origin)
-        recording = begin(session, prompt, first=first, folder=folder, writers=writers, corrections=told)
+        recording = begin(
+            session, prompt, choice=choice, first=first, folder=folder, writers=writers, corrections=told
+        )
         if recording is not None:
             go_through(source, chain(skipped, [first], frames), [recording], listener)
 
@@ -153,13 +158,16 @@ def record_objects(
         skipped, first = first_frame(frames, source.name, skip_damaged)
         prompts = make_prompts(first, boxes, masks, config.tracker.name, points)
         folders = object_folders(folder, len(prompts))
+        config, choice = with_tracker(config, source, first, prompts[0], folders[0], resume)
         encoder = build_encoder(config)
         sessions = [
             Session(config, prompt, source.intrinsics, source.intrinsics_origin, encoder)
             for prompt in prompts
         ]
         recordings = [
-            begin(session, prompt, first=first, folder=into, writers=writers, corrections=theirs)
+            begin(
+                session, prompt, choice=choice, first=first, folder=into, writers=writers, corrections=theirs
+            )
             for session, prompt, into, theirs in zip(sessions, prompts, folders, told, strict=True)
         ]
         if unfinished := [recording for recording in recordings if recording is not None]:
@@ -197,6 +205,7 @@ def begun(
     session: Session,
     prompt: Prompt | None,
     *,
+    choice: str | None,
     first: Frame,
     folder: Path,
     command: str | None,
@@ -250,6 +259,7 @@ def begun(
         command=command,
         selection=selection,
         given=given,
+        tracker_choice=choice,
         overwrite=overwrite or resume,
         resume=WrittenSoFar(kept.progress.lines, kept.progress.seconds, kept.skipped) if kept else None,
     )
@@ -262,6 +272,30 @@ def begun(
     elif source.repeatable:
         checkpoint = Checkpoint(folder, session.state_classes, device)
     return ObjectRecording(session, writer, checkpoint, kept, corrections, redraw=start_frame is not None)
+
+
+def with_tracker(
+    config: PipelineConfig,
+    source: FrameSource,
+    first: Frame,
+    prompt: Prompt | None,
+    folder: Path,
+    resume: bool,
+) -> tuple[PipelineConfig, str | None]:
+    """The configuration with a tracker in place of ``auto``, and why it is that one; None where it was named.
+
+    A run that goes on does so with the tracker that it was begun with.
+    """
+    if config.tracker.name != AUTO or prompt is None:
+        return config, None
+    if resume and (folder / RUN).is_file():
+        before = RunReader(folder)
+        if why := before.description.get("tracker_choice"):
+            tracker = PluginChoice.model_validate(before.config["tracker"])
+            return config.model_copy(update={"tracker": tracker}), str(why)
+    config, why = choose_tracker(config, source.count, not source.repeatable, first, prompt)
+    _log.info("Mask tracker: %s.", why)
+    return config, why
 
 
 def first_frame(

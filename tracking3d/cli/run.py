@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
-from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quiet, configure, numbers
+from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quality, Quiet, configure, numbers
 from tracking3d.errors import InputError
 
 _TRACKING, _CAMERA, _RUNNING = "The object and how to track it", "The camera", "Running"
@@ -120,6 +120,7 @@ def run(
     ] = False,
     config: ConfigFile = None,
     preset: Preset = None,
+    quality: Quality = None,
     overrides: Overrides = None,
     size: Annotated[
         int | None, typer.Option(help="Working resolution in pixels.", rich_help_panel=_RUNNING)
@@ -162,7 +163,7 @@ def run(
         raise InputError("Give either --box, --mask or --points, not more than one of them.")
     chosen: dict[str, str | None] = {"name": tracker}
     if masks is not None:
-        if tracker not in (None, "precomputed"):
+        if tracker not in (None, "precomputed", "auto"):
             raise InputError(f"--masks is for the tracker precomputed; leave out --tracker {tracker}.")
         chosen = {"name": "precomputed", "path": str(masks)}
     camera = None
@@ -172,6 +173,7 @@ def run(
         config,
         preset,
         overrides,
+        quality,
         tracker=chosen,
         features=features,
         camera={"fov": fov, "intrinsics": camera},
@@ -217,12 +219,10 @@ def run(
     finished = {one: _written(one) for one in folders if resume and is_finished(one)}
     with resumable(folders), progress(opened.count, quiet, objects) as about["listener"]:
         if objects > 1:
-            objects_given = {"boxes": given, "masks": object_masks, "points": clicked}
-            record_objects(opened, settings, folder, **objects_given, **about)
+            record_objects(opened, settings, folder, boxes=given, masks=object_masks, points=clicked, **about)
         else:
-            the_box, the_mask, its_points = (
-                next(iter(some), None) for some in (given, object_masks, clicked)
-            )
+            the_box, the_mask = next(iter(given), None), next(iter(object_masks), None)
+            its_points = next(iter(clicked), None)
             record(opened, settings, folder, box=the_box, mask=the_mask, points=its_points, **about)
     for one in () if quiet else folders:
         if one in finished and finished[one] == _written(one):

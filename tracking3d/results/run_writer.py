@@ -63,6 +63,7 @@ class RunWriter:
         fps: Frames per second of the source, where known.
         command: The command line, where there was one.
         given: What tells source and object apart from others, see `tracking3d.checkpoint.resuming.given_of`.
+        tracker_choice: Why the mask tracker ``auto`` stood for that of ``config``; None where it was named.
         overwrite: Replace a run that is there. Only files a run writes are removed, only from a run folder.
         resume: Go on with the run that is there, of which so much is kept. What is behind that in ``frames.jsonl``
             stays until something is written in its place.
@@ -84,6 +85,7 @@ class RunWriter:
         selection: str | None = None,
         renderer: Mapping[str, str | int] | None = None,
         given: Mapping[str, Any] | None = None,
+        tracker_choice: str | None = None,
         overwrite: bool = False,
         resume: WrittenSoFar | None = None,
     ) -> None:
@@ -105,6 +107,7 @@ class RunWriter:
             selection=selection,
             renderer=renderer,
             given=given,
+            tracker_choice=tracker_choice,
         )
         self._kept: dict[int, FrameRecord] = {}
         with writing(self.folder):
