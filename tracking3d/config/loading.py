@@ -157,8 +157,9 @@ def _files(file: Path | None, preset: str | None, quality: str | None) -> list[L
         name = from_file.pop(key, {})
         if not isinstance(name, str) and name != {}:
             raise InputError(f"{file}: '{key}' must be the name of a {key}, not {shown(name)}.")
-        named[key] = spoken if spoken is not None else name or None
-    layers = [_named_layer("preset", "presets", list_presets(), named["preset"] or DEFAULT_PRESET)]
+        named[key] = spoken if spoken is not None else None if name == {} else name
+    chosen = DEFAULT_PRESET if named["preset"] is None else named["preset"]
+    layers = [_named_layer("preset", "presets", list_presets(), chosen)]
     if named["quality"] is not None:
         layers.append(_named_layer("quality", "qualities", list_qualities(), named["quality"]))
     return [*layers, (str(file), from_file)] if file is not None else layers
