@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,13 @@ from tracking3d.errors import InputError
 from tracking3d.frames import Frame
 from tracking3d.point_prompts import checked_points, parse_points
 from tracking3d.prompts import make_prompt
+
+
+@pytest.fixture(autouse=True)
+def usual_log_level():
+    yield
+    logging.getLogger("tracking3d").setLevel(logging.NOTSET)
+
 
 IMAGE = np.full((48, 64, 3), (40, 80, 200), np.uint8)
 IMAGE[10:30, 20:45] = 220, 90, 30
@@ -155,3 +164,45 @@ def test_masks_that_were_made_elsewhere_are_not_corrected(refused, clip, script,
         Path(f"masks/{number:03d}.png").write_bytes(Path("mask.png").read_bytes())
     line = refused("run", clip, "--masks", "masks", "--correct", "3:1,2,5,5")
     assert "put the better mask among them" in line
+
+
+def test_a_file_says_what_is_tracked_and_the_command_line_wins(call, clip, script):
+    Path("mine.yaml").write_text(
+        "prompt:\n  points: 20,20+ 60,40-\n  start_frame: 2\n  correct: '4:1,2,5,5'\n"
+        "solver: {final_refine: false}\n"
+    )
+    assert call("run", clip, "--config", "mine.yaml", "--quiet", "--out", "one").exit_code == 0
+    [(_, prompt)] = script.built
+    assert prompt.points.tolist() == [[20, 20, 1], [60, 40, 0]]
+    given = json.loads(Path("one/run.json").read_text())["given"]
+    assert (given["start_frame"], [one["frame"] for one in given["corrections"]]) == (2, [4])
+    arguments = (
+        "--box",
+        "20,10,20,20",
+        "--start-frame",
+        "1",
+        "--correct",
+        "3:1,2,6,6",
+        "--out",
+        "two",
+        "--quiet",
+    )
+    assert call("run", clip, "--config", "mine.yaml", *arguments).exit_code == 0
+    assert script.built[1][1].points is None
+    given = json.loads(Path("two/run.json").read_text())["given"]
+    assert (given["start_frame"], [one["frame"] for one in given["corrections"]]) == (1, [3])
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("prompt: 1,2,3,4", "'prompt' must be a mapping"),
+        ("prompt: {bx: '1,2,3,4'}", "did you mean 'box'"),
+        ("prompt: {start_frame: -1}", "start_frame"),
+        ("prompt: {box: [1, 2, 3, 4]}", "box"),
+        ("prompt: {box: '1,2,3'}", "is not four numbers"),
+    ],
+)
+def test_a_bad_prompt_in_a_file_is_refused(refused, clip, script, text, sentence):
+    Path("mine.yaml").write_text(text)
+    assert sentence in refused("run", clip, "--config", "mine.yaml")

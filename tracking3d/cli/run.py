@@ -154,7 +154,14 @@ def run(
     Say what the object is by --box, --mask, --points or --masks. Several boxes, masks or --points are several objects,
     each with a run folder of its own in the one of the run.
     """
+    from tracking3d.config.loading import load_prompt
+
+    told = load_prompt(config)
     boxes, object_masks, object_points = box or [], mask or [], points or []
+    if not (boxes or object_masks or object_points or masks):
+        boxes, object_points = list(told.box), list(told.points)
+        object_masks = [Path(file) for file in told.mask]
+    start_frame = told.start_frame if start_frame is None else start_frame
     if resume and overwrite:
         raise InputError(
             "Give either --resume or --overwrite: one keeps the run that is there, one does not."
@@ -204,7 +211,7 @@ def run(
     if quiet:
         logging.getLogger("tracking3d").setLevel(logging.ERROR)
     objects = max(len(given) + len(object_masks) + len(clicked), 1)
-    corrections = [parse_correction(text) for text in correct or ()]
+    corrections = [parse_correction(text) for text in correct or told.correct]
     checked_corrections(corrections, objects)  # before anything is written
     folders = object_folders(folder, objects) if objects > 1 else [folder]
     about: dict[str, Any] = {

@@ -15,6 +15,7 @@ from pydantic import ValidationError
 
 from tracking3d.config.explain import describe, hint, shown
 from tracking3d.config.models import PipelineConfig, PluginChoice
+from tracking3d.config.prompt_section import PromptSection
 from tracking3d.config.yaml_files import parse_yaml, read_mapping
 from tracking3d.errors import InputError, argument
 
@@ -71,6 +72,15 @@ def load_config(
     return config
 
 
+def load_prompt(file: Path | None) -> PromptSection:
+    """What a configuration file says is tracked; nothing where there is no file.
+
+    Raises:
+        InputError: If the file or that section cannot be used.
+    """
+    return _prompt_of(file, read_mapping(_located(Path(file)), empty={}) if file is not None else {})
+
+
 def layers_in_words(
     file: Path | None = None, preset: str | None = None, quality: str | None = None
 ) -> list[str]:
@@ -120,6 +130,11 @@ def config_schema() -> dict[str, Any]:
         "enum": list_qualities(),
         "description": "Tracker, window, refinement and model together, which the settings of this file change.",
     }
+    prompt = PromptSection.model_json_schema()
+    schema["properties"]["prompt"] = {
+        **prompt,
+        "description": "What is tracked; read by `tracking3d run` only.",
+    }
     choice = schema["$defs"]["PluginChoice"]
     schema["$defs"]["PluginChoice"] = {"anyOf": [{"type": "string"}, choice]}
     solver = schema["properties"]["solver"]
@@ -152,6 +167,7 @@ def _located(file: Path) -> Path:
 def _files(file: Path | None, preset: str | None, quality: str | None) -> list[Layer]:
     """The layers that are written somewhere: preset, quality and file."""
     from_file = read_mapping(_located(Path(file)), empty={}) if file is not None else {}
+    _prompt_of(file, from_file)
     named = {}
     for key, spoken in (("preset", preset), ("quality", quality)):
         name = from_file.pop(key, {})
@@ -163,6 +179,19 @@ def _files(file: Path | None, preset: str | None, quality: str | None) -> list[L
     if named["quality"] is not None:
         layers.append(_named_layer("quality", "qualities", list_qualities(), named["quality"]))
     return [*layers, (str(file), from_file)] if file is not None else layers
+
+
+def _prompt_of(file: Path | None, from_file: dict[str, Any]) -> PromptSection:
+    """The section ``prompt``, which is taken out of what a file holds."""
+    given = from_file.pop("prompt", {})
+    if not isinstance(given, dict):
+        raise InputError(
+            f"{file}: 'prompt' must be a mapping, such as 'prompt: {{box: \"301,11,296,227\"}}'."
+        )
+    try:
+        return PromptSection.model_validate(given)
+    except ValidationError as error:
+        raise InputError(f"{file}: prompt.{describe(error, PromptSection)}") from error
 
 
 def _named_layer(kind: str, folder: str, names: Sequence[str], name: str) -> Layer:
