@@ -70,7 +70,8 @@ class ObjectRecording:
 
     def take(self, frame: Frame | SkippedFrame) -> FrameRecord | SkippedFrame | None:
         """Answer for the next frame and keep the answer; what was answered before the run was stopped stands."""
-        self._unmet.discard(frame.index)
+        if isinstance(frame, Frame):
+            self._unmet.discard(frame.index)
         if self._kept and frame.index in self._past:
             return self._take_kept(self._kept, frame)
         if isinstance(frame, SkippedFrame):

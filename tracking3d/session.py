@@ -156,10 +156,7 @@ class Session:
             "camera": self._camera,
             "initial_mask": self.initial_mask,
             "last_pose": self._last_pose,
-            "first_pose": self._first_pose,
-            "presented": self._presented,
-            "latest": self._latest,
-            "anew": self._tracker.anew,
+            "steering": (self._first_pose, self._presented, self._latest, self._tracker.anew),
             "refined": self._refined,
             "refining": self.refining,
             "random": self._settings.random,
@@ -183,9 +180,9 @@ class Session:
         self._solver = self._begun(first)
         self._state, self._camera = kept["solver"], kept["camera"]
         self.initial_mask, self._last_pose = kept["initial_mask"], kept["last_pose"]
-        self._first_pose, self._presented = kept["first_pose"], kept["presented"]
-        self._latest = kept["latest"]
-        self._refined, self._failures, self._tracker.anew = kept["refined"], dict(failures), kept["anew"]
+        self._refined, self._failures = kept["refined"], dict(failures)
+        if steering := kept.get("steering"):  # an older version kept none
+            self._first_pose, self._presented, self._latest, self._tracker.anew = steering
         self.refining, self._settings.random = kept["refining"], kept["random"]
         if self._tracker.can_resume and not self._refined:
             with self._settings.in_force():

@@ -19,7 +19,7 @@ from tracking3d.frames import Frame, SkippedFrame
 from tracking3d.prompts import make_prompt
 from tracking3d.recording import record, record_objects
 from tracking3d.results import layout
-from tracking3d.results.files import write_image
+from tracking3d.results.files import write_image, write_mask
 from tracking3d.results.pictures import Pictures
 from tracking3d.results.run_reader import RunReader, read_records
 from tracking3d.session import SOLVERS, Session
@@ -64,7 +64,8 @@ def images(clip, tmp_path_factory) -> Path:
 
 
 def settings(*overrides: str):
-    quick = ["tracker.name=flow", "tracker.segmentation_size=64"]
+    precomputed = any("precomputed" in override for override in overrides)
+    quick = [] if precomputed else ["tracker.name=flow", "tracker.segmentation_size=64"]
     return load_config(
         overrides=[*quick, "window.size=32", "object.frequency=2", "object.texture_size=32", *overrides],
         runtime={"on_plugin_failure": "stop"},
@@ -199,6 +200,19 @@ def test_a_stopped_run_goes_on_in_either_direction(clip, images, both, tmp_path,
     stopped_in(monkeypatch, call, clip, images, tmp_path / "run", CAUSAL, start_frame=START)
     run(clip, images, tmp_path / "run", CAUSAL, start_frame=START, resume=True)
     assert_alike(tmp_path / "run", both["causal"])
+
+
+def test_masks_that_were_made_elsewhere_go_both_ways_too(clip, images, tmp_path, monkeypatch):
+    for index, mask in enumerate(clip.masks):
+        (tmp_path / "masks").mkdir(exist_ok=True)
+        write_mask(tmp_path / "masks" / f"{index:03d}.png", mask)
+    precomputed = ("tracker.name=precomputed", f"tracker.path={tmp_path / 'masks'}", CAUSAL)
+    whole = run(clip, images, tmp_path / "whole", *precomputed, mask=None, start_frame=START)
+    for index in range(FRAMES):
+        assert (whole.initial_mask(index) == clip.masks[index]).all()
+    stopped_in(monkeypatch, 5, clip, images, tmp_path / "run", *precomputed, mask=None, start_frame=START)
+    run(clip, images, tmp_path / "run", *precomputed, mask=None, start_frame=START, resume=True)
+    assert_alike(tmp_path / "run", tmp_path / "whole")
 
 
 @pytest.mark.slow

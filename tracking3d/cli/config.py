@@ -20,7 +20,10 @@ def show(
     overrides: Overrides = None,
     debug: Debug = False,
 ) -> None:
-    """Print the whole configuration as YAML, with every default, as `run` would use it, and what its layers set."""
+    """Print the whole configuration as YAML, with every default, as `run` would use it.
+
+    What preset, quality and file set is told on the standard error.
+    """
     import yaml
 
     from tracking3d.config.loading import layers_in_words
@@ -35,7 +38,7 @@ def show(
             continue  # which one that is depends on the video
         shown[section] = {"name": choice.name, **check_options(group, choice).model_dump(mode="json")}
     for words in layers_in_words(config, preset, quality):
-        typer.echo(f"# {words}")
+        typer.echo(f"# {words}", err=True)
     typer.echo(yaml.safe_dump(shown, sort_keys=False, allow_unicode=True), nl=False)
 
 

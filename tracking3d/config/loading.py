@@ -19,6 +19,8 @@ from tracking3d.config.prompt_section import PromptSection
 from tracking3d.config.yaml_files import parse_yaml, read_mapping
 from tracking3d.errors import InputError, argument
 
+_MOST_LEAVES = 12  # settings of a layer that words tell one by one
+
 DEFAULT_PRESET = "default"
 """The preset that is used when none is named."""
 
@@ -89,10 +91,12 @@ def layers_in_words(
     Raises:
         InputError: As `load_config`.
     """
-    return [
-        f"{origin}: {', '.join(_leaves(_without_shorthand(layer))) or 'changes nothing'}"
-        for origin, layer in _files(file, preset, quality)
-    ]
+    words = []
+    for origin, layer in _files(file, preset, quality):
+        leaves = _leaves(_without_shorthand(layer))
+        more = f" and {len(leaves) - _MOST_LEAVES} more" if len(leaves) > _MOST_LEAVES else ""
+        words.append(f"{origin}: {', '.join(leaves[:_MOST_LEAVES]) or 'changes nothing'}{more}")
+    return words
 
 
 def list_presets() -> list[str]:
