@@ -10,14 +10,18 @@ from numpy.typing import NDArray
 from tracking3d.config.models import PluginChoice
 from tracking3d.frames import Frame, MaskEstimate, Prompt
 from tracking3d.plugins import TRACKERS, build_plugin, plugin_label
-from tracking3d.plugins.guard import GuardedTracker
+from tracking3d.plugins.guard import GuardedTracker, PluginFailure
+
+STRAYED = 0.5
+"""IoU of the tracker's own answer and what the user says, below which it is on something else and forgets all."""
 
 
 class PromptedTracker:
     """A mask tracker and the prompts that it starts from.
 
     Frames that come from before the first one are tracked backwards from it: the tracker is then started once more
-    on the first frame. Where a frame has a prompt of its own, it is started there.
+    on the first frame. Where a frame has a prompt of its own, the tracker is set on that: re-anchored where it can be
+    and still is on the object, since what it has learnt is worth keeping; else started anew.
 
     Args:
         choice: The tracker of the configuration.
@@ -45,7 +49,7 @@ class PromptedTracker:
         return self._tracker.init(frame, self._first_prompt)
 
     def step(self, frame: Frame, prompt: Prompt | None = None) -> MaskEstimate:
-        """Answer for the next frame; with a prompt, which says what the object is in it, the tracker starts anew.
+        """Answer for the next frame; with a prompt, which says what the object is in it, by that.
 
         Raises:
             PluginError: If the tracker fails.
@@ -55,10 +59,25 @@ class PromptedTracker:
             self._backwards = True
             self._begin_anew()
             self._tracker.init(self._first, self._first_prompt)
-        if prompt is None:
-            return self._tracker.step(frame)
-        self._begin_anew()
-        return self._tracker.init(frame, prompt)
+        return self._tracker.step(frame) if prompt is None else self._set_on(frame, prompt)
+
+    def _set_on(self, frame: Frame, prompt: Prompt) -> MaskEstimate:
+        other = self._new()
+        told = other.init(frame, prompt)
+        try:
+            own = self._tracker.step(frame).found
+        except PluginFailure:
+            own = None
+        if (
+            self.can_correct
+            and told.found is not None
+            and own is not None
+            and _iou(own, told.found) >= STRAYED
+        ):
+            self._tracker.correct(frame, told.found)
+        else:
+            self._tracker, self.anew = other, True
+        return told
 
     @property
     def can_correct(self) -> bool:
@@ -106,3 +125,7 @@ class PromptedTracker:
 
     def _new(self) -> GuardedTracker:
         return GuardedTracker(build_plugin(TRACKERS, self._choice), plugin_label(TRACKERS, self._choice.name))
+
+
+def _iou(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
+    return float(np.count_nonzero(a & b) / max(np.count_nonzero(a | b), 1))

@@ -53,7 +53,7 @@ def track(
             box, mask and points is given, or none where the tracker knows its masks (``precomputed``).
         start_frame: Index of the frame in which the object is given, instead of the first. Answers then come from there
             to the end, and after them backwards to the beginning. Only where frames can be gone through again.
-        corrections: What the object is in later frames: there the mask tracker starts anew, and the mask is trusted.
+        corrections: What the object is in later frames: there the mask tracker is set on it, and the mask is trusted.
         config: The pipeline, or a YAML file of one; the default preset if None.
         skip_damaged: Where the first frame could not be read, take the box or mask for the first one that could.
 

@@ -70,7 +70,7 @@ def record(
         start_frame: Index of the frame in which the object is given, instead of the first: it is tracked from there to
             the end, and then backwards to the beginning, with what was learnt. Only of a source that can be read
             again.
-        corrections: What the object is in later frames: there the mask tracker starts anew, and the mask is trusted.
+        corrections: What the object is in later frames: there the mask tracker is set on it, and the mask is trusted.
         command: The command line, for the record.
         selection: The ``START:STOP:STEP`` that the source was opened with, for the record.
         overwrite: Replace a run that is in the folder.

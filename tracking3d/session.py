@@ -105,7 +105,7 @@ class Session:
 
         Args:
             frame: The frame.
-            prompt: What the object is in this frame, where somebody has said so: the mask tracker starts anew from
+            prompt: What the object is in this frame, where somebody has said so: the mask tracker is set on
                 it, and the solver trusts the mask that it makes. Not for the first frame.
 
         Raises:

@@ -16,6 +16,7 @@ from tracking3d.corrections import Correction
 from tracking3d.errors import InputError
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.frames import Frame, SkippedFrame
+from tracking3d.mask_tracking import PromptedTracker
 from tracking3d.prompts import make_prompt
 from tracking3d.recording import record, record_objects
 from tracking3d.results import layout
@@ -284,6 +285,19 @@ def test_from_a_correction_on_the_object_is_what_it_says(clip, images, tmp_path)
     assert (after.initial_mask(CORRECTED) == clip.masks[CORRECTED]).all()
     [told] = after.description["given"]["corrections"]
     assert (told["frame"], told["box"], told["points"]) == (CORRECTED, None, None)
+
+
+def test_a_tracker_that_is_on_the_object_keeps_what_it_has_learnt(clip):
+    tracker = PromptedTracker(settings().tracker, make_prompt(Frame(0, clip.images[0]), mask=clip.masks[0]))
+    tracker.start(Frame(0, clip.images[0]))
+    mask = clip.masks[1]
+    answer = tracker.step(Frame(1, clip.images[1]), make_prompt(Frame(1, clip.images[1]), mask=mask))
+    assert (answer.binary == mask).all()
+    assert not tracker.anew
+    elsewhere = make_prompt(Frame(2, clip.images[2]), mask=wrong_place(clip))
+    tracker.step(Frame(2, clip.images[2]), elsewhere)
+    assert tracker.anew
+    assert iou(tracker.step(Frame(3, clip.images[3])).binary, wrong_place(clip)) > 0.5
 
 
 def test_boxes_and_points_correct_too_and_backwards_as_well(clip):
