@@ -125,7 +125,3 @@ class PromptedTracker:
 
     def _new(self) -> GuardedTracker:
         return GuardedTracker(build_plugin(TRACKERS, self._choice), plugin_label(TRACKERS, self._choice.name))
-
-
-def _iou(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
-    return float(np.count_nonzero(a & b) / max(np.count_nonzero(a | b), 1))
