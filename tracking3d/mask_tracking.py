@@ -68,13 +68,10 @@ class PromptedTracker:
             own = self._tracker.step(frame).found
         except PluginFailure:
             own = None
-        if (
-            self.can_correct
-            and told.found is not None
-            and own is not None
-            and _iou(own, told.found) >= STRAYED
-        ):
-            self._tracker.correct(frame, told.found)
+        mask = told.found
+        common = None if mask is None else mask_iou(mask, own)
+        if mask is not None and self.can_correct and common is not None and common >= STRAYED:
+            self._tracker.correct(frame, mask)
         else:
             self._tracker, self.anew = other, True
         return told
