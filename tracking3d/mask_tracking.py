@@ -11,6 +11,7 @@ from tracking3d.config.models import PluginChoice
 from tracking3d.frames import Frame, MaskEstimate, Prompt
 from tracking3d.plugins import TRACKERS, build_plugin, plugin_label
 from tracking3d.plugins.guard import GuardedTracker, PluginFailure
+from tracking3d.results.records import mask_iou
 
 STRAYED = 0.5
 """IoU of the tracker's own answer and what the user says, below which it is on something else and forgets all."""
