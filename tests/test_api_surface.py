@@ -30,7 +30,7 @@ EXACT = {
 """Packages that say in ``__all__`` what is public: exactly this."""
 
 AT_LEAST = {
-    "tracking3d.config.loading": "config_schema list_presets load_config",
+    "tracking3d.config.loading": "config_schema layers_in_words list_presets list_qualities load_config load_prompt",
     "tracking3d.config.models": """CameraConfig ObjectConfig PipelineConfig PluginChoice RuntimeConfig
         SolverConfig WindowConfig""",
     "tracking3d.config.solvers": """KeyframeConfig LearningRates OnlineConfig PaperConfig SolverConfig
@@ -43,6 +43,7 @@ AT_LEAST = {
     "tracking3d.benchmark.suite": "run_suite",
     "tracking3d.benchmark.tables": "TABLES",
     "tracking3d.benchmark.variant": "Variant",
+    "tracking3d.corrections": "Correction parse_correction",
     "tracking3d.datasets.answers": "Answers PointTracker",
     "tracking3d.datasets.bop_export": "write_bop",
     "tracking3d.datasets.clip": "Truth read_truth write_clip",
@@ -84,6 +85,7 @@ AT_LEAST = {
     "tracking3d.networks.session": "Network TensorInfo",
     "tracking3d.networks.store": "find_network",
     "tracking3d.prompts": "make_prompt parse_box",
+    "tracking3d.point_prompts": "parse_points points_prompt",
     "tracking3d.recording": "record record_objects",
     "tracking3d.report.comparison": "write_comparison",
     "tracking3d.report.differences": "Comparison Difference compare_runs",
@@ -98,13 +100,15 @@ AT_LEAST = {
     "tracking3d.trackers.precomputed": "PrecomputedMasks",
     "tracking3d.trackers.protocol": "CorrectableTracker MaskTracker Options",
     "tracking3d.trackers.segmentation": "ColourSegmentation",
+    "tracking3d.tracker_choice": "choose_tracker",
+    "tracking3d.trackers.mask_from_points": "mask_from_points",
     "tracking3d.vot": "VotTracker",
 }
 """Modules that the documentation sends users to, or that hold what the above take and give."""
 
 FIELDS = {
     tracking3d.Frame: "index image time name",
-    tracking3d.Prompt: "box mask",
+    tracking3d.Prompt: "box mask points",
     tracking3d.FrameEstimate: """index time T_cam_obj mask initial_mask status reason confidence losses
         iterations keyframe seconds failure revised""",
     tracking3d.ObjectModel: "vertices faces face_uvs texture texture_weight features",
@@ -142,9 +146,10 @@ def test_settings_keep_their_sections():
 def test_track_is_called_as_documented():
     parameters = inspect.signature(tracking3d.track).parameters
     assert list(parameters)[:1] == ["frames"]
-    for name in ("box", "mask", "config"):
+    for name in ("box", "mask", "points", "start_frame", "config"):
         assert parameters[name].kind is inspect.Parameter.KEYWORD_ONLY
         assert parameters[name].default is None
+    assert parameters["corrections"].default == ()
 
 
 def test_statuses_are_their_names():

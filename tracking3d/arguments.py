@@ -15,6 +15,7 @@ from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, Image, Prompt, SkippedFrame
 from tracking3d.prompts import checked_box, checked_mask
+from tracking3d.tracker_choice import AUTO
 from tracking3d.video.source import FrameSource
 
 _WANTED = "(H, W, 3) arrays of uint8, RGB"
@@ -110,6 +111,11 @@ def check_session(config: Any, prompt: Any, intrinsics: Any) -> None:
     """
     if not isinstance(config, PipelineConfig):
         raise InputError(f"config= is {a_kind(config)}; give a PipelineConfig, see load_config.")
+    if config.tracker.name == AUTO:
+        raise InputError(
+            f"The tracker '{AUTO}' is chosen by the first frame, in track and record; for a session name one, or take "
+            "what tracking3d.tracker_choice.choose_tracker gives."
+        )
     if prompt is not None:
         if not isinstance(prompt, Prompt):
             raise InputError(

@@ -40,6 +40,11 @@ class Frame:
         """``(height, width)`` in pixels."""
         return self.image.shape[0], self.image.shape[1]
 
+    @property
+    def label(self) -> str:
+        """What messages call it, whether it has a name or not."""
+        return self.name or f"frame {self.index}"
+
 
 @dataclass(frozen=True)
 class SkippedFrame:
@@ -51,15 +56,18 @@ class SkippedFrame:
 
 @dataclass(frozen=True, eq=False)
 class Prompt:
-    """The object in the first frame.
+    """The object in one frame: the first, or one in which it is told anew.
 
     Attributes:
         box: ``(x, y, width, height)`` in pixels. Always present; the mask's bounding box where a mask was given.
-        mask: ``(H, W)`` bool, or None where only a box was given.
+        mask: ``(H, W)`` bool, or None where only a box was given. Where points were given, what an image method makes
+            of them.
+        points: ``(N, 3)`` float32, where points were given: x, y in pixels, and 1 on the object or 0 beside it.
     """
 
     box: Box
     mask: NDArray[np.bool_] | None = None
+    points: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +88,12 @@ class MaskEstimate:
     def binary(self) -> NDArray[np.bool_] | None:
         """The mask thresholded at one half, or None."""
         return None if self.mask is None else self.mask >= 0.5
+
+    @property
+    def found(self) -> NDArray[np.bool_] | None:
+        """The same; None where it is empty, too."""
+        binary = self.binary
+        return binary if binary is not None and binary.any() else None
 
 
 def pixels(size: tuple[int, int]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -15,6 +15,7 @@ import numpy as np
 from tracking3d.checkpoint.folder import Checkpoint
 from tracking3d.checkpoint.progress import Kept, Progress, TakenFrame, checksum
 from tracking3d.checkpoint.trees import UnkeptError
+from tracking3d.corrections import Correction, prompts_in
 from tracking3d.errors import InputError, OutputError, PluginError
 from tracking3d.estimation.estimate import ObjectModel, Status
 from tracking3d.frames import Frame, MaskEstimate, SkippedFrame
@@ -40,6 +41,8 @@ class ObjectRecording:
         writer: Keeps the answers.
         checkpoint: Keeps the state after each; None where that is of no use, since the source cannot be read again.
         kept: The state of a stopped run that this one goes on with, which ``session`` was given.
+        corrections: What the user has said of the object in later frames, by their index.
+        redraw: Whether frames come in another order than that of time, and are drawn once more in that order.
     """
 
     def __init__(
@@ -48,11 +51,16 @@ class ObjectRecording:
         writer: RunWriter,
         checkpoint: Checkpoint | None = None,
         kept: Kept | None = None,
+        corrections: Mapping[int, Correction] | None = None,
+        redraw: bool = False,
     ) -> None:
         self._session, self._writer, self._checkpoint = session, writer, checkpoint
+        self._corrections, self._unmet = corrections or {}, set(corrections or {})
+        self._redraw = redraw
         self._kept = kept
         self._progress = kept.progress if kept else Progress()
         self._until = self._progress  # what was done before
+        self._past = {*kept.taken, *(one.index for one in kept.skipped)} if kept else set()
         self._answered = kept is not None
         self._said = False
         self._initial: dict[int, tuple[float, str]] = {}
@@ -64,14 +72,16 @@ class ObjectRecording:
 
     def take(self, frame: Frame | SkippedFrame) -> FrameRecord | SkippedFrame | None:
         """Answer for the next frame and keep the answer; what was answered before the run was stopped stands."""
-        if self._kept and frame.index <= self._until.last:
+        if isinstance(frame, Frame):
+            self._unmet.discard(frame.index)
+        if self._kept and frame.index in self._past:
             return self._take_kept(self._kept, frame)
         if isinstance(frame, SkippedFrame):
             self._writer.skip(frame)
             if self._checkpoint:
                 self._checkpoint.note(frame)
             return frame
-        estimate = self._session.step(frame)
+        estimate = self._session.step(frame, *prompts_in(frame, self._corrections))
         answer = self._writer.write(estimate, frame)
         self._answered = True
         initial = self._session.initial_mask
@@ -98,12 +108,21 @@ class ObjectRecording:
         return not self._until.refining
 
     @property
-    def refines(self) -> bool:
-        """Whether the frames are to come once more."""
-        return self._refinement is not None
+    def looks_again(self) -> bool:
+        """Whether the frames are to come once more, in order of time."""
+        return self._refinement is not None or self._redraw
 
     def begin_refinement(self, source: FrameSource) -> None:
         """All frames were taken: solve everything once more, or record why not though it was asked for."""
+        for index in sorted(self._unmet):
+            _log.warning(
+                "Frame %d, which was to be corrected, is not among the frames that could be read.", index
+            )
+        self._begin_refinement(source)
+        if self._redraw and self._refinement is None:
+            self._writer.begin_drawing_anew()
+
+    def _begin_refinement(self, source: FrameSource) -> None:
         if self._until.refining:
             self._refinement = self._writer.begin_refinement(
                 None, self._until.refined_lines, self._until.refinement_seconds
@@ -133,7 +152,10 @@ class ObjectRecording:
     def take_again(self, frame: Frame) -> FrameRecord | None:
         """Answer for a frame once more; None where it has no causal answer or there is no refinement."""
         refinement = self._refinement
-        if refinement is None or frame.index not in refinement.causal:
+        if refinement is None:
+            self._writer.draw_again(frame)
+            return None
+        if frame.index not in refinement.causal:
             return None
         if self._kept:
             self._check(self._kept, frame)
@@ -196,11 +218,11 @@ class ObjectRecording:
         self._check(kept, frame)
         assert isinstance(frame, Frame)
         if self._session.replays:
-            taken, first = kept.taken[frame.index], frame.index == min(kept.taken)
+            taken, first = kept.taken[frame.index], frame.index == next(iter(kept.taken))
             correction = None
             if taken.corrected and self._checkpoint:
                 correction = self._checkpoint.correction(frame.index)
-            answer = self._session.replay(frame, first, correction)
+            answer = self._session.replay(frame, first, correction, *prompts_in(frame, self._corrections))
             if (
                 not self._said
                 and not taken.failure
@@ -283,7 +305,7 @@ def go_through(
         for frame in frames if any(recording.takes for recording in going_on) else ():
             each(partial(ObjectRecording.take, frame=_shared(frame, share)))
         each(partial(ObjectRecording.begin_refinement, source=source))
-        for frame in timed(source) if any(recording.refines for recording in going_on) else ():
+        for frame in timed(source) if any(recording.looks_again for recording in going_on) else ():
             if isinstance(frame, Frame):
                 each(partial(ObjectRecording.take_again, frame=_shared(frame, share)))
         each(ObjectRecording.finish)

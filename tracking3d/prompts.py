@@ -1,4 +1,4 @@
-"""What the user says the object is in the first frame: a box or a mask, checked against that frame."""
+"""What the user says the object is in a frame: a box, a mask or points, checked against that frame."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from tracking3d.config.explain import a_kind, shown
 from tracking3d.errors import InputError, argument
 from tracking3d.frames import Box, Frame, Prompt, SkippedFrame
+from tracking3d.point_prompts import POINTS, checked_points, points_prompt
 from tracking3d.trackers.crops import box_of, clip_box
 from tracking3d.trackers.mask_files import ImageMasks, UnreadableMaskError
 
@@ -25,16 +26,18 @@ MASK = argument("mask=", "--mask ")
 """What sentences call the two, before their values."""
 
 _SKIP = argument("skip_damaged=True", "--skip-damaged")
-_EITHER = "Say what the object is by either a box or a mask of the first frame: {} or {}.".format(
-    argument("box=", "--box"), argument("mask=", "--mask")
+_EITHER = "Say what the object is by either a box or a mask of the first frame, or points in it: {}, {} or {}.".format(
+    argument("box=", "--box"), argument("mask=", "--mask"), argument("points=", "--points")
 )
-_NO_OBJECTS = "Say what the objects are by boxes or masks of the first frame: {} or {}.".format(
-    argument("boxes=", "--box"), argument("masks=", "--mask")
+_NO_OBJECTS = (
+    "Say what the objects are by boxes or masks of the first frame, or points in it: {}, {} or {}.".format(
+        argument("boxes=", "--box"), argument("masks=", "--mask"), argument("points=", "--points")
+    )
 )
 
 
-def parse_box(text: str) -> Box:
-    """Read ``X,Y,WIDTH,HEIGHT`` in pixels.
+def parse_box(text: str, name: str = BOX) -> Box:
+    """Read ``X,Y,WIDTH,HEIGHT`` in pixels; ``name`` is what sentences call it.
 
     Raises:
         InputError: Other than four numbers, or no positive size.
@@ -43,26 +46,30 @@ def parse_box(text: str) -> Box:
         x, y, width, height = (float(part) for part in text.split(","))
     except ValueError as error:
         raise InputError(
-            f"{BOX}'{text}' is not four numbers; write it as X,Y,WIDTH,HEIGHT in pixels."
+            f"{name}'{text}' is not four numbers; write it as X,Y,WIDTH,HEIGHT in pixels."
         ) from error
-    return checked_box((x, y, width, height))
+    return checked_box((x, y, width, height), name)
 
 
-def check_prompt(box: Any, mask: Any, needed: bool = True) -> None:
-    """Make sure of a box or a mask as far as that can be done before the first frame is there.
+def check_prompt(box: Any, mask: Any, needed: bool = True, points: Any = None) -> None:
+    """Make sure of a box, a mask or points as far as that can be done before the first frame is there.
 
     Args:
         box: ``(x, y, width, height)`` in pixels, or None.
         mask: ``(H, W)``, an image file of one, or None.
         needed: Whether one of them must be given.
+        points: See `tracking3d.point_prompts.checked_points`, or None.
 
     Raises:
-        InputError: Neither (if needed) or both are given, or what is given cannot be one.
+        InputError: None (if needed) or more than one are given, or what is given cannot be one.
     """
-    if (box is not None and mask is not None) or (needed and box is None and mask is None):
+    given = sum(one is not None for one in (box, mask, points))
+    if given > 1 or (needed and not given):
         raise InputError(_EITHER)
     if box is not None:
         checked_box(box)
+    if points is not None:
+        checked_points(points)
     if mask is not None and not isinstance(mask, Path):
         checked_mask(mask)
 
@@ -72,36 +79,43 @@ def make_prompt(
     box: Box | None = None,
     mask: NDArray[np.bool_] | Path | None = None,
     *,
+    points: Any = None,
     box_name: str = BOX,
     mask_name: str = MASK,
+    points_name: str = POINTS,
 ) -> Prompt:
     """Make the prompt for ``frame``.
 
     Args:
-        frame: The first frame.
+        frame: The first frame, or the one of which something is told.
         box: ``(x, y, width, height)`` in pixels. The part outside the frame is cut off, with a
             warning in the log.
         mask: ``(H, W)``, or an image file of one; what is not zero (in a file: above half) is the object.
+        points: ``(N, 3)``: x, y in pixels, and 1 on the object or 0 beside it; see `tracking3d.point_prompts`.
         box_name: What sentences call the box, see `tracking3d.errors.argument`.
         mask_name: What they call the mask.
+        points_name: What they call the points.
 
     Raises:
-        InputError: Neither or both are given, the box has no size or lies outside the frame, or the mask
-            cannot be read, is empty, covers everything or is not of the frame's size.
+        InputError: None or more than one are given, the box has no size or lies outside the frame, the mask
+            cannot be read, is empty, covers everything or is not of the frame's size, or the points lie outside,
+            contradict each other, or none is on the object.
     """
-    check_prompt(box, mask)
+    check_prompt(box, mask, points=points)
+    if points is not None:
+        return points_prompt(frame, points, points_name)
     if box is not None:
         return Prompt(_inside(checked_box(box, box_name), frame, box_name))
     label = f"{mask_name}{mask if isinstance(mask, Path) else ''}"
-    binary = _read(mask, label) if isinstance(mask, Path) else checked_mask(mask, mask_name)
+    binary = read_mask_file(mask, label) if isinstance(mask, Path) else checked_mask(mask, mask_name)
     height, width = frame.size
     if binary.shape != frame.size:
         size = " x ".join(str(side) for side in binary.shape[::-1])
         raise InputError(
-            f"{label} is {size} pixels but {_name(frame)} is {width} x {height}; they must be alike."
+            f"{label} is {size} pixels but {frame.label} is {width} x {height}; they must be alike."
         )
     if binary.all():
-        raise InputError(f"{label} covers the whole of {_name(frame)}; mark the object only.")
+        raise InputError(f"{label} covers the whole of {frame.label}; mark the object only.")
     around = box_of(binary)
     if around is None:
         raise InputError(f"{label} is empty; mark the object in it.")
@@ -113,14 +127,16 @@ def make_prompts(
     boxes: Sequence[Box] = (),
     masks: Sequence[NDArray[np.bool_] | Path] = (),
     tracker: str = "",
+    points: Sequence[Any] = (),
 ) -> list[Prompt]:
-    """The prompts of several objects, first those of the boxes; see `make_prompt`.
+    """The prompts of several objects, first those of the boxes, then those of the masks; see `make_prompt`.
 
     Args:
         frame: The first frame.
         boxes: Each ``(x, y, width, height)`` in pixels.
         masks: Each ``(H, W)``, or an image file of one.
         tracker: Name of the mask tracker.
+        points: The points of each object.
 
     Raises:
         InputError: If there is no object, one cannot be used, or the tracker knows the masks of one object only.
@@ -132,6 +148,10 @@ def make_prompts(
     prompts += [
         make_prompt(frame, mask=mask, mask_name=argument(f"masks[{number}]=", "--mask "))
         for number, mask in enumerate(masks)
+    ]
+    prompts += [
+        make_prompt(frame, points=each, points_name=argument(f"points[{number}]=", "--points "))
+        for number, each in enumerate(points)
     ]
     if not prompts:
         raise InputError(_NO_OBJECTS)
@@ -148,24 +168,26 @@ def damaged_start(frame: SkippedFrame) -> InputError:
     )
 
 
-def check_prompts(boxes: Any, masks: Any) -> None:
+def check_prompts(boxes: Any, masks: Any, points: Any = ()) -> None:
     """Make sure of the prompts of several objects as far as that can be done before the first frame is there.
 
     Raises:
         InputError: If there is none, or one cannot be used.
     """
-    for name, given in (("boxes", boxes), ("masks", masks)):
+    for name, given in (("boxes", boxes), ("masks", masks), ("points", points)):
         if not isinstance(given, Sequence | np.ndarray) or isinstance(given, str | bytes):
             raise InputError(
                 f"{name}={shown(given)} is {a_kind(given)}; give a list with one for each object."
             )
-    if not len(boxes) and not len(masks):
+    if not len(boxes) and not len(masks) and not len(points):
         raise InputError(_NO_OBJECTS)
     for number, box in enumerate(boxes):
         checked_box(box, argument(f"boxes[{number}]=", "--box "))
     for number, mask in enumerate(masks):
         if not isinstance(mask, Path):
             checked_mask(mask, argument(f"masks[{number}]=", "--mask "))
+    for number, each in enumerate(points):
+        checked_points(each, argument(f"points[{number}]=", "--points "))
 
 
 def check_prompt_fits(prompt: Prompt, frame: Frame) -> None:
@@ -177,12 +199,12 @@ def check_prompt_fits(prompt: Prompt, frame: Frame) -> None:
     height, width = frame.size
     if prompt.mask is not None and np.shape(prompt.mask) != frame.size:
         raise InputError(
-            f"prompt.mask= has shape {np.shape(prompt.mask)} but {_name(frame)} ({height}, {width}); make the "
+            f"prompt.mask= has shape {np.shape(prompt.mask)} but {frame.label} ({height}, {width}); make the "
             "prompt of the first frame."
         )
     if clip_box(prompt.box, frame.size) is None:
         raise InputError(
-            f"prompt.box={_shown(prompt.box)} lies outside {_name(frame)}, which is {width} x {height} pixels."
+            f"prompt.box={_shown(prompt.box)} lies outside {frame.label}, which is {width} x {height} pixels."
         )
 
 
@@ -244,7 +266,7 @@ def _inside(box: Box, frame: Frame, name: str) -> Box:
     if inside is None:
         height, width = frame.size
         raise InputError(
-            f"{name}{_shown(box)} lies outside {_name(frame)}, which is {width} x {height} pixels; "
+            f"{name}{_shown(box)} lies outside {frame.label}, which is {width} x {height} pixels; "
             "give the object's box as left edge, upper edge, width and height."
         )
     if inside != box:
@@ -254,7 +276,12 @@ def _inside(box: Box, frame: Frame, name: str) -> Box:
     return inside
 
 
-def _read(file: Path, label: str) -> NDArray[np.bool_]:
+def read_mask_file(file: Path, label: str) -> NDArray[np.bool_]:
+    """The mask ``(H, W)`` in an image file, which sentences call ``label``: what is brighter than half.
+
+    Raises:
+        InputError: If it does not exist, or cannot be read.
+    """
     try:
         there = file.is_file()
     except (OSError, ValueError):  # a loop of links, a name that no file can have
@@ -271,7 +298,3 @@ def _read(file: Path, label: str) -> NDArray[np.bool_]:
 
 def _shown(box: Box) -> str:
     return ",".join(f"{value:g}" for value in box)
-
-
-def _name(frame: Frame) -> str:
-    return frame.name or f"frame {frame.index}"

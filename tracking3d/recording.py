@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import logging
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,15 +17,22 @@ from tracking3d.arguments import check_source, checked_config, checked_folder
 from tracking3d.checkpoint.folder import Checkpoint, remove_state
 from tracking3d.checkpoint.resuming import earlier_run, given_of
 from tracking3d.config.camera import choose_camera
-from tracking3d.config.models import PipelineConfig
+from tracking3d.config.models import PipelineConfig, PluginChoice
+from tracking3d.corrections import Correction, check_corrections_fit, checked_corrections
 from tracking3d.errors import InputError
 from tracking3d.frames import Box, Frame, Prompt, SkippedFrame
 from tracking3d.object_recording import Listener, ObjectRecording, go_through, timed
+from tracking3d.parts import build_encoder, check_turns
 from tracking3d.prompts import check_prompt, check_prompts, damaged_start, make_prompt, make_prompts
-from tracking3d.results.layout import object_folders
+from tracking3d.results.layout import RUN, object_folders
+from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_writer import RunWriter, WrittenSoFar
-from tracking3d.session import Session, build_encoder
+from tracking3d.session import Session
+from tracking3d.tracker_choice import AUTO, choose_tracker
+from tracking3d.video.both_ways import both_ways, check_start_frame
 from tracking3d.video.source import FrameSource
+
+_log = logging.getLogger(__name__)
 
 __all__ = ["Listener", "record", "record_objects"]
 
@@ -35,6 +44,9 @@ def record(
     *,
     box: Box | None = None,
     mask: NDArray[np.bool_] | Path | None = None,
+    points: Any = None,
+    start_frame: int | None = None,
+    corrections: Iterable[Correction] = (),
     command: str | None = None,
     selection: str | None = None,
     overwrite: bool = False,
@@ -52,14 +64,20 @@ def record(
         config: The pipeline, or a YAML file of one; the default preset if None.
         folder: The run folder.
         box: The object in the first frame, ``(x, y, width, height)``.
-        mask: The object in the first frame, as a mask or the image file of one. Without a box and a mask the
-            tracker's own first mask is the prompt.
+        mask: The object in the first frame, as a mask or the image file of one. Without a box, a mask and points
+            the tracker's own first mask is the prompt.
+        points: The object in the first frame by ``(N, 3)`` points: x, y in pixels, and 1 on it or 0 beside it.
+        start_frame: Index of the frame in which the object is given, instead of the first: it is tracked from there to
+            the end, and then backwards to the beginning, with what was learnt. Only of a source that can be read
+            again.
+        corrections: What the object is in later frames: there the mask tracker is set on it, and the mask is trusted.
         command: The command line, for the record.
         selection: The ``START:STOP:STEP`` that the source was opened with, for the record.
         overwrite: Replace a run that is in the folder.
         skip_damaged: Where the first frame cannot be read, take the box or mask for the first one that can.
         resume: Go on with the run that is in the folder, from the last frame that it finished; begin one where there
-            is none. With a finished run nothing is done.
+            is none. With a finished run nothing is done. Where a frame that is answered is corrected, all is computed
+            again: only the state after the latest frame is kept.
         listener: Is told of every frame, those finished before included.
 
     Raises:
@@ -68,13 +86,21 @@ def record(
     """
     check_source(source)
     config, folder = checked_config(config), checked_folder(folder)
-    check_prompt(box, mask, needed=config.tracker.name != "precomputed")
-    begin = partial(begun, source, command=command, selection=selection, overwrite=overwrite, resume=resume)
-    with opened(source) as frames, ExitStack() as writers:
-        skipped, first = first_frame(frames, source.name, skip_damaged or (box is None and mask is None))
-        prompt = None if box is None and mask is None else make_prompt(first, box, mask)
+    check_prompt(box, mask, needed=config.tracker.name != "precomputed", points=points)
+    [told] = checked_corrections(corrections)
+    begin = partial(
+        begun, source, command=command, selection=selection, overwrite=overwrite, resume=resume,
+        start_frame=start_frame,
+    )  # fmt: skip
+    untold = box is None and mask is None and points is None
+    with opened(source, config, start_frame) as frames, ExitStack() as writers:
+        skipped, first = first_frame(frames, source.name, skip_damaged or untold)
+        prompt = None if untold else make_prompt(first, box, mask, points=points)
+        config, choice = with_tracker(config, source, first, prompt, folder, resume)
         session = Session(config, prompt, source.intrinsics, source.intrinsics_origin)
-        recording = begin(session, prompt, first=first, folder=folder, writers=writers)
+        recording = begin(
+            session, prompt, choice=choice, first=first, folder=folder, writers=writers, corrections=told
+        )
         if recording is not None:
             go_through(source, chain(skipped, [first], frames), [recording], listener)
 
@@ -86,6 +112,9 @@ def record_objects(
     *,
     boxes: Sequence[Box] = (),
     masks: Sequence[NDArray[np.bool_] | Path] = (),
+    points: Sequence[Any] = (),
+    start_frame: int | None = None,
+    corrections: Iterable[Correction] = (),
     command: str | None = None,
     selection: str | None = None,
     overwrite: bool = False,
@@ -103,6 +132,9 @@ def record_objects(
         folder: Gets the run folders ``object_0``, ``object_1`` and so on, in the order of the objects.
         boxes: The objects in the first frame; see `record` for this and what follows.
         masks: More objects, after those of the boxes.
+        points: More objects, after those of the masks.
+        start_frame: The frame in which the objects are given.
+        corrections: What an object is in later frames; `Correction.object` says which, in the order of the objects.
         command: The command line.
         selection: The ``START:STOP:STEP`` that the source was opened with.
         overwrite: Replace runs that are in those folders.
@@ -116,29 +148,52 @@ def record_objects(
     """
     check_source(source)
     config, folder = checked_config(config), checked_folder(folder)
-    check_prompts(boxes, masks)
-    begin = partial(begun, source, command=command, selection=selection, overwrite=overwrite, resume=resume)
-    with opened(source) as frames, ExitStack() as writers:
+    check_prompts(boxes, masks, points)
+    told = checked_corrections(corrections, len(boxes) + len(masks) + len(points))
+    begin = partial(
+        begun, source, command=command, selection=selection, overwrite=overwrite, resume=resume,
+        start_frame=start_frame,
+    )  # fmt: skip
+    with opened(source, config, start_frame) as frames, ExitStack() as writers:
         skipped, first = first_frame(frames, source.name, skip_damaged)
-        prompts = make_prompts(first, boxes, masks, config.tracker.name)
+        prompts = make_prompts(first, boxes, masks, config.tracker.name, points)
         folders = object_folders(folder, len(prompts))
+        config, choice = with_tracker(config, source, first, prompts[0], folders[0], resume)
         encoder = build_encoder(config)
         sessions = [
             Session(config, prompt, source.intrinsics, source.intrinsics_origin, encoder)
             for prompt in prompts
         ]
         recordings = [
-            begin(session, prompt, first=first, folder=into, writers=writers)
-            for session, prompt, into in zip(sessions, prompts, folders, strict=True)
+            begin(
+                session, prompt, choice=choice, first=first, folder=into, writers=writers, corrections=theirs
+            )
+            for session, prompt, into, theirs in zip(sessions, prompts, folders, told, strict=True)
         ]
         if unfinished := [recording for recording in recordings if recording is not None]:
             go_through(source, chain(skipped, [first], frames), unfinished, listener)
 
 
 @contextmanager
-def opened(source: FrameSource) -> Iterator[Iterator[Frame | SkippedFrame]]:
-    """The frames of a source, which is let go at the end, however that comes."""
-    frames = timed(source)
+def opened(
+    source: FrameSource, config: PipelineConfig, start_frame: int | None = None
+) -> Iterator[Iterator[Frame | SkippedFrame]]:
+    """The frames of a source, which is let go at the end, however that comes.
+
+    Args:
+        source: The source.
+        config: The pipeline.
+        start_frame: The frame to start from and to go both ways; None gives the frames in order of time.
+
+    Raises:
+        InputError: If the source or the solver cannot go both ways.
+    """
+    if start_frame is None:
+        frames = timed(source)
+    else:
+        check_start_frame(start_frame, source.repeatable, source.name)
+        check_turns(config)
+        frames = both_ways(partial(timed, source), start_frame, source.name)
     try:
         yield frames
     finally:
@@ -150,6 +205,7 @@ def begun(
     session: Session,
     prompt: Prompt | None,
     *,
+    choice: str | None,
     first: Frame,
     folder: Path,
     command: str | None,
@@ -157,6 +213,8 @@ def begun(
     overwrite: bool,
     resume: bool,
     writers: ExitStack,
+    start_frame: int | None = None,
+    corrections: Mapping[int, Correction] | None = None,
 ) -> ObjectRecording | None:
     """One object's recording, begun or resumed; None where its run is finished. See `record` for the arguments.
 
@@ -164,7 +222,12 @@ def begun(
         OutputError: If the folder is in use, holds a run already, or cannot be written.
         InputError: If the run there cannot be resumed.
     """
-    given, config = given_of(first, prompt, source.count), session.config.model_dump(mode="json")
+    corrections = corrections or {}
+    check_corrections_fit(
+        corrections.values(), first, session.config.tracker.name, getattr(source, "selection", None)
+    )
+    given = given_of(first, prompt, source.count, start_frame, corrections.values())
+    config = session.config.model_dump(mode="json")
     if resume and not source.repeatable:
         raise InputError(
             f"{source.name} cannot be read again from its start, so that no run of it can be resumed."
@@ -173,6 +236,12 @@ def begun(
     if earlier == "finished":
         remove_state(folder)
         return None
+    if earlier == "outdated":
+        _log.warning(
+            "%s holds answers for a frame that is corrected now. Only the state after the latest frame is kept, so "
+            "that all is computed again; frames before the correction get the answers that they had.",
+            folder,
+        )
     device = session.config.runtime.device
     checkpoint = kept = None
     if earlier == "stopped":
@@ -190,6 +259,7 @@ def begun(
         command=command,
         selection=selection,
         given=given,
+        tracker_choice=choice,
         overwrite=overwrite or resume,
         resume=WrittenSoFar(kept.progress.lines, kept.progress.seconds, kept.skipped) if kept else None,
     )
@@ -201,7 +271,31 @@ def begun(
         writer.use_camera(session.camera)
     elif source.repeatable:
         checkpoint = Checkpoint(folder, session.state_classes, device)
-    return ObjectRecording(session, writer, checkpoint, kept)
+    return ObjectRecording(session, writer, checkpoint, kept, corrections, redraw=start_frame is not None)
+
+
+def with_tracker(
+    config: PipelineConfig,
+    source: FrameSource,
+    first: Frame,
+    prompt: Prompt | None,
+    folder: Path,
+    resume: bool,
+) -> tuple[PipelineConfig, str | None]:
+    """The configuration with a tracker in place of ``auto``, and why it is that one; None where it was named.
+
+    A run that goes on does so with the tracker that it was begun with.
+    """
+    if config.tracker.name != AUTO or prompt is None:
+        return config, None
+    if resume and (folder / RUN).is_file():
+        before = RunReader(folder)
+        if why := before.description.get("tracker_choice"):
+            tracker = PluginChoice.model_validate(before.config["tracker"])
+            return config.model_copy(update={"tracker": tracker}), str(why)
+    config, why = choose_tracker(config, source.count, not source.repeatable, first, prompt)
+    _log.info("Mask tracker: %s.", why)
+    return config, why
 
 
 def first_frame(

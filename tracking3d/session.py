@@ -2,40 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from tracking3d.arguments import check_frame, check_session
 from tracking3d.config.camera import choose_camera, warn_of_unlikely
 from tracking3d.config.models import PipelineConfig
-from tracking3d.errors import InputError, argument
+from tracking3d.errors import InputError
 from tracking3d.estimation.correction import corrects
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status, unanswered
-from tracking3d.estimation.online.solver import OnlineSolver
-from tracking3d.estimation.paper.solver import PaperSolver
-from tracking3d.estimation.solver import RefiningSolver, Solver
+from tracking3d.estimation.solver import RefiningSolver, Solver, SteeredSolver
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame, MaskEstimate, Prompt, pixels
 from tracking3d.geometry.camera import Camera
-from tracking3d.plugins import FEATURES, TRACKERS, build_plugin, plugin_label
-from tracking3d.plugins.guard import GuardedEncoder, GuardedTracker, PluginFailure
-from tracking3d.process_settings import OwnSettings, RandomState, process_kept
+from tracking3d.mask_tracking import PromptedTracker
+from tracking3d.parts import SOLVERS, build_encoder, check_device, check_turns, with_times
+from tracking3d.plugins.guard import PluginFailure
+from tracking3d.presented import Presented
+from tracking3d.process_settings import OwnSettings, RandomState
 from tracking3d.prompts import check_prompt_fits
-from tracking3d.rendering.backend import choose_backend, threads_kept
-from tracking3d.stages import StageTimes, Stopwatch, measured
-
-SOLVERS: dict[str, Callable[[PipelineConfig, Camera, FeatureEncoder], Solver[Any]]] = {
-    "paper": PaperSolver,
-    "online": OnlineSolver,
-}
-"""Solvers by the name that `solver.name` selects."""
-
-_CPU = argument("runtime.device 'cpu'", "--device cpu")
+from tracking3d.rendering.backend import choose_backend
+from tracking3d.stages import StageTimes, measured
 
 
 class Session:
@@ -85,16 +76,16 @@ class Session:
         self._settings = OwnSettings(self.renderer, runtime.device, runtime.seed)
         self._replaying = OwnSettings(self.renderer, runtime.device, runtime.seed)
         with self._settings.in_force():
-            self._tracker = GuardedTracker(
-                build_plugin(TRACKERS, config.tracker), plugin_label(TRACKERS, config.tracker.name)
-            )
+            self._tracker = PromptedTracker(config.tracker, prompt)
             self._encoder = build_encoder(config) if encoder is None else encoder
         self._solver: Solver[Any] | None = None
         self._state: Any = None
         self._camera: Camera | None = None
+        self._first: Frame | None = None
+        self._presented, self._latest = Presented(0), 0
         self.initial_mask = MaskEstimate(None)
         self.corrected = False
-        self._last_pose = np.eye(4)
+        self._last_pose = self._first_pose = np.eye(4)
         self._failures: dict[int, str] = {}
         self._refined = False
         self.refining = StageTimes()
@@ -106,11 +97,20 @@ class Session:
             raise RuntimeError("the camera is known after the first step")
         return self._camera
 
-    def step(self, frame: Frame) -> FrameEstimate:
+    def step(self, frame: Frame, prompt: Prompt | None = None) -> FrameEstimate:
         """Track the object in the next frame; the first call starts on it.
 
+        Frames from before the first one may follow the last, the nearest first: they are tracked backwards from the
+        first one, with all that was learnt since.
+
+        Args:
+            frame: The frame.
+            prompt: What the object is in this frame, where somebody has said so: the mask tracker is set on
+                it, and the solver trusts the mask that it makes. Not for the first frame.
+
         Raises:
-            InputError: If this is no `Frame` of uint8 RGB, the first one has no object, or another size than the first.
+            InputError: If this is no `Frame` of uint8 RGB, the first one has no object, another size than the first, or
+                the solver cannot track backwards.
             PluginError: If a plug-in fails: in the first frame, or with ``runtime.on_plugin_failure`` ``stop`` in
                 any. With ``continue`` a later frame is answered with what there is, and ``failure`` says why.
             RuntimeError: After ``refine``.
@@ -120,18 +120,19 @@ class Session:
         check_frame(frame)
         try:
             with self._settings.in_force(), measured("solve") as watch:
-                estimate = self._start(frame) if self._solver is None else self._go_on(self._solver, frame)
+                estimate = self._start(frame) if self._solver is None else self._go_on(frame, prompt)
         except PluginFailure as error:
-            raise error.at(_label(frame)) from error.__cause__
-        return _timed(estimate, watch, frame)
+            raise error.at(frame.label) from error.__cause__
+        return with_times(estimate, watch, frame)
 
     def _start(self, frame: Frame) -> FrameEstimate:
         solver = self._begun(frame)
         if self._prompt is not None:
             check_prompt_fits(self._prompt, frame)
-        mask = self._tracker.init(frame, self._prompt_for(frame))
+        mask = self._tracker.start(frame)
         self._state, estimate = solver.init(frame, mask)
-        self._solver, self.initial_mask, self._last_pose = solver, mask, estimate.T_cam_obj
+        self._solver, self.initial_mask = solver, mask
+        self._last_pose = self._first_pose = estimate.T_cam_obj
         return estimate
 
     def _begun(self, first: Frame) -> Solver[Any]:
@@ -139,17 +140,14 @@ class Session:
         height, width = first.size
         self._camera = choose_camera(self.config.camera, width, height, *self._intrinsics)
         warn_of_unlikely(self._camera)
+        self._first, self._presented, self._latest = first, Presented(first.index), first.index
         return SOLVERS[self.config.solver.name](self.config, self._camera, self._encoder)
-
-    def _prompt_for(self, first: Frame) -> Prompt:
-        height, width = first.size
-        return self._prompt or Prompt((0.0, 0.0, float(width), float(height)))
 
     @property
     def state_classes(self) -> tuple[type, ...]:
         """The classes of what `kept` gives, beside arrays, tensors and plain values."""
         own: tuple[type, ...] = getattr(SOLVERS[self.config.solver.name], "state_classes", ())
-        return (Camera, MaskEstimate, RandomState, StageTimes, *own)
+        return (Camera, MaskEstimate, Presented, RandomState, StageTimes, *own)
 
     def kept(self) -> dict[str, Any]:
         """All that another session needs to go on after the latest frame, see `resume`; its parts never change."""
@@ -158,10 +156,11 @@ class Session:
             "camera": self._camera,
             "initial_mask": self.initial_mask,
             "last_pose": self._last_pose,
+            "steering": (self._first_pose, self._presented, self._latest, self._tracker.anew),
             "refined": self._refined,
             "refining": self.refining,
             "random": self._settings.random,
-            "tracker": self._tracker.state() if self._tracker.can_resume else None,
+            "tracker": self._tracker.state(),
         }
 
     def resume(self, first: Frame, kept: Mapping[str, Any], failures: Mapping[int, str]) -> None:
@@ -182,23 +181,28 @@ class Session:
         self._state, self._camera = kept["solver"], kept["camera"]
         self.initial_mask, self._last_pose = kept["initial_mask"], kept["last_pose"]
         self._refined, self._failures = kept["refined"], dict(failures)
+        if steering := kept.get("steering"):  # an older version kept none
+            self._first_pose, self._presented, self._latest, self._tracker.anew = steering
         self.refining, self._settings.random = kept["refining"], kept["random"]
         if self._tracker.can_resume and not self._refined:
             with self._settings.in_force():
-                self._tracker.restore(first, self._prompt_for(first), kept["tracker"])
+                self._tracker.restore(first, kept["tracker"])
 
     @property
     def replays(self) -> bool:
         """Whether the mask tracker has to see the frames again after `resume`."""
         return not self._tracker.can_resume and not self._refined
 
-    def replay(self, frame: Frame, first: bool, correction: NDArray[np.bool_] | None) -> MaskEstimate | None:
+    def replay(
+        self, frame: Frame, first: bool, correction: NDArray[np.bool_] | None, prompt: Prompt | None = None
+    ) -> MaskEstimate | None:
         """Take the mask tracker alone through a frame that is answered already.
 
         Args:
             frame: The frame.
             first: Whether it is the first one.
             correction: ``(H, W)`` what was handed back to the tracker after it, if anything was.
+            prompt: What ``step`` was given with it.
 
         Returns:
             The tracker's answer; None where it fails.
@@ -206,37 +210,46 @@ class Session:
         answer = None
         try:
             with self._replaying.in_force():
-                answer = (
-                    self._tracker.init(frame, self._prompt_for(frame)) if first else self._tracker.step(frame)
-                )
+                answer = self._tracker.start(frame) if first else self._tracker.step(frame, prompt)
                 if correction is not None:
                     self._tracker.correct(frame, correction)
         except PluginFailure as error:
             if first:
-                raise error.at(_label(frame)) from error.__cause__
+                raise error.at(frame.label) from error.__cause__
         return answer
 
-    def _go_on(self, solver: Solver[Any], frame: Frame) -> FrameEstimate:
+    def _go_on(self, frame: Frame, prompt: Prompt | None) -> FrameEstimate:
         if frame.size != (self.camera.height, self.camera.width):
             raise InputError(
-                f"{_label(frame)} has {pixels(frame.size)} pixels but the first frame "
+                f"{frame.label} has {pixels(frame.size)} pixels but the first frame "
                 f"{pixels((self.camera.height, self.camera.width))}; all frames must have one size."
             )
         failures = []
-        self.corrected = False
+        self.corrected, solver = False, self._facing(frame)
         try:
-            mask = self._tracker.step(frame)
+            mask = self._tracker.step(frame, prompt)
         except PluginFailure as error:
             failures.append(self._excused(error))
             mask = replace(self.initial_mask, score=0.0, reason=error.reason)
         self.initial_mask = mask
         try:
-            self._state, estimate = solver.step(self._state, frame, mask)
+            shown = self._presented.number(frame)
+            if prompt is not None and mask.found is not None and isinstance(solver, SteeredSolver):
+                self._state = solver.trusting(self._state, shown, mask.found)
+            self._state, estimate = solver.step(self._state, shown, mask)
+            estimate = self._presented.index(estimate)
         except PluginFailure as error:
             failures.append(self._excused(error))
             estimate = unanswered(frame, mask, self._last_pose)
         self._last_pose, self._camera = estimate.T_cam_obj, estimate.camera or self._camera
-        if self.config.solver.correct_tracker and self._tracker.can_correct and corrects(estimate):
+        for answer in (*estimate.revised, estimate):
+            self._first_pose = answer.T_cam_obj if answer.index == self._presented.first else self._first_pose
+        if (
+            prompt is None
+            and self.config.solver.correct_tracker
+            and self._tracker.can_correct
+            and corrects(estimate)
+        ):
             self.corrected = True
             try:
                 self._tracker.correct(frame, estimate.mask)
@@ -246,6 +259,20 @@ class Session:
             self._failures[frame.index] = "; ".join(failures)
         revised = tuple(self._with_failure(earlier) for earlier in estimate.revised)
         return self._with_failure(replace(estimate, revised=revised))
+
+    def _facing(self, frame: Frame) -> Solver[Any]:
+        """The solver, turned back to the first frame where this one is the first from before it."""
+        solver, first = self._solver, self._first
+        assert solver is not None and first is not None
+        if self._presented.last is None:
+            if frame.index >= first.index:
+                self._latest = frame.index
+            else:
+                check_turns(self.config)
+                assert isinstance(solver, SteeredSolver)
+                self._presented = Presented(first.index, self._latest)
+                self._state = solver.turned_back(self._state, first, self._latest, self._first_pose)
+        return solver
 
     def _excused(self, error: PluginFailure) -> str:
         """Why a plug-in failed, where the run goes on in spite of it."""
@@ -314,45 +341,14 @@ class Session:
             raise RuntimeError("frames are revisited after refine")
         try:
             with self._settings.in_force(), measured("solve") as watch:
-                self._state, estimate = solver.revisit(self._state, frame, mask, T_cam_obj)
+                shown = self._presented.number(frame)
+                self._state, estimate = solver.revisit(self._state, shown, mask, T_cam_obj)
+                estimate = self._presented.index(estimate)
         except PluginFailure as error:
-            raise error.at(_label(frame)) from error.__cause__
-        return _timed(self._with_failure(replace(estimate, refined=True)), watch, frame)
+            raise error.at(frame.label) from error.__cause__
+        return with_times(self._with_failure(replace(estimate, refined=True)), watch, frame)
 
     def _refining(self) -> RefiningSolver[Any]:
         if not isinstance(self._solver, RefiningSolver):
             raise RuntimeError(f"the solver {self.config.solver.name} cannot refine, or has not started")
         return self._solver
-
-
-def build_encoder(config: PipelineConfig) -> FeatureEncoder:
-    """The feature encoder that a configuration names, under guard.
-
-    Raises:
-        PluginError: If it is unknown or broken.
-    """
-    label = plugin_label(FEATURES, config.features.name)
-    with threads_kept(), process_kept(torch.device("cpu")):
-        return cast(FeatureEncoder, GuardedEncoder(build_plugin(FEATURES, config.features), label))
-
-
-def check_device(name: str) -> None:
-    """Make sure that a device is there.
-
-    Raises:
-        InputError: If it is not.
-    """
-    try:
-        device = torch.device(name)
-        torch.zeros(1, device=device).item()
-    except (RuntimeError, AssertionError) as error:
-        raise InputError(f"The device '{name}' is not available on this machine; use {_CPU}.") from error
-
-
-def _timed(estimate: FrameEstimate, watch: Stopwatch, frame: Frame) -> FrameEstimate:
-    stages = watch.times + StageTimes(decode=frame.decoding)
-    return replace(estimate, stages=stages, seconds=stages.whole)
-
-
-def _label(frame: Frame) -> str:
-    return frame.name or f"frame {frame.index}"

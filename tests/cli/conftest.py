@@ -50,7 +50,7 @@ def script(monkeypatch) -> Script:
             self.can_refine, self.initial_mask = False, MaskEstimate(None)
             build_plugin(TRACKERS, config.tracker)
 
-        def step(self, frame):
+        def step(self, frame, prompt=None):
             if fault := script.faults.get(frame.index):
                 raise fault
             self.camera = Camera.from_fov(frame.size[1], frame.size[0])

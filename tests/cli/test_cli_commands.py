@@ -131,6 +131,15 @@ def test_plugins_as_json(call):
     assert "path" in infos["precomputed"]["options"]["properties"]
 
 
+def test_config_show_says_what_each_layer_sets(call):
+    result = call("config", "show", "--quality", "draft")
+    preset, quality = result.stderr.splitlines()
+    assert preset == "# preset default: changes nothing"
+    assert quality == "# quality draft: tracker.name=flow, window.size=96, solver.final_refine=False"
+    assert yaml.safe_load(result.stdout)["window"]["size"] == 96
+    assert yaml.safe_load(call("config", "show", "--quality", "best").stdout)["tracker"] == {"name": "auto"}
+
+
 def test_config_show_is_a_configuration_file_with_every_default(call, tmp_path):
     result = call("config", "show", "--preset", "paper", "--set", "window.size=64")
     shown = yaml.safe_load(result.stdout)

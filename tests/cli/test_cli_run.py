@@ -262,7 +262,7 @@ def test_folder_that_cannot_be_written_is_named(refused, clip, script, tmp_path)
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ("", "--box X,Y,W,H, --mask FILE, or --masks DIR"),
+        ("", "--mask FILE, --points"),
         ("--box 1,2,3", "error: --box '1,2,3' is not four numbers"),
         ("--box here", "'here' is not four numbers"),
         ("--box a,b,c,d", "'a,b,c,d' is not four numbers"),
@@ -271,7 +271,7 @@ def test_folder_that_cannot_be_written_is_named(refused, clip, script, tmp_path)
         ("--box 1,2,3,-4", "has no size"),
         ("--box 100,100,9,9", "error: --box 100,100,9,9 lies outside 000.png, which is 64 x 48"),
         ("--mask absent.png", "error: --mask absent.png does not exist"),
-        ("--box 1,1,9,9 --mask m.png", "either --box or --mask"),
+        ("--box 1,1,9,9 --mask m.png", "either --box, --mask or --points"),
         ("--box 1,1,9,9 --box 1,2", "'1,2' is not four numbers"),
         ("--box 1,1,9,9 --box 100,100,9,9", "outside 000.png, which is 64 x 48"),
         ("--masks absent", "absent"),

@@ -8,6 +8,7 @@ from judging import Case
 RUN_OPTIONS = (
     "--box", "--mask", "--masks", "--tracker", "--features", "--prototype", "--fov", "--intrinsics", "--out",
     "--frames", "--config", "--preset", "--set", "--size", "--device", "--seed", "--on-plugin-failure",
+    "--points", "--start-frame", "--correct", "--quality",
 )  # fmt: skip
 RUN_FLAGS = (
     "--flat",
@@ -42,6 +43,7 @@ OTHERS: tuple[tuple[str, ...], ...] = (
     ("config", "show", "--set", "WORD"),
     ("config", "show", "--preset", "WORD"),
     ("config", "show", "--config", "WORD"),
+    ("config", "show", "--quality", "WORD"),
     ("config", "validate", "WORD"),
     ("config", "schema", "WORD"),
     ("plugins", "WORD"),

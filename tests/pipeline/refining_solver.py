@@ -28,6 +28,14 @@ class CausalSolver:
             raise self.faults[frame.index]
         return state + 1, self._answer(frame, mask)
 
+    @staticmethod
+    def turned_back(state: int, frame: Frame, number: int, T_cam_obj) -> int:
+        return state
+
+    @staticmethod
+    def trusting(state: int, frame: Frame, mask) -> int:
+        return state
+
     def result(self, state: int) -> ObjectModel:
         sphere = trimesh.creation.icosphere(1)
         texture = np.full((4, 4, 3), 50, np.uint8)

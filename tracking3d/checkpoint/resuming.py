@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from tracking3d.checkpoint.progress import checksum
+from tracking3d.corrections import Correction
 from tracking3d.errors import InputError, OutputError
 from tracking3d.frames import Frame, Prompt
 from tracking3d.results import layout
@@ -14,21 +17,32 @@ from tracking3d.results.lock import is_locked
 from tracking3d.results.records import jsonable
 from tracking3d.results.run_reader import RunReader
 
-Earlier = Literal["none", "stopped", "finished"]
-"""What is in a run folder: nothing that could be resumed, a run that was stopped, or one that is done."""
+Earlier = Literal["none", "stopped", "finished", "outdated"]
+"""What is in a run folder: nothing that could be resumed, a run that was stopped, one that is done, or one in which a
+frame that is answered is now corrected."""
 
 
-def given_of(first: Frame, prompt: Prompt | None, count: int | None) -> dict[str, Any]:
+def given_of(
+    first: Frame,
+    prompt: Prompt | None,
+    count: int | None,
+    start_frame: int | None = None,
+    corrections: Iterable[Correction] = (),
+) -> dict[str, Any]:
     """What tells a source and the object in it apart from others, for ``run.json``.
 
     Args:
         first: The first frame.
         prompt: The object in it.
         count: Number of frames, where known.
+        start_frame: The frame from which it is tracked both ways; None where frames come in order of time.
+        corrections: What was said of the object in later frames.
     """
     height, width = first.size
     mask = None if prompt is None or prompt.mask is None else checksum(prompt.mask.astype("uint8"))
     return {
+        "start_frame": start_frame,
+        "corrections": [_told(one) for one in sorted(corrections, key=lambda one: one.frame)],
         "frames": count,
         "width": width,
         "height": height,
@@ -36,10 +50,23 @@ def given_of(first: Frame, prompt: Prompt | None, count: int | None) -> dict[str
         "first_picture": checksum(first.image),
         "box": None if prompt is None else [float(value) for value in prompt.box],
         "mask": mask,
+        "points": None if prompt is None or prompt.points is None else prompt.points.tolist(),
+    }
+
+
+def _told(correction: Correction) -> dict[str, Any]:
+    """A correction as ``run.json`` has it."""
+    mask, points = correction.mask, correction.points
+    return {
+        "frame": correction.frame,
+        "box": None if correction.box is None else list(correction.box),
+        "mask": checksum(mask.astype("uint8")) if isinstance(mask, np.ndarray) else None,
+        "points": None if points is None else np.asarray(points).tolist(),
     }
 
 
 _NAMES = {
+    "start_frame": "frame to start from",
     "frames": "number of frames",
     "width": "width of the frames",
     "height": "height of the frames",
@@ -47,6 +74,7 @@ _NAMES = {
     "first_picture": "first picture",
     "box": "object's box",
     "mask": "object's mask",
+    "points": "object's points",
 }
 _CHECKSUMS = ("first_picture", "mask")
 
@@ -83,7 +111,21 @@ def earlier_run(
             f"The run {folder} cannot be resumed with other settings or another source: {what}; "
             f"give what it was begun with, or start anew with {layout.OVERWRITE}."
         )
+    if changed := _changed(run.description, given):
+        answered = {record.index for record in run.frames}
+        if finished or changed & answered:
+            return "outdated"
     return "finished" if finished else "stopped"
+
+
+def _changed(before: Mapping[str, Any], given: Mapping[str, Any]) -> set[int]:
+    """Frames that are corrected now and were not, or otherwise."""
+    then, now = _by_frame(before.get("given") or {}), _by_frame(given)
+    return {frame for frame in now if then.get(frame) != now[frame]}
+
+
+def _by_frame(given: Mapping[str, Any]) -> dict[int, Any]:
+    return {one["frame"]: one for one in given.get("corrections") or ()}
 
 
 def _differences(
@@ -97,10 +139,16 @@ def _differences(
         if then.get(key) != now.get(key):
             yield f"{key} was {then.get(key)} and is {now.get(key)}"
     earlier = before.get("given") or {}
+    if gone := sorted(_by_frame(earlier).keys() - _by_frame(given).keys()):
+        yield f"it was corrected in {_frames(gone)}, which is not asked for now"
     for key, name in _NAMES.items():
         if earlier.get(key) != given[key]:
             was = "is another one" if key in _CHECKSUMS else f"was {earlier.get(key)} and is {given[key]}"
             yield f"the {name} {was}"
+
+
+def _frames(indices: list[int]) -> str:
+    return f"frame{'s' * (len(indices) > 1)} {', '.join(map(str, indices))}"
 
 
 def _flat(tree: Any, prefix: str = "") -> dict[str, Any]:

@@ -7,25 +7,38 @@ from typing import Annotated
 
 import typer
 
-from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, configure
+from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quality, configure
 
 app = typer.Typer(help="Show, describe and check configurations.", no_args_is_help=True)
 
 
 @app.command()
 def show(
-    config: ConfigFile = None, preset: Preset = None, overrides: Overrides = None, debug: Debug = False
+    config: ConfigFile = None,
+    preset: Preset = None,
+    quality: Quality = None,
+    overrides: Overrides = None,
+    debug: Debug = False,
 ) -> None:
-    """Print the whole configuration as YAML, with every default, as `run` would use it."""
+    """Print the whole configuration as YAML, with every default, as `run` would use it.
+
+    What preset, quality and file set is told on the standard error.
+    """
     import yaml
 
+    from tracking3d.config.loading import layers_in_words
     from tracking3d.plugins import FEATURES, TRACKERS, check_options
+    from tracking3d.tracker_choice import AUTO
 
-    settings = configure(config, preset, overrides)
+    settings = configure(config, preset, overrides, quality)
     shown = settings.model_dump(mode="json")
     for section, group in (("tracker", TRACKERS), ("features", FEATURES)):
         choice = getattr(settings, section)
+        if section == "tracker" and choice.name == AUTO:
+            continue  # which one that is depends on the video
         shown[section] = {"name": choice.name, **check_options(group, choice).model_dump(mode="json")}
+    for words in layers_in_words(config, preset, quality):
+        typer.echo(f"# {words}", err=True)
     typer.echo(yaml.safe_dump(shown, sort_keys=False, allow_unicode=True), nl=False)
 
 

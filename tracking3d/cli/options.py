@@ -25,6 +25,14 @@ Preset = Annotated[
     str | None,
     typer.Option(metavar="NAME", help="Settings to start from, such as paper.", rich_help_panel=_SETTINGS),
 ]
+Quality = Annotated[
+    str | None,
+    typer.Option(
+        metavar="draft|good|best",
+        help="Tracker, window, refinement and model together.",
+        rich_help_panel=_SETTINGS,
+    ),
+]
 Overrides = Annotated[
     list[str] | None,
     typer.Option(
@@ -37,14 +45,19 @@ Overrides = Annotated[
 
 
 def configure(
-    file: Path | None, preset: str | None, overrides: list[str] | None, **direct: Any
+    file: Path | None,
+    preset: str | None,
+    overrides: list[str] | None,
+    quality: str | None = None,
+    **direct: Any,
 ) -> PipelineConfig:
     """The configuration, the options of its plug-ins checked too; None in ``direct`` is no setting."""
     from tracking3d.config.loading import load_config
-    from tracking3d.plugins import FEATURES, TRACKERS, check_options
+    from tracking3d.plugins import FEATURES, check_options
+    from tracking3d.tracker_choice import check_tracker_options
 
-    config = load_config(file, preset, overrides or (), **_given(direct))
-    check_options(TRACKERS, config.tracker)
+    config = load_config(file, preset, overrides or (), quality=quality, **_given(direct))
+    check_tracker_options(config)
     check_options(FEATURES, config.features)
     return config
 

@@ -68,6 +68,8 @@ def print_summary(folder: Path) -> None:
     table = Table(
         title=f"{escape(str(folder))} ({reader.state_in_words})", show_header=False, title_justify="left"
     )
+    if choice := run.get("tracker_choice"):
+        table.add_row("mask tracker", escape(str(choice)))
     table.add_row("frames", str(counts["frames"]))
     for status in ("tracked", "uncertain", "lost", "skipped"):
         if counts[status] or status == "tracked":

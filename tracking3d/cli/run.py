@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
-from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quiet, configure, numbers
+from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quality, Quiet, configure, numbers
 from tracking3d.errors import InputError
 
 _TRACKING, _CAMERA, _RUNNING = "The object and how to track it", "The camera", "Running"
@@ -38,6 +38,30 @@ def run(
         typer.Option(
             metavar="FILE",
             help="Mask of the object in the first frame; may be repeated.",
+            rich_help_panel=_TRACKING,
+        ),
+    ] = None,
+    points: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="'X,Y+ X,Y-'",
+            help="Points of the first frame on the object (+) and beside it (-); may be repeated.",
+            rich_help_panel=_TRACKING,
+        ),
+    ] = None,
+    start_frame: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="The object is given in frame N, and tracked both ways from there.",
+            rich_help_panel=_TRACKING,
+        ),
+    ] = None,
+    correct: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="FRAME:BOX|MASK|POINTS",
+            help="The object in a later frame, from which the tracker goes on; may be repeated.",
             rich_help_panel=_TRACKING,
         ),
     ] = None,
@@ -96,6 +120,7 @@ def run(
     ] = False,
     config: ConfigFile = None,
     preset: Preset = None,
+    quality: Quality = None,
     overrides: Overrides = None,
     size: Annotated[
         int | None, typer.Option(help="Working resolution in pixels.", rich_help_panel=_RUNNING)
@@ -135,19 +160,26 @@ def run(
 ) -> None:
     """Track the object through SOURCE: masks, poses and a textured mesh in a run folder.
 
-    Say what the object is by --box, --mask or --masks. Several boxes or masks are several objects, each with a run
-    folder of its own in the one of the run.
+    Say what the object is by --box, --mask, --points or --masks. Several boxes, masks or --points are several objects,
+    each with a run folder of its own in the one of the run.
     """
-    boxes, object_masks = box or [], mask or []
+    from tracking3d.config.loading import load_prompt
+
+    told = load_prompt(config)
+    boxes, object_masks, object_points = box or [], mask or [], points or []
+    if not (boxes or object_masks or object_points or masks):
+        boxes, object_points = list(told.box), list(told.points)
+        object_masks = [Path(file) for file in told.mask]
+    start_frame = told.start_frame if start_frame is None else start_frame
     if resume and overwrite:
         raise InputError(
             "Give either --resume or --overwrite: one keeps the run that is there, one does not."
         )
-    if boxes and object_masks:
-        raise InputError("Give either --box or --mask, not both.")
+    if sum(map(bool, (boxes, object_masks, object_points))) > 1:
+        raise InputError("Give either --box, --mask or --points, not more than one of them.")
     chosen: dict[str, str | None] = {"name": tracker}
     if masks is not None:
-        if tracker not in (None, "precomputed"):
+        if tracker not in (None, "precomputed", "auto"):
             raise InputError(f"--masks is for the tracker precomputed; leave out --tracker {tracker}.")
         chosen = {"name": "precomputed", "path": str(masks)}
     camera = None
@@ -157,6 +189,7 @@ def run(
         config,
         preset,
         overrides,
+        quality,
         tracker=chosen,
         features=features,
         camera={"fov": fov, "intrinsics": camera},
@@ -165,13 +198,16 @@ def run(
         solver={"final_refine": final_refine},
         runtime={"device": device, "seed": seed, "on_plugin_failure": on_plugin_failure},
     )
-    if not boxes and not object_masks and settings.tracker.name != "precomputed":
+    if not (boxes or object_masks or object_points) and settings.tracker.name != "precomputed":
         raise InputError(
-            "Say what the object is in the first frame: --box X,Y,W,H, --mask FILE, or --masks DIR."
+            "Say what the object is in the first frame: --box X,Y,W,H, --mask FILE, --points 'X,Y+ X,Y-', or "
+            "--masks DIR."
         )
 
     from tracking3d.cli.progress import print_summary, progress
     from tracking3d.cli.report import reported
+    from tracking3d.corrections import checked_corrections, parse_correction
+    from tracking3d.point_prompts import parse_points
     from tracking3d.prompts import parse_box
     from tracking3d.recording import record, record_objects
     from tracking3d.results.layout import object_folders
@@ -179,11 +215,14 @@ def run(
     from tracking3d.video import open_source
 
     given = [parse_box(text) for text in boxes]
+    clicked = [parse_points(text) for text in object_points]
     opened = open_source(source, frames)
     folder = out or default_folder(source)
     if quiet:
         logging.getLogger("tracking3d").setLevel(logging.ERROR)
-    objects = max(len(given) + len(object_masks), 1)
+    objects = max(len(given) + len(object_masks) + len(clicked), 1)
+    corrections = [parse_correction(text) for text in correct or told.correct]
+    checked_corrections(corrections, objects)  # before anything is written
     folders = object_folders(folder, objects) if objects > 1 else [folder]
     about: dict[str, Any] = {
         "command": shlex.join(sys.argv),
@@ -191,24 +230,34 @@ def run(
         "overwrite": overwrite,
         "skip_damaged": skip_damaged,
         "resume": resume,
+        "start_frame": start_frame,
+        "corrections": corrections,
     }
-    done = {one for one in folders if resume and is_finished(one)}
+    finished = {one: _written(one) for one in folders if resume and is_finished(one)}
     with (
         resumable(folders),
-        reported(folders if report else []) as told,
+        reported(folders if report else []) as reporting,
         progress(opened.count, quiet, objects) as listener,
     ):
-        about["listener"] = told(listener)
+        about["listener"] = reporting(listener)
         if objects > 1:
-            record_objects(opened, settings, folder, boxes=given, masks=object_masks, **about)
+            record_objects(opened, settings, folder, boxes=given, masks=object_masks, points=clicked, **about)
         else:
             the_box, the_mask = next(iter(given), None), next(iter(object_masks), None)
-            record(opened, settings, folder, box=the_box, mask=the_mask, **about)
+            its_points = next(iter(clicked), None)
+            record(opened, settings, folder, box=the_box, mask=the_mask, points=its_points, **about)
     for one in () if quiet else folders:
-        if one in done:
+        if one in finished and finished[one] == _written(one):
             typer.echo(f"The run {one} is finished already; there is nothing to resume.")
         else:
             print_summary(one)
+
+
+def _written(folder: Path) -> int:
+    """When the description of a run was written last."""
+    from tracking3d.results.layout import RUN
+
+    return (folder / RUN).stat().st_mtime_ns
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""One configuration from its layers: model defaults, preset, file, ``--set``, and options given directly.
+"""One configuration from its layers: model defaults, preset, quality, file, ``--set``, and options given directly.
 
 A later layer wins key by key. Where a layer names another solver or plug-in, the settings that lower layers gave to
 the old one are dropped; settings without a name belong to whatever solver or plug-in is chosen.
@@ -15,8 +15,11 @@ from pydantic import ValidationError
 
 from tracking3d.config.explain import describe, hint, shown
 from tracking3d.config.models import PipelineConfig, PluginChoice
+from tracking3d.config.prompt_section import PromptSection
 from tracking3d.config.yaml_files import parse_yaml, read_mapping
 from tracking3d.errors import InputError, argument
+
+_MOST_LEAVES = 12  # settings of a layer that words tell one by one
 
 DEFAULT_PRESET = "default"
 """The preset that is used when none is named."""
@@ -32,14 +35,21 @@ Layer = tuple[str, Mapping[str, Any]]
 
 
 def load_config(
-    file: Path | None = None, preset: str | None = None, overrides: Sequence[str] = (), **direct: Any
+    file: Path | None = None,
+    preset: str | None = None,
+    overrides: Sequence[str] = (),
+    *,
+    quality: str | None = None,
+    **direct: Any,
 ) -> PipelineConfig:
     """Build the configuration of a run.
 
     Args:
         file: A YAML file, or the name of a ready one (`ready_files`); it may choose its preset by a top-level
-            ``preset: name``.
+            ``preset: name`` and its quality by ``quality: name``.
         preset: Name of a preset; wins over the file's.
+        quality: ``draft``, ``good`` or ``best``: tracker, window, refinement and model together; wins over the preset,
+            and over the file's own.
         overrides: ``section.key=value`` items as ``--set`` takes them; the value is YAML.
         direct: Settings by section, such as ``camera={"fov": 60}`` or ``tracker="csrt"``; they win over all.
 
@@ -50,16 +60,8 @@ def load_config(
     Raises:
         InputError: A file, preset, key or value that cannot be used.
     """
-    from_file = read_mapping(_located(Path(file)), empty={}) if file is not None else {}
-    file_preset = from_file.pop("preset", {})
-    file_preset = DEFAULT_PRESET if file_preset == {} else file_preset
-    if not isinstance(file_preset, str):
-        raise InputError(f"{file}: 'preset' must be the name of a preset, not {shown(file_preset)}.")
-
     settings: dict[str, Any] = PipelineConfig().model_dump()
-    layers: list[Layer] = [_preset_layer(file_preset if preset is None else preset)]
-    if file is not None:
-        layers.append((str(file), from_file))
+    layers = _files(file, preset, quality)
     spoken = [(_called(item), _parse_override(item)) for item in overrides]
     spoken.append(("", direct))
     # What is chosen on the command line comes first, so that the options of a `--set tracker.path=...`
@@ -72,10 +74,44 @@ def load_config(
     return config
 
 
+def load_prompt(file: Path | None) -> PromptSection:
+    """What a configuration file says is tracked; nothing where there is no file.
+
+    Raises:
+        InputError: If the file or that section cannot be used.
+    """
+    return _prompt_of(file, read_mapping(_located(Path(file)), empty={}) if file is not None else {})
+
+
+def layers_in_words(
+    file: Path | None = None, preset: str | None = None, quality: str | None = None
+) -> list[str]:
+    """The layers below what is said on the command line, the lowest first: where from, and what each sets.
+
+    Raises:
+        InputError: As `load_config`.
+    """
+    words = []
+    for origin, layer in _files(file, preset, quality):
+        leaves = _leaves(_without_shorthand(layer))
+        more = f" and {len(leaves) - _MOST_LEAVES} more" if len(leaves) > _MOST_LEAVES else ""
+        words.append(f"{origin}: {', '.join(leaves[:_MOST_LEAVES]) or 'changes nothing'}{more}")
+    return words
+
+
 def list_presets() -> list[str]:
     """The names of the presets that come with the package."""
-    folder = resources.files("tracking3d.config") / "presets"
-    return sorted(Path(item.name).stem for item in folder.iterdir() if item.name.endswith(".yaml"))
+    return _names("presets")
+
+
+def list_qualities() -> list[str]:
+    """The names of the qualities, the quickest first."""
+    return sorted(_names("qualities"), key=["draft", "good", "best"].index)
+
+
+def _names(folder: str) -> list[str]:
+    files = (resources.files("tracking3d.config") / folder).iterdir()
+    return sorted(Path(item.name).stem for item in files if item.name.endswith(".yaml"))
 
 
 def ready_files() -> dict[str, Path]:
@@ -92,6 +128,16 @@ def config_schema() -> dict[str, Any]:
         "enum": list_presets(),
         "default": DEFAULT_PRESET,
         "description": "The preset that the settings of this file change.",
+    }
+    schema["properties"]["quality"] = {
+        "type": "string",
+        "enum": list_qualities(),
+        "description": "Tracker, window, refinement and model together, which the settings of this file change.",
+    }
+    prompt = PromptSection.model_json_schema()
+    schema["properties"]["prompt"] = {
+        **prompt,
+        "description": "What is tracked; read by `tracking3d run` only.",
     }
     choice = schema["$defs"]["PluginChoice"]
     schema["$defs"]["PluginChoice"] = {"anyOf": [{"type": "string"}, choice]}
@@ -122,12 +168,52 @@ def _located(file: Path) -> Path:
     )
 
 
-def _preset_layer(name: str) -> Layer:
-    names = list_presets()
+def _files(file: Path | None, preset: str | None, quality: str | None) -> list[Layer]:
+    """The layers that are written somewhere: preset, quality and file."""
+    from_file = read_mapping(_located(Path(file)), empty={}) if file is not None else {}
+    _prompt_of(file, from_file)
+    named = {}
+    for key, spoken in (("preset", preset), ("quality", quality)):
+        name = from_file.pop(key, {})
+        if not isinstance(name, str) and name != {}:
+            raise InputError(f"{file}: '{key}' must be the name of a {key}, not {shown(name)}.")
+        named[key] = spoken if spoken is not None else None if name == {} else name
+    chosen = DEFAULT_PRESET if named["preset"] is None else named["preset"]
+    layers = [_named_layer("preset", "presets", list_presets(), chosen)]
+    if named["quality"] is not None:
+        layers.append(_named_layer("quality", "qualities", list_qualities(), named["quality"]))
+    return [*layers, (str(file), from_file)] if file is not None else layers
+
+
+def _prompt_of(file: Path | None, from_file: dict[str, Any]) -> PromptSection:
+    """The section ``prompt``, which is taken out of what a file holds."""
+    given = from_file.pop("prompt", {})
+    if not isinstance(given, dict):
+        raise InputError(
+            f"{file}: 'prompt' must be a mapping, such as 'prompt: {{box: \"301,11,296,227\"}}'."
+        )
+    try:
+        return PromptSection.model_validate(given)
+    except ValidationError as error:
+        raise InputError(f"{file}: prompt.{describe(error, PromptSection)}") from error
+
+
+def _named_layer(kind: str, folder: str, names: Sequence[str], name: str) -> Layer:
     if name not in names:
-        raise InputError(f"There is no preset '{name}' (available: {', '.join(names)}); {hint(name, names)}")
-    with resources.as_file(resources.files("tracking3d.config") / "presets" / f"{name}.yaml") as path:
-        return f"preset {name}", read_mapping(path)
+        raise InputError(f"There is no {kind} '{name}' (available: {', '.join(names)}); {hint(name, names)}")
+    with resources.as_file(resources.files("tracking3d.config") / folder / f"{name}.yaml") as path:
+        return f"{kind} {name}", read_mapping(path)
+
+
+def _leaves(settings: Mapping[str, Any], prefix: str = "") -> list[str]:
+    """``section.key=value`` of all settings of a layer."""
+    leaves = []
+    for key, value in settings.items():
+        if isinstance(value, Mapping):
+            leaves += _leaves(value, f"{prefix}{key}.")
+        else:
+            leaves.append(f"{prefix}{key}={value}")
+    return leaves
 
 
 def _called(override: str) -> str:

@@ -76,3 +76,23 @@ class RefiningSolver(Protocol, Generic[State]):
             T_cam_obj: ``(4, 4)`` the causal answer.
         """
         ...
+
+
+@runtime_checkable
+class SteeredSolver(Protocol, Generic[State]):
+    """A solver that goes on as the user says: backwards from the first frame, and by a mask that is right."""
+
+    def turned_back(self, state: State, frame: Frame, number: int, T_cam_obj: NDArray[np.float64]) -> State:
+        """Go on from a frame seen before; the frames that follow come from before it, numbered after ``number``.
+
+        Args:
+            state: After the last frame.
+            frame: The frame to go on from.
+            number: The index that the last frame had.
+            T_cam_obj: ``(4, 4)`` the answer for ``frame``.
+        """
+        ...
+
+    def trusting(self, state: State, frame: Frame, mask: NDArray[np.bool_]) -> State:
+        """The state before ``step`` takes a frame whose mask ``(H, W)`` the user has given."""
+        ...

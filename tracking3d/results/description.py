@@ -36,8 +36,13 @@ def description_at_start(
     selection: str | None,
     renderer: Mapping[str, str | int] | None,
     given: Mapping[str, Any] | None = None,
+    tracker_choice: str | None = None,
 ) -> dict[str, Any]:
-    """What is known of a run before its first frame; ``given`` tells source and object apart from others."""
+    """What is known of a run before its first frame.
+
+    ``given`` tells source and object apart from others; ``tracker_choice`` is why ``auto`` stood for the tracker of
+    ``config``.
+    """
     return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -54,6 +59,7 @@ def description_at_start(
         "command": command,
         "seed": seed,
         "config": config,
+        "tracker_choice": tracker_choice,
         "camera": asdict(camera),
         "renderer": renderer,
         "versions": versions(),

@@ -3,13 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from tracking3d.errors import OutputError
+from tracking3d.frames import SkippedFrame
 from tracking3d.results import layout
 from tracking3d.results.files import writing
 from tracking3d.results.lock import try_lock
 from tracking3d.results.records import FrameRecord
+
+
+@dataclass(frozen=True)
+class WrittenSoFar:
+    """What a stopped run has written.
+
+    Attributes:
+        lines: Bytes of ``frames.jsonl`` that are of finished frames.
+        seconds: Wall time of the run until then.
+        skipped: Frames that were not taken.
+    """
+
+    lines: int = 0
+    seconds: float = 0.0
+    skipped: tuple[SkippedFrame, ...] = ()
 
 
 class FrameLines:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -30,7 +30,7 @@ from tracking3d.results.files import (
     write_reserved,
     writing,
 )
-from tracking3d.results.frame_lines import FrameLines
+from tracking3d.results.frame_lines import FrameLines, WrittenSoFar
 from tracking3d.results.making_room import make_room
 from tracking3d.results.mesh_export import export_mesh
 from tracking3d.results.notes import notes_of
@@ -48,21 +48,6 @@ DEFAULT_FPS = 10.0
 """Speed of the overlay video where the source has none, such as a folder of images."""
 
 
-@dataclass(frozen=True)
-class WrittenSoFar:
-    """What a stopped run has written.
-
-    Attributes:
-        lines: Bytes of ``frames.jsonl`` that are of finished frames.
-        seconds: Wall time of the run until then.
-        skipped: Frames that were not taken.
-    """
-
-    lines: int = 0
-    seconds: float = 0.0
-    skipped: tuple[SkippedFrame, ...] = ()
-
-
 class RunWriter:
     """Writes one run folder.
 
@@ -78,6 +63,7 @@ class RunWriter:
         fps: Frames per second of the source, where known.
         command: The command line, where there was one.
         given: What tells source and object apart from others, see `tracking3d.checkpoint.resuming.given_of`.
+        tracker_choice: Why the mask tracker ``auto`` stood for that of ``config``; None where it was named.
         overwrite: Replace a run that is there. Only files a run writes are removed, only from a run folder.
         resume: Go on with the run that is there, of which so much is kept. What is behind that in ``frames.jsonl``
             stays until something is written in its place.
@@ -99,6 +85,7 @@ class RunWriter:
         selection: str | None = None,
         renderer: Mapping[str, str | int] | None = None,
         given: Mapping[str, Any] | None = None,
+        tracker_choice: str | None = None,
         overwrite: bool = False,
         resume: WrittenSoFar | None = None,
     ) -> None:
@@ -120,6 +107,7 @@ class RunWriter:
             selection=selection,
             renderer=renderer,
             given=given,
+            tracker_choice=tracker_choice,
         )
         self._kept: dict[int, FrameRecord] = {}
         with writing(self.folder):
@@ -158,6 +146,16 @@ class RunWriter:
             mask = read_mask(layout.mask_path(self.folder, frame.index))
             self._pictures.add_kept(frame, record, mask, initial)
         return record
+
+    def begin_drawing_anew(self) -> None:
+        """All frames are answered: from here on `draw_again` draws them, in the order in which they come.
+
+        Raises:
+            OutputError: If the video that was drawn so far cannot be finished.
+        """
+        self._pictures.close()
+        self._pictures = Pictures(self.folder / layout.OVERLAY, self._camera, self._fps)
+        self._kept = {record.index: record for record in latest(read_records(self.folder / layout.FRAMES))}
 
     def write(self, estimate: FrameEstimate, frame: Frame) -> FrameRecord:
         """Keep the answer for one frame, and those it revises.

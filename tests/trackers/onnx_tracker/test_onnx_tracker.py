@@ -355,3 +355,50 @@ def test_real_networks_reach_what_the_docs_promise_on_a_short_clip(shared_data: 
         frames.append(Frame(index, cv2.cvtColor(image, cv2.COLOR_BGR2RGB)))
         truth.append(cv2.imread(str(folder / "masks" / f"{index:06d}.png"), cv2.IMREAD_GRAYSCALE) > 127)
     assert min(ious(track(tracker, (frames, np.stack(truth))), np.stack(truth))) > 0.96
+
+
+class ScriptedSegmenter:
+    """Proposes what it is told, and remembers the points that it was given."""
+
+    def __init__(self, *masks: np.ndarray) -> None:
+        self.masks, self.given = masks, []
+
+    def propose(self, image: np.ndarray, box: Box, last: np.ndarray | None) -> list[proposals.Proposal]:
+        return [proposals.Proposal(mask.astype(np.float32), 1.0, "box") for mask in self.masks]
+
+    def propose_by_points(self, image: np.ndarray, points: np.ndarray) -> list[proposals.Proposal]:
+        self.given.append(points)
+        return [proposals.Proposal(mask.astype(np.float32), 1.0, "points") for mask in self.masks]
+
+
+def test_a_network_that_takes_points_makes_the_first_mask_of_them(disc, saliency, monkeypatch):
+    frames, truth = disc
+    y, x = np.argwhere(truth[0]).mean(0)
+    points = np.float32([(x, y, 1), (2, 2, 0)])
+    rough = cv2.dilate(truth[0].astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    prompt = Prompt(box_of(rough), rough, points)
+    beside = np.zeros_like(rough)
+    beside[:10, :10] = True
+    for masks, expected in (((beside, truth[0]), truth[0]), ((beside,), rough)):
+        segmenter = ScriptedSegmenter(*masks)
+        monkeypatch.setattr(tracker_module, "build_segmenter", lambda options, made=segmenter: made)
+        answer = OnnxTracker(OnnxTracker.Options(**saliency)).init(frames[0], prompt)
+        assert segmenter.given[0] is points
+        assert ((answer.mask > 0.5) == expected).all()
+
+
+def test_a_network_that_takes_no_points_starts_from_the_mask_that_was_made_of_them(disc, saliency):
+    frames, truth = disc
+    y, x = np.argwhere(truth[0]).mean(0)
+    prompt = Prompt(box_of(truth[0]), truth[0], np.float32([(x, y, 1)]))
+    answer = OnnxTracker(OnnxTracker.Options(**saliency)).init(frames[0], prompt)
+    assert ((answer.mask > 0.5) == truth[0]).all()
+
+
+def test_a_promptable_network_is_asked_with_the_points_and_then_with_their_box(disc, promptable):
+    frames, truth = disc
+    y, x = np.argwhere(truth[0]).mean(0)
+    prompt = Prompt(box_of(truth[0]), truth[0], np.float32([(x, y, 1)]))
+    answer = OnnxTracker(OnnxTracker.Options(**promptable)).init(frames[0], prompt)
+    found = answer.mask > 0.5
+    assert (found & truth[0]).sum() / (found | truth[0]).sum() > 0.9

@@ -35,6 +35,7 @@ from tracking3d.estimation.online.points import FollowedPoints, follow, grey
 from tracking3d.estimation.online.pose_refinement import PoseFit, PoseWeights
 from tracking3d.estimation.online.sighting import meets, sighted
 from tracking3d.estimation.online.start import Start
+from tracking3d.estimation.online.steering import trusting, turned_back
 from tracking3d.estimation.online.tracking import (
     agreeing,
     coast,
@@ -67,7 +68,7 @@ _TRAIL = 5  # believed frames that give the motion where nothing is seen
 
 @dataclass(frozen=True)
 class OnlineSolver:
-    """See the module; implements `tracking3d.estimation.solver.Solver` and `RefiningSolver`.
+    """See the module; implements `tracking3d.estimation.solver.Solver`, `RefiningSolver` and `SteeredSolver`.
 
     Attributes:
         config: The pipeline's configuration.
@@ -135,7 +136,10 @@ class OnlineSolver:
     def step(self, state: Belief, frame: Frame, mask: MaskEstimate) -> tuple[Belief, FrameEstimate]:
         """Take one more frame."""
         advance = self._track if state.waiting is None else self._wait
-        return advance(state, frame, grey(frame.image), _usable(mask))
+        return advance(state, frame, grey(frame.image), mask.found)
+
+    turned_back = staticmethod(turned_back)
+    trusting = staticmethod(trusting)
 
     def refine(self, state: Belief) -> Belief:
         """All keyframes together once more."""
@@ -157,7 +161,7 @@ class OnlineSolver:
         self, state: Belief, frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]
     ) -> tuple[Belief, FrameEstimate]:
         """A frame's pose once more, against the final map."""
-        binary, image, known = _usable(mask), grey(frame.image), state.known
+        binary, image, known = mask.found, grey(frame.image), state.known
         causal = pose_of(T_cam_obj[:3, :3], T_cam_obj[:3, 3], known.vertices)
         if state.surface is None:
             return state, replace(unsolved(frame, binary, causal, state.camera), refined=True)
@@ -347,9 +351,3 @@ class OnlineSolver:
         if state.space is None:
             return observation
         return replace(observation, features=state.space.project(observation.features))
-
-
-def _usable(mask: MaskEstimate) -> NDArray[np.bool_] | None:
-    """The binary mask; None where there is none or it is empty."""
-    binary = mask.binary
-    return binary if binary is not None and binary.any() else None

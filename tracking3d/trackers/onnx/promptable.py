@@ -72,6 +72,15 @@ class PromptableSegmenter:
             proposals += look.ask(box, beside, origin="box without holes")
         return proposals
 
+    def propose_by_points(self, image: Image, points: Points) -> list[Proposal]:
+        """See `PointSegmenter.propose_by_points`: the points alone, and with the box around the best mask of them."""
+        look = self.look(image)
+        proposals = look.ask(points=points, origin="points")
+        sharpest = max(proposals, key=lambda proposal: proposal.sharpness)
+        if (place := box_of(sharpest.mask)) is not None:
+            proposals += look.ask(place, points, origin="points and their box")
+        return proposals
+
     def look(self, image: Image) -> Look:
         """Run the encoder on ``image`` ``(H, W, 3)``; the answer can be asked many times."""
         fit = fit_image(image.shape[:2], self._description.input)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,20 @@ class Segmenter(Protocol):
             image: The frame.
             box: ``(x, y, w, h)``, where a box tracker sees the object.
             last: ``(H, W)`` in [0, 1], the last mask carried into this frame, or None at the start.
+        """
+        ...
+
+
+@runtime_checkable
+class PointSegmenter(Protocol):
+    """A segmentation network that takes points on the object and beside it, too."""
+
+    def propose_by_points(self, image: Image, points: NDArray[np.float32]) -> list[Proposal]:
+        """Masks of the object in ``image`` ``(H, W, 3)`` RGB.
+
+        Args:
+            image: The frame.
+            points: ``(N, 3)``: x, y in pixels of the image, and 1 on the object or 0 beside it.
         """
         ...
 

@@ -13,6 +13,7 @@ from tracking3d.frames import Box, Frame, Image, MaskEstimate, Prompt
 from tracking3d.trackers.crops import box_iou, box_of, clip_box
 from tracking3d.trackers.onnx.judging import ColourJudge, Verdict
 from tracking3d.trackers.onnx.options import OnnxOptions, build_boxes, build_segmenter
+from tracking3d.trackers.onnx.proposals import PointSegmenter
 from tracking3d.trackers.segmentation import ColourSegmentation
 
 _LEAST_SHARPNESS = 0.35  # of a network's mask; below, it has not found anything
@@ -63,6 +64,8 @@ class OnnxTracker:
             )
         estimate = self._first_answer(image, prompt)
         mask = np.zeros(frame.size, np.float32) if estimate.mask is None else estimate.mask
+        if prompt.points is not None:
+            box = box_of(mask) or box
         self._judge = ColourJudge(image, mask)
         self._carried = ColourSegmentation(image, box, mask > 0.5)
         self._boxes.start(image, box)
@@ -94,7 +97,7 @@ class OnnxTracker:
 
     def _first_answer(self, image: Image, prompt: Prompt) -> MaskEstimate:
         if prompt.mask is not None:
-            return MaskEstimate(prompt.mask.astype(np.float32))
+            return self._by_points(image, prompt.mask, prompt.points)
         guess = ColourSegmentation(image, prompt.box).estimate
         if guess.mask is None:
             return guess
@@ -102,6 +105,23 @@ class OnnxTracker:
         best = self._best(judge, image, prompt.box, None, prompt.box)
         if reason := _unusable(best):
             return MaskEstimate(guess.mask, guess.score / 2, f"{reason}; colours in the box stand in")
+        return MaskEstimate(best.proposal.mask, best.score)
+
+    def _by_points(
+        self, image: Image, mask: NDArray[np.bool_], points: NDArray[np.float32] | None
+    ) -> MaskEstimate:
+        """What the network makes of points, if there are any and it takes them; else the mask that was given."""
+        soft = mask.astype(np.float32)
+        given = MaskEstimate(soft)
+        if points is None or not isinstance(self._segmenter, PointSegmenter):
+            return given
+        judge = ColourJudge(image, soft)
+        verdicts = [
+            judge.verdict(image, one, None) for one in self._segmenter.propose_by_points(image, points)
+        ]
+        best = max(verdicts, key=lambda one: (_kept(one.proposal.mask, points), one.preference))
+        if _unusable(best) or _kept(best.proposal.mask, points) < _kept(soft, points):
+            return given
         return MaskEstimate(best.proposal.mask, best.score)
 
     def _segmented(self, image: Image, witness: Box | None, carried: MaskEstimate) -> MaskEstimate:
@@ -153,6 +173,13 @@ class OnnxTracker:
         """Where to look while the box tracker is lost."""
         found = None if carried.mask is None else box_of(carried.mask)
         return self._last_box if found is None else found
+
+
+def _kept(mask: NDArray[np.float32], points: NDArray[np.float32]) -> int:
+    """How many of the points a mask keeps to."""
+    x, y = np.rint(points[:, :2]).astype(int).T
+    inside = mask[y.clip(0, mask.shape[0] - 1), x.clip(0, mask.shape[1] - 1)] > 0.5
+    return int(np.count_nonzero(inside == (points[:, 2] > 0)))
 
 
 def _unusable(verdict: Verdict) -> str:

@@ -1,0 +1,125 @@
+"""The mask tracker of one object, started where its prompt is, and anew wherever the object is told anew."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.config.models import PluginChoice
+from tracking3d.frames import Frame, MaskEstimate, Prompt
+from tracking3d.plugins import TRACKERS, build_plugin, plugin_label
+from tracking3d.plugins.guard import GuardedTracker, PluginFailure
+from tracking3d.results.records import mask_iou
+
+STRAYED = 0.5
+"""IoU of the tracker's own answer and what the user says, below which it is on something else and forgets all."""
+
+
+class PromptedTracker:
+    """A mask tracker and the prompts that it starts from.
+
+    Frames that come from before the first one are tracked backwards from it: the tracker is then started once more
+    on the first frame. Where a frame has a prompt of its own, the tracker is set on that: re-anchored where it can be
+    and still is on the object, since what it has learnt is worth keeping; else started anew.
+
+    Args:
+        choice: The tracker of the configuration.
+        prompt: The object in the first frame; None takes the tracker's own first mask.
+
+    Raises:
+        PluginError: If it is unknown or broken.
+    """
+
+    def __init__(self, choice: PluginChoice, prompt: Prompt | None) -> None:
+        self._choice, self._prompt = choice, prompt
+        self._tracker = self._new()
+        self._first: Frame | None = None
+        self._backwards = False
+        self.anew = False
+        """Whether it was started more than once."""
+
+    def start(self, frame: Frame) -> MaskEstimate:
+        """Start on the first frame.
+
+        Raises:
+            PluginError: If the tracker fails.
+        """
+        self._first = frame
+        return self._tracker.init(frame, self._first_prompt)
+
+    def step(self, frame: Frame, prompt: Prompt | None = None) -> MaskEstimate:
+        """Answer for the next frame; with a prompt, which says what the object is in it, by that.
+
+        Raises:
+            PluginError: If the tracker fails.
+        """
+        assert self._first is not None
+        if frame.index < self._first.index and not self._backwards:
+            self._backwards = True
+            self._begin_anew()
+            self._tracker.init(self._first, self._first_prompt)
+        return self._tracker.step(frame) if prompt is None else self._set_on(frame, prompt)
+
+    def _set_on(self, frame: Frame, prompt: Prompt) -> MaskEstimate:
+        other = self._new()
+        told = other.init(frame, prompt)
+        try:
+            own = self._tracker.step(frame).found
+        except PluginFailure:
+            own = None
+        mask = told.found
+        common = None if mask is None else mask_iou(mask, own)
+        if mask is not None and self.can_correct and common is not None and common >= STRAYED:
+            self._tracker.correct(frame, mask)
+        else:
+            self._tracker, self.anew = other, True
+        return told
+
+    @property
+    def can_correct(self) -> bool:
+        """Whether the tracker can be re-anchored, see `tracking3d.trackers.protocol.CorrectableTracker`."""
+        return self._tracker.can_correct
+
+    def correct(self, frame: Frame, mask: NDArray[np.bool_]) -> None:
+        """Re-anchor the tracker on ``mask`` ``(H, W)`` in ``frame``, the latest one.
+
+        Raises:
+            PluginError: If the tracker fails.
+        """
+        self._tracker.correct(frame, mask)
+
+    @property
+    def can_resume(self) -> bool:
+        """Whether its memory can be kept; that of one that was started twice is not told by one first frame."""
+        return self._tracker.can_resume and not self.anew
+
+    def state(self) -> Any:
+        """Its memory; None where it cannot tell.
+
+        Raises:
+            PluginError: If the tracker fails.
+        """
+        return self._tracker.state() if self.can_resume else None
+
+    def restore(self, first: Frame, state: Any) -> None:
+        """Give it its memory back.
+
+        Raises:
+            PluginError: If the tracker fails.
+        """
+        self._first = first
+        self._tracker.restore(first, self._first_prompt, state)
+
+    @property
+    def _first_prompt(self) -> Prompt:
+        assert self._first is not None
+        height, width = self._first.size
+        return self._prompt or Prompt((0.0, 0.0, float(width), float(height)))
+
+    def _begin_anew(self) -> None:
+        self._tracker, self.anew = self._new(), True
+
+    def _new(self) -> GuardedTracker:
+        return GuardedTracker(build_plugin(TRACKERS, self._choice), plugin_label(TRACKERS, self._choice.name))

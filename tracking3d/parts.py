@@ -1,0 +1,77 @@
+"""What a session is built of: solvers by name, the feature encoder, the device; and what its answers took."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, cast
+
+import torch
+
+from tracking3d.config.models import PipelineConfig
+from tracking3d.errors import InputError, argument
+from tracking3d.estimation.estimate import FrameEstimate
+from tracking3d.estimation.online.solver import OnlineSolver
+from tracking3d.estimation.paper.solver import PaperSolver
+from tracking3d.estimation.solver import Solver
+from tracking3d.features.protocol import FeatureEncoder
+from tracking3d.frames import Frame
+from tracking3d.geometry.camera import Camera
+from tracking3d.plugins import FEATURES, build_plugin, plugin_label
+from tracking3d.plugins.guard import GuardedEncoder
+from tracking3d.process_settings import process_kept
+from tracking3d.rendering.backend import threads_kept
+from tracking3d.stages import StageTimes, Stopwatch
+
+SOLVERS: dict[str, Callable[[PipelineConfig, Camera, FeatureEncoder], Solver[Any]]] = {
+    "paper": PaperSolver,
+    "online": OnlineSolver,
+}
+"""Solvers by the name that `solver.name` selects."""
+
+_CPU = argument("runtime.device 'cpu'", "--device cpu")
+
+
+def build_encoder(config: PipelineConfig) -> FeatureEncoder:
+    """The feature encoder that a configuration names, under guard.
+
+    Raises:
+        PluginError: If it is unknown or broken.
+    """
+    label = plugin_label(FEATURES, config.features.name)
+    with threads_kept(), process_kept(torch.device("cpu")):
+        return cast(FeatureEncoder, GuardedEncoder(build_plugin(FEATURES, config.features), label))
+
+
+def check_device(name: str) -> None:
+    """Make sure that a device is there.
+
+    Raises:
+        InputError: If it is not.
+    """
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device).item()
+    except (RuntimeError, AssertionError) as error:
+        raise InputError(f"The device '{name}' is not available on this machine; use {_CPU}.") from error
+
+
+def check_turns(config: PipelineConfig) -> None:
+    """Make sure that the solver can track backwards from the first frame.
+
+    Raises:
+        InputError: If it cannot.
+    """
+    name = config.solver.name
+    if not hasattr(SOLVERS[name], "turned_back"):
+        turning = ", ".join(other for other, solver in SOLVERS.items() if hasattr(solver, "turned_back"))
+        raise InputError(
+            f"The solver {name} goes forwards only; frames from before the first one need another ({turning}), or "
+            "are left out: --frames N: begins with frame N."
+        )
+
+
+def with_times(estimate: FrameEstimate, watch: Stopwatch, frame: Frame) -> FrameEstimate:
+    """An answer with what it took, reading the frame included."""
+    stages = watch.times + StageTimes(decode=frame.decoding)
+    return replace(estimate, stages=stages, seconds=stages.whole)
