@@ -6,13 +6,14 @@ import logging
 import shlex
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quiet, configure, numbers
+from tracking3d.cli.view import Host, watched
 from tracking3d.errors import InputError
 
 _TRACKING, _CAMERA, _RUNNING = "The object and how to track it", "The camera", "Running"
@@ -121,6 +122,13 @@ def run(
             rich_help_panel=_RUNNING,
         ),
     ] = None,
+    view: Annotated[
+        bool,
+        typer.Option(
+            "--view", help="Look at the run in the browser while it goes on.", rich_help_panel=_RUNNING
+        ),
+    ] = False,
+    host: Host = None,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
@@ -136,6 +144,8 @@ def run(
         )
     if boxes and object_masks:
         raise InputError("Give either --box or --mask, not both.")
+    if host is not None and not view:
+        raise InputError("--host is where --view serves its page; give both.")
     chosen: dict[str, str | None] = {"name": tracker}
     if masks is not None:
         if tracker not in (None, "precomputed"):
@@ -183,7 +193,13 @@ def run(
         "resume": resume,
     }
     done = {one for one in folders if resume and is_finished(one)}
-    with resumable(folders), progress(opened.count, quiet, objects) as about["listener"]:
+    with ExitStack() as ends:
+        ends.enter_context(resumable(folders))
+        about["listener"] = ends.enter_context(progress(opened.count, quiet, objects))
+        if view:
+            opened, about["listener"] = ends.enter_context(
+                watched(opened, folder, about["listener"], host, quiet)
+            )
         if objects > 1:
             record_objects(opened, settings, folder, boxes=given, masks=object_masks, **about)
         else:

@@ -90,7 +90,7 @@ class VideoFile:
                     yield SkippedFrame(index, f"frame {index}: {picture}")
                 else:
                     # Once, because asking PyAV for side data keeps the picture until Python collects cycles.
-                    orientation = orientation or _orientation(picture)
+                    orientation = orientation or orientation_of(picture)
                     yield _frame(index, picture, seconds, orientation)
                 if index + 1 >= self.selection.stop:
                     return
@@ -122,7 +122,8 @@ def _announced_frames(container: InputContainer, stream: VideoStream) -> int | N
     return round(duration * stream.average_rate) if duration > 0 and stream.average_rate else None
 
 
-def _orientation(picture: av.VideoFrame) -> int:
+def orientation_of(picture: av.VideoFrame) -> int:
+    """How the file asks for the picture to be turned, see `tracking3d.video.orientation`."""
     matrix: Any = picture.side_data.get("DISPLAYMATRIX")
     return UPRIGHT if matrix is None else orientation_from_display_matrix(bytes(matrix))
 
