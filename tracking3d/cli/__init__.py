@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import typer
 
-from tracking3d.cli import bench, config, demo, evaluate, models, plugins, points, run, synth, view
+from tracking3d.cli import bench, config, demo, evaluate, models, pick, plugins, points, run, synth, view
 from tracking3d.cli.options import Debug
 from tracking3d.cli.program import Program
 
@@ -21,6 +21,7 @@ app = typer.Typer(
 app.command(name="run")(run.run)
 app.command(name="demo")(demo.demo)
 app.command(name="synth")(synth.synth)
+app.command(name="pick")(pick.pick)
 app.command(name="view")(view.view)
 app.command(name="points")(points.points)
 app.add_typer(evaluate.app, name="evaluate")

@@ -5,16 +5,19 @@ from __future__ import annotations
 import logging
 import shlex
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quiet, configure, numbers
 from tracking3d.cli.view import Host, watched
 from tracking3d.errors import InputError
+
+if TYPE_CHECKING:
+    from tracking3d.config.models import PipelineConfig
 
 _TRACKING, _CAMERA, _RUNNING = "The object and how to track it", "The camera", "Running"
 
@@ -166,33 +169,72 @@ def run(
         solver={"final_refine": final_refine},
         runtime={"device": device, "seed": seed, "on_plugin_failure": on_plugin_failure},
     )
-    if not boxes and not object_masks and settings.tracker.name != "precomputed":
-        raise InputError(
-            "Say what the object is in the first frame: --box X,Y,W,H, --mask FILE, or --masks DIR."
-        )
+    folder = out or default_folder(source)
+    about: dict[str, Any] = {
+        "command": shlex.join(sys.argv),
+        "overwrite": overwrite,
+        "skip_damaged": skip_damaged,
+        "resume": resume,
+    }
+    given: Sequence[Any] = object_masks
+    places: Sequence[Any] = []
+    if boxes or object_masks or settings.tracker.name == "precomputed":
+        from tracking3d.prompts import parse_box
 
+        places = [parse_box(text) for text in boxes]
+    elif sys.stdin.isatty() and sys.stderr.isatty() and not (quiet or resume or source.isdigit()):
+        from tracking3d.cli.pick import picked_in_browser, start_of
+
+        typer.echo("Say in the browser what the object is; Ctrl-C ends it.", err=True)
+        picked = picked_in_browser(source, frames, settings, folder, overwrite=overwrite)
+        places, given, frames = picked.boxes, picked.masks, start_of(picked, frames)
+    else:
+        raise InputError(
+            "Say what the object is in the first frame: --box X,Y,W,H, --mask FILE, or --masks DIR; "
+            "or draw it with `tracking3d pick`."
+        )
+    track(source, frames, settings, folder, places, given, about, quiet, view, host)
+
+
+def track(
+    source: str,
+    frames: str | None,
+    settings: PipelineConfig,
+    folder: Path,
+    boxes: Sequence[Any],
+    masks: Sequence[Any],
+    about: dict[str, Any],
+    quiet: bool,
+    view: bool = False,
+    host: str | None = None,
+) -> None:
+    """Track what boxes or masks say, show how it goes, and print what came of it.
+
+    Args:
+        source: What SOURCE is.
+        frames: ``START:STOP:STEP``.
+        settings: The configuration.
+        folder: The run folder.
+        boxes: One for each object, or none.
+        masks: One for each object, as an array or a file, or none.
+        about: Further arguments of `tracking3d.recording.record`.
+        quiet: Print nothing.
+        view: Show the run in the browser.
+        host: Where that is served.
+    """
     from tracking3d.cli.progress import print_summary, progress
-    from tracking3d.prompts import parse_box
     from tracking3d.recording import record, record_objects
     from tracking3d.results.layout import object_folders
     from tracking3d.results.run_reader import is_finished
     from tracking3d.video import open_source
 
-    given = [parse_box(text) for text in boxes]
     opened = open_source(source, frames)
-    folder = out or default_folder(source)
+    about = {**about, "selection": frames}
     if quiet:
         logging.getLogger("tracking3d").setLevel(logging.ERROR)
-    objects = max(len(given) + len(object_masks), 1)
+    objects = max(len(boxes) + len(masks), 1)
     folders = object_folders(folder, objects) if objects > 1 else [folder]
-    about: dict[str, Any] = {
-        "command": shlex.join(sys.argv),
-        "selection": frames,
-        "overwrite": overwrite,
-        "skip_damaged": skip_damaged,
-        "resume": resume,
-    }
-    done = {one for one in folders if resume and is_finished(one)}
+    done = {one for one in folders if about.get("resume") and is_finished(one)}
     with ExitStack() as ends:
         ends.enter_context(resumable(folders))
         about["listener"] = ends.enter_context(progress(opened.count, quiet, objects))
@@ -201,9 +243,9 @@ def run(
                 watched(opened, folder, about["listener"], host, quiet)
             )
         if objects > 1:
-            record_objects(opened, settings, folder, boxes=given, masks=object_masks, **about)
+            record_objects(opened, settings, folder, boxes=boxes, masks=masks, **about)
         else:
-            the_box, the_mask = next(iter(given), None), next(iter(object_masks), None)
+            the_box, the_mask = next(iter(boxes), None), next(iter(masks), None)
             record(opened, settings, folder, box=the_box, mask=the_mask, **about)
     for one in () if quiet else folders:
         if one in done:

@@ -32,16 +32,17 @@ class FrameImages(Protocol):
         ...
 
 
-def frame_images(source: FrameSource) -> FrameImages:
+def frame_images(source: FrameSource) -> KeptImages:
     """Access to any frame of a source.
 
     Raises:
         InputError: If it is one that cannot be read again, such as a camera.
     """
     if isinstance(source, ImageSequence):
-        return KeptImages(ImageFiles(source).image)
+        return KeptImages(ImageFiles(source).image, len(source.files))
     if isinstance(source, VideoFile):
-        return KeptImages(VideoPictures(source).image)
+        pictures = VideoPictures(source)
+        return KeptImages(pictures.image, pictures.count or source.count)
     raise InputError(f"{source.name} cannot be read again; give a video file or a folder of images.")
 
 
@@ -50,10 +51,11 @@ class KeptImages:
 
     Args:
         decode: Gives the picture of a frame, or None.
+        count: Number of all frames of the source, where it is known.
     """
 
-    def __init__(self, decode: Callable[[int], Image | None]) -> None:
-        self._decode = decode
+    def __init__(self, decode: Callable[[int], Image | None], count: int | None) -> None:
+        self._decode, self.count = decode, count
         self._kept: OrderedDict[int, Image | None] = OrderedDict()
         self._bytes = 0
         self._lock = threading.Lock()
@@ -109,6 +111,11 @@ class VideoPictures:
         self._place = {time: index for index, time in enumerate(self._times)}
         self._running: Iterator[av.VideoFrame] | None = None
         self._next = -1
+
+    @property
+    def count(self) -> int:
+        """Number of pictures; 0 where the file has no times to count them by."""
+        return len(self._times)
 
     def image(self, index: int) -> Image | None:
         """The frame ``(H, W, 3)``, or None where it cannot be decoded."""

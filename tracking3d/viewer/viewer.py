@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import html
+import io
 import threading
 import time
 from bisect import bisect_left
 from collections.abc import Sequence
+from contextlib import redirect_stdout
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -103,7 +105,8 @@ class Viewer:
             self._changed.notify_all()
         for thread in self._threads:
             thread.join(5)
-        self._server.stop()
+        with redirect_stdout(io.StringIO()):  # it says so
+            self._server.stop()
 
     def _want(self, index: int | None = None) -> None:
         with self._changed:
