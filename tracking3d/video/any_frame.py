@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from typing import Protocol, cast
 
@@ -12,16 +13,18 @@ import av
 from av.error import FFmpegError
 
 from tracking3d.errors import InputError
-from tracking3d.frames import Frame, Image
+from tracking3d.frames import Frame, Image, SkippedFrame
 from tracking3d.video.image_file import read_image
 from tracking3d.video.image_sequence import ImageSequence
 from tracking3d.video.orientation import turn_upright
 from tracking3d.video.selection import EVERY_FRAME
 from tracking3d.video.source import FrameSource
-from tracking3d.video.video_file import VideoFile, orientation_of
+from tracking3d.video.video_file import VideoFile, orientation_of, video_stream
 
 MOST_KEPT = 128 * 2**20
 """Bytes of decoded frames that are kept for when they are asked for again."""
+_INDEXED = frozenset({"mp4", "matroska"})
+"""Containers that say of every packet when it is shown, and of which pictures need no other."""
 
 
 class FrameImages(Protocol):
@@ -97,7 +100,8 @@ class VideoPictures:
     """The pictures of a video file, found by seeking.
 
     The header's index tells the time of every picture; from the picture before it that needs no other, everything is
-    decoded up to the one that is asked for. Pictures asked for one after another are decoded once.
+    decoded up to the one that is asked for. Pictures asked for one after another are decoded once. Containers whose
+    index is not to be relied on are read from their beginning, or on from where they are.
 
     Args:
         video: The file.
@@ -106,11 +110,14 @@ class VideoPictures:
     def __init__(self, video: VideoFile) -> None:
         self._video = replace(video, selection=EVERY_FRAME)
         self._container = av.open(f"file:{video.path}", metadata_errors="ignore")
-        self._stream = self._container.streams.video[0]
+        stream = video_stream(self._container)
+        assert stream is not None  # VideoFile.open has made sure
+        self._stream = stream
         self._times = self._presentation_times()
         self._place = {time: index for index, time in enumerate(self._times)}
         self._running: Iterator[av.VideoFrame] | None = None
-        self._next = -1
+        self._reading: Iterator[Frame | SkippedFrame] = iter(())
+        self._next = 0
 
     @property
     def count(self) -> int:
@@ -125,12 +132,14 @@ class VideoPictures:
             return None
         try:
             return self._sought(index)
-        except FFmpegError:
+        except FFmpegError:  # it cannot be sought
             self._running = None
             return None
 
     def _presentation_times(self) -> list[int]:
-        """Of all pictures, in the order in which they are shown; none where one has no time, or two have the same."""
+        """Of all pictures, in the order in which they are shown; none where they are not to be relied on."""
+        if not _INDEXED & set(self._container.format.name.split(",")):
+            return []
         try:
             packets = [packet for packet in self._container.demux(self._stream) if packet.size]
         except FFmpegError:
@@ -142,7 +151,7 @@ class VideoPictures:
         near = self._running is not None and 0 <= index - self._next < 16
         if not near:
             self._container.seek(self._times[index], stream=self._stream, backward=True)
-            self._running = self._container.decode(self._stream)
+            self._running = self._pictures()
         for picture in self._running or ():
             at = self._place.get(picture.pts) if picture.pts is not None else None
             if at is None:
@@ -158,9 +167,20 @@ class VideoPictures:
     def _upright(self, picture: av.VideoFrame) -> Image:
         return turn_upright(cast(Image, picture.to_ndarray(format="rgb24")), orientation_of(picture))
 
+    def _pictures(self) -> Iterator[av.VideoFrame]:
+        """From where the file stands, those that can be decoded."""
+        for packet in self._container.demux(self._stream):
+            with suppress(FFmpegError):
+                yield from (picture for picture in packet.decode() if isinstance(picture, av.VideoFrame))
+
     def _counted(self, index: int) -> Image | None:
-        """Where the file has no times to seek by: decoded from its beginning."""
-        for frame in self._video:
+        """The frame by reading on to it, or from the beginning where it is behind."""
+        if index < self._next:
+            self._reading, self._next = iter(()), 0
+        if not self._next:
+            self._reading = iter(self._video)
+        for frame in self._reading:
+            self._next = frame.index + 1
             if frame.index >= index:
                 return frame.image if isinstance(frame, Frame) and frame.index == index else None
         return None

@@ -52,7 +52,7 @@ class VideoFile:
         with _open(name, path) as container:
             if container.format.name in ("tty", "image2") or container.format.name.endswith("_pipe"):
                 raise InputError(f"{name} is not a video; give a video file or a folder of images.")
-            stream = _video_stream(container)
+            stream = video_stream(container)
             if stream is None:
                 raise InputError(f"{name} has no video in it; give a file with a video stream.")
             if stream.codec_context is None:
@@ -75,7 +75,7 @@ class VideoFile:
 
     def _frames(self) -> Iterator[Frame | SkippedFrame]:
         with _open(self.name, self.path) as container:
-            stream = _video_stream(container)
+            stream = video_stream(container)
             assert stream is not None
             start = stream.start_time
             orientation: int | None = None
@@ -105,7 +105,7 @@ def _open(name: str, path: Path) -> InputContainer:
         raise InputError(f"{name} cannot be read as a video; is it complete? ({reason})") from error
 
 
-def _video_stream(container: InputContainer) -> VideoStream | None:
+def video_stream(container: InputContainer) -> VideoStream | None:
     """The first video stream that is not the cover picture of a song."""
     cover = av.stream.Disposition.attached_pic
     return next((stream for stream in container.streams.video if not stream.disposition & cover), None)
