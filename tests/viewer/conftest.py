@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # recorded_runs
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # recorded_runs, raw_requests, browser
 
 from recorded_runs import write_run
 

@@ -23,6 +23,7 @@ MOST_CONNECTIONS = 32
 """Requests that are worked on at a time; a browser needs a few."""
 PATIENCE = 15.0
 """Seconds that a request may take to arrive."""
+_POLL = 0.05  # seconds until it is seen that the server is to stop
 _PORTS = 100  # that are tried, from the wanted one on
 _FRAME = re.compile(r"/frame/(\d{1,9})\.jpg")
 _PAGE = {
@@ -55,7 +56,9 @@ class Picker:
         self._server = _listening(self, access.host, port)
         self.port: int = self._server.server_address[1]
         self.address = access.address(self.port)
-        self._thread = threading.Thread(target=self._server.serve_forever, name="picker", daemon=True)
+        self._thread = threading.Thread(
+            target=self._server.serve_forever, args=(_POLL,), name="picker", daemon=True
+        )
         self._thread.start()
 
     def wait(self) -> Picked:

@@ -212,7 +212,10 @@ class Viewer:
             first, last = self._ends()
             panel.timeline.content = timeline.with_cursor(self._timeline, index, first, last)
             told = "".join(timeline.describe(run, run.frames.get(index)) for run in self._runs)
-            panel.told.content = f'<div style="font-size:12px;margin:4px 12px">frame {index}{told}{self._fault}</div>'
+            panel.told.content = (
+                f'<div class="told" data-frame="{index}" style="font-size:12px;line-height:1.4;margin:4px 12px">'
+                f"frame {index}{told}{self._fault}</div>"
+            )
         self._shown = index
 
     def _follow(self) -> None:
