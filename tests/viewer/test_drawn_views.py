@@ -12,7 +12,7 @@ from recorded_runs import append_lines, frame_of
 from tracking3d.results import drawing
 from tracking3d.viewer import timeline
 from tracking3d.viewer.followed_run import FollowedRun
-from tracking3d.viewer.picture import CAUSAL, LAYERS, Shown, axes_of, draw_picture
+from tracking3d.viewer.picture import CAUSAL, LAYERS, Shown, axes_of, beside, draw_picture
 from tracking3d.viewer.run_images import LatestImages, OverlayPictures, images_of_run
 from tracking3d.video import open_source
 
@@ -135,3 +135,11 @@ def test_the_latest_frames_of_a_camera_are_kept_within_bounds():
     assert source.image(0) is None
     assert [frame.index for frame in source] == list(range(6))
     assert source.image(2) is None and np.array_equal(source.image(4), frame_of(4).image)
+
+
+def test_several_videos_stand_in_rows_of_two_and_one_alone_is_left_as_it_is():
+    wide, tall = np.full((60, 120, 3), 200, np.uint8), np.full((200, 100, 3), 90, np.uint8)
+    assert beside([wide], ["a"]) is wide
+    three = beside([wide, tall, wide], ["a", "b" * 500, ""])
+    assert three.shape == (2 * (960 + 22), 960, 3)
+    assert three[100, 100, 0] == 200 and three[100, 600, 0] == 90 and three[-1, -1, 0] == drawing.PAPER[0]

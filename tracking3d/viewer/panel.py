@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import viser
 
@@ -11,8 +9,8 @@ from tracking3d.frames import Image
 from tracking3d.viewer import timeline
 from tracking3d.viewer.picture import LAYERS, Shown
 
-VIDEO_WIDTH = 560
-"""Pixels of the panel with the video."""
+VIDEO_WIDTH, VIDEOS_WIDTH = 560, 720
+"""Pixels of the panel with the video, or with several."""
 SPEEDS = {"¼ x": 0.25, "½ x": 0.5, "1 x": 1.0, "2 x": 2.0, "4 x": 4.0}
 _STEPS = ("◀◀", "◀", "▶", "▶▶")
 _STEP_HINT = "Doubtful frame before, frame before, next frame, next doubtful frame."
@@ -23,29 +21,26 @@ class Panel:
 
     Args:
         server: Shows them.
-        videos: Names of the videos that stand one above the other.
+        videos: How many stand beside one another.
         live: Whether a run may still grow.
         causal: Whether there are answers of before a final refinement.
     """
 
-    def __init__(self, server: viser.ViserServer, videos: Sequence[str], live: bool, causal: bool) -> None:
+    def __init__(self, server: viser.ViserServer, videos: int, live: bool, causal: bool) -> None:
         self._gui = gui = server.gui
         gui.configure_theme(control_width="medium", dark_mode=True, show_logo=False, show_share_button=False)
         gui.set_panel_label("tracking3d")
         panel = gui.add_panel()
         with panel.add_tab("Video"):
             blank: Image = np.full((9, 16, 3), 40, np.uint8)
-            self.pictures = [
-                gui.add_image(blank, label=name if len(videos) > 1 else None, format="jpeg", jpeg_quality=85)
-                for name in videos
-            ]
+            self.picture = gui.add_image(blank, format="jpeg", jpeg_quality=85)
             self.timeline = gui.add_html("")
             self.slider = gui.add_slider(timeline.SLIDER, 0, 1, 1, 0)
             self.play = gui.add_button("Play", hint="Key P.")
             self.steps = gui.add_button_group("go to", _STEPS, hint=_STEP_HINT)
             self.told = gui.add_html("")
         panel.dock_left()
-        panel.set_width(VIDEO_WIDTH)
+        panel.set_width(VIDEO_WIDTH if videos == 1 else VIDEOS_WIDTH)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Show"):
             self._add_choices(causal)

@@ -73,6 +73,20 @@ def draw_picture(
     return picture
 
 
+def beside(pictures: Sequence[Image], names: Sequence[str]) -> Image:
+    """The pictures of several videos in rows of two, each with its name; one alone is left as it is."""
+    if len(pictures) == 1:
+        return pictures[0]
+    width = WIDEST // 2
+    tiles = [_named(picture, name, width) for picture, name in zip(pictures, names, strict=True)]
+    height = max(len(tile) for tile in tiles)
+    canvas = np.full((height * -(-len(tiles) // 2), 2 * width, 3), drawing.PAPER, np.uint8)
+    for number, tile in enumerate(tiles):
+        top, left = number // 2 * height, number % 2 * width
+        canvas[top : top + len(tile), left : left + width] = tile
+    return canvas
+
+
 def axes_of(run: FollowedRun) -> ObjectAxes | None:
     """Where an object's axes are drawn: in the middle of its mesh, or as its first frame shows it before there is one."""
     if run.model is not None and len(run.model.vertices):
@@ -84,6 +98,14 @@ def axes_of(run: FollowedRun) -> ObjectAxes | None:
         if mask is not None and mask.any():
             return ObjectAxes.of(_estimate(record, mask), record.through(run.camera))
     return None
+
+
+def _named(picture: Image, name: str, width: int) -> Image:
+    height = max(round(picture.shape[0] * width / picture.shape[1]), 1)
+    tile = np.full((height + 22, width, 3), drawing.PAPER, np.uint8)
+    tile[22:] = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
+    drawing.draw_text(tile, drawing.shorten(name, 10, width - 16), 8, 16, 10, drawing.INK)
+    return tile
 
 
 def _estimate(record: FrameRecord, mask: NDArray[np.bool_]) -> FrameEstimate:

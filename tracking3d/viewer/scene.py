@@ -36,7 +36,7 @@ class ObjectScene:
     Args:
         server: Shows it.
         run: The object's run.
-        number: Tells it from others; they stand beside one another.
+        number: Tells it from others; they stand below one another.
         jump: Is called with the index of a frame whose frustum was clicked.
     """
 
@@ -58,9 +58,9 @@ class ObjectScene:
         """Show what is new in the run.
 
         Args:
-            place: How far to the right of the first object it stands.
+            place: How far below the first object it stands.
         """
-        self.place = np.array([place, 0.0, 0.0])
+        self.place = np.array([0.0, place, 0.0])
         self._draw_mesh()
         records = [record for record in self._run.frames.values() if np.isfinite(record.T_cam_obj).all()]
         if records:

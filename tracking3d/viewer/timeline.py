@@ -89,9 +89,16 @@ def list_streaks(runs: Sequence[FollowedRun]) -> str:
     return f'<div style="font-size:12px;line-height:1.35;max-height:40vh;overflow-y:auto;margin:4px 12px">{told}</div>'
 
 
-def describe(run: FollowedRun, record: FrameRecord | None) -> str:
-    """One run's answer for a frame in a line of HTML."""
+def colour_of(number: int, runs: int) -> Colour | None:
+    """The colour of a run's curve; None where there is but one run to tell apart."""
+    return RUN_COLOURS[number % len(RUN_COLOURS)] if runs > 1 else None
+
+
+def describe(run: FollowedRun, record: FrameRecord | None, colour: Colour | None = None) -> str:
+    """One run's answer for a frame in a line of HTML, after the colour of its curve."""
     name = html.escape(run.name)
+    if colour is not None:
+        name = f'<span style="color:{_hex(colour)}">▬</span> {name}'
     if record is None:
         return f"<div><b>{name}</b> has no answer for this frame</div>"
     figures = f"confidence {record.confidence:.2f}"

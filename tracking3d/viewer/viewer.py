@@ -24,7 +24,7 @@ from tracking3d.viewer.followed_run import FollowedRun
 from tracking3d.viewer.guarded_server import start_server
 from tracking3d.viewer.kept_landmarks import kept_landmarks
 from tracking3d.viewer.panel import SPEEDS, Panel
-from tracking3d.viewer.picture import axes_of, draw_picture
+from tracking3d.viewer.picture import axes_of, beside, draw_picture
 from tracking3d.viewer.scene import ObjectScene
 from tracking3d.web.access import Access
 
@@ -78,7 +78,7 @@ class Viewer:
         self.address = access.address(self._server.get_port())
         self._server.scene.set_up_direction("-y")
         self._panel = Panel(
-            self._server, [video.name for video in videos], live, any(run.refined for run in self._runs)
+            self._server, len(videos), live, any(run.refined for run in self._runs)
         )
         self._scenes = [
             ObjectScene(self._server, run, number, self.go_to) for number, run in enumerate(self._runs)
@@ -193,25 +193,26 @@ class Viewer:
                 self._fault = f"<p>Frame {index} cannot be drawn: {html.escape(str(error))}</p>"
 
     def _draw_frame(self, index: int) -> None:
-        panel, pictures = self._panel, []
+        panel = self._panel
+        pictures: dict[FollowedRun, Image] = {}
+        drawn: list[Image] = []
         for video in self._videos:
             image = video.images.image(index) if video.images is not None else None
             fits = image is not None and _fits(image, video.runs[0])
-            pictures.append(
-                draw_picture(image if fits else None, video.runs, index, panel.shown, video.axes)
-            )
+            picture = draw_picture(image if fits else None, video.runs, index, panel.shown, video.axes)
+            pictures.update(dict.fromkeys(video.runs, picture))
+            drawn.append(picture)
         with self._server.atomic():
-            number = 0
-            for video, picture, widget in zip(self._videos, pictures, panel.pictures, strict=True):
-                widget.image = picture
-                for _ in video.runs:
-                    scene = self._scenes[number]
-                    scene.go_to(index, picture[::2, ::2], panel.still.value)
-                    scene.show(panel.mesh.value, panel.path.value, panel.landmarks.value)
-                    number += 1
+            panel.picture.image = beside(drawn, [video.name for video in self._videos])
+            for scene, picture in zip(self._scenes, pictures.values(), strict=True):
+                scene.go_to(index, picture[::2, ::2], panel.still.value)
+                scene.show(panel.mesh.value, panel.path.value, panel.landmarks.value)
             first, last = self._ends()
             panel.timeline.content = timeline.with_cursor(self._timeline, index, first, last)
-            told = "".join(timeline.describe(run, run.frames.get(index)) for run in self._runs)
+            told = "".join(
+                timeline.describe(run, run.frames.get(index), timeline.colour_of(number, len(self._runs)))
+                for number, run in enumerate(self._runs)
+            )
             panel.told.content = (
                 f'<div class="told" data-frame="{index}" style="font-size:12px;line-height:1.4;margin:4px 12px">'
                 f"frame {index}{told}{self._fault}</div>"
@@ -264,7 +265,7 @@ class Viewer:
         place = 0.0
         for scene, run in zip(self._scenes, self._runs, strict=True):
             scene.draw_again(place)
-            place += 2.2 * scene.distance
+            place += 1.2 * scene.distance
             points = kept_landmarks(run.folder)
             if points is not None:
                 colours = np.full(points.shape, (255, 230, 120), np.uint8)
@@ -292,13 +293,12 @@ class Viewer:
         first, last = self._scenes[0], self._scenes[-1]
         row = last.place - first.place
         to_path = first.middle_of_path
-        look_at = 0.4 * to_path + row / 2
         aside = np.cross(to_path, [0.0, 1.0, 0.0])
         aside = aside / max(float(np.linalg.norm(aside)), 1e-9)
-        reach = max(first.distance, float(np.linalg.norm(row)))
+        reach = first.distance + 0.7 * float(np.linalg.norm(row))
         camera = self._server.initial_camera
-        camera.look_at = look_at
-        camera.position = look_at + 1.9 * reach * aside + 0.6 * to_path - [0.0, 0.9 * reach, 0.0]
+        camera.look_at = 0.45 * to_path + row / 2
+        camera.position = camera.look_at + 0.5 * to_path + reach * (2.2 * aside - [0.0, 0.8, 0.0])
         camera.fov = 0.8
 
     def _look_through(self) -> None:
@@ -324,13 +324,14 @@ def _about(run: FollowedRun) -> str:
     """What a run says of itself."""
     description: dict[str, Any] = run.description
     tracker = description.get("config", {}).get("tracker", {}).get("name", "")
+    seconds = (description.get("timings") or {}).get("seconds_total")
     rows = {
         "state": run.reader.state_in_words,
         "source": description.get("source"),
         "frames": len(run.frames),
         "mask tracker": tracker,
         "lens": run.camera.origin,
-        "seconds": (description.get("timings") or {}).get("seconds_total"),
+        "seconds": seconds and round(seconds),
     }
     cells = "".join(
         f"<tr><td style='opacity:.6;padding-right:8px;vertical-align:top'>{name}</td>"
