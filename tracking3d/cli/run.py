@@ -182,7 +182,7 @@ def run(
         from tracking3d.prompts import parse_box
 
         places = [parse_box(text) for text in boxes]
-    elif sys.stdin.isatty() and sys.stderr.isatty() and not (quiet or resume or source.isdigit()):
+    elif a_person_is_there() and not (quiet or resume or source.isdigit()):
         from tracking3d.cli.pick import picked_in_browser, start_of
 
         typer.echo("Say in the browser what the object is; Ctrl-C ends it.", err=True)
@@ -252,6 +252,11 @@ def track(
             typer.echo(f"The run {one} is finished already; there is nothing to resume.")
         else:
             print_summary(one)
+
+
+def a_person_is_there() -> bool:
+    """Whether the program was called from a terminal, not by a script."""
+    return sys.stdin is not None and sys.stdin.isatty() and sys.stderr is not None and sys.stderr.isatty()
 
 
 @contextmanager
