@@ -9,7 +9,12 @@ from typing import Any
 
 import pytest
 
-ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+ARGUMENTS = [
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+]
 
 
 @contextmanager
@@ -21,7 +26,9 @@ def open_page(address: str, width: int = 1280, height: int = 800) -> Iterator[An
     program = shutil.which("chromium") or shutil.which("chromium-browser")
     if program is None:
         pytest.skip("there is no chromium on this machine")
-    driver = pytest.importorskip("playwright.sync_api", reason="playwright, which drives the browser, is absent")
+    driver = pytest.importorskip(
+        "playwright.sync_api", reason="playwright, which drives the browser, is absent"
+    )
     with driver.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=program, args=ARGUMENTS)
         page = browser.new_page(viewport={"width": width, "height": height})

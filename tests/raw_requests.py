@@ -22,8 +22,17 @@ def status(answer: bytes) -> int:
 
 def request(method: str, path: str, body: bytes = b"", **headers: str) -> bytes:
     """A request of our own page, unless ``headers`` say otherwise; None for a name leaves it out."""
-    told = {"Host": "127.0.0.1", "Connection": "close", **{k.replace("_", "-"): v for k, v in headers.items()}}
+    told = {
+        "Host": "127.0.0.1",
+        "Connection": "close",
+        **{k.replace("_", "-"): v for k, v in headers.items()},
+    }
     if method == "POST":
-        told = {"Origin": "http://127.0.0.1", "Content-Type": "application/json", "Content-Length": str(len(body)), **told}
+        told = {
+            "Origin": "http://127.0.0.1",
+            "Content-Type": "application/json",
+            "Content-Length": str(len(body)),
+            **told,
+        }
     lines = [f"{name}: {value}\r\n" for name, value in told.items() if value is not None]
     return f"{method} {path} HTTP/1.1\r\n{''.join(lines)}\r\n".encode("latin-1") + body

@@ -100,5 +100,10 @@ def append_lines(folder: Path, count: int) -> None:
     lines = [json.loads(line) for line in path.read_text().splitlines()]
     with path.open("a") as file:
         for index in range(len(lines), count):
-            line = {**lines[index % len(lines)], "index": index, "name": f"{index:06d}.png", "time": index / 10}
+            line = {
+                **lines[index % len(lines)],
+                "index": index,
+                "name": f"{index:06d}.png",
+                "time": index / 10,
+            }
             file.write(json.dumps(line) + "\n")

@@ -13,7 +13,7 @@ from recorded_runs import frame_of
 from tracking3d.cli import app
 from tracking3d.config.loading import load_config
 from tracking3d.errors import InputError
-from tracking3d.picker.drawing import DrawnObject, Drawing, Point, Stroke, read_drawing, read_object
+from tracking3d.picker.drawing import Drawing, DrawnObject, Point, Stroke, read_drawing, read_object
 from tracking3d.picker.drawn_mask import drawn_mask
 from tracking3d.picker.outcome import command_of, save_picked, selection_from
 from tracking3d.picker.session import Picked
@@ -114,7 +114,9 @@ def test_nonsense_is_refused_in_a_sentence(text):
 def test_numbers_that_are_none_are_refused():
     for number in ("NaN", "Infinity", "1e999"):
         with pytest.raises(InputError):
-            read_object(f'{{"name": "a", "colour": "#000000", "frame": 0, "box": [{number}, 1, 1, 1]}}'.encode())
+            read_object(
+                f'{{"name": "a", "colour": "#000000", "frame": 0, "box": [{number}, 1, 1, 1]}}'.encode()
+            )
 
 
 def understood(command: str):

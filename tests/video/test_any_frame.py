@@ -39,7 +39,9 @@ def test_a_video_is_sought_as_it_is_read(tmp_path, name, options):
 
 
 def test_a_damaged_picture_is_none_and_those_after_it_keep_their_place(tmp_path):
-    path = encode_video(tmp_path / "a.mp4", [moving_picture(n) for n in range(COUNT)], options={"g": "6", "bf": "0"})
+    path = encode_video(
+        tmp_path / "a.mp4", [moving_picture(n) for n in range(COUNT)], options={"g": "6", "bf": "0"}
+    )
     damage_packet(path, 8)
     read = {frame.index: frame.image for frame in open_source(str(path)) if isinstance(frame, Frame)}
     images = frame_images(open_source(str(path)))
@@ -52,7 +54,12 @@ def test_images_are_found_by_their_place_in_the_folder_whatever_is_selected(tmp_
         Image.fromarray(np.full((4, 6, 3), number * 40, np.uint8)).save(tmp_path / f"{number}.png")
     (tmp_path / "3.png").write_bytes(b"nonsense")
     images = frame_images(open_source(str(tmp_path), "1::2"))
-    assert [None if (image := images.image(n)) is None else int(image[0, 0, 0]) for n in (4, 0, 3, 5)] == [160, 0, None, None]
+    assert [None if (image := images.image(n)) is None else int(image[0, 0, 0]) for n in (4, 0, 3, 5)] == [
+        160,
+        0,
+        None,
+        None,
+    ]
 
 
 def test_a_source_that_gives_each_frame_once_is_refused():

@@ -99,7 +99,9 @@ def test_doubtful_frames_in_a_row_are_one_streak_where_only_figures_differ(run):
 def test_objects_of_one_video_come_in_their_order_with_the_names_they_were_picked_with(tmp_path):
     for number in range(11):
         write_run(tmp_path / "runs" / f"object_{number}", 2)
-    (tmp_path / "runs" / "picked.json").write_text(json.dumps({"objects": [{"name": "cup"}, {"name": "box"}]}))
+    (tmp_path / "runs" / "picked.json").write_text(
+        json.dumps({"objects": [{"name": "cup"}, {"name": "box"}]})
+    )
     names = [run.name for run in runs_in(tmp_path / "runs")]
     assert names[:3] == ["cup", "box", "object_2"] and names[-1] == "object_10"
     (tmp_path / "runs" / "picked.json").write_text('{"objects": 7}')
@@ -115,7 +117,10 @@ def kept_state(folder: Path, points: np.ndarray) -> Path:
     """A state as a run keeps it, with nothing in it but landmarks."""
     (folder / ".state").mkdir()
     landmarks = json.loads(TreeFolder(folder / ".state", ()).text(points))
-    solver = {"class": "Belief", "fields": {"known": {"class": "ObjectMap", "fields": {"landmarks": landmarks}}}}
+    solver = {
+        "class": "Belief",
+        "fields": {"known": {"class": "ObjectMap", "fields": {"landmarks": landmarks}}},
+    }
     state = folder / ".state" / "state.json"
     state.write_text(json.dumps({"version": 1, "session": {"dict": [["solver", solver]]}}))
     return state

@@ -80,14 +80,20 @@ def test_an_upgrade_in_any_spelling_passes_the_check(server, upgrade):
     assert status(answer) == 403
 
 
-@pytest.mark.parametrize("path", ["/../../../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "/..%5c..%5cetc", "//etc/passwd"])
+@pytest.mark.parametrize(
+    "path", ["/../../../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "/..%5c..%5cetc", "//etc/passwd"]
+)
 def test_no_path_leads_out_of_the_page(server, path):
     assert status(raw_request(server.get_port(), request("GET", path))) in (400, 404)
 
 
 @pytest.mark.parametrize(
     "text",
-    [b"\x00" * 100 + b"\r\n", b"GET / HTTP/1.1\r\n" + b"a: b\r\n" * 500 + b"\r\n", b"GET /" + b"a" * 99_999 + b"\r\n"],
+    [
+        b"\x00" * 100 + b"\r\n",
+        b"GET / HTTP/1.1\r\n" + b"a: b\r\n" * 500 + b"\r\n",
+        b"GET /" + b"a" * 99_999 + b"\r\n",
+    ],
     ids=["nulls", "many headers", "a long path"],
 )
 def test_nonsense_ends_its_own_connection_only(server, text):
@@ -126,7 +132,10 @@ def test_a_large_message_ends_its_connection_before_it_is_read(server, size):
     assert answers(port)
 
 
-@pytest.mark.parametrize("message", ["text", b"", b"\xc1", b"\x80", b"\x81\xa4type\xa4Evil", b"\x81\xa4type\xbaFileTransferStartUpload"])
+@pytest.mark.parametrize(
+    "message",
+    ["text", b"", b"\xc1", b"\x80", b"\x81\xa4type\xa4Evil", b"\x81\xa4type\xbaFileTransferStartUpload"],
+)
 def test_what_the_page_never_sends_ends_its_connection_only(server, message):
     port = server.get_port()
     with closing(our_socket(port)) as connection, pytest.raises(websockets.exceptions.ConnectionClosed):

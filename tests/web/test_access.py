@@ -17,14 +17,17 @@ def refused(access: Access, from_page: bool = False, **told) -> int:
     return int(refusal.status) if refusal else 0
 
 
-@pytest.mark.parametrize("host", ["127.0.0.1:8080", "localhost:8080", "LOCALHOST", "[::1]:8080", "localhost:9000"])
+@pytest.mark.parametrize(
+    "host", ["127.0.0.1:8080", "localhost:8080", "LOCALHOST", "[::1]:8080", "localhost:9000"]
+)
 def test_this_machine_s_names_are_answered(host):
     assert not refused(Access(), host=host)
     assert not refused(Access(), host=host, origin=f"http://{host}", from_page=True)
 
 
 @pytest.mark.parametrize(
-    "host", ["evil.example:8080", "127.0.0.1.evil.example", "evil.example", "", None, "localhost.evil.example:8080"]
+    "host",
+    ["evil.example:8080", "127.0.0.1.evil.example", "evil.example", "", None, "localhost.evil.example:8080"],
 )
 def test_a_name_that_was_pointed_at_this_machine_is_not(host):
     assert refused(Access(), host=host) == 403

@@ -18,9 +18,7 @@ if TYPE_CHECKING:
 
 
 def pick(
-    source: Annotated[
-        str, typer.Argument(metavar="VIDEO", help="Video file, folder or pattern of images.")
-    ],
+    source: Annotated[str, typer.Argument(metavar="VIDEO", help="Video file, folder or pattern of images.")],
     tracker: Annotated[str | None, typer.Option(metavar="NAME", help="Mask tracker.")] = None,
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Run folder; default runs/<source>.")
@@ -33,8 +31,11 @@ def pick(
     preset: Preset = None,
     overrides: Overrides = None,
     host: Host = None,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Or the next one that is free; 0 for any.")] = 8090,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Or the next one that is free; 0 for any.")
+    ] = 8090,
     browser: Browser = True,
+    view: Annotated[bool, typer.Option("--view", help="Look at the run, once it is started, in the viewer.")] = False,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
@@ -43,7 +44,10 @@ def pick(
     The mask that the tracker makes of it is shown at once. The command and a YAML file can be copied instead.
     """
     from tracking3d.cli.run import default_folder, track
+    from tracking3d.viewer.opening import check_viser
 
+    if view:
+        check_viser("--view")
     settings = configure(config, preset, overrides, tracker={"name": tracker})
     folder = out or default_folder(source)
     picked = picked_in_browser(source, frames, settings, folder, host, port, browser, overwrite)
@@ -56,6 +60,8 @@ def pick(
         masks=picked.masks,
         about={"command": shlex.join(sys.argv), "overwrite": overwrite},
         quiet=quiet,
+        view=view,
+        host=host,
     )
 
 

@@ -6,7 +6,7 @@ import sys
 import threading
 import webbrowser
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from tracking3d.frames import SkippedFrame
     from tracking3d.recording import Listener
     from tracking3d.results.records import FrameRecord
+    from tracking3d.video.any_frame import FrameImages
     from tracking3d.video.source import FrameSource
     from tracking3d.viewer.viewer import Viewer
 
@@ -43,7 +44,9 @@ def view(
         typer.Option(metavar="VIDEO", help="The video, where it is not where the run found it."),
     ] = None,
     host: Host = None,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Or the next one that is free; 0 for any.")] = 8080,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Or the next one that is free; 0 for any.")
+    ] = 8080,
     browser: Browser = True,
     debug: Debug = False,
 ) -> None:
@@ -91,10 +94,10 @@ def watched(
     check_viser("--view")
     opened: list[Viewer] = []
     kept = LatestImages(source)
-    try:
+    images: FrameImages = kept
+    passed_on: FrameSource = kept
+    with suppress(InputError):  # a camera gives each frame once
         images, passed_on = frame_images(source), source
-    except InputError:  # a camera gives each frame once
-        images, passed_on = kept, kept
 
     def listening(frame: FrameRecord | SkippedFrame) -> None:
         if not opened:

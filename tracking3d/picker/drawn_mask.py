@@ -13,7 +13,9 @@ from tracking3d.trackers.first_mask import mask_in_box
 
 _SIZE = 320  # longer side in pixels at which colours are compared
 _SEED = 0.012  # radius around a point that is certain, as a share of the longer side
-_REACH = 0.22  # of the longer side: how far from the points, at first, the object may reach where no box says it
+_REACH = (
+    0.22  # of the longer side: how far from the points, at first, the object may reach where no box says it
+)
 _LEAST_CONTRAST = 2.0
 
 
@@ -45,7 +47,9 @@ def drawn_mask(image: Image, drawn: DrawnObject) -> NDArray[np.bool_] | None:
 def _of_points(image: Image, drawn: DrawnObject) -> NDArray[np.uint8]:
     height, width = image.shape[:2]
     scale = _SIZE / max(height, width)
-    small = cv2.resize(image, (max(round(width * scale), 8), max(round(height * scale), 8)), interpolation=cv2.INTER_AREA)
+    small = cv2.resize(
+        image, (max(round(width * scale), 8), max(round(height * scale), 8)), interpolation=cv2.INTER_AREA
+    )
     on = [(point.x * scale, point.y * scale) for point in drawn.points if point.on]
     beside = [(point.x * scale, point.y * scale) for point in drawn.points if not point.on]
     labels = np.full(small.shape[:2], cv2.GC_BGD, np.uint8)

@@ -33,7 +33,11 @@ def save_picked(picked: Picked, config: PipelineConfig, folder: Path, source: st
         (folder / FOLDER if picked.masks else folder).mkdir(parents=True, exist_ok=True)
     for path, mask in zip(mask_files(picked, folder), picked.masks, strict=True):
         write_mask(path, mask)
-    told = {"source": source, "frame": picked.frame, "objects": [one.model_dump(mode="json") for one in picked.objects]}
+    told = {
+        "source": source,
+        "frame": picked.frame,
+        "objects": [one.model_dump(mode="json") for one in picked.objects],
+    }
     write_atomic(folder / DESCRIPTION, (json.dumps(told, indent=1) + "\n").encode())
     write_atomic(folder / SETTINGS, settings_as_yaml(config).encode())
 
@@ -69,8 +73,7 @@ def command_of(picked: Picked, folder: Path, source: str, selection: range) -> s
 
 
 def selection_from(frame: int, selection: range) -> str | None:
-    """``START:STOP:STEP`` of what is left of a selection from ``frame`` on; None for every frame.
-    """
+    """``START:STOP:STEP`` of what is left of a selection from ``frame`` on; None for every frame."""
     everything = selection.stop >= 2**62
     stop = "" if everything else str(selection.stop)
     if not frame and everything and selection.step == 1:

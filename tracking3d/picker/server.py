@@ -31,7 +31,9 @@ _PAGE = {
     "/picker.js": ("picker.js", "text/javascript; charset=utf-8"),
     "/picker.css": ("picker.css", "text/css; charset=utf-8"),
 }
-_POLICY = "default-src 'self'; img-src 'self' data:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+_POLICY = (
+    "default-src 'self'; img-src 'self' data:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+)
 
 
 class Picker:
@@ -216,7 +218,9 @@ def _listening(picker: Picker, host: str, port: int) -> _Server:
             return _Server((host, number), picker)
         except OSError as error:
             problem = error
-    raise InputError(f"No page can be served on {host}, port {port}: {problem.strerror}; choose another --host or --port.")
+    raise InputError(
+        f"No page can be served on {host}, port {port}: {problem.strerror}; choose another --host or --port."
+    )
 
 
 def _told(session: PickingSession) -> dict[str, Any]:

@@ -119,7 +119,12 @@ class FollowedRun:
             if record.status == Status.TRACKED:
                 continue
             last = found[-1] if found else None
-            if last and last.last == index - 1 and last.status == record.status and _alike(last.reason, record.reason):
+            if (
+                last
+                and last.last == index - 1
+                and last.status == record.status
+                and _alike(last.reason, record.reason)
+            ):
                 found[-1] = Streak(last.first, index, last.status, last.reason)
             else:
                 found.append(Streak(index, index, record.status, record.reason))
@@ -189,7 +194,9 @@ def runs_in(folder: Path) -> list[FollowedRun]:
     if (folder / layout.RUN).is_file() or not inner:
         return [FollowedRun(folder, folder.name or str(folder))]
     names = picked_names(folder)
-    return [FollowedRun(path, names.get(path.name, path.name)) for path in inner if (path / layout.RUN).is_file()]
+    return [
+        FollowedRun(path, names.get(path.name, path.name)) for path in inner if (path / layout.RUN).is_file()
+    ]
 
 
 def picked_names(folder: Path) -> dict[str, str]:

@@ -49,12 +49,12 @@ def start_server(access: Access, port: int) -> viser.ViserServer:
     """
     guard = _Guard(access)
     with _starting:
-        websockets.asyncio.server.serve = guard.serve  # type: ignore[assignment, misc]
+        websockets.asyncio.server.serve = guard.serve
         try:
             with redirect_stdout(io.StringIO()):  # it prints an address, which lacks the token
                 server = viser.ViserServer(host=access.host, port=port, verbose=False)
         finally:
-            websockets.asyncio.server.serve = _serve  # type: ignore[misc]
+            websockets.asyncio.server.serve = _serve
     if not guard.in_place:
         server.stop()
         raise PluginError(
@@ -129,7 +129,7 @@ class _Guard:
         if refusal is not None:
             return _refused(connection, refusal)
         if self.access.gives_token(request.path) and not socket:
-            answer = connection.respond(303, "")  # type: ignore[arg-type]
+            answer = connection.respond(303, "")
             answer.headers["Location"] = urlsplit(request.path).path or "/"
             answer.headers["Set-Cookie"] = self.access.cookie(self.port)
         elif (found := usual(connection, request)) is None:

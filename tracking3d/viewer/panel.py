@@ -44,7 +44,9 @@ class Panel:
         tabs = gui.add_tab_group()
         with tabs.add_tab("Show"):
             self._add_choices(causal)
-            self.follow = gui.add_checkbox("newest frame", live, visible=live, hint="Stay at the end of the run.")
+            self.follow = gui.add_checkbox(
+                "newest frame", live, visible=live, hint="Stay at the end of the run."
+            )
         with tabs.add_tab("Doubts"):
             self.doubts = gui.add_html("")
         with tabs.add_tab("Run"):
@@ -56,7 +58,11 @@ class Panel:
         gui = self._gui
         self.quantity = gui.add_dropdown("plot", timeline.PLAIN_QUANTITIES)
         self.speed = gui.add_dropdown("speed", tuple(SPEEDS), initial_value="1 x")
-        names = {"initial": "initial mask", "causal": "causal mask", "refined": "refined mask" if causal else "mask"}
+        names = {
+            "initial": "initial mask",
+            "causal": "causal mask",
+            "refined": "refined mask" if causal else "mask",
+        }
         with gui.add_folder("In the video"):
             self.layers = {
                 layer: gui.add_checkbox(names[layer], layer != "causal", visible=causal or layer != "causal")
@@ -66,9 +72,13 @@ class Panel:
             self.axes = gui.add_checkbox("axes", True)
         with gui.add_folder("In space"):
             self.mesh = gui.add_checkbox("model", True)
-            self.path = gui.add_checkbox("path of the camera", True, hint="Click a frustum to go to its frame.")
+            self.path = gui.add_checkbox(
+                "path of the camera", True, hint="Click a frustum to go to its frame."
+            )
             self.landmarks = gui.add_checkbox("landmarks", True, visible=False)
-            self.still = gui.add_checkbox("camera stands still", False, hint="Move the object, not the camera.")
+            self.still = gui.add_checkbox(
+                "camera stands still", False, hint="Move the object, not the camera."
+            )
             self.look = gui.add_button("Look through the camera")
 
     def show_causal(self) -> None:

@@ -38,7 +38,11 @@ class Shown:
 
 
 def draw_picture(
-    image: Image | None, runs: Sequence[FollowedRun], index: int, shown: Shown, axes: Sequence[ObjectAxes | None]
+    image: Image | None,
+    runs: Sequence[FollowedRun],
+    index: int,
+    shown: Shown,
+    axes: Sequence[ObjectAxes | None],
 ) -> Image:
     """One frame with the outlines and axes of all its objects.
 
@@ -66,7 +70,9 @@ def draw_picture(
         for layer, colour in LAYERS.items():
             if layer in shown.layers and (mask := run.mask(index, layer)) is not None:
                 small = cv2.resize(mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
-                drawing.draw_outline(picture, small.astype(bool), colour, thin if layer == "initial" else thin + 1)
+                drawing.draw_outline(
+                    picture, small.astype(bool), colour, thin if layer == "initial" else thin + 1
+                )
         if shown.axes and placed is not None and record is not None and record.status != Status.LOST:
             draw_axes(picture, record.T_cam_obj, record.through(camera), placed, scale, thin + 1)
     _draw_frame_of_doubt(picture, [run.frames.get(index) for run in runs], 2 * thin + 2)
@@ -88,7 +94,7 @@ def beside(pictures: Sequence[Image], names: Sequence[str]) -> Image:
 
 
 def axes_of(run: FollowedRun) -> ObjectAxes | None:
-    """Where an object's axes are drawn: in the middle of its mesh, or as its first frame shows it before there is one."""
+    """Where an object's axes are drawn: in the middle of its mesh, or of what its first frame shows."""
     if run.model is not None and len(run.model.vertices):
         vertices = run.model.vertices
         low, high = vertices.min(axis=0), vertices.max(axis=0)
@@ -110,7 +116,14 @@ def _named(picture: Image, name: str, width: int) -> Image:
 
 def _estimate(record: FrameRecord, mask: NDArray[np.bool_]) -> FrameEstimate:
     return FrameEstimate(
-        record.index, record.time, record.T_cam_obj, mask, None, record.status, record.reason, record.confidence
+        record.index,
+        record.time,
+        record.T_cam_obj,
+        mask,
+        None,
+        record.status,
+        record.reason,
+        record.confidence,
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -81,7 +82,7 @@ class ObjectScene:
         if record is None or not known:
             return
         T_cam_obj = record.T_cam_obj
-        T_obj_cam = np.linalg.inv(T_cam_obj)
+        T_obj_cam = np.linalg.inv(T_cam_obj).astype(np.float64)
         camera = record.through(self._run.camera)
         if self._here is None:
             self._here = self._server.scene.add_camera_frustum(
@@ -110,7 +111,11 @@ class ObjectScene:
     def draw_landmarks(self, points: NDArray[np.float32], colours: NDArray[np.uint8]) -> None:
         """Show the points ``(N, 3)`` that the run follows, coloured ``(N, 3)``."""
         self._server.scene.add_point_cloud(
-            f"{self._landmarks.name}/points", points, colours, point_size=0.006 * self.distance, point_shape="circle"
+            f"{self._landmarks.name}/points",
+            points,
+            colours,
+            point_size=0.006 * self.distance,
+            point_shape="circle",
         )
 
     def _draw_mesh(self) -> None:
@@ -124,7 +129,7 @@ class ObjectScene:
         )
 
     def _draw_path(self, records: list[FrameRecord]) -> None:
-        T_obj_cam = np.linalg.inv(np.stack([record.T_cam_obj for record in records]))
+        T_obj_cam: NDArray[np.float64] = np.linalg.inv(np.stack([record.T_cam_obj for record in records]))
         places = T_obj_cam[:, :3, 3]
         self.distance = float(np.median(np.linalg.norm(places, axis=1)))
         self.middle_of_path = places.mean(axis=0)
@@ -140,6 +145,9 @@ class ObjectScene:
         for slot, number in enumerate(_spread(records)):
             self._draw_frustum(slot, records[number], T_obj_cam[number])
 
+    def _clicked(self, index: int, event: object) -> None:
+        self._jump(index)
+
     def _draw_frustum(self, slot: int, record: FrameRecord, T_obj_cam: NDArray[np.float64]) -> None:
         camera = record.through(self._run.camera)
         handle = self._server.scene.add_camera_frustum(
@@ -153,7 +161,7 @@ class ObjectScene:
             wxyz=_wxyz(T_obj_cam),
             position=T_obj_cam[:3, 3],
         )
-        handle.on_click(lambda _, index=record.index: self._jump(index))
+        handle.on_click(partial(self._clicked, record.index))
 
 
 def _spread(records: list[FrameRecord]) -> list[int]:
@@ -181,7 +189,7 @@ def _wxyz(T: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _changed(path: Path, before: float) -> tuple[float, bytes | None]:
-    """When a file was written, and what it holds where that is not as ``before``; None where it is, or there is none."""
+    """When a file was written, and what it holds if that is not as ``before``; None if it is, or there is none."""
     try:
         told = path.stat()
         if told.st_mtime == before or told.st_size > LARGEST_MESH:

@@ -18,12 +18,19 @@ from tracking3d.viewer.followed_run import FollowedRun, Streak
 
 SLIDER = "frame"
 """The label of the slider that a click sets."""
-RUN_COLOURS: tuple[Colour, ...] = ((0, 150, 200), (200, 80, 160), (110, 150, 30), (150, 100, 220), (220, 120, 30))
+RUN_COLOURS: tuple[Colour, ...] = (
+    (0, 150, 200),
+    (200, 80, 160),
+    (110, 150, 30),
+    (150, 100, 220),
+    (220, 120, 30),
+)
 PLAIN_QUANTITIES = ("confidence", "IoU with the initial mask", "seconds")
 LONGEST_LIST = 200
 """Entries of the list of doubtful frames; the rest is counted."""
 _COLUMNS = 600  # of a curve; more frames than that are drawn by the lowest and highest of each column
 _STRIP, _PLOT = 10, 90
+
 
 def quantities(runs: Sequence[FollowedRun]) -> list[str]:
     """What can be plotted of these runs."""
@@ -67,9 +74,7 @@ def draw_timeline(runs: Sequence[FollowedRun], quantity: str, first: int, last: 
 def with_cursor(drawn: str, frame: int, first: int, last: int) -> str:
     """The plot with the line of the present frame, ready to be clicked."""
     share = (frame - first) / max(last - first, 1)
-    jump = _jump(
-        f"{first}+(event.clientX-this.getBoundingClientRect().left)/this.clientWidth*{last - first}"
-    )
+    jump = _jump(f"{first}+(event.clientX-this.getBoundingClientRect().left)/this.clientWidth*{last - first}")
     return (
         f'<div class="timeline" onclick="{jump}" style="position:relative;font-size:10px;line-height:12px;'
         f'margin:2px 12px">{drawn}'

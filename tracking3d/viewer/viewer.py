@@ -7,9 +7,10 @@ import io
 import threading
 import time
 from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -77,9 +78,7 @@ class Viewer:
         self._server = start_server(access, port)
         self.address = access.address(self._server.get_port())
         self._server.scene.set_up_direction("-y")
-        self._panel = Panel(
-            self._server, len(videos), live, any(run.refined for run in self._runs)
-        )
+        self._panel = Panel(self._server, len(videos), live, any(run.refined for run in self._runs))
         self._scenes = [
             ObjectScene(self._server, run, number, self.go_to) for number, run in enumerate(self._runs)
         ]
@@ -123,13 +122,13 @@ class Viewer:
         boxes = [*panel.layers.values(), panel.axes, panel.mesh, panel.path, panel.landmarks, panel.still]
         for box in boxes:
             box.on_update(lambda _: self._want())
-        for key, label, act in (
-            ("P", "Play or pause", self._play_or_pause),
-            ("N", "Next doubtful frame", lambda: self._step("▶▶")),
-            ("B", "Doubtful frame before", lambda: self._step("◀◀")),
-        ):
-            command = self._server.gui.add_command(label, hotkey=key)  # type: ignore[arg-type]
-            command.on_trigger(lambda _, act=act: act())
+        keys: dict[str, tuple[str, Callable[[], None]]] = {
+            "P": ("Play or pause", self._play_or_pause),
+            "N": ("Next doubtful frame", partial(self._step, "▶▶")),
+            "B": ("Doubtful frame before", partial(self._step, "◀◀")),
+        }
+        for key, (label, act) in keys.items():
+            self._server.gui.add_command(label, hotkey=key).on_trigger(partial(_ignoring_the_event, act))
 
     def _play_or_pause(self) -> None:
         at_end = bool(self._indices) and self._wanted >= self._indices[-1]
@@ -165,7 +164,11 @@ class Viewer:
             while self._playing and not self._over:
                 time.sleep(0.02)
                 if self._wanted != wanted:  # somebody went elsewhere: on from there
-                    started, place, wanted = time.monotonic(), bisect_left(self._indices, self._wanted), self._wanted
+                    started, place, wanted = (
+                        time.monotonic(),
+                        bisect_left(self._indices, self._wanted),
+                        self._wanted,
+                    )
                 rate = self._rate() * SPEEDS[self._panel.speed.value]
                 reached = min(place + int((time.monotonic() - started) * rate), len(self._indices) - 1)
                 if self._indices[reached] != wanted:
@@ -177,7 +180,9 @@ class Viewer:
 
     def _rate(self) -> float:
         rates = [run.description.get("fps") for run in self._runs]
-        return next((float(rate) for rate in rates if isinstance(rate, int | float) and 0 < rate < 1e3), _USUAL_RATE)
+        return next(
+            (float(rate) for rate in rates if isinstance(rate, int | float) and 0 < rate < 1e3), _USUAL_RATE
+        )
 
     def _draw(self) -> None:
         """Draw the frame that is wanted; those that were wanted while another was drawn are left out."""
@@ -313,6 +318,10 @@ class Viewer:
             with client.atomic():
                 client.camera.position, client.camera.wxyz = T_world_cam[:3, 3], rotation.wxyz
                 client.camera.fov = np.radians(record.through(run.camera).fov)
+
+
+def _ignoring_the_event(act: Callable[[], None], event: object) -> None:
+    act()
 
 
 def _fits(image: Image, run: FollowedRun) -> bool:

@@ -99,7 +99,8 @@ class Access:
             return Refusal(HTTPStatus.FORBIDDEN, "Only this server's own page may ask for that.")
         if self.token and not (self.gives_token(path) or self._matches(_in_cookie(cookie, port))):
             return Refusal(
-                HTTPStatus.UNAUTHORIZED, "Open the address that was printed, with its token, to see this page."
+                HTTPStatus.UNAUTHORIZED,
+                "Open the address that was printed, with its token, to see this page.",
             )
         return None
 
