@@ -51,7 +51,7 @@ def test_the_timeline_and_the_doubts_lead_to_their_frames(shown, run):
 
 
 def test_a_run_that_goes_on_is_followed_to_its_end(shown, tmp_path):
-    write_frames(tmp_path / "frames", 9)
+    write_frames(tmp_path / "frames", 10)
     with open_run(tmp_path / "run", str(tmp_path / "frames")) as writer:
         for index in range(3):
             writer.write(estimate_of(index), frame_of(index))
@@ -60,6 +60,11 @@ def test_a_run_that_goes_on_is_followed_to_its_end(shown, tmp_path):
             for index in range(3, 9):
                 writer.write(estimate_of(index), frame_of(index))
             wait_for_frame(page, 8)
+            area = page.locator(".timeline").bounding_box()
+            page.mouse.click(area["x"] + area["width"] * 2 / 8, area["y"] + 60)
+            wait_for_frame(page, 2)
+            writer.write(estimate_of(9), frame_of(9))
             writer.finish(model(), "finished")
             page.click("[role=tab]:has-text('Run')")
             page.wait_for_selector("td:text('finished')")
+            wait_for_frame(page, 2)  # who looks at another frame is left there

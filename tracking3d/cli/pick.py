@@ -35,7 +35,9 @@ def pick(
         int, typer.Option(min=0, max=65535, help="Or the next one that is free; 0 for any.")
     ] = 8090,
     browser: Browser = True,
-    view: Annotated[bool, typer.Option("--view", help="Look at the run, once it is started, in the viewer.")] = False,
+    view: Annotated[
+        bool, typer.Option("--view", help="Look at the run, once it is started, in the viewer.")
+    ] = False,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:

@@ -23,6 +23,7 @@ MOST_FRUSTA = 48
 LARGEST_MESH = 2**28
 """Bytes of a mesh file that are sent to the browser."""
 _FRUSTUM = 0.06  # of the distance between camera and object
+_LANDMARK = (255, 230, 120)
 _HALF_TURN_ABOUT_X = (0.0, 1.0, 0.0, 0.0)  # from glTF's axes, in which mesh.glb is, to the object's
 
 
@@ -50,6 +51,7 @@ class ObjectScene:
         self._landmarks = server.scene.add_frame(f"/object_{number}/landmarks", show_axes=False)
         self._here: viser.CameraFrustumHandle | None = None
         self._mesh: viser.GlbHandle | None = None
+        self._points: viser.PointCloudHandle | None = None
         self._mesh_written = 0.0
         self.place = np.zeros(3)
         self.distance = 4.0
@@ -108,15 +110,19 @@ class ObjectScene:
         if self._mesh is not None:
             self._mesh.visible = mesh
 
-    def draw_landmarks(self, points: NDArray[np.float32], colours: NDArray[np.uint8]) -> None:
-        """Show the points ``(N, 3)`` that the run follows, coloured ``(N, 3)``."""
-        self._server.scene.add_point_cloud(
-            f"{self._landmarks.name}/points",
-            points,
-            colours,
-            point_size=0.006 * self.distance,
-            point_shape="circle",
-        )
+    def draw_landmarks(self, points: NDArray[np.float32] | None) -> None:
+        """Show the points ``(N, 3)`` that the run follows; None takes away those that were shown."""
+        if self._points is not None:
+            self._points.remove()
+            self._points = None
+        if points is not None:
+            self._points = self._server.scene.add_point_cloud(
+                f"{self._landmarks.name}/points",
+                points,
+                np.full(points.shape, _LANDMARK, np.uint8),
+                point_size=0.006 * self.distance,
+                point_shape="circle",
+            )
 
     def _draw_mesh(self) -> None:
         path = self._run.folder / layout.GLB

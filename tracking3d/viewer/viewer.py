@@ -114,7 +114,7 @@ class Viewer:
 
     def _listen(self) -> None:
         panel = self._panel
-        panel.slider.on_update(lambda _: self._want(panel.slider.value))
+        panel.slider.on_update(self._slid)
         panel.play.on_click(lambda _: self._play_or_pause())
         panel.steps.on_click(lambda event: self._step(event.target.value))
         panel.quantity.on_update(lambda _: self._redraw_timeline())
@@ -130,8 +130,16 @@ class Viewer:
         for key, (label, act) in keys.items():
             self._server.gui.add_command(label, hotkey=key).on_trigger(partial(_ignoring_the_event, act))
 
+    def _slid(self, event: Any) -> None:
+        """The slider was moved: by a person, who then no longer wants the newest frame, or by this program."""
+        if event.client_id is not None and self._panel.follow.value:
+            self._panel.follow.value = False
+        self._want(self._panel.slider.value)
+
     def _play_or_pause(self) -> None:
-        at_end = bool(self._indices) and self._wanted >= self._indices[-1]
+        if not self._indices:
+            return
+        at_end = self._wanted >= self._indices[-1]
         with self._changed:
             self._playing = not self._playing
             self._changed.notify_all()
@@ -267,15 +275,15 @@ class Viewer:
             self.go_to(first)
 
     def _draw_scene(self) -> None:
-        place = 0.0
+        place, any_landmarks = 0.0, False
         for scene, run in zip(self._scenes, self._runs, strict=True):
             scene.draw_again(place)
             place += 1.2 * scene.distance
-            points = kept_landmarks(run.folder)
-            if points is not None:
-                colours = np.full(points.shape, (255, 230, 120), np.uint8)
-                scene.draw_landmarks(points, colours)
-                self._panel.landmarks.visible = True
+            # Of the state of a run that goes on: the final refinement may scale and turn the object.
+            points = None if run.refined else kept_landmarks(run.folder)
+            scene.draw_landmarks(points)
+            any_landmarks = any_landmarks or points is not None
+        self._panel.landmarks.visible = any_landmarks
         for video in self._videos:
             video.axes = [axes_of(run) for run in video.runs]
 
