@@ -11,7 +11,7 @@ from recorded_runs import append_lines, frame_of
 
 from tracking3d.results import drawing
 from tracking3d.video import open_source
-from tracking3d.viewer import timeline
+from tracking3d.viewer import timeline, told
 from tracking3d.viewer.followed_run import FollowedRun
 from tracking3d.viewer.picture import CAUSAL, LAYERS, Shown, axes_of, beside, draw_picture
 from tracking3d.viewer.run_images import LatestImages, OverlayPictures, images_of_run
@@ -78,9 +78,9 @@ def test_a_frame_that_is_not_at_hand_is_said_to_be_so(follower):
 
 def test_what_a_run_says_is_text_and_never_markup(follower):
     pages = [
-        timeline.list_streaks([follower, follower]),
-        timeline.describe(follower, follower.frames[5]),
-        timeline.describe(follower, None),
+        told.list_streaks([follower, follower]),
+        told.describe(follower, follower.frames[5]),
+        told.describe(follower, None),
     ]
     for page in pages:
         tags = Tags(page)
@@ -89,11 +89,28 @@ def test_what_a_run_says_is_text_and_never_markup(follower):
     assert "<b onclick='alert(1)'>too few</b> points" in Tags(pages[0]).text
 
 
+@pytest.mark.parametrize(
+    "fault",
+    [
+        {
+            "config": {"tracker": "<script>"},
+            "timings": {"seconds_total": "<script>"},
+            "notes": [["<script>"]],
+        },
+        {"config": {}, "timings": {}, "source": {"<script>": 1}, "fps": "fast"},
+    ],
+)
+def test_a_description_of_any_kind_is_told_as_text(follower, fault):
+    follower.description = {**follower.description, **fault}
+    page = Tags(told.about(follower))
+    assert page.names <= {"div", "b", "table", "tr", "td", "p"} and "a <run>" in page.text
+
+
 def test_the_list_names_frames_status_and_reason_of_every_streak(follower):
-    text = Tags(timeline.list_streaks([follower])).text
+    text = Tags(told.list_streaks([follower])).text
     assert "uncertain3 to 4" in text.replace(" 3", "3") and "lost 8: no reason given" in text
     follower.frames = {0: follower.frames[0]}
-    assert "No frame is uncertain or lost" in timeline.list_streaks([follower])
+    assert "No frame is uncertain or lost" in told.list_streaks([follower])
 
 
 def test_the_timeline_of_a_long_run_stays_small(run):
@@ -107,7 +124,7 @@ def test_the_timeline_of_a_long_run_stays_small(run):
     assert len(points) <= 1400
     lowest = min(float(point.split(",")[1]) for point in points)
     assert lowest == min(float(p.split(",")[1]) for p in points if abs(float(p.split(",")[0]) - 500) < 2)
-    assert len(timeline.list_streaks([follower])) < 200_000
+    assert len(told.list_streaks([follower])) < 200_000
 
 
 def test_every_quantity_of_the_run_can_be_plotted(follower):

@@ -1,4 +1,4 @@
-"""Status, keyframes and one quantity over time, as a picture that can be clicked, and the doubtful frames as a list.
+"""Status, keyframes and one quantity over time, as a picture that can be clicked.
 
 Viser's plots tell nobody where they are clicked, so the plot is HTML of our own. A click writes the frame's number
 into the field beside the slider, as a person would; everything else follows from that.
@@ -6,15 +6,13 @@ into the field beside the slider, as a person would; everything else follows fro
 
 from __future__ import annotations
 
-import html
 import math
 from collections.abc import Sequence
 
-from tracking3d.estimation.estimate import Status
 from tracking3d.results import drawing
 from tracking3d.results.drawing import Colour
 from tracking3d.results.records import FrameRecord
-from tracking3d.viewer.followed_run import FollowedRun, Streak
+from tracking3d.viewer.followed_run import FollowedRun
 
 SLIDER = "frame"
 """The label of the slider that a click sets."""
@@ -26,8 +24,6 @@ RUN_COLOURS: tuple[Colour, ...] = (
     (220, 120, 30),
 )
 PLAIN_QUANTITIES = ("confidence", "IoU with the initial mask", "seconds")
-LONGEST_LIST = 200
-"""Entries of the list of doubtful frames; the rest is counted."""
 _COLUMNS = 600  # of a curve; more frames than that are drawn by the lowest and highest of each column
 _STRIP, _PLOT = 10, 90
 
@@ -74,24 +70,13 @@ def draw_timeline(runs: Sequence[FollowedRun], quantity: str, first: int, last: 
 def with_cursor(drawn: str, frame: int, first: int, last: int) -> str:
     """The plot with the line of the present frame, ready to be clicked."""
     share = (frame - first) / max(last - first, 1)
-    jump = _jump(f"{first}+(event.clientX-this.getBoundingClientRect().left)/this.clientWidth*{last - first}")
+    going = jump(f"{first}+(event.clientX-this.getBoundingClientRect().left)/this.clientWidth*{last - first}")
     return (
-        f'<div class="timeline" onclick="{jump}" style="position:relative;font-size:10px;line-height:12px;'
+        f'<div class="timeline" onclick="{going}" style="position:relative;font-size:10px;line-height:12px;'
         f'margin:2px 12px">{drawn}'
         f'<div style="position:absolute;top:0;bottom:0;width:2px;margin-left:-1px;left:{100 * share:.3f}%;'
         f'background:currentColor;opacity:.7;pointer-events:none"></div></div>'
     )
-
-
-def list_streaks(runs: Sequence[FollowedRun]) -> str:
-    """The doubtful frames of all runs with their reasons; a click goes there."""
-    rows = [(run, streak) for run in runs for streak in run.streaks()]
-    told = "".join(_row(run, streak, len(runs) > 1) for run, streak in rows[:LONGEST_LIST])
-    if not rows:
-        told = "<p>No frame is uncertain or lost.</p>"
-    elif len(rows) > LONGEST_LIST:
-        told += f"<p>… and {len(rows) - LONGEST_LIST} more.</p>"
-    return f'<div style="font-size:12px;line-height:1.35;max-height:40vh;overflow-y:auto;margin:4px 12px">{told}</div>'
 
 
 def colour_of(number: int, runs: int) -> Colour | None:
@@ -99,25 +84,7 @@ def colour_of(number: int, runs: int) -> Colour | None:
     return RUN_COLOURS[number % len(RUN_COLOURS)] if runs > 1 else None
 
 
-def describe(run: FollowedRun, record: FrameRecord | None, colour: Colour | None = None) -> str:
-    """One run's answer for a frame in a line of HTML, after the colour of its curve."""
-    name = html.escape(run.name)
-    if colour is not None:
-        name = f'<span style="color:{_hex(colour)}">▬</span> {name}'
-    if record is None:
-        return f"<div><b>{name}</b> has no answer for this frame</div>"
-    figures = f"confidence {record.confidence:.2f}"
-    if record.iou_initial is not None:
-        figures += f", IoU with the initial mask {record.iou_initial:.2f}"
-    told = [figures, *(["keyframe"] if record.keyframe else []), *(["refined"] if record.refined else [])]
-    why = [html.escape(text) for text in (record.reason, record.failure) if text]
-    return (
-        f"<div><b>{name}</b> {_badge(record.status)} {', '.join(told)}"
-        f"{'<br>' if why else ''}{'; '.join(why)}</div>"
-    )
-
-
-def _jump(frame: str) -> str:
+def jump(frame: str) -> str:
     """JavaScript that goes to a frame, for an attribute in double quotes; ``frame`` is an expression of it."""
     return (
         f"var f=Math.round({frame});"
@@ -125,25 +92,6 @@ def _jump(frame: str) -> str:
         "var i=document.getElementById(l.htmlFor).parentElement.querySelector('input:not([type=hidden])');"
         "Object.getOwnPropertyDescriptor(HTMLInputElement.prototype,'value').set.call(i,f);"
         "i.dispatchEvent(new Event('input',{bubbles:true}))"
-    )
-
-
-def _badge(status: Status) -> str:
-    red, green, blue = drawing.STATUS[status]
-    return (
-        f'<span style="background:rgb({red},{green},{blue});color:#111;border-radius:3px;padding:0 5px">'
-        f"{status.value}</span>"
-    )
-
-
-def _row(run: FollowedRun, streak: Streak, named: bool) -> str:
-    frames = f"{streak.first}" if streak.first == streak.last else f"{streak.first} to {streak.last}"
-    name = f"{html.escape(run.name)}, " if named else ""
-    jump = _jump(str(streak.first))
-    return (
-        f'<div class="streak" role="button" tabindex="0" onclick="{jump}" '
-        f'onkeydown="if(event.key===\'Enter\')this.click()" style="cursor:pointer;padding:3px 0">'
-        f"{_badge(streak.status)} {name}<b>{frames}</b>: {html.escape(streak.reason) or 'no reason given'}</div>"
     )
 
 
@@ -163,7 +111,7 @@ def _strip(run: FollowedRun, number: int, first: int, span: int) -> str:
             x, width = (begin.index - first - 0.5) * step, (before.index - begin.index + 1) * step
             parts.append(
                 f'<rect x="{x:.1f}" y="{top}" width="{max(width, 1.5):.1f}" height="{_STRIP - 2}" '
-                f'fill="{_hex(drawing.STATUS[begin.status])}"/>'
+                f'fill="{hexadecimal(drawing.STATUS[begin.status])}"/>'
             )
         begin = begin if joined else record
         before = record
@@ -200,10 +148,11 @@ def _curve(
         for index, value in kept
     )
     return (
-        f'<polyline points="{points}" fill="none" stroke="{_hex(colour)}" stroke-width="1.5" '
+        f'<polyline points="{points}" fill="none" stroke="{hexadecimal(colour)}" stroke-width="1.5" '
         f'vector-effect="non-scaling-stroke"/>'
     )
 
 
-def _hex(colour: Colour) -> str:
+def hexadecimal(colour: Colour) -> str:
+    """``#rrggbb``."""
     return "#{:02x}{:02x}{:02x}".format(*colour)

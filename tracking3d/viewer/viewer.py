@@ -14,19 +14,20 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import viser
 
 from tracking3d.errors import Tracking3dError
 from tracking3d.frames import Image
 from tracking3d.results.overlay import ObjectAxes
 from tracking3d.video.any_frame import FrameImages
 from tracking3d.viewer import timeline
+from tracking3d.viewer.browser_camera import look_from_aside, look_through
 from tracking3d.viewer.followed_run import FollowedRun
 from tracking3d.viewer.guarded_server import start_server
 from tracking3d.viewer.kept_landmarks import kept_landmarks
 from tracking3d.viewer.panel import SPEEDS, Panel
 from tracking3d.viewer.picture import axes_of, beside, draw_picture
 from tracking3d.viewer.scene import ObjectScene
+from tracking3d.viewer.told import about, describe, list_streaks
 from tracking3d.web.access import Access
 
 POLL = 0.5
@@ -83,7 +84,7 @@ class Viewer:
             ObjectScene(self._server, run, number, self.go_to) for number, run in enumerate(self._runs)
         ]
         self._take_news(draw=True)
-        self._look_from_aside()
+        look_from_aside(self._server, self._scenes)
         self._listen()
         self._threads = [
             threading.Thread(target=work, name=f"viewer {work.__name__}", daemon=True)
@@ -223,7 +224,7 @@ class Viewer:
             first, last = self._ends()
             panel.timeline.content = timeline.with_cursor(self._timeline, index, first, last)
             told = "".join(
-                timeline.describe(run, run.frames.get(index), timeline.colour_of(number, len(self._runs)))
+                describe(run, run.frames.get(index), timeline.colour_of(number, len(self._runs)))
                 for number, run in enumerate(self._runs)
             )
             panel.told.content = (
@@ -266,8 +267,8 @@ class Viewer:
             panel.quantity.options = offered
         if draw:
             self._draw_scene()
-            panel.doubts.content = timeline.list_streaks(self._runs)
-            panel.about.content = "".join(_about(run) for run in self._runs)
+            panel.doubts.content = list_streaks(self._runs)
+            panel.about.content = "".join(about(run) for run in self._runs)
         self._redraw_timeline()
         if panel.follow.value and self._indices:
             self.go_to(last)
@@ -301,31 +302,11 @@ class Viewer:
         near = self._indices[max(place - 1, 0) : place + 1]
         return min(near, key=lambda one: abs(one - index))
 
-    def _look_from_aside(self) -> None:
-        """Where a browser looks from at first: from the side and a little above, at objects and paths together."""
-        first, last = self._scenes[0], self._scenes[-1]
-        row = last.place - first.place
-        to_path = first.middle_of_path
-        aside = np.cross(to_path, [0.0, 1.0, 0.0])
-        aside = aside / max(float(np.linalg.norm(aside)), 1e-9)
-        reach = first.distance + 0.7 * float(np.linalg.norm(row))
-        camera = self._server.initial_camera
-        camera.look_at = 0.45 * to_path + row / 2
-        camera.position = camera.look_at + 0.5 * to_path + reach * (2.2 * aside - [0.0, 0.8, 0.0])
-        camera.fov = 0.8
-
     def _look_through(self) -> None:
-        """Let every browser look where the video's camera stands."""
-        run = self._runs[0]
-        record = run.frames.get(self._nearest(self._wanted))
-        if record is None or not np.isfinite(record.T_cam_obj).all():
-            return
-        T_world_cam = np.eye(4) if self._panel.still.value else np.linalg.inv(record.T_cam_obj)
-        rotation = viser.transforms.SO3.from_matrix(T_world_cam[:3, :3])
-        for client in self._server.get_clients().values():
-            with client.atomic():
-                client.camera.position, client.camera.wxyz = T_world_cam[:3, 3], rotation.wxyz
-                client.camera.fov = np.radians(record.through(run.camera).fov)
+        record = self._runs[0].frames.get(self._nearest(self._wanted))
+        if record is not None and np.isfinite(record.T_cam_obj).all():
+            T_world_cam = np.eye(4) if self._panel.still.value else np.linalg.inv(record.T_cam_obj)
+            look_through(self._server, T_world_cam, record.through(self._runs[0].camera).fov)
 
 
 def _ignoring_the_event(act: Callable[[], None], event: object) -> None:
@@ -335,29 +316,3 @@ def _ignoring_the_event(act: Callable[[], None], event: object) -> None:
 def _fits(image: Image, run: FollowedRun) -> bool:
     height, width = image.shape[:2]
     return abs(width / height - run.camera.width / run.camera.height) < 0.01
-
-
-def _about(run: FollowedRun) -> str:
-    """What a run says of itself."""
-    description: dict[str, Any] = run.description
-    tracker = description.get("config", {}).get("tracker", {}).get("name", "")
-    seconds = (description.get("timings") or {}).get("seconds_total")
-    rows = {
-        "state": run.reader.state_in_words,
-        "source": description.get("source"),
-        "frames": len(run.frames),
-        "mask tracker": tracker,
-        "lens": run.camera.origin,
-        "seconds": seconds and round(seconds),
-    }
-    cells = "".join(
-        f"<tr><td style='opacity:.6;padding-right:8px;vertical-align:top'>{name}</td>"
-        f"<td style='overflow-wrap:anywhere'>{html.escape(str(value))}</td></tr>"
-        for name, value in rows.items()
-        if value not in (None, "")
-    )
-    notes = "".join(f"<p>{html.escape(str(note))}</p>" for note in description.get("notes") or [])
-    return (
-        f'<div style="font-size:12px;line-height:1.35;margin:4px 12px"><b>{html.escape(run.name)}</b>'
-        f"<table>{cells}</table>{notes}</div>"
-    )
