@@ -21,11 +21,17 @@ def shown():
 
     def shown(*folders):
         viewers.append(open_viewer(folders, Access(), port=0))
-        return open_page(viewers[-1].address, 1000, 500)
+        return open_page(viewers[-1].address, 1360, 760)
 
     yield shown
     for viewer in viewers:
         viewer.close()
+
+
+def close_notice(page) -> None:
+    """The notice that there is no graphics card lies over the panels."""
+    page.wait_for_selector(".timeline svg")
+    page.evaluate("document.querySelector('.mantine-Notifications-root').style.display = 'none'")
 
 
 def wait_for_frame(page, index: int) -> None:
@@ -34,6 +40,7 @@ def wait_for_frame(page, index: int) -> None:
 
 def test_the_timeline_and_the_doubts_lead_to_their_frames(shown, run):
     with shown(run) as page:
+        close_notice(page)
         wait_for_frame(page, 0)
         area = page.locator(".timeline").bounding_box()
         page.mouse.click(area["x"] + area["width"] * 5 / 11, area["y"] + 60)
@@ -56,6 +63,7 @@ def test_a_run_that_goes_on_is_followed_to_its_end(shown, tmp_path):
         for index in range(3):
             writer.write(estimate_of(index), frame_of(index))
         with shown(tmp_path / "run") as page:
+            close_notice(page)
             wait_for_frame(page, 2)
             for index in range(3, 9):
                 writer.write(estimate_of(index), frame_of(index))
