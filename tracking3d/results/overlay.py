@@ -106,7 +106,7 @@ def draw_overlay(
     if estimate.initial_mask is not None:
         drawing.draw_outline(picture, _scaled(estimate.initial_mask, shape), drawing.INITIAL, thin)
     if axes is not None:
-        draw_axes(picture, estimate.T_cam_obj, camera, axes, size.scale, thin + 1)
+        _draw_axes(picture, estimate.T_cam_obj, camera, axes, size.scale, thin + 1)
     _draw_bar(canvas[size.picture :], record)
     return canvas
 
@@ -115,7 +115,7 @@ def _scaled(mask: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np.bool_
     return cv2.resize(mask.astype(np.uint8), shape, interpolation=cv2.INTER_NEAREST).astype(bool)
 
 
-def draw_axes(
+def _draw_axes(
     picture: Image,
     T_cam_obj: NDArray[np.float64],
     camera: Camera,
@@ -123,16 +123,6 @@ def draw_axes(
     scale: float,
     thickness: int,
 ) -> None:
-    """Draw the object's axes into the picture, x red, y green, z blue; nothing where they are behind the camera.
-
-    Args:
-        picture: ``(H, W, 3)``, drawn into.
-        T_cam_obj: ``(4, 4)`` the pose.
-        camera: The camera that the pose is of.
-        axes: Where the axes are.
-        scale: Pixels of the picture per pixel of the frame.
-        thickness: Of the lines, in pixels.
-    """
     ends = np.concatenate([axes.origin[None], axes.origin + axes.length * np.eye(3)])
     points = ends @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3]
     if not np.isfinite(points).all() or points[:, 2].min() <= 0:

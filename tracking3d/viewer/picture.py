@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate, Status
 from tracking3d.frames import Image
+from tracking3d.geometry.camera import Camera
 from tracking3d.results import drawing
-from tracking3d.results.overlay import ObjectAxes, draw_axes
+from tracking3d.results.overlay import ObjectAxes
 from tracking3d.results.records import FrameRecord
 from tracking3d.viewer.followed_run import FollowedRun
 
@@ -21,6 +22,7 @@ WIDEST = 960
 CAUSAL: drawing.Colour = (255, 120, 230)
 LAYERS = {"initial": drawing.INITIAL, "causal": CAUSAL, "refined": drawing.REFINED}
 """The masks whose outlines can be drawn, and their colours, from the lowest to the uppermost."""
+_AXES: tuple[drawing.Colour, ...] = ((255, 60, 60), (60, 220, 60), (80, 120, 255))
 _GREY = 70
 
 
@@ -74,7 +76,7 @@ def draw_picture(
                     picture, small.astype(bool), colour, thin if layer == "initial" else thin + 1
                 )
         if shown.axes and placed is not None and record is not None and record.status != Status.LOST:
-            draw_axes(picture, record.T_cam_obj, record.through(camera), placed, scale, thin + 1)
+            _draw_axes(picture, record.T_cam_obj, record.through(camera), placed, scale, thin + 1)
     _draw_frame_of_doubt(picture, [run.frames.get(index) for run in runs], 2 * thin + 2)
     return picture
 
@@ -125,6 +127,25 @@ def _estimate(record: FrameRecord, mask: NDArray[np.bool_]) -> FrameEstimate:
         record.reason,
         record.confidence,
     )
+
+
+def _draw_axes(
+    picture: Image,
+    T_cam_obj: NDArray[np.float64],
+    camera: Camera,
+    axes: ObjectAxes,
+    scale: float,
+    thickness: int,
+) -> None:
+    """The axes x red, y green, z blue, the nearest on top; nothing where they reach behind the camera."""
+    ends = np.concatenate([axes.origin[None], axes.origin + axes.length * np.eye(3)])
+    points = ends @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3]
+    if not np.isfinite(points).all() or points[:, 2].min() <= 0:
+        return
+    pixels = (points @ camera.K.T)[:, :2] / points[:, 2:]
+    start, *tips = np.clip((pixels + 0.5) * scale - 0.5, -1e5, 1e5).round().astype(int)
+    for axis in np.argsort(-points[1:, 2]):
+        cv2.line(picture, start, tips[axis], _AXES[axis], thickness, cv2.LINE_AA)
 
 
 def _draw_frame_of_doubt(picture: Image, records: Iterable[FrameRecord | None], thickness: int) -> None:
