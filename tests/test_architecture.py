@@ -15,7 +15,7 @@ SHARED_BY_SOLVERS = {"evidence"}
 # Who lives on which floor; a module may import from lower floors and from its own room only.
 # Rooms of one floor may use each other, but never in circles.
 FLOORS = [
-    {"errors", "frames", "geometry", "config", "features", "networks", "process_memory", "stages"},
+    {"errors", "frames", "geometry", "config", "features", "networks", "process_memory", "stages", "web"},
     {"rendering", "trackers", "video"},
     {"corrections", "estimation", "plugins", "point_prompts", "prompts", "testing"},
     {
@@ -34,7 +34,7 @@ FLOORS = [
         "tracker_choice",
     },
     {"datasets"},
-    {"evaluation", "export", "report", "speed", "synthesis", "viewer"},
+    {"evaluation", "export", "picker", "report", "speed", "synthesis", "viewer"},
     {"benchmark"},
     {"cli", "vot", "__main__"},
 ]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tracking3d.cli.run import default_folder
+from tracking3d.cli.tracking import default_folder
 from tracking3d.errors import PluginError
 from tracking3d.results.run_reader import RunReader
 

@@ -16,11 +16,13 @@ from tracking3d.cli import (
     export,
     model,
     models,
+    pick,
     plugins,
     points,
     report,
     run,
     synth,
+    view,
 )
 from tracking3d.cli.options import Debug
 from tracking3d.cli.program import Program
@@ -35,6 +37,8 @@ app = typer.Typer(
 app.command(name="run")(run.run)
 app.command(name="demo")(demo.demo)
 app.command(name="synth")(synth.synth)
+app.command(name="pick")(pick.pick)
+app.command(name="view")(view.view)
 app.command(name="points")(points.points)
 app.command(name="model")(model.model)
 app.command(name="export")(export.export)

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import logging
 import shlex
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quality, Quiet, configure, numbers
+from tracking3d.cli.tracking import Given, a_person_is_there, default_folder, track
+from tracking3d.cli.view import Host
 from tracking3d.errors import InputError
 
 _TRACKING, _CAMERA, _RUNNING = "The object and how to track it", "The camera", "Running"
@@ -155,6 +154,13 @@ def run(
             rich_help_panel=_RUNNING,
         ),
     ] = True,
+    view: Annotated[
+        bool,
+        typer.Option(
+            "--view", help="Look at the run in the browser while it goes on.", rich_help_panel=_RUNNING
+        ),
+    ] = False,
+    host: Host = None,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
@@ -177,6 +183,8 @@ def run(
         )
     if sum(map(bool, (boxes, object_masks, object_points))) > 1:
         raise InputError("Give either --box, --mask or --points, not more than one of them.")
+    if host is not None and not view:
+        raise InputError("--host is where --view serves its page; give both.")
     chosen: dict[str, str | None] = {"name": tracker}
     if masks is not None:
         if tracker not in (None, "precomputed", "auto"):
@@ -198,33 +206,28 @@ def run(
         solver={"final_refine": final_refine},
         runtime={"device": device, "seed": seed, "on_plugin_failure": on_plugin_failure},
     )
-    if not (boxes or object_masks or object_points) and settings.tracker.name != "precomputed":
-        raise InputError(
-            "Say what the object is in the first frame: --box X,Y,W,H, --mask FILE, --points 'X,Y+ X,Y-', or "
-            "--masks DIR."
-        )
-
-    from tracking3d.cli.progress import print_summary, progress
-    from tracking3d.cli.report import reported
     from tracking3d.corrections import checked_corrections, parse_correction
     from tracking3d.point_prompts import parse_points
     from tracking3d.prompts import parse_box
-    from tracking3d.recording import record, record_objects
-    from tracking3d.results.layout import object_folders
-    from tracking3d.results.run_reader import is_finished
-    from tracking3d.video import open_source
 
-    given = [parse_box(text) for text in boxes]
-    clicked = [parse_points(text) for text in object_points]
-    opened = open_source(source, frames)
-    folder = out or default_folder(source)
-    if quiet:
-        logging.getLogger("tracking3d").setLevel(logging.ERROR)
-    objects = max(len(given) + len(object_masks) + len(clicked), 1)
+    given = Given(
+        [parse_box(text) for text in boxes], object_masks, [parse_points(text) for text in object_points]
+    )
     corrections = [parse_correction(text) for text in correct or told.correct]
-    checked_corrections(corrections, objects)  # before anything is written
-    folders = object_folders(folder, objects) if objects > 1 else [folder]
-    about: dict[str, Any] = {
+    checked_corrections(corrections, max(len(given), 1))  # before anything is written
+    folder = out or default_folder(source)
+    if not given and settings.tracker.name != "precomputed":
+        if not a_person_is_there() or quiet or resume or source.isdigit():
+            raise InputError(
+                "Say what the object is in the first frame: --box X,Y,W,H, --mask FILE, --points 'X,Y+ X,Y-', or "
+                "--masks DIR; or draw it with `tracking3d pick`."
+            )
+        from tracking3d.cli.pick import picked_in_browser
+
+        typer.echo("Say in the browser what the object is; Ctrl-C ends it.", err=True)
+        picked = picked_in_browser(source, frames, settings, folder, overwrite=overwrite)
+        given, start_frame = Given(picked.boxes, picked.masks), picked.frame
+    about = {
         "command": shlex.join(sys.argv),
         "selection": frames,
         "overwrite": overwrite,
@@ -233,53 +236,4 @@ def run(
         "start_frame": start_frame,
         "corrections": corrections,
     }
-    finished = {one: _written(one) for one in folders if resume and is_finished(one)}
-    with (
-        resumable(folders),
-        reported(folders if report else []) as reporting,
-        progress(opened.count, quiet, objects) as listener,
-    ):
-        about["listener"] = reporting(listener)
-        if objects > 1:
-            record_objects(opened, settings, folder, boxes=given, masks=object_masks, points=clicked, **about)
-        else:
-            the_box, the_mask = next(iter(given), None), next(iter(object_masks), None)
-            its_points = next(iter(clicked), None)
-            record(opened, settings, folder, box=the_box, mask=the_mask, points=its_points, **about)
-    for one in () if quiet else folders:
-        if one in finished and finished[one] == _written(one):
-            typer.echo(f"The run {one} is finished already; there is nothing to resume.")
-        else:
-            print_summary(one)
-
-
-def _written(folder: Path) -> int:
-    """When the description of a run was written last."""
-    from tracking3d.results.layout import RUN
-
-    return (folder / RUN).stat().st_mtime_ns
-
-
-@contextmanager
-def resumable(folders: list[Path]) -> Iterator[None]:
-    """Whatever stops a run, it says how to go on, where that is possible."""
-    from tracking3d.results.layout import has_state
-
-    try:
-        yield
-    except BaseException as error:
-        if any(has_state(folder) for folder in folders):
-            error.add_note("The same command with --resume goes on from there.")
-        raise
-
-
-def default_folder(source: str) -> Path:
-    """``runs/<name>`` after the file, the folder of images, or the camera."""
-    if source.isdigit() and not Path(source).exists():
-        return Path("runs", f"camera_{source}")
-    path = Path(source).expanduser().absolute()
-    if any(sign in path.name for sign in "*?["):
-        path = path.parent
-    if path.name in ("frames", "images"):
-        path = path.parent
-    return Path("runs", path.stem if path.is_file() else path.name)
+    track(source, settings, folder, given, about, quiet=quiet, report=report, view=view, host=host)

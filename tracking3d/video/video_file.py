@@ -52,7 +52,7 @@ class VideoFile:
         with _open(name, path) as container:
             if container.format.name in ("tty", "image2") or container.format.name.endswith("_pipe"):
                 raise InputError(f"{name} is not a video; give a video file or a folder of images.")
-            stream = _video_stream(container)
+            stream = video_stream(container)
             if stream is None:
                 raise InputError(f"{name} has no video in it; give a file with a video stream.")
             if stream.codec_context is None:
@@ -75,7 +75,7 @@ class VideoFile:
 
     def _frames(self) -> Iterator[Frame | SkippedFrame]:
         with _open(self.name, self.path) as container:
-            stream = _video_stream(container)
+            stream = video_stream(container)
             assert stream is not None
             start = stream.start_time
             orientation: int | None = None
@@ -90,7 +90,7 @@ class VideoFile:
                     yield SkippedFrame(index, f"frame {index}: {picture}")
                 else:
                     # Once, because asking PyAV for side data keeps the picture until Python collects cycles.
-                    orientation = orientation or _orientation(picture)
+                    orientation = orientation or orientation_of(picture)
                     yield _frame(index, picture, seconds, orientation)
                 if index + 1 >= self.selection.stop:
                     return
@@ -105,7 +105,7 @@ def _open(name: str, path: Path) -> InputContainer:
         raise InputError(f"{name} cannot be read as a video; is it complete? ({reason})") from error
 
 
-def _video_stream(container: InputContainer) -> VideoStream | None:
+def video_stream(container: InputContainer) -> VideoStream | None:
     """The first video stream that is not the cover picture of a song."""
     cover = av.stream.Disposition.attached_pic
     return next((stream for stream in container.streams.video if not stream.disposition & cover), None)
@@ -122,7 +122,8 @@ def _announced_frames(container: InputContainer, stream: VideoStream) -> int | N
     return round(duration * stream.average_rate) if duration > 0 and stream.average_rate else None
 
 
-def _orientation(picture: av.VideoFrame) -> int:
+def orientation_of(picture: av.VideoFrame) -> int:
+    """How the file asks for the picture to be turned, see `tracking3d.video.orientation`."""
     matrix: Any = picture.side_data.get("DISPLAYMATRIX")
     return UPRIGHT if matrix is None else orientation_from_display_matrix(bytes(matrix))
 

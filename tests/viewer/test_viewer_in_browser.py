@@ -1,0 +1,78 @@
+"""The viewer as a person uses it, in a real browser."""
+
+from __future__ import annotations
+
+import pytest
+from browser import open_page
+from recorded_runs import estimate_of, frame_of, model, open_run, write_frames
+
+pytest.importorskip("viser", reason="viser is absent: pip install 'tracking3d[view]'")
+
+from tracking3d.viewer.opening import open_viewer
+from tracking3d.web.access import Access
+
+pytestmark = pytest.mark.slow  # without a graphics card the browser draws the model on the processor
+
+
+@pytest.fixture
+def shown():
+    """Open a viewer of these folders, and a page of it."""
+    viewers = []
+
+    def shown(*folders):
+        viewers.append(open_viewer(folders, Access(), port=0))
+        return open_page(viewers[-1].address, 1360, 760)
+
+    yield shown
+    for viewer in viewers:
+        viewer.close()
+
+
+def close_notice(page) -> None:
+    """The notice that there is no graphics card lies over the panels."""
+    page.wait_for_selector(".timeline svg")
+    page.evaluate("document.querySelector('.mantine-Notifications-root').style.display = 'none'")
+
+
+def wait_for_frame(page, index: int) -> None:
+    page.wait_for_selector(f".told[data-frame='{index}']")
+
+
+def test_the_timeline_and_the_doubts_lead_to_their_frames(shown, run):
+    with shown(run) as page:
+        close_notice(page)
+        wait_for_frame(page, 0)
+        area = page.locator(".timeline").bounding_box()
+        page.mouse.click(area["x"] + area["width"] * 5 / 11, area["y"] + 60)
+        wait_for_frame(page, 5)
+        assert "<b onclick='alert(1)'>too few</b> points" in page.inner_text("body")
+        page.click("text=Doubts")
+        page.click(".streak >> nth=2")
+        wait_for_frame(page, 8)
+        page.click("text=▶▶")
+        page.click("text=◀◀")
+        wait_for_frame(page, 5)
+        page.click("text=Play")
+        wait_for_frame(page, 11)
+        assert page.locator("canvas").first.bounding_box()["width"] > 200
+
+
+def test_a_run_that_goes_on_is_followed_to_its_end(shown, tmp_path):
+    write_frames(tmp_path / "frames", 10)
+    with open_run(tmp_path / "run", str(tmp_path / "frames")) as writer:
+        for index in range(3):
+            writer.write(estimate_of(index), frame_of(index))
+        with shown(tmp_path / "run") as page:
+            close_notice(page)
+            wait_for_frame(page, 2)
+            for index in range(3, 9):
+                writer.write(estimate_of(index), frame_of(index))
+            wait_for_frame(page, 8)
+            area = page.locator(".timeline").bounding_box()
+            page.mouse.click(area["x"] + area["width"] * 2 / 8, area["y"] + 60)
+            wait_for_frame(page, 2)
+            writer.write(estimate_of(9), frame_of(9))
+            writer.finish(model(), "finished")
+            page.click("[role=tab]:has-text('Run')")
+            page.wait_for_selector("td:text('finished')")
+            wait_for_frame(page, 2)  # who looks at another frame is left there

@@ -1,0 +1,132 @@
+"""``tracking3d view``: look at runs in the browser; and ``run --view``: at one that goes on."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import webbrowser
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from tracking3d.cli.options import Debug
+
+if TYPE_CHECKING:
+    from tracking3d.frames import SkippedFrame
+    from tracking3d.recording import Listener
+    from tracking3d.results.records import FrameRecord
+    from tracking3d.video.any_frame import FrameImages
+    from tracking3d.video.source import FrameSource
+    from tracking3d.viewer.viewer import Viewer
+
+Host = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Serve others too, on this address of the machine; the printed one then holds a token.",
+    ),
+]
+Browser = Annotated[
+    bool,
+    typer.Option("--browser/--no-browser", help="Open the page in the browser, where a person is there."),
+]
+
+
+def view(
+    runs: Annotated[
+        list[Path], typer.Argument(metavar="RUN...", help="Run folders, finished or still going on.")
+    ],
+    source: Annotated[
+        str | None,
+        typer.Option(metavar="VIDEO", help="The video, where it is not where the run found it."),
+    ] = None,
+    host: Host = None,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Or the next one that is free; 0 for any.")
+    ] = 8080,
+    browser: Browser = True,
+    debug: Debug = False,
+) -> None:
+    """Look at runs in the browser: model, camera path, video, masks, doubts. Ctrl-C ends it.
+
+    A run that still goes on is followed; several runs stand beside one another.
+    """
+    from tracking3d.viewer.opening import check_viser, open_viewer
+    from tracking3d.web.access import Access
+
+    check_viser("`tracking3d view`")
+    viewer = open_viewer(runs, Access.on(host), port, source)
+    try:
+        show_address(viewer.address, browser and host is None)
+        wait_for_the_end()
+    finally:
+        viewer.close()
+
+
+@contextmanager
+def watched(
+    source: FrameSource, folder: Path, listener: Listener, host: str | None, quiet: bool
+) -> Iterator[tuple[FrameSource, Listener]]:
+    """Show a run while it goes on, from its first answer; at its end, until Ctrl-C.
+
+    Args:
+        source: The frames of the run.
+        folder: Where it is written.
+        listener: Is told of its frames.
+        host: See `Access.on`.
+        quiet: Print no address.
+
+    Yields:
+        The source and the listener to give the run.
+
+    Raises:
+        PluginError: If viser is not installed.
+    """
+    from tracking3d.errors import InputError
+    from tracking3d.video.any_frame import frame_images
+    from tracking3d.viewer.opening import check_viser, open_viewer
+    from tracking3d.viewer.run_images import LatestImages
+    from tracking3d.web.access import Access
+
+    check_viser("--view")
+    opened: list[Viewer] = []
+    kept = LatestImages(source)
+    images: FrameImages = kept
+    passed_on: FrameSource = kept
+    with suppress(InputError):  # a camera gives each frame once
+        images, passed_on = frame_images(source), source
+
+    def listening(frame: FrameRecord | SkippedFrame) -> None:
+        if not opened:
+            opened.append(open_viewer([folder], Access.on(host), images=images))
+            if not quiet:
+                show_address(opened[0].address, host is None)
+        listener(frame)
+
+    try:
+        yield passed_on, listening
+        if opened:
+            if not quiet:
+                typer.echo("The viewer stays open; Ctrl-C ends it.", err=True)
+            wait_for_the_end()
+    finally:
+        for viewer in opened:
+            viewer.close()
+
+
+def show_address(address: str, browser: bool) -> None:
+    """Print where the page is, and open it where a person sits at this machine."""
+    typer.echo(address, err=True)
+    if browser and sys.stdin.isatty() and sys.stdout.isatty():
+        webbrowser.open(address)
+
+
+def wait_for_the_end() -> None:
+    """Until Ctrl-C."""
+    try:
+        threading.Event().wait()
+    except KeyboardInterrupt:
+        typer.echo("", err=True)

@@ -1,0 +1,115 @@
+"""What a person drew on a frame, as it comes from the network: checked and bounded before anything is done with it."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from tracking3d.errors import InputError
+
+MOST_OBJECTS, MOST_POINTS, MOST_STROKES, LONGEST_STROKE = 16, 200, 400, 2000
+_FARTHEST = 2**16
+
+Pixel = Annotated[float, Field(ge=-_FARTHEST, le=_FARTHEST, allow_inf_nan=False)]
+Extent = Annotated[float, Field(gt=0, le=_FARTHEST, allow_inf_nan=False)]
+
+
+class _Drawn(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Point(_Drawn):
+    """A click.
+
+    Attributes:
+        x: Column in pixels.
+        y: Row in pixels.
+        on: Whether it is on the object, or beside it.
+    """
+
+    x: Pixel
+    y: Pixel
+    on: bool
+
+
+class Stroke(_Drawn):
+    """A line of the brush.
+
+    Attributes:
+        path: Its points ``(x, y)`` in pixels.
+        radius: Of the brush, in pixels.
+        on: Whether it adds to the mask, or takes away from it.
+    """
+
+    path: Annotated[tuple[tuple[Pixel, Pixel], ...], Field(min_length=1, max_length=LONGEST_STROKE)]
+    radius: Extent
+    on: bool
+
+
+class DrawnObject(_Drawn):
+    """One object.
+
+    Attributes:
+        name: What the person calls it.
+        colour: ``#rrggbb`` in which it is shown.
+        frame: Index of the frame that it was drawn on.
+        box: ``(x, y, width, height)`` in pixels, or None.
+        points: The clicks.
+        strokes: The paint, in order.
+    """
+
+    name: Annotated[str, Field(min_length=1, max_length=40)]
+    colour: Annotated[str, Field(pattern=r"^#[0-9a-f]{6}$")]
+    frame: Annotated[int, Field(ge=0, le=2**31)]
+    box: tuple[Pixel, Pixel, Extent, Extent] | None = None
+    points: Annotated[tuple[Point, ...], Field(max_length=MOST_POINTS)] = ()
+    strokes: Annotated[tuple[Stroke, ...], Field(max_length=MOST_STROKES)] = ()
+
+    @field_validator("name")
+    @classmethod
+    def _one_line(cls, name: str) -> str:
+        if not name.strip() or not name.isprintable():
+            raise ValueError("the name has no letter, or a sign that cannot be printed")
+        return name.strip()
+
+    @property
+    def only_a_box(self) -> bool:
+        """Whether a box says it all."""
+        return self.box is not None and not self.points and not self.strokes
+
+
+class Drawing(_Drawn):
+    """All objects."""
+
+    objects: Annotated[tuple[DrawnObject, ...], Field(min_length=1, max_length=MOST_OBJECTS)]
+
+
+def read_object(text: bytes) -> DrawnObject:
+    """One object from JSON.
+
+    Raises:
+        InputError: If it is none.
+    """
+    try:
+        return DrawnObject.model_validate_json(text)
+    except ValidationError as error:
+        raise InputError(_in_words(error)) from error
+
+
+def read_drawing(text: bytes) -> Drawing:
+    """All objects from JSON.
+
+    Raises:
+        InputError: If it is no drawing.
+    """
+    try:
+        return Drawing.model_validate_json(text)
+    except ValidationError as error:
+        raise InputError(_in_words(error)) from error
+
+
+def _in_words(error: ValidationError) -> str:
+    first = error.errors()[0]
+    where = ".".join(str(part) for part in first["loc"])
+    return f"What was drawn cannot be used: {where or 'it'}: {first['msg']}."

@@ -1,0 +1,75 @@
+"""What a picked object becomes: the files and the command of a run."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from pathlib import Path
+
+import yaml
+
+from tracking3d.config.models import PipelineConfig
+from tracking3d.picker.session import Picked
+from tracking3d.results.files import write_atomic, write_mask, writing
+from tracking3d.video import parse_selection
+
+FOLDER = "picked"
+"""In the run folder: the masks that were drawn."""
+DESCRIPTION, SETTINGS = "picked.json", "picked.yaml"
+
+
+def save_picked(picked: Picked, config: PipelineConfig, folder: Path, source: str) -> None:
+    """Write what was picked into the run folder: masks, names and colours, and the settings as YAML.
+
+    Args:
+        picked: What was picked.
+        config: The settings of the run.
+        folder: The run folder; made with its parents. Nothing is written elsewhere.
+        source: The video.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
+    with writing(folder):
+        (folder / FOLDER if picked.masks else folder).mkdir(parents=True, exist_ok=True)
+    for path, mask in zip(mask_files(picked, folder), picked.masks, strict=True):
+        write_mask(path, mask)
+    told = {
+        "source": source,
+        "frame": picked.frame,
+        "objects": [one.model_dump(mode="json") for one in picked.objects],
+    }
+    write_atomic(folder / DESCRIPTION, (json.dumps(told, indent=1) + "\n").encode())
+    write_atomic(folder / SETTINGS, settings_as_yaml(config).encode())
+
+
+def mask_files(picked: Picked, folder: Path) -> list[Path]:
+    """Where the masks of `save_picked` lie."""
+    return [folder / FOLDER / f"object_{number}.png" for number in range(len(picked.masks))]
+
+
+def settings_as_yaml(config: PipelineConfig) -> str:
+    """The settings as a file that ``--config`` takes."""
+    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+
+
+def command_of(picked: Picked, folder: Path, source: str, frames: str | None) -> str:
+    """The command line of the run; its files are those of `save_picked`.
+
+    Args:
+        picked: What was picked.
+        folder: The run folder.
+        source: The video.
+        frames: ``START:STOP:STEP``, the frames that were asked for.
+    """
+    words = ["tracking3d", "run", source]
+    for box in picked.boxes:
+        words += ["--box", ",".join(f"{side:g}" for side in box)]
+    for path in mask_files(picked, folder):
+        words += ["--mask", str(path)]
+    if picked.frame != parse_selection(frames).start:
+        words += ["--start-frame", str(picked.frame)]
+    if frames:
+        words += ["--frames", frames]
+    words += ["--config", str(folder / SETTINGS), "--out", str(folder)]
+    return shlex.join(words)

@@ -1,0 +1,236 @@
+"""The page's server: a handful of answers, each bounded, on the standard library."""
+
+from __future__ import annotations
+
+import json
+import re
+import threading
+from collections.abc import Callable
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.resources import files
+from typing import Any
+from urllib.parse import urlsplit
+
+from tracking3d.errors import InputError, Tracking3dError
+from tracking3d.picker.drawing import read_drawing, read_object
+from tracking3d.picker.session import Picked, PickingSession
+from tracking3d.web.access import SAFE_HEADERS, Access
+
+LARGEST_BODY = 2 * 2**20
+"""Bytes that a request may bring: every stroke of every object."""
+MOST_CONNECTIONS = 32
+"""Requests that are worked on at a time; a browser needs a few."""
+PATIENCE = 15.0
+"""Seconds that a request may take to arrive."""
+_POLL = 0.05  # seconds until it is seen that the server is to stop
+_PORTS = 100  # that are tried, from the wanted one on
+_FRAME = re.compile(r"/frame/(\d{1,9})\.jpg")
+_PAGE = {
+    "/": ("index.html", "text/html; charset=utf-8"),
+    "/picker.js": ("picker.js", "text/javascript; charset=utf-8"),
+    "/picker.css": ("picker.css", "text/css; charset=utf-8"),
+}
+_POLICY = (
+    "default-src 'self'; img-src 'self' data:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+)
+
+
+class Picker:
+    """Serves the page until something was picked.
+
+    Args:
+        session: What the page asks for.
+        save: Writes what was picked to the run folder, and gives the command of the run and the settings as YAML.
+        access: Where to listen, and whom to answer.
+        port: The port, or the next one that is free; 0 for any.
+
+    Raises:
+        InputError: If it cannot listen there.
+    """
+
+    def __init__(
+        self, session: PickingSession, save: Callable[[Picked], tuple[str, str]], access: Access, port: int
+    ) -> None:
+        self.session, self.save, self.access = session, save, access
+        self.picked: Picked | None = None
+        self._over = threading.Event()
+        self._server = _listening(self, access.host, port)
+        self.port: int = self._server.server_address[1]
+        self.address = access.address(self.port)
+        self._thread = threading.Thread(
+            target=self._server.serve_forever, args=(_POLL,), name="picker", daemon=True
+        )
+        self._thread.start()
+
+    def wait(self) -> Picked:
+        """What the person picked, once the run is to start."""
+        self._over.wait()
+        assert self.picked is not None
+        return self.picked
+
+    def start(self, picked: Picked) -> None:
+        """The run is to start with that."""
+        self.picked = picked
+        self._over.set()
+
+    def close(self) -> None:
+        """Stop serving."""
+        self._server.shutdown()
+        self._server.server_close()
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+    block_on_close = False
+    allow_reuse_address = True
+    request_queue_size = 128
+
+    def __init__(self, address: tuple[str, int], picker: Picker) -> None:
+        self.picker = picker
+        self._free = threading.BoundedSemaphore(MOST_CONNECTIONS)
+        super().__init__(address, _Handler)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Work on a request beside the others, or hang up where there are too many."""
+        if not self._free.acquire(blocking=False):
+            self.shutdown_request(request)
+            return
+        try:
+            super().process_request(request, client_address)
+        except BaseException:
+            self._free.release()
+            raise
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """What each thread does."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._free.release()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A browser that went away is no news."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    timeout = PATIENCE
+    server: _Server
+    server_version, sys_version = "tracking3d", ""
+
+    def do_GET(self) -> None:
+        if not self._may(from_page=False):
+            return
+        path = urlsplit(self.path).path
+        picker = self.server.picker
+        if picker.access.gives_token(self.path):
+            self._send(HTTPStatus.SEE_OTHER, b"", Location="/", Set_Cookie=picker.access.cookie(picker.port))
+        elif path in _PAGE:
+            name, kind = _PAGE[path]
+            self._send(HTTPStatus.OK, (files("tracking3d.picker") / "page" / name).read_bytes(), kind)
+        elif path == "/session.json":
+            self._send_json(_told(picker.session))
+        elif found := _FRAME.fullmatch(path):
+            picture = picker.session.picture(int(found[1]))
+            if picture is None:
+                self._refuse(HTTPStatus.NOT_FOUND, "There is no such frame, or it cannot be read.")
+            else:
+                self._send(HTTPStatus.OK, picture, "image/jpeg")
+        else:
+            self._refuse(HTTPStatus.NOT_FOUND, "There is no such page.")
+
+    def do_POST(self) -> None:
+        if not self._may(from_page=True) or (body := self._body()) is None:
+            return
+        picker = self.server.picker
+        try:
+            if self.path == "/mask":
+                drawn = read_object(body)
+                mask = picker.session.mask(drawn)
+                self._send_json({"veil": picker.session.veil(mask, drawn.colour), "area": int(mask.sum())})
+            elif self.path in ("/save", "/start"):
+                picked = picker.session.picked(read_drawing(body))
+                command, settings = picker.save(picked)
+                self._send_json({"command": command, "settings": settings})
+                if self.path == "/start":
+                    picker.start(picked)
+            else:
+                self._refuse(HTTPStatus.NOT_FOUND, "There is no such page.")
+        except Tracking3dError as error:
+            self._refuse(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
+
+    def _may(self, from_page: bool) -> bool:
+        """Whether the request is answered; where not, it is refused."""
+        picker = self.server.picker
+        refusal = picker.access.refusal(
+            self.path,
+            self._one("Host"),
+            self._one("Origin"),
+            self._one("Cookie"),
+            picker.port,
+            from_page=from_page,
+        )
+        if refusal is not None:
+            self._refuse(*refusal)
+        return refusal is None
+
+    def _one(self, name: str) -> str | None:
+        values = self.headers.get_all(name) or []
+        return values[0] if len(values) == 1 else ("" if values else None)
+
+    def _body(self) -> bytes | None:
+        """What the request brings; None where it is refused for that."""
+        told = self._one("Content-Length") or ""
+        if not re.fullmatch(r"\d{1,12}", told) or self.headers.get("Transfer-Encoding"):
+            self._refuse(HTTPStatus.LENGTH_REQUIRED, "Say how long it is.")
+        elif self._one("Content-Type") != "application/json":
+            self._refuse(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "Send JSON.")
+        elif int(told) > LARGEST_BODY:
+            self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "That is too much.")
+        else:
+            body = self.rfile.read(int(told))
+            return body if len(body) == int(told) else None  # a browser that went away in the middle
+        return None
+
+    def _send_json(self, told: Any) -> None:
+        self._send(HTTPStatus.OK, json.dumps(told).encode(), "application/json")
+
+    def _refuse(self, status: HTTPStatus, reason: str) -> None:
+        self._send(status, (reason + "\n").encode(), "text/plain; charset=utf-8")
+
+    def _send(self, status: HTTPStatus, body: bytes, kind: str = "text/plain", **headers: str) -> None:
+        self.close_connection = True
+        self.send_response(status)
+        every = {**SAFE_HEADERS, "Content-Security-Policy": _POLICY, **headers}
+        every |= {"Content-Type": kind, "Content-Length": str(len(body))}
+        for name, value in every.items():
+            self.send_header(name.replace("_", "-"), value)
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Nothing is printed; the token is in the address."""
+
+
+def _listening(picker: Picker, host: str, port: int) -> _Server:
+    for number in range(port, port + _PORTS if port else 1):
+        try:
+            return _Server((host, number), picker)
+        except OSError as error:
+            problem = error
+    raise InputError(
+        f"No page can be served on {host}, port {port}: {problem.strerror}; choose another --host or --port."
+    )
+
+
+def _told(session: PickingSession) -> dict[str, Any]:
+    frames = session.frames
+    return {
+        "source": session.source,
+        "first": frames.start,
+        "last": frames[-1],
+        "step": frames.step,
+        "width": session.width,
+        "height": session.height,
+        "tracker": session.config.tracker.name,
+    }

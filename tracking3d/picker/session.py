@@ -1,0 +1,126 @@
+"""A person picks objects in one video: its frames, the masks of what is drawn, and what comes of it."""
+
+from __future__ import annotations
+
+import base64
+import threading
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.config.models import PipelineConfig
+from tracking3d.errors import InputError
+from tracking3d.frames import Box, Frame
+from tracking3d.picker.drawing import Drawing, DrawnObject
+from tracking3d.picker.drawn_mask import drawn_mask
+from tracking3d.plugins import TRACKERS, build_plugin
+from tracking3d.prompts import make_prompt
+from tracking3d.trackers.protocol import MaskTracker
+from tracking3d.video.any_frame import FrameImages
+
+_VEIL = 110  # of 255: how much a mask hides of the frame
+
+
+@dataclass(frozen=True, eq=False)
+class Picked:
+    """What was picked.
+
+    Attributes:
+        frame: Index of the frame that it was picked in, which the run begins with.
+        objects: What was drawn.
+        boxes: One ``(x, y, width, height)`` for each object, where boxes say it all, else none.
+        masks: One ``(H, W)`` bool for each object, where they do not, else none.
+    """
+
+    frame: int
+    objects: tuple[DrawnObject, ...]
+    boxes: list[Box] = field(default_factory=list)
+    masks: list[NDArray[np.bool_]] = field(default_factory=list)
+
+
+class PickingSession:
+    """What the page asks for, without the network.
+
+    Args:
+        source: What messages call the video.
+        images: Its frames.
+        frames: Indices of the frames that can be picked in.
+        config: With the tracker that makes the masks.
+
+    Raises:
+        InputError: If the first frame cannot be read.
+    """
+
+    def __init__(self, source: str, images: FrameImages, frames: range, config: PipelineConfig) -> None:
+        self.source, self.frames, self.config = source, frames, config
+        self._images = images
+        self._busy = threading.Lock()
+        first = images.image(frames.start)
+        if first is None:
+            raise InputError(f"The first frame of {source} cannot be read; begin with another one.")
+        self.height, self.width = first.shape[:2]
+
+    def picture(self, index: int) -> bytes | None:
+        """A frame as JPEG; None where there is none."""
+        if index not in self.frames:
+            return None
+        image = self._images.image(index)
+        if image is None:
+            return None
+        return cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 88])[
+            1
+        ].tobytes()
+
+    def mask(self, drawn: DrawnObject) -> NDArray[np.bool_]:
+        """The mask ``(H, W)`` that the tracker makes of what was drawn.
+
+        Raises:
+            InputError: If nothing can be made of it.
+            PluginError: If the tracker fails.
+        """
+        frame = self._frame(drawn.frame)
+        with self._busy:  # a tracker takes all that the machine has
+            given = drawn_mask(frame.image, drawn)
+            if given is None and drawn.box is None:
+                raise InputError("Nothing is marked as the object yet.")
+            prompt = make_prompt(frame, drawn.box if given is None else None, given)
+            tracker: MaskTracker = build_plugin(TRACKERS, self.config.tracker)
+            mask = tracker.init(frame, prompt).binary
+        if mask is None or not mask.any():
+            raise InputError("The tracker finds no object there; draw it another way.")
+        return mask
+
+    def veil(self, mask: NDArray[np.bool_], colour: str) -> str:
+        """A mask as a PNG to lay over the frame, as a data URL."""
+        layer = np.zeros((*mask.shape, 4), np.uint8)
+        red, green, blue = (int(colour[start : start + 2], 16) for start in (1, 3, 5))
+        layer[mask] = (blue, green, red, _VEIL)
+        outline, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+        cv2.drawContours(layer, outline, -1, (blue, green, red, 255), max(round(mask.shape[1] / 640), 1))
+        return "data:image/png;base64," + base64.b64encode(cv2.imencode(".png", layer)[1].tobytes()).decode()
+
+    def picked(self, drawing: Drawing) -> Picked:
+        """What the run is to begin with.
+
+        Raises:
+            InputError: If the objects are not of one frame, or one cannot be used.
+        """
+        frames = sorted({one.frame for one in drawing.objects})
+        if len(frames) > 1:
+            told = " and ".join(str(index) for index in frames)
+            raise InputError(f"The objects are drawn on frames {told}; a run begins with all of them on one.")
+        if len(drawing.objects) > 1 and self.config.tracker.name == "precomputed":
+            raise InputError("Precomputed masks are of one object; pick one.")
+        frame = self._frame(frames[0])
+        if all(one.only_a_box for one in drawing.objects):
+            boxes = [one.box for one in drawing.objects if one.box is not None]
+            return Picked(frame.index, drawing.objects, [make_prompt(frame, box).box for box in boxes])
+        return Picked(frame.index, drawing.objects, masks=[self.mask(one) for one in drawing.objects])
+
+    def _frame(self, index: int) -> Frame:
+        image = self._images.image(index) if index in self.frames else None
+        if image is None:
+            raise InputError(f"Frame {index} cannot be read; pick in another one.")
+        return Frame(index, image, name=f"frame {index}")

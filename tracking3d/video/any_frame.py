@@ -1,0 +1,186 @@
+"""Any frame of a video, decoded when it is asked for."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import replace
+from typing import Protocol, cast
+
+import av
+from av.error import FFmpegError
+
+from tracking3d.errors import InputError
+from tracking3d.frames import Frame, Image, SkippedFrame
+from tracking3d.video.image_file import read_image
+from tracking3d.video.image_sequence import ImageSequence
+from tracking3d.video.orientation import turn_upright
+from tracking3d.video.selection import EVERY_FRAME
+from tracking3d.video.source import FrameSource
+from tracking3d.video.video_file import VideoFile, orientation_of, video_stream
+
+MOST_KEPT = 128 * 2**20
+"""Bytes of decoded frames that are kept for when they are asked for again."""
+_INDEXED = frozenset({"mp4", "matroska"})
+"""Containers that say of every packet when it is shown, and of which pictures need no other."""
+
+
+class FrameImages(Protocol):
+    """Gives the picture of a frame by its index."""
+
+    def image(self, index: int) -> Image | None:
+        """``(H, W, 3)``, or None where there is none."""
+        ...
+
+
+def frame_images(source: FrameSource) -> KeptImages:
+    """Access to any frame of a source.
+
+    Raises:
+        InputError: If it is one that cannot be read again, such as a camera.
+    """
+    if isinstance(source, ImageSequence):
+        return KeptImages(ImageFiles(source).image, len(source.files))
+    if isinstance(source, VideoFile):
+        pictures = VideoPictures(source)
+        return KeptImages(pictures.image, pictures.count or source.count)
+    raise InputError(f"{source.name} cannot be read again; give a video file or a folder of images.")
+
+
+class KeptImages:
+    """Keeps what was decoded lately, within `MOST_KEPT`; for several threads.
+
+    Args:
+        decode: Gives the picture of a frame, or None.
+        count: Number of all frames of the source, where it is known.
+    """
+
+    def __init__(self, decode: Callable[[int], Image | None], count: int | None) -> None:
+        self._decode, self.count = decode, count
+        self._kept: OrderedDict[int, Image | None] = OrderedDict()
+        self._bytes = 0
+        self._lock = threading.Lock()
+
+    def image(self, index: int) -> Image | None:
+        """The frame ``(H, W, 3)``, or None where there is none."""
+        with self._lock:
+            if index in self._kept:
+                self._kept.move_to_end(index)
+                return self._kept[index]
+            image = self._decode(index)
+            self._kept[index] = image
+            self._bytes += image.nbytes if image is not None else 0
+            while self._bytes > MOST_KEPT and len(self._kept) > 1:
+                _, gone = self._kept.popitem(last=False)
+                self._bytes -= gone.nbytes if gone is not None else 0
+            return image
+
+
+class ImageFiles:
+    """The images of a sequence, each a file.
+
+    Args:
+        sequence: Which files.
+    """
+
+    def __init__(self, sequence: ImageSequence) -> None:
+        self._files = sequence.files
+
+    def image(self, index: int) -> Image | None:
+        """The frame ``(H, W, 3)``, or None where it cannot be read."""
+        try:
+            return read_image(self._files[index]) if 0 <= index < len(self._files) else None
+        except InputError:
+            return None
+
+
+class VideoPictures:
+    """The pictures of a video file, found by seeking.
+
+    The header's index tells the time of every picture; from the picture before it that needs no other, everything is
+    decoded up to the one that is asked for. Pictures asked for one after another are decoded once. Containers whose
+    index is not to be relied on are read from their beginning, or on from where they are.
+
+    Args:
+        video: The file.
+    """
+
+    def __init__(self, video: VideoFile) -> None:
+        self._video = replace(video, selection=EVERY_FRAME)
+        self._container = av.open(f"file:{video.path}", metadata_errors="ignore")
+        stream = video_stream(self._container)
+        assert stream is not None  # VideoFile.open has made sure
+        self._stream = stream
+        self._times = self._presentation_times()
+        self._place = {time: index for index, time in enumerate(self._times)}
+        self._running: Iterator[av.VideoFrame] | None = None
+        self._reading: Iterator[Frame | SkippedFrame] = iter(())
+        self._next = 0
+
+    @property
+    def count(self) -> int:
+        """Number of pictures; 0 where the file has no times to count them by."""
+        return len(self._times)
+
+    def image(self, index: int) -> Image | None:
+        """The frame ``(H, W, 3)``, or None where it cannot be decoded."""
+        if not self._times:
+            return self._counted(index)
+        if not 0 <= index < len(self._times):
+            return None
+        try:
+            return self._sought(index)
+        except FFmpegError:  # it cannot be sought
+            self._running = None
+            return None
+
+    def _presentation_times(self) -> list[int]:
+        """Of all pictures, in the order in which they are shown; none where they are not to be relied on."""
+        if not _INDEXED & set(self._container.format.name.split(",")):
+            return []
+        try:
+            packets = [packet for packet in self._container.demux(self._stream) if packet.size]
+        except FFmpegError:
+            return []
+        times = [packet.pts for packet in packets if packet.pts is not None and not packet.is_discard]
+        return sorted(times) if len(set(times)) == len(packets) else []
+
+    def _sought(self, index: int) -> Image | None:
+        near = self._running is not None and 0 <= index - self._next < 16
+        if not near:
+            self._container.seek(self._times[index], stream=self._stream, backward=True)
+            self._running = self._pictures()
+        for picture in self._running or ():
+            at = self._place.get(picture.pts) if picture.pts is not None else None
+            if at is None:
+                continue
+            self._next = at + 1
+            if at == index:
+                return self._upright(picture)
+            if at > index:
+                break
+        self._running = None
+        return None
+
+    def _upright(self, picture: av.VideoFrame) -> Image:
+        return turn_upright(cast(Image, picture.to_ndarray(format="rgb24")), orientation_of(picture))
+
+    def _pictures(self) -> Iterator[av.VideoFrame]:
+        """From where the file stands, those that can be decoded."""
+        for packet in self._container.demux(self._stream):
+            with suppress(FFmpegError):
+                yield from (picture for picture in packet.decode() if isinstance(picture, av.VideoFrame))
+
+    def _counted(self, index: int) -> Image | None:
+        """The frame by reading on to it, or from the beginning where it is behind."""
+        if index < self._next:
+            self._reading, self._next = iter(()), 0
+        if not self._next:
+            self._reading = iter(self._video)
+        for frame in self._reading:
+            self._next = frame.index + 1
+            if frame.index >= index:
+                return frame.image if isinstance(frame, Frame) and frame.index == index else None
+        return None

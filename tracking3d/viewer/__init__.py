@@ -1,0 +1,1 @@
+"""The web viewer of run folders, by viser."""

@@ -1,0 +1,209 @@
+"""A run folder that may still grow: its lines as they come, its mesh when it is there."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.errors import InputError, Tracking3dError
+from tracking3d.estimation.estimate import ObjectModel, Status
+from tracking3d.geometry.camera import Camera
+from tracking3d.results import layout
+from tracking3d.results.files import read_mask
+from tracking3d.results.mesh_export import load_model
+from tracking3d.results.records import FrameRecord, latest
+from tracking3d.results.run_reader import LONGEST_LINE, RunReader
+
+_FIGURES = re.compile(r"[\d.]+")
+_MOST_AT_ONCE = 2**26
+"""Bytes of new lines that are taken at a time; the rest comes with the next look."""
+
+
+@dataclass(frozen=True)
+class Streak:
+    """Frames in a row that the run doubts for one reason.
+
+    Attributes:
+        first: Index of the first frame.
+        last: Index of the last one.
+        status: What the run says of them.
+        reason: Why; figures in it are those of the first frame.
+    """
+
+    first: int
+    last: int
+    status: Status
+    reason: str
+
+
+@dataclass(eq=False)
+class FollowedRun:
+    """One object's run folder, read again as far as it has grown.
+
+    Attributes:
+        folder: The run folder.
+        name: What the viewer calls it.
+        frames: The final answers by frame index, in order.
+        causal: Those from before the final refinement.
+        model: The object, once the run has written it.
+        description: What ``run.json`` says.
+        reader: Gives the masks and the camera.
+    """
+
+    folder: Path
+    name: str
+    description: dict[str, Any] = field(default_factory=dict)
+    frames: dict[int, FrameRecord] = field(default_factory=dict)
+    causal: dict[int, FrameRecord] = field(default_factory=dict)
+    model: ObjectModel | None = None
+    reader: RunReader = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._lines: list[FrameRecord] = []
+        self._read = 0
+        self._model_time = 0.0
+        self.reader = RunReader(self.folder)
+        self.description = self.reader.description
+        self.reader.camera  # noqa: B018 (a damaged one is told of before anything is shown)
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of the full frame, as the run knows it now."""
+        return self.reader.camera
+
+    @property
+    def going_on(self) -> bool:
+        """Whether the run may still grow."""
+        return self.reader.state == "running"
+
+    @property
+    def refined(self) -> bool:
+        """Whether there are answers of a final refinement."""
+        return any(record.refined for record in self.frames.values())
+
+    def look_again(self) -> bool:
+        """Take what has come since the last look.
+
+        Returns:
+            Whether there is anything new.
+
+        Raises:
+            InputError: If a whole line of the run is damaged.
+        """
+        described, grown = self._look_at_description(), self._look_at_lines()
+        return self._look_at_model() or described or grown
+
+    def mask(self, index: int, kind: str) -> NDArray[np.bool_] | None:
+        """A mask ``(H, W)`` of frame ``index``: ``refined`` (the answer), ``causal`` or ``initial``; None without."""
+        if kind == "initial":
+            path = layout.initial_mask_path(self.folder, index)
+        else:
+            path = layout.mask_path(self.folder, index)
+            before = layout.mask_path(self.folder / layout.CAUSAL, index)
+            if kind == "causal" and before.is_file():
+                path = before
+        mask = read_mask(path)
+        camera = self.camera
+        return mask if mask is not None and mask.shape == (camera.height, camera.width) else None
+
+    def streaks(self) -> list[Streak]:
+        """The frames that are uncertain or lost, those in a row together."""
+        found: list[Streak] = []
+        for index, record in self.frames.items():
+            if record.status == Status.TRACKED:
+                continue
+            last = found[-1] if found else None
+            if (
+                last
+                and last.last == index - 1
+                and last.status == record.status
+                and _alike(last.reason, record.reason)
+            ):
+                found[-1] = Streak(last.first, index, last.status, last.reason)
+            else:
+                found.append(Streak(index, index, record.status, record.reason))
+        return found
+
+    def _look_at_description(self) -> bool:
+        try:
+            reader = RunReader(self.folder)
+            reader.camera  # noqa: B018
+        except InputError:  # it is being replaced, or somebody removes the run: what was known stays
+            return False
+        new = reader.description != self.description
+        self.reader, self.description = reader, reader.description
+        return new
+
+    def _look_at_lines(self) -> bool:
+        path = self.folder / layout.FRAMES
+        try:
+            size = path.stat().st_size
+            if size < self._read:  # begun anew, or cut back to where a stopped run goes on
+                self._lines.clear()
+                self._read = 0
+            if size == self._read:
+                return False
+            with path.open("rb") as file:
+                file.seek(self._read)
+                text = file.read(_MOST_AT_ONCE)
+        except OSError:
+            return False
+        whole = text[: text.rfind(b"\n") + 1]
+        if not whole and len(text) > LONGEST_LINE:
+            raise InputError(f"{path} is damaged: a line of it has no end; restore it.")
+        self._read += len(whole)
+        for line in whole.splitlines():
+            try:
+                self._lines.append(FrameRecord.from_json(line))
+            except ValueError as error:
+                raise InputError(f"A line of {path} is damaged ({error}); remove it.") from error
+        self.frames = {record.index: record for record in latest(self._lines)}
+        self.causal = {record.index: record for record in latest(self._lines, refined=False)}
+        return bool(whole)
+
+    def _look_at_model(self) -> bool:
+        try:
+            written = (self.folder / layout.FEATURES).stat().st_mtime
+            if written == self._model_time:
+                return False
+            self.model = load_model(self.folder)
+        except (OSError, Tracking3dError):  # not there yet, or not whole yet
+            return False
+        self._model_time = written
+        return True
+
+
+def _alike(reason: str, other: str) -> bool:
+    """Whether two reasons are the same but for their figures."""
+    return reason == other or _FIGURES.sub("", reason) == _FIGURES.sub("", other)
+
+
+def runs_in(folder: Path) -> list[FollowedRun]:
+    """The runs in a folder: its own, or those of the several objects of one video.
+
+    Raises:
+        InputError: If there is none.
+    """
+    inner = sorted(folder.glob("object_*/"), key=lambda path: (len(path.name), path.name))
+    if (folder / layout.RUN).is_file() or not inner:
+        return [FollowedRun(folder, folder.name or str(folder))]
+    names = picked_names(folder)
+    return [
+        FollowedRun(path, names.get(path.name, path.name)) for path in inner if (path / layout.RUN).is_file()
+    ]
+
+
+def picked_names(folder: Path) -> dict[str, str]:
+    """What the objects of a run were called when they were picked, by the name of their folder."""
+    try:
+        told = json.loads((folder / "picked.json").read_bytes()[:LONGEST_LINE])
+        names = [str(one["name"])[:60] for one in told["objects"]]
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+    return {f"object_{number}": name for number, name in enumerate(names)}

@@ -1,0 +1,80 @@
+"""From run folders to a viewer that shows them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tracking3d.errors import InputError, PluginError
+from tracking3d.video.any_frame import FrameImages, frame_images
+from tracking3d.video.opening import open_source
+from tracking3d.viewer.followed_run import FollowedRun, runs_in
+from tracking3d.viewer.run_images import OverlayPictures, images_of_run
+from tracking3d.web.access import Access
+
+if TYPE_CHECKING:
+    from tracking3d.viewer.viewer import Viewer
+
+PORT = 8080
+"""Where the viewer listens, or the next port that is free."""
+
+
+def check_viser(what: str) -> None:
+    """Make sure of the library that draws, before anything begins.
+
+    Args:
+        what: The command or option that needs it.
+
+    Raises:
+        PluginError: If it is not installed.
+    """
+    if find_spec("viser") is None:
+        raise PluginError(f"{what} needs viser; install it with: pip install 'tracking3d[view]'.")
+
+
+def open_viewer(
+    folders: Sequence[Path],
+    access: Access,
+    port: int = PORT,
+    source: str | None = None,
+    images: FrameImages | None = None,
+) -> Viewer:
+    """Show runs in the browser.
+
+    Args:
+        folders: Run folders, or folders of the several objects of one video.
+        access: Where to listen, and whom to answer.
+        port: The port, or the next one that is free; 0 for any.
+        source: The video, where it is not where the runs found it.
+        images: Gives the frames of all runs, where they are at hand already.
+
+    Raises:
+        InputError: If a folder holds no run, or a damaged one.
+        PluginError: If viser is not installed, or cannot be guarded.
+    """
+    check_viser("The viewer")
+    from tracking3d.viewer.viewer import Video, Viewer
+
+    if images is None and source is not None:
+        images = frame_images(open_source(source))
+    videos = []
+    for folder in folders:
+        runs = runs_in(folder)
+        if not runs:
+            raise InputError(f"{folder} holds no run; give a folder that --out of `tracking3d run` was.")
+        videos.append(Video(folder.name or str(folder), runs, images or _images_of(runs[0])))
+    return Viewer(videos, access, port)
+
+
+def _images_of(run: FollowedRun) -> FrameImages | None:
+    """The frames of a run, or those in its overlay video."""
+    found = images_of_run(str(run.description.get("source", "")), run.folder)
+    if found is not None:
+        return found
+    run.look_again()
+    try:
+        return OverlayPictures(run.folder, list(run.frames), run.camera.height, run.camera.width)
+    except InputError:
+        return None

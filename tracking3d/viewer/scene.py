@@ -1,0 +1,205 @@
+"""What stands in space: each object's mesh, the path of the camera around it, and where the camera is now."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from tracking3d.estimation.estimate import Status
+from tracking3d.frames import Image
+from tracking3d.results import drawing, layout
+from tracking3d.results.records import FrameRecord
+from tracking3d.viewer.followed_run import FollowedRun
+
+MOST_FRUSTA = 48
+"""Frusta along a path; of more frames so many are shown, spread over them."""
+LARGEST_MESH = 2**28
+"""Bytes of a mesh file that are sent to the browser."""
+_FRUSTUM = 0.06  # of the distance between camera and object
+_LANDMARK = (255, 230, 120)
+_HALF_TURN_ABOUT_X = (0.0, 1.0, 0.0, 0.0)  # from glTF's axes, in which mesh.glb is, to the object's
+
+
+class ObjectScene:
+    """One object in the scene.
+
+    Attributes:
+        distance: From the object to the camera, in the median.
+        place: ``(3,)`` where the object stands.
+        middle_of_path: ``(3,)`` the camera's mean place, in object coordinates.
+
+    Args:
+        server: Shows it.
+        run: The object's run.
+        number: Tells it from others; they stand below one another.
+        jump: Is called with the index of a frame whose frustum was clicked.
+    """
+
+    def __init__(
+        self, server: viser.ViserServer, run: FollowedRun, number: int, jump: Callable[[int], None]
+    ) -> None:
+        self._server, self._run, self._jump = server, run, jump
+        self._root = server.scene.add_frame(f"/object_{number}", show_axes=False)
+        self._path = server.scene.add_frame(f"/object_{number}/path", show_axes=False)
+        self._landmarks = server.scene.add_frame(f"/object_{number}/landmarks", show_axes=False)
+        self._here: viser.CameraFrustumHandle | None = None
+        self._mesh: viser.GlbHandle | None = None
+        self._points: viser.PointCloudHandle | None = None
+        self._mesh_written = 0.0
+        self.place = np.zeros(3)
+        self.distance = 4.0
+        self.middle_of_path = np.array([0.0, 0.0, -4.0])
+
+    def draw_again(self, place: float) -> None:
+        """Show what is new in the run.
+
+        Args:
+            place: How far below the first object it stands.
+        """
+        self.place = np.array([0.0, place, 0.0])
+        self._draw_mesh()
+        records = [record for record in self._run.frames.values() if np.isfinite(record.T_cam_obj).all()]
+        if records:
+            self._draw_path(records)
+
+    def go_to(self, index: int, image: Image | None, camera_stands_still: bool) -> None:
+        """Put the camera where it was in a frame.
+
+        Args:
+            index: The frame.
+            image: ``(H, W, 3)`` what it saw, for the frustum; None leaves the frustum empty.
+            camera_stands_still: Move the object before the camera, not the camera around the object.
+        """
+        record = self._run.frames.get(index)
+        known = record is not None and bool(np.isfinite(record.T_cam_obj).all())
+        if self._here is not None:
+            self._here.visible = known
+        if record is None or not known:
+            return
+        T_cam_obj = record.T_cam_obj
+        T_obj_cam = np.linalg.inv(T_cam_obj).astype(np.float64)
+        camera = record.through(self._run.camera)
+        if self._here is None:
+            self._here = self._server.scene.add_camera_frustum(
+                f"{self._root.name}/here",
+                fov=math.radians(camera.fov),
+                aspect=camera.width / camera.height,
+                scale=3 * _FRUSTUM * self.distance,
+                thickness=2.0,
+                thickness_units="screen",
+            )
+        self._here.scale = 3 * _FRUSTUM * self.distance
+        self._here.color = drawing.STATUS[record.status]
+        self._here.image = image
+        self._here.wxyz, self._here.position = _wxyz(T_obj_cam), T_obj_cam[:3, 3]
+        if camera_stands_still:
+            self._root.wxyz, self._root.position = _wxyz(T_cam_obj), T_cam_obj[:3, 3]
+        else:
+            self._root.wxyz, self._root.position = (1.0, 0.0, 0.0, 0.0), self.place
+
+    def show(self, mesh: bool, path: bool, landmarks: bool) -> None:
+        """Which parts are to be seen."""
+        self._path.visible, self._landmarks.visible = path, landmarks
+        if self._mesh is not None:
+            self._mesh.visible = mesh
+
+    def draw_landmarks(self, points: NDArray[np.float32] | None) -> None:
+        """Show the points ``(N, 3)`` that the run follows; None takes away those that were shown."""
+        if self._points is not None:
+            self._points.remove()
+            self._points = None
+        if points is not None:
+            self._points = self._server.scene.add_point_cloud(
+                f"{self._landmarks.name}/points",
+                points,
+                np.full(points.shape, _LANDMARK, np.uint8),
+                point_size=0.006 * self.distance,
+                point_shape="circle",
+            )
+
+    def _draw_mesh(self) -> None:
+        path = self._run.folder / layout.GLB
+        written, data = _changed(path, self._mesh_written)
+        if data is None:
+            return
+        self._mesh_written = written
+        self._mesh = self._server.scene.add_glb(
+            f"{self._root.name}/mesh", data, wxyz=_HALF_TURN_ABOUT_X, cast_shadow=False, receive_shadow=False
+        )
+
+    def _draw_path(self, records: list[FrameRecord]) -> None:
+        T_obj_cam: NDArray[np.float64] = np.linalg.inv(np.stack([record.T_cam_obj for record in records]))
+        places = T_obj_cam[:, :3, 3]
+        self.distance = float(np.median(np.linalg.norm(places, axis=1)))
+        self.middle_of_path = places.mean(axis=0)
+        colours = np.array([drawing.STATUS[record.status] for record in records], np.uint8)
+        if len(records) > 1:
+            self._server.scene.add_line_segments(
+                f"{self._path.name}/line",
+                np.stack([places[:-1], places[1:]], axis=1).astype(np.float32),
+                np.stack([colours[:-1], colours[1:]], axis=1),
+                thickness=2.0,
+                thickness_units="screen",
+            )
+        for slot, number in enumerate(_spread(records)):
+            self._draw_frustum(slot, records[number], T_obj_cam[number])
+
+    def _clicked(self, index: int, event: object) -> None:
+        self._jump(index)
+
+    def _draw_frustum(self, slot: int, record: FrameRecord, T_obj_cam: NDArray[np.float64]) -> None:
+        camera = record.through(self._run.camera)
+        handle = self._server.scene.add_camera_frustum(
+            f"{self._path.name}/frustum_{slot:03d}",
+            fov=math.radians(camera.fov),
+            aspect=camera.width / camera.height,
+            scale=_FRUSTUM * self.distance * (1.0 if record.keyframe else 0.6),
+            thickness=2.0 if record.keyframe else 1.0,
+            thickness_units="screen",
+            color=drawing.KEYFRAME if record.keyframe else drawing.STATUS[record.status],
+            wxyz=_wxyz(T_obj_cam),
+            position=T_obj_cam[:3, 3],
+        )
+        handle.on_click(partial(self._clicked, record.index))
+
+
+def _spread(records: list[FrameRecord]) -> list[int]:
+    """Places of those records that get a frustum: the keyframes, the doubtful, and others between, spread evenly."""
+    keyframes = [place for place, record in enumerate(records) if record.keyframe]
+    doubtful = [
+        place
+        for place, record in enumerate(records)
+        if record.status != Status.TRACKED and (not place or records[place - 1].status == Status.TRACKED)
+    ]
+    chosen = {*_evenly(keyframes, MOST_FRUSTA // 3), *_evenly(doubtful, MOST_FRUSTA // 3)}
+    others = [place for place in range(len(records)) if place not in chosen]
+    return sorted({*chosen, *_evenly(others, MOST_FRUSTA - len(chosen))})
+
+
+def _evenly(places: list[int], most: int) -> Iterable[int]:
+    if len(places) <= most:
+        return places
+    return [places[round(step)] for step in np.linspace(0, len(places) - 1, most)]
+
+
+def _wxyz(T: NDArray[np.float64]) -> NDArray[np.float64]:
+    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
+    return np.array([w, x, y, z])
+
+
+def _changed(path: Path, before: float) -> tuple[float, bytes | None]:
+    """When a file was written, and what it holds if that is not as ``before``; None if it is, or there is none."""
+    try:
+        told = path.stat()
+        if told.st_mtime == before or told.st_size > LARGEST_MESH:
+            return before, None
+        return told.st_mtime, path.read_bytes()
+    except OSError:
+        return before, None

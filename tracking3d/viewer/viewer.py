@@ -1,0 +1,318 @@
+"""The viewer: runs that are followed, a frame that everything shows, and the threads that keep both up."""
+
+from __future__ import annotations
+
+import html
+import io
+import threading
+import time
+from bisect import bisect_left
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stdout
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from tracking3d.errors import Tracking3dError
+from tracking3d.frames import Image
+from tracking3d.results.overlay import ObjectAxes
+from tracking3d.video.any_frame import FrameImages
+from tracking3d.viewer import timeline
+from tracking3d.viewer.browser_camera import look_from_aside, look_through
+from tracking3d.viewer.followed_run import FollowedRun
+from tracking3d.viewer.guarded_server import start_server
+from tracking3d.viewer.kept_landmarks import kept_landmarks
+from tracking3d.viewer.panel import SPEEDS, Panel
+from tracking3d.viewer.picture import axes_of, beside, draw_picture
+from tracking3d.viewer.scene import ObjectScene
+from tracking3d.viewer.told import about, describe, list_streaks
+from tracking3d.web.access import Access
+
+POLL = 0.5
+"""Seconds between two looks at run folders that may grow."""
+_DRAW_ANEW = 2.0  # seconds between two drawings of the path of a run that grows
+_USUAL_RATE = 10.0  # frames a second where the source has no rate
+
+
+@dataclass(eq=False)
+class Video:
+    """One RUN of the command line: a video, and its objects.
+
+    Attributes:
+        name: What the viewer calls it.
+        runs: The objects.
+        images: Gives the frames; None where they are not at hand.
+    """
+
+    name: str
+    runs: list[FollowedRun]
+    images: FrameImages | None
+    axes: list[ObjectAxes | None] = field(default_factory=list)
+
+
+class Viewer:
+    """Shows runs in the browser until it is closed.
+
+    Args:
+        videos: What to show.
+        access: Where to listen, and whom to answer.
+        port: The port, or the next one that is free; 0 for any.
+
+    Raises:
+        PluginError: If this version of viser cannot be guarded.
+        InputError: If a run is damaged.
+    """
+
+    def __init__(self, videos: Sequence[Video], access: Access, port: int) -> None:
+        self._videos = list(videos)
+        self._runs = [run for video in videos for run in video.runs]
+        for run in self._runs:
+            run.look_again()
+        self._changed = threading.Condition()
+        self._wanted, self._shown, self._again = 0, -1, True
+        self._playing = self._over = False
+        self._indices: list[int] = []
+        self._timeline = self._fault = ""
+        live = any(run.going_on for run in self._runs)
+        self._server = start_server(access, port)
+        self.address = access.address(self._server.get_port())
+        self._server.scene.set_up_direction("-y")
+        self._panel = Panel(self._server, len(videos), live, any(run.refined for run in self._runs))
+        self._scenes = [
+            ObjectScene(self._server, run, number, self.go_to) for number, run in enumerate(self._runs)
+        ]
+        self._take_news(draw=True)
+        look_from_aside(self._server, self._scenes)
+        self._listen()
+        self._threads = [
+            threading.Thread(target=work, name=f"viewer {work.__name__}", daemon=True)
+            for work in (self._draw, self._follow, self._advance)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def go_to(self, index: int) -> None:
+        """Show the frame ``index``, or the nearest one that has an answer."""
+        self._panel.slider.value = int(index)
+        self._want(index)
+
+    def close(self) -> None:
+        """Stop serving."""
+        with self._changed:
+            self._over = True
+            self._changed.notify_all()
+        for thread in self._threads:
+            thread.join(5)
+        with redirect_stdout(io.StringIO()):  # it says so
+            self._server.stop()
+
+    def _want(self, index: int | None = None) -> None:
+        with self._changed:
+            self._wanted, self._again = self._wanted if index is None else int(index), True
+            self._changed.notify_all()
+
+    def _listen(self) -> None:
+        panel = self._panel
+        panel.slider.on_update(self._slid)
+        panel.play.on_click(lambda _: self._play_or_pause())
+        panel.steps.on_click(lambda event: self._step(event.target.value))
+        panel.quantity.on_update(lambda _: self._redraw_timeline())
+        panel.look.on_click(lambda _: self._look_through())
+        boxes = [*panel.layers.values(), panel.axes, panel.mesh, panel.path, panel.landmarks, panel.still]
+        for box in boxes:
+            box.on_update(lambda _: self._want())
+        keys: dict[str, tuple[str, Callable[[], None]]] = {
+            "P": ("Play or pause", self._play_or_pause),
+            "N": ("Next doubtful frame", partial(self._step, "▶▶")),
+            "B": ("Doubtful frame before", partial(self._step, "◀◀")),
+        }
+        for key, (label, act) in keys.items():
+            self._server.gui.add_command(label, hotkey=key).on_trigger(partial(_ignoring_the_event, act))
+
+    def _slid(self, event: Any) -> None:
+        """The slider was moved: by a person, who then no longer wants the newest frame, or by this program."""
+        if event.client_id is not None and self._panel.follow.value:
+            self._panel.follow.value = False
+        self._want(self._panel.slider.value)
+
+    def _play_or_pause(self) -> None:
+        if not self._indices:
+            return
+        at_end = self._wanted >= self._indices[-1]
+        with self._changed:
+            self._playing = not self._playing
+            self._changed.notify_all()
+        self._panel.play_or_pause(self._playing)
+        if self._playing:
+            self._panel.follow.value = False
+            if at_end:
+                self.go_to(self._indices[0])
+
+    def _step(self, way: str) -> None:
+        if not self._indices:
+            return
+        place = bisect_left(self._indices, self._wanted)
+        if way in ("◀", "▶"):
+            step = 1 if way == "▶" else -1
+            self.go_to(self._indices[min(max(place + step, 0), len(self._indices) - 1)])
+            return
+        starts = sorted({streak.first for run in self._runs for streak in run.streaks()})
+        found = [start for start in starts if (start > self._wanted if way == "▶▶" else start < self._wanted)]
+        if found:
+            self.go_to(found[0] if way == "▶▶" else found[-1])
+
+    def _advance(self) -> None:
+        """Go on through the frames while the video plays; frames are left out where drawing is slower."""
+        while not self._over:
+            with self._changed:
+                self._changed.wait_for(lambda: self._playing or self._over)
+            started, place = time.monotonic(), bisect_left(self._indices, self._wanted)
+            wanted = self._wanted
+            while self._playing and not self._over:
+                time.sleep(0.02)
+                if self._wanted != wanted:  # somebody went elsewhere: on from there
+                    started, place, wanted = (
+                        time.monotonic(),
+                        bisect_left(self._indices, self._wanted),
+                        self._wanted,
+                    )
+                rate = self._rate() * SPEEDS[self._panel.speed.value]
+                reached = min(place + int((time.monotonic() - started) * rate), len(self._indices) - 1)
+                if self._indices[reached] != wanted:
+                    wanted = self._indices[reached]
+                    self.go_to(wanted)
+                if reached == len(self._indices) - 1:
+                    self._playing = False
+                    self._panel.play_or_pause(False)
+
+    def _rate(self) -> float:
+        rates = [run.description.get("fps") for run in self._runs]
+        return next(
+            (float(rate) for rate in rates if isinstance(rate, int | float) and 0 < rate < 1e3), _USUAL_RATE
+        )
+
+    def _draw(self) -> None:
+        """Draw the frame that is wanted; those that were wanted while another was drawn are left out."""
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._again or self._over)
+                if self._over:
+                    return
+                index, self._again = self._wanted, False
+            try:
+                self._draw_frame(self._nearest(index))
+            except Exception as error:  # a damaged file must not end the viewer
+                self._fault = f"<p>Frame {index} cannot be drawn: {html.escape(str(error))}</p>"
+
+    def _draw_frame(self, index: int) -> None:
+        panel = self._panel
+        pictures: dict[FollowedRun, Image] = {}
+        drawn: list[Image] = []
+        for video in self._videos:
+            image = video.images.image(index) if video.images is not None else None
+            fits = image is not None and _fits(image, video.runs[0])
+            picture = draw_picture(image if fits else None, video.runs, index, panel.shown, video.axes)
+            pictures.update(dict.fromkeys(video.runs, picture))
+            drawn.append(picture)
+        with self._server.atomic():
+            panel.picture.image = beside(drawn, [video.name for video in self._videos])
+            for scene, picture in zip(self._scenes, pictures.values(), strict=True):
+                scene.go_to(index, picture[::2, ::2], panel.still.value)
+                scene.show(panel.mesh.value, panel.path.value, panel.landmarks.value)
+            first, last = self._ends()
+            panel.timeline.content = timeline.with_cursor(self._timeline, index, first, last)
+            told = "".join(
+                describe(run, run.frames.get(index), timeline.colour_of(number, len(self._runs)))
+                for number, run in enumerate(self._runs)
+            )
+            panel.told.content = (
+                f'<div class="told" data-frame="{index}" style="font-size:12px;line-height:1.4;margin:4px 12px">'
+                f"frame {index}{told}{self._fault}</div>"
+            )
+        self._shown = index
+
+    def _follow(self) -> None:
+        """Look whether the runs have grown."""
+        drawn, waiting = time.monotonic(), False
+        while not self._over:
+            with self._changed:
+                self._changed.wait_for(lambda: self._over, timeout=POLL)
+            if self._over:
+                return
+            try:
+                news = [run.look_again() for run in self._runs]
+            except Tracking3dError as error:
+                self._fault = f"<p>{html.escape(str(error))}</p>"
+                self._want()
+                continue
+            waiting = waiting or any(news)
+            going_on = any(run.going_on for run in self._runs)
+            if waiting and (time.monotonic() - drawn > _DRAW_ANEW or not going_on):
+                waiting, drawn = False, time.monotonic()
+                self._take_news(draw=True)
+            elif any(news):
+                self._take_news(draw=False)
+
+    def _take_news(self, draw: bool) -> None:
+        self._indices = sorted({index for run in self._runs for index in run.frames})
+        first, last = self._ends()
+        panel = self._panel
+        panel.slider.min, panel.slider.max = first, max(last, first + 1)
+        if any(run.refined for run in self._runs):
+            panel.show_causal()
+        offered = tuple(timeline.quantities(self._runs))
+        if offered != tuple(panel.quantity.options):
+            panel.quantity.options = offered
+        if draw:
+            self._draw_scene()
+            panel.doubts.content = list_streaks(self._runs)
+            panel.about.content = "".join(about(run) for run in self._runs)
+        self._redraw_timeline()
+        if panel.follow.value and self._indices:
+            self.go_to(last)
+        elif self._wanted < first:
+            self.go_to(first)
+
+    def _draw_scene(self) -> None:
+        place, any_landmarks = 0.0, False
+        for scene, run in zip(self._scenes, self._runs, strict=True):
+            scene.draw_again(place)
+            place += 1.2 * scene.distance
+            # Of the state of a run that goes on: the final refinement may scale and turn the object.
+            points = None if run.refined else kept_landmarks(run.folder)
+            scene.draw_landmarks(points)
+            any_landmarks = any_landmarks or points is not None
+        self._panel.landmarks.visible = any_landmarks
+        for video in self._videos:
+            video.axes = [axes_of(run) for run in video.runs]
+
+    def _redraw_timeline(self) -> None:
+        self._timeline = timeline.draw_timeline(self._runs, self._panel.quantity.value, *self._ends())
+        self._want()
+
+    def _ends(self) -> tuple[int, int]:
+        return (self._indices[0], self._indices[-1]) if self._indices else (0, 1)
+
+    def _nearest(self, index: int) -> int:
+        if not self._indices:
+            return index
+        place = bisect_left(self._indices, index)
+        near = self._indices[max(place - 1, 0) : place + 1]
+        return min(near, key=lambda one: abs(one - index))
+
+    def _look_through(self) -> None:
+        record = self._runs[0].frames.get(self._nearest(self._wanted))
+        if record is not None and np.isfinite(record.T_cam_obj).all():
+            T_world_cam = np.eye(4) if self._panel.still.value else np.linalg.inv(record.T_cam_obj)
+            look_through(self._server, T_world_cam, record.through(self._runs[0].camera).fov)
+
+
+def _ignoring_the_event(act: Callable[[], None], event: object) -> None:
+    act()
+
+
+def _fits(image: Image, run: FollowedRun) -> bool:
+    height, width = image.shape[:2]
+    return abs(width / height - run.camera.width / run.camera.height) < 0.01

@@ -1,0 +1,1 @@
+"""Who may talk to the pages that tracking3d serves."""
