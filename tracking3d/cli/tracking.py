@@ -75,7 +75,7 @@ def track(
             opened, listener = ends.enter_context(watched(opened, folder, listener, host, quiet))
         about = {**about, "listener": listener}
         if objects > 1:
-            several = {"boxes": given.boxes, "masks": given.masks, "points": given.points}
+            several: dict[str, Any] = {"boxes": given.boxes, "masks": given.masks, "points": given.points}
             record_objects(opened, settings, folder, **several, **about)
         else:
             box, mask, points = (next(iter(one), None) for one in (given.boxes, given.masks, given.points))
