@@ -9,6 +9,7 @@
     overlay.mp4         the video with outlines and axes
     contact_sheet.png   the run at a glance
     mesh.obj, mesh.mtl, texture.png, mesh.glb, features.npz
+    landmarks.npz       surface and poses as points were followed by, once they were
     causal/             masks and mesh as they were before the final refinement
     .refining/          what the final refinement has made so far, until it has ended
     .state/             what a stopped run goes on from, until it is finished
@@ -40,6 +41,7 @@ MTL = "mesh.mtl"
 TEXTURE = "texture.png"
 GLB = "mesh.glb"
 FEATURES = "features.npz"
+LANDMARKS = "landmarks.npz"
 
 OUT = argument("folder", "--out")
 OVERWRITE = argument("overwrite=True", "--overwrite")
@@ -58,7 +60,8 @@ CONVENTIONS = {
 }
 
 MESH_FILES = (OBJ, MTL, TEXTURE, GLB, FEATURES)
-_FILES = (RUN, FRAMES, OVERLAY, CONTACT_SHEET, *MESH_FILES)
+_OF_MESH = (*MESH_FILES, LANDMARKS)
+_FILES = (RUN, FRAMES, OVERLAY, CONTACT_SHEET, *_OF_MESH)
 _MASK_NAME = re.compile(r"\d{6,}\.png")
 _ARRAY_NAME = re.compile(r"\d{8,}\.npz")
 
@@ -94,7 +97,7 @@ def partial_path(path: Path) -> Path:
 def run_files(folder: Path) -> list[Path]:
     """The files in ``folder`` that bear the names a run writes, unfinished ones included."""
     named = [folder / name for name in _FILES]
-    named += [folder / CAUSAL / name for name in MESH_FILES]
+    named += [folder / CAUSAL / name for name in _OF_MESH]
     named += [folder / REFINING / name for name in (OVERLAY, FRAMES)]
     for masks in (
         folder / MASKS,
