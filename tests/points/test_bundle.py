@@ -12,7 +12,9 @@ INTRINSICS = np.tile([300.0, 310.0, 80.0, 60.0], (9, 1))
 
 def poses(count: int = 9) -> np.ndarray:
     T = np.tile(np.eye(4), (count, 1, 1))
-    T[:, :3, :3] = Rotation.from_euler("y", np.linspace(0, 50, count), degrees=True).as_matrix()
+    T[:, :3, :3] = Rotation.from_rotvec(
+        np.deg2rad(np.linspace(0, 50, count))[:, None] * np.array([0.0, 1.0, 0.0])
+    ).as_matrix()
     T[:, :3, 3] = [0.1, -0.2, 6.0]
     return T
 
@@ -61,6 +63,6 @@ def test_poses_that_are_off_are_put_right_up_to_the_priors():
         POINTS, INTRINSICS, off, measured, np.full((9, 40), 0.1), 0.1, 0.1, 0.1, turns=30
     )
     before, after = (np.abs(projected(p, Ts) - measured).max() for p, Ts in ((POINTS, off), (points, found)))
-    assert before > 5
+    assert before > 2
     assert after < 0.1
     assert np.allclose(found[:, :3, :3] @ found[:, :3, :3].transpose(0, 2, 1), np.eye(3), atol=1e-9)

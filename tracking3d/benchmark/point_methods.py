@@ -47,7 +47,7 @@ def chained_lucas_kanade(frames: Sequence[Grey]) -> PointMethod:
 
 def chained_dense_flow(frames: Sequence[Grey]) -> PointMethod:
     """OpenCV's dense inverse search from frame to frame (Kroeger et al., 2016), with the same check."""
-    search = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     flows: dict[tuple[int, int], NDArray[np.float32]] = {}
 
     def at(a: int, b: int, xy: Array) -> Array:

@@ -64,6 +64,9 @@ def points(
         raise InputError(
             "No point is asked for; give pixels by --xy X,Y, or --grid STEP for all of the object."
         )
+    for file in (csv, video):
+        if file is not None and not file.absolute().parent.is_dir():
+            raise OutputError(f"{file} cannot be written: there is no folder {file.parent}; make it first.")
     reader = RunReader(run, refined=not causal)
     if grid is not None:
         pixels += grid_on_object(reader, frame, grid)

@@ -68,7 +68,7 @@ def align(
     points = np.ascontiguousarray(xy, dtype=np.float64)
     window = _window()
     if not use_numba(backend, torch.empty(0, dtype=torch.float32)):
-        return _align_together(*planes, points, window, prior)
+        return _align_together(planes[0], planes[1], planes[2], points, window, prior)
     from tracking3d.points.kernels.alignment import align as compiled
 
     count = len(points)

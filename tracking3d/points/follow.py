@@ -91,7 +91,7 @@ def follow_points(scene: Scene, start: int, xy: Array) -> Followed:
         slant=view.slant(pixels[on]),
         gap=np.abs(np.array(there) - start),
     )
-    placed = np.ix_(there, on)
+    placed = np.ix_(np.array(there), on)
     scales = np.stack([one.scale.mean() for one in views])[:, None]
     found.positions[placed] = np.stack(
         [one.to_frame(xy) for one, xy in zip(views, predicted + gain[..., None] * left, strict=True)]

@@ -81,7 +81,7 @@ class View:
         """``(N,)`` cosines between the rays of pixels ``(N, 2)`` and the surface; 0 beyond the outline."""
         here = self.surface(xy)
         across = [self.surface(xy + step) - here for step in ((0.5, 0.0), (0.0, 0.5))]
-        normal = np.cross(*across)
+        normal = np.cross(across[0], across[1])
         ray = here + self.T_cam_obj[:3, :3].T @ self.T_cam_obj[:3, 3]
         length = np.linalg.norm(normal, axis=1) * np.linalg.norm(ray, axis=1)
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -185,7 +185,7 @@ def draw(view: View, vertices: Array, faces: NDArray[np.int64], T_cam_obj: Array
         torch.tensor(faces),
         (height, width),
     ).depth[0].numpy()  # fmt: skip
-    covered = np.isfinite(drawn)
+    covered = np.asarray(np.isfinite(drawn))
     if not covered.any():
         nothing = np.zeros((height, width), np.float32)
         return replace(view, inverse_depth=nothing, beyond=nothing + np.float32(height + width))

@@ -61,7 +61,7 @@ class RunScene:
         start = next(row for row, one in enumerate(records) if one is asked)
         inside = in_frame(self.run.camera, query)
         found = follow_points(self.scene, start, np.where(inside[:, None], query, np.nan))
-        on_object = np.isfinite(found.points).all(1)
+        on_object = np.asarray(np.isfinite(found.points).all(1))
         face, barycentric = np.full(len(query), -1), np.full((len(query), 3), np.nan)
         if (view := self.scene.views[start]) is not None and on_object.any():
             face[on_object], barycentric[on_object] = surface_under(

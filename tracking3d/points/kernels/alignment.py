@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from math import sqrt
+from typing import Any
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from tracking3d.rendering.kernels.compilation import OPTIONS, REORDER, kernel
 
 
 @numba.njit(inline="always", fastmath=REORDER, **OPTIONS)
-def _between(plane, x, y):
+def _between(plane: NDArray[Any], x: float, y: float) -> Any:
     height, width = plane.shape
     x = min(max(x, 0.0), width - 1.001)
     y = min(max(y, 0.0), height - 1.001)
@@ -28,8 +30,19 @@ def _between(plane, x, y):
     fastmath=REORDER,
 )
 def align(
-    template, weight, image, xy, window, prior, noise, least_cover, steps, shift, covariance, agreement
-):
+    template: NDArray[Any],
+    weight: NDArray[Any],
+    image: NDArray[Any],
+    xy: NDArray[Any],
+    window: NDArray[Any],
+    prior: float,
+    noise: float,
+    least_cover: float,
+    steps: int,
+    shift: NDArray[Any],
+    covariance: NDArray[Any],
+    agreement: NDArray[Any],
+) -> None:
     """Fill ``shift`` (N, 2), ``covariance`` (N, 3) as xx, xy, yy, and ``agreement`` (N, 2): correlation, and
     contrast of the template."""
     side = window.shape[0]
