@@ -84,11 +84,8 @@ def refine_scene(
 def _refine_once(scene: Scene) -> Scene:
     there = [index for index, view in enumerate(scene.views) if view is not None]
     warps = scene.warps()
-    starts = (
-        [there[at] for at in np.unique(np.linspace(0, len(there) - 1, START_VIEWS).round().astype(int))]
-        if there
-        else []
-    )
+    spread = np.unique(np.linspace(0, max(len(there) - 1, 0), START_VIEWS).round().astype(int))
+    starts = [there[at] for at in spread if at < len(there)]
     found = [
         (face, barycentric, follow_chain(warps, start, xy))
         for start in starts

@@ -112,7 +112,7 @@ class View:
 
 def sample(plane: Plane, xy: Array) -> Plane:
     """``(N,)`` values of ``(h, w)`` between pixels; 0 where a pixel is not finite."""
-    finite = np.isfinite(xy).all(1)
+    finite = np.asarray(np.isfinite(xy).all(1))
     at = np.where(finite[:, None], xy, 0).astype(np.float32)
     if not len(at):
         return np.zeros(0, np.float32)
