@@ -17,7 +17,7 @@ SHARED_BY_SOLVERS = {"evidence"}
 FLOORS = [
     {"errors", "frames", "geometry", "config", "features", "networks", "process_memory", "stages", "web"},
     {"rendering", "trackers", "video"},
-    {"corrections", "estimation", "plugins", "point_prompts", "prompts", "testing"},
+    {"corrections", "estimation", "plugins", "point_prompts", "points", "prompts", "testing"},
     {
         "arguments",
         "checkpoint",
@@ -97,6 +97,12 @@ def test_geometry_and_rendering_know_nothing_of_video_or_tracking(room):
     allowed = {"geometry", "rendering", "errors"}
     for path in (PACKAGE / room).rglob("*.py"):
         assert {name.split(".")[1] for name in imported_modules(path)} <= allowed, path
+
+
+def test_points_are_followed_by_surface_and_images_alone():
+    for path in (PACKAGE / "points").rglob("*.py"):
+        rooms = {name.split(".")[1] for name in imported_modules(path)}
+        assert rooms <= {"errors", "geometry", "points", "rendering"}, path
 
 
 def test_the_solvers_are_tenants_that_never_import_each_other():

@@ -224,11 +224,32 @@ def test_points_are_followed_as_csv_and_json(call, finished):
     assert list(csv.DictReader(io.StringIO(Path("points.csv").read_text()))) == rows
 
 
+def test_points_of_a_grid_are_drawn_and_need_no_video_by_mesh(call, finished):
+    result = call("points", finished, "--grid", 8, "--frame", 2, "--video", "trails.mp4", "--quiet")
+    assert (result.exit_code, result.stdout) == (0, "")
+    assert Path("trails.mp4").stat().st_size > 1000
+    by_mesh = call("points", finished, "--grid", 8, "--by-mesh").stdout
+    assert {row["measured"] for row in csv.DictReader(io.StringIO(by_mesh))} == {"0"}
+
+
+def test_points_without_their_video_are_carried_by_the_mesh_and_that_is_said(call, finished):
+    run_json = finished / "run.json"
+    run_json.write_text(run_json.read_text().replace('"source": "', '"source": "gone/'))
+    result = call("points", finished, "--xy", "31,23")
+    assert "mesh and pose alone" in result.stderr
+    assert "--source" in result.stderr
+    assert len(result.stdout.splitlines()) == 6
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         ("points absent --xy 1,1", "absent"),
         ("points run", "--xy"),
+        ("points run --grid 0", "--grid"),
+        ("points run --grid 500", "smaller --grid"),
+        ("points run --xy 31,23 --source absent", "--source"),
+        ("points run --xy 31,23 --video run/no/trails.mp4", "run/no/trails.mp4"),
         ("points run --xy 1", "--xy '1' is not 2 numbers"),
         ("points run --xy a,b", "--xy 'a,b' is not 2 numbers"),
         ("points run --xy nan,1", "--xy 'nan,1' is not 2 numbers"),

@@ -257,5 +257,17 @@ def test_tracks_are_written_as_json_and_csv(tmp_path):
         "y": "62.000",
         "visible": "1",
         "on_object": "1",
+        "uncertainty": "",
+        "measured": "0",
+        "X": f"{tracks.points[0, 0]:.5f}",
+        "Y": f"{tracks.points[0, 1]:.5f}",
+        "Z": f"{tracks.points[0, 2]:.5f}",
     }
-    assert rows[1] == {"frame": "10", "point": "1", "x": "", "y": "", "visible": "0", "on_object": "0"}
+    unknown = ("x", "y", "uncertainty", "X", "Y", "Z")
+    assert rows[1] == {
+        "frame": "10",
+        "point": "1",
+        "visible": "0",
+        "on_object": "0",
+        "measured": "0",
+    } | dict.fromkeys(unknown, "")

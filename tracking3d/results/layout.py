@@ -11,6 +11,7 @@
     report.html         the run to look at, in one file
     turntable.mp4       the model, turned once around
     mesh.obj, mesh.mtl, texture.png, mesh.glb, features.npz
+    landmarks.npz       surface and poses as points were followed by, once they were
     causal/             masks and mesh as they were before the final refinement
     .refining/          what the final refinement has made so far, until it has ended
     .state/             what a stopped run goes on from, until it is finished
@@ -46,6 +47,7 @@ MTL = "mesh.mtl"
 TEXTURE = "texture.png"
 GLB = "mesh.glb"
 FEATURES = "features.npz"
+LANDMARKS = "landmarks.npz"
 
 OUT = argument("folder", "--out")
 OVERWRITE = argument("overwrite=True", "--overwrite")
@@ -64,7 +66,8 @@ CONVENTIONS = {
 }
 
 MESH_FILES = (OBJ, MTL, TEXTURE, GLB, FEATURES)
-_FILES = (RUN, FRAMES, OVERLAY, CONTACT_SHEET, REPORT, TURNTABLE, *MESH_FILES)
+_OF_MESH = (*MESH_FILES, LANDMARKS)
+_FILES = (RUN, FRAMES, OVERLAY, CONTACT_SHEET, REPORT, TURNTABLE, *_OF_MESH)
 _MASK_NAME = re.compile(r"\d{6,}\.png")
 _ARRAY_NAME = re.compile(r"\d{8,}\.npz")
 
@@ -114,7 +117,7 @@ def partial_path(path: Path) -> Path:
 def run_files(folder: Path) -> list[Path]:
     """The files in ``folder`` that bear the names a run writes, unfinished ones included."""
     named = [folder / name for name in _FILES]
-    named += [folder / CAUSAL / name for name in MESH_FILES]
+    named += [folder / CAUSAL / name for name in _OF_MESH]
     named += [folder / REFINING / name for name in (OVERLAY, FRAMES)]
     for masks in (
         folder / MASKS,

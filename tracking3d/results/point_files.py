@@ -15,14 +15,27 @@ def points_to_json(tracks: PointTracks) -> str:
     return json.dumps(jsonable(vars(tracks)), allow_nan=False)
 
 
+COLUMNS = ["frame", "point", "x", "y", "visible", "on_object", "uncertainty", "measured", "X", "Y", "Z"]
+
+
 def points_to_csv(tracks: PointTracks) -> str:
-    """One row a frame and point: ``frame, point, x, y, visible, on_object``; x and y empty where unknown."""
+    """One row a frame and point, with the columns `COLUMNS`.
+
+    x, y and uncertainty are pixels, X, Y and Z object coordinates; empty where they are unknown.
+    """
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
-    table.writerow(["frame", "point", "x", "y", "visible", "on_object"])
+    table.writerow(COLUMNS)
+    places = [[_number(value, 5) for value in point] for point in tracks.points]
     for row, frame in enumerate(tracks.frames):
         for point, (x, y) in enumerate(tracks.positions[row]):
-            place = [f"{x:.3f}", f"{y:.3f}"] if x == x else ["", ""]
             flags = [int(tracks.visible[row, point]), int(tracks.on_object[point])]
-            table.writerow([int(frame), point, *place, *flags])
+            unsure = _number(tracks.uncertainty[row, point], 3)
+            place = [_number(x, 3), _number(y, 3)]
+            measured = int(tracks.measured[row, point])
+            table.writerow([int(frame), point, *place, *flags, unsure, measured, *places[point]])
     return text.getvalue()
+
+
+def _number(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if value == value else ""

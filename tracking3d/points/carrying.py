@@ -1,0 +1,101 @@
+"""Points of one view carried into another one by surface and poses, and corrected there by the image.
+
+What the one view shows is warped into the other through the surface, so that it has the right turn and size there; how
+far the image lies beside it is the correction.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.points.alignment import NOISE, align
+from tracking3d.points.view import REACH, Array, Plane, View
+
+LEAST_AGREEMENT = 0.7
+"""Correlation of a patch with its template from which a correction is believed."""
+_TELLS = 2 * NOISE  # contrast of a template that can be told from something else
+_FLOOR = 0.05  # deviation in pixels of the best alignments: interpolation, shading
+_BEYOND = REACH / 2  # pixels around the surface onto which an image is warped
+
+
+@dataclass(frozen=True, eq=False)
+class Carried:
+    """N points in a further view.
+
+    Attributes:
+        predicted: ``(N, 2)`` pixels by surface and poses; NaN where there is no surface.
+        measured: ``(N, 2)`` pixels, where the image says they are; NaN where it says nothing.
+        variance: ``(N,)`` squared pixels that the step adds to x and to y; infinite where nothing was measured.
+        likeness: ``(N,)`` correlation with the template, 1 where that is too plain to tell; -1 where there was none.
+    """
+
+    predicted: Array
+    measured: Array
+    variance: Array
+    likeness: Array
+
+
+class Warps:
+    """Views warped into one another, each pair once.
+
+    Args:
+        views: In any order; None where there is none.
+        tolerance: How far behind a drawn surface a point may lie and be seen, in object units.
+    """
+
+    def __init__(self, views: list[View | None], tolerance: float) -> None:
+        self.views, self.tolerance = views, tolerance
+        self._warped: dict[tuple[int, int], tuple[Plane, Plane]] = {}
+        self._pixels: dict[int, tuple[NDArray[np.bool_], Array]] = {}
+
+    def carry(self, source: int, target: int, xy: Array, backend: str = "auto") -> Carried:
+        """Carry pixels ``xy`` ``(N, 2)`` of view ``source`` into view ``target``."""
+        start, end = self.views[source], self.views[target]
+        if start is None or end is None:
+            nothing = np.full(xy.shape, np.nan)
+            return Carried(nothing, nothing, np.full(len(xy), np.inf), np.full(len(xy), -1.0))
+        predicted, seen = end.sees(start.surface(xy), self.tolerance)
+        warped, known = self._warp(source, target)
+        found = align(warped, known, end.image, np.where(seen[:, None], predicted, np.nan), backend=backend)
+        good = found.agreement > LEAST_AGREEMENT
+        return Carried(
+            predicted,
+            np.where(good[:, None], predicted + found.shift, np.nan),
+            np.where(good, found.variance + _FLOOR**2, np.inf),
+            np.where(found.contrast > _TELLS, found.agreement, np.sign(found.contrast) * 2 - 1),
+        )
+
+    def _warp(self, source: int, target: int) -> tuple[Plane, Plane]:
+        """The image of ``source`` as ``target`` would see it, and where it is known."""
+        if (source, target) not in self._warped:
+            start = self.views[source]
+            assert start is not None
+            near, points = self._surface_pixels(target)
+            xy, depth = start.project(points)
+            maps = np.full((2, *near.shape), -1e4, np.float32)
+            maps[:, near] = np.nan_to_num(xy.T, nan=-1e4)
+            behind = np.full(near.shape, np.inf, np.float32)
+            behind[near] = depth
+            image, mask, inverse = (
+                cv2.remap(plane, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+                for plane in (start.image, start.mask, start.inverse_depth)
+            )
+            with np.errstate(divide="ignore", invalid="ignore"):
+                seen = (inverse > 0) & (behind < 1 / inverse + self.tolerance)
+            self._warped[source, target] = image, np.where(seen, mask, 0).astype(np.float32)
+        return self._warped[source, target]
+
+    def _surface_pixels(self, index: int) -> tuple[NDArray[np.bool_], Array]:
+        """``(h, w)`` pixels on or near the surface of a view, and ``(P, 3)`` the points under them."""
+        if index not in self._pixels:
+            view = self.views[index]
+            assert view is not None
+            near = (view.beyond < _BEYOND) & (view.inverse_depth > 0)
+            rows, columns = np.nonzero(near)
+            points = view.back_project(np.stack([columns, rows], 1).astype(float), view.inverse_depth[near])
+            self._pixels[index] = near, points
+        return self._pixels[index]

@@ -1,0 +1,116 @@
+"""Where points of one view are in all views: predicted by surface and poses, corrected by the images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.points.bundle import intersect
+from tracking3d.points.chain import follow_chain
+from tracking3d.points.landmarks import Scene
+from tracking3d.points.uncertainty import FEATURES, Evidence, expected_error, features
+from tracking3d.points.view import Array, View, sample
+
+_RIM = 3.0  # pixels beside the drawn surface that are still on its rim
+_HELD = 0.06  # deviation in radii of a point's way off the surface
+_DEVIATION = 0.03  # pixels that the best measurement is off
+_BELIEVED = 0.25  # share of its full weight from which a measurement counts
+_LEAST_DEVIATION = 0.1  # pixels that a prediction is off at best
+_SEEN = 0.02  # radii behind the drawn surface at which a point is seen
+_UNLIKE = 0.2  # likeness below which something else is in front
+
+
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """N points in T views, in pixels of the frames.
+
+    Attributes:
+        positions: ``(T, N, 2)``; NaN for points beside the object, and where there is no view.
+        visible: ``(T, N)`` bool.
+        uncertainty: ``(T, N)`` pixels within twice which a position is right in some 19 of 20 cases; NaN where there is
+            no position.
+        measured: ``(T, N)`` bool: whether the image had a say.
+        points: ``(N, 3)`` in object coordinates; NaN for points beside the object.
+        features: ``(T, N, F)`` what the uncertainty was told from, see `tracking3d.points.uncertainty.features`; NaN
+            where there is no position.
+    """
+
+    positions: Array
+    visible: NDArray[np.bool_]
+    uncertainty: Array
+    measured: NDArray[np.bool_]
+    points: Array
+    features: Array
+
+
+def follow_points(scene: Scene, start: int, xy: Array) -> Followed:
+    """Follow pixels of one view through all of them.
+
+    Args:
+        scene: The surface in its views; see `tracking3d.points.landmarks.refine_scene`.
+        start: Index of the view that the pixels are in.
+        xy: ``(N, 2)`` pixels of its frame; those up to a few pixels beside the surface count as on its rim.
+    """
+    count, whole = len(xy), len(scene.views)
+    found = Followed(
+        np.full((whole, count, 2), np.nan),
+        np.zeros((whole, count), bool),
+        np.full((whole, count), np.nan),
+        np.zeros((whole, count), bool),
+        np.full((count, 3), np.nan),
+        np.full((whole, count, FEATURES), np.nan),
+    )
+    view = scene.views[start]
+    if view is None:
+        return found
+    pixels = view.to_window(xy)
+    points = view.surface(pixels)
+    on = np.flatnonzero(np.isfinite(points).all(1) & (sample(view.beyond, pixels) < _RIM))
+    if not len(on):
+        return found
+    chain = follow_chain(scene.warps(), start, pixels[on])
+    there = [index for index, one in enumerate(scene.views) if one is not None]
+    views = [one for one in scene.views if one is not None]
+    variance, measured = chain.variance[there], chain.measured[there]
+    moved, share = _landmarks(views, points[on], measured, variance, _HELD * scene.radius)
+    predicted, seen = (
+        np.stack(part) for part in zip(*(one.sees(moved, _SEEN * scene.radius) for one in views), strict=True)
+    )
+    believed = (share > _BELIEVED) & np.isfinite(predicted).all(2)
+    left = np.where(believed[..., None], measured - predicted, 0.0)
+    spread = (left**2).sum((0, 2)) / 2 / np.maximum(believed.sum(0), 1)
+    own = np.maximum(spread, _LEAST_DEVIATION**2)
+    gain = np.where(believed, own / (own + np.where(believed, variance, 1.0)), 0.0)
+    unlike = (chain.likeness[there] > -1) & (chain.likeness[there] < _UNLIKE)
+    evidence = Evidence(
+        variance=np.where(believed, variance, np.inf),
+        spread=spread,
+        views=believed.sum(0),
+        slant=view.slant(pixels[on]),
+        gap=np.abs(np.array(there) - start),
+    )
+    placed = np.ix_(np.array(there), on)
+    scales = np.stack([one.scale.mean() for one in views])[:, None]
+    found.positions[placed] = np.stack(
+        [one.to_frame(xy) for one, xy in zip(views, predicted + gain[..., None] * left, strict=True)]
+    )
+    found.visible[placed] = seen & ~unlike
+    found.uncertainty[placed] = expected_error(evidence) / scales
+    found.measured[placed] = believed
+    found.features[placed] = features(evidence)
+    found.points[on] = moved
+    found.positions[start, on], found.visible[start, on] = xy[on], True
+    return found
+
+
+def _landmarks(
+    views: list[View], points: Array, measured: Array, variance: Array, held: float
+) -> tuple[Array, Array]:
+    """Points moved to where all views see them, and the share of its weight that each measurement kept."""
+    deviation = np.sqrt(variance + _DEVIATION**2)
+    intrinsics, poses = np.stack([v.intrinsics for v in views]), np.stack([v.T_cam_obj for v in views])
+    moved, weight = intersect(points, intrinsics, poses, measured, deviation, held)
+    with np.errstate(invalid="ignore"):
+        return moved, np.where(np.isfinite(deviation), weight * deviation**2, 0.0)

@@ -1,0 +1,201 @@
+"""Points of a run followed with the help of its video; see `tracking3d.points`.
+
+Surface and poses that the video has put right are kept in the run folder, so that they are found once.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tracking3d.errors import InputError, OutputError
+from tracking3d.estimation.estimate import Status
+from tracking3d.frames import Frame, Image
+from tracking3d.points.follow import follow_points
+from tracking3d.points.landmarks import ROUNDS, Scene, refine_scene
+from tracking3d.points.meeting import surface_under
+from tracking3d.points.view import View, open_view
+from tracking3d.results import layout
+from tracking3d.results.correspondences import PointTracks, as_points, in_frame, tracked_record
+from tracking3d.results.files import write_atomic
+from tracking3d.results.records import FrameRecord
+from tracking3d.results.run_reader import RunReader
+from tracking3d.video import FrameSource, open_source
+
+_VERSION = 1  # of what is kept; another one is found anew
+
+
+@dataclass(frozen=True, eq=False)
+class RunScene:
+    """A run with the views of its frames.
+
+    Attributes:
+        run: The run.
+        scene: Its surface in the frames, in their order.
+    """
+
+    run: RunReader
+    scene: Scene
+
+    def track(self, frame: int, xy: ArrayLike) -> PointTracks:
+        """Follow pixels of one frame through the whole run: predicted by surface and poses, corrected by the images.
+
+        Args:
+            frame: Index of the frame that ``xy`` is in.
+            xy: ``(N, 2)`` pixels; (0, 0) is the centre of the top-left pixel. Those that lie a few pixels beside the
+                surface count as on its rim; their ``face`` is -1.
+
+        Raises:
+            InputError: If the run has no such frame, the object was lost there, or ``xy`` are no points.
+        """
+        query = as_points(xy)
+        asked = tracked_record(self.run, frame)
+        records = self.run.frames
+        start = next(row for row, one in enumerate(records) if one is asked)
+        inside = in_frame(self.run.camera, query)
+        found = follow_points(self.scene, start, np.where(inside[:, None], query, np.nan))
+        on_object = np.asarray(np.isfinite(found.points).all(1))
+        face, barycentric = np.full(len(query), -1), np.full((len(query), 3), np.nan)
+        if (view := self.scene.views[start]) is not None and on_object.any():
+            face[on_object], barycentric[on_object] = surface_under(
+                *view.project(self.scene.vertices), self.scene.faces, view.to_window(query[on_object])
+            )
+        lost = np.array([one.status == Status.LOST or one.area == 0 for one in records])
+        return PointTracks(
+            frame,
+            query,
+            np.array([one.index for one in records], dtype=np.int64),
+            found.positions,
+            found.visible & ~lost[:, None],
+            on_object,
+            face,
+            barycentric,
+            found.points,
+            found.uncertainty,
+            found.measured,
+        )
+
+
+def open_run_source(run: RunReader, source: str | Path | None = None) -> FrameSource:
+    """The video that a run was made on.
+
+    Args:
+        run: The run.
+        source: Where it lies now; as the run has it if left out.
+
+    Raises:
+        InputError: If it is not there.
+    """
+    named = source if source is not None else run.description.get("source")
+    if not isinstance(named, str | Path) or not str(named) or str(named).isdigit():
+        raise InputError(
+            f"The run {run.folder} does not name a video that can be read again; give it by --source."
+        )
+    try:
+        return open_source(named, run.description.get("selection"))
+    except InputError as error:
+        raise InputError(
+            f"The video of the run {run.folder} cannot be read ({str(error).rstrip('.')}); say by --source where it is."
+        ) from error
+
+
+def open_scene(
+    run: RunReader | Path,
+    source: FrameSource | None = None,
+    rounds: int = ROUNDS,
+    after_round: Callable[[int], None] = lambda done: None,
+) -> RunScene:
+    """Read the frames of a run and put its surface and poses right by them.
+
+    What is found is written to ``landmarks.npz`` beside the mesh, and taken from there the next time. Where the folder
+    cannot be written it is found anew each time.
+
+    Args:
+        run: A run with a mesh.
+        source: Its frames; those that the run names if left out.
+        rounds: See `refine_scene`; 0 leaves surface and poses as the run has them, and nothing is kept.
+        after_round: See `refine_scene`.
+
+    Raises:
+        InputError: If the run has no mesh, or its frames cannot be read or are of another size.
+    """
+    run = run if isinstance(run, RunReader) else RunReader(run)
+    mesh = run.mesh()
+    # An OBJ may hold a vertex once for each texture coordinate; to move, a surface must hang together.
+    vertices, merged = np.unique(np.asarray(mesh.vertices).round(9), axis=0, return_inverse=True)
+    faces = merged.reshape(-1)[np.asarray(mesh.faces)]
+    images: dict[int, View | None] = {}
+    records = {one.index: one for one in run.frames}
+    for frame in source if source is not None else open_run_source(run):
+        if isinstance(frame, Frame) and (record := records.get(frame.index)) is not None:
+            images[frame.index] = _view(run, record, frame.image, vertices, faces)
+    if not images:
+        raise InputError(
+            f"The video has no frame of the run {run.folder}; say by --source which one it was made on."
+        )
+    scene = Scene([images.get(one.index) for one in run.frames], vertices, faces)
+    if not rounds:
+        return RunScene(run, scene)
+    file = run.mesh_folder / layout.LANDMARKS
+    key = _key(run, vertices, rounds)
+    if (kept := _read(file, key, scene)) is not None:
+        return RunScene(run, kept)
+    scene = refine_scene(scene, rounds, after_round)
+    _write(file, key, scene)
+    return RunScene(run, scene)
+
+
+def _view(
+    run: RunReader,
+    record: FrameRecord,
+    image: Image,
+    vertices: NDArray[np.float64],
+    faces: NDArray[np.int64],
+) -> View | None:
+    camera = run.camera_of(record)
+    if image.shape[:2] != (camera.height, camera.width):
+        raise InputError(
+            f"Frame {record.index} of the video has {image.shape[1]} x {image.shape[0]} pixels, the run {run.folder} "
+            f"{camera.width} x {camera.height}; say by --source which video it was made on."
+        )
+    if record.status == Status.LOST:
+        return None
+    return open_view(image, run.mask(record.index), camera, record.T_cam_obj, vertices, faces)
+
+
+def _key(run: RunReader, vertices: NDArray[np.float64], rounds: int) -> str:
+    """What the refined scene depends on."""
+    parts = [vertices.tobytes(), *(one.T_cam_obj.tobytes() for one in run.frames)]
+    return f"{_VERSION} {rounds} {hashlib.sha256(b''.join(parts)).hexdigest()}"
+
+
+def _read(file: Path, key: str, scene: Scene) -> Scene | None:
+    """The scene with surface and poses as they were kept, if they are of the same run."""
+    try:
+        with np.load(file, allow_pickle=False) as kept:
+            if str(kept["key"]) != key:
+                return None
+            vertices, T = kept["vertices"], kept["T_cam_obj"]
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
+    if vertices.shape != scene.vertices.shape or T.shape != (len(scene.views), 4, 4):
+        return None
+    return scene.redrawn(vertices, dict(enumerate(T)))
+
+
+def _write(file: Path, key: str, scene: Scene) -> None:
+    nowhere = np.full((4, 4), np.nan)
+    T = np.stack([nowhere if view is None else view.T_cam_obj for view in scene.views])
+    data = io.BytesIO()
+    np.savez_compressed(data, key=np.array(key), vertices=scene.vertices, T_cam_obj=T)
+    try:
+        write_atomic(file, data.getvalue())
+    except OutputError:
+        return  # a folder that is only read
