@@ -9,7 +9,7 @@ import typer
 
 from tracking3d.cli.evaluate.options import Data, Jobs, Masks, Out, Sequences, name_of_settings
 from tracking3d.cli.fresh import Count, Meshes, drawn_suite
-from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quiet, configure
+from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quality, Quiet, configure
 
 
 def suite(
@@ -32,6 +32,7 @@ def suite(
     label: Annotated[str | None, typer.Option(help="What tables call the results.")] = None,
     config: ConfigFile = None,
     preset: Preset = None,
+    quality: Quality = None,
     overrides: Overrides = None,
     jobs: Jobs = 1,
     out: Out = Path("benchmark"),
@@ -53,8 +54,8 @@ def suite(
 
     check_masks(masks)
     name, specs = drawn_suite(name, seed, count, meshes)
-    settings = configure(config, preset, overrides)
-    called = label or name_of_settings(config, preset, overrides, masks)
+    settings = configure(config, preset, overrides, quality)
+    called = label or name_of_settings(config, quality or preset, overrides, masks)
     variant = Variant(label=called, config=settings, masks=masks)
     with making_progress(quiet) as made:
         dataset = open_dataset(name, data, out, jobs, made, specs).only(sequences or [])
