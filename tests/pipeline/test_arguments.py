@@ -125,7 +125,7 @@ def test_a_wrong_configuration_is_refused_when_track_is_called(wrong, sentence):
 
 @pytest.mark.parametrize("prompt", [{}, {"box": BOX, "mask": MASK}], ids=["neither", "both"])
 def test_either_a_box_or_a_mask_is_asked_for_by_their_names(config, prompt):
-    with pytest.raises(InputError, match=r"either a box or a mask .*: box= or mask=\.$"):
+    with pytest.raises(InputError, match=r"either a box or a mask .*: box=, mask= or points=\.$"):
         track([IMAGE], config=config, **prompt)
 
 
@@ -133,7 +133,7 @@ def test_objects_are_asked_for_by_lists(config):
     for boxes in (None, "box", 5):
         with pytest.raises(InputError, match=r"^boxes=.*; give a list with one for each object"):
             track_objects([IMAGE], boxes=boxes, config=config)
-    with pytest.raises(InputError, match=r"boxes or masks .*: boxes= or masks=\.$"):
+    with pytest.raises(InputError, match=r"boxes or masks .*: boxes=, masks= or points=\.$"):
         track_objects([IMAGE], config=config)
 
 
@@ -153,7 +153,7 @@ def test_what_only_the_first_frame_can_tell_is_told_by_its_argument(config):
         ({"config": {}}, r"^config= is a dict; "),
         ({"folder": None}, r"^folder= is None; "),
         ({"box": (1, 2)}, r"^box=\(1, 2\) is not four numbers"),
-        ({"box": None}, r": box= or mask=\.$"),
+        ({"box": None}, r": box=, mask= or points=\.$"),
         ({"box": None, "mask": "mask.png"}, r"^mask='mask.png' is text"),
         ({"box": None, "mask": Path("nowhere.png")}, r"^mask=nowhere.png does not exist"),
         ({"box": (500, 500, 5, 5)}, r"^box=500,500,5,5 lies outside"),
