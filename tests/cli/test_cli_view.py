@@ -132,7 +132,8 @@ def test_run_without_an_object_picks_where_a_person_is_there(call, clip, script,
     monkeypatch.setattr(pick_module, "picked_in_browser", picked)
     assert call("run", clip, "--tracker", "csrt", "--out", "run").exit_code == 0
     assert asked == [(str(clip), None, "csrt", Path("run"))]
-    assert [frame.index for frame in RunReader(Path("run")).frames] == [2, 3, 4]
+    assert [frame.index for frame in RunReader(Path("run")).frames] == [0, 1, 2, 3, 4]
+    assert RunReader(Path("run")).description["given"]["first_frame"] == 2
     assert script.built[0][1].box == (20, 10, 20, 20)
 
 
@@ -141,7 +142,7 @@ def test_who_wants_no_conversation_gets_the_sentence(refused, clip, terminal, op
     assert "Say what the object is" in refused("run", clip, *options)
 
 
-def test_pick_starts_the_run_from_the_frame_that_was_picked_in(call, clip, script, monkeypatch):
+def test_pick_starts_the_run_both_ways_from_the_frame_that_was_picked_in(call, clip, script, monkeypatch):
     masks = np.zeros((2, 48, 64), bool)
     masks[:, 10:20, 30:50] = True
     monkeypatch.setattr(
@@ -151,8 +152,9 @@ def test_pick_starts_the_run_from_the_frame_that_was_picked_in(call, clip, scrip
     assert result.exit_code == 0, result.output
     for number in (0, 1):
         reader = RunReader(Path("run", f"object_{number}"))
-        assert [frame.index for frame in reader.frames] == [1, 2, 3]
-        assert reader.description["selection"] == "1:4"
+        assert [frame.index for frame in reader.frames] == [0, 1, 2, 3]
+        assert reader.description["selection"] == "0:4"
+        assert reader.description["given"]["first_frame"] == 1
 
 
 def test_pick_refuses_a_folder_with_a_run_before_anything_is_drawn(call, refused, clip, script):

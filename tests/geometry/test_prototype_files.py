@@ -115,7 +115,7 @@ def test_scanned_household_objects_can_be_prototypes(shared_data, clip):
         ("line.obj", b"v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "without area"),
         ("point.obj", b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "at one point"),
         ("nan.obj", b"v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n", "not finite"),
-        ("not_text.obj", b"v 0 0 0\nv 1 0 0\xff\xfe\n", r"cannot be read as a mesh \(its text is damaged\)"),
+        ("not_text.obj", b"v 0 0 0\nv 1 0 0\xff\xfe\n", r"cannot be read as a mesh \("),
         ("beyond.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "no triangles|cannot be read"),
     ],
 )

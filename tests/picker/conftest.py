@@ -45,9 +45,7 @@ def picker(session, tmp_path):
 
     def save(picked):
         save_picked(picked, session.config, folder, session.source)
-        return command_of(picked, folder, session.source, range(0, 2**63 - 1)), settings_as_yaml(
-            session.config
-        )
+        return command_of(picked, folder, session.source, None), settings_as_yaml(session.config)
 
     picker = Picker(session, save, Access(), 0)
     yield picker

@@ -89,7 +89,7 @@ def test_saving_writes_the_files_and_starting_hands_over_what_was_picked(picker,
     told = body(post(picker, "/start", {"objects": [{**BOX, "frame": 3}, {**POINTS, "frame": 3}]}))
     picked = picker.wait()
     assert (picked.frame, len(picked.masks), picked.boxes) == (3, 2, [])
-    assert (tmp_path / "out" / "picked" / "object_1.png").is_file() and "--frames 3:" in told["command"]
+    assert (tmp_path / "out" / "picked" / "object_1.png").is_file() and "--start-frame 3" in told["command"]
 
 
 @pytest.mark.parametrize(
