@@ -1,4 +1,4 @@
-"""From what was drawn to a mask. Where prompts by points are made into masks elsewhere, `drawn_mask` is the seam."""
+"""From what was drawn to a mask."""
 
 from __future__ import annotations
 
@@ -6,23 +6,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.frames import Image
+from tracking3d.frames import Box, Image
 from tracking3d.picker.drawing import DrawnObject
 from tracking3d.trackers.crops import clip_box
 from tracking3d.trackers.first_mask import mask_in_box
+from tracking3d.trackers.mask_from_points import mask_from_points
 
 _SIZE = 320  # longer side in pixels at which colours are compared
 _SEED = 0.012  # radius around a point that is certain, as a share of the longer side
-_REACH = (
-    0.22  # of the longer side: how far from the points, at first, the object may reach where no box says it
-)
 _LEAST_CONTRAST = 2.0
 
 
 def drawn_mask(image: Image, drawn: DrawnObject) -> NDArray[np.bool_] | None:
     """The mask ``(H, W)`` of what was drawn; None where nothing was, or only a box, which a tracker takes as it is.
 
-    Points decide by colour (GrabCut, Rother et al. 2004, with the points as what is known); paint is what it says.
+    Points alone make the mask that they make as a prompt (`mask_from_points`); in a box they decide by colour (GrabCut,
+    Rother et al. 2004, with the points as what is known). Paint is what it says.
 
     Args:
         image: ``(H, W, 3)`` uint8 RGB.
@@ -31,7 +30,9 @@ def drawn_mask(image: Image, drawn: DrawnObject) -> NDArray[np.bool_] | None:
     if drawn.only_a_box:
         return None
     mask = np.zeros(image.shape[:2], np.uint8)
-    if drawn.points:
+    if drawn.points and drawn.box is not None:
+        mask = _in_box(image, drawn, drawn.box)
+    elif drawn.points:
         mask = _of_points(image, drawn)
     elif drawn.box is not None:
         mask = (mask_in_box(image, drawn.box) >= 0.5).astype(np.uint8)
@@ -45,6 +46,18 @@ def drawn_mask(image: Image, drawn: DrawnObject) -> NDArray[np.bool_] | None:
 
 
 def _of_points(image: Image, drawn: DrawnObject) -> NDArray[np.uint8]:
+    """The object by points alone, of those inside the image; nothing where none of them is on it."""
+    height, width = image.shape[:2]
+    points = [
+        (one.x, one.y, one.on) for one in drawn.points if 0 <= one.x <= width - 1 and 0 <= one.y <= height - 1
+    ]
+    if not any(on for _, _, on in points):
+        return np.zeros((height, width), np.uint8)
+    return (mask_from_points(image, np.array(points, np.float32)) >= 0.5).astype(np.uint8)
+
+
+def _in_box(image: Image, drawn: DrawnObject, box: Box) -> NDArray[np.uint8]:
+    """The object in a box, by points on it and beside it."""
     height, width = image.shape[:2]
     scale = _SIZE / max(height, width)
     small = cv2.resize(
@@ -53,9 +66,11 @@ def _of_points(image: Image, drawn: DrawnObject) -> NDArray[np.uint8]:
     on = [(point.x * scale, point.y * scale) for point in drawn.points if point.on]
     beside = [(point.x * scale, point.y * scale) for point in drawn.points if not point.on]
     labels = np.full(small.shape[:2], cv2.GC_BGD, np.uint8)
-    labels[_candidates(small.shape[:2], drawn, on, scale)] = cv2.GC_PR_FGD
-    if not (labels == cv2.GC_PR_FGD).any():
+    inside = clip_box((box[0] * scale, box[1] * scale, box[2] * scale, box[3] * scale), small.shape)
+    if inside is None:
         return np.zeros((height, width), np.uint8)
+    left, top, across, down = (round(side) for side in inside)
+    labels[top : top + down, left : left + across] = cv2.GC_PR_FGD
     radius = max(round(_SEED * _SIZE), 2)
     for points, label in ((on, cv2.GC_FGD), (beside, cv2.GC_BGD)):
         for x, y in points:
@@ -67,23 +82,6 @@ def _of_points(image: Image, drawn: DrawnObject) -> NDArray[np.uint8]:
     found = _touching(found, on) if on else found
     full = cv2.resize(found.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
     return (full >= 0.5).astype(np.uint8)
-
-
-def _candidates(
-    shape: tuple[int, int], drawn: DrawnObject, on: list[tuple[float, float]], scale: float
-) -> NDArray[np.bool_]:
-    """Where the object may be: in the box, else near the points that are on it."""
-    inside = np.zeros(shape, np.uint8)
-    if drawn.box is not None:
-        box = clip_box(tuple(side * scale for side in drawn.box), shape)  # type: ignore[arg-type]
-        if box is not None:
-            x, y, width, height = (round(side) for side in box)
-            inside[y : y + height, x : x + width] = 1
-    elif on:
-        hull = cv2.convexHull(np.array(on, np.float32).round().astype(np.int32))
-        cv2.polylines(inside, [hull], True, 1, max(round(2 * _REACH * _SIZE), 1))
-        cv2.fillPoly(inside, [hull], 1)
-    return inside.astype(bool)
 
 
 def _touching(found: NDArray[np.uint8], on: list[tuple[float, float]]) -> NDArray[np.uint8]:
