@@ -12,6 +12,9 @@ from tracking3d.estimation.online.mapping import pose_of
 from tracking3d.estimation.online.points import FollowedPoints, follow, grey
 from tracking3d.frames import Frame
 
+_ELSEWHERE = 0.3
+"""IoU of the last pose's silhouette with a mask that is right, below which that pose is none to go on from."""
+
 
 def turned_back(state: Belief, frame: Frame, number: int, T_cam_obj: NDArray[np.float64]) -> Belief:
     """The belief that goes on from a frame seen long ago, with all that was learnt since.
@@ -40,8 +43,13 @@ def turned_back(state: Belief, frame: Frame, number: int, T_cam_obj: NDArray[np.
 def trusting(state: Belief, frame: Frame, mask: NDArray[np.bool_]) -> Belief:
     """The belief before a frame whose mask ``(H, W)`` is right: points that are followed out of it are no witnesses.
 
-    Without witnesses against it the mask counts in full, and a pose that does not fit it is looked for anew.
+    Without witnesses against it the mask counts in full. Where the last pose is elsewhere the object was lost, though
+    nobody noticed: all sides of it are looked at, where the mask is.
     """
+    if state.waiting is None:
+        rendered = state.known.silhouette(state.last[0], state.camera)
+        if np.count_nonzero(rendered & mask) < _ELSEWHERE * np.count_nonzero(rendered | mask):
+            state = replace(state, lost_for=max(state.lost_for, 1))
     if not len(state.followed):
         return state
     here = follow(state.grey, grey(frame.image), state.followed)
