@@ -16,7 +16,7 @@ SHARED_BY_SOLVERS = {"evidence"}
 # Rooms of one floor may use each other, but never in circles.
 FLOORS = [
     {"errors", "frames", "geometry", "config", "features", "networks", "process_memory", "stages", "web"},
-    {"rendering", "trackers", "video"},
+    {"bundle_adjustment", "rendering", "trackers", "video"},
     {"corrections", "estimation", "plugins", "point_prompts", "points", "prompts", "testing"},
     {
         "arguments",
@@ -102,7 +102,7 @@ def test_geometry_and_rendering_know_nothing_of_video_or_tracking(room):
 def test_points_are_followed_by_surface_and_images_alone():
     for path in (PACKAGE / "points").rglob("*.py"):
         rooms = {name.split(".")[1] for name in imported_modules(path)}
-        assert rooms <= {"errors", "geometry", "points", "rendering"}, path
+        assert rooms <= {"bundle_adjustment", "errors", "geometry", "points", "rendering"}, path
 
 
 def test_the_solvers_are_tenants_that_never_import_each_other():

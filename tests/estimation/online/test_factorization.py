@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from tracked_solids import degrees_between, intrinsics, scene
 
-from tracking3d.estimation.online.bundle import Structure
+from tracking3d.bundle_adjustment.adjustment import Structure
+from tracking3d.bundle_adjustment.reprojection import project, to_camera
 from tracking3d.estimation.online.factorization import (
     affine_motion,
     assumed_relief,
@@ -16,7 +17,6 @@ from tracking3d.estimation.online.factorization import (
     metric_structure,
     onto_axis,
 )
-from tracking3d.estimation.online.reprojection import project, to_camera
 
 
 def far_away(frames: int, **settings):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tracked_solids import degrees_between, scene
 
-from tracking3d.estimation.online.bundle import Tracks
+from tracking3d.bundle_adjustment.adjustment import Tracks
 from tracking3d.estimation.online.flat import _fitted, flat_structures, looks_flat, resected
 
 

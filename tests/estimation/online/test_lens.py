@@ -10,8 +10,8 @@ import torch
 from tracked_solids import SIZE, degrees_between, scene
 from turned_solid import turned_map
 
+from tracking3d.bundle_adjustment.adjustment import Structure, adjust
 from tracking3d.estimation.online import lens
-from tracking3d.estimation.online.bundle import Structure, adjust
 from tracking3d.estimation.online.lens import solve_lens
 from tracking3d.estimation.online.mapping import pose_arrays, pose_of
 from tracking3d.estimation.online.points import FollowedPoints

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from tracked_solids import disturbed, scene
 
-from tracking3d.estimation.online import bundle, pose_from_points
-from tracking3d.estimation.online.bundle import Problem, adjust
+from tracking3d.bundle_adjustment import adjustment
+from tracking3d.bundle_adjustment.adjustment import Problem, adjust
+from tracking3d.estimation.online import pose_from_points
 from tracking3d.estimation.online.pose_from_points import pose_of_tracks
 
 SCENES = {
@@ -27,7 +28,7 @@ def both(monkeypatch):
     def both(function):
         answers = []
         for chosen in (True, False):
-            monkeypatch.setattr(bundle, "compiled", lambda chosen=chosen: chosen)
+            monkeypatch.setattr(adjustment, "compiled", lambda chosen=chosen: chosen)
             monkeypatch.setattr(pose_from_points, "compiled", lambda chosen=chosen: chosen)
             answers.append(function())
         return answers

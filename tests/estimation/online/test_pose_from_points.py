@@ -8,13 +8,13 @@ import pytest
 import torch
 from tracked_solids import degrees_between, scene
 
+from tracking3d.bundle_adjustment.reprojection import moved
 from tracking3d.estimation.online import pose_from_points as module
 from tracking3d.estimation.online.pose_from_points import (
     point_equations,
     pose_from_points,
     pose_of_tracks,
 )
-from tracking3d.estimation.online.reprojection import moved
 from tracking3d.rendering.normal_equations import NormalEquations
 
 THRESHOLD = 1.5

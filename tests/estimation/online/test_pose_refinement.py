@@ -10,9 +10,9 @@ import torch
 from rendered_solids import SIZE, observed, pose_of, shape_of, surface_of
 from torch import Tensor
 
+from tracking3d.bundle_adjustment.reprojection import moved
 from tracking3d.estimation.observation import Observation
 from tracking3d.estimation.online.pose_refinement import PoseWeights, _Evidence, refine_pose, refine_poses
-from tracking3d.estimation.online.reprojection import moved
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_angle
 from tracking3d.rendering import MatchedPoints, Surface
 

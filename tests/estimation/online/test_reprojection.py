@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from tracked_solids import intrinsics
 
-from tracking3d.estimation.online.reprojection import (
+from tracking3d.bundle_adjustment.reprojection import (
     finite_rows,
     moved,
     pixel_by_point,

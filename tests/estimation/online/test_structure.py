@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from tracked_solids import degrees_between, intrinsics, scene
 
-from tracking3d.estimation.online.bundle import Tracks, adjust
+from tracking3d.bundle_adjustment.adjustment import Tracks, adjust
 from tracking3d.estimation.online.completion import completed
 from tracking3d.estimation.online.structure import motion_enough, structure_hypotheses
 

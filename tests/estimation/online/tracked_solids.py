@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from tracking3d.estimation.online.bundle import Structure, Tracks
-from tracking3d.estimation.online.reprojection import project, to_camera
+from tracking3d.bundle_adjustment.adjustment import Structure, Tracks
+from tracking3d.bundle_adjustment.reprojection import project, to_camera
 
 SIZE = (640, 480)
 RADIUS = 0.9

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.estimation.online.bundle import Structure, Tracks, adjust
+from tracking3d.bundle_adjustment.adjustment import Structure, Tracks, adjust
+from tracking3d.bundle_adjustment.reprojection import FloatArray, finite_rows
 from tracking3d.estimation.online.pose_from_points import pose_of_tracks
-from tracking3d.estimation.online.reprojection import FloatArray, finite_rows
 
 FEWEST = 6
 """Points that a frame must see for a pose of its own."""

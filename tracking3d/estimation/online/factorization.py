@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.estimation.online.bundle import Structure
-from tracking3d.estimation.online.reprojection import FloatArray
+from tracking3d.bundle_adjustment.adjustment import Structure
+from tracking3d.bundle_adjustment.reprojection import FloatArray
 
 _SAMPLES = 200
 _UPGRADE_STEPS = 15

@@ -12,9 +12,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from tracking3d.estimation.online.bundle import Problem, Structure, System, Tracks, adjust
+from tracking3d.bundle_adjustment.adjustment import Problem, Structure, System, Tracks, adjust
+from tracking3d.bundle_adjustment.reprojection import FloatArray
 from tracking3d.estimation.online.pose_from_points import pose_of_tracks
-from tracking3d.estimation.online.reprojection import FloatArray
 
 SLANTS = (25.0, 50.0)
 """Degrees by which planes are tried to be tilted, in eight directions."""

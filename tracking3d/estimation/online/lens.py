@@ -12,9 +12,9 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from tracking3d.bundle_adjustment.adjustment import Structure, adjust
 from tracking3d.config.camera import USUAL_ANGLES
 from tracking3d.estimation.online.belief import ObjectMap, View
-from tracking3d.estimation.online.bundle import Structure, adjust
 from tracking3d.estimation.online.mapping import pose_of, shared_landmarks, structure_of, tracks_of
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose

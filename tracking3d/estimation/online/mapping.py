@@ -10,8 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tracking3d.bundle_adjustment.adjustment import Structure, Tracks, adjust
 from tracking3d.estimation.online.belief import ObjectMap, View
-from tracking3d.estimation.online.bundle import Structure, Tracks, adjust
 from tracking3d.estimation.online.keypoints import Keypoints, match
 from tracking3d.estimation.online.points import FollowedPoints
 from tracking3d.estimation.online.surface_fit import FitWeights, Landmarks, Views, fit_surface

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.estimation.online.reprojection import (
+from tracking3d.bundle_adjustment.reprojection import (
     BEHIND,
     FloatArray,
     finite_rows,

@@ -15,8 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tracking3d.bundle_adjustment.reprojection import FloatArray, moved
 from tracking3d.estimation.observation import Observation
-from tracking3d.estimation.online.reprojection import FloatArray, moved
 from tracking3d.geometry.pose import Pose, from_matrix
 from tracking3d.rendering import MatchedPoints, NormalEquations, Scales, Surface, pose_terms
 from tracking3d.rendering.backend import use_numba

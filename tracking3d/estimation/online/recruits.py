@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tracking3d.bundle_adjustment.adjustment import Structure, adjust
+from tracking3d.bundle_adjustment.reprojection import project, to_camera
 from tracking3d.estimation.online.belief import ObjectMap, View
-from tracking3d.estimation.online.bundle import Structure, adjust
 from tracking3d.estimation.online.mapping import pose_arrays, tracks_of
 from tracking3d.estimation.online.points import FollowedPoints, new_corners
-from tracking3d.estimation.online.reprojection import project, to_camera
 from tracking3d.geometry.camera import Camera
 
 MOST_CANDIDATES = 100

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from tracking3d.bundle_adjustment.adjustment import Structure
 from tracking3d.estimation.observation import halved
 from tracking3d.estimation.online.belief import ObjectMap, View
-from tracking3d.estimation.online.bundle import Structure
 from tracking3d.estimation.online.joint_fit import fit_jointly
 from tracking3d.estimation.online.keypoints import Keypoints
 from tracking3d.estimation.online.lens import through

@@ -2,7 +2,7 @@
 
 A small object is seen almost without perspective. Its reversal in depth (Necker) then fits nearly as well as itself,
 with two views any amount of relief does (bas-relief), and a plane turns one way or the other. So hypotheses are
-made, refined under perspective by `tracking3d.estimation.online.bundle`, and the distinct ones are kept: which of
+made, refined under perspective by `tracking3d.bundle_adjustment.adjustment`, and the distinct ones are kept: which of
 them is right shows when they are rendered.
 """
 
@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from tracking3d.estimation.online.bundle import Structure, Tracks, adjust
+from tracking3d.bundle_adjustment.adjustment import Structure, Tracks, adjust
+from tracking3d.bundle_adjustment.reprojection import FloatArray
 from tracking3d.estimation.online.completion import FEWEST, completed, part_of
 from tracking3d.estimation.online.factorization import (
     affine_motion,
@@ -24,7 +25,6 @@ from tracking3d.estimation.online.factorization import (
     metric_structure,
 )
 from tracking3d.estimation.online.flat import flat_structures, looks_flat
-from tracking3d.estimation.online.reprojection import FloatArray
 
 RELIEFS = (0.3, 0.7)
 """Depths that are tried where views do not tell it: spread about the tilted plane over the spread in x and y."""

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from tracking3d.estimation.online.kernels.reprojection import (
+from tracking3d.bundle_adjustment.kernels.reprojection import (
     factorised,
     pixel_motion,
     shared,
@@ -15,6 +15,7 @@ from tracking3d.estimation.online.kernels.reprojection import (
     to_camera,
     turned_by,
 )
+from tracking3d.bundle_adjustment.reprojection import BEHIND, NEAREST, FloatArray
 from tracking3d.estimation.online.pose_from_points import (
     CONVERGED,
     FIRST_DAMPING,
@@ -22,7 +23,6 @@ from tracking3d.estimation.online.pose_from_points import (
     PointEquations,
     PoseFit,
 )
-from tracking3d.estimation.online.reprojection import BEHIND, NEAREST, FloatArray
 from tracking3d.rendering.kernels.compilation import kernel
 
 

@@ -7,12 +7,13 @@ import math
 
 import numpy as np
 
-from tracking3d.estimation.online.kernels.reprojection import (
+from tracking3d.bundle_adjustment.kernels.reprojection import (
     factorised,
     shared,
     solve_factorised,
     turned_by,
 )
+from tracking3d.bundle_adjustment.reprojection import FloatArray
 from tracking3d.estimation.online.pose_refinement import (
     ENOUGH,
     FIRST_DAMPING,
@@ -22,7 +23,6 @@ from tracking3d.estimation.online.pose_refinement import (
     EvaluatedPoses,
     PoseWeights,
 )
-from tracking3d.estimation.online.reprojection import FloatArray
 from tracking3d.rendering import MatchedPoints, PoseTarget, Surface
 from tracking3d.rendering.kernels.compilation import kernel
 from tracking3d.rendering.kernels.pose_terms import (

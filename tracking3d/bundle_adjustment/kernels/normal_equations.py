@@ -1,4 +1,4 @@
-"""Kernels of `tracking3d.estimation.online.bundle`: residuals, normal equations and a step without the points."""
+"""Kernels of `tracking3d.bundle_adjustment.adjustment`: residuals, normal equations and a step without the points."""
 # mypy: disable-error-code="no-untyped-def"
 
 from __future__ import annotations
@@ -7,14 +7,14 @@ import math
 
 import numpy as np
 
-from tracking3d.estimation.online.kernels.reprojection import (
+from tracking3d.bundle_adjustment.kernels.reprojection import (
     factorised,
     pixel_motion,
     shared,
     solve_factorised,
     to_camera,
 )
-from tracking3d.estimation.online.reprojection import BEHIND, NEAREST, FloatArray
+from tracking3d.bundle_adjustment.reprojection import BEHIND, NEAREST, FloatArray
 from tracking3d.rendering.kernels.compilation import kernel
 
 
@@ -43,7 +43,7 @@ def linearised(
     fixed: int,
     free_focal: bool,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Blocks of the normal equations as `tracking3d.estimation.online.bundle` has them, without the prior's."""
+    """Blocks of the normal equations as `tracking3d.bundle_adjustment.adjustment` has them, without the prior's."""
     many, size = len(points), 6 * (len(R) - fixed) + free_focal
     poses, blocks, coupling = np.zeros((size, size)), np.zeros((many, 3, 3)), np.zeros((many, 3, size))
     poses_gradient, points_gradient = np.zeros(size), np.zeros((many, 3))

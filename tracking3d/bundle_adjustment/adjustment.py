@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.estimation.online.reprojection import (
+from tracking3d.bundle_adjustment.reprojection import (
     BEHIND,
     FloatArray,
     finite_rows,
@@ -98,9 +98,11 @@ class System:
         """Damped step of poses ``(C,)`` and points ``(N, 3)``; None where there is none."""
         poses, points = _damped(self.poses, damping), _damped(self.points, damping)
         if compiled():
-            from tracking3d.estimation.online.kernels import bundle
+            from tracking3d.bundle_adjustment.kernels import normal_equations
 
-            return bundle.step(poses, points, self.coupling, self.poses_gradient, self.points_gradient)
+            return normal_equations.step(
+                poses, points, self.coupling, self.poses_gradient, self.points_gradient
+            )
         flat = self.coupling.reshape(3 * len(points), len(poses))
         by_points = (np.linalg.inv(points) @ self.coupling).reshape(flat.shape)
         gradient = self.poses_gradient - by_points.T @ self.points_gradient.ravel()
@@ -139,10 +141,10 @@ class Problem:
         """With its cost and its residuals."""
         K = self.intrinsics(at.focal_factor)
         if compiled():
-            from tracking3d.estimation.online.kernels import bundle
+            from tracking3d.bundle_adjustment.kernels import normal_equations
 
             given = self.pixels, self.weight, K, at.R, at.t, at.points
-            total, residual = bundle.evaluated(*given, self.scale)
+            total, residual = normal_equations.evaluated(*given, self.scale)
         else:
             difference = project(to_camera(at.R, at.t, at.points), K) - self.pixels
             distance = np.hypot(difference[..., 0], difference[..., 1])
@@ -156,9 +158,9 @@ class Problem:
         """The quadratic model of the weighted sum of losses."""
         given = self.pixels, self.weight, self.intrinsics(at.focal_factor), at.R, at.t, at.points
         if compiled():
-            from tracking3d.estimation.online.kernels import bundle
+            from tracking3d.bundle_adjustment.kernels import normal_equations
 
-            system = System(*bundle.linearised(*given, self.scale, self.fixed, self.free_focal))
+            system = System(*normal_equations.linearised(*given, self.scale, self.fixed, self.free_focal))
         else:
             system = self._linearised(at)
         points = system.points + 2 * self.prior_weight[:, None, None] * np.eye(3)
