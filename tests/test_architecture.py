@@ -23,6 +23,7 @@ FLOORS = [
         "checkpoint",
         "mask_tracking",
         "object_recording",
+        "passes",
         "parts",
         "pipeline",
         "presented",

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import logging
-import time
-from collections.abc import Callable, Generator, Iterable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -20,17 +17,16 @@ from tracking3d.errors import InputError, OutputError, PluginError
 from tracking3d.estimation.estimate import ObjectModel, Status
 from tracking3d.frames import Frame, MaskEstimate, SkippedFrame
 from tracking3d.reconstruction import BELIEVED, TextureView, kept_views, texture_view, textured
+from tracking3d.reconstruction.second_look import SecondLook
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.refinement_writer import RefinementWriter
 from tracking3d.results.run_writer import RunWriter
 from tracking3d.session import Session
+from tracking3d.stages import measured
 from tracking3d.video.source import FrameSource
 
 _log = logging.getLogger(__name__)
-
-Listener = Callable[[FrameRecord | SkippedFrame], None]
-"""Is told of every frame as it is done, or skipped; where there is a final refinement, once more of each."""
 
 
 class ObjectRecording:
@@ -68,6 +64,7 @@ class ObjectRecording:
             self._initial = {one.index: (one.score, one.reason) for one in kept.taken.values()}
         self._causal_model: ObjectModel | None = None
         self._refinement: RefinementWriter | None = None
+        self._look: SecondLook | None = None
         self._views: tuple[TextureView, ...] = ()
 
     def take(self, frame: Frame | SkippedFrame) -> FrameRecord | SkippedFrame | None:
@@ -119,7 +116,11 @@ class ObjectRecording:
                 "Frame %d, which was to be corrected, is not among the frames that could be read.", index
             )
         self._begin_refinement(source)
-        if self._redraw and self._refinement is None:
+        if self._refinement is not None:
+            answered = sorted(self._refinement.causal)
+            most = self._session.config.object.landmark_views
+            self._look = SecondLook(self._session.result(), self._session.camera, answered, most)
+        elif self._redraw:
             self._writer.begin_drawing_anew()
 
     def _begin_refinement(self, source: FrameSource) -> None:
@@ -160,7 +161,7 @@ class ObjectRecording:
         if self._kept:
             self._check(self._kept, frame)
             if frame.index <= self._until.last_refined:
-                return self._seen_again(refinement, refinement.draw_again(frame), frame)
+                return self._seen_again(refinement, refinement.answer(frame.index), frame)
         mask = refinement.initial_mask(frame.index)
         score, reason = self._initial.get(frame.index, (1.0, ""))
         initial = MaskEstimate(None if mask is None else mask.astype(np.float32), score, reason)
@@ -177,17 +178,49 @@ class ObjectRecording:
         return self._seen_again(refinement, answer, frame)
 
     def _seen_again(self, refinement: RefinementWriter, answer: FrameRecord, frame: Frame) -> FrameRecord:
-        """Keep what the texture of the final model can be taken from; the answer as it is."""
-        most = self._session.config.object.texture_views
+        """Keep what poses, surface and texture of the end can be taken from; the answer as it is."""
+        most, mask = self._session.config.object.texture_views, refinement.mask(answer)
+        if self._look and answer.refined:
+            self._look.see(answer, frame.image, mask)
         if most and answer.status is Status.TRACKED and answer.confidence >= BELIEVED:
-            mask, camera = refinement.mask(answer), answer.through(self._session.camera)
+            camera = answer.through(self._session.camera)
             view = texture_view(frame.index, frame.image, mask, camera, answer.T_cam_obj)
             self._views = self._views if view is None else kept_views(self._views, view, most)
         return answer
 
+    @property
+    def draws(self) -> bool:
+        """Whether the frames are to come a last time, to be drawn as they are answered in the end."""
+        return self._refinement is not None
+
+    def settle(self) -> None:
+        """All frames were looked at again: put right together what they say."""
+        if self._refinement is None or self._look is None:
+            return
+        with measured("map") as watch:
+            self._look.settle()
+        self._refinement.together += watch.times
+        self._writer.refine_camera(self._look.camera)
+
+    def draw(self, frame: Frame) -> None:
+        """Draw the final answer for a frame, its pose put right."""
+        refinement = self._refinement
+        if refinement is None or frame.index not in refinement.causal:
+            return
+        answer = refinement.answer(frame.index)
+        if self._look and answer.refined:
+            T_cam_obj = self._look.pose(answer, frame.image, refinement.mask(answer))
+            refinement.put_right(frame.index, T_cam_obj)
+        refinement.draw(frame)
+
     def finish(self) -> None:
         """Write what is made at the end."""
-        model = textured(self._session.result(), self._views, self._session.config.object.largest_texture)
+        model, views = self._session.result(), self._views
+        if self._refinement is not None and self._look is not None:
+            answers = [self._refinement.answer(view.index) for view in views]
+            model = self._look.moved(model)
+            views = tuple(map(self._look.seen_by, views, answers))
+        model = textured(model, views, self._session.config.object.largest_texture)
         if self._refinement is not None:
             self._writer.end_refinement()
             self._causal_model = None
@@ -265,75 +298,6 @@ class ObjectRecording:
             _log.warning("This run cannot be resumed when it is stopped: %s.", error)
             self._checkpoint.remove()
             self._checkpoint = None
-
-
-def go_through(
-    source: FrameSource,
-    frames: Iterable[Frame | SkippedFrame],
-    recordings: list[ObjectRecording],
-    listener: Listener,
-) -> None:
-    """Take every recording through the frames, and through them again where it refines.
-
-    A recording that fails is ended; the others go on.
-
-    Args:
-        source: Where the frames come from.
-        frames: Its frames, begun already.
-        recordings: One an object.
-        listener: Is told of every frame of every object.
-
-    Raises:
-        Tracking3dError: The first failure, at the end or as soon as no recording is left.
-    """
-    going_on, errors = list(recordings), list[Exception]()
-    share = 1 / len(recordings)
-
-    def each(action: Callable[[ObjectRecording], FrameRecord | SkippedFrame | None]) -> None:
-        for recording in tuple(going_on):
-            try:
-                if told := action(recording):
-                    listener(told)
-            except Exception as error:
-                going_on.remove(recording)
-                recording.give_up(error)
-                errors.append(error)
-        if not going_on:
-            raise errors[0]
-
-    try:
-        for frame in frames if any(recording.takes for recording in going_on) else ():
-            each(partial(ObjectRecording.take, frame=_shared(frame, share)))
-        each(partial(ObjectRecording.begin_refinement, source=source))
-        for frame in timed(source) if any(recording.looks_again for recording in going_on) else ():
-            if isinstance(frame, Frame):
-                each(partial(ObjectRecording.take_again, frame=_shared(frame, share)))
-        each(ObjectRecording.finish)
-    except BaseException as error:
-        for recording in going_on:
-            recording.give_up(error)
-        raise
-    if errors:
-        raise errors[0]
-
-
-def timed(source: FrameSource) -> Generator[Frame | SkippedFrame]:
-    """The frames of a source with the time that reading them took; of a live one, which is waited for, without."""
-    frames, started = iter(source), time.perf_counter()
-    try:
-        for frame in frames:
-            if isinstance(frame, Frame) and source.repeatable:
-                yield replace(frame, decoding=time.perf_counter() - started)
-            else:
-                yield frame
-            started = time.perf_counter()
-    finally:
-        if isinstance(frames, Generator):
-            frames.close()
-
-
-def _shared(frame: Frame | SkippedFrame, share: float) -> Any:
-    return replace(frame, decoding=share * frame.decoding) if isinstance(frame, Frame) else frame
 
 
 def _model(session: Session) -> ObjectModel | None:

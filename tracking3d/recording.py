@@ -21,8 +21,9 @@ from tracking3d.config.models import PipelineConfig, PluginChoice
 from tracking3d.corrections import Correction, check_corrections_fit, checked_corrections
 from tracking3d.errors import InputError
 from tracking3d.frames import Box, Frame, Prompt, SkippedFrame
-from tracking3d.object_recording import Listener, ObjectRecording, go_through, timed
+from tracking3d.object_recording import ObjectRecording
 from tracking3d.parts import build_encoder, check_turns
+from tracking3d.passes import Listener, go_through, timed
 from tracking3d.prompts import check_prompt, check_prompts, damaged_start, make_prompt, make_prompts
 from tracking3d.results.layout import RUN, object_folders
 from tracking3d.results.run_reader import RunReader

@@ -1,9 +1,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
-from tracking3d.points.bundle import bundle, intersect
+from tracking3d.points.bundle import LEAST_MEASURED, bundle, intersect
 
 RNG = np.random.default_rng(3)
 POINTS = RNG.uniform(-1, 1, (40, 3))
@@ -22,6 +23,14 @@ def poses(count: int = 9) -> np.ndarray:
 def projected(points: np.ndarray, T: np.ndarray) -> np.ndarray:
     seen = points @ T[:, :3, :3].transpose(0, 2, 1) + T[:, None, :3, 3]
     return seen[..., :2] / seen[..., 2:] * INTRINSICS[:, None, :2] + INTRINSICS[:, None, 2:]
+
+
+def turned(T: np.ndarray, degrees: float) -> np.ndarray:
+    """Every pose turned on its own."""
+    turns = Rotation.from_rotvec(np.deg2rad(np.random.default_rng(4).normal(0, degrees, (len(T), 3))))
+    off = T.copy()
+    off[:, :3, :3] = turns.as_matrix() @ T[:, :3, :3]
+    return off
 
 
 def test_points_come_to_lie_where_the_views_saw_them():
@@ -47,22 +56,55 @@ def test_a_wrong_measurement_hardly_counts():
 def test_without_measurements_nothing_moves():
     measured = np.full((9, 40, 2), np.nan)
     nothing = np.full((9, 40), np.inf)
-    points, T, weight = bundle(POINTS, INTRINSICS, poses(), measured, nothing, 0.1, 0.03, 0.03)
-    assert np.array_equal(points, POINTS)
-    assert np.allclose(T, poses(), atol=1e-12)
-    assert (weight == 0).all()
+    found = bundle(POINTS, INTRINSICS, poses(), measured, nothing, 0.1, free_focal=True)
+    assert np.array_equal(found.points, POINTS)
+    assert np.array_equal(found.T_cam_obj, poses())
+    assert (found.weight == 0).all()
+    assert found.focal_factor == 1
 
 
-def test_poses_that_are_off_are_put_right_up_to_the_priors():
+def test_a_view_that_holds_few_measurements_keeps_its_pose():
+    off = turned(poses(), 1.0)
+    measured = projected(POINTS, poses())
+    deviation = np.full((9, 40), 0.1)
+    deviation[4, LEAST_MEASURED - 1 :] = np.inf
+    found = bundle(POINTS, INTRINSICS, off, measured, deviation, 0.1)
+    assert np.allclose(found.T_cam_obj[4], off[4], atol=1e-12)
+    assert not np.allclose(found.T_cam_obj[5], off[5], atol=1e-3)
+
+
+def test_poses_that_are_off_are_put_right():
     T = poses()
-    off = T.copy()
-    turns = Rotation.from_rotvec(np.deg2rad(RNG.normal(0, 1, (9, 3)))).as_matrix()
-    off[:, :3, :3] = turns @ T[:, :3, :3]
+    off = turned(T, 2.0)
     measured = projected(POINTS, T)
-    points, found, _ = bundle(
-        POINTS, INTRINSICS, off, measured, np.full((9, 40), 0.1), 0.1, 0.1, 0.1, turns=30
-    )
-    before, after = (np.abs(projected(p, Ts) - measured).max() for p, Ts in ((POINTS, off), (points, found)))
-    assert before > 2
-    assert after < 0.1
-    assert np.allclose(found[:, :3, :3] @ found[:, :3, :3].transpose(0, 2, 1), np.eye(3), atol=1e-9)
+    found = bundle(POINTS, INTRINSICS, off, measured, np.full((9, 40), 0.1), 0.1)
+    assert np.abs(projected(POINTS, off) - measured).max() > 4
+    assert np.abs(projected(found.points, found.T_cam_obj) - measured).max() < 0.01
+    relative, truly = (R @ R[0].T for R in (found.T_cam_obj[:, :3, :3], T[:, :3, :3]))
+    assert np.rad2deg(Rotation.from_matrix(relative @ truly.transpose(0, 2, 1)).magnitude()).max() < 0.3
+
+
+def seen_through(factor: float, noise: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Measured pixels, and the points and poses of one who takes the lens for ``factor`` times shorter."""
+    T = poses()
+    T[:, 2, 3] = 4.0
+    measured = projected(POINTS, T) + np.random.default_rng(5).normal(0, noise, (9, 40, 2))
+    T[:, 2, 3] /= factor
+    lens = INTRINSICS / [factor, factor, 1, 1]
+    return measured, lens, T
+
+
+@pytest.mark.parametrize("factor", [0.6, 1.7])
+def test_a_lens_that_nobody_gave_is_found_where_perspective_tells_it(factor):
+    measured, lens, T = seen_through(factor, noise=0.1)
+    found = bundle(POINTS, lens, T, measured, np.full((9, 40), 0.1), 0.1, free_focal=True)
+    assert found.focal_factor == pytest.approx(factor, rel=0.05)
+    given = bundle(POINTS, lens, T, measured, np.full((9, 40), 0.1), 0.1)
+    assert given.focal_factor == 1
+    assert given.cost > found.cost
+
+
+def test_noise_is_no_proof_of_another_lens():
+    measured, lens, T = seen_through(1.0, noise=1.0)
+    found = bundle(POINTS, lens, T, measured, np.full((9, 40), 1.0), 0.1, free_focal=True)
+    assert found.focal_factor == pytest.approx(1, abs=0.05)

@@ -14,7 +14,7 @@ from tracking3d.errors import Tracking3dError
 
 if TYPE_CHECKING:
     from tracking3d.frames import SkippedFrame
-    from tracking3d.object_recording import Listener
+    from tracking3d.passes import Listener
     from tracking3d.results.records import FrameRecord
 
 

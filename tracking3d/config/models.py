@@ -70,6 +70,15 @@ class ObjectConfig(Section):
             "first mask, and given one spread; empty keeps them as they are (paper)."
         ),
     )
+    landmark_views: int = Field(
+        120,
+        ge=0,
+        le=2000,
+        description=(
+            "Frames whose poses, lens (where nobody gave it) and surface are put right by points, at the end of the "
+            "final refinement; the others follow them. 0 leaves them as rendering has them."
+        ),
+    )
     texture_views: int = Field(
         24,
         ge=0,

@@ -1,19 +1,44 @@
 """Points in space and poses that agree with where points were measured in the images.
 
-Poses and points take turns in Gauss-Newton steps (resection and intersection), with weights of Geman and McClure so
-that wrong tracks do not count, and priors that hold both at what the run has found: they go only where the images say
-so, and size and place of the whole stay.
+Wrong tracks do not count for robust weights, and a prior holds the points at the surface that the run has found: they
+go only where the images say so, and size and place of the whole stay.
 """
 
 from __future__ import annotations
 
-import numpy as np
-from scipy.spatial.transform import Rotation
+import math
+from dataclasses import dataclass
+from functools import partial
 
+import numpy as np
+
+from tracking3d.bundle_adjustment import Structure, Tracks, adjust
 from tracking3d.points.view import Array
 
 TURNS = 12
+LEAST_MEASURED = 8
+"""Points that a view has to hold for its pose to be moved by them."""
 _OUTLIER = 3.0  # deviations at which a measurement has a quarter of its weight
+_LENS = 0.3  # deviation of the logarithm of a focal length that nobody gave
+
+
+@dataclass(frozen=True, eq=False)
+class Bundled:
+    """Points and poses that agree with the measurements.
+
+    Attributes:
+        points: ``(N, 3)`` in object coordinates.
+        T_cam_obj: ``(T, 4, 4)``.
+        weight: ``(T, N)`` that the measurements had in the end: 0 where there is none.
+        focal_factor: By which all focal lengths are to be multiplied.
+        cost: Mean robust loss of the measurements, by weight.
+    """
+
+    points: Array
+    T_cam_obj: Array
+    weight: Array
+    focal_factor: float
+    cost: float
 
 
 def intersect(
@@ -51,37 +76,48 @@ def bundle(
     measured: Array,
     deviation: Array,
     held: float,
-    held_rotation: float,
-    held_translation: float,
-    turns: int = TURNS,
-) -> tuple[Array, Array, Array]:
+    free_focal: bool = False,
+) -> Bundled:
     """Move points and poses to where the measurements agree with both.
 
-    Args:
-        points, intrinsics, T_cam_obj, measured, deviation, held, turns: See `intersect`.
-        held_rotation: Deviation of the poses' rotation in radians.
-        held_translation: Deviation of their translation in object units.
+    Views that hold too few measurements keep their poses. Another lens needs proof: errors along a track hang together,
+    so that a whole track counts as much as one independent measurement, and has to pay for how far the lens changes.
 
-    Returns:
-        Points, poses ``(T, 4, 4)`` and weights ``(T, N)``.
+    Args:
+        points, intrinsics, T_cam_obj, measured, deviation, held: See `intersect`.
+        free_focal: Whether all focal lengths may change by one factor, that is, whether nobody knows them.
     """
-    start, begun, T = points, T_cam_obj, T_cam_obj.copy()
-    prior = np.repeat([1 / held_rotation**2, 1 / held_translation**2], 3)
-    weight = np.zeros(deviation.shape)
-    for _ in range(turns):
-        points, weight = _move_points(points, start, intrinsics, T, measured, deviation, held)
-        left, jacobian, weight, seen = _residuals(points, intrinsics, T, measured, deviation)
-        arm = seen - T[:, None, :3, 3]
-        jacobian = np.concatenate([np.cross(arm[:, :, None, :], jacobian), jacobian], 3)
-        weighted = weight[..., None, None] * jacobian
-        turned = Rotation.from_matrix(T[:, :3, :3] @ begun[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
-        away = np.concatenate([turned, T[:, :3, 3] - begun[:, :3, 3]], 1)
-        H = np.einsum("tnij,tnik->tjk", weighted, jacobian) + np.diag(prior)
-        b = np.einsum("tnij,tni->tj", weighted, left) - away * prior
-        step = np.linalg.solve(H, b[..., None])[..., 0]
-        T[:, :3, :3] = Rotation.from_rotvec(step[:, :3]).as_matrix() @ T[:, :3, :3]
-        T[:, :3, 3] += step[:, 3:]
-    return points, T, weight
+    known = np.isfinite(deviation) & np.isfinite(measured).all(2)
+    known &= (known.sum(1) >= LEAST_MEASURED)[:, None]
+    if not known.any():
+        return Bundled(points, T_cam_obj.copy(), np.zeros(deviation.shape), 1.0, math.inf)
+    # One camera for all views: its pixels are those of the middle one.
+    focal = float(np.median(intrinsics[:, :2]))
+    pixels = focal * (measured - intrinsics[:, None, 2:]) / intrinsics[:, None, :2]
+    spread = np.where(known, deviation * (focal / intrinsics[:, :2].mean(1))[:, None], np.inf)
+    outlier = _OUTLIER * float(np.median(spread[known]))
+    tracks = Tracks(pixels, known, np.where(known, (outlier / _OUTLIER / spread) ** 2, 0.0))
+    solved = partial(
+        adjust,
+        tracks,
+        np.diag([focal, focal, 1.0]),
+        fixed=0,
+        scale=outlier,
+        iterations=TURNS,
+        point_prior=points,
+        point_prior_weight=(_OUTLIER * held) ** -2,
+    )
+    found = solved(Structure(T_cam_obj[:, :3, :3].copy(), T_cam_obj[:, :3, 3].copy(), points.copy()))
+    if free_focal:
+        other = solved(found, free_focal=True)
+        gain = _OUTLIER**2 * (found.cost - other.cost) * tracks.weights().sum() / known.any(1).sum()
+        if gain > (math.log(other.focal_factor) / _LENS) ** 2:
+            found = other
+    T = T_cam_obj.copy()
+    T[:, :3, :3], T[:, :3, 3] = found.R, found.t
+    far = np.where(known, found.residual, 0.0) / (_OUTLIER * np.where(known, spread, 1.0))
+    weight = np.where(known, 1 / (1 + far**2) ** 2 / spread**2, 0.0)
+    return Bundled(found.points, T, weight, found.focal_factor, found.cost)
 
 
 def _move_points(

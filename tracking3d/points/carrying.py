@@ -40,7 +40,7 @@ class Carried:
 
 
 class Warps:
-    """Views warped into one another, each pair once.
+    """Views warped into one another.
 
     Args:
         views: In any order; None where there is none.
@@ -49,8 +49,9 @@ class Warps:
 
     def __init__(self, views: list[View | None], tolerance: float) -> None:
         self.views, self.tolerance = views, tolerance
-        self._warped: dict[tuple[int, int], tuple[Plane, Plane]] = {}
-        self._pixels: dict[int, tuple[NDArray[np.bool_], Array]] = {}
+        self._pixels: tuple[int, NDArray[np.bool_], Array] | None = (
+            None  # of the view that was last asked for
+        )
 
     def carry(self, source: int, target: int, xy: Array, backend: str = "auto") -> Carried:
         """Carry pixels ``xy`` ``(N, 2)`` of view ``source`` into view ``target``."""
@@ -71,31 +72,29 @@ class Warps:
 
     def _warp(self, source: int, target: int) -> tuple[Plane, Plane]:
         """The image of ``source`` as ``target`` would see it, and where it is known."""
-        if (source, target) not in self._warped:
-            start = self.views[source]
-            assert start is not None
-            near, points = self._surface_pixels(target)
-            xy, depth = start.project(points)
-            maps = np.full((2, *near.shape), -1e4, np.float32)
-            maps[:, near] = np.nan_to_num(xy.T, nan=-1e4)
-            behind = np.full(near.shape, np.inf, np.float32)
-            behind[near] = depth
-            image, mask, inverse = (
-                cv2.remap(plane, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-                for plane in (start.image, start.mask, start.inverse_depth)
-            )
-            with np.errstate(divide="ignore", invalid="ignore"):
-                seen = (inverse > 0) & (behind < 1 / inverse + self.tolerance)
-            self._warped[source, target] = image, np.where(seen, mask, 0).astype(np.float32)
-        return self._warped[source, target]
+        start = self.views[source]
+        assert start is not None
+        near, points = self._surface_pixels(target)
+        xy, depth = start.project(points)
+        maps = np.full((2, *near.shape), -1e4, np.float32)
+        maps[:, near] = np.nan_to_num(xy.T, nan=-1e4)
+        behind = np.full(near.shape, np.inf, np.float32)
+        behind[near] = depth
+        image, mask, inverse = (
+            cv2.remap(plane, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+            for plane in (start.image, start.mask, start.inverse_depth)
+        )
+        with np.errstate(divide="ignore", invalid="ignore"):
+            seen = (inverse > 0) & (behind < 1 / inverse + self.tolerance)
+        return image, np.where(seen, mask, 0).astype(np.float32)
 
     def _surface_pixels(self, index: int) -> tuple[NDArray[np.bool_], Array]:
         """``(h, w)`` pixels on or near the surface of a view, and ``(P, 3)`` the points under them."""
-        if index not in self._pixels:
+        if self._pixels is None or self._pixels[0] != index:
             view = self.views[index]
             assert view is not None
             near = (view.beyond < _BEYOND) & (view.inverse_depth > 0)
             rows, columns = np.nonzero(near)
             points = view.back_project(np.stack([columns, rows], 1).astype(float), view.inverse_depth[near])
-            self._pixels[index] = near, points
-        return self._pixels[index]
+            self._pixels = index, near, points
+        return self._pixels[1:]

@@ -1,4 +1,4 @@
-"""Points followed from one view through all others, forwards and backwards in time."""
+"""Points followed from the views that they begin in through all others, forwards and backwards in time."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tracking3d.points.carrying import Warps
 from tracking3d.points.view import Array
@@ -29,8 +30,8 @@ class Chain:
     likeness: Array
 
 
-def follow_chain(warps: Warps, start: int, xy: Array, steps: Sequence[int] = STEPS) -> Chain:
-    """Follow pixels ``xy`` ``(N, 2)`` of view ``start`` from view to view.
+def follow_chain(warps: Warps, start: NDArray[np.integer], xy: Array, steps: Sequence[int] = STEPS) -> Chain:
+    """Follow pixels ``xy`` ``(N, 2)`` of views ``start`` ``(N,)`` from view to view.
 
     A point that the views just before do not hold, since it was hidden there, is looked for again with the template of
     its first view.
@@ -39,28 +40,41 @@ def follow_chain(warps: Warps, start: int, xy: Array, steps: Sequence[int] = STE
     chain = Chain(
         np.full((views, count, 2), np.nan), np.full((views, count), np.inf), np.full((views, count), -1.0)
     )
-    chain.measured[start], chain.variance[start], chain.likeness[start] = xy, 0.0, 1.0
-    for direction, path in ((1, range(start + 1, views)), (-1, range(start - 1, -1, -1))):
+    rows = np.arange(count)
+    chain.measured[start, rows], chain.variance[start, rows], chain.likeness[start, rows] = xy, 0.0, 1.0
+    for direction, path in ((1, range(views)), (-1, range(views - 1, -1, -1))):
         for target in path:
-            if warps.views[target] is None:
+            behind = (target - start) * direction  # how many views ago each point began
+            if warps.views[target] is None or not (behind > 0).any():
                 continue
-            before = [target - direction * step for step in steps]
-            _extend(chain, warps, target, [one for one in before if (one - start) * direction >= 0])
-            missing = ~np.isfinite(chain.variance[target])
-            if missing.any() and start not in before:
-                _extend(chain, warps, target, [start], missing)
+            before = [
+                (target - direction * step, behind >= step)
+                for step in steps
+                if 0 <= target - direction * step < views
+            ]
+            _extend(chain, warps, target, before)
+            missing = ~np.isfinite(chain.variance[target]) & (behind > 0)
+            _extend(
+                chain,
+                warps,
+                target,
+                [
+                    (first, missing & (start == first))
+                    for first in np.unique(start[missing]).tolist()
+                    if abs(target - first) not in steps
+                ],
+            )
     return chain
 
 
 def _extend(
-    chain: Chain, warps: Warps, target: int, sources: list[int], of: np.ndarray | None = None
+    chain: Chain, warps: Warps, target: int, sources: Sequence[tuple[int, NDArray[np.bool_]]]
 ) -> None:
-    """Write what the templates of some views say about one more view."""
+    """Write what the templates of some views say about some points ``(N,)`` in one more view."""
     count = chain.variance.shape[1]
     total, weights = np.zeros((count, 2)), np.zeros(count)
-    for source in sources:
-        known = np.isfinite(chain.variance[source])
-        chosen = np.flatnonzero(known if of is None else known & of)
+    for source, of in sources:
+        chosen = np.flatnonzero(of & np.isfinite(chain.variance[source]))
         if not len(chosen):
             continue
         carried = warps.carry(source, target, chain.measured[source, chosen])

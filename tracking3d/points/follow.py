@@ -70,7 +70,7 @@ def follow_points(scene: Scene, start: int, xy: Array) -> Followed:
     on = np.flatnonzero(np.isfinite(points).all(1) & (sample(view.beyond, pixels) < _RIM))
     if not len(on):
         return found
-    chain = follow_chain(scene.warps(), start, pixels[on])
+    chain = follow_chain(scene.warps(), np.full(len(on), start), pixels[on])
     there = [index for index, one in enumerate(scene.views) if one is not None]
     views = [one for one in scene.views if one is not None]
     variance, measured = chain.variance[there], chain.measured[there]

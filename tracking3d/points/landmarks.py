@@ -7,12 +7,13 @@ points are followed better: it is done several times.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from tracking3d.points.bundle import bundle
 from tracking3d.points.carrying import Warps
@@ -21,16 +22,18 @@ from tracking3d.points.meeting import surface_under
 from tracking3d.points.surface import move_surface
 from tracking3d.points.view import Array, View, draw
 
-ROUNDS = 4
+ROUNDS = 6
 START_VIEWS = 8
 MOST_SEEDS = 120
 """Landmarks that begin in one view."""
 TOLERANCE = 0.03
 """How far behind a drawn surface a point may lie and be seen, in radii of the object."""
+DEVIATION = 0.1
+"""Pixels that a measurement is off at best."""
 _BETWEEN = 7.0  # pixels between seeds
 _LEAST_VIEWS = 6  # of a landmark that moves the surface
-_DEVIATION = 0.1  # pixels that a measurement is off at best
-_POINT, _ROTATION, _TRANSLATION = 0.1, 0.03, 0.03  # priors of the bundle: radii, radians, radii
+_SETTLED = np.deg2rad(0.03)
+_HELD = 0.1  # deviation of landmarks from the surface, in radii
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,11 +44,13 @@ class Scene:
         views: None where the object was not found.
         vertices: ``(V, 3)`` in object coordinates.
         faces: ``(F, 3)``.
+        focal_factor: By which the views' focal lengths are those that they were opened with.
     """
 
     views: list[View | None]
     vertices: Array
     faces: NDArray[np.int64]
+    focal_factor: float = 1.0
 
     @property
     def radius(self) -> float:
@@ -56,68 +61,86 @@ class Scene:
         """The views for carrying points between them."""
         return Warps(self.views, TOLERANCE * self.radius)
 
-    def redrawn(self, vertices: Array, poses: dict[int, Array]) -> Scene:
-        """The same views with another surface in other poses, by index of the view."""
+    def redrawn(self, vertices: Array, poses: Mapping[int, Array], focal_factor: float = 1.0) -> Scene:
+        """The same views with another surface in other poses, by index of the view, through another lens."""
+        lens = np.array([focal_factor, focal_factor, 1.0, 1.0])
         views = [
-            None if view is None else draw(view, vertices, self.faces, poses[index])
+            None
+            if view is None
+            else draw(replace(view, intrinsics=view.intrinsics * lens), vertices, self.faces, poses[index])
             for index, view in enumerate(self.views)
         ]
-        return Scene(views, vertices, self.faces)
+        return Scene(views, vertices, self.faces, self.focal_factor * focal_factor)
 
 
 def refine_scene(
-    scene: Scene, rounds: int = ROUNDS, after_round: Callable[[int], None] = lambda done: None
+    scene: Scene,
+    rounds: int = ROUNDS,
+    after_round: Callable[[int], None] = lambda done: None,
+    free_focal: bool = False,
 ) -> Scene:
-    """Put surface and poses right, as far as the images say how.
+    """Put surface and poses right, as far as the images say how, until the poses hardly turn any more.
 
     Args:
         scene: As a run left it.
-        rounds: How many times.
+        rounds: How many times at most.
         after_round: Is told how many are done.
+        free_focal: Whether the lens is to be put right too, since nobody knows it.
     """
     for done in range(1, rounds + 1):
-        scene = _refine_once(scene)
+        before, scene = scene, _refine_once(scene, free_focal)
         after_round(done)
+        if _turned(before, scene) < _SETTLED:
+            break
     return scene
 
 
-def _refine_once(scene: Scene) -> Scene:
-    there = [index for index, view in enumerate(scene.views) if view is not None]
-    warps = scene.warps()
-    spread = np.unique(np.linspace(0, max(len(there) - 1, 0), START_VIEWS).round().astype(int))
-    starts = [there[at] for at in spread if at < len(there)]
-    found = [
-        (face, barycentric, follow_chain(warps, start, xy))
-        for start in starts
-        for face, barycentric, xy in [_seeds(scene, start)]
-        if len(xy)
+def _turned(before: Scene, after: Scene) -> float:
+    """Median angle in radians by which the poses turned, that of the object frame itself left out."""
+    pairs = [
+        (a.T_cam_obj, b.T_cam_obj)
+        for a, b in zip(before.views, after.views, strict=True)
+        if a is not None and b is not None
     ]
-    if not found:
+    if not pairs:
+        return 0.0
+    first, second = (np.stack(part)[:, :3, :3] for part in zip(*pairs, strict=True))
+    turned = Rotation.from_matrix(first.transpose(0, 2, 1) @ second)
+    return float(np.median((turned.mean().inv() * turned).magnitude()))
+
+
+def _refine_once(scene: Scene, free_focal: bool) -> Scene:
+    there = [index for index, view in enumerate(scene.views) if view is not None]
+    if not there:
         return scene
-    face, barycentric = (np.concatenate([one[part] for one in found]) for part in (0, 1))
-    points = np.einsum("nk,nkd->nd", barycentric, scene.vertices[scene.faces[face]])
     views = [view for view in scene.views if view is not None]
+    spread = np.unique(np.linspace(0, len(there) - 1, START_VIEWS).round().astype(int))
+    begun = [seeds(views[at], scene.vertices, scene.faces) for at in spread]
+    face, barycentric, xy = (np.concatenate(part) for part in zip(*begun, strict=True))
+    if not len(xy):
+        return scene
+    start = np.repeat(np.array(there)[spread], [len(one[2]) for one in begun])
+    chain = follow_chain(scene.warps(), start, xy)
+    points = np.einsum("nk,nkd->nd", barycentric, scene.vertices[scene.faces[face]])
     intrinsics, T = np.stack([v.intrinsics for v in views]), np.stack([v.T_cam_obj for v in views])
-    measured = np.concatenate([one[2].measured[there] for one in found], 1)
-    deviation = np.sqrt(np.concatenate([one[2].variance[there] for one in found], 1) + _DEVIATION**2)
+    measured = chain.measured[there]
+    deviation = np.sqrt(chain.variance[there] + DEVIATION**2)
     radius = scene.radius
-    landmarks, T, weight = bundle(
-        points, intrinsics, T, measured, deviation, _POINT * radius, _ROTATION, _TRANSLATION * radius
-    )
-    kept = (weight > 0).sum(0) >= min(_LEAST_VIEWS, len(there))
-    vertices = move_surface(scene.vertices, scene.faces, face[kept], barycentric[kept], landmarks[kept])
-    return scene.redrawn(vertices, dict(zip(there, T, strict=True)))
+    found = bundle(points, intrinsics, T, measured, deviation, _HELD * radius, free_focal)
+    kept = (found.weight > 0).sum(0) >= min(_LEAST_VIEWS, len(there))
+    vertices = move_surface(scene.vertices, scene.faces, face[kept], barycentric[kept], found.points[kept])
+    return scene.redrawn(vertices, dict(zip(there, found.T_cam_obj, strict=True)), found.focal_factor)
 
 
-def _seeds(scene: Scene, index: int) -> tuple[NDArray[np.int64], Array, Array]:
-    """Where landmarks begin in a view: face, weights of its corners, and pixel of each."""
-    view = scene.views[index]
-    assert view is not None
+def seeds(view: View, vertices: Array, faces: NDArray[np.int64]) -> tuple[NDArray[np.int64], Array, Array]:
+    """Where landmarks begin in a view of a surface: face ``(N,)``, weights of its corners ``(N, 3)``, and pixel
+    ``(N, 2)`` of each.
+    """
     inside = cv2.erode(((view.beyond == 0) & (view.mask > 0.5)).astype(np.uint8), np.ones((5, 5), np.uint8))
     corners = cv2.goodFeaturesToTrack(
         view.image.clip(0, 255).astype(np.uint8), MOST_SEEDS, 0.005, _BETWEEN, mask=inside
     )
     xy = np.zeros((0, 2)) if corners is None else corners[:, 0].astype(np.float64)
-    face, barycentric = surface_under(*view.project(scene.vertices), scene.faces, xy)
+    face, barycentric = surface_under(*view.project(vertices), faces, xy)
     on = face >= 0
     return face[on], barycentric[on], xy[on]

@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 Plane = NDArray[np.float32]
 
 LONGEST_SIDE = 320
-"""Pixels of a window; larger ones are scaled down."""
+"""Pixels of a window, where nothing else is said."""
 MARGIN = 12
 """Frame pixels around mask and mesh that belong to the window."""
 REACH = 12.0
@@ -129,6 +129,7 @@ def open_view(
     T_cam_obj: Array,
     vertices: Array,
     faces: NDArray[np.int64],
+    longest_side: int = LONGEST_SIDE,
 ) -> View | None:
     """The window of a frame around its mask and the projected mesh.
 
@@ -139,6 +140,7 @@ def open_view(
         T_cam_obj: ``(4, 4)``.
         vertices: ``(V, 3)``.
         faces: ``(F, 3)``.
+        longest_side: Pixels of the window; a larger one is scaled down.
 
     Returns:
         The view, or None where the pose is no number or nothing of the object lies in the frame.
@@ -160,7 +162,7 @@ def open_view(
     (left, top), (right, bottom) = low.tolist(), high.tolist()
     grey = cv2.cvtColor(image[top:bottom, left:right], cv2.COLOR_RGB2GRAY).astype(np.float32)
     inside = mask[top:bottom, left:right].astype(np.float32)
-    factor = min(1.0, LONGEST_SIDE / max(grey.shape))
+    factor = min(1.0, longest_side / max(grey.shape))
     width, height = (max(round(side * factor), 8) for side in (right - left, bottom - top))
     if factor < 1:
         grey, inside = (cv2.resize(p, (width, height), interpolation=cv2.INTER_AREA) for p in (grey, inside))

@@ -79,14 +79,29 @@ class RefinementWriter:
         """Wall time of the refinement so far, pauses left out."""
         return time.monotonic() - self._started
 
-    def draw_again(self, frame: Frame) -> FrameRecord:
-        """Draw a frame that was looked at again before the run was stopped."""
-        record = self._records.get(frame.index)
-        if record is None:
-            return self._let_stand(frame)
-        mask = read_mask(layout.mask_path(self._aside, frame.index))
-        self.pictures.add_kept(frame, record, mask, self.initial_mask(frame.index))
-        return record
+    def answer(self, index: int) -> FrameRecord:
+        """The answer for frame ``index`` as it is now: the second one, or the causal one where there is none."""
+        return self._records.get(index) or self.causal[index]
+
+    def put_right(self, index: int, T_cam_obj: NDArray[np.float64]) -> None:
+        """Give a second answer the pose ``T_cam_obj`` ``(4, 4)``, that of the camera of the end; causal ones stand.
+
+        It is not kept for a run that is stopped here and goes on later: that finds it anew.
+        """
+        if (record := self._records.get(index)) is not None:
+            self._records[index] = replace(record, T_cam_obj=T_cam_obj, camera=None)
+
+    def draw(self, frame: Frame) -> None:
+        """Draw the answer for a frame.
+
+        Raises:
+            OutputError: If the video cannot be written.
+        """
+        record = self.answer(frame.index)
+        with measured("write") as watch:
+            self.pictures.add_kept(frame, record, self.mask(record), self.initial_mask(frame.index))
+        if frame.index in self._records:
+            self._records[frame.index] = record.and_wrote(watch.times.write)
 
     def write(self, estimate: FrameEstimate | None, frame: Frame) -> FrameRecord:
         """Keep the second answer for one frame; None lets the causal one stand.
@@ -98,7 +113,7 @@ class RefinementWriter:
             OutputError: If it cannot be written.
         """
         if estimate is None:
-            return self._let_stand(frame)
+            return self.causal[frame.index]
         causal, initial = self.causal[frame.index], self.initial_mask(frame.index)
         estimate = replace(
             estimate, refined=True, initial_mask=initial, keyframe=estimate.keyframe or causal.keyframe
@@ -106,7 +121,6 @@ class RefinementWriter:
         with measured("write") as watch:
             record = FrameRecord.of(estimate, frame.name, initial, revision=True)
             write_mask(layout.mask_path(self._aside, frame.index), estimate.mask)
-            self.pictures.add(frame, estimate, record)
         record = record.and_wrote(watch.times.write)
         with writing(self._aside), (self._aside / layout.FRAMES).open("ab") as lines:
             lines.write(record.to_json().encode() + b"\n")
@@ -121,13 +135,6 @@ class RefinementWriter:
             if mask is None
             else mask
         )
-
-    def _let_stand(self, frame: Frame) -> FrameRecord:
-        """Draw the causal answer."""
-        causal = self.causal[frame.index]
-        mask = read_mask(layout.mask_path(self._folder, frame.index))
-        self.pictures.add_kept(frame, causal, mask, self.initial_mask(frame.index))
-        return causal
 
     def initial_mask(self, index: int) -> NDArray[np.bool_] | None:
         """What the mask tracker gave for frame ``index``, ``(H, W)`` bool, or None."""

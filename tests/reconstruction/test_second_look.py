@@ -1,0 +1,98 @@
+"""Poses and lens of a patterned ball that are off are put right by what its frames show."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rendered_views import CAMERA, ball, pattern, pose, seen
+from scipy.spatial.transform import Rotation
+
+from tracking3d.estimation.estimate import Status
+from tracking3d.evaluation.alignment import align_object_frame
+from tracking3d.reconstruction.second_look import SecondLook
+from tracking3d.results.records import FrameRecord
+
+YAWS = np.linspace(0, 48, 9)
+TRUE = np.stack([pose(yaw, 0.4 * yaw) for yaw in YAWS])
+FRAMES = [seen(T, pattern()) for T in TRUE]
+
+
+def answer(index: int, T_cam_obj: np.ndarray, status: Status = Status.TRACKED) -> FrameRecord:
+    return FrameRecord(index, None, str(index), T_cam_obj, status, "", 0.9, {}, 0, False, 0.0, None, 100)
+
+
+def disturbed(degrees: float = 1.5) -> np.ndarray:
+    turns = Rotation.from_rotvec(np.deg2rad(np.random.default_rng(2).normal(0, degrees, (len(TRUE), 3))))
+    T = TRUE.copy()
+    T[:, :3, :3] = turns.as_matrix() @ TRUE[:, :3, :3]
+    return T
+
+
+def rotation_errors(T: np.ndarray) -> np.ndarray:
+    R = align_object_frame(T, TRUE).poses(T)[:, :3, :3] @ TRUE[:, :3, :3].transpose(0, 2, 1)
+    return np.rad2deg(Rotation.from_matrix(R).magnitude())
+
+
+def settled(T: np.ndarray, most: int = 20, camera=CAMERA) -> tuple[SecondLook, np.ndarray]:
+    look = SecondLook(ball(), camera, range(len(T)), most)
+    for index, (image, mask) in enumerate(FRAMES):
+        look.see(answer(index, T[index]), image, mask)
+    look.settle()
+    poses = [look.pose(answer(index, T[index]), *FRAMES[index]) for index in range(len(T))]
+    return look, np.stack(poses)
+
+
+@pytest.mark.parametrize("most", [20, 5])
+def test_poses_are_put_right_also_of_frames_that_were_not_kept(most):
+    off = disturbed()
+    look, found = settled(off, most)
+    assert rotation_errors(off).mean() > 1.5
+    assert rotation_errors(found).mean() < 0.3
+    assert look.camera == CAMERA
+    assert np.abs(np.linalg.norm(look.vertices, axis=1) - 1).max() < 0.1
+
+
+def test_a_lens_that_was_assumed_is_put_right_with_them_and_one_that_was_given_stays():
+    longer = replace(CAMERA, fx=1.3 * CAMERA.fx, fy=1.3 * CAMERA.fy)
+    off = disturbed(0.5)
+    off[:, 2, 3] *= 1.3
+    given, _ = settled(off, camera=longer)
+    assert given.camera == longer
+    look, found = settled(off, camera=replace(longer, assumed=True))
+    assert look.camera.fx == pytest.approx(CAMERA.fx, rel=0.08)
+    assert look.camera.fy == pytest.approx(look.camera.fx)
+    assert rotation_errors(found).mean() < 0.5
+
+
+def test_a_lost_frame_is_not_looked_at_but_goes_with_the_object():
+    off = disturbed()
+    look = SecondLook(ball(), CAMERA, range(9), 20)
+    nothing = np.zeros_like(FRAMES[4][0])
+    for index, (image, mask) in enumerate(FRAMES):
+        lost = index == 4
+        record = answer(index, off[index], Status.LOST if lost else Status.TRACKED)
+        look.see(record, nothing if lost else image, mask)
+    look.settle()
+    found = look.pose(answer(4, off[4], Status.LOST), nothing, FRAMES[4][1])
+    assert np.isfinite(found).all()
+    assert np.rad2deg(Rotation.from_matrix(found[:3, :3] @ off[4, :3, :3].T).magnitude()) < 6
+
+
+def test_too_few_frames_or_poses_that_are_no_numbers_change_nothing():
+    off = disturbed()
+    look, found = settled(off, most=3)
+    assert np.array_equal(found, off)
+    assert np.array_equal(look.vertices, ball().vertices)
+    broken = off.copy()
+    broken[3] = np.nan
+    look, found = settled(broken)
+    assert np.isnan(found[3]).all()
+    assert np.isfinite(np.delete(found, 3, 0)).all()
+
+
+def test_without_frames_there_is_nothing_to_settle():
+    look = SecondLook(ball(), CAMERA, (), 20)
+    look.settle()
+    assert np.array_equal(look.pose(answer(0, TRUE[0]), *FRAMES[0]), TRUE[0])

@@ -1,0 +1,90 @@
+"""The passes over a video: every frame is answered, looked at again where there is a final refinement, and drawn."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Generator, Iterable
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+from tracking3d.frames import Frame, SkippedFrame
+from tracking3d.object_recording import ObjectRecording
+from tracking3d.results.records import FrameRecord
+from tracking3d.video.source import FrameSource
+
+Listener = Callable[[FrameRecord | SkippedFrame], None]
+"""Is told of every frame as it is done, or skipped; where there is a final refinement, once more of each."""
+
+
+def go_through(
+    source: FrameSource,
+    frames: Iterable[Frame | SkippedFrame],
+    recordings: list[ObjectRecording],
+    listener: Listener,
+) -> None:
+    """Take every recording through the frames, and through them again where it refines.
+
+    A recording that fails is ended; the others go on.
+
+    Args:
+        source: Where the frames come from.
+        frames: Its frames, begun already.
+        recordings: One an object.
+        listener: Is told of every frame of every object.
+
+    Raises:
+        Tracking3dError: The first failure, at the end or as soon as no recording is left.
+    """
+    going_on, errors = list(recordings), list[Exception]()
+    share = 1 / len(recordings)
+
+    def each(action: Callable[[ObjectRecording], FrameRecord | SkippedFrame | None]) -> None:
+        for recording in tuple(going_on):
+            try:
+                if told := action(recording):
+                    listener(told)
+            except Exception as error:
+                going_on.remove(recording)
+                recording.give_up(error)
+                errors.append(error)
+        if not going_on:
+            raise errors[0]
+
+    try:
+        for frame in frames if any(recording.takes for recording in going_on) else ():
+            each(partial(ObjectRecording.take, frame=_shared(frame, share)))
+        each(partial(ObjectRecording.begin_refinement, source=source))
+        for frame in timed(source) if any(recording.looks_again for recording in going_on) else ():
+            if isinstance(frame, Frame):
+                each(partial(ObjectRecording.take_again, frame=_shared(frame, share)))
+        each(ObjectRecording.settle)
+        for frame in timed(source) if any(recording.draws for recording in going_on) else ():
+            if isinstance(frame, Frame):
+                each(partial(ObjectRecording.draw, frame=frame))
+        each(ObjectRecording.finish)
+    except BaseException as error:
+        for recording in going_on:
+            recording.give_up(error)
+        raise
+    if errors:
+        raise errors[0]
+
+
+def timed(source: FrameSource) -> Generator[Frame | SkippedFrame]:
+    """The frames of a source with the time that reading them took; of a live one, which is waited for, without."""
+    frames, started = iter(source), time.perf_counter()
+    try:
+        for frame in frames:
+            if isinstance(frame, Frame) and source.repeatable:
+                yield replace(frame, decoding=time.perf_counter() - started)
+            else:
+                yield frame
+            started = time.perf_counter()
+    finally:
+        if isinstance(frames, Generator):
+            frames.close()
+
+
+def _shared(frame: Frame | SkippedFrame, share: float) -> Any:
+    return replace(frame, decoding=share * frame.decoding) if isinstance(frame, Frame) else frame

@@ -1,0 +1,121 @@
+"""Poses, lens and surface put right by points, once all frames of a video have been looked at again.
+
+The final refinement gives a pose to every frame by what is rendered there, through a surface that is a few percent off.
+Points that the images follow over many views have no such bias (`tracking3d.points`). Some of the frames, spread over
+the video, are bundled; every other one is resected from its neighbours among them, so that memory is bounded.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.estimation.estimate import ObjectModel, Status
+from tracking3d.frames import Image
+from tracking3d.geometry.camera import Camera
+from tracking3d.points.landmarks import Scene, refine_scene
+from tracking3d.points.resection import resect
+from tracking3d.points.view import View, open_view
+from tracking3d.reconstruction.views import TextureView
+from tracking3d.results.records import FrameRecord
+
+ROUNDS = 5
+LONGEST_SIDE = 240
+"""Pixels of the windows in which points are followed."""
+_LEAST_VIEWS = 4
+_Pose = NDArray[np.float64]
+
+
+class SecondLook:
+    """The frames of the final refinement as they come by, and what they say together.
+
+    Args:
+        model: The final object; its surface is what points are on.
+        camera: Of the full frame.
+        answered: Indices of the frames that will come, ascending.
+        most: How many of them are kept.
+
+    Attributes:
+        camera: The same, through another lens where nobody gave it and `settle` found it.
+        vertices: ``(V, 3)`` of the object; others after `settle`.
+    """
+
+    def __init__(self, model: ObjectModel, camera: Camera, answered: Sequence[int], most: int) -> None:
+        self.camera, self.vertices = camera, np.asarray(model.vertices, np.float64)
+        self._lens, self._faces = camera.fx, np.asarray(model.faces, np.int64)
+        count = min(most, len(answered))
+        at = np.linspace(0, len(answered) - 1, count).round().astype(int) if count else ()
+        self._wanted = {answered[index] for index in at}
+        self._views: dict[int, View] = {}
+        self._scene: Scene | None = None
+        self._bundled: list[int] = []
+        self._before: dict[int, _Pose] = {}
+
+    def see(self, record: FrameRecord, image: Image, mask: NDArray[np.bool_]) -> None:
+        """Keep a frame, if it is one of those to be bundled and its object was found."""
+        if record.index in self._wanted and record.status is not Status.LOST:
+            view = self._view(record.T_cam_obj, image, mask)
+            if view is not None:
+                self._views[record.index] = view
+
+    def settle(self) -> None:
+        """Put poses, lens and surface right, as far as the frames say how."""
+        if len(self._views) < _LEAST_VIEWS:
+            return
+        self._bundled = sorted(self._views)
+        views: list[View | None] = [self._views[index] for index in self._bundled]
+        self._before = {index: self._views[index].T_cam_obj for index in self._bundled}
+        self._views = {}
+        scene = refine_scene(Scene(views, self.vertices, self._faces), ROUNDS, free_focal=self.camera.assumed)
+        self._scene, self.vertices = scene, scene.vertices
+        factor = scene.focal_factor
+        self.camera = replace(self.camera, fx=factor * self.camera.fx, fy=factor * self.camera.fy)
+
+    def pose(self, record: FrameRecord, image: Image, mask: NDArray[np.bool_]) -> _Pose:
+        """The pose ``(4, 4)`` of any frame, after `settle`.
+
+        Args:
+            record: Its answer.
+            image: ``(H, W, 3)`` RGB.
+            mask: ``(H, W)`` the answer's.
+        """
+        scene = self._scene
+        if scene is None or not np.isfinite(record.T_cam_obj).all():
+            return record.T_cam_obj
+        after = bisect(self._bundled, record.index)
+        around = [at for at in (after - 1, after) if 0 <= at < len(self._bundled)]
+        nearest = min(around, key=lambda at: abs(self._bundled[at] - record.index))
+        kept = scene.views[nearest]
+        assert kept is not None
+        if self._bundled[nearest] == record.index:
+            return kept.T_cam_obj
+        # What the nearest frame's pose was moved by in object coordinates: mostly, the object frame itself moved.
+        T_before_now = (
+            np.linalg.inv(self._through_lens(self._before[self._bundled[nearest]])) @ kept.T_cam_obj
+        )
+        predicted = self._through_lens(record.T_cam_obj) @ T_before_now
+        view = None if record.status is Status.LOST else self._view(predicted, image, mask)
+        return predicted if view is None else resect(scene, view, around).T_cam_obj
+
+    def moved(self, model: ObjectModel) -> ObjectModel:
+        """The model with the surface that was found."""
+        return replace(model, vertices=self.vertices)
+
+    def seen_by(self, view: TextureView, record: FrameRecord) -> TextureView:
+        """What the texture is taken from, with the pose that its frame has in the end."""
+        factor = self.camera.fx / self._lens
+        return replace(view, K=view.K @ np.diag([factor, factor, 1.0]), T_cam_obj=record.T_cam_obj)
+
+    def _view(self, T_cam_obj: _Pose, image: Image, mask: NDArray[np.bool_]) -> View | None:
+        return open_view(image, mask, self.camera, T_cam_obj, self.vertices, self._faces, LONGEST_SIDE)
+
+    def _through_lens(self, T_cam_obj: _Pose) -> _Pose:
+        """A pose of before at which the object has the same size through the lens of now."""
+        assert self._scene is not None
+        T = T_cam_obj.copy()
+        T[2, 3] *= self._scene.focal_factor
+        return T
