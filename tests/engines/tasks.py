@@ -59,3 +59,13 @@ def surroundings(tell: Any, *names: str) -> tuple[Any, ...]:
 
     found = [os.environ.get(name) for name in names]
     return (*found, torch.get_num_threads(), cv2.getNumThreads(), Path.cwd().name)
+
+
+def node(tell: Any, seconds: float) -> str:
+    """On which node of Ray it is; takes its time."""
+    import ray
+
+    name = ray.get_runtime_context().get_node_id()
+    tell(name)
+    time.sleep(seconds)
+    return name
