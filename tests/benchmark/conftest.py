@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 
 import pytest
+
 from tracking3d.benchmark.variant import Variant
 from tracking3d.config.loading import load_config
 from tracking3d.datasets.clip import write_clip

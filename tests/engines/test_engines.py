@@ -1,4 +1,4 @@
-"""Engines do tasks, tell how they go on, and outlive what kills a worker; the loop tries again and knows when to stop."""
+"""Engines do tasks and outlive what kills a worker; the loop tries again, and knows when to stop."""
 
 from __future__ import annotations
 
@@ -95,7 +95,9 @@ def test_a_worker_whose_master_is_gone_stops(tmp_path):
     engine.stop()
 
 
-def test_a_worker_has_its_share_of_threads_the_environment_and_the_folder_of_the_caller(tmp_path, monkeypatch):
+def test_a_worker_has_its_share_of_threads_the_environment_and_the_folder_of_the_caller(
+    tmp_path, monkeypatch
+):
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     monkeypatch.setenv("TRACKING3D_OF_A_TEST", "set")

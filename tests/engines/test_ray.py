@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-import time
+from pathlib import Path
 
 import pytest
 import tasks
@@ -11,7 +11,7 @@ import tasks
 from tracking3d.engines.choosing import open_engine
 from tracking3d.engines.mapping import map_tasks
 from tracking3d.engines.on_ray import RayEngine
-from tracking3d.engines.protocol import Began, Ended, Needs, Task, Told
+from tracking3d.engines.protocol import Began, Needs, Task, Told
 
 pytestmark = [
     pytest.mark.slow,
@@ -29,8 +29,7 @@ def ray():
 @pytest.fixture
 def here(monkeypatch):
     """Workers of Ray find the functions of these tests."""
-    folder = os.path.dirname(__file__)
-    paths = [folder, os.getcwd(), os.environ.get("PYTHONPATH", "")]
+    paths = [str(Path(__file__).parent), str(Path.cwd()), os.environ.get("PYTHONPATH", "")]
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, paths)))
 
 
@@ -48,7 +47,7 @@ def test_faults_retries_and_stops_are_those_of_processes(ray, here, tmp_path):
         ended = map_tasks(engine, jobs, retries=1, pause=0.0, listener=told.append)
         assert ended[1].value == 9
         assert ended[2].fault.reason == "No such video." and not ended[2].fault.crashed
-        assert ended[3].fault.crashed and "the last words" in ended[3].fault.reason
+        assert ended[3].fault.crashed and "Aborted; see" in ended[3].fault.reason
         assert ended[4].value == "done" and ended[4].attempts == 2
         assert ended[5].value == "Haswell"
         assert any(isinstance(event, Began) and event.worker.startswith("worker") for event in told)

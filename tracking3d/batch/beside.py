@@ -10,9 +10,12 @@ from tracking3d.batch.places import base, is_folder, joined, matches, names_in, 
 from tracking3d.batch.rows import Row, read_row
 from tracking3d.errors import InputError
 
-VIDEOS = frozenset(
-    ".3gp .avi .flv .m2ts .m4v .mkv .mov .mp4 .mpeg .mpg .mts .mxf .ogv .ts .webm .wmv .y4m".split()
-)
+# fmt: off
+VIDEOS = frozenset((
+    ".3gp", ".avi", ".flv", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg",
+    ".mpg", ".mts", ".mxf", ".ogv", ".ts", ".webm", ".wmv", ".y4m",
+))
+# fmt: on
 """Names that count as videos in a folder."""
 
 BOX, JSON = ".box", ".json"

@@ -100,11 +100,14 @@ def _together(rows: Sequence[tuple[Row, int]]) -> list[tuple[Row, int]]:
     """Rows that differ in the object only, as one."""
     groups: defaultdict[str, list[tuple[Row, int]]] = defaultdict(list)
     for row, size in rows:
-        groups[row.model_copy(update={"box": (), "mask": (), "points": ()}).model_dump_json()].append((row, size))
+        groups[row.model_copy(update={"box": (), "mask": (), "points": ()}).model_dump_json()].append(
+            (row, size)
+        )
     together = []
     for group in groups.values():
         objects: Mapping[str, Any] = {
-            kind: tuple(one for row, _ in group for one in getattr(row, kind)) for kind in ("box", "mask", "points")
+            kind: tuple(one for row, _ in group for one in getattr(row, kind))
+            for kind in ("box", "mask", "points")
         }
         together.append((group[0][0].model_copy(update=objects), group[0][1]))
     return together

@@ -201,7 +201,9 @@ def _opened(place: str) -> tuple[Any, str]:
     except ImportError as error:
         kind = place.partition("://")[0]
         what = f"pip install 'tracking3d[{_EXTRAS[kind]}]'" if kind in _EXTRAS else f"it says: {error}"
-        raise InputError(f"Paths that begin with {kind}:// need a package that is not installed: {what}.") from error
+        raise InputError(
+            f"Paths that begin with {kind}:// need a package that is not installed: {what}."
+        ) from error
     except ValueError as error:
         raise InputError(f"{place} is no path that can be opened ({error}).") from error
     files.invalidate_cache()

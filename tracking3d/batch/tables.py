@@ -51,7 +51,7 @@ def _csv(content: bytes) -> list[tuple[int, dict[str, Any]]]:
     reader = csv.DictReader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True)
     rows = []
     for values in reader:
-        more = values.pop(None, None)  # type: ignore[call-overload]
+        more = values.pop(None, None)
         if more:
             raise ValueError(f"line {reader.line_num} has more values than there are columns")
         rows.append((reader.line_num, values))

@@ -91,7 +91,13 @@ def run_jobs(
     for first in sorted(same.keys() & outcomes.keys()):
         follow(first)
     tasks = [
-        Task(number, _run_written, (_absolute(job.write()),), _absolute(job.folder / LOG), job.variant.environment)
+        Task(
+            number,
+            _run_written,
+            (_absolute(job.write()),),
+            _absolute(job.folder / LOG),
+            job.variant.environment,
+        )
         for number, job in ((number, jobs[number]) for number in same if number not in outcomes)
     ]
     if tasks:

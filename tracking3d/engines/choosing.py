@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from tracking3d.engines.processes import ProcessEngine
-from tracking3d.engines.protocol import Engine, Needs
+from tracking3d.engines.protocol import ONE_CORE, Engine, Needs
 
 
 @contextmanager
 def open_engine(
-    address: str | None = None, workers: int | None = None, needs: Needs = Needs()
+    address: str | None = None, workers: int | None = None, needs: Needs = ONE_CORE
 ) -> Iterator[Engine]:
     """Ray where an address is given, else processes of this machine; what runs is stopped at the end.
 

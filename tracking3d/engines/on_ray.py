@@ -16,7 +16,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from tracking3d.engines.protocol import Began, Ended, Event, Fault, Needs, Task, Told
+from tracking3d.engines.protocol import ONE_CORE, Began, Ended, Event, Fault, Needs, Task, Told
 from tracking3d.engines.worker import call, last_words, threads_in_words
 from tracking3d.errors import InputError
 
@@ -38,7 +38,7 @@ _QUIET = {
 
 
 @contextmanager
-def open_ray(address: str, workers: int | None = None, needs: Needs = Needs()) -> Iterator[RayEngine]:
+def open_ray(address: str, workers: int | None = None, needs: Needs = ONE_CORE) -> Iterator[RayEngine]:
     """Connect to a cluster, or start Ray on this machine; a Ray that runs in this process already is taken.
 
     Args:
@@ -69,6 +69,7 @@ def open_ray(address: str, workers: int | None = None, needs: Needs = Needs()) -
                 f"No Ray cluster answers at --address {address} ({' '.join(str(error).split())[:200]}); give auto on a "
                 f"machine of the cluster, HOST:PORT, ray://HOST:PORT, or {THIS_MACHINE}."
             ) from error
+    _silence()
     try:
         yield RayEngine(workers, needs)
     finally:
@@ -89,7 +90,7 @@ class RayEngine:
 
     name = "Ray"
 
-    def __init__(self, workers: int | None = None, needs: Needs = Needs()) -> None:
+    def __init__(self, workers: int | None = None, needs: Needs = ONE_CORE) -> None:
         ray = _ray()
         cores = int(ray.cluster_resources().get("CPU", 1))
         self.workers = workers or max(1, cores // needs.threads)
@@ -173,7 +174,8 @@ class RayEngine:
             return value, fault
         except ray.exceptions.RayError as error:
             lines = str(error).strip().splitlines() or [type(error).__name__]
-            reason = f"Its worker or its machine was lost: {lines[0].strip().rstrip('.')}{last_words(task.log)}."
+            said = lines[0].partition(". ")[0].strip().rstrip(".")
+            reason = f"Its worker or its machine was lost ({said}){last_words(task.log)}."
             return None, Fault(reason, crashed=True)
 
 
@@ -198,6 +200,14 @@ def _call_remotely(mailbox: Any, task: Task, threads: int, folder: str) -> tuple
         os.chdir(folder)
     mailbox.put.remote(task.number, ray.util.get_node_ip_address(), None)
     return call(task, lambda content: mailbox.put.remote(task.number, "", content), threads)
+
+
+def _silence() -> None:
+    """Ray prints what becomes of workers on the standard output, which is the command's; no setting forbids it."""
+    with suppress(ImportError, AttributeError):
+        from ray._private import worker
+
+        worker.print_to_stdstream = lambda *given, **named: None
 
 
 @contextmanager

@@ -16,8 +16,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
+from typing import Any
 
-from tracking3d.engines.protocol import Began, Ended, Event, Fault, Needs, Task, Told
+from tracking3d.engines.protocol import ONE_CORE, Began, Ended, Event, Fault, Needs, Task, Told
 from tracking3d.engines.worker import call, interruptible, last_words, threads_in_words
 
 GRACE = 20.0
@@ -59,7 +60,7 @@ class ProcessEngine:
 
     name = "processes of this machine"
 
-    def __init__(self, workers: int | None = None, needs: Needs = Needs()) -> None:
+    def __init__(self, workers: int | None = None, needs: Needs = ONE_CORE) -> None:
         self.workers = workers or default_workers(needs)
         self._threads = needs.threads
         self._running: dict[int, _Running] = {}
@@ -70,9 +71,9 @@ class ProcessEngine:
         methods = multiprocessing.get_all_start_methods()
         # Variables that are read when a library is imported want a process that has imported nothing.
         forks = "forkserver" in methods and not task.environment
-        context = multiprocessing.get_context("forkserver" if forks else "spawn")
         if forks:
-            context.set_forkserver_preload(PRELOADED)
+            multiprocessing.set_forkserver_preload(PRELOADED)
+        context: Any = multiprocessing.get_context("forkserver" if forks else "spawn")
         ours, theirs = context.Pipe()
         variables = {**threads_in_words(self._threads), **task.environment}
         arguments = (theirs, task, self._threads, {**os.environ, **variables}, os.getcwd())  # noqa: PTH109
@@ -137,7 +138,9 @@ class ProcessEngine:
         del self._running[running.task.number]
         fault = running.fault
         if not running.answered:
-            how = f"was ended by signal {-code}" if code is not None and code < 0 else f"ended with code {code}"
+            how = (
+                f"was ended by signal {-code}" if code is not None and code < 0 else f"ended with code {code}"
+            )
             fault = Fault(f"The process {how}{last_words(running.task.log)}.", crashed=True)
         self._events.append(Ended(running.task.number, running.value, fault))
 
@@ -152,7 +155,7 @@ def default_workers(needs: Needs) -> int:
     return workers
 
 
-def _handles(running: _Running) -> tuple[object, ...]:
+def _handles(running: _Running) -> tuple[Any, ...]:
     """What to wait for: after its answer only the end of a process."""
     if running.answered:
         return (running.process.sentinel,)
@@ -174,9 +177,7 @@ def _environment(variables: Mapping[str, str]) -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _work(
-    connection: Connection, task: Task, threads: int, environment: dict[str, str], folder: str
-) -> None:
+def _work(connection: Connection, task: Task, threads: int, environment: dict[str, str], folder: str) -> None:
     """What the process does: one task."""
     interruptible()
     os.environ.clear()

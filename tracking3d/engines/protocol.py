@@ -26,6 +26,9 @@ class Needs:
     gpus: float = 0.0
 
 
+ONE_CORE = Needs()
+
+
 @dataclass(frozen=True)
 class Task:
     """One call in a worker.

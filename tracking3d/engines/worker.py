@@ -7,7 +7,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -17,6 +17,8 @@ from tracking3d.errors import Tracking3dError
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """What libraries take the number of their threads from when they are imported."""
+
+_DUMP = 100  # lines, at most, of what the fault handler writes
 
 
 def threads_in_words(threads: int) -> dict[str, str]:
@@ -35,7 +37,8 @@ def call(task: Task, tell: Tell, threads: int = 1) -> tuple[Any, Fault | None]:
             _give_threads(threads)
             return task.function(tell, *task.arguments), None
         except (Exception, SystemExit) as error:
-            traceback.print_exc()
+            with suppress(OSError):  # the disk may be full
+                traceback.print_exc()
             return None, Fault(sentence_of(error))
 
 
@@ -54,7 +57,10 @@ def last_words(log: Path | None) -> str:
         lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
     except OSError:
         return ""
-    return f": {lines[-1].strip() if lines else 'it said nothing'}; see {log}"
+    # Where Python's fault handler is on, it lists modules after what matters.
+    fatal = [line for line in lines[-_DUMP:] if line.startswith("Fatal Python error")]
+    said = (fatal or lines[-1:] or ["it said nothing"])[0]
+    return f": {said.strip()}; see {log}"
 
 
 def interruptible() -> None:
@@ -92,7 +98,7 @@ def printed_into(log: Path | None) -> Iterator[None]:
 
 def _flush() -> None:
     for stream in (sys.stdout, sys.stderr):
-        if stream is not None:
+        with suppress(OSError, AttributeError):
             stream.flush()
 
 
