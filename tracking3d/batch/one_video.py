@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from tracking3d.batch.networks import SharedNetwork, keep_networks
 from tracking3d.batch.places import absolute, fetch, joined, local, remove, send, write
 from tracking3d.batch.summary import MARKER, write_marker
 from tracking3d.batch.video_job import VideoJob
@@ -60,7 +61,14 @@ def log_file(out: str, job: VideoJob) -> Path:
     return work_folder(out, job) / "log.txt"
 
 
-def track_video(tell: Tell, job: VideoJob, out: str, command: str, report: bool) -> dict[str, Any]:
+def track_video(
+    tell: Tell,
+    job: VideoJob,
+    out: str,
+    command: str,
+    report: bool,
+    networks: tuple[SharedNetwork, ...] = (),
+) -> dict[str, Any]:
     """Track one video; see `tracking3d.batch.summary.write_marker` for what is returned.
 
     A video that was begun before and stopped in whatever way goes on from its last finished frame.
@@ -71,6 +79,7 @@ def track_video(tell: Tell, job: VideoJob, out: str, command: str, report: bool)
         out: The folder of the batch.
         command: The command line, for the record.
         report: Whether to write a report.
+        networks: What the machine may lack.
 
     Raises:
         Tracking3dError: If it cannot be tracked; what is finished is kept for another time.
@@ -79,6 +88,7 @@ def track_video(tell: Tell, job: VideoJob, out: str, command: str, report: bool)
     with writing(work):
         work.mkdir(parents=True, exist_ok=True)
         attempts = _counted(work / "attempts")
+    keep_networks(networks)
     run = work / "run"
     try:
         _track(tell, _fetched(job, work / "source"), run, command)

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from tracking3d.batch.folder import Failure, Progress, relative, write_progress, write_tables
+from tracking3d.batch.networks import share_networks
 from tracking3d.batch.one_video import LOGS, log_file, track_video
 from tracking3d.batch.overview import write_overview
 from tracking3d.batch.places import joined, local, read_many
@@ -238,8 +239,11 @@ def run_batch(
         batch = Batch(out, jobs, engine, report, listener)
         left = batch.find_finished(overwrite)
         batch.write(now=True)
+        shared = share_networks(engine, jobs)
         tasks = [
-            Task(number, track_video, (jobs[number], out, command, report), log_file(out, jobs[number]))
+            Task(
+                number, track_video, (jobs[number], out, command, report, shared), log_file(out, jobs[number])
+            )
             for number in sorted(left, key=lambda number: -jobs[number].size)
         ]
         batch.say_all()

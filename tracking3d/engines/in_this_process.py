@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from tracking3d.engines.protocol import Began, Ended, Event, Task, Told
 from tracking3d.engines.worker import call
 
@@ -32,6 +34,9 @@ class InThisProcess:
         told: list[Event] = []
         value, fault = call(task, lambda content: told.append(Told(task.number, content)))
         return [Began(task.number, "this process"), *told, Ended(task.number, value, fault)]
+
+    def share(self, file: Path) -> None:
+        """See `Engine.share`; workers see the same files."""
 
     def stop(self) -> None:
         """See `Engine.stop`; nothing runs."""

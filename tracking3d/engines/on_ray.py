@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -134,6 +135,10 @@ class RayEngine:
             del self._slots[task.number]
         return events
 
+    def share(self, file: Path) -> _InObjectStore:
+        """See `Engine.share`; the file goes into Ray's object store."""
+        return _InObjectStore(_ray().put(file.read_bytes()))
+
     def stop(self) -> None:
         """See `Engine.stop`."""
         ray, running = _ray(), list(self._running)
@@ -177,6 +182,17 @@ class RayEngine:
             said = lines[0].partition(". ")[0].strip().rstrip(".")
             reason = f"Its worker or its machine was lost ({said}){last_words(task.log)}."
             return None, Fault(reason, crashed=True)
+
+
+@dataclass(frozen=True)
+class _InObjectStore:
+    """A file in Ray's object store, which a machine fetches when one of its workers reads it first."""
+
+    reference: Any
+
+    def read(self) -> bytes:
+        content: bytes = _ray().get(self.reference)
+        return content
 
 
 class _Mailbox:

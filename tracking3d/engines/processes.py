@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
+from pathlib import Path
 from typing import Any
 
 from tracking3d.engines.protocol import ONE_CORE, Began, Ended, Event, Fault, Needs, Task, Told
@@ -98,6 +99,9 @@ class ProcessEngine:
                 self._end(running)
         events, self._events = self._events, []
         return events
+
+    def share(self, file: Path) -> None:
+        """See `Engine.share`; workers see the same files."""
 
     def stop(self) -> None:
         """See `Engine.stop`."""

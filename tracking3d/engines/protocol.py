@@ -106,6 +106,14 @@ class Ended:
 Event = Began | Told | Ended
 
 
+class Shared(Protocol):
+    """A file that workers on other machines may read; it is sent to each of them once."""
+
+    def read(self) -> bytes:
+        """What it holds."""
+        ...
+
+
 class Engine(Protocol):
     """Calls functions in workers, several at a time. A worker that dies costs the task that it was at only.
 
@@ -123,6 +131,10 @@ class Engine(Protocol):
 
     def wait(self, seconds: float) -> list[Event]:
         """What has happened, in order; returns at once if something has, else after so many seconds."""
+        ...
+
+    def share(self, file: Path) -> Shared | None:
+        """Make a file known to workers, as an argument of tasks; None where they see this machine's files anyway."""
         ...
 
     def stop(self) -> None:

@@ -1,0 +1,112 @@
+"""Small videos with prompts beside them, a recording that takes a moment, and a batch without workers."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from recorded_runs import HEIGHT, WIDTH, estimate_of, frame_of, model, open_run
+
+from tracking3d.batch import one_video
+from tracking3d.batch.listing import list_jobs
+from tracking3d.batch.running import run_batch
+from tracking3d.config.loading import load_config
+from tracking3d.engines.in_this_process import InThisProcess
+from tracking3d.errors import OutputError
+from tracking3d.results.run_reader import is_finished
+
+BOX = "30,20,36,24"
+
+
+def write_video(path: Path, frames: int = 2) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 10, (WIDTH, HEIGHT))
+    for index in range(frames):
+        writer.write(np.ascontiguousarray(frame_of(index).image[..., ::-1]))
+    writer.release()
+    return path
+
+
+@pytest.fixture
+def videos(tmp_path):
+    """``one.mp4`` and ``in/two.mp4``, each with a box beside it."""
+    folder = tmp_path / "videos"
+    for name in ("one", "in/two"):
+        write_video(folder / f"{name}.mp4").with_suffix(".box").write_text(BOX + "\n")
+    return folder
+
+
+class Recorded:
+    """Stands for `tracking3d.recording.record`: writes a run at once, unless it is told to fail first.
+
+    Attributes:
+        calls: What it was called with.
+        faults: What to raise, by a part of the source's name, one after the other.
+    """
+
+    def __init__(self) -> None:
+        self.calls: list[dict[str, Any]] = []
+        self.faults: dict[str, list[BaseException]] = {}
+
+    def __call__(self, source: Any, config: Any, folder: Path, *, listener: Any, **about: Any) -> None:
+        self.calls.append({"source": source, "config": config, "folder": folder, **about})
+        faults = next((faults for part, faults in self.faults.items() if part in source.name), [])
+        if is_finished(folder):
+            return
+        shutil.rmtree(folder, ignore_errors=True)
+        with open_run(folder, source.name) as writer:
+            if faults:
+                writer.write(estimate_of(0), frame_of(0))
+                raise faults.pop(0)
+            for index in range(source.count):
+                listener(writer.write(estimate_of(index), frame_of(index)))
+            writer.finish(model(), "finished")
+
+    def several(self, source: Any, config: Any, folder: Path, *, boxes, masks, points, **about: Any) -> None:
+        """Stands for `tracking3d.recording.record_objects`."""
+        folder.mkdir(parents=True, exist_ok=True)
+        for number in range(len(boxes) + len(masks) + len(points)):
+            self(source, config, folder / f"object_{number}", **about)
+
+
+@pytest.fixture
+def recorded(monkeypatch):
+    record = Recorded()
+    monkeypatch.setattr(one_video, "record", record)
+    monkeypatch.setattr(one_video, "record_objects", record.several)
+    return record
+
+
+@pytest.fixture
+def batch(recorded, tmp_path):
+    """Run a batch into ``out`` in this process; gives how far it came and what happened."""
+
+    def run(place: Any, out: Any = tmp_path / "out", configure: Any = lambda row: load_config(), **more: Any):
+        told: list[Any] = []
+        jobs = list_jobs(str(place), configure)
+        options = {"report": False, "pause": 0.0, **more}
+        progress = run_batch(jobs, str(out), InThisProcess(), listener=told.append, **options)
+        return progress, told
+
+    return run
+
+
+@pytest.fixture
+def full_disk(monkeypatch):
+    """Let writing files of some name fail."""
+
+    def fill(module: Any, name: str) -> None:
+        write = module.write
+
+        def refused(place: str, content: bytes) -> None:
+            if place.endswith(name):
+                raise OutputError(f"The disk is full at {place}; free some space.")
+            write(place, content)
+
+        monkeypatch.setattr(module, "write", refused)
+
+    return fill
