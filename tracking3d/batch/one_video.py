@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import shutil
 import tempfile
 import time
@@ -110,16 +111,16 @@ def _track(tell: Tell, job: VideoJob, run: Path, command: str) -> None:
     source = _source(job)
     passes = 2 if job.config.solver.final_refine else 1
     whole = source.count and source.count * job.objects * passes
-    answers, last = 0, 0.0
+    answers, last, process = 0, 0.0, os.getpid()
 
     def listener(frame: FrameRecord | SkippedFrame) -> None:
         nonlocal answers, last
         answers += 1
         if time.monotonic() - last > _TELL:
             last = time.monotonic()
-            tell({"frames": answers, "of": whole})
+            tell({"frames": answers, "of": whole, "process": process})
 
-    tell({"frames": 0, "of": whole})
+    tell({"frames": 0, "of": whole, "process": process})
     boxes: list[Any] = [parse_box(text) for text in job.box]
     masks: list[Any] = [Path(file) for file in job.mask]
     points: list[Any] = [parse_points(text) for text in job.points]
