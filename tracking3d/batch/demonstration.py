@@ -146,7 +146,7 @@ def _with_faults(jobs: Sequence[VideoJob], folder: Path, disk: bool) -> list[Vid
     entries = [
         f"tracking3d.trackers:{name}={fault_plugins.__file__}:{kind}" for kind, name in trackers.items()
     ]
-    os.environ[VARIABLE] = ",".join(entries)
+    os.environ[VARIABLE] = ";".join(entries)
     note = (folder / "disk_was_full").absolute()
     note.unlink(missing_ok=True)
     broken = folder / "clips" / f"{DAMAGED}.mp4"
