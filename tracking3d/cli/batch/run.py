@@ -107,8 +107,9 @@ def run(
     if quiet:
         logging.getLogger("tracking3d").setLevel(logging.ERROR)
     videos: list[VideoJob]
+    # What is wrong on the command line is no fault of any video.
+    settings = configure(config, preset, overrides, quality, runtime=_runtime(threads))
     if data is not None:
-        settings = configure(config, preset, overrides, quality, runtime=_runtime(threads))
         videos = dataset_jobs(open_dataset(jobs, data, data, 1).only(sequences or []), settings)
     else:
         videos = list_jobs(jobs, of_row)
