@@ -17,7 +17,6 @@ from tracking3d.batch.running import run_batch
 from tracking3d.config.loading import load_config
 from tracking3d.engines.in_this_process import InThisProcess
 from tracking3d.errors import OutputError
-from tracking3d.results.run_reader import is_finished
 
 BOX = "30,20,36,24"
 
@@ -41,30 +40,31 @@ def videos(tmp_path):
 
 
 class Recorded:
-    """Stands for `tracking3d.recording.record`: writes a run at once, unless it is told to fail first.
+    """Stands for `tracking3d.recording.record`: a run of two frames is there at once, unless it is told to fail first.
+
+    Args:
+        run: That run.
 
     Attributes:
         calls: What it was called with.
         faults: What to raise, by a part of the source's name, one after the other.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, run: Path) -> None:
+        self._run = run
         self.calls: list[dict[str, Any]] = []
         self.faults: dict[str, list[BaseException]] = {}
 
     def __call__(self, source: Any, config: Any, folder: Path, *, listener: Any, **about: Any) -> None:
         self.calls.append({"source": source, "config": config, "folder": folder, **about})
         faults = next((faults for part, faults in self.faults.items() if part in source.name), [])
-        if is_finished(folder):
-            return
         shutil.rmtree(folder, ignore_errors=True)
-        with open_run(folder, source.name) as writer:
-            if faults:
-                writer.write(estimate_of(0), frame_of(0))
-                raise faults.pop(0)
-            for index in range(source.count):
-                listener(writer.write(estimate_of(index), frame_of(index)))
-            writer.finish(model(), "finished")
+        if faults:
+            folder.mkdir(parents=True)
+            raise faults.pop(0)
+        for frame in source:
+            listener(frame)
+        shutil.copytree(self._run, folder)
 
     def several(self, source: Any, config: Any, folder: Path, *, boxes, masks, points, **about: Any) -> None:
         """Stands for `tracking3d.recording.record_objects`."""
@@ -73,9 +73,20 @@ class Recorded:
             self(source, config, folder / f"object_{number}", **about)
 
 
+@pytest.fixture(scope="session")
+def finished_run(tmp_path_factory):
+    """Of two frames; its source is nowhere."""
+    folder = tmp_path_factory.mktemp("finished") / "run"
+    with open_run(folder) as writer:
+        for index in range(2):
+            writer.write(estimate_of(index), frame_of(index))
+        writer.finish(model(), "finished")
+    return folder
+
+
 @pytest.fixture
-def recorded(monkeypatch):
-    record = Recorded()
+def recorded(monkeypatch, finished_run):
+    record = Recorded(finished_run)
     monkeypatch.setattr(one_video, "record", record)
     monkeypatch.setattr(one_video, "record_objects", record.several)
     return record

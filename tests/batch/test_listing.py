@@ -65,6 +65,15 @@ def test_videos_that_differ_in_their_suffix_keep_it(videos):
     assert set(jobs_of(videos)) == {"one.mp4", "one.mov", "in/two"}
 
 
+def test_no_run_folder_lies_within_another_or_among_the_logs(videos):
+    write_video(videos / "in.mp4")
+    write_video(videos / "logs.mp4")
+    assert set(jobs_of(videos)) == {"one", "in.mp4", "in/two", "logs.mp4"}
+    (videos / "jobs.csv").write_text("video,name\none.mp4,a\nin/two.mp4,a/b\n")
+    with pytest.raises(InputError, match="within another"):
+        jobs_of(videos / "jobs.csv")
+
+
 ROWS = [
     {"video": "one.mp4", "box": BOX, "fov": 50.0},
     {"video": "in/two.mp4", "points": "40,30+ 2,2-", "settings": "solver.iterations=3; runtime.seed=7"},

@@ -78,6 +78,15 @@ def test_a_run_of_other_settings_is_left_alone_and_said(batch, videos, tmp_path)
     assert (tmp_path / "out/one" / MARKER).read_bytes() == before
 
 
+def test_a_folder_that_no_batch_has_written_is_left_alone(batch, videos, tmp_path):
+    mine = tmp_path / "out/one/mine.txt"
+    mine.parent.mkdir(parents=True)
+    mine.write_text("mine")
+    progress, _ = batch(videos)
+    assert (progress.finished, progress.failed) == (1, 1) and mine.read_text() == "mine"
+    assert "no batch has written" in read_failures(str(tmp_path / "out"))[0].reason
+
+
 def test_a_video_that_fails_once_goes_on_where_it_was(batch, videos, recorded, tmp_path):
     recorded.faults["one"] = [OutputError("The disk is full.")]
     progress, told = batch(videos)

@@ -11,6 +11,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from tracking3d.batch.beside import videos_of
+from tracking3d.batch.one_video import LOGS
 from tracking3d.batch.places import absolute, is_folder, local, parent
 from tracking3d.batch.rows import Row
 from tracking3d.batch.tables import is_table, read_table
@@ -126,20 +127,34 @@ def _names(rows: Sequence[Row], root: str) -> list[str]:
         root = os.path.commonpath(folders) if alike and len(folders) > 1 else min(folders, key=len)
     inside = [PurePosixPath(_within(video, root)) for video in videos]
     bare = Counter(path.with_suffix("") for path in inside)
+    # A run folder within another one would be replaced with it.
+    folders_of_others = {folder for path in inside for folder in path.parents} | {PurePosixPath(LOGS)}
+    taken = {path for path, count in bare.items() if count > 1} | folders_of_others
     names = [
-        row.name or str(path.with_suffix("") if bare[path.with_suffix("")] == 1 else path)
+        row.name or str(path if path.with_suffix("") in taken else path.with_suffix(""))
         for row, path in zip(rows, inside, strict=True)
     ]
     seen: dict[str, str] = {}
     for name, video in zip(names, videos, strict=True):
         parts = PurePosixPath(name).parts
-        if not parts or PurePosixPath(name).is_absolute() or any(part.startswith(".") for part in parts):
+        if (
+            not parts
+            or parts == (LOGS,)
+            or PurePosixPath(name).is_absolute()
+            or any(part.startswith(".") for part in parts)
+        ):
             raise InputError(f"The name '{name}' of {video} cannot be that of a run folder; give it another.")
         if name in seen:
             raise InputError(
                 f"{video} and {seen[name]} would both be written to {name}; give them names in a column name."
             )
         seen[name] = video
+    if within := next(
+        (name for name in names for one in PurePosixPath(name).parents if str(one) in seen), None
+    ):
+        raise InputError(
+            f"The run folder {within} would lie within another one; give it a name in a column name."
+        )
     return names
 
 

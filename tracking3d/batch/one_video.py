@@ -205,5 +205,3 @@ def _counted(file: Path) -> int:
 
 def _forget(work: Path) -> None:
     shutil.rmtree(work, ignore_errors=True)
-    with suppress(OSError):
-        work.parent.rmdir()  # the last one removes the folder of all

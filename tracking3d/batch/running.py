@@ -11,7 +11,7 @@ from typing import Any
 
 from tracking3d.batch.folder import Failure, Progress, relative, write_progress, write_tables
 from tracking3d.batch.networks import share_networks
-from tracking3d.batch.one_video import LOGS, log_file, track_video
+from tracking3d.batch.one_video import LOGS, WORK, log_file, track_video
 from tracking3d.batch.overview import write_overview
 from tracking3d.batch.places import joined, local, read_many
 from tracking3d.batch.summary import MARKER, read_marker
@@ -87,12 +87,7 @@ class Batch:
         left = []
         for number, (job, place) in enumerate(zip(self._jobs, places, strict=True)):
             marker = read_marker(contents.get(place))
-            fault = job.fault
-            if not fault and marker is not None and marker["key"] != job.key:
-                fault = (
-                    f"{joined(self._out, job.name)} holds a run of another video, prompt or setting; give another "
-                    "--out, or --overwrite."
-                )
+            fault = job.fault or ("" if overwrite else self._why_taken(job, marker))
             if fault:
                 self.failures[job.name] = Failure(job.name, job.video, fault, 0, False, "")
             elif marker is None:
@@ -157,6 +152,16 @@ class Batch:
     def say_all(self) -> None:
         """Tell the listener how far all is."""
         self._listener(Happening("batch", "", {}, self.progress))
+
+    def _why_taken(self, job: VideoJob, marker: Mapping[str, Any] | None) -> str:
+        """Why a video's run folder cannot be had, in a sentence; empty where it can, or is there already."""
+        place = joined(self._out, job.name)
+        if marker is not None:
+            what = "" if marker["key"] == job.key else "a run of another video, prompt or setting"
+        else:  # what is whole comes with its marker, but elsewhere, where a part of it may have been sent
+            path = local(place)
+            what = "what no batch has written" if path is not None and path.exists() else ""
+        return f"{place} holds {what}; give another --out, or --overwrite." if what else ""
 
     def _end(self, job: VideoJob, ended: Ended) -> None:
         self._running.pop(self._workers.pop(ended.number, ""), None)
@@ -253,6 +258,9 @@ def run_batch(
             with suppress(OutputError):
                 batch.write("interrupted", now=True)
             raise
+        if (folder := local(out)) is not None:
+            with suppress(OSError):  # where something is left to go on from, it stays
+                (folder / WORK).rmdir()
         batch.write("finished", now=True)
         batch.say_all()
         return batch.progress
