@@ -6,10 +6,9 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
 import pytest
-from recorded_runs import HEIGHT, WIDTH, estimate_of, frame_of, model, open_run
+from recorded_runs import estimate_of, frame_of, model, open_run
+from small_videos import BOX, write_video
 
 from tracking3d.batch import one_video
 from tracking3d.batch.listing import list_jobs
@@ -17,17 +16,6 @@ from tracking3d.batch.running import run_batch
 from tracking3d.config.loading import load_config
 from tracking3d.engines.in_this_process import InThisProcess
 from tracking3d.errors import OutputError
-
-BOX = "30,20,36,24"
-
-
-def write_video(path: Path, frames: int = 2) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 10, (WIDTH, HEIGHT))
-    for index in range(frames):
-        writer.write(np.ascontiguousarray(frame_of(index).image[..., ::-1]))
-    writer.release()
-    return path
 
 
 @pytest.fixture

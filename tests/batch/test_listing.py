@@ -10,8 +10,8 @@ from pathlib import Path
 import fsspec
 import numpy as np
 import pytest
-from conftest import BOX, write_video
 from recorded_runs import write_frames
+from small_videos import BOX, write_video
 
 from tracking3d.batch.listing import NO_PROMPT, dataset_jobs, list_jobs
 from tracking3d.batch.places import absolute, joined, local

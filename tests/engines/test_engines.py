@@ -6,8 +6,8 @@ import os
 import signal
 import time
 
+import engine_tasks as tasks
 import pytest
-import tasks
 
 from tracking3d.engines.choosing import open_engine
 from tracking3d.engines.in_this_process import InThisProcess

@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import engine_tasks as tasks
 import pytest
-import tasks
 
 from tracking3d.engines.choosing import open_engine
 from tracking3d.engines.mapping import map_tasks

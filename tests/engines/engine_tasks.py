@@ -41,8 +41,8 @@ def killed_once(tell: Any, note: Path) -> str:
 
 def told_to_stop(tell: Any, note: Path) -> None:
     """Goes on for ever, and notes that it was asked to stop."""
-    tell("begun")
     try:
+        tell("begun")
         time.sleep(600)
     except KeyboardInterrupt:
         note.write_text("stopped")
