@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from heavy_task import hold
 
 from tracking3d.batch.demonstration import ABORTING, DAMAGED, FILLING, demonstrate, make_clips
-from tracking3d.batch.load import measured_load
+from tracking3d.batch.load import load_now
 from tracking3d.batch.running import run_batch
 from tracking3d.benchmark.job import Job
 from tracking3d.benchmark.pool import run_jobs
@@ -21,7 +22,7 @@ from tracking3d.datasets.clip import write_clip
 from tracking3d.engines.choosing import open_engine
 from tracking3d.engines.mapping import map_tasks
 from tracking3d.engines.processes import ProcessEngine
-from tracking3d.engines.protocol import Task
+from tracking3d.engines.protocol import Ended, Task
 from tracking3d.results.run_reader import RunReader
 from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
 
@@ -108,27 +109,15 @@ def test_evaluate_gives_the_same_figures_on_both_engines(tmp_path, workers_find_
 
 
 def test_a_hundred_tasks_leave_nothing_behind():
-    engine = ProcessEngine(2)
-    with measured_load(0.2) as samples:
-        ended = map_tasks(engine, [Task(number, _allocate) for number in range(100)])
-    assert all(one.value == 3 for one in ended.values())
-    settled = samples[len(samples) // 3 :]
-    first, last = settled[: len(settled) // 3], settled[-len(settled) // 3 :]
+    loads = []
 
-    def mean(of, name):
-        return np.mean([getattr(one, name) for one in of])
+    def listener(event):
+        if isinstance(event, Ended):
+            loads.append(load_now())
 
-    assert mean(last, "own_descriptors") <= mean(first, "own_descriptors") + 1
-    assert mean(last, "descriptors") <= mean(first, "descriptors") + 10
-    assert mean(last, "own_memory") <= 1.02 * mean(first, "own_memory") + 2
-    assert (
-        max(one.processes for one in settled) <= 2 + 2 + 1
-    )  # workers, what forks them, what tidies, this one
-
-
-def _allocate(tell) -> int:
-    """Holds memory and files, and lets nothing go."""
-    kept = np.ones(2_000_000)
-    files = [os.open("/dev/null", os.O_RDONLY) for _ in range(20)]
-    tell(len(files))
-    return int(kept[:3].sum())
+    ended = map_tasks(ProcessEngine(2), [Task(number, hold) for number in range(100)], listener=listener)
+    assert all(one.value == 16_000_000 for one in ended.values())
+    first, last = loads[20:40], loads[80:]
+    for name, more in (("own_descriptors", 0), ("descriptors", 10), ("own_memory", 2), ("processes", 0)):
+        before, after = (max(getattr(one, name) for one in some) for some in (first, last))
+        assert after <= before + more, name

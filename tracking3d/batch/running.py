@@ -117,7 +117,6 @@ class Batch:
                 self._say("progress", job, {"worker": worker, **event.content})
         else:
             self._end(job, event)
-        self.write()
 
     def write(self, state: str = "running", *, now: bool = False) -> None:
         """Write what is due; at the end (``now``) everything.
@@ -126,13 +125,10 @@ class Batch:
             OutputError: At the end, if something cannot be written; before, that is only said.
         """
         self._count(state)
-        rows = [row for rows in self._rows.values() for row in rows]
-        failures = sorted(self.failures.values(), key=lambda one: one.run)
-        page = (self._out, self.progress, rows, self._pictures, failures, self._report)
         steps: list[tuple[str, float, Callable[[], object]]] = [
             ("progress", PROGRESS_EVERY, lambda: write_progress(self._out, self.progress)),
-            ("tables", TABLES_EVERY, lambda: write_tables(self._out, rows, failures)),
-            ("page", PAGE_EVERY, lambda: write_overview(*page)),
+            ("tables", TABLES_EVERY, self._write_tables),
+            ("page", PAGE_EVERY, self._write_page),
         ]
         problem: OutputError | None = None
         for name, every, step in steps:
@@ -148,6 +144,17 @@ class Batch:
             self._due[name] = time.monotonic() + max(every, _PATIENCE * took)
         if now and problem:
             raise problem
+
+    def _write_tables(self) -> None:
+        write_tables(self._out, *self._told_so_far())
+
+    def _write_page(self) -> None:
+        rows, failures = self._told_so_far()
+        write_overview(self._out, self.progress, rows, self._pictures, failures, self._report)
+
+    def _told_so_far(self) -> tuple[list[Mapping[str, Any]], list[Failure]]:
+        rows = [row for rows in self._rows.values() for row in rows]
+        return rows, sorted(self.failures.values(), key=lambda one: one.run)
 
     def say_all(self) -> None:
         """Tell the listener how far all is."""
@@ -253,7 +260,7 @@ def run_batch(
         ]
         batch.say_all()
         try:
-            map_tasks(engine, tasks, retries=retries, pause=pause, listener=batch.told)
+            map_tasks(engine, tasks, retries=retries, pause=pause, listener=batch.told, meanwhile=batch.write)
         except BaseException:
             with suppress(OutputError):
                 batch.write("interrupted", now=True)

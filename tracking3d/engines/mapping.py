@@ -27,6 +27,7 @@ def map_tasks(
     pause: float = PAUSE,
     listener: Listener = lambda event: None,
     further: Callable[[Ended], Sequence[Task]] = lambda ended: (),
+    meanwhile: Callable[[], None] = lambda: None,
 ) -> dict[int, Ended]:
     """Do all tasks, in their order as far as there are workers; how each ended, by its number.
 
@@ -39,6 +40,7 @@ def map_tasks(
         pause: See `PAUSE`.
         listener: Is told of everything that happens; what it raises ends the loop.
         further: What is to be done after a task that has ended for good, such as the next step of the same video.
+        meanwhile: Is called again and again, at least twice a second, whether something happens or not.
 
     Raises:
         BaseException: What ended the loop, such as Ctrl-C; every task that ran is stopped first.
@@ -54,6 +56,7 @@ def map_tasks(
                 running[task.number] = task
                 attempts[task.number] += 1
                 engine.start(task)
+            meanwhile()
             for event in engine.wait(_LOOK):
                 tried = attempts[event.number]
                 if isinstance(event, Began):

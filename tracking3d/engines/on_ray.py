@@ -17,6 +17,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from tracking3d.engines.processes import default_workers
 from tracking3d.engines.protocol import ONE_CORE, Began, Ended, Event, Fault, Needs, Task, Told
 from tracking3d.engines.worker import call, last_words, threads_in_words
 from tracking3d.errors import InputError
@@ -58,7 +59,7 @@ def open_ray(address: str, workers: int | None = None, needs: Needs = ONE_CORE) 
         return
     begun: dict[str, Any] = {"logging_level": logging.ERROR, "log_to_driver": False}
     if address == THIS_MACHINE:
-        cores = (workers or len(os.sched_getaffinity(0))) * needs.threads
+        cores = (workers or default_workers(needs)) * needs.threads
         begun |= {"num_cpus": cores, "include_dashboard": False, "object_store_memory": _OBJECT_STORE}
     else:
         begun["address"] = address
