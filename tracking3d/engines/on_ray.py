@@ -99,6 +99,7 @@ class RayEngine:
         self._needs = needs
         self._running: dict[Any, Task] = {}
         self._slots: dict[int, int] = {}
+        self._begun: set[int] = set()
         self._mailbox = ray.remote(_Mailbox).options(num_cpus=0, max_restarts=-1).remote()
 
     def start(self, task: Task) -> None:
@@ -132,6 +133,11 @@ class RayEngine:
         for one in ready:
             task = self._running.pop(one)
             value, fault = self._answer(one, task)
+            if (
+                task.number not in self._begun
+            ):  # that it has begun is still on its way, or was lost with its worker
+                events.append(Began(task.number, f"worker {self._slots[task.number]}"))
+            self._begun.discard(task.number)
             events.append(Ended(task.number, value, fault))
             del self._slots[task.number]
         return events
@@ -152,6 +158,7 @@ class RayEngine:
                     running = ray.wait(running, num_returns=len(running), timeout=GRACE)[1]
         self._running.clear()
         self._slots.clear()
+        self._begun.clear()
 
     def _variables(self) -> dict[str, str]:
         ours = {name: value for name, value in os.environ.items() if name.startswith(_VARIABLES)}
@@ -168,6 +175,7 @@ class RayEngine:
             if number not in self._slots:
                 continue
             if machine:
+                self._begun.add(number)
                 events.append(Began(number, f"worker {self._slots[number]} ({machine})"))
             else:
                 events.append(Told(number, content))
