@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import runpy
 import sys
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from threading import Event
 from typing import Any
 
 _IMPORTED = [
@@ -50,18 +48,6 @@ def forked(function: Callable[..., None], *arguments: Any) -> BaseProcess:
 def forked_program(folder: Path, *arguments: object, **environment: str) -> Ended:
     """The command line in a process of its own; what it prints passes through files in ``folder``."""
     return _ended(folder, _program, list(map(str, arguments)), environment)
-
-
-def forked_job(command: list[str], log: Path, stop: Event, variables: Mapping[str, str]) -> int:
-    """What `tracking3d.benchmark.pool` starts for a job, see there; ``command`` ends with the file of the job."""
-    process = forked(_told, log, log, _job, (command[-1], {**os.environ, **variables}))
-    process.start()
-    while process.is_alive():
-        if stop.wait(0.02):
-            process.kill()
-    process.join()
-    assert process.exitcode is not None
-    return process.exitcode
 
 
 def forked_script(folder: Path, script: str, *arguments: object) -> Ended:
@@ -107,12 +93,6 @@ def _program(arguments: list[str], environment: dict[str, str]) -> None:
     sys.path[:0] = environment.get("PYTHONPATH", "").split(os.pathsep)
     sys.argv = ["tracking3d", *arguments]
     main()
-
-
-def _job(file: str, variables: dict[str, str]) -> None:
-    os.environ.update(variables)
-    sys.argv = ["", file]
-    runpy.run_module("tracking3d.benchmark.job", run_name="__main__")
 
 
 def _script(script: str, arguments: list[str]) -> None:

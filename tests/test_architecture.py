@@ -15,7 +15,18 @@ SHARED_BY_SOLVERS = {"evidence"}
 # Who lives on which floor; a module may import from lower floors and from its own room only.
 # Rooms of one floor may use each other, but never in circles.
 FLOORS = [
-    {"errors", "frames", "geometry", "config", "features", "networks", "process_memory", "stages", "web"},
+    {
+        "config",
+        "engines",
+        "errors",
+        "features",
+        "frames",
+        "geometry",
+        "networks",
+        "process_memory",
+        "stages",
+        "web",
+    },
     {"bundle_adjustment", "rendering", "trackers", "video"},
     {"corrections", "estimation", "plugins", "point_prompts", "points", "prompts", "testing"},
     {
@@ -37,6 +48,7 @@ FLOORS = [
     {"datasets"},
     {"evaluation", "export", "picker", "report", "speed", "synthesis", "viewer"},
     {"benchmark"},
+    {"batch"},
     {"cli", "vot", "__main__"},
 ]
 """``tracking3d/__init__.py`` is the front door: it imports from anywhere, and nobody imports from it."""

@@ -5,9 +5,7 @@ from __future__ import annotations
 import shutil
 
 import pytest
-from forked import forked_job
 
-from tracking3d.benchmark import pool
 from tracking3d.benchmark.variant import Variant
 from tracking3d.config.loading import load_config
 from tracking3d.datasets.clip import write_clip
@@ -52,12 +50,6 @@ class Scripted:
     def step(self, frame):
         return MaskEstimate(self.mask)
 '''
-
-
-@pytest.fixture
-def quick_processes(monkeypatch):
-    """Jobs run in processes that have imported everything when they start."""
-    monkeypatch.setattr(pool, "_call", forked_job)
 
 
 @pytest.fixture(scope="session")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from pathlib import Path
+from contextlib import contextmanager
 
 import pytest
 
@@ -13,6 +13,7 @@ from tracking3d.benchmark import job as job_module
 from tracking3d.benchmark import pool
 from tracking3d.benchmark.job import Job
 from tracking3d.benchmark.pool import run_jobs
+from tracking3d.engines.in_this_process import InThisProcess
 
 
 @pytest.fixture
@@ -69,7 +70,7 @@ def test_growth_is_what_the_second_half_holds_more_at_most():
     assert job_module.memory_growth([10]) is None and job_module.memory_growth([]) is None
 
 
-def test_a_failure_is_told_in_its_own_sentence(jobs, scripted, quick_processes):
+def test_a_failure_is_told_in_its_own_sentence(jobs, scripted):
     [outcome] = run_jobs(jobs(scripted(fail=70), ["wide"]))
     told = r"mask tracker 'scripted' \(TRACKING3D_PLUGINS [0-9a-f]+\) failed at 000000.png: RuntimeError"
     assert re.match(told, outcome.error)
@@ -83,13 +84,16 @@ def test_a_sequence_that_cannot_be_read_is_an_outcome(jobs, scripted):
 def test_equal_jobs_are_done_once(jobs, scripted, monkeypatch):
     done = []
 
-    def call(command, *others) -> int:
-        """Here instead of in a process of its own."""
-        done.append(Job.read(Path(command[-1])))
+    def run(tell, file) -> None:
+        done.append(Job.read(file))
         job_module.run_job(done[-1])
-        return 0
 
-    monkeypatch.setattr(pool, "_call", call)
+    @contextmanager
+    def here(address, workers):
+        yield InThisProcess()
+
+    monkeypatch.setattr(pool, "_run_written", run)
+    monkeypatch.setattr(pool, "open_engine", here)
     first, second = run_jobs(jobs(scripted(), ["narrow"]) + jobs(scripted("another label"), ["narrow"]), 2)
     assert sorted([first.cached, second.cached]) == [False, True]
     assert first.scores == second.scores

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from tracking3d.cli import app
 
 
-def test_the_smoke_suite_is_made_tracked_and_scored(tmp_path, quick_processes):
+def test_the_smoke_suite_is_made_tracked_and_scored(tmp_path):
     pytest.importorskip("embreex", reason="the extra synth is not installed")
     arguments = ["evaluate", "suite", "smoke", "--masks", "truth", "--jobs", "2", "--out", str(tmp_path)]
     result = CliRunner().invoke(app, [*arguments, "--json"])

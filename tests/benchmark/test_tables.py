@@ -30,7 +30,7 @@ def asked(monkeypatch):
     """What is asked to be run; every variant starts from an IoU of 0.7 and ends with that in `IOU`, or 0.77."""
     calls = []
 
-    def run(variants, dataset, out, processes, listener):
+    def run(variants, dataset, out, processes, listener, address=None):
         calls.append((list(variants), dataset))
         return [
             ResultSet(

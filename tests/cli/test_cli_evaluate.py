@@ -36,7 +36,7 @@ def jobs(monkeypatch):
     """Answer every job at once: IoU 0.8 with preset paper and 0.9 else; the sequence ``two`` may fail."""
     asked, failing = [], []
 
-    def run(jobs, processes, listener):
+    def run(jobs, processes, listener, address=None):
         outcomes = []
         for job in jobs:
             asked.append(job)

@@ -1,6 +1,6 @@
-"""One sequence run one way, in a process of its own: ``python -m tracking3d.benchmark.job job.json``.
+"""One sequence run one way, in a worker that reads what it is to do from a file.
 
-A crash of that process, whatever its cause, costs this job only. What is finished is found again by what it
+What is finished is found again by what it
 depends on: the run by configuration, masks, frames and code; its scores by the code that judges, too.
 """
 
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -30,7 +29,7 @@ from tracking3d.datasets.layout import load_layout
 from tracking3d.datasets.reading import read_sequence
 from tracking3d.datasets.run_answers import answers_of_run, is_refined
 from tracking3d.datasets.truth import Truth
-from tracking3d.errors import InputError, Tracking3dError
+from tracking3d.errors import InputError
 from tracking3d.evaluation.score import score
 from tracking3d.process_memory import resident_memory
 from tracking3d.recording import Listener, record
@@ -205,10 +204,3 @@ def _read(file: Path) -> Any:
         return json.loads(file.read_bytes())
     except (OSError, ValueError):
         return None
-
-
-if __name__ == "__main__":
-    try:
-        run_job(Job.read(Path(sys.argv[1])))
-    except Tracking3dError as error:
-        sys.exit(" ".join(str(error).split()))

@@ -1,23 +1,19 @@
-"""Jobs in parallel processes: one that crashes costs itself only, and what is finished is not done again."""
+"""Jobs in workers: one that crashes costs itself only, and what is finished is not done again."""
 
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 import time
-from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Event, Lock
 from typing import Any
 
-from tracking3d.benchmark.job import LOG, Job
+from tracking3d.benchmark.job import LOG, Job, run_job
+from tracking3d.engines.choosing import open_engine
+from tracking3d.engines.mapping import map_tasks
+from tracking3d.engines.protocol import Began, Ended, Event, Task, Tell
 from tracking3d.errors import Tracking3dError
-
-_LOOK = 0.1  # seconds between looks at a process
 
 
 @dataclass(frozen=True)
@@ -44,65 +40,84 @@ Listener = Callable[[Outcome], None]
 
 
 def run_jobs(
-    jobs: Sequence[Job], processes: int = 1, listener: Listener = lambda outcome: None
+    jobs: Sequence[Job],
+    processes: int = 1,
+    listener: Listener = lambda outcome: None,
+    address: str | None = None,
 ) -> list[Outcome]:
     """Run all jobs, ``processes`` at a time; the outcomes are in the order of the jobs.
 
     Jobs that depend on the same things, as when two rows of a table are one setting, are done once. Ctrl-C stops
-    the processes; what was finished is kept and found again by the next call.
+    the workers; what was finished is kept and found again by the next call.
+
+    Args:
+        jobs: What to run.
+        processes: Workers.
+        listener: Is told of every outcome.
+        address: Of a Ray cluster that runs them, which must see the same files; this machine if None.
     """
-    stop = Event()
-    turns: defaultdict[Path, Lock] = defaultdict(Lock)
-    asking = Lock()
+    outcomes: dict[int, Outcome] = {}
+    equal: dict[Path, list[int]] = {}
+    began: dict[int, float] = {}
 
-    def one(job: Job) -> Outcome:
+    def done(number: int, outcome: Outcome) -> None:
+        outcomes[number] = outcome
+        listener(outcome)
+
+    for number, job in enumerate(jobs):
         try:
-            with asking:
-                turn = turns[job.folder]
-            with turn:  # the second of two equal jobs finds the first one's result
-                outcome = _run(job, stop)
+            others = equal.setdefault(job.folder, [])
+            if not others and (scores := job.finished()) is not None:
+                done(number, Outcome(job, scores, cached=True))
+            others.append(number)
         except Tracking3dError as error:  # the sequence cannot be read
-            outcome = Outcome(job, None, str(error))
-        if not stop.is_set():  # what was stopped did not fail
-            listener(outcome)
-        return outcome
+            done(number, Outcome(job, None, str(error)))
+    same = {numbers[0]: numbers for numbers in equal.values()}
 
-    with ThreadPoolExecutor(max(processes, 1)) as pool:
-        try:
-            return list(pool.map(one, jobs))
-        except BaseException:
-            stop.set()
-            pool.shutdown(cancel_futures=True)
-            raise
+    def follow(first: int) -> None:
+        """The second of two equal jobs has the first one's result."""
+        result = outcomes[first]
+        for number in same[first][1:]:
+            done(number, Outcome(jobs[number], result.scores, result.error, cached=result.scores is not None))
 
+    def told(event: Event) -> None:
+        if isinstance(event, Began):
+            began[event.number] = time.monotonic()
+        elif isinstance(event, Ended):
+            seconds = time.monotonic() - began.get(event.number, time.monotonic())
+            done(event.number, _outcome(jobs[event.number], event, seconds))
+            follow(event.number)
 
-def _run(job: Job, stop: Event) -> Outcome:
-    started = time.monotonic()
-    if (scores := job.finished()) is not None:
-        return Outcome(job, scores, cached=True)
-    log = job.folder / LOG
-    command = [sys.executable, "-m", "tracking3d.benchmark.job", str(job.write())]
-    code = _call(command, log, stop, job.variant.environment)
-    scores = job.written() if code == 0 else None
-    error = "" if scores is not None else _reason(code, log)
-    return Outcome(job, scores, error, seconds=time.monotonic() - started)
-
-
-def _call(command: list[str], log: Path, stop: Event, variables: Mapping[str, str]) -> int:
-    # Processes that share a machine must not each take all of its cores.
-    environment = {"OMP_NUM_THREADS": "1", **os.environ, **variables}
-    with log.open("wb") as output:
-        process = subprocess.Popen(command, stdout=output, stderr=output, env=environment)
-        while process.poll() is None:
-            if stop.wait(_LOOK):
-                process.kill()
-        return process.wait()
+    for first in sorted(same.keys() & outcomes.keys()):
+        follow(first)
+    tasks = [
+        Task(
+            number,
+            _run_written,
+            (_absolute(job.write()),),
+            _absolute(job.folder / LOG),
+            job.variant.environment,
+        )
+        for number, job in ((number, jobs[number]) for number in same if number not in outcomes)
+    ]
+    if tasks:
+        with open_engine(address, processes) as engine:
+            map_tasks(engine, tasks, listener=told)
+    return [outcomes[number] for number in range(len(jobs))]
 
 
-def _reason(code: int, log: Path) -> str:
-    if code == 0:
-        return "Settings, frames or code changed while it ran; run it again."
-    lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-    said = lines[-1].strip() if lines else "it said nothing"
-    how = f"was ended by signal {-code}" if code < 0 else f"ended with code {code}"
-    return said if code == 1 and len(lines) == 1 else f"The process {how}: {said}; see {log}."
+def _run_written(tell: Tell, file: Path) -> None:
+    """What a worker does: the job that was written for it."""
+    run_job(Job.read(file))
+
+
+def _outcome(job: Job, ended: Ended, seconds: float) -> Outcome:
+    if ended.fault is not None:
+        return Outcome(job, None, ended.fault.reason, seconds=seconds)
+    scores = job.written()
+    error = "" if scores is not None else "Its scores are not there; do all machines see the same files?"
+    return Outcome(job, scores, error, seconds=seconds)
+
+
+def _absolute(path: Path) -> Path:
+    return Path(os.path.abspath(path))  # noqa: PTH100 (links stay as they are)

@@ -135,6 +135,7 @@ def fill(
     patterns: Sequence[str] = (),
     processes: int = 1,
     listener: Listener = lambda outcome: None,
+    address: str | None = None,
 ) -> SideBySide:
     """Run what the table needs; every result set is written to ``out/results`` as well.
 
@@ -145,6 +146,7 @@ def fill(
         patterns: Only solvers with features that match any of them, such as ``*RGB``; all if there is none.
         processes: Jobs at a time.
         listener: Is told of every job.
+        address: Of a Ray cluster that runs them; this machine if None.
 
     Raises:
         InputError: If a pattern matches nothing.
@@ -159,7 +161,7 @@ def fill(
         if not patterns or any(fnmatch(label, pattern) for pattern in patterns)
     }
     variants = [one for one in chosen.values() if isinstance(one, Variant)]
-    sets = run_suite(variants, dataset, out, processes, listener)
+    sets = run_suite(variants, dataset, out, processes, listener, address)
     masks = "" if base.masks == "tracker" else f"{file_name(Path(base.masks).name)}-"
     for one in sets:
         write_results(one, out / "results" / f"{NAME}-{file_name(one.label)}-{masks}{dataset.name}.json")

@@ -18,11 +18,12 @@ def run_suite(
     out: Path,
     processes: int = 1,
     listener: Listener = lambda outcome: None,
+    address: str | None = None,
 ) -> list[ResultSet]:
     """Run every variant on every sequence; one result set a variant, in their order.
 
     What is finished is kept in ``out`` and not done again while configuration, masks, frames and code are the same.
-    A sequence that fails is named in the result set.
+    A sequence that fails is named in the result set. With the ``address`` of a Ray cluster the jobs run there.
 
     Raises:
         InputError: If a variant's masks cannot be meant.
@@ -34,7 +35,7 @@ def run_suite(
         for variant in variants
         for sequence in dataset.sequences
     ]
-    outcomes = run_jobs(jobs, processes, listener)
+    outcomes = run_jobs(jobs, processes, listener, address)
     count = len(dataset.sequences)
     return [
         collect(variant, dataset, outcomes[n * count : (n + 1) * count]) for n, variant in enumerate(variants)

@@ -89,6 +89,7 @@ def fill(
     processes: int = 1,
     initial: Mapping[str, Path] | None = None,
     listener: Listener = lambda outcome: None,
+    address: str | None = None,
 ) -> Filled:
     """Run what a table needs and put it beside the paper's figures; every result set is written to ``out/results``.
 
@@ -100,6 +101,7 @@ def fill(
         processes: Jobs at a time.
         initial: Folders of initial masks by tracker, in lower case.
         listener: Is told of every job.
+        address: Of a Ray cluster that runs them; this machine if None.
     """
     plan = table.plan(base, dataset.synthetic, initial or {})
     chosen = _chosen(table, dataset)
@@ -107,7 +109,7 @@ def fill(
     variants = {
         name: variant for name, variant in plan.items() if isinstance(variant, Variant) and name in used
     }
-    sets = run_suite(list(variants.values()), chosen, out, processes, listener)
+    sets = run_suite(list(variants.values()), chosen, out, processes, listener, address)
     results = dict(zip(variants, sets, strict=True))
     for name, result in results.items():
         write_results(result, out / "results" / f"{table.name}-{file_name(name)}-{chosen.name}.json")

@@ -8,6 +8,7 @@ from __future__ import annotations
 import typer
 
 from tracking3d.cli import (
+    batch,
     bench,
     compare,
     config,
@@ -44,6 +45,7 @@ app.command(name="model")(model.model)
 app.command(name="export")(export.export)
 app.command(name="report")(report.report)
 app.command(name="compare")(compare.compare)
+app.add_typer(batch.app, name="batch")
 app.add_typer(evaluate.app, name="evaluate")
 app.add_typer(models.app, name="models")
 app.add_typer(plugins.app, name="plugins")

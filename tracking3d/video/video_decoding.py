@@ -11,6 +11,8 @@ from av.container import InputContainer
 from av.error import FFmpegError
 from av.video.stream import VideoStream
 
+from tracking3d.video.codec_threads import codec_threads
+
 # These decoders leave out a picture whose references are lost, and say nothing.
 _SILENT_CODECS = ("h264", "hevc")
 
@@ -31,6 +33,7 @@ def decode_pictures(container: InputContainer, stream: VideoStream) -> Iterator[
         before the time that its header announces, one more reason says so.
     """
     stream.thread_type = "SLICE"  # with threads by frame, errors would come with later packets
+    stream.codec_context.thread_count = codec_threads()
     silent = stream.codec_context.name in _SILENT_CODECS
     waiting: dict[int, str] = {}
     latest = -math.inf

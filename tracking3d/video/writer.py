@@ -17,6 +17,7 @@ from av.video.stream import VideoStream
 
 from tracking3d.errors import OutputError
 from tracking3d.frames import Image
+from tracking3d.video.codec_threads import codec_threads
 
 ENCODERS = ("libx264", "libopenh264", "h264_videotoolbox", "h264_mf", "mpeg4")
 """Encoders by preference: x264, other H.264 encoders, and MPEG-4 part 2, which every FFmpeg has."""
@@ -71,6 +72,7 @@ class VideoWriter:
         height, width = self.size
         stream.height, stream.width = height + height % 2, width + width % 2
         stream.pix_fmt = "yuv420p"
+        stream.codec_context.thread_count = codec_threads()
         # FFmpeg's own assumption where an encoder cannot store it, such as mpeg4; H.264 does, for browsers.
         stream.codec_context.colorspace = Colorspace.ITU601
         stream.codec_context.color_range = ColorRange.MPEG

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from tracking3d.cli.bench import live, masks, matching, points, render, soak
+from tracking3d.cli.bench import batch, live, masks, matching, points, render, soak
 
 app = typer.Typer(
     help="Measure how fast, and how good by themselves, the parts are on this machine.",
@@ -15,4 +15,5 @@ app.command(name="live")(live.live)
 app.command(name="masks")(masks.masks)
 app.command(name="matching")(matching.matching)
 app.command(name="points")(points.points)
+app.command(name="batch")(batch.batch)
 app.command(name="soak")(soak.soak)

@@ -5,26 +5,16 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import typer
-from typer.core import TyperGroup
 
+from tracking3d.cli.default_command import WithDefault
 from tracking3d.cli.evaluate import answers, compare, peer, spread, suite, table
 
 DEFAULT = "answers"
 
 
-class _Evaluate(TyperGroup):
-    """A group whose first word may be left out: what names no command is what is to be scored."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        if args and args[0] not in self.commands and args[0] not in ("--help", "--debug"):
-            args = [DEFAULT, *args]
-        return super().parse_args(ctx, args)
-
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        return super().resolve_command(ctx, args if args[0] in self.commands else [DEFAULT, *args])
+class _Evaluate(WithDefault):
+    default = DEFAULT
 
 
 app = typer.Typer(

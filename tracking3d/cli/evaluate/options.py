@@ -26,6 +26,13 @@ Sequences = Annotated[
     typer.Option("--sequence", metavar="PATTERN", help="Only sequences that match; may be repeated."),
 ]
 Jobs = Annotated[int, typer.Option(min=1, max=256, help="Sequences run at the same time.")]
+Address = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Run them on a Ray cluster: auto, HOST:PORT, ray://HOST:PORT, or local for this machine.",
+    ),
+]
 Out = Annotated[Path, typer.Option(metavar="DIR", help="Folder for data, runs, results and tables.")]
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tracking3d.cli.evaluate.options import Data, Jobs, Masks, Out, Sequences, name_of_settings
+from tracking3d.cli.evaluate.options import Address, Data, Jobs, Masks, Out, Sequences, name_of_settings
 from tracking3d.cli.fresh import Count, Meshes, drawn_suite
 from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quality, Quiet, configure
 
@@ -35,6 +35,7 @@ def suite(
     quality: Quality = None,
     overrides: Overrides = None,
     jobs: Jobs = 1,
+    address: Address = None,
     out: Out = Path("benchmark"),
     as_json: Annotated[bool, typer.Option("--json", help="Print the file of the results only.")] = False,
     quiet: Quiet = False,
@@ -60,7 +61,7 @@ def suite(
     with making_progress(quiet) as made:
         dataset = open_dataset(name, data, out, jobs, made, specs).only(sequences or [])
     with jobs_progress(len(dataset.sequences), quiet) as listener:
-        [results] = run_suite([variant], dataset, out, jobs, listener)
+        [results] = run_suite([variant], dataset, out, jobs, listener, address)
     file = out / "results" / f"{file_name(called)}-{dataset.name}.json"
     write_results(results, file)
     if as_json:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tracking3d.cli.evaluate.options import Data, Jobs, Masks, Out, Sequences, name_of_settings
+from tracking3d.cli.evaluate.options import Address, Data, Jobs, Masks, Out, Sequences, name_of_settings
 from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quiet, configure
 from tracking3d.errors import InputError
 
@@ -43,6 +43,7 @@ def table(
         Path | None, typer.Option(metavar="FILE", help="Draw it into an .svg, .png or .pdf too.")
     ] = None,
     jobs: Jobs = 1,
+    address: Address = None,
     out: Out = Path("benchmark"),
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON only.")] = False,
     quiet: Quiet = False,
@@ -84,11 +85,11 @@ def table(
         dataset = open_dataset(real if data else suite, data, out, jobs, made).only(sequences or [])
     with jobs_progress(None, quiet) as listener:
         if wanted is None:
-            solvers = solver_table.fill(base, dataset, out, rows or [], jobs, listener)
+            solvers = solver_table.fill(base, dataset, out, rows or [], jobs, listener, address)
             files = solver_table.write_table(solvers, out / "tables")
             text, printed = solver_table.to_json(solvers), solver_table.format_table(solvers)
         else:
-            filled = fill(wanted, base, dataset, out, jobs, folders, listener)
+            filled = fill(wanted, base, dataset, out, jobs, folders, listener, address)
             files = write_table(filled, out / "tables")
             text, printed = to_json(filled), [format_table(filled)]
             if plot:

@@ -1,0 +1,111 @@
+"""Small videos with prompts beside them, a recording that takes a moment, and a batch without workers."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+from recorded_runs import estimate_of, frame_of, model, open_run
+from small_videos import BOX, write_video
+
+from tracking3d.batch import one_video
+from tracking3d.batch.listing import list_jobs
+from tracking3d.batch.running import run_batch
+from tracking3d.config.loading import load_config
+from tracking3d.engines.in_this_process import InThisProcess
+from tracking3d.errors import OutputError
+
+
+@pytest.fixture
+def videos(tmp_path):
+    """``one.mp4`` and ``in/two.mp4``, each with a box beside it."""
+    folder = tmp_path / "videos"
+    for name in ("one", "in/two"):
+        write_video(folder / f"{name}.mp4").with_suffix(".box").write_text(BOX + "\n")
+    return folder
+
+
+class Recorded:
+    """Stands for `tracking3d.recording.record`: a run of two frames is there at once, unless it is told to fail first.
+
+    Args:
+        run: That run.
+
+    Attributes:
+        calls: What it was called with.
+        faults: What to raise, by a part of the source's name, one after the other.
+    """
+
+    def __init__(self, run: Path) -> None:
+        self._run = run
+        self.calls: list[dict[str, Any]] = []
+        self.faults: dict[str, list[BaseException]] = {}
+
+    def __call__(self, source: Any, config: Any, folder: Path, *, listener: Any, **about: Any) -> None:
+        self.calls.append({"source": source, "config": config, "folder": folder, **about})
+        faults = next((faults for part, faults in self.faults.items() if part in source.name), [])
+        shutil.rmtree(folder, ignore_errors=True)
+        if faults:
+            folder.mkdir(parents=True)
+            raise faults.pop(0)
+        for frame in source:
+            listener(frame)
+        shutil.copytree(self._run, folder)
+
+    def several(self, source: Any, config: Any, folder: Path, *, boxes, masks, points, **about: Any) -> None:
+        """Stands for `tracking3d.recording.record_objects`."""
+        folder.mkdir(parents=True, exist_ok=True)
+        for number in range(len(boxes) + len(masks) + len(points)):
+            self(source, config, folder / f"object_{number}", **about)
+
+
+@pytest.fixture(scope="session")
+def finished_run(tmp_path_factory):
+    """Of two frames; its source is nowhere."""
+    folder = tmp_path_factory.mktemp("finished") / "run"
+    with open_run(folder) as writer:
+        for index in range(2):
+            writer.write(estimate_of(index), frame_of(index))
+        writer.finish(model(), "finished")
+    return folder
+
+
+@pytest.fixture
+def recorded(monkeypatch, finished_run):
+    record = Recorded(finished_run)
+    monkeypatch.setattr(one_video, "record", record)
+    monkeypatch.setattr(one_video, "record_objects", record.several)
+    return record
+
+
+@pytest.fixture
+def batch(recorded, tmp_path):
+    """Run a batch into ``out`` in this process; gives how far it came and what happened."""
+
+    def run(place: Any, out: Any = tmp_path / "out", configure: Any = lambda row: load_config(), **more: Any):
+        told: list[Any] = []
+        jobs = list_jobs(str(place), configure)
+        options = {"report": False, "pause": 0.0, **more}
+        progress = run_batch(jobs, str(out), InThisProcess(), listener=told.append, **options)
+        return progress, told
+
+    return run
+
+
+@pytest.fixture
+def full_disk(monkeypatch):
+    """Let writing files of some name fail."""
+
+    def fill(module: Any, name: str) -> None:
+        write = module.write
+
+        def refused(place: str, content: bytes) -> None:
+            if place.endswith(name):
+                raise OutputError(f"The disk is full at {place}; free some space.")
+            write(place, content)
+
+        monkeypatch.setattr(module, "write", refused)
+
+    return fill

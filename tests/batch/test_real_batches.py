@@ -1,0 +1,123 @@
+"""Batches with real workers and real tracking: slow. Answers are those of single runs; faults cost their video only."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from heavy_task import hold
+
+from tracking3d.batch.demonstration import ABORTING, DAMAGED, FILLING, demonstrate, make_clips
+from tracking3d.batch.load import load_now
+from tracking3d.batch.running import run_batch
+from tracking3d.benchmark.job import Job
+from tracking3d.benchmark.pool import run_jobs
+from tracking3d.benchmark.variant import Variant
+from tracking3d.config.loading import load_config
+from tracking3d.datasets.clip import write_clip
+from tracking3d.engines.choosing import open_engine
+from tracking3d.engines.mapping import map_tasks
+from tracking3d.engines.processes import ProcessEngine
+from tracking3d.engines.protocol import Ended, Task
+from tracking3d.results.run_reader import RunReader
+from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
+
+pytestmark = [
+    pytest.mark.slow,
+    # Files and sockets that Ray leaves to the end of its processes.
+    pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"),
+    pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning"),
+]
+
+QUICK = ["window.size=32", "object.frequency=2", "solver.final_refine=false"]
+
+
+@pytest.fixture
+def config():
+    return load_config(overrides=QUICK)
+
+
+@pytest.fixture
+def workers_find_the_package(monkeypatch):
+    """Workers of Ray run the code that is tested."""
+    paths = [str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, paths)))
+
+
+def poses(folder: Path) -> np.ndarray:
+    return np.stack([record.T_cam_obj for record in RunReader(folder).frames])
+
+
+def test_whatever_goes_wrong_all_other_answers_are_those_of_a_single_run(config, tmp_path, monkeypatch):
+    monkeypatch.setenv("TRACKING3D_PLUGINS", "")  # is put back at the end
+    plain, faults, single = demonstrate(config, tmp_path, videos=3, frames=5, workers=(2,), report=False)
+    assert plain.failed == {} and plain.finished == 3
+    assert set(faults.failed) == {DAMAGED, ABORTING} and faults.finished == 4
+    assert {"clip_0000", FILLING, DAMAGED, ABORTING} <= set(faults.again)
+    assert "signal 6" in faults.failed[ABORTING]
+    assert faults.different < 1e-9 and single.different < 1e-9
+
+
+@pytest.mark.parametrize("address", [None, "local"])
+def test_sigterm_keeps_what_is_done_and_the_same_batch_goes_on(
+    config, tmp_path, address, workers_find_the_package
+):
+    if address:
+        pytest.importorskip("ray", reason="the extra ray is not installed")
+    jobs = make_clips(tmp_path / "clips", 2, 6, config)
+    out = tmp_path / "out"
+
+    def stop(happening):
+        if happening.event == "progress" and happening.about.get("frames", 0) >= 2:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with open_engine(address, 1) as engine:
+        with pytest.raises(KeyboardInterrupt):
+            run_batch(jobs, str(out), engine, report=False, listener=stop)
+        [work] = (out / ".work").iterdir()
+        state = json.loads((work / "run/run.json").read_text())["state"]
+        assert state == "interrupted" and not list(out.glob("clip_*"))
+        progress = run_batch(jobs, str(out), engine, report=False)
+    assert progress.finished == 2
+    resumed = [json.loads((out / job.name / "run.json").read_text())["resumed"] for job in jobs]
+    assert sorted(map(len, resumed)) == [0, 1]
+
+
+def test_evaluate_gives_the_same_figures_on_both_engines(tmp_path, workers_find_the_package):
+    pytest.importorskip("ray", reason="the extra ray is not installed")
+    clip = synthesize(SyntheticSpec(frames=4, size=(64, 48), supersample=1))
+    for name in ("one", "two"):
+        poses, camera = clip.T_cam_obj, clip.camera
+        write_clip(tmp_path / "clips" / name, clip.images, clip.masks, poses, camera, source="test", note="")
+    variant = Variant(label="quick", config=load_config(overrides=QUICK))
+
+    def scores(out: str, address: str | None):
+        jobs = [Job("clip", tmp_path / "clips", name, variant, tmp_path / out) for name in ("one", "two")]
+        outcomes = run_jobs(jobs, 2, address=address)
+        assert [outcome.error for outcome in outcomes] == ["", ""]
+        measured = [dict(outcome.scores) for outcome in outcomes]
+        return [
+            {key: value for key, value in one.items() if "second" not in key and "memory" not in key}
+            for one in measured
+        ]
+
+    assert scores("here", None) == scores("ray", "local")
+
+
+def test_a_hundred_tasks_leave_nothing_behind():
+    loads = []
+
+    def listener(event):
+        if isinstance(event, Ended):
+            loads.append(load_now())
+
+    ended = map_tasks(ProcessEngine(2), [Task(number, hold) for number in range(100)], listener=listener)
+    assert all(one.value == 16_000_000 for one in ended.values())
+    first, last = loads[20:40], loads[80:]
+    for name, more in (("own_descriptors", 0), ("descriptors", 10), ("own_memory", 2), ("processes", 0)):
+        before, after = (max(getattr(one, name) for one in some) for some in (first, last))
+        assert after <= before + more, name

@@ -1,0 +1,113 @@
+"""``tracking3d batch``: what it takes, prints and keeps, and how it ends."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from contextlib import contextmanager
+
+import pytest
+
+from tracking3d.engines.in_this_process import InThisProcess
+from tracking3d.engines.protocol import Needs
+
+BOX = "20,10,20,20"
+
+
+@pytest.fixture
+def opened(monkeypatch):
+    """Work in this process, and what was asked for instead."""
+    asked = []
+
+    @contextmanager
+    def here(address=None, workers=None, needs=None):
+        asked.append((address, workers, needs))
+        yield InThisProcess()
+
+    monkeypatch.setattr("tracking3d.engines.choosing.open_engine", here)
+    monkeypatch.setattr("tracking3d.batch.running.PAUSE", 0.0)
+    return asked
+
+
+@pytest.fixture
+def shots(clip, tmp_path):
+    """Two folders of images, of one of which nothing is said."""
+    folder = tmp_path / "shots"
+    for name in ("cup", "plate"):
+        shutil.copytree(clip, folder / name)
+    (folder / "cup.box").write_text(BOX)
+    return folder
+
+
+@pytest.fixture
+def table(shots, tmp_path):
+    """Both with an object, and settings in a row of one."""
+    file = tmp_path / "jobs.csv"
+    file.write_text(
+        f'video,box,settings,fov\nshots/cup,"{BOX}",runtime.seed=5,\nshots/plate,"{BOX}; 5,5,9,9",,40\n'
+    )
+    return file
+
+
+def test_a_table_is_tracked_with_the_settings_of_its_rows(call, table, script, opened):
+    result = call("batch", table, "--out", "out", "--no-report", "--set", "window.size=64", "--threads", 2)
+    assert result.exit_code == 0, result.output
+    assert opened == [(None, None, Needs(2, 0.0, 0.0))]
+    (cup, _), *plate = sorted(script.built, key=lambda one: one[0].runtime.seed != 5)
+    assert (cup.runtime.seed, cup.window.size, cup.runtime.threads) == (5, 64, 2)
+    assert [config.camera.fov for config, _ in plate] == [40, 40]
+    assert [prompt.box for _, prompt in plate] == [(20, 10, 20, 20), (5, 5, 9, 9)]
+    assert "cup: 5 frames" in result.stderr and "2 of 2 videos" in result.stderr
+
+    status = call("batch", "status", "out")
+    assert status.exit_code == 0 and "finished" in status.stdout and "2 of 2 videos" in status.stdout
+    again = call("batch", table, "--out", "out", "--no-report", "--set", "window.size=64", "--threads", 2)
+    assert again.exit_code == 0 and len(script.built) == 3 and "2 of them before" in again.stderr
+
+
+def test_events_are_lines_of_json_and_a_failure_is_the_exit_code(call, shots, script, opened):
+    script.faults[3] = RuntimeError("the solver has a fault")
+    result = call("batch", shots / "*", "--out", "out", "--json", "--retries", 1, "--no-report")
+    assert result.exit_code == 1
+    events = [json.loads(line) for line in result.stdout.splitlines()]
+    assert [event["event"] for event in events if event["video"] == "plate"] == ["failed"]
+    of_cup = [event["event"] for event in events if event["video"] == "cup" and event["event"] != "progress"]
+    assert of_cup == ["began", "again", "began", "failed"]
+    assert events[-1]["event"] == "batch" and events[-1]["batch"]["failed"] == 2
+    told = json.loads(call("batch", "status", "out", "--json").stdout)
+    reasons = {failure["run"]: failure["reason"] for failure in told["failures"]}
+    assert "the solver has a fault" in reasons["cup"] and "plate.box" not in reasons
+    assert "VIDEO.box" in reasons["plate"]
+
+
+def test_ctrl_c_says_that_the_same_command_goes_on(call, shots, script, opened):
+    script.faults[2] = KeyboardInterrupt()
+    result = call("batch", shots, "--out", "out", "--quiet", "--no-report")
+    assert result.exit_code == 130 and "The same command goes on" in result.stderr
+    assert "interrupted" in call("batch", "status", "out").stdout
+    script.faults.clear()
+    assert call("batch", shots, "--out", "out", "--quiet", "--no-report").exit_code == 0
+
+
+def test_a_dataset_is_tracked_from_its_boxes(call, tmp_path, script, opened):
+    from tracking3d.datasets.clip import write_clip
+    from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
+
+    clip = synthesize(SyntheticSpec(frames=2, size=(64, 48), supersample=1))
+    for name in ("one", "two"):
+        poses, camera = clip.T_cam_obj, clip.camera
+        write_clip(tmp_path / "clips" / name, clip.images, clip.masks, poses, camera, source="test", note="")
+    arguments = ("batch", "real", "--data", "clips", "--sequence", "t*", "--out", "out", "--no-report")
+    assert call(*arguments).exit_code == 0
+    [(config, prompt)] = script.built
+    assert config.camera.intrinsics[0] == pytest.approx(clip.camera.fx) and prompt.box[2] > 0
+    assert (tmp_path / "out/two/batch.json").is_file()
+
+
+def test_what_cannot_be_used_is_said_before_anything_is_written(refused, shots, tmp_path):
+    (tmp_path / "jobs.csv").write_text("video,wdith\nshots/cup,3\n")
+    assert "'wdith'" in refused("batch", "jobs.csv", "--out", "out")
+    assert "names no video" in refused("batch", "absent/*.mp4", "--out", "out")
+    assert "progress.json" in refused("batch", "status", "shots")
+    assert "no setting" in refused("batch", shots, "--out", "out", "--set", "solver.nothing=1")
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,181 @@
+"""The folder of a batch: its tables, which grow as videos end, and how far it is; readable at any time."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+from tracking3d.batch.places import joined, local, read, write
+from tracking3d.batch.summary import COLUMNS
+from tracking3d.errors import InputError
+
+PROGRESS, RESULTS, PARQUET, FAILURES = "progress.json", "results.csv", "results.parquet", "failures.csv"
+FORMAT = "tracking3d-batch"
+_FAILURE = ("run", "video", "reason", "attempts", "crashed", "log")
+_SILENT = 120.0  # seconds after which a batch that says nothing is taken for ended
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A video that came to nothing.
+
+    Attributes:
+        run: What its run folder would have been called.
+        video: The video.
+        reason: Why, in a sentence.
+        attempts: How often it was begun.
+        crashed: Whether its process ended.
+        log: What was printed.
+    """
+
+    run: str
+    video: str
+    reason: str
+    attempts: int
+    crashed: bool
+    log: str
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a batch is.
+
+    Attributes:
+        state: ``running``, ``finished`` or ``interrupted``.
+        total: Videos.
+        finished: Of them, those that are whole.
+        failed: Those that came to nothing.
+        before: Those of the finished ones that were so before the command began.
+        running: By worker: the video, how many frames of how many, since when, at which attempt.
+        engine: Where the work is done.
+        workers: How many videos at a time.
+        began: When, in seconds since 1970.
+        updated: When this was written.
+        seconds_to_go: About how long it will take; None where that cannot be said yet.
+    """
+
+    state: str
+    total: int
+    finished: int = 0
+    failed: int = 0
+    before: int = 0
+    running: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    engine: str = ""
+    workers: int = 0
+    began: float = 0.0
+    updated: float = 0.0
+    seconds_to_go: float | None = None
+
+    @property
+    def state_in_words(self) -> str:
+        """The state; of a batch that has not said anything for long, that too."""
+        silent = time.time() - self.updated
+        if self.state == "running" and silent > _SILENT:
+            return f"running, but nothing was heard of it for {silent / 60:.0f} minutes"
+        return self.state
+
+
+def write_progress(out: str, progress: Progress) -> Progress:
+    """Write how far the batch is, with the time of now.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
+    progress = replace(progress, updated=time.time())
+    write(
+        joined(out, PROGRESS), json.dumps({"format": FORMAT, **asdict(progress)}, indent=1).encode() + b"\n"
+    )
+    return progress
+
+
+def read_progress(out: str) -> Progress:
+    """How far a batch is.
+
+    Raises:
+        InputError: If the folder is none of a batch, or what is there is damaged.
+    """
+    content = read(joined(out, PROGRESS))
+    if content is None:
+        raise InputError(f"{out} is no folder of a batch: it holds no {PROGRESS}; give what --out was.")
+    try:
+        document = json.loads(content)
+        if document.pop("format") != FORMAT:
+            raise ValueError("another format")
+        return Progress(**document)
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{joined(out, PROGRESS)} is damaged ({error}); run the batch once more.") from error
+
+
+def write_tables(out: str, rows: Sequence[Mapping[str, Any]], failures: Iterable[Failure]) -> None:
+    """Replace the tables by those of now, each whole: CSV, and Parquet too where pyarrow is installed.
+
+    Raises:
+        OutputError: If one cannot be written; it is then as it was.
+    """
+    write(joined(out, RESULTS), _csv(COLUMNS, rows))
+    write(joined(out, FAILURES), _csv(_FAILURE, [asdict(one) for one in failures]))
+    if (content := _parquet(rows)) is not None:
+        write(joined(out, PARQUET), content)
+
+
+def read_failures(out: str) -> list[Failure]:
+    """The videos that came to nothing.
+
+    Raises:
+        InputError: If the table is damaged.
+    """
+    content = read(joined(out, FAILURES)) or b""
+    try:
+        return [
+            Failure(
+                row["run"],
+                row["video"],
+                row["reason"],
+                int(row["attempts"]),
+                row["crashed"] == "True",
+                row["log"],
+            )
+            for row in csv.DictReader(io.StringIO(content.decode("utf-8")), strict=True)
+        ]
+    except (ValueError, KeyError, TypeError, csv.Error) as error:
+        raise InputError(f"{joined(out, FAILURES)} is damaged ({error}); run the batch once more.") from error
+
+
+def read_results(out: str) -> list[dict[str, str]]:
+    """The rows of the table of results, as texts."""
+    content = read(joined(out, RESULTS)) or b""
+    return list(csv.DictReader(io.StringIO(content.decode("utf-8", "replace"))))
+
+
+def relative(out: str, place: str) -> str:
+    """A place within the folder of the batch as the tables have it."""
+    base = local(out)
+    start = f"{base}/" if base is not None else f"{out.rstrip('/')}/"
+    return place.removeprefix(start)
+
+
+def _csv(columns: Iterable[str], rows: Iterable[Mapping[str, Any]]) -> bytes:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(columns), extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue().encode("utf-8", "replace")
+
+
+def _parquet(rows: Sequence[Mapping[str, Any]]) -> bytes | None:
+    try:
+        import pyarrow
+        from pyarrow import parquet
+    except ImportError:
+        return None
+    types = {str: pyarrow.string(), int: pyarrow.int64(), float: pyarrow.float64()}
+    schema = pyarrow.schema([(name, types[kind]) for name, kind in COLUMNS.items()])
+    table = pyarrow.Table.from_pylist([{name: row.get(name) for name in COLUMNS} for row in rows], schema)
+    stream = io.BytesIO()
+    parquet.write_table(table, stream)
+    return stream.getvalue()

@@ -1,0 +1,190 @@
+"""From what the user names to the videos of a batch: a folder, a pattern, a table, or a dataset."""
+
+from __future__ import annotations
+
+import os
+import posixpath
+from collections import Counter, defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from tracking3d.batch.beside import videos_of
+from tracking3d.batch.one_video import LOGS
+from tracking3d.batch.places import absolute, is_folder, local, parent
+from tracking3d.batch.rows import Row
+from tracking3d.batch.tables import is_table, read_table
+from tracking3d.batch.video_job import VideoJob
+from tracking3d.benchmark.sequences import Dataset
+from tracking3d.config.models import PipelineConfig
+from tracking3d.datasets.layout import load_layout
+from tracking3d.datasets.reading import read_sequence
+from tracking3d.errors import InputError, Tracking3dError
+
+Configure = Callable[[Row], PipelineConfig]
+"""Makes the pipeline of a row."""
+
+NO_PROMPT = (
+    "Nothing says what the object is: put VIDEO.box (X,Y,W,H), VIDEO.json or a first-frame mask VIDEO.png beside it, "
+    "or give a column box, mask or points."
+)
+
+
+def list_jobs(place: str, configure: Configure) -> list[VideoJob]:
+    """The videos of a folder, a pattern or a table.
+
+    Rows of one video with the same settings are one job with several objects. What is wrong with one video is its
+    fault, and stops no other.
+
+    Args:
+        place: What the user named.
+        configure: Makes the pipeline of a row.
+
+    Raises:
+        InputError: If there is nothing, a table cannot be read, or two videos would have one name.
+    """
+    if is_table(place):
+        rows = [(row, 0) for row in read_table(place)]
+        folder = absolute(parent(place))
+        rows = [(_absolute(row, folder), size) for row, size in rows]
+        root = ""
+    else:
+        root = absolute(place) if is_folder(place) else ""
+        rows = [(_absolute(row, "."), size) for row, size in videos_of(place)]
+    rows = _together(rows)
+    names = _names([row for row, _ in rows], root)
+    jobs = [_job(row, name, size, configure) for (row, size), name in zip(rows, names, strict=True)]
+    return jobs
+
+
+def dataset_jobs(dataset: Dataset, config: PipelineConfig) -> list[VideoJob]:
+    """The sequences of a dataset, each from the box and through the camera that it tells a tracker of."""
+    return [_of_sequence(dataset, name, config) for name in dataset.sequences]
+
+
+def _of_sequence(dataset: Dataset, name: str, config: PipelineConfig) -> VideoJob:
+    root = str(dataset.root.absolute())
+    layout = str(Path(dataset.layout).absolute()) if Path(dataset.layout).is_file() else dataset.layout
+    job = VideoJob(name, joined_name(root, name), config, sequence=(layout, root, name))
+    try:
+        truth = read_sequence(load_layout(layout), dataset.root, name)
+    except Tracking3dError as error:
+        return replace(job, fault=str(error))
+    if truth.box is None and config.tracker.name != "precomputed":
+        return replace(job, fault=f"{name} has no box in its first frame; a mask tracker cannot start.")
+    camera, given = truth.told_camera or truth.camera, config.camera
+    if camera is not None and truth.camera_told and given.intrinsics is None and given.fov is None:
+        told = given.model_copy(update={"intrinsics": (camera.fx, camera.fy, camera.cx, camera.cy)})
+        config = config.model_copy(update={"camera": told})
+    box = () if truth.box is None else (",".join(f"{value:.17g}" for value in truth.box),)
+    size = sum(file.stat().st_size for file in truth.frames[:1]) * len(truth.frames)
+    return replace(job, config=config, box=box, size=size)
+
+
+def joined_name(root: str, name: str) -> str:
+    """A sequence of a dataset as messages call it."""
+    return posixpath.join(root, name)
+
+
+def _absolute(row: Row, folder: str) -> Row:
+    """The row with places that mean the same everywhere."""
+    update: dict[str, Any] = {
+        "video": absolute(row.video, folder),
+        "mask": tuple(absolute(one, folder) for one in row.mask),
+        "masks": row.masks and absolute(row.masks, folder),
+    }
+    return row.model_copy(update=update)
+
+
+def _together(rows: Sequence[tuple[Row, int]]) -> list[tuple[Row, int]]:
+    """Rows that differ in the object only, as one."""
+    groups: defaultdict[str, list[tuple[Row, int]]] = defaultdict(list)
+    for row, size in rows:
+        groups[row.model_copy(update={"box": (), "mask": (), "points": ()}).model_dump_json()].append(
+            (row, size)
+        )
+    together = []
+    for group in groups.values():
+        objects: Mapping[str, Any] = {
+            kind: tuple(one for row, _ in group for one in getattr(row, kind))
+            for kind in ("box", "mask", "points")
+        }
+        together.append((group[0][0].model_copy(update=objects), group[0][1]))
+    return together
+
+
+def _names(rows: Sequence[Row], root: str) -> list[str]:
+    """What the run folders are called: after the video's place within ``root``, or within what all have in common.
+
+    Raises:
+        InputError: If two have the same name, or one leads out of the folder.
+    """
+    videos = [row.video for row in rows]
+    if not root and videos:
+        folders = {parent(video) for video in videos}
+        alike = len({"://" in folder for folder in folders}) == 1
+        root = os.path.commonpath(folders) if alike and len(folders) > 1 else min(folders, key=len)
+    inside = [PurePosixPath(_within(video, root)) for video in videos]
+    bare = Counter(path.with_suffix("") for path in inside)
+    # A run folder within another one would be replaced with it.
+    folders_of_others = {folder for path in inside for folder in path.parents} | {PurePosixPath(LOGS)}
+    taken = {path for path, count in bare.items() if count > 1} | folders_of_others
+    names = [
+        row.name or str(path if path.with_suffix("") in taken else path.with_suffix(""))
+        for row, path in zip(rows, inside, strict=True)
+    ]
+    seen: dict[str, str] = {}
+    for name, video in zip(names, videos, strict=True):
+        parts = PurePosixPath(name).parts
+        if (
+            not parts
+            or parts == (LOGS,)
+            or PurePosixPath(name).is_absolute()
+            or any(part.startswith(".") for part in parts)
+        ):
+            raise InputError(f"The name '{name}' of {video} cannot be that of a run folder; give it another.")
+        if name in seen:
+            raise InputError(
+                f"{video} and {seen[name]} would both be written to {name}; give them names in a column name."
+            )
+        seen[name] = video
+    if within := next(
+        (name for name in names for one in PurePosixPath(name).parents if str(one) in seen), None
+    ):
+        raise InputError(
+            f"The run folder {within} would lie within another one; give it a name in a column name."
+        )
+    return names
+
+
+def _within(video: str, root: str) -> str:
+    inside = video.removeprefix(root).lstrip("/") if video.startswith(root) else PurePosixPath(video).name
+    # A pattern of images is called after the folder that they are in.
+    path = PurePosixPath(inside)
+    while any(sign in path.name for sign in "*?[") and len(path.parts) > 1:
+        path = path.parent
+    return "/".join(part.lstrip(".") or "_" for part in path.parts) or "video"
+
+
+def _job(row: Row, name: str, size: int, configure: Configure) -> VideoJob:
+    fault = "" if row.has_prompt else NO_PROMPT
+    try:
+        config = configure(row)
+    except Tracking3dError as error:
+        config, fault = PipelineConfig(), str(error)
+    if not fault and not size and (path := local(row.video)) is not None and path.is_file():
+        size = path.stat().st_size
+    return VideoJob(
+        name,
+        row.video,
+        config,
+        row.box,
+        row.mask,
+        row.points,
+        row.correct,
+        row.start_frame,
+        row.frames,
+        size=size,
+        fault="" if config.tracker.name == "precomputed" and fault == NO_PROMPT else fault,
+    )

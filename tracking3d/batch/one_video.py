@@ -1,0 +1,207 @@
+"""What a worker does for one video: tracks it in a folder beside, and puts the run folder into its place when whole."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import tempfile
+import time
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from tracking3d.batch.networks import SharedNetwork, keep_networks
+from tracking3d.batch.places import absolute, fetch, joined, local, remove, send, write
+from tracking3d.batch.summary import MARKER, write_marker
+from tracking3d.batch.video_job import VideoJob
+from tracking3d.config.models import PipelineConfig
+from tracking3d.corrections import parse_correction
+from tracking3d.datasets.layout import load_layout
+from tracking3d.datasets.reading import read_sequence
+from tracking3d.engines.protocol import Tell
+from tracking3d.errors import InputError, OutputError
+from tracking3d.frames import SkippedFrame
+from tracking3d.point_prompts import parse_points
+from tracking3d.prompts import parse_box
+from tracking3d.recording import record, record_objects
+from tracking3d.report.several import write_reports
+from tracking3d.results import layout
+from tracking3d.results.files import writing
+from tracking3d.results.records import FrameRecord
+from tracking3d.video import open_source
+from tracking3d.video.image_sequence import ImageSequence
+from tracking3d.video.source import FrameSource
+
+WORK = ".work"
+"""In the folder of a batch: what is not whole yet, and what a video that is tried again goes on from."""
+LOGS = "logs"
+
+_TELL = 1.0  # seconds between two words about how far it is
+
+
+def work_folder(out: str, job: VideoJob) -> Path:
+    """Where a video is worked on; another one for every setting, since a run goes on with its own only.
+
+    Beside the results where they are on this machine, so that a worker elsewhere that sees the same files can go on;
+    else in the machine's own folder for temporary files.
+    """
+    base = local(out)
+    if base is None:
+        base = Path(
+            tempfile.gettempdir(), f"tracking3d-batch-{hashlib.sha256(out.encode()).hexdigest()[:12]}"
+        )
+    return base / WORK / f"{job.name.replace('/', '__')[-100:]}-{job.key}"
+
+
+def log_file(out: str, job: VideoJob) -> Path:
+    """Where a worker prints to: beside the results, or in its work folder where these are elsewhere."""
+    if (base := local(out)) is not None:
+        return base / LOGS / f"{job.name}.log"
+    return work_folder(out, job) / "log.txt"
+
+
+def track_video(
+    tell: Tell,
+    job: VideoJob,
+    out: str,
+    command: str,
+    report: bool,
+    networks: tuple[SharedNetwork, ...] = (),
+) -> dict[str, Any]:
+    """Track one video; see `tracking3d.batch.summary.write_marker` for what is returned.
+
+    A video that was begun before and stopped in whatever way goes on from its last finished frame.
+
+    Args:
+        tell: Is given a mapping of ``frames``, how many answers there are, and ``of`` how many, where known.
+        job: The video.
+        out: The folder of the batch.
+        command: The command line, for the record.
+        report: Whether to write a report.
+        networks: What the machine may lack.
+
+    Raises:
+        Tracking3dError: If it cannot be tracked; what is finished is kept for another time.
+    """
+    work = work_folder(out, job)
+    with writing(work):
+        work.mkdir(parents=True, exist_ok=True)
+        attempts = _counted(work / "attempts")
+    keep_networks(networks)
+    run = work / "run"
+    try:
+        _track(tell, _fetched(job, work / "source"), run, command)
+        if report:
+            write_reports(layout.runs_in(run))
+        told = write_marker(run, job, attempts)
+        _put_into_place(run, joined(out, job.name))
+    except InputError:
+        if not run.exists():  # nothing was begun that could go on
+            _forget(work)
+        raise
+    finally:
+        _send_log(out, job)
+    _forget(work)
+    return told
+
+
+def _track(tell: Tell, job: VideoJob, run: Path, command: str) -> None:
+    source = _source(job)
+    passes = 2 if job.config.solver.final_refine else 1
+    whole = source.count and source.count * job.objects * passes
+    answers, last, process = 0, 0.0, os.getpid()
+
+    def listener(frame: FrameRecord | SkippedFrame) -> None:
+        nonlocal answers, last
+        answers += 1
+        if time.monotonic() - last > _TELL:
+            last = time.monotonic()
+            tell({"frames": answers, "of": whole, "process": process})
+
+    tell({"frames": 0, "of": whole, "process": process})
+    boxes: list[Any] = [parse_box(text) for text in job.box]
+    masks: list[Any] = [Path(file) for file in job.mask]
+    points: list[Any] = [parse_points(text) for text in job.points]
+    about: dict[str, Any] = {
+        "start_frame": job.start_frame,
+        "corrections": [parse_correction(text) for text in job.correct],
+        "command": command,
+        "selection": job.frames,
+        "resume": True,
+        "listener": listener,
+    }
+    if job.objects > 1:
+        record_objects(source, job.config, run, boxes=boxes, masks=masks, points=points, **about)
+    else:
+        box, mask, point = (next(iter(given), None) for given in (boxes, masks, points))
+        record(source, job.config, run, box=box, mask=mask, points=point, **about)
+
+
+def _source(job: VideoJob) -> FrameSource:
+    if job.sequence is None:
+        return open_source(job.video, job.frames)
+    described, root, name = job.sequence
+    frames = read_sequence(load_layout(described), Path(root), name).frames
+    return ImageSequence(name, frames, range(len(frames)))
+
+
+def _fetched(job: VideoJob, folder: Path) -> VideoJob:
+    """The same job with files that are elsewhere copied to this machine."""
+
+    def here(place: str, number: int) -> str:
+        if local(place) is not None:
+            return absolute(place)
+        return str(fetch(place, folder / str(number)))
+
+    if job.sequence is not None:
+        return job
+    tracker = job.config.tracker
+    masks: str | None = getattr(tracker, "path", None)
+    config = job.config
+    if masks is not None and local(masks) is None:
+        document = config.model_dump()
+        document["tracker"]["path"] = here(masks, 0)
+        config = PipelineConfig.model_validate(document)
+    return replace(
+        job,
+        video=here(job.video, 1),
+        mask=tuple(here(one, number) for number, one in enumerate(job.mask, 2)),
+        config=config,
+    )
+
+
+def _put_into_place(run: Path, place: str) -> None:
+    """Make a whole run folder appear where it belongs, in place of one that is there."""
+    target = local(place)
+    if target is None:
+        remove(place)
+        send(run, place, MARKER)
+        return
+    with writing(target):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        before = run.with_name("before")
+        if target.exists():
+            shutil.rmtree(before, ignore_errors=True)
+            target.rename(before)
+        run.rename(target)
+
+
+def _send_log(out: str, job: VideoJob) -> None:
+    """Keep what was printed beside the results where these are elsewhere."""
+    log = log_file(out, job)
+    if local(out) is None and log.is_file():
+        with suppress(OutputError):  # the results are what counts
+            write(joined(out, LOGS, f"{job.name}.log"), log.read_bytes())
+
+
+def _counted(file: Path) -> int:
+    """How often this has been called for the file."""
+    times = int(file.read_text()) + 1 if file.is_file() else 1
+    file.write_text(str(times))
+    return times
+
+
+def _forget(work: Path) -> None:
+    shutil.rmtree(work, ignore_errors=True)

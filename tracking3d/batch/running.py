@@ -1,0 +1,289 @@
+"""A batch from its first video to its last: what is whole is left alone, the rest is handed out, tables grow."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from typing import Any
+
+from tracking3d.batch.folder import Failure, Progress, relative, write_progress, write_tables
+from tracking3d.batch.networks import share_networks
+from tracking3d.batch.one_video import LOGS, WORK, log_file, track_video
+from tracking3d.batch.overview import write_overview
+from tracking3d.batch.places import joined, local, read_many
+from tracking3d.batch.summary import MARKER, read_marker
+from tracking3d.batch.video_job import VideoJob
+from tracking3d.engines.mapping import PAUSE, map_tasks
+from tracking3d.engines.protocol import Began, Ended, Engine, Event, Task, Told
+from tracking3d.errors import OutputError
+from tracking3d.results.files import writing
+from tracking3d.results.lock import try_lock
+
+_log = logging.getLogger(__name__)
+
+PROGRESS_EVERY, TABLES_EVERY, PAGE_EVERY = 2.0, 5.0, 60.0
+"""Seconds, at least, between two times that each is written."""
+_PATIENCE = 20.0  # a file that takes long to write is written less often: so many times as long lies between
+
+
+@dataclass(frozen=True)
+class Happening:
+    """Something that a scheduler or a person may want to know.
+
+    Attributes:
+        event: ``began``, ``progress``, ``again``, ``finished`` or ``failed`` of a video; ``batch`` of all.
+        video: Name of the run folder; empty for all.
+        about: What belongs to it.
+        progress: How far the batch is.
+    """
+
+    event: str
+    video: str
+    about: Mapping[str, Any]
+    progress: Progress
+
+
+Listener = Callable[[Happening], None]
+
+
+class Batch:
+    """What is known of a batch while it goes on.
+
+    Args:
+        out: Its folder.
+        jobs: All videos.
+        engine: Where they are tracked.
+        report: Whether runs get reports.
+        listener: Is told what happens.
+
+    Attributes:
+        progress: How far it is.
+        failures: Videos that came to nothing, by name.
+    """
+
+    def __init__(
+        self, out: str, jobs: Sequence[VideoJob], engine: Engine, report: bool, listener: Listener
+    ) -> None:
+        self._out, self._jobs, self._report, self._listener = out, jobs, report, listener
+        self._rows: dict[str, list[Mapping[str, Any]]] = {}
+        self._pictures: dict[str, str] = {}
+        self._workers: dict[int, str] = {}
+        self._running: dict[str, dict[str, Any]] = {}
+        self._due = {"progress": 0.0, "tables": 0.0, "page": time.monotonic() + PAGE_EVERY}
+        self._clock = time.monotonic()
+        self._refused = 0
+        self.failures: dict[str, Failure] = {}
+        self.progress = Progress(
+            "running", len(jobs), engine=engine.name, workers=engine.workers, began=time.time()
+        )
+
+    def find_finished(self, overwrite: bool) -> list[int]:
+        """Take in what an earlier command has finished; the numbers of the jobs that are still to be done."""
+        places = [joined(self._out, job.name, MARKER) for job in self._jobs]
+        contents = {} if overwrite else read_many(places)
+        left = []
+        for number, (job, place) in enumerate(zip(self._jobs, places, strict=True)):
+            marker = read_marker(contents.get(place))
+            fault = job.fault or ("" if overwrite else self._why_taken(job, marker))
+            if fault:
+                self.failures[job.name] = Failure(job.name, job.video, fault, 0, False, "")
+            elif marker is None:
+                left.append(number)
+            else:
+                self._take(job, marker)
+        self.progress = replace(self.progress, before=len(self._rows))
+        self._refused = len(self.failures)
+        self._count()
+        for job in self._jobs:
+            if failure := self.failures.get(job.name):
+                self._say("failed", job, {"reason": failure.reason, "attempts": 0, "crashed": False})
+        return left
+
+    def told(self, event: Event) -> None:
+        """Take in what an engine tells."""
+        job = self._jobs[event.number]
+        if isinstance(event, Began):
+            self._workers[event.number] = event.worker
+            about: dict[str, Any] = {"frames": 0, "of": None, "attempt": event.attempt}
+            self._running[event.worker] = {"video": job.name, "since": time.time(), **about}
+            self._say("began", job, {"worker": event.worker, **about})
+        elif isinstance(event, Told):
+            worker = self._workers.get(event.number, "")
+            if worker in self._running:
+                self._running[worker].update(event.content)
+                self._say("progress", job, {"worker": worker, **event.content})
+        else:
+            self._end(job, event)
+
+    def write(self, state: str = "running", *, now: bool = False) -> None:
+        """Write what is due; at the end (``now``) everything.
+
+        Raises:
+            OutputError: At the end, if something cannot be written; before, that is only said.
+        """
+        self._count(state)
+        steps: list[tuple[str, float, Callable[[], object]]] = [
+            ("progress", PROGRESS_EVERY, lambda: write_progress(self._out, self.progress)),
+            ("tables", TABLES_EVERY, self._write_tables),
+            ("page", PAGE_EVERY, self._write_page),
+        ]
+        problem: OutputError | None = None
+        for name, every, step in steps:
+            started = time.monotonic()
+            if not now and started < self._due[name]:
+                continue
+            try:
+                step()
+            except OutputError as error:
+                problem = problem or error
+                _log.warning("%s It is tried again.", error)
+            took = time.monotonic() - started
+            self._due[name] = time.monotonic() + max(every, _PATIENCE * took)
+        if now and problem:
+            raise problem
+
+    def _write_tables(self) -> None:
+        write_tables(self._out, *self._told_so_far())
+
+    def _write_page(self) -> None:
+        rows, failures = self._told_so_far()
+        write_overview(self._out, self.progress, rows, self._pictures, failures, self._report)
+
+    def _told_so_far(self) -> tuple[list[Mapping[str, Any]], list[Failure]]:
+        rows = [row for rows in self._rows.values() for row in rows]
+        return rows, sorted(self.failures.values(), key=lambda one: one.run)
+
+    def say_all(self) -> None:
+        """Tell the listener how far all is."""
+        self._listener(Happening("batch", "", {}, self.progress))
+
+    def _why_taken(self, job: VideoJob, marker: Mapping[str, Any] | None) -> str:
+        """Why a video's run folder cannot be had, in a sentence; empty where it can, or is there already."""
+        place = joined(self._out, job.name)
+        if marker is not None:
+            what = "" if marker["key"] == job.key else "a run of another video, prompt or setting"
+        else:  # what is whole comes with its marker, but elsewhere, where a part of it may have been sent
+            path = local(place)
+            what = "what no batch has written" if path is not None and path.exists() else ""
+        return f"{place} holds {what}; give another --out, or --overwrite." if what else ""
+
+    def _end(self, job: VideoJob, ended: Ended) -> None:
+        self._running.pop(self._workers.pop(ended.number, ""), None)
+        fault = ended.fault
+        if fault is None:
+            self._take(job, ended.value)
+            self._count()
+            self._say("finished", job, {"attempts": ended.attempts, "rows": self._rows[job.name]})
+            return
+        about = {"reason": fault.reason, "attempts": ended.attempts, "crashed": fault.crashed}
+        if not ended.again:
+            log = log_file(self._out, job)
+            told = relative(self._out, str(log)) if log.is_file() else ""
+            self.failures[job.name] = Failure(
+                job.name, job.video, fault.reason, ended.attempts, fault.crashed, told
+            )
+            self._count()
+        self._say("again" if ended.again else "failed", job, about)
+
+    def _take(self, job: VideoJob, marker: Mapping[str, Any]) -> None:
+        self._rows[job.name] = marker["rows"]
+        for row, picture in zip(marker["rows"], marker["thumbnails"], strict=True):
+            self._pictures[row["run"]] = picture
+
+    def _count(self, state: str = "running") -> None:
+        finished, failed = len(self._rows), len(self.failures)
+        done = finished + failed - self.progress.before - self._refused
+        parts = (min(1.0, one["frames"] / one["of"]) for one in self._running.values() if one.get("of"))
+        share, left = done + sum(parts), self.progress.total - self.progress.before - self._refused
+        spent = time.monotonic() - self._clock
+        to_go = spent * (left - share) / share if share > 0 else None
+        self.progress = replace(
+            self.progress,
+            state=state,
+            finished=finished,
+            failed=failed,
+            running={worker: dict(one) for worker, one in self._running.items()}
+            if state == "running"
+            else {},
+            seconds_to_go=to_go if state == "running" else None,
+        )
+
+    def _say(self, event: str, job: VideoJob, about: Mapping[str, Any]) -> None:
+        self._listener(Happening(event, job.name, about, self.progress))
+
+
+def run_batch(
+    jobs: Sequence[VideoJob],
+    out: str,
+    engine: Engine,
+    *,
+    retries: int = 1,
+    overwrite: bool = False,
+    report: bool = True,
+    command: str = "",
+    listener: Listener = lambda happening: None,
+    pause: float = PAUSE,
+) -> Progress:
+    """Track all videos; how far it came.
+
+    What an earlier command has finished is left alone, and what it has begun goes on from its last finished frame.
+    The largest videos are begun first, so that none is left alone at the end.
+
+    Args:
+        jobs: The videos.
+        out: The folder of the batch.
+        engine: Where they are tracked.
+        retries: How often a video that came to nothing is tried again.
+        overwrite: Track all videos again, and replace their run folders.
+        report: Write a report of each run.
+        command: The command line, for the record.
+        listener: Is told what happens.
+        pause: Seconds before a video is tried again.
+
+    Raises:
+        OutputError: If the folder is in use by another batch, or cannot be written.
+        KeyboardInterrupt: After Ctrl-C; what is done is kept, and the same call goes on.
+    """
+    with _alone(out):
+        batch = Batch(out, jobs, engine, report, listener)
+        left = batch.find_finished(overwrite)
+        batch.write(now=True)
+        shared = share_networks(engine, jobs)
+        tasks = [
+            Task(
+                number, track_video, (jobs[number], out, command, report, shared), log_file(out, jobs[number])
+            )
+            for number in sorted(left, key=lambda number: -jobs[number].size)
+        ]
+        batch.say_all()
+        try:
+            map_tasks(engine, tasks, retries=retries, pause=pause, listener=batch.told, meanwhile=batch.write)
+        except BaseException:
+            with suppress(OutputError):
+                batch.write("interrupted", now=True)
+            raise
+        if (folder := local(out)) is not None:
+            with suppress(OSError):  # where something is left to go on from, it stays
+                (folder / WORK).rmdir()
+        batch.write("finished", now=True)
+        batch.say_all()
+        return batch.progress
+
+
+@contextmanager
+def _alone(out: str) -> Iterator[None]:
+    """No other batch writes into the folder, as far as this machine can tell."""
+    folder = local(out)
+    if folder is None:
+        yield
+        return
+    with writing(folder):
+        (folder / LOGS).mkdir(parents=True, exist_ok=True)
+        lock = (folder / ".lock").open("ab")
+    with lock:
+        if not try_lock(lock.fileno()):
+            raise OutputError(f"{out} is in use by another batch; wait for it or choose another --out.")
+        yield

@@ -1,0 +1,63 @@
+"""One video of a batch: where it is, what is tracked in it, with which settings, and what its results are called."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from tracking3d.config.models import PipelineConfig
+
+
+@dataclass(frozen=True)
+class VideoJob:
+    """What one worker does in one go: a video is decoded once, however many objects are tracked in it.
+
+    Attributes:
+        name: Where its run folder is, within that of the batch.
+        video: Video file, folder or pattern of images.
+        config: The pipeline.
+        box: Objects by their box in the first frame, as ``tracking3d run --box`` has them.
+        mask: Objects by the image file of their mask.
+        points: Objects by points.
+        correct: Corrections.
+        start_frame: The frame in which the objects are given; None for the first.
+        frames: ``START:STOP:STEP``.
+        sequence: Layout, folder and name of a sequence of a dataset, whose images are then the video.
+        size: Bytes of the video, where known: large ones are begun first.
+        fault: Why it cannot be done, where that is known beforehand.
+    """
+
+    name: str
+    video: str
+    config: PipelineConfig
+    box: tuple[str, ...] = ()
+    mask: tuple[str, ...] = ()
+    points: tuple[str, ...] = ()
+    correct: tuple[str, ...] = ()
+    start_frame: int | None = None
+    frames: str | None = None
+    sequence: tuple[str, str, str] | None = None
+    size: int = 0
+    fault: str = ""
+
+    @property
+    def objects(self) -> int:
+        """How many objects are tracked."""
+        return max(len(self.box) + len(self.mask) + len(self.points), 1)
+
+    @cached_property
+    def key(self) -> str:
+        """What tells its results from those of another video, prompt or setting."""
+        told: dict[str, Any] = {
+            "video": self.video,
+            "config": self.config.model_dump(mode="json"),
+            "objects": [self.box, self.mask, self.points],
+            "correct": self.correct,
+            "start_frame": self.start_frame,
+            "frames": self.frames,
+            "sequence": self.sequence,
+        }
+        return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]

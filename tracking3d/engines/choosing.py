@@ -1,0 +1,32 @@
+"""From what the user asks for to an engine."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from tracking3d.engines.processes import ProcessEngine
+from tracking3d.engines.protocol import ONE_CORE, Engine, Needs
+
+
+@contextmanager
+def open_engine(
+    address: str | None = None, workers: int | None = None, needs: Needs = ONE_CORE
+) -> Iterator[Engine]:
+    """Ray where an address is given, else processes of this machine; what runs is stopped at the end.
+
+    Args:
+        address: Of a Ray cluster, see `tracking3d.engines.on_ray.open_ray`.
+        workers: Tasks at a time; as many as there are cores for if None.
+        needs: What each takes.
+
+    Raises:
+        InputError: If Ray is asked for and not installed, or nothing answers there.
+    """
+    if address is None:
+        yield ProcessEngine(workers, needs)
+        return
+    from tracking3d.engines.on_ray import open_ray
+
+    with open_ray(address, workers, needs) as engine:
+        yield engine
