@@ -181,7 +181,8 @@ class ObjectRecording:
         most = self._session.config.object.texture_views
         if most and answer.status is Status.TRACKED and answer.confidence >= BELIEVED:
             mask, camera = refinement.mask(answer), answer.through(self._session.camera)
-            view = texture_view(frame.index, frame.image, mask, camera, answer.T_cam_obj)
+            image, seen = camera.undistorted(frame.image), camera.mask_to_pinhole(mask)
+            view = texture_view(frame.index, image, seen, camera, answer.T_cam_obj)
             self._views = self._views if view is None else kept_views(self._views, view, most)
         return answer
 

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quality, Quiet, configure, numbers
+from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quality, Quiet, camera_settings, configure
 from tracking3d.cli.tracking import Given, a_person_is_there, default_folder, track
 from tracking3d.cli.view import Host
 from tracking3d.errors import InputError
@@ -92,6 +92,23 @@ def run(
         str | None,
         typer.Option(metavar="FX,FY,CX,CY", help="In pixels of the full frame.", rich_help_panel=_CAMERA),
     ] = None,
+    distortion: Annotated[
+        str | None,
+        typer.Option(
+            metavar="K1,K2,P1,P2,...",
+            help="Of the lens, as OpenCV has it; fisheye:K1,K2,K3,K4 of a fisheye.",
+            rich_help_panel=_CAMERA,
+        ),
+    ] = None,
+    camera_file: Annotated[
+        str | None,
+        typer.Option(
+            "--camera",
+            metavar="FILE",
+            help="Camera with its lens: OpenCV's or ROS's YAML, Kalibr, COLMAP's cameras.txt.",
+            rich_help_panel=_CAMERA,
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="Run folder; default runs/<source>.", rich_help_panel=_RUNNING),
@@ -108,6 +125,10 @@ def run(
         typer.Option(
             metavar="START:STOP:STEP", help="Which frames, counted from 0.", rich_help_panel=_RUNNING
         ),
+    ] = None,
+    fps: Annotated[
+        float | None,
+        typer.Option(help="Images per second of a folder or pattern of images.", rich_help_panel=_RUNNING),
     ] = None,
     skip_damaged: Annotated[
         bool,
@@ -190,9 +211,7 @@ def run(
         if tracker not in (None, "precomputed", "auto"):
             raise InputError(f"--masks is for the tracker precomputed; leave out --tracker {tracker}.")
         chosen = {"name": "precomputed", "path": str(masks)}
-    camera = None
-    if intrinsics is not None:
-        camera = numbers(intrinsics, 4, "--intrinsics", "FX,FY,CX,CY in pixels")
+    camera = camera_settings(fov, intrinsics, distortion, camera_file)
     settings = configure(
         config,
         preset,
@@ -200,7 +219,7 @@ def run(
         quality,
         tracker=chosen,
         features=features,
-        camera={"fov": fov, "intrinsics": camera},
+        camera=camera,
         object={"flat": flat or None, "prototype": prototype},
         window={"size": size},
         solver={"final_refine": final_refine},
@@ -236,4 +255,4 @@ def run(
         "start_frame": start_frame,
         "corrections": corrections,
     }
-    track(source, settings, folder, given, about, quiet=quiet, report=report, view=view, host=host)
+    track(source, settings, folder, given, about, fps=fps, quiet=quiet, report=report, view=view, host=host)

@@ -35,6 +35,7 @@ def track(
     given: Given,
     about: dict[str, Any],
     *,
+    fps: float | None = None,
     quiet: bool = False,
     report: bool = True,
     view: bool = False,
@@ -48,6 +49,7 @@ def track(
         folder: The run folder.
         given: What the objects are.
         about: Further arguments of `tracking3d.recording.record`, ``selection`` among them.
+        fps: Images per second of a source that has no times of its own.
         quiet: Print nothing.
         report: Write a report at the end.
         view: Show the run in the browser.
@@ -61,7 +63,7 @@ def track(
     from tracking3d.results.run_reader import is_finished
     from tracking3d.video import open_source
 
-    opened = open_source(source, about.get("selection"))
+    opened = open_source(source, about.get("selection"), fps)
     if quiet:
         logging.getLogger("tracking3d").setLevel(logging.ERROR)
     objects = max(len(given), 1)

@@ -182,6 +182,15 @@ class ExportedRun:
             return np.zeros((self.camera.height, self.camera.width), bool)
         return self.reader.mask(index)
 
+    def pinhole_mask(self, index: int) -> NDArray[np.bool_]:
+        """The same as the camera of the poses sees it, without the distortion of a lens."""
+        return self.camera.mask_to_pinhole(self.mask(index))
+
+    def pinhole_pictures(self) -> Iterator[Frame]:
+        """The pictures as the camera of the poses sees them, without the distortion of a lens; see `pictures`."""
+        for frame in self.pictures():
+            yield replace(frame, image=self.camera.undistorted(frame.image))
+
     def pictures(self) -> Iterator[Frame]:
         """The pictures of all frames that have an answer, read from the source once more.
 

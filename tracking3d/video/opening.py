@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import glob
 from collections.abc import Iterable
+from dataclasses import replace
+from numbers import Real
 from pathlib import Path
 
-from tracking3d.errors import InputError
+from tracking3d.errors import InputError, argument
 from tracking3d.frames import Image
 from tracking3d.video.array_source import ArraySource
 from tracking3d.video.image_file import is_still_image
@@ -16,8 +18,14 @@ from tracking3d.video.selection import parse_selection
 from tracking3d.video.source import FrameSource
 from tracking3d.video.video_file import VideoFile
 
+_FPS = argument("fps=", "--fps")
+LEAST_FPS, MOST_FPS = 0.001, 100_000.0
+"""Images per second: from one in a quarter of an hour to the fastest cameras."""
 
-def open_source(source: str | Path | Iterable[Image], frames: str | None = None) -> FrameSource:
+
+def open_source(
+    source: str | Path | Iterable[Image], frames: str | None = None, fps: float | None = None
+) -> FrameSource:
     """Open a video file, a folder or glob pattern of images, a camera, or any iterable of arrays.
 
     Args:
@@ -25,18 +33,34 @@ def open_source(source: str | Path | Iterable[Image], frames: str | None = None)
             camera, such as ``"0"``; or an iterable of ``(H, W, 3)`` uint8 RGB arrays. A text that exists as a
             path is taken as a path.
         frames: ``START:STOP:STEP`` to select frames (see `parse_selection`); frames keep the source's index.
+        fps: Frames per second of images or arrays, which have no times of their own.
 
     Raises:
-        InputError: If there is nothing that can be read as frames, or the selection is bad or empty.
+        InputError: If there is nothing that can be read as frames, the selection is bad or empty, or ``fps`` is given
+            for a source that has times of its own.
     """
-    selection = parse_selection(frames)
+    selection, fps = parse_selection(frames), _checked_fps(fps)
     if isinstance(source, str | Path):
-        return _open_path(str(source), selection)
+        opened = _open_path(str(source), selection)
+        if fps is not None and not isinstance(opened, ImageSequence):
+            raise InputError(f"{opened.name} has times of its own; {_FPS} is for images.")
+        return opened if fps is None else replace(opened, rate=fps)
     if isinstance(source, Iterable):
-        return ArraySource(source, selection)
+        return ArraySource(source, selection, rate=fps)
     raise InputError(
         f"A {type(source).__name__} is no source of frames; give a path or an iterable of RGB arrays."
     )
+
+
+def _checked_fps(fps: float | None) -> float | None:
+    if fps is None:
+        return None
+    number = isinstance(fps, Real) and not isinstance(fps, bool)
+    if not number or not LEAST_FPS <= fps <= MOST_FPS:
+        raise InputError(
+            f"{_FPS} {fps!r:.40} is no rate of a video; give images per second from {LEAST_FPS:g} to {MOST_FPS:g}."
+        )
+    return float(fps)
 
 
 def _open_path(name: str, selection: range) -> FrameSource:
