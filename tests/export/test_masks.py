@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from tracking3d.datasets.region_files import read_regions
-from tracking3d.datasets.vot_regions import rasterise
+from tracking3d.trackers.vot_regions import rasterise
 from tracking3d.results.run_reader import RunReader
 
 SIZE = (96, 128)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import shlex
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quality, Quiet, camera_settings, configure
+from tracking3d.cli.objects import given_box, given_masks
 from tracking3d.cli.tracking import Given, a_person_is_there, default_folder, track
 from tracking3d.cli.view import Host
 from tracking3d.errors import InputError
@@ -27,16 +28,16 @@ def run(
     box: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="X,Y,W,H",
-            help="Object in the first frame, in pixels; may be repeated.",
+            metavar="X,Y,W,H|FILE",
+            help="Object in the first frame, in pixels or as VOT's regions; may be repeated.",
             rich_help_panel=_TRACKING,
         ),
     ] = None,
     mask: Annotated[
         list[Path] | None,
         typer.Option(
-            metavar="FILE",
-            help="Mask of the object in the first frame; may be repeated.",
+            metavar="FILE[@N|@all]",
+            help="Mask of the object in the first frame, or object N of an indexed one; may be repeated.",
             rich_help_panel=_TRACKING,
         ),
     ] = None,
@@ -67,8 +68,8 @@ def run(
     masks: Annotated[
         Path | None,
         typer.Option(
-            metavar="DIR",
-            help="Masks of all frames, as a folder, video or .npz; the first is also the object.",
+            metavar="DIR|FILE[@N]",
+            help="Masks of all frames: a folder, video, .npz, COCO's .json, VOT's .txt; the first is also the object.",
             rich_help_panel=_TRACKING,
         ),
     ] = None,
@@ -206,11 +207,14 @@ def run(
         raise InputError("Give either --box, --mask or --points, not more than one of them.")
     if host is not None and not view:
         raise InputError("--host is where --view serves its page; give both.")
-    chosen: dict[str, str | None] = {"name": tracker}
+    chosen: dict[str, Any] = {"name": tracker}
     if masks is not None:
         if tracker not in (None, "precomputed", "auto"):
             raise InputError(f"--masks is for the tracker precomputed; leave out --tracker {tracker}.")
-        chosen = {"name": "precomputed", "path": str(masks)}
+        from tracking3d.trackers.mask_images import split_object
+
+        path, number = split_object(masks)
+        chosen = {"name": "precomputed", "path": str(path), "object": number}
     camera = camera_settings(fov, intrinsics, distortion, camera_file)
     settings = configure(
         config,
@@ -227,10 +231,13 @@ def run(
     )
     from tracking3d.corrections import checked_corrections, parse_correction
     from tracking3d.point_prompts import parse_points
-    from tracking3d.prompts import parse_box
+    from tracking3d.video.selection import parse_selection
 
+    first = start_frame if start_frame is not None else parse_selection(frames).start
     given = Given(
-        [parse_box(text) for text in boxes], object_masks, [parse_points(text) for text in object_points]
+        [given_box(text, first) for text in boxes],
+        [one for file in object_masks for one in given_masks(file)],
+        [parse_points(text) for text in object_points],
     )
     corrections = [parse_correction(text) for text in correct or told.correct]
     checked_corrections(corrections, max(len(given), 1))  # before anything is written

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as Pillow
 
-from tracking3d.datasets.vot_regions import Region, rasterise
+from tracking3d.trackers.vot_regions import Region, rasterise
 from tracking3d.errors import InputError
 
 Label = int | tuple[int, int, int]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.datasets.clip import is_rigid
-from tracking3d.datasets.vot_regions import parse_numbers
+from tracking3d.trackers.vot_regions import parse_numbers
 from tracking3d.errors import InputError
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from tracking3d.datasets.vot_regions import Polygon, rasterise
+from tracking3d.trackers.vot_regions import Polygon, rasterise
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, Prompt
 from tracking3d.prompts import make_prompt
