@@ -16,7 +16,7 @@ from tracking3d.errors import InputError, argument
 from tracking3d.frames import Box, Frame, Prompt, SkippedFrame
 from tracking3d.point_prompts import POINTS, checked_points, points_prompt
 from tracking3d.trackers.crops import box_of, clip_box
-from tracking3d.trackers.mask_files import ImageMasks, UnreadableMaskError, split_object
+from tracking3d.trackers.mask_images import ImageMasks, UnreadableMaskError, split_object
 
 _log = logging.getLogger(__name__)
 
