@@ -1,0 +1,137 @@
+"""HDR pictures as sRGB: what is brighter than a sheet of white paper is rolled off, wide colours are brought in.
+
+Signals become light in cd/m2 by the transfer function that the video names, PQ (SMPTE ST 2084) or HLG, both in ITU-R
+BT.2100. Light up to `SOURCE_PEAK` is brought below `WHITE` by the EETF of Report ITU-R BT.2390 (5.4.1), by the brightest
+of the three channels, so that hues stay. BT.2020's primaries become BT.709's (ITU-R BT.2087), and the result is encoded
+as sRGB (IEC 61966-2-1). `WHITE` is the white of BT.2408, so that faces and paper are as bright as in an SDR video.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import cast
+
+import av
+import cv2
+import numpy as np
+from av.video.reformatter import ColorPrimaries, ColorTrc
+from numpy.typing import NDArray
+
+from tracking3d.frames import Image
+
+WHITE = 203.0
+"""cd/m2 of the white of SDR (Report ITU-R BT.2408)."""
+SOURCE_PEAK = 1000.0
+"""cd/m2 that videos are taken to be mastered for."""
+
+_TO_709 = np.array(
+    [[1.660491, -0.587641, -0.072850], [-0.124550, 1.132900, -0.008349], [-0.018151, -0.100579, 1.118730]],
+    np.float32,
+)
+_LUMA_2020 = np.array([0.2627, 0.6780, 0.0593], np.float32)
+_FINE = 4095  # steps of light before it is encoded
+
+
+@dataclass(frozen=True)
+class ToneMapping:
+    """How pictures of one video become sRGB.
+
+    Attributes:
+        transfer: ``"PQ"``, ``"HLG"``, or ``"SDR"`` of wide colours that need no rolling off.
+        wide: Whether primaries are BT.2020's.
+    """
+
+    transfer: str
+    wide: bool
+
+    @property
+    def said(self) -> str:
+        """A clause for who looks at the run."""
+        colours = "the wide colours of BT.2020" if self.wide else "its colours"
+        if self.transfer == "SDR":
+            return f"{colours} were brought into sRGB"
+        return (
+            f"the video is HDR ({self.transfer}); it was tone-mapped to sRGB (BT.2390, {SOURCE_PEAK:g} to {WHITE:g} cd/m2)"
+        )
+
+    def __call__(self, signal: NDArray[np.uint16]) -> Image:
+        """``(H, W, 3)`` uint16 R'G'B' of full range as uint8 sRGB."""
+        light = _light(self.transfer)[signal >> 6]
+        if self.transfer == "HLG":  # the display's gamma, which follows the brightness of the scene
+            scene = cv2.transform(light, _LUMA_2020[None])
+            light *= SOURCE_PEAK * np.power(scene, np.float32(0.2))[..., None]
+        if self.transfer != "SDR":
+            grid, ratio = _roll_off()
+            light *= np.interp(light.max(2), grid, ratio).astype(np.float32)[..., None] / np.float32(WHITE)
+        if self.wide:
+            light = cv2.transform(light, _TO_709)
+        steps = (np.clip(light, 0.0, 1.0) * _FINE + 0.5).astype(np.uint16)
+        return cast(Image, _srgb()[steps])
+
+
+def tone_mapping_of(picture: av.VideoFrame) -> ToneMapping | None:
+    """What a decoded picture needs to be sRGB; None where it is that already, nearly."""
+    wide = picture.color_primaries == ColorPrimaries.BT2020
+    if picture.color_trc == ColorTrc.SMPTE2084:
+        return ToneMapping("PQ", wide)
+    if picture.color_trc == ColorTrc.ARIB_STD_B67:
+        return ToneMapping("HLG", wide)
+    return ToneMapping("SDR", True) if wide else None
+
+
+def pq_to_light(signal: NDArray) -> NDArray[np.float64]:
+    """cd/m2 of PQ signals in [0, 1] (BT.2100, table 4)."""
+    m1, m2, c1, c2, c3 = 2610 / 16384, 2523 / 4096 * 128, 3424 / 4096, 2413 / 4096 * 32, 2392 / 4096 * 32
+    power = np.power(signal, 1 / m2)
+    return 10_000 * np.power(np.maximum(power - c1, 0) / (c2 - c3 * power), 1 / m1)
+
+
+def light_to_pq(light: NDArray) -> NDArray[np.float64]:
+    """The inverse of `pq_to_light`."""
+    m1, m2, c1, c2, c3 = 2610 / 16384, 2523 / 4096 * 128, 3424 / 4096, 2413 / 4096 * 32, 2392 / 4096 * 32
+    power = np.power(np.asarray(light) / 10_000, m1)
+    return np.power((c1 + c2 * power) / (1 + c3 * power), m2)
+
+
+def hlg_to_scene(signal: NDArray) -> NDArray[np.float64]:
+    """Light of the scene in [0, 1] of HLG signals in [0, 1] (BT.2100, table 5)."""
+    a, b, c = 0.17883277, 0.28466892, 0.55991073
+    return np.where(signal <= 0.5, signal**2 / 3, (np.exp((signal - c) / a) + b) / 12)
+
+
+_TRANSFERS: dict[str, Callable[[NDArray], NDArray[np.float64]]] = {
+    "PQ": pq_to_light,
+    "HLG": hlg_to_scene,
+    "SDR": lambda signal: np.power(signal, 2.4),  # BT.1886
+}
+
+
+@lru_cache(maxsize=4)
+def _light(transfer: str) -> NDArray[np.float32]:
+    """Of all signals of 10 bits."""
+    return _TRANSFERS[transfer](np.arange(1024) / 1023).astype(np.float32)
+
+
+@lru_cache(maxsize=1)
+def _roll_off() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Light in cd/m2 and the factors that bring it below `WHITE`: BT.2390's Hermite spline over PQ."""
+    grid = np.linspace(0.0, 1.0, 2048) ** 3 * 10_000
+    most = float(light_to_pq(np.array(SOURCE_PEAK)))
+    signal = np.minimum(light_to_pq(grid) / most, 1.0)
+    white = float(light_to_pq(np.array(WHITE))) / most
+    knee = 1.5 * white - 0.5
+    t = np.clip((signal - knee) / (1 - knee), 0.0, 1.0)
+    spline = (
+        (2 * t**3 - 3 * t**2 + 1) * knee + (t**3 - 2 * t**2 + t) * (1 - knee) + (3 * t**2 - 2 * t**3) * white
+    )
+    target = pq_to_light(np.where(signal < knee, signal, spline) * most)
+    return grid, np.divide(target, grid, out=np.ones_like(grid), where=grid > 0)
+
+
+@lru_cache(maxsize=1)
+def _srgb() -> NDArray[np.uint8]:
+    linear = np.arange(_FINE + 1) / _FINE
+    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.power(linear, 1 / 2.4) - 0.055)
+    return np.round(255 * encoded).astype(np.uint8)
