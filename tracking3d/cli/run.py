@@ -22,7 +22,8 @@ def run(
     source: Annotated[
         str,
         typer.Argument(
-            metavar="SOURCE", help="Video file, folder or pattern of images, or the number of a camera."
+            metavar="SOURCE",
+            help="Video file, folder or pattern of images, number of a camera, or http(s) or rtsp(s) address.",
         ),
     ],
     box: Annotated[
@@ -232,6 +233,7 @@ def run(
     from tracking3d.corrections import checked_corrections, parse_correction
     from tracking3d.point_prompts import parse_points
     from tracking3d.video.selection import parse_selection
+    from tracking3d.video.stream import without_password
 
     first = start_frame if start_frame is not None else parse_selection(frames).start
     given = Given(
@@ -254,7 +256,7 @@ def run(
         picked = picked_in_browser(source, frames, settings, folder, overwrite=overwrite)
         given, start_frame = Given(picked.boxes, picked.masks), picked.frame
     about = {
-        "command": shlex.join(sys.argv),
+        "command": shlex.join(map(without_password, sys.argv)),
         "selection": frames,
         "overwrite": overwrite,
         "skip_damaged": skip_damaged,

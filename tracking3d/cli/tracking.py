@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -108,9 +109,14 @@ def resumable(folders: list[Path]) -> Iterator[None]:
 
 
 def default_folder(source: str) -> Path:
-    """``runs/<name>`` after the file, the folder of images, or the camera."""
+    """``runs/<name>`` after the file, the folder of images, the camera, or the end of an address."""
+    from tracking3d.video.stream import SCHEMES, scheme_of, without_password
+
     if source.isdigit() and not Path(source).exists():
         return Path("runs", f"camera_{source}")
+    if not Path(source).exists() and (scheme_of(source) in SCHEMES):
+        end = Path(without_password(source).partition("//")[2].partition("?")[0]).stem
+        return Path("runs", re.sub("[^A-Za-z0-9_-]+", "_", end).strip("_") or "stream")
     path = Path(source).expanduser().absolute()
     if any(sign in path.name for sign in "*?["):
         path = path.parent

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -33,7 +33,7 @@ from tracking3d.results.files import (
 from tracking3d.results.frame_lines import FrameLines, WrittenSoFar
 from tracking3d.results.making_room import make_room
 from tracking3d.results.mesh_export import export_mesh
-from tracking3d.results.notes import notes_of
+from tracking3d.results.notes import notes_of, notes_of_times
 from tracking3d.results.pictures import Pictures
 from tracking3d.results.records import FrameRecord, jsonable, latest
 from tracking3d.results.refinement_writer import RefinementWriter, clear_refinement
@@ -62,6 +62,8 @@ class RunWriter:
         renderer: What renders, and why.
         fps: Frames per second of the source, where known.
         command: The command line, where there was one.
+        source_notes: What the source did to its pictures, in clauses.
+        live: Whether frames come when they come, as from a camera, so that nobody expects them to come evenly.
         given: What tells source and object apart from others, see `tracking3d.checkpoint.resuming.given_of`.
         tracker_choice: Why the mask tracker ``auto`` stood for that of ``config``; None where it was named.
         overwrite: Replace a run that is there. Only files a run writes are removed, only from a run folder.
@@ -82,6 +84,8 @@ class RunWriter:
         seed: int,
         fps: float | None,
         command: str | None,
+        source_notes: Sequence[str] = (),
+        live: bool = False,
         selection: str | None = None,
         renderer: Mapping[str, str | int] | None = None,
         given: Mapping[str, Any] | None = None,
@@ -91,7 +95,7 @@ class RunWriter:
     ) -> None:
         self.folder = Path(folder)
         self._camera = camera
-        self._fps = fps or DEFAULT_FPS
+        self._fps, self._live = fps or DEFAULT_FPS, live
         self._started = time.monotonic()
         self._pictures = Pictures(self.folder / layout.OVERLAY, camera, self._fps)
         self._refinement: RefinementWriter | None = None
@@ -104,6 +108,7 @@ class RunWriter:
             seed=seed,
             fps=fps,
             command=command,
+            source_notes=source_notes,
             selection=selection,
             renderer=renderer,
             given=given,
@@ -345,13 +350,18 @@ class RunWriter:
             self._refinement.give_up(keep=layout.has_state(self.folder))
             self._description["refinement"] = self._refinement.described(state, error or "")
 
+    def _notes(self, model: ObjectModel | None, records: Sequence[FrameRecord]) -> list[str]:
+        about = self._description
+        uneven = [] if self._live else notes_of_times(records)
+        return [*about["source_notes"], *uneven, *notes_of(about["camera"], model)]
+
     def _finish(self, model: ObjectModel | None) -> None:
         records = list(read_records(self.folder / layout.FRAMES))
         seconds = time.monotonic() - self._started
         figures = description.summary(
             latest(records), len(self._description["skipped"]), seconds, latest(records, refined=False)
         )
-        self._description |= figures | {"notes": notes_of(self._description["camera"], model)}
+        self._description |= figures | {"notes": self._notes(model, latest(records))}
         replaced = {record.index for record in latest(records) if record.revision and not record.refined}
         sheet = self._pictures.contact_sheet(model, self._description, replaced)
         if sheet is not None:

@@ -16,6 +16,7 @@ from tracking3d.video.image_sequence import ImageSequence
 from tracking3d.video.live_camera import LiveCamera
 from tracking3d.video.selection import parse_selection
 from tracking3d.video.source import FrameSource
+from tracking3d.video.stream import SCHEMES, open_stream, scheme_of
 from tracking3d.video.video_file import VideoFile
 
 _FPS = argument("fps=", "--fps")
@@ -26,11 +27,11 @@ LEAST_FPS, MOST_FPS = 0.001, 100_000.0
 def open_source(
     source: str | Path | Iterable[Image], frames: str | None = None, fps: float | None = None
 ) -> FrameSource:
-    """Open a video file, a folder or glob pattern of images, a camera, or any iterable of arrays.
+    """Open a video file, a folder or pattern of images, a camera, a video by its address, or any iterable of arrays.
 
     Args:
         source: A path; a pattern such as ``"shots/*.png"`` (``**`` for all subfolders); the number of a
-            camera, such as ``"0"``; or an iterable of ``(H, W, 3)`` uint8 RGB arrays. A text that exists as a
+            camera, such as ``"0"``; an address that begins with http, https, rtsp or rtsps; or an iterable of ``(H, W, 3)`` uint8 RGB arrays. A text that exists as a
             path is taken as a path.
         frames: ``START:STOP:STEP`` to select frames (see `parse_selection`); frames keep the source's index.
         fps: Frames per second of images or arrays, which have no times of their own.
@@ -78,6 +79,13 @@ def _open_path(name: str, selection: range) -> FrameSource:
         raise InputError(f"{name} cannot be opened: {getattr(error, 'strerror', None) or error}.") from error
     if name.isascii() and name.isdigit():
         return LiveCamera.open(int(name), selection)
+    if (scheme := scheme_of(name)) in SCHEMES:
+        return open_stream(name, selection)
+    if scheme is not None and not glob.has_magic(name):
+        raise InputError(
+            f"{name} does not exist, and addresses that begin with {scheme}: are not opened; give a path, or an address "
+            f"that begins with {', '.join(SCHEMES[:-1])} or {SCHEMES[-1]}."
+        )
     if glob.has_magic(name):
         found = glob.iglob(str(path), recursive=True)  # noqa: PTH207 (Path.glob takes no absolute pattern)
         return ImageSequence.open(name, map(Path, found), selection)

@@ -74,10 +74,9 @@ class ToneMapping:
 def tone_mapping_of(picture: av.VideoFrame) -> ToneMapping | None:
     """What a decoded picture needs to be sRGB; None where it is that already, nearly."""
     wide = picture.color_primaries == ColorPrimaries.BT2020
-    if picture.color_trc == ColorTrc.SMPTE2084:
-        return ToneMapping("PQ", wide)
-    if picture.color_trc == ColorTrc.ARIB_STD_B67:
-        return ToneMapping("HLG", wide)
+    hdr = {ColorTrc.SMPTE2084: "PQ", ColorTrc.ARIB_STD_B67: "HLG"}.get(picture.color_trc)
+    if hdr is not None:  # whose primaries are BT.2020's where nobody says
+        return ToneMapping(hdr, wide or picture.color_primaries == ColorPrimaries.UNSPECIFIED)
     return ToneMapping("SDR", True) if wide else None
 
 

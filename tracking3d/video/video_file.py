@@ -59,27 +59,7 @@ class VideoFile:
             InputError: If it is no video, or truncated beyond use.
         """
         with open_container(name, path) as container:
-            if container.format.name in ("tty", "image2") or container.format.name.endswith("_pipe"):
-                raise InputError(f"{name} is not a video; give a video file or a folder of images.")
-            stream = video_stream(container)
-            if stream is None:
-                raise InputError(f"{name} has no video in it; give a file with a video stream.")
-            if stream.codec_context is None:
-                raise InputError(
-                    f"{name} uses a video codec that is not known here; convert it to H.264 first."
-                )
-            frames = _announced_frames(container, stream)
-            rate = stream.average_rate or stream.guessed_rate
-            first = _first_picture(container, stream)
-        return cls(
-            name,
-            path,
-            selection,
-            len(within(selection, frames)) if frames else None,
-            float(rate) / selection.step if rate else None,
-            interlaced=first is not None and first.interlaced_frame,
-            notes=() if first is None else said_of(first),
-        )
+            return described(container, name, path, selection)
 
     def container(self) -> InputContainer:
         """The file, open at its beginning.
@@ -111,6 +91,29 @@ class VideoFile:
                     yield frame_of(index, picture, seconds, convert)
                 if index + 1 >= self.selection.stop:
                     return
+
+
+def described(container: InputContainer, name: str, path: Path, selection: range) -> VideoFile:
+    """What an open file's header and first picture tell; see `VideoFile.open`."""
+    if container.format.name in ("tty", "image2") or container.format.name.endswith("_pipe"):
+        raise InputError(f"{name} is not a video; give a video file or a folder of images.")
+    stream = video_stream(container)
+    if stream is None:
+        raise InputError(f"{name} has no video in it; give a file with a video stream.")
+    if stream.codec_context is None:
+        raise InputError(f"{name} uses a video codec that is not known here; convert it to H.264 first.")
+    frames = _announced_frames(container, stream)
+    rate = stream.average_rate or stream.guessed_rate
+    first = _first_picture(container, stream)
+    return VideoFile(
+        name,
+        path,
+        selection,
+        len(within(selection, frames)) if frames else None,
+        float(rate) / selection.step if rate else None,
+        interlaced=first is not None and first.interlaced_frame,
+        notes=() if first is None else said_of(first),
+    )
 
 
 def open_container(name: str, path: Path) -> InputContainer:
