@@ -15,7 +15,18 @@ SHARED_BY_SOLVERS = {"evidence"}
 # Who lives on which floor; a module may import from lower floors and from its own room only.
 # Rooms of one floor may use each other, but never in circles.
 FLOORS = [
-    {"calibration", "errors", "frames", "geometry", "config", "features", "networks", "process_memory", "stages", "web"},
+    {
+        "calibration",
+        "errors",
+        "frames",
+        "geometry",
+        "config",
+        "features",
+        "networks",
+        "process_memory",
+        "stages",
+        "web",
+    },
     {"rendering", "trackers", "video"},
     {"corrections", "estimation", "plugins", "point_prompts", "points", "prompts", "testing"},
     {

@@ -84,13 +84,27 @@ def test_damaged_runs_are_refused(text):
         decompress(text)
 
 
-@pytest.mark.parametrize("segmentation", [None, 5, {}, {"size": [4, 4], "counts": [3]}, {"size": [0, 0], "counts": []}, [[1]]])
+@pytest.mark.parametrize(
+    "segmentation", [None, 5, {}, {"size": [4, 4], "counts": [3]}, {"size": [0, 0], "counts": []}, [[1]]]
+)
 def test_a_damaged_segmentation_is_a_gap(tmp_path, segmentation):
-    answer = tracked(coco(tmp_path / "m.json", [{"image_id": 7, "category_id": 1, "segmentation": segmentation}]))[0]
+    answer = tracked(
+        coco(tmp_path / "m.json", [{"image_id": 7, "category_id": 1, "segmentation": segmentation}])
+    )[0]
     assert answer.mask is None and "cannot be read" in answer.reason
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", '{"images": 3}', '{"images": [], "annotations": []}', '{"images": [{}], "annotations": []}'])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "{",
+        "[]",
+        '{"images": 3}',
+        '{"images": [], "annotations": []}',
+        '{"images": [{}], "annotations": []}',
+    ],
+)
 def test_what_is_no_coco_is_refused(tmp_path, text):
     (tmp_path / "m.json").write_text(text)
     with pytest.raises(InputError, match="m.json"):

@@ -92,6 +92,8 @@ def test_what_cannot_be_decoded_stays_in_its_place(clip):
 def test_progressive_video_is_left_alone(tmp_path):
     from sample_videos import encode_video, moving_picture
 
-    source = open_source(encode_video(tmp_path / "plain.mkv", [moving_picture(3)] * 3, codec="ffv1", pix_fmt="bgr0"))
+    source = open_source(
+        encode_video(tmp_path / "plain.mkv", [moving_picture(3)] * 3, codec="ffv1", pix_fmt="bgr0")
+    )
     assert not source.interlaced and source.notes == ()
     np.testing.assert_array_equal(next(iter(source)).image, moving_picture(3))

@@ -10,10 +10,14 @@ from tracking3d.video import open_source
 from tracking3d.video.tone_mapping import WHITE, ToneMapping, hlg_to_scene, light_to_pq, pq_to_light
 
 TO_2020 = np.linalg.inv(
-    np.array([[1.660491, -0.587641, -0.072850], [-0.124550, 1.132900, -0.008349], [-0.018151, -0.100579, 1.118730]])
+    np.array(
+        [[1.660491, -0.587641, -0.072850], [-0.124550, 1.132900, -0.008349], [-0.018151, -0.100579, 1.118730]]
+    )
 )
 LUMA = np.array([0.2627, 0.6780, 0.0593])
-PATCHES = np.array([[60, 60, 60], [128, 128, 128], [150, 60, 40], [40, 120, 60], [50, 70, 150], [170, 160, 120]], np.uint8)
+PATCHES = np.array(
+    [[60, 60, 60], [128, 128, 128], [150, 60, 40], [40, 120, 60], [50, 70, 150], [170, 160, 120]], np.uint8
+)
 """sRGB colours below the knee of the roll-off."""
 
 
@@ -97,7 +101,9 @@ def write_10_bits(path, signal, transfer):
         codec.colorspace, codec.color_range, codec.color_primaries, codec.color_trc = 9, 1, 9, transfer
         for index in range(2):
             picture = av.VideoFrame(width, height, "yuv444p10le")
-            for plane, values in zip(picture.planes, (64 + 876 * luma, 512 + 896 * blue, 512 + 896 * red), strict=True):
+            for plane, values in zip(
+                picture.planes, (64 + 876 * luma, 512 + 896 * blue, 512 + 896 * red), strict=True
+            ):
                 rows = np.zeros((height, plane.line_size // 2), np.uint16)
                 rows[:, :width] = values.round()
                 plane.update(rows.tobytes())

@@ -14,6 +14,7 @@ from tracking3d.errors import InputError
 from tracking3d.geometry.lens import COUNTS, Model, Pinhole
 
 _LONGEST = 256 << 10
+_DEEPEST = 20
 _CENTRE = 0.5
 """Of the top-left pixel in COLMAP's coordinates."""
 
@@ -160,9 +161,7 @@ class _Loader(yaml.SafeLoader):
 _Loader.add_constructor(
     "tag:yaml.org,2002:opencv-matrix", lambda loader, node: loader.construct_mapping(node, deep=True)
 )
-_Loader.add_constructor(
-    "!opencv-matrix", lambda loader, node: loader.construct_mapping(node, deep=True)
-)
+_Loader.add_constructor("!opencv-matrix", lambda loader, node: loader.construct_mapping(node, deep=True))
 
 
 def _from_yaml(text: str, path: Path) -> dict[str, Callable[[], CalibratedCamera]]:
@@ -171,19 +170,28 @@ def _from_yaml(text: str, path: Path) -> dict[str, Callable[[], CalibratedCamera
     if lines and lines[0].startswith("%YAML"):
         text = "\n".join(lines[1:])
     try:
-        node = yaml.compose(text, _Loader)
-        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, _Loader)):
-            raise yaml.YAMLError("it has aliases")
-        content = yaml.load(text, _Loader) if node is not None else None  # noqa: S506 (a safe loader)
+        _check_events(text)
+        content = yaml.load(text, _Loader)  # noqa: S506 (a safe loader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         problem = getattr(error, "problem", None) or str(error).splitlines()[0]
         raise InputError(f"The camera file {path} is not valid YAML: {problem}.") from error
     if not isinstance(content, dict):
         raise InputError(f"The camera file {path} holds no camera; {_WANTED}.")
-    kalibr = {str(name): one for name, one in content.items() if isinstance(one, dict) and "intrinsics" in one}
+    kalibr = {
+        str(name): one for name, one in content.items() if isinstance(one, dict) and "intrinsics" in one
+    }
     if kalibr:
         return {name: lambda one=one: _kalibr(one, path) for name, one in kalibr.items()}  # type: ignore[misc]
     return {path.stem: lambda: _opencv(content, path)}
+
+
+def _check_events(text: str) -> None:
+    """Refuse what no camera file has and what takes long to read: aliases and deep nesting."""
+    depth = 0
+    for event in yaml.parse(text, _Loader):
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if isinstance(event, yaml.AliasEvent) or depth > _DEEPEST:
+            raise yaml.YAMLError("it has aliases" if depth <= _DEEPEST else "it is nested too deeply")
 
 
 _WANTED = (
@@ -225,14 +233,21 @@ def _opencv(content: Mapping[Any, Any], path: Path) -> CalibratedCamera:
             f"{path} has a distortion of the model {named}, which is not known here; known are plumb_bob, "
             "rational_polynomial and fisheye (equidistant)."
         )
-    camera = CalibratedCamera((K[0], K[4], K[2], K[5]), "fisheye" if fisheye else "radtan", k, size, path.name)
+    camera = CalibratedCamera(
+        (K[0], K[4], K[2], K[5]), "fisheye" if fisheye else "radtan", k, size, path.name
+    )
     return _checked(camera, path)
 
 
 def _kalibr(content: Mapping[str, Any], path: Path) -> CalibratedCamera:
     """One camera of a camchain, https://github.com/ethz-asl/kalibr/wiki/yaml-formats."""
     kind, lens = content.get("camera_model", "pinhole"), content.get("distortion_model", "none")
-    models: dict[Any, Model] = {"radtan": "radtan", "equidistant": "fisheye", "equi": "fisheye", "none": "radtan"}
+    models: dict[Any, Model] = {
+        "radtan": "radtan",
+        "equidistant": "fisheye",
+        "equi": "fisheye",
+        "none": "radtan",
+    }
     if kind != "pinhole" or lens not in models:
         raise InputError(
             f"{path} has a camera of the models {kind} and {lens}, which are not known here; known are pinhole with "
@@ -247,7 +262,9 @@ def _kalibr(content: Mapping[str, Any], path: Path) -> CalibratedCamera:
     if size is not None and (not isinstance(size, list) or len(size) != 2):
         raise InputError(f"The resolution in {path} is not width and height; restore the file.")
     wide = None if size is None else (_whole(size[0], path), _whole(size[1], path))
-    return _checked(CalibratedCamera((fx, fy, cx, cy), models[lens], k if lens != "none" else (), wide, path.name), path)
+    return _checked(
+        CalibratedCamera((fx, fy, cx, cy), models[lens], k if lens != "none" else (), wide, path.name), path
+    )
 
 
 def _numbers(value: Any, path: Path, what: str) -> tuple[float, ...]:
@@ -265,7 +282,9 @@ def _whole(value: Any, path: Path) -> int:
     try:
         return int(value)
     except (TypeError, ValueError, OverflowError):
-        raise InputError(f"The size of the pictures in {path} is not in whole pixels; restore the file.") from None
+        raise InputError(
+            f"The size of the pictures in {path} is not in whole pixels; restore the file."
+        ) from None
 
 
 def _checked(camera: CalibratedCamera, path: Path) -> CalibratedCamera:
@@ -273,7 +292,9 @@ def _checked(camera: CalibratedCamera, path: Path) -> CalibratedCamera:
     fx, fy, *_ = camera.intrinsics
     numbers = (*camera.intrinsics, *camera.coefficients)
     if not all(map(math.isfinite, numbers)) or not min(fx, fy) > 0:
-        raise InputError(f"The camera of {path} has no positive, finite focal lengths and numbers; restore the file.")
+        raise InputError(
+            f"The camera of {path} has no positive, finite focal lengths and numbers; restore the file."
+        )
     if camera.size is not None and not min(camera.size) > 0:
         raise InputError(f"The size of the pictures in {path} is not positive; restore the file.")
     coefficients = as_coefficients(camera.model, camera.coefficients, f"The distortion in {path}")
@@ -303,7 +324,9 @@ def as_coefficients(model: Model, values: tuple[float, ...], what: str) -> tuple
     return (*values, *[0.0] * (count - len(values)))
 
 
-def write_camera(path: Path, camera: CalibratedCamera, notes: Mapping[str, float | int | str] | None = None) -> None:
+def write_camera(
+    path: Path, camera: CalibratedCamera, notes: Mapping[str, float | int | str] | None = None
+) -> None:
     """Write a camera as OpenCV's YAML, which `read_camera` and ``cv2.FileStorage`` read.
 
     Args:
@@ -318,10 +341,19 @@ def write_camera(path: Path, camera: CalibratedCamera, notes: Mapping[str, float
     lines += _matrix("camera_matrix", 3, 3, (fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0))
     k = camera.coefficients or (0.0,) * 4
     lines += _matrix("distortion_coefficients", 1, len(k), k)
-    lines += [f"{key}: {value!r}" if not isinstance(value, str) else f'{key}: "{value}"' for key, value in (notes or {}).items()]
+    lines += [
+        f"{key}: {value!r}" if not isinstance(value, str) else f'{key}: "{value}"'
+        for key, value in (notes or {}).items()
+    ]
     path.write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
 def _matrix(name: str, rows: int, columns: int, values: tuple[float, ...]) -> list[str]:
     data = ", ".join(f"{one:.12e}" for one in values)
-    return [f"{name}: !!opencv-matrix", f"   rows: {rows}", f"   cols: {columns}", "   dt: d", f"   data: [ {data} ]"]
+    return [
+        f"{name}: !!opencv-matrix",
+        f"   rows: {rows}",
+        f"   cols: {columns}",
+        "   dt: d",
+        f"   data: [ {data} ]",
+    ]

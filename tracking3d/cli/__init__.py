@@ -9,6 +9,7 @@ import typer
 
 from tracking3d.cli import (
     bench,
+    calibrate,
     compare,
     config,
     demo,
@@ -44,6 +45,7 @@ app.command(name="model")(model.model)
 app.command(name="export")(export.export)
 app.command(name="report")(report.report)
 app.command(name="compare")(compare.compare)
+app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(evaluate.app, name="evaluate")
 app.add_typer(models.app, name="models")
 app.add_typer(plugins.app, name="plugins")

@@ -9,7 +9,16 @@ from typing import Annotated, Any
 
 import typer
 
-from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quality, Quiet, camera_settings, configure
+from tracking3d.cli.options import (
+    ConfigFile,
+    Debug,
+    Overrides,
+    Preset,
+    Quality,
+    Quiet,
+    camera_settings,
+    configure,
+)
 from tracking3d.cli.objects import given_box, given_masks
 from tracking3d.cli.tracking import Given, a_person_is_there, default_folder, track
 from tracking3d.cli.view import Host

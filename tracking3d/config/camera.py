@@ -51,7 +51,11 @@ def choose_camera(
             f"{argument('camera.intrinsics', '--intrinsics FX,FY,CX,CY')} too, or both in a camera file."
         )
     taken = CalibratedCamera(
-        (camera.fx, camera.fy, camera.cx, camera.cy), config.distortion_model, coefficients, None, camera.origin
+        (camera.fx, camera.fy, camera.cx, camera.cy),
+        config.distortion_model,
+        coefficients,
+        None,
+        camera.origin,
     )
     return _measured(taken, width, height)
 

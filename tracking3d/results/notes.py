@@ -47,7 +47,11 @@ def notes_of_times(records: Sequence[FrameRecord]) -> list[str]:
     """
     timed = [(one.index, one.time) for one in records if one.time is not None]
     steps = np.array(
-        [(later - time) / (after - index) for (index, time), (after, later) in pairwise(timed) if after > index]
+        [
+            (later - time) / (after - index)
+            for (index, time), (after, later) in pairwise(timed)
+            if after > index
+        ]
     )
     if len(steps) < 2 or not 0 < steps.min() * UNEVEN < steps.max():
         return []

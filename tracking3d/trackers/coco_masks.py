@@ -62,7 +62,15 @@ class CocoMasks:
             try:
                 piece = decode(segmentation, size)
                 mask = piece if mask is None else mask | piece
-            except (TypeError, ValueError, KeyError, IndexError, OverflowError, AttributeError, cv2.error) as error:
+            except (
+                TypeError,
+                ValueError,
+                KeyError,
+                IndexError,
+                OverflowError,
+                AttributeError,
+                cv2.error,
+            ) as error:
                 raise UnreadableMaskError(f"{self.label(position)} cannot be read") from error
         return mask
 
@@ -82,7 +90,9 @@ def decode(segmentation: Any, size: tuple[int, int] | None) -> NDArray[np.bool_]
             raise ValueError("a polygon without the size of its image")
         canvas = np.zeros(size, np.uint8)
         # COCO counts from the outer corner of the first pixel.
-        corners = [np.round(np.asarray(one, float).reshape(-1, 2) - 0.5).astype(np.int32) for one in segmentation]
+        corners = [
+            np.round(np.asarray(one, float).reshape(-1, 2) - 0.5).astype(np.int32) for one in segmentation
+        ]
         return cv2.fillPoly(canvas, corners, 1).astype(bool)
     height, width = (int(side) for side in segmentation["size"])
     counts = segmentation["counts"]
@@ -124,7 +134,9 @@ def _read(path: Path) -> tuple[dict[Any, Mapping[str, Any]], list[Mapping[str, A
     wanted = "give images and annotations as COCO has them, or a list of its results"
     try:
         if path.stat().st_size > _LONGEST:
-            raise InputError(f"{path} is longer than {_LONGEST >> 30} GiB, which is too much for one object's masks.")
+            raise InputError(
+                f"{path} is longer than {_LONGEST >> 30} GiB, which is too much for one object's masks."
+            )
         content = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"The masks {path} cannot be read as JSON; {wanted}.") from error
@@ -135,7 +147,9 @@ def _read(path: Path) -> tuple[dict[Any, Mapping[str, Any]], list[Mapping[str, A
     annotations = content.get("annotations") if isinstance(content, dict) else None
     if not isinstance(images, list) or not isinstance(annotations, list) or not images:
         raise InputError(f"{path} holds no masks of COCO; {wanted}.")
-    known = {one["id"]: one for one in images if isinstance(one, dict) and isinstance(one.get("id"), int | str)}
+    known = {
+        one["id"]: one for one in images if isinstance(one, dict) and isinstance(one.get("id"), int | str)
+    }
     usable = [
         one for one in annotations if isinstance(one, dict) and isinstance(one.get("image_id"), int | str)
     ]

@@ -83,10 +83,14 @@ def _of_one_video(path: Path) -> Path:
     inner = path / "Annotations" if (path / "Annotations").is_dir() else path
     if any(map(_is_image, inner.iterdir())):
         return inner
-    folders = sorted(folder for folder in inner.iterdir() if folder.is_dir() and any(map(_is_image, folder.iterdir())))
+    folders = sorted(
+        folder for folder in inner.iterdir() if folder.is_dir() and any(map(_is_image, folder.iterdir()))
+    )
     if len(folders) > 1:
         names = ", ".join(folder.name for folder in folders[:4])
-        raise InputError(f"{path} has masks of several videos ({names}...); give the folder of one: {folders[0]}.")
+        raise InputError(
+            f"{path} has masks of several videos ({names}...); give the folder of one: {folders[0]}."
+        )
     return folders[0] if folders else path
 
 

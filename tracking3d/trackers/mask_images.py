@@ -107,7 +107,9 @@ def of_objects(numbers: Collection[Any], chosen: int | None, path: Path) -> Any:
     if chosen is not None and chosen not in numbers:
         raise InputError(f"{path} has no object {chosen}; it has {listed or 'none'}.")
     if chosen is None and len(numbers) > 1:
-        raise InputError(f"{path} has several objects ({listed}); say which one, as in {path}@{min(numbers, key=str)}.")
+        raise InputError(
+            f"{path} has several objects ({listed}); say which one, as in {path}@{min(numbers, key=str)}."
+        )
     return chosen if chosen is not None else next(iter(numbers), None)
 
 

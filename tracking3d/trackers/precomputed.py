@@ -44,7 +44,9 @@ class PrecomputedMasks:
             )
         )
         object: int | None = Field(
-            None, ge=0, description="Which object, where files hold several: its palette index, or COCO's number."
+            None,
+            ge=0,
+            description="Which object, where files hold several: its palette index, or COCO's number.",
         )
 
     def __init__(self, masks: MaskFiles) -> None:

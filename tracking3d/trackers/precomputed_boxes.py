@@ -43,7 +43,9 @@ class PrecomputedBoxes:
     def step(self, frame: Frame) -> MaskEstimate:
         """The mask in the frame's box; without a box, what the segmentation finds by itself, not to be relied on."""
         if self._segmentation is None:
-            raise PluginError("The tracker precomputed was asked for a frame before it was started with init.")
+            raise PluginError(
+                "The tracker precomputed was asked for a frame before it was started with init."
+            )
         box = self._regions.box(frame.index)
         estimate = self._segmentation.step(frame.image, box)
         if box is None and estimate.mask is not None:

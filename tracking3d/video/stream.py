@@ -153,7 +153,9 @@ class LiveStream:
                 reason = str(error)
             failed += 1
             if failed > TRIES:
-                _log.warning("%s did not come back after %d tries; the run ends with what was seen.", self.name, TRIES)
+                _log.warning(
+                    "%s did not come back after %d tries; the run ends with what was seen.", self.name, TRIES
+                )
                 return
             pause = PAUSE * 2 ** (failed - 1)
             _log.warning(

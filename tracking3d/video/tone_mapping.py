@@ -16,7 +16,6 @@ from typing import cast
 import av
 import cv2
 import numpy as np
-from av.video.reformatter import ColorPrimaries, ColorTrc
 from numpy.typing import NDArray
 
 from tracking3d.frames import Image
@@ -31,6 +30,8 @@ _TO_709 = np.array(
     np.float32,
 )
 _LUMA_2020 = np.array([0.2627, 0.6780, 0.0593], np.float32)
+# Numbers of ITU-T H.273.
+_HDR, _BT2020, _UNSPECIFIED = {16: "PQ", 18: "HLG"}, 9, 2
 _FINE = 4095  # steps of light before it is encoded
 
 
@@ -52,9 +53,7 @@ class ToneMapping:
         colours = "the wide colours of BT.2020" if self.wide else "its colours"
         if self.transfer == "SDR":
             return f"{colours} were brought into sRGB"
-        return (
-            f"the video is HDR ({self.transfer}); it was tone-mapped to sRGB (BT.2390, {SOURCE_PEAK:g} to {WHITE:g} cd/m2)"
-        )
+        return f"the video is HDR ({self.transfer}); it was tone-mapped to sRGB (BT.2390, {SOURCE_PEAK:g} to {WHITE:g} cd/m2)"
 
     def __call__(self, signal: NDArray[np.uint16]) -> Image:
         """``(H, W, 3)`` uint16 R'G'B' of full range as uint8 sRGB."""
@@ -73,10 +72,11 @@ class ToneMapping:
 
 def tone_mapping_of(picture: av.VideoFrame) -> ToneMapping | None:
     """What a decoded picture needs to be sRGB; None where it is that already, nearly."""
-    wide = picture.color_primaries == ColorPrimaries.BT2020
-    hdr = {ColorTrc.SMPTE2084: "PQ", ColorTrc.ARIB_STD_B67: "HLG"}.get(picture.color_trc)
+    primaries = getattr(picture, "color_primaries", _UNSPECIFIED)  # older versions of PyAV do not tell
+    wide = primaries == _BT2020
+    hdr = _HDR.get(getattr(picture, "color_trc", _UNSPECIFIED))
     if hdr is not None:  # whose primaries are BT.2020's where nobody says
-        return ToneMapping(hdr, wide or picture.color_primaries == ColorPrimaries.UNSPECIFIED)
+        return ToneMapping(hdr, wide or primaries == _UNSPECIFIED)
     return ToneMapping("SDR", True) if wide else None
 
 
