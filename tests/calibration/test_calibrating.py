@@ -76,7 +76,7 @@ def test_another_board_is_refused(views):
 
 def test_views_that_leave_much_of_the_picture_out_are_refused():
     far = [view(BOARD, lens(), 4 * index, near=False) for index in range(7)]
-    with pytest.raises(InputError, match="of the picture of the source only, least in its .* part"):
+    with pytest.raises(InputError, match=r"of the picture of the source only, least in its .* part"):
         calibrate(far, BOARD)
 
 
@@ -90,7 +90,7 @@ def test_views_that_differ_are_taken():
     rng = np.random.default_rng(0)
     corners = rng.uniform(0, 50, (12, 2)).astype(np.float32)
     near = [View(index, np.arange(12), corners + index % 2) for index in range(20)]
-    away = [View(20 + index, np.arange(12), corners + (200 * index, 100)) for index in range(1, 3)]
+    away = [View(20 + index, np.arange(12), corners + np.array([200 * index, 100])) for index in range(1, 3)]
     kept = {one.index for one in spread_views([*near, *away], (640, 480), 4)}
     assert {21, 22} <= kept and len(kept) == 4
     assert coverage(away, (640, 480)) > coverage(away[:1], (640, 480))

@@ -107,7 +107,7 @@ def test_a_damaged_segmentation_is_a_gap(tmp_path, segmentation):
 )
 def test_what_is_no_coco_is_refused(tmp_path, text):
     (tmp_path / "m.json").write_text(text)
-    with pytest.raises(InputError, match="m.json"):
+    with pytest.raises(InputError, match=r"m.json"):
         open_masks(tmp_path / "m.json")
 
 
@@ -134,7 +134,7 @@ def test_rectangles_are_boxes_that_the_object_is_segmented_in(tmp_path):
 @pytest.mark.parametrize("text", ["", "1,2,3\n", "hello\n", "m1,2\n"])
 def test_a_damaged_file_of_regions_is_refused_by_its_line(tmp_path, text):
     (tmp_path / "r.txt").write_text(text)
-    with pytest.raises(InputError, match="r.txt"):
+    with pytest.raises(InputError, match=r"r.txt"):
         open_masks(tmp_path / "r.txt")
 
 

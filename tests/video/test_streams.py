@@ -139,7 +139,7 @@ def test_a_server_that_says_nothing_is_given_up(scheme):
     with socket.socket() as silent:
         silent.bind(("127.0.0.1", 0))
         silent.listen()
-        with pytest.raises(InputError, match="cannot be opened .*answers within 0.5 seconds"):
+        with pytest.raises(InputError, match=r"cannot be opened .*answers within 0.5 seconds"):
             open_source(f"{scheme}://127.0.0.1:{silent.getsockname()[1]}/x")
 
 

@@ -111,8 +111,8 @@ def calibrate(
     if len(views) < LEAST_VIEWS:
         raise InputError(
             f"{name} shows the {board.kind} board of {board.columns} x {board.rows} squares in {len(views)} of "
-            f"{len(views) + len(left_out)} frames, and {LEAST_VIEWS} at least are needed; film it sharp, whole and from "
-            "many sides, and say by --squares and --board which it is."
+            f"{len(views) + len(left_out)} frames, and {LEAST_VIEWS} at least are needed; film it sharp, whole and "
+            "from many sides, and say by --squares and --board which it is."
         )
     kept = spread_views(views, size, MOST_VIEWS)
     left_out |= {view.index: "like another view" for view in views if view not in kept}
@@ -130,8 +130,8 @@ def calibrate(
     _check_coverage(kept, size, name)
     if solved.error > LARGEST_ERROR:
         raise InputError(
-            f"No camera explains the views of the board in {name}: the error is {solved.error:.1f} pixels; is the board "
-            "flat, sharp, and that of --squares, and was the zoom left alone? A very wide lens needs --model fisheye."
+            f"No camera explains the views of the board in {name}: the error is {solved.error:.1f} pixels; is the "
+            "board flat, sharp, and that of --squares, and was the zoom left alone? A very wide lens needs --model fisheye."
         )
     return Calibration(
         solved.camera,

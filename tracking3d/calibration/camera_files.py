@@ -158,10 +158,13 @@ class _Loader(yaml.SafeLoader):
     """PyYAML's safe loader, which takes OpenCV's matrices for the mappings that they are."""
 
 
-_Loader.add_constructor(
-    "tag:yaml.org,2002:opencv-matrix", lambda loader, node: loader.construct_mapping(node, deep=True)
-)
-_Loader.add_constructor("!opencv-matrix", lambda loader, node: loader.construct_mapping(node, deep=True))
+def _matrix_mapping(loader: yaml.SafeLoader, node: Any) -> dict[Any, Any]:
+    mapping: dict[Any, Any] = loader.construct_mapping(node, deep=True)
+    return mapping
+
+
+for _tag in ("tag:yaml.org,2002:opencv-matrix", "!opencv-matrix"):
+    _Loader.add_constructor(_tag, _matrix_mapping)
 
 
 def _from_yaml(text: str, path: Path) -> dict[str, Callable[[], CalibratedCamera]]:
@@ -171,7 +174,7 @@ def _from_yaml(text: str, path: Path) -> dict[str, Callable[[], CalibratedCamera
         text = "\n".join(lines[1:])
     try:
         _check_events(text)
-        content = yaml.load(text, _Loader)  # noqa: S506 (a safe loader)
+        content = yaml.load(text, _Loader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         problem = getattr(error, "problem", None) or str(error).splitlines()[0]
         raise InputError(f"The camera file {path} is not valid YAML: {problem}.") from error

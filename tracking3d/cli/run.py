@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from tracking3d.cli.objects import given_box, given_masks
 from tracking3d.cli.options import (
     ConfigFile,
     Debug,
@@ -19,7 +20,6 @@ from tracking3d.cli.options import (
     camera_settings,
     configure,
 )
-from tracking3d.cli.objects import given_box, given_masks
 from tracking3d.cli.tracking import Given, a_person_is_there, default_folder, track
 from tracking3d.cli.view import Host
 from tracking3d.errors import InputError

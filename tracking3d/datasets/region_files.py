@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 
+from tracking3d.errors import InputError
 from tracking3d.trackers.vot_regions import (
     EncodedMask,
     Polygon,
@@ -18,7 +19,6 @@ from tracking3d.trackers.vot_regions import (
     parse_numbers,
     parse_region,
 )
-from tracking3d.errors import InputError
 
 Form = Literal["vot", "xywh", "xyxy", "polygon"]
 

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tracking3d.trackers.vot_regions import Special, encode_mask, format_region
 from tracking3d.export.exported_run import ExportedRun
+from tracking3d.trackers.vot_regions import Special, encode_mask, format_region
 
 
 def write_vot(run: ExportedRun, path: Path) -> None:

@@ -41,8 +41,8 @@ def description_at_start(
 ) -> dict[str, Any]:
     """What is known of a run before its first frame.
 
-    ``source_notes`` say what was done to the pictures before anything else; ``given`` tells source and object apart from others; ``tracker_choice`` is why ``auto`` stood for the tracker of
-    ``config``.
+    ``source_notes`` say what was done to the pictures before anything else; ``given`` tells source and object apart
+    from others; ``tracker_choice`` is why ``auto`` stood for the tracker of ``config``.
     """
     return {
         "format": FORMAT,

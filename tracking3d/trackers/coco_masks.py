@@ -147,10 +147,10 @@ def _read(path: Path) -> tuple[dict[Any, Mapping[str, Any]], list[Mapping[str, A
     annotations = content.get("annotations") if isinstance(content, dict) else None
     if not isinstance(images, list) or not isinstance(annotations, list) or not images:
         raise InputError(f"{path} holds no masks of COCO; {wanted}.")
-    known = {
+    known: dict[Any, Mapping[str, Any]] = {
         one["id"]: one for one in images if isinstance(one, dict) and isinstance(one.get("id"), int | str)
     }
-    usable = [
+    usable: list[Mapping[str, Any]] = [
         one for one in annotations if isinstance(one, dict) and isinstance(one.get("image_id"), int | str)
     ]
     if not known:

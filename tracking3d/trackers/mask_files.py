@@ -57,7 +57,8 @@ def open_masks(path: Path, object: int | None = None) -> MaskFiles:
     """
     if not path.exists():
         raise InputError(
-            f"There are no masks at {path}; give a folder, a video, an .npz or an .npy file, COCO's .json or VOT's .txt."
+            f"There are no masks at {path}; give a folder, a video, an .npz or an .npy file, COCO's .json or "
+            "VOT's .txt."
         )
     if path.is_dir():
         folder = _of_one_video(path)

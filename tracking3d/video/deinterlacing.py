@@ -48,7 +48,7 @@ class _Deinterlacer:
         source = self._graph.add_buffer(
             width=picture.width,
             height=picture.height,
-            format=picture.format.name,
+            format=picture.format,
             time_base=picture.time_base or Fraction(1, 25),
         )
         # One picture for one; those that say they are progressive are left alone.

@@ -31,8 +31,8 @@ def open_source(
 
     Args:
         source: A path; a pattern such as ``"shots/*.png"`` (``**`` for all subfolders); the number of a
-            camera, such as ``"0"``; an address that begins with http, https, rtsp or rtsps; or an iterable of ``(H, W, 3)`` uint8 RGB arrays. A text that exists as a
-            path is taken as a path.
+            camera, such as ``"0"``; an address that begins with http, https, rtsp or rtsps; or an iterable of
+            ``(H, W, 3)`` uint8 RGB arrays. A text that exists as a path is taken as a path.
         frames: ``START:STOP:STEP`` to select frames (see `parse_selection`); frames keep the source's index.
         fps: Frames per second of images or arrays, which have no times of their own.
 
@@ -43,9 +43,11 @@ def open_source(
     selection, fps = parse_selection(frames), _checked_fps(fps)
     if isinstance(source, str | Path):
         opened = _open_path(str(source), selection)
-        if fps is not None and not isinstance(opened, ImageSequence):
+        if fps is None:
+            return opened
+        if not isinstance(opened, ImageSequence):
             raise InputError(f"{opened.name} has times of its own; {_FPS} is for images.")
-        return opened if fps is None else replace(opened, rate=fps)
+        return replace(opened, rate=fps)
     if isinstance(source, Iterable):
         return ArraySource(source, selection, rate=fps)
     raise InputError(
@@ -83,8 +85,8 @@ def _open_path(name: str, selection: range) -> FrameSource:
         return open_stream(name, selection)
     if scheme is not None and not glob.has_magic(name):
         raise InputError(
-            f"{name} does not exist, and addresses that begin with {scheme}: are not opened; give a path, or an address "
-            f"that begins with {', '.join(SCHEMES[:-1])} or {SCHEMES[-1]}."
+            f"{name} does not exist, and addresses that begin with {scheme}: are not opened; give a path, or an "
+            f"address that begins with {', '.join(SCHEMES[:-1])} or {SCHEMES[-1]}."
         )
     if glob.has_magic(name):
         found = glob.iglob(str(path), recursive=True)  # noqa: PTH207 (Path.glob takes no absolute pattern)

@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import Any, cast
 
 import av
+import numpy as np
 from av.error import FFmpegError
+from numpy.typing import NDArray
 
 from tracking3d.frames import Image
 from tracking3d.video.orientation import UPRIGHT, orientation_from_display_matrix, turn_upright
@@ -32,7 +34,7 @@ class PictureConverter:
             if self._tone_mapping is None:
                 image = cast(Image, picture.to_ndarray(format="rgb24"))
             else:
-                image = self._tone_mapping(picture.to_ndarray(format="rgb48le"))
+                image = self._tone_mapping(cast("NDArray[np.uint16]", picture.to_ndarray(format="rgb48le")))
         except (FFmpegError, ValueError) as error:
             raise ValueError(f"its pixels cannot be converted to RGB: {error}") from error
         return turn_upright(image, self._orientation)

@@ -1,9 +1,9 @@
 """HDR pictures as sRGB: what is brighter than a sheet of white paper is rolled off, wide colours are brought in.
 
 Signals become light in cd/m2 by the transfer function that the video names, PQ (SMPTE ST 2084) or HLG, both in ITU-R
-BT.2100. Light up to `SOURCE_PEAK` is brought below `WHITE` by the EETF of Report ITU-R BT.2390 (5.4.1), by the brightest
-of the three channels, so that hues stay. BT.2020's primaries become BT.709's (ITU-R BT.2087), and the result is encoded
-as sRGB (IEC 61966-2-1). `WHITE` is the white of BT.2408, so that faces and paper are as bright as in an SDR video.
+BT.2100. Light up to `SOURCE_PEAK` is brought below `WHITE` by the EETF of Report ITU-R BT.2390 (5.4.1), by the
+brightest of the three channels, so that hues stay. BT.2020's primaries become BT.709's (ITU-R BT.2087), and the result
+is encoded as sRGB (IEC 61966-2-1). `WHITE` is the white of BT.2408, so that faces and paper are as bright as in an SDR video.
 """
 
 from __future__ import annotations
@@ -53,7 +53,8 @@ class ToneMapping:
         colours = "the wide colours of BT.2020" if self.wide else "its colours"
         if self.transfer == "SDR":
             return f"{colours} were brought into sRGB"
-        return f"the video is HDR ({self.transfer}); it was tone-mapped to sRGB (BT.2390, {SOURCE_PEAK:g} to {WHITE:g} cd/m2)"
+        how = f"BT.2390, {SOURCE_PEAK:g} to {WHITE:g} cd/m2"
+        return f"the video is HDR ({self.transfer}); it was tone-mapped to sRGB ({how})"
 
     def __call__(self, signal: NDArray[np.uint16]) -> Image:
         """``(H, W, 3)`` uint16 R'G'B' of full range as uint8 sRGB."""
