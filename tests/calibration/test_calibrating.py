@@ -108,3 +108,19 @@ def test_what_are_no_squares(text):
 def test_a_board_that_cannot_be_is_refused(bad):
     with pytest.raises(InputError):
         Board(*bad)
+
+
+def test_the_command_writes_what_run_reads(views, tmp_path, monkeypatch):
+    from PIL import Image
+    from typer.testing import CliRunner
+
+    from tracking3d.calibration.camera_files import read_camera
+    from tracking3d.cli import app
+
+    monkeypatch.chdir(tmp_path)
+    for one in views[:8]:
+        Image.fromarray(one.image).save(f"{one.index:02d}.png")
+    result = CliRunner().invoke(app, ["calibrate", "*.png", "--squares", "7x5", "--square-mm", "30"])
+    assert result.exit_code == 0, result.output
+    assert "8 views, reprojection error 0." in result.output and "% of the picture covered" in result.output
+    assert read_camera("camera.yaml").intrinsics[0] == pytest.approx(420, abs=4)

@@ -131,7 +131,8 @@ def calibrate(
     if solved.error > LARGEST_ERROR:
         raise InputError(
             f"No camera explains the views of the board in {name}: the error is {solved.error:.1f} pixels; is the "
-            "board flat, sharp, and that of --squares, and was the zoom left alone? A very wide lens needs --model fisheye."
+            "board flat, sharp, and that of --squares, and was the zoom left alone? A very wide lens needs --model "
+            "fisheye."
         )
     return Calibration(
         solved.camera,

@@ -3,7 +3,8 @@
 Signals become light in cd/m2 by the transfer function that the video names, PQ (SMPTE ST 2084) or HLG, both in ITU-R
 BT.2100. Light up to `SOURCE_PEAK` is brought below `WHITE` by the EETF of Report ITU-R BT.2390 (5.4.1), by the
 brightest of the three channels, so that hues stay. BT.2020's primaries become BT.709's (ITU-R BT.2087), and the result
-is encoded as sRGB (IEC 61966-2-1). `WHITE` is the white of BT.2408, so that faces and paper are as bright as in an SDR video.
+is encoded as sRGB (IEC 61966-2-1). `WHITE` is the white of BT.2408, so that faces and paper are as bright as in an SDR
+video.
 """
 
 from __future__ import annotations
