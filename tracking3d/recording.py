@@ -257,7 +257,6 @@ def begun(
         renderer=session.renderer,
         fps=source.fps,
         source_notes=notes_of(source),
-        live=not source.repeatable,
         command=command,
         selection=selection,
         given=given,

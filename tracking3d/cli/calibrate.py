@@ -29,10 +29,15 @@ class _VideoFirst(TyperGroup):
     """A group whose command ``video`` need not be named."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Put ``video`` before what names no command."""
-        if args and args[0] not in (*self.commands, "--help"):
-            args = ["video", *args]
-        return list(super().parse_args(ctx, args))
+        """Put ``video`` before what names no command, options too."""
+        return list(super().parse_args(ctx, self._named(args)))
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """The command that is meant, and its arguments."""
+        return super().resolve_command(ctx, self._named(args))
+
+    def _named(self, args: list[str]) -> list[str]:
+        return ["video", *args] if args and args[0] not in (*self.commands, "--help") else args
 
 
 app = typer.Typer(

@@ -97,7 +97,7 @@ def camera_settings(
 
 
 def _distortion(text: str) -> dict[str, Any]:
-    from tracking3d.calibration.camera_files import as_coefficients
+    from tracking3d.calibration.calibrated_camera import as_coefficients
 
     name, colon, values = text.rpartition(":")
     model = name.strip().casefold() if colon else "radtan"

@@ -6,7 +6,8 @@ import logging
 import math
 from dataclasses import replace
 
-from tracking3d.calibration.camera_files import CalibratedCamera, as_coefficients, read_camera
+from tracking3d.calibration.calibrated_camera import CalibratedCamera, as_coefficients
+from tracking3d.calibration.camera_files import read_camera
 from tracking3d.config.models import CameraConfig
 from tracking3d.errors import InputError, argument
 from tracking3d.geometry.camera import DEFAULT_FIELD_OF_VIEW, Camera

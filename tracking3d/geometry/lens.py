@@ -107,7 +107,7 @@ class Lens:
     def to_pinhole(self, xy: NDArray) -> NDArray[np.float64]:
         """Pixels ``(N, 2)`` of the picture as those of the pinhole camera; NaN where there are none."""
         pixels = np.asarray(xy, np.float64)
-        there: NDArray[np.bool_] = np.isfinite(pixels).all(1)
+        there = np.asarray(np.isfinite(pixels).all(1))
         rays = self._rays(np.where(there[:, None], pixels, self.picture[2:]))
         found = rays * self.pinhole[:2] + self.pinhole[2:]
         # The inverse is found step by step, which may end elsewhere beyond where the lens folds over.

@@ -19,8 +19,25 @@ UNEVEN = 1.5
 _CORNERS = 6  # points a side of a face at which the texture is asked
 
 
+def notes_of_run(run: dict[str, Any], model: ObjectModel | None, records: Sequence[FrameRecord]) -> list[str]:
+    """All notes of a run.
+
+    Args:
+        run: Its ``run.json``, before the notes are in it.
+        model: The object; None if there is none.
+        records: The answer for every frame, in order.
+    """
+    # Nobody expects frames to come evenly from a camera, which has no number of frames either.
+    counted = (run.get("given") or {}).get("frames") is not None
+    return [
+        *run["source_notes"],
+        *(notes_of_times(records) if counted else ()),
+        *notes_of(run["camera"], model),
+    ]
+
+
 def notes_of(camera: dict[str, Any], model: ObjectModel | None) -> list[str]:
-    """The notes of a run.
+    """What is known of lens and model.
 
     Args:
         camera: As ``run.json`` has it.

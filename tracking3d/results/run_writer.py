@@ -33,7 +33,7 @@ from tracking3d.results.files import (
 from tracking3d.results.frame_lines import FrameLines, WrittenSoFar
 from tracking3d.results.making_room import make_room
 from tracking3d.results.mesh_export import export_mesh
-from tracking3d.results.notes import notes_of, notes_of_times
+from tracking3d.results.notes import notes_of_run
 from tracking3d.results.pictures import Pictures
 from tracking3d.results.records import FrameRecord, jsonable, latest
 from tracking3d.results.refinement_writer import RefinementWriter, clear_refinement
@@ -63,7 +63,6 @@ class RunWriter:
         fps: Frames per second of the source, where known.
         command: The command line, where there was one.
         source_notes: What the source did to its pictures, in clauses.
-        live: Whether frames come when they come, as from a camera, so that nobody expects them to come evenly.
         given: What tells source and object apart from others, see `tracking3d.checkpoint.resuming.given_of`.
         tracker_choice: Why the mask tracker ``auto`` stood for that of ``config``; None where it was named.
         overwrite: Replace a run that is there. Only files a run writes are removed, only from a run folder.
@@ -85,7 +84,6 @@ class RunWriter:
         fps: float | None,
         command: str | None,
         source_notes: Sequence[str] = (),
-        live: bool = False,
         selection: str | None = None,
         renderer: Mapping[str, str | int] | None = None,
         given: Mapping[str, Any] | None = None,
@@ -95,7 +93,7 @@ class RunWriter:
     ) -> None:
         self.folder = Path(folder)
         self._camera = camera
-        self._fps, self._live = fps or DEFAULT_FPS, live
+        self._fps = fps or DEFAULT_FPS
         self._started = time.monotonic()
         self._pictures = Pictures(self.folder / layout.OVERLAY, camera, self._fps)
         self._refinement: RefinementWriter | None = None
@@ -350,18 +348,12 @@ class RunWriter:
             self._refinement.give_up(keep=layout.has_state(self.folder))
             self._description["refinement"] = self._refinement.described(state, error or "")
 
-    def _notes(self, model: ObjectModel | None, records: Sequence[FrameRecord]) -> list[str]:
-        about = self._description
-        uneven = [] if self._live else notes_of_times(records)
-        return [*about["source_notes"], *uneven, *notes_of(about["camera"], model)]
-
     def _finish(self, model: ObjectModel | None) -> None:
         records = list(read_records(self.folder / layout.FRAMES))
-        seconds = time.monotonic() - self._started
         figures = description.summary(
-            latest(records), len(self._description["skipped"]), seconds, latest(records, refined=False)
+            latest(records), len(self._description["skipped"]), self.seconds, latest(records, refined=False)
         )
-        self._description |= figures | {"notes": self._notes(model, latest(records))}
+        self._description |= figures | {"notes": notes_of_run(self._description, model, latest(records))}
         replaced = {record.index for record in latest(records) if record.revision and not record.refined}
         sheet = self._pictures.contact_sheet(model, self._description, replaced)
         if sheet is not None:
