@@ -22,6 +22,8 @@ GIVEN = "given intrinsics"
 USUAL_ANGLES = (3.0, 110.0)
 """Fields of view in degrees beyond which a pinhole camera is more likely a mistake."""
 
+_ALL = 0.99  # of a picture that is kept, from which on nothing need be said
+
 _log = logging.getLogger(__name__)
 
 
@@ -112,7 +114,13 @@ def _pinhole(
 
 
 def warn_of_unlikely(camera: Camera) -> None:
-    """Tell the log where given intrinsics are possible for images of that size, but hardly meant."""
+    """Tell the log where given intrinsics are possible for images of that size, but hardly meant; and what is lost."""
+    if camera.lens is not None and (kept := camera.lens.kept) < _ALL:
+        _log.warning(
+            "The lens is so wide that %.0f %% of the picture, its outermost part, is not seen by the pinhole camera; "
+            "the object has no answer there.",
+            100 * (1 - kept),
+        )
     if not camera.origin.startswith(GIVEN):
         return
     inside = 0 <= camera.cx < camera.width and 0 <= camera.cy < camera.height

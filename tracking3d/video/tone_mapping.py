@@ -59,13 +59,15 @@ class ToneMapping:
 
     def __call__(self, signal: NDArray[np.uint16]) -> Image:
         """``(H, W, 3)`` uint16 R'G'B' of full range as uint8 sRGB."""
-        light = _light(self.transfer)[signal >> 6]
-        if self.transfer == "HLG":  # the display's gamma, which follows the brightness of the scene
-            scene = cv2.transform(light, _LUMA_2020[None])
-            light *= SOURCE_PEAK * np.power(scene, np.float32(0.2))[..., None]
-        if self.transfer != "SDR":
-            grid, ratio = _roll_off()
-            light *= np.interp(light.max(2), grid, ratio).astype(np.float32)[..., None] / np.float32(WHITE)
+        codes = signal >> 6
+        light = _light(self.transfer)[codes]
+        if self.transfer == "PQ":
+            light *= _rolled_off_codes()[codes.max(2)][..., None]
+        if self.transfer == "HLG":
+            # The display's gamma, which follows the brightness of the scene.
+            gain = SOURCE_PEAK * cv2.pow(cv2.transform(light, _LUMA_2020[None]), 0.2)
+            peak = np.sqrt(gain * light.max(2) / SOURCE_PEAK) * _FINE
+            light *= (gain * _rolled_off_roots()[np.minimum(peak + 0.5, _FINE).astype(np.uint16)])[..., None]
         if self.wide:
             light = cv2.transform(light, _TO_709)
         steps = (np.clip(light, 0.0, 1.0) * _FINE + 0.5).astype(np.uint16)
@@ -116,11 +118,21 @@ def _light(transfer: str) -> NDArray[np.float32]:
 
 
 @lru_cache(maxsize=1)
-def _roll_off() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Light in cd/m2 and the factors that bring it below `WHITE`: BT.2390's Hermite spline over PQ."""
-    grid = np.linspace(0.0, 1.0, 2048) ** 3 * 10_000
+def _rolled_off_codes() -> NDArray[np.float32]:
+    """Factors for the brightest channel's PQ signal of 10 bits; light is then 1 at `WHITE`."""
+    return _rolled_off(pq_to_light(np.arange(1024) / 1023))
+
+
+@lru_cache(maxsize=1)
+def _rolled_off_roots() -> NDArray[np.float32]:
+    """The same for the root of the brightest channel's light, in steps of `_FINE` up to `SOURCE_PEAK`."""
+    return _rolled_off((np.arange(_FINE + 1) / _FINE) ** 2 * SOURCE_PEAK)
+
+
+def _rolled_off(light: NDArray[np.float64]) -> NDArray[np.float32]:
+    """The factors that bring light in cd/m2 below 1, which is `WHITE`: BT.2390's Hermite spline over PQ."""
     most = float(light_to_pq(np.array(SOURCE_PEAK)))
-    signal = np.minimum(light_to_pq(grid) / most, 1.0)
+    signal = np.minimum(light_to_pq(light) / most, 1.0)
     white = float(light_to_pq(np.array(WHITE))) / most
     knee = 1.5 * white - 0.5
     t = np.clip((signal - knee) / (1 - knee), 0.0, 1.0)
@@ -128,7 +140,8 @@ def _roll_off() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         (2 * t**3 - 3 * t**2 + 1) * knee + (t**3 - 2 * t**2 + t) * (1 - knee) + (3 * t**2 - 2 * t**3) * white
     )
     target = pq_to_light(np.where(signal < knee, signal, spline) * most)
-    return grid, np.divide(target, grid, out=np.ones_like(grid), where=grid > 0)
+    factor = np.divide(target, light, out=np.ones_like(light), where=light > 0) / WHITE
+    return factor.astype(np.float32)
 
 
 @lru_cache(maxsize=1)
