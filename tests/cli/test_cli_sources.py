@@ -143,7 +143,7 @@ def test_a_board_is_printed_at_its_true_size(call):
     )
     with Image.open("board.png") as image:
         across = image.width / image.info["dpi"][0]
-        assert across == pytest.approx(4.8, abs=0.01)  # four squares of an inch, and the margins
+        assert across == pytest.approx(4.4, abs=0.01)  # four squares of an inch, and the margins
         assert image.convert("L").getextrema() == (0, 255)
     assert call("calibrate", "board", "--out", "board.pdf").exit_code == 0
     assert Path("board.pdf").read_bytes().startswith(b"%PDF")

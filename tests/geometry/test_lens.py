@@ -94,3 +94,19 @@ def test_what_the_lens_does_not_see_is_nowhere():
 def test_what_no_lens_does_is_refused(k):
     with pytest.raises(InputError, match="folds pictures"):
         Lens.of("radtan", k, TAKEN, WIDTH, HEIGHT)
+
+
+def test_a_camera_with_its_lens_is_kept_with_the_state_of_a_run(tmp_path):
+    """As a stopped run goes on with it: equal, and still of use as a key."""
+    import json
+
+    from tracking3d.checkpoint.trees import TreeFolder
+    from tracking3d.geometry.camera import Camera
+
+    model, k = LENSES["barrel"]
+    lens = Lens.of(model, k, TAKEN, WIDTH, HEIGHT)
+    camera = Camera(*lens.pinhole, WIDTH, HEIGHT, "file", lens=lens)
+    trees = TreeFolder(tmp_path, (Camera, Lens))
+    again = TreeFolder(tmp_path, (Camera, Lens)).read(json.loads(trees.text(camera)))
+    assert again == camera and hash(again) == hash(camera)
+    assert again.lens.kept == lens.kept

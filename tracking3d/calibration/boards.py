@@ -34,7 +34,7 @@ class Board:
     columns: int = 7
     rows: int = 10
     kind: Kind = "charuco"
-    square: float = 27.0
+    square: float = 25.0
 
     def __post_init__(self) -> None:
         if not (3 <= self.columns <= LARGEST and 3 <= self.rows <= LARGEST):

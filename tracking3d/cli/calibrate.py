@@ -20,7 +20,7 @@ MOST_FRAMES = 150
 """Of a video that the board is looked for in, spread over it."""
 _PIXELS = 320
 """Of a printed square."""
-_MARGIN = 0.4
+_MARGIN = 0.2
 """Squares of white around a printed board, which its border has to be told from."""
 _MILLIMETRES_AN_INCH = 25.4
 
@@ -58,7 +58,7 @@ def print_board(
     out: Annotated[Path, typer.Option(metavar="FILE.png|FILE.pdf", help="Where it is written.")],
     kind: Kind = "charuco",
     squares: Squares = "7x10",
-    square: Millimetres = 27.0,
+    square: Millimetres = 25.0,
     debug: Debug = False,
 ) -> None:
     """Draw a board to be printed at its true size; the default fits on A4 and Letter."""
@@ -98,7 +98,7 @@ def video(
     ),
     kind: Kind = "charuco",
     squares: Squares = "7x10",
-    square: Millimetres = 27.0,
+    square: Millimetres = 25.0,
     model: Annotated[
         str, typer.Option(metavar="radtan|fisheye", help="Kind of lens; fisheye beyond about 120 degrees.")
     ] = "radtan",
