@@ -16,6 +16,7 @@ SHARED_BY_SOLVERS = {"evidence"}
 # Rooms of one floor may use each other, but never in circles.
 FLOORS = [
     {
+        "calibration",
         "config",
         "engines",
         "errors",

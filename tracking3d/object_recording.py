@@ -184,7 +184,8 @@ class ObjectRecording:
             self._look.see(answer, frame.image, mask)
         if most and answer.status is Status.TRACKED and answer.confidence >= BELIEVED:
             camera = answer.through(self._session.camera)
-            view = texture_view(frame.index, frame.image, mask, camera, answer.T_cam_obj)
+            image, seen = camera.undistorted(frame.image), camera.mask_to_pinhole(mask)
+            view = texture_view(frame.index, image, seen, camera, answer.T_cam_obj)
             self._views = self._views if view is None else kept_views(self._views, view, most)
         return answer
 

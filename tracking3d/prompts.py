@@ -16,7 +16,7 @@ from tracking3d.errors import InputError, argument
 from tracking3d.frames import Box, Frame, Prompt, SkippedFrame
 from tracking3d.point_prompts import POINTS, checked_points, points_prompt
 from tracking3d.trackers.crops import box_of, clip_box
-from tracking3d.trackers.mask_files import ImageMasks, UnreadableMaskError
+from tracking3d.trackers.mask_images import ImageMasks, UnreadableMaskError, split_object
 
 _log = logging.getLogger(__name__)
 
@@ -279,17 +279,24 @@ def _inside(box: Box, frame: Frame, name: str) -> Box:
 def read_mask_file(file: Path, label: str) -> NDArray[np.bool_]:
     """The mask ``(H, W)`` in an image file, which sentences call ``label``: what is brighter than half.
 
+    ``FILE@N`` is object N of an indexed image, such as the annotations of DAVIS.
+
     Raises:
         InputError: If it does not exist, or cannot be read.
     """
     try:
         there = file.is_file()
+        if not there:
+            file, number = split_object(file)
+            there = number is not None and file.is_file()
+        else:
+            number = None
     except (OSError, ValueError):  # a loop of links, a name that no file can have
         there = False
     if not there:
         raise InputError(f"{label} does not exist.")
     try:
-        mask = ImageMasks(file, [file]).read(0)
+        mask = ImageMasks(file, [file], number).read(0)
     except (InputError, UnreadableMaskError) as error:
         raise InputError(f"{label} cannot be read as an image.") from error
     assert mask is not None  # there is one file

@@ -31,7 +31,7 @@ from tracking3d.results.run_writer import RunWriter, WrittenSoFar
 from tracking3d.session import Session
 from tracking3d.tracker_choice import AUTO, choose_tracker
 from tracking3d.video.both_ways import both_ways, check_start_frame
-from tracking3d.video.source import FrameSource
+from tracking3d.video.source import FrameSource, notes_of
 
 _log = logging.getLogger(__name__)
 
@@ -257,6 +257,7 @@ def begun(
         seed=session.config.runtime.seed,
         renderer=session.renderer,
         fps=source.fps,
+        source_notes=notes_of(source),
         command=command,
         selection=selection,
         given=given,

@@ -16,9 +16,11 @@ from tracking3d.errors import InputError
 from tracking3d.estimation.correction import corrects
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status, unanswered
 from tracking3d.estimation.solver import RefiningSolver, Solver, SteeredSolver
+from tracking3d.estimation.undistorting import behind
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame, MaskEstimate, Prompt, pixels
 from tracking3d.geometry.camera import Camera
+from tracking3d.geometry.lens import Lens
 from tracking3d.mask_tracking import PromptedTracker
 from tracking3d.parts import SOLVERS, build_encoder, check_device, check_turns, with_times
 from tracking3d.plugins.guard import PluginFailure
@@ -141,13 +143,14 @@ class Session:
         self._camera = choose_camera(self.config.camera, width, height, *self._intrinsics)
         warn_of_unlikely(self._camera)
         self._first, self._presented, self._latest = first, Presented(first.index), first.index
-        return SOLVERS[self.config.solver.name](self.config, self._camera, self._encoder)
+        solver = SOLVERS[self.config.solver.name](self.config, self._camera, self._encoder)
+        return behind(self._camera.lens, solver)
 
     @property
     def state_classes(self) -> tuple[type, ...]:
         """The classes of what `kept` gives, beside arrays, tensors and plain values."""
         own: tuple[type, ...] = getattr(SOLVERS[self.config.solver.name], "state_classes", ())
-        return (Camera, MaskEstimate, Presented, RandomState, StageTimes, *own)
+        return (Camera, Lens, MaskEstimate, Presented, RandomState, StageTimes, *own)
 
     def kept(self) -> dict[str, Any]:
         """All that another session needs to go on after the latest frame, see `resume`; its parts never change."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from written_datasets import HEIGHT, WIDTH, rectangle
 
-from tracking3d.datasets.vot_regions import (
+from tracking3d.trackers.vot_regions import (
     EncodedMask,
     Polygon,
     Rectangle,

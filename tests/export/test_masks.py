@@ -10,8 +10,8 @@ import pytest
 from PIL import Image
 
 from tracking3d.datasets.region_files import read_regions
-from tracking3d.datasets.vot_regions import rasterise
 from tracking3d.results.run_reader import RunReader
+from tracking3d.trackers.vot_regions import rasterise
 
 SIZE = (96, 128)
 

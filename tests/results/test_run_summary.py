@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from tracking3d.cli.progress import print_summary
-from tracking3d.estimation.estimate import MaskSource
+from tracking3d.estimation.estimate import MaskSource, unanswered
+from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.results.contact_sheet import CROPS, TILE
-from tracking3d.results.notes import notes_of, unseen_share
+from tracking3d.results.notes import notes_of, notes_of_run, notes_of_times, unseen_share
+from tracking3d.results.records import FrameRecord
 from tracking3d.stages import STAGES, StageTimes
 from tracking3d.video.image_file import read_image
 
@@ -110,3 +112,23 @@ def test_a_surface_that_was_mostly_never_seen_is_noted(turning_sphere):
     assert notes_of({"assumed": False, "origin": ""}, mostly) == [
         f"{100 * share:.0f} % of the mesh's surface was never seen; what is there is a guess"
     ]
+
+
+def timed(*milliseconds: int) -> list[FrameRecord]:
+    image = np.zeros((4, 4, 3), np.uint8)
+    frames = [Frame(2 * n, image, time / 1000) for n, time in enumerate(milliseconds)]
+    return [FrameRecord.of(unanswered(frame, MaskEstimate(None), np.eye(4))) for frame in frames]
+
+
+@pytest.mark.parametrize("times", [(), (0,), (0, 40), (0, 40, 80, 120), (0, 33, 67, 100), (0, 0, 40)])
+def test_frames_that_come_evenly_need_no_note(times):
+    assert notes_of_times(timed(*times)) == []
+
+
+def test_a_variable_frame_rate_is_a_note_but_not_of_a_camera():
+    records = timed(0, 40, 80, 200)  # every second frame
+    [note] = notes_of_times(records)
+    assert note.startswith("frames come 20 to 60 ms apart (variable frame rate)")
+    run = {"source_notes": ["toned"], "camera": {"assumed": False, "origin": ""}, "given": {"frames": 4}}
+    assert notes_of_run(run, None, records) == ["toned", note]
+    assert notes_of_run(run | {"given": {"frames": None}}, None, records) == ["toned"]

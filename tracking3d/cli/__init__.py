@@ -10,6 +10,7 @@ import typer
 from tracking3d.cli import (
     batch,
     bench,
+    calibrate,
     compare,
     config,
     demo,
@@ -46,6 +47,7 @@ app.command(name="export")(export.export)
 app.command(name="report")(report.report)
 app.command(name="compare")(compare.compare)
 app.add_typer(batch.app, name="batch")
+app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(evaluate.app, name="evaluate")
 app.add_typer(models.app, name="models")
 app.add_typer(plugins.app, name="plugins")

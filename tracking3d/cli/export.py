@@ -44,6 +44,12 @@ def export(
     images: Annotated[
         bool, typer.Option("--images/--no-images", help="Whether pictures are written along.")
     ] = True,
+    undistorted: Annotated[
+        bool,
+        typer.Option(
+            "--undistorted", help="Masks without the distortion of the lens, as poses and cameras are."
+        ),
+    ] = False,
     xy: Annotated[
         list[str] | None,
         typer.Option(
@@ -78,6 +84,7 @@ def export(
         of=of,  # type: ignore[arg-type]
         cut_out=cut_out,
         images=images,
+        undistorted=undistorted,
         frame=frame,
         xy=pixels,  # type: ignore[arg-type]
     )

@@ -68,6 +68,46 @@ def _given(values: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in sections.items() if value is not None and value != {}}
 
 
+def camera_settings(
+    fov: float | None, intrinsics: str | None, distortion: str | None, file: str | None
+) -> dict[str, Any]:
+    """The section ``camera`` of the configuration, by the options that say of the camera.
+
+    Raises:
+        InputError: If one cannot be read, or two say the same.
+    """
+    if intrinsics is not None and Path(intrinsics.partition(":")[0]).is_file():
+        if file is not None:
+            raise InputError("Give the camera file either as --camera or as --intrinsics, not both.")
+        intrinsics, file = None, intrinsics
+    camera: dict[str, Any] = {"fov": fov, "file": file}
+    if file is not None:
+        from tracking3d.calibration.camera_files import read_camera
+
+        if not (fov is intrinsics is distortion is None):
+            raise InputError(
+                "A camera file says all of the camera; leave out --fov, --intrinsics and --distortion."
+            )
+        read_camera(file)  # before anything is done
+    if intrinsics is not None:
+        camera["intrinsics"] = numbers(intrinsics, 4, "--intrinsics", "FX,FY,CX,CY in pixels")
+    if distortion is not None:
+        camera |= _distortion(distortion)
+    return camera
+
+
+def _distortion(text: str) -> dict[str, Any]:
+    from tracking3d.calibration.calibrated_camera import as_coefficients
+
+    name, colon, values = text.rpartition(":")
+    model = name.strip().casefold() if colon else "radtan"
+    if model not in ("radtan", "fisheye"):
+        raise InputError(f"--distortion '{text}' is of the model '{name}'; known are radtan and fisheye.")
+    given = numbers(values, len(values.split(",")), "--distortion", "K1,K2,P1,P2,... or fisheye:K1,K2,K3,K4")
+    as_coefficients("fisheye" if model == "fisheye" else "radtan", given, f"--distortion '{text}'")
+    return {"distortion": given, "distortion_model": model}
+
+
 def numbers(text: str, count: int, option: str, form: str) -> tuple[float, ...]:
     """Read ``count`` finite numbers with commas between them.
 

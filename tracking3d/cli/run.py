@@ -5,11 +5,21 @@ from __future__ import annotations
 import shlex
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quality, Quiet, configure, numbers
+from tracking3d.cli.objects import given_box, given_masks
+from tracking3d.cli.options import (
+    ConfigFile,
+    Debug,
+    Overrides,
+    Preset,
+    Quality,
+    Quiet,
+    camera_settings,
+    configure,
+)
 from tracking3d.cli.tracking import Given, a_person_is_there, default_folder, track
 from tracking3d.cli.view import Host
 from tracking3d.errors import InputError
@@ -21,22 +31,23 @@ def run(
     source: Annotated[
         str,
         typer.Argument(
-            metavar="SOURCE", help="Video file, folder or pattern of images, or the number of a camera."
+            metavar="SOURCE",
+            help="Video file, folder or pattern of images, number of a camera, or http(s) or rtsp(s) address.",
         ),
     ],
     box: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="X,Y,W,H",
-            help="Object in the first frame, in pixels; may be repeated.",
+            metavar="X,Y,W,H|FILE",
+            help="Object in the first frame, in pixels or as VOT's regions; may be repeated.",
             rich_help_panel=_TRACKING,
         ),
     ] = None,
     mask: Annotated[
         list[Path] | None,
         typer.Option(
-            metavar="FILE",
-            help="Mask of the object in the first frame; may be repeated.",
+            metavar="FILE[@N|@all]",
+            help="Mask of the object in the first frame, or object N of an indexed one; may be repeated.",
             rich_help_panel=_TRACKING,
         ),
     ] = None,
@@ -67,8 +78,8 @@ def run(
     masks: Annotated[
         Path | None,
         typer.Option(
-            metavar="DIR",
-            help="Masks of all frames, as a folder, video or .npz; the first is also the object.",
+            metavar="DIR|FILE[@N]",
+            help="Masks of all frames: a folder, video, .npz, COCO's .json, VOT's .txt; the first is also the object.",
             rich_help_panel=_TRACKING,
         ),
     ] = None,
@@ -92,6 +103,23 @@ def run(
         str | None,
         typer.Option(metavar="FX,FY,CX,CY", help="In pixels of the full frame.", rich_help_panel=_CAMERA),
     ] = None,
+    distortion: Annotated[
+        str | None,
+        typer.Option(
+            metavar="K1,K2,P1,P2,...",
+            help="Of the lens, as OpenCV has it; fisheye:K1,K2,K3,K4 of a fisheye.",
+            rich_help_panel=_CAMERA,
+        ),
+    ] = None,
+    camera_file: Annotated[
+        str | None,
+        typer.Option(
+            "--camera",
+            metavar="FILE",
+            help="Camera with its lens: OpenCV's or ROS's YAML, Kalibr, COLMAP's cameras.txt.",
+            rich_help_panel=_CAMERA,
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="Run folder; default runs/<source>.", rich_help_panel=_RUNNING),
@@ -108,6 +136,10 @@ def run(
         typer.Option(
             metavar="START:STOP:STEP", help="Which frames, counted from 0.", rich_help_panel=_RUNNING
         ),
+    ] = None,
+    fps: Annotated[
+        float | None,
+        typer.Option(help="Images per second of a folder or pattern of images.", rich_help_panel=_RUNNING),
     ] = None,
     skip_damaged: Annotated[
         bool,
@@ -185,14 +217,15 @@ def run(
         raise InputError("Give either --box, --mask or --points, not more than one of them.")
     if host is not None and not view:
         raise InputError("--host is where --view serves its page; give both.")
-    chosen: dict[str, str | None] = {"name": tracker}
+    chosen: dict[str, Any] = {"name": tracker}
     if masks is not None:
         if tracker not in (None, "precomputed", "auto"):
             raise InputError(f"--masks is for the tracker precomputed; leave out --tracker {tracker}.")
-        chosen = {"name": "precomputed", "path": str(masks)}
-    camera = None
-    if intrinsics is not None:
-        camera = numbers(intrinsics, 4, "--intrinsics", "FX,FY,CX,CY in pixels")
+        from tracking3d.trackers.mask_images import split_object
+
+        path, number = split_object(masks)
+        chosen = {"name": "precomputed", "path": str(path), "object": number}
+    camera = camera_settings(fov, intrinsics, distortion, camera_file)
     settings = configure(
         config,
         preset,
@@ -200,7 +233,7 @@ def run(
         quality,
         tracker=chosen,
         features=features,
-        camera={"fov": fov, "intrinsics": camera},
+        camera=camera,
         object={"flat": flat or None, "prototype": prototype},
         window={"size": size},
         solver={"final_refine": final_refine},
@@ -208,10 +241,14 @@ def run(
     )
     from tracking3d.corrections import checked_corrections, parse_correction
     from tracking3d.point_prompts import parse_points
-    from tracking3d.prompts import parse_box
+    from tracking3d.video.selection import parse_selection
+    from tracking3d.video.stream import without_password
 
+    first = start_frame if start_frame is not None else parse_selection(frames).start
     given = Given(
-        [parse_box(text) for text in boxes], object_masks, [parse_points(text) for text in object_points]
+        [given_box(text, first) for text in boxes],
+        [one for file in object_masks for one in given_masks(file)],
+        [parse_points(text) for text in object_points],
     )
     corrections = [parse_correction(text) for text in correct or told.correct]
     checked_corrections(corrections, max(len(given), 1))  # before anything is written
@@ -228,7 +265,7 @@ def run(
         picked = picked_in_browser(source, frames, settings, folder, overwrite=overwrite)
         given, start_frame = Given(picked.boxes, picked.masks), picked.frame
     about = {
-        "command": shlex.join(sys.argv),
+        "command": shlex.join(map(without_password, sys.argv)),
         "selection": frames,
         "overwrite": overwrite,
         "skip_damaged": skip_damaged,
@@ -236,4 +273,4 @@ def run(
         "start_frame": start_frame,
         "corrections": corrections,
     }
-    track(source, settings, folder, given, about, quiet=quiet, report=report, view=view, host=host)
+    track(source, settings, folder, given, about, fps=fps, quiet=quiet, report=report, view=view, host=host)

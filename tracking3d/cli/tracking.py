@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -35,6 +36,7 @@ def track(
     given: Given,
     about: dict[str, Any],
     *,
+    fps: float | None = None,
     quiet: bool = False,
     report: bool = True,
     view: bool = False,
@@ -48,6 +50,7 @@ def track(
         folder: The run folder.
         given: What the objects are.
         about: Further arguments of `tracking3d.recording.record`, ``selection`` among them.
+        fps: Images per second of a source that has no times of its own.
         quiet: Print nothing.
         report: Write a report at the end.
         view: Show the run in the browser.
@@ -61,7 +64,7 @@ def track(
     from tracking3d.results.run_reader import is_finished
     from tracking3d.video import open_source
 
-    opened = open_source(source, about.get("selection"))
+    opened = open_source(source, about.get("selection"), fps)
     if quiet:
         logging.getLogger("tracking3d").setLevel(logging.ERROR)
     objects = max(len(given), 1)
@@ -106,9 +109,14 @@ def resumable(folders: list[Path]) -> Iterator[None]:
 
 
 def default_folder(source: str) -> Path:
-    """``runs/<name>`` after the file, the folder of images, or the camera."""
+    """``runs/<name>`` after the file, the folder of images, the camera, or the end of an address."""
+    from tracking3d.video.stream import SCHEMES, scheme_of, without_password
+
     if source.isdigit() and not Path(source).exists():
         return Path("runs", f"camera_{source}")
+    if not Path(source).exists() and (scheme_of(source) in SCHEMES):
+        end = Path(without_password(source).partition("//")[2].partition("?")[0]).stem
+        return Path("runs", re.sub("[^A-Za-z0-9_-]+", "_", end).strip("_") or "stream")
     path = Path(source).expanduser().absolute()
     if any(sign in path.name for sign in "*?["):
         path = path.parent

@@ -6,15 +6,23 @@ import logging
 import math
 from dataclasses import replace
 
+from tracking3d.calibration.calibrated_camera import CalibratedCamera, as_coefficients
+from tracking3d.calibration.camera_files import read_camera
 from tracking3d.config.models import CameraConfig
-from tracking3d.errors import InputError
+from tracking3d.errors import InputError, argument
 from tracking3d.geometry.camera import DEFAULT_FIELD_OF_VIEW, Camera
+from tracking3d.geometry.lens import Lens
+
+DISTORTION = argument("camera.distortion", "--distortion")
+"""What sentences call the coefficients of a lens."""
 
 GIVEN = "given intrinsics"
 """Where a camera comes from whose intrinsics the user gave."""
 
 USUAL_ANGLES = (3.0, 110.0)
 """Fields of view in degrees beyond which a pinhole camera is more likely a mistake."""
+
+_ALL = 0.99  # of a picture that is kept, from which on nothing need be said
 
 _log = logging.getLogger(__name__)
 
@@ -26,12 +34,68 @@ def choose_camera(
     known: tuple[float, float, float, float] | None = None,
     known_origin: str = "",
 ) -> Camera:
-    """The camera by what is known best: given intrinsics, given field of view, the source's own, 45 degrees.
+    """The camera by what is known best: a file, given intrinsics, given field of view, the source's own, 45 degrees.
+
+    With distortion it is the pinhole camera that pictures are turned into, and has its ``lens``.
 
     Raises:
-        InputError: If the intrinsics that were given cannot be of images of that size. Those that the source has are
+        InputError: If the camera that was given cannot be of images of that size. Intrinsics that the source has are
             then left aside, and the log says so.
     """
+    if config.file is not None:
+        return _measured(read_camera(config.file), width, height)
+    camera = _pinhole(config, width, height, known, known_origin)
+    coefficients = given_distortion(config)
+    if not coefficients:
+        return camera
+    if camera.assumed:
+        raise InputError(
+            f"{DISTORTION} means nothing without the focal lengths that it was measured with; give "
+            f"{argument('camera.intrinsics', '--intrinsics FX,FY,CX,CY')} too, or both in a camera file."
+        )
+    taken = CalibratedCamera(
+        (camera.fx, camera.fy, camera.cx, camera.cy),
+        config.distortion_model,
+        coefficients,
+        None,
+        camera.origin,
+    )
+    return _measured(taken, width, height)
+
+
+def given_distortion(config: CameraConfig) -> tuple[float, ...]:
+    """The coefficients, as many as their model has; none where there is no distortion.
+
+    Raises:
+        InputError: If there are too many.
+    """
+    return as_coefficients(config.distortion_model, config.distortion or (), DISTORTION)
+
+
+def _measured(taken: CalibratedCamera, width: int, height: int) -> Camera:
+    """The pinhole camera that pictures of a measured one are turned into.
+
+    Raises:
+        InputError: If it cannot be of pictures of that size.
+    """
+    fits = taken.for_frames(width, height)
+    camera = Camera(*fits.intrinsics, width, height, fits.origin)
+    _check(camera)
+    if not fits.coefficients:
+        return camera
+    lens = Lens.of(fits.model, fits.coefficients, fits.intrinsics, width, height)
+    origin = f"{fits.origin}, without the distortion of its lens ({fits.model})"
+    return Camera(*lens.pinhole, width, height, origin, lens=lens)
+
+
+def _pinhole(
+    config: CameraConfig,
+    width: int,
+    height: int,
+    known: tuple[float, float, float, float] | None,
+    known_origin: str,
+) -> Camera:
+    """The camera as far as it has no lens."""
     if config.intrinsics is not None:
         camera = Camera(*config.intrinsics, width, height, GIVEN)
         _check(camera)
@@ -50,8 +114,14 @@ def choose_camera(
 
 
 def warn_of_unlikely(camera: Camera) -> None:
-    """Tell the log where given intrinsics are possible for images of that size, but hardly meant."""
-    if camera.origin != GIVEN:
+    """Tell the log where given intrinsics are possible for images of that size, but hardly meant; and what is lost."""
+    if camera.lens is not None and (kept := camera.lens.kept) < _ALL:
+        _log.warning(
+            "The lens is so wide that %.0f %% of the picture, its outermost part, is not seen by the pinhole camera; "
+            "the object has no answer there.",
+            100 * (1 - kept),
+        )
+    if not camera.origin.startswith(GIVEN):
         return
     inside = 0 <= camera.cx < camera.width and 0 <= camera.cy < camera.height
     if not _usual(camera):

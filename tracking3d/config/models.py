@@ -5,6 +5,7 @@ The defaults are those of preset ``default``; ``tracking3d/config/presets`` hold
 
 from __future__ import annotations
 
+import math
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
@@ -40,6 +41,38 @@ class CameraConfig(Section):
     intrinsics: tuple[float, float, float, float] | None = Field(
         None, description="fx, fy, cx, cy in pixels of the full frame; wins over fov."
     )
+
+    distortion: tuple[float, ...] | None = Field(
+        None,
+        max_length=14,
+        description=(
+            "k1, k2, p1, p2, k3 and so on of the lens, as OpenCV has them; pictures are undistorted on the way in, and "
+            "masks distorted on the way out."
+        ),
+    )
+    distortion_model: Literal["radtan", "fisheye"] = Field(
+        "radtan", description="What distortion is of: radtan (OpenCV's usual one) or fisheye (equidistant)."
+    )
+    file: str | None = Field(
+        None,
+        description=(
+            "Camera file instead of intrinsics and distortion: OpenCV's or ROS's YAML, Kalibr's camchain, or COLMAP's "
+            "cameras.txt."
+        ),
+    )
+
+    @model_validator(mode="after")
+    def _are_said_once(self) -> CameraConfig:
+        if self.file is not None and not (self.fov is self.intrinsics is self.distortion is None):
+            raise ValueError("file, or fov, intrinsics and distortion, since the file says both")
+        return self
+
+    @field_validator("distortion")
+    @classmethod
+    def _is_of_a_lens(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
+        if value is not None and not all(map(math.isfinite, value)):
+            raise ValueError("finite numbers k1, k2, p1, p2 and so on")
+        return value
 
     @field_validator("intrinsics")
     @classmethod

@@ -8,9 +8,9 @@ from typing import Any, Literal
 import numpy as np
 
 from tracking3d.datasets.json_files import read_json
-from tracking3d.datasets.vot_regions import parse_numbers
 from tracking3d.errors import InputError
 from tracking3d.geometry.camera import Camera
+from tracking3d.trackers.vot_regions import parse_numbers
 
 _LARGEST_SKEW = 1.0
 """Pixels. Less than that moves no point of a frame by more than about half a pixel."""

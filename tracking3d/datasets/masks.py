@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as Pillow
 
-from tracking3d.datasets.vot_regions import Region, rasterise
 from tracking3d.errors import InputError
+from tracking3d.trackers.vot_regions import Region, rasterise
 
 Label = int | tuple[int, int, int]
 """A grey value or palette index, or a colour ``(red, green, blue)``."""

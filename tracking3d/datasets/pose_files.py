@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.datasets.clip import is_rigid
-from tracking3d.datasets.vot_regions import parse_numbers
 from tracking3d.errors import InputError
+from tracking3d.trackers.vot_regions import parse_numbers
 
 
 def read_matrices(files: Mapping[int, Path], *, inverse: bool = False) -> dict[int, NDArray[np.float64]]:

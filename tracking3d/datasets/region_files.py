@@ -9,7 +9,8 @@ from typing import Literal
 
 import numpy as np
 
-from tracking3d.datasets.vot_regions import (
+from tracking3d.errors import InputError
+from tracking3d.trackers.vot_regions import (
     EncodedMask,
     Polygon,
     Rectangle,
@@ -18,7 +19,6 @@ from tracking3d.datasets.vot_regions import (
     parse_numbers,
     parse_region,
 )
-from tracking3d.errors import InputError
 
 Form = Literal["vot", "xywh", "xyxy", "polygon"]
 
@@ -36,7 +36,7 @@ def read_regions(
 
     Args:
         file: Empty lines at its end do not count.
-        form: What a line holds; ``vot`` decides line by line, see `tracking3d.datasets.vot_regions`.
+        form: What a line holds; ``vot`` decides line by line, see `tracking3d.trackers.vot_regions`.
         header_lines: Number of lines to leave out at the start.
         frame_column: Column, from 0, of the frame's number. Else line n is frame n.
         first_column: Column, from 0, where the region begins.

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from tracking3d.datasets.vot_regions import EncodedMask, Region, bounding_box, rasterise
 from tracking3d.errors import PluginError
 from tracking3d.frames import Frame, MaskEstimate, Prompt
 from tracking3d.trackers.segmentation import ColourSegmentation
+from tracking3d.trackers.vot_regions import EncodedMask, Region, bounding_box, rasterise
 
 
 class RegionTracker:

@@ -19,10 +19,10 @@ from tracking3d.datasets.placeholders import Place
 from tracking3d.datasets.pose_files import read_matrices, read_matrix_lines
 from tracking3d.datasets.region_files import read_regions
 from tracking3d.datasets.truth import DepthFile, MaskFile, MaskReference, MeshFile
-from tracking3d.datasets.vot_regions import EncodedMask, Region, Special, bounding_box
 from tracking3d.errors import InputError
 from tracking3d.frames import Box
 from tracking3d.geometry.camera import Camera
+from tracking3d.trackers.vot_regions import EncodedMask, Region, Special, bounding_box
 from tracking3d.video.image_file import read_image
 
 

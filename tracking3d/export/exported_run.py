@@ -180,7 +180,18 @@ class ExportedRun:
         """``(H, W)``: the answer's mask of a frame of `span`; empty where the frame was skipped."""
         if index not in self.records:
             return np.zeros((self.camera.height, self.camera.width), bool)
-        return self.reader.mask(index)
+        return self.reader.pinhole_mask(index) if self.options.undistorted else self.reader.mask(index)
+
+    def pinhole_mask(self, index: int) -> NDArray[np.bool_]:
+        """The same as the camera of the poses sees it, without the distortion of a lens."""
+        if index not in self.records:
+            return np.zeros((self.camera.height, self.camera.width), bool)
+        return self.reader.pinhole_mask(index)
+
+    def pinhole_pictures(self) -> Iterator[Frame]:
+        """The pictures as the camera of the poses sees them, without the distortion of a lens; see `pictures`."""
+        for frame in self._read_pictures():
+            yield replace(frame, image=self.camera.undistorted(frame.image))
 
     def pictures(self) -> Iterator[Frame]:
         """The pictures of all frames that have an answer, read from the source once more.
@@ -188,6 +199,9 @@ class ExportedRun:
         Raises:
             InputError: If the source is not there any more, or is another one.
         """
+        yield from self.pinhole_pictures() if self.options.undistorted else self._read_pictures()
+
+    def _read_pictures(self) -> Iterator[Frame]:
         from tracking3d.export.pictures import read_pictures
 
         return read_pictures(self.reader, self.options.source, self.records)

@@ -29,6 +29,8 @@ class ExportOptions:
         of: ``object`` for poses ``T_cam_obj``, ``camera`` for those of a camera about the still object, ``T_obj_cam``.
         cut_out: Pictures as PNG that are transparent around the object, instead of whole ones with masks beside.
         images: Whether pictures are written where a format has room for them.
+        undistorted: Masks and pictures as a camera without the distortion of the lens sees them, instead of as they
+            were taken.
         frame: The frame that ``xy`` is in; None takes the first one with a pose.
         xy: Pixels on the object whose surface points are followed; empty for a grid over the object.
     """
@@ -40,6 +42,7 @@ class ExportOptions:
     of: Of = "object"
     cut_out: bool = False
     images: bool = True
+    undistorted: bool = False
     frame: int | None = None
     xy: tuple[tuple[float, float], ...] = ()
 

@@ -30,6 +30,7 @@ _NAMED = {
     "source": argument("source=", "--source"),
     "of": argument("of=", "--of"),
     "cut_out": argument("cut_out=", "--cut-out"),
+    "undistorted": argument("undistorted=", "--undistorted"),
     "images": argument("images=", "--no-images"),
     "frame": argument("frame=", "--frame"),
     "xy": argument("xy=", "--xy"),

@@ -28,6 +28,7 @@ _TIMED = _LENGTHS | {"fps"}
 _PICTURES = frozenset({"source"})
 _TRAINING = _LENGTHS | _PICTURES | {"cut_out", "images"}
 _POINTS = frozenset({"frame", "xy"})
+_MASKS = frozenset({"undistorted"})
 
 _ALL = (
     Exporter("tum", "poses", "trajectory in the TUM format", write_tum, ".txt", options=_TIMED | {"of"}),
@@ -68,13 +69,20 @@ _ALL = (
     Exporter(
         "nerfstudio", "cameras", "transforms.json, pictures, masks", write_nerfstudio, options=_TRAINING
     ),
-    Exporter("davis", "masks", "indexed PNG as DAVIS has them", write_davis),
-    Exporter("youtube-vos", "masks", "indexed PNG and meta.json of YouTube-VOS", write_youtube_vos),
-    Exporter("coco", "masks", "COCO's JSON, run-length encoded", write_coco, ".json"),
-    Exporter("vot", "masks", "regions of the VOT toolkit", write_vot, ".txt"),
-    Exporter("cut-outs", "masks", "the object as PNG with alpha", write_cut_outs, options=_PICTURES),
+    Exporter("davis", "masks", "indexed PNG as DAVIS has them", write_davis, options=_MASKS),
     Exporter(
-        "vp9", "masks", "the object as WebM with alpha", write_vp9, ".webm", options=_PICTURES | {"fps"}
+        "youtube-vos", "masks", "indexed PNG and meta.json of YouTube-VOS", write_youtube_vos, options=_MASKS
+    ),
+    Exporter("coco", "masks", "COCO's JSON, run-length encoded", write_coco, ".json", options=_MASKS),
+    Exporter("vot", "masks", "regions of the VOT toolkit", write_vot, ".txt", options=_MASKS),
+    Exporter("cut-outs", "masks", "the object as PNG with alpha", write_cut_outs, options=_PICTURES | _MASKS),
+    Exporter(
+        "vp9",
+        "masks",
+        "the object as WebM with alpha",
+        write_vp9,
+        ".webm",
+        options=_PICTURES | _MASKS | {"fps"},
     ),
     Exporter(
         "prores",
@@ -82,7 +90,7 @@ _ALL = (
         "the object as ProRes 4444 with alpha",
         write_prores,
         ".mov",
-        options=_PICTURES | {"fps"},
+        options=_PICTURES | _MASKS | {"fps"},
     ),
     Exporter("tapvid", "points", "point tracks as TAP-Vid's arrays", write_tapvid, ".npz", options=_POINTS),
     Exporter("points-csv", "points", "point tracks as a table", write_points_csv, ".csv", options=_POINTS),

@@ -42,7 +42,7 @@ def write_rerun(run: ExportedRun, path: Path) -> None:
     recording.log("camera/object", mesh, static=True)
     _log_answers(recording, run)
     if run.options.images:
-        for frame in run.pictures():
+        for frame in run.pinhole_pictures():
             _set_time(recording, run, frame.index)
             recording.log("camera/image", rerun.Image(frame.image).compress(_QUALITY))
     recording.flush()
@@ -55,7 +55,7 @@ def _log_answers(recording: RecordingStream, run: ExportedRun) -> None:
     posed = {one.index: one for one in run.poses}
     for index, record in run.records.items():
         _set_time(recording, run, index)
-        recording.log("camera/mask", rerun.SegmentationImage(run.mask(index).astype(np.uint8)))
+        recording.log("camera/mask", rerun.SegmentationImage(run.pinhole_mask(index).astype(np.uint8)))
         recording.log("status", rerun.TextLog(f"{record.status} {record.reason}".strip()))
         if math.isfinite(record.confidence):
             recording.log("confidence", rerun.Scalars(record.confidence))

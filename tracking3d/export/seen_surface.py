@@ -72,6 +72,6 @@ def _look(run: ExportedRun, one: PosedFrame) -> tuple[NDArray[np.float64], NDArr
     pixels = drawn.screen[0].double().numpy()
     seen: NDArray[np.bool_] = visible_vertices(drawn)[0].numpy()
     column, row = np.where(seen[:, None], pixels, 0.0).round().astype(int).T
-    return pixels, seen & run.mask(one.index)[
+    return pixels, seen & run.pinhole_mask(one.index)[
         row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)
     ]

@@ -36,10 +36,10 @@ def write_pictures(run: ExportedRun, images: Path, masks: Path, mask_name: str) 
     posed = {one.index for one in run.poses}
     images.mkdir(parents=True)
     masks.mkdir(parents=True)
-    for frame in run.pictures():
+    for frame in run.pinhole_pictures():
         if frame.index not in posed:
             continue
-        mask, name = run.mask(frame.index), picture_name(run, frame.index)
+        mask, name = run.pinhole_mask(frame.index), picture_name(run, frame.index)
         if run.options.cut_out:
             Pillow.fromarray(cut_out(frame.image, mask)).save(images / name)
         else:

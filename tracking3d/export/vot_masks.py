@@ -1,4 +1,4 @@
-"""Masks as the VOT toolkit writes regions: one line a frame, run-length encoded; see `tracking3d.datasets.vot_regions`.
+"""Masks as the VOT toolkit writes regions: one line a frame, run-length encoded; see `tracking3d.trackers.vot_regions`.
 
 Lines have no number: line n is frame n of those that were asked for, and one that was skipped is ``0``, no region.
 """
@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tracking3d.datasets.vot_regions import Special, encode_mask, format_region
 from tracking3d.export.exported_run import ExportedRun
+from tracking3d.trackers.vot_regions import Special, encode_mask, format_region
 
 
 def write_vot(run: ExportedRun, path: Path) -> None:

@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tracking3d.geometry.lens import Lens
+
 DEFAULT_FIELD_OF_VIEW = 45.0
 """Vertical field of view in degrees when nothing better is known (paper section 3.2)."""
 
@@ -27,6 +29,7 @@ class Camera:
         width, height: Frame size in pixels.
         origin: Where the intrinsics came from, in words; recorded in the run.
         assumed: Whether nobody gave the focal length.
+        lens: How the pictures that were taken differ from what this camera sees; None where they do not.
     """
 
     fx: float
@@ -37,6 +40,7 @@ class Camera:
     height: int
     origin: str = "given"
     assumed: bool = False
+    lens: Lens | None = None
 
     @classmethod
     def from_fov(
@@ -58,6 +62,22 @@ class Camera:
     def zoomed(self, factor: float, origin: str) -> Camera:
         """With ``factor`` times the focal lengths; ``origin`` says in words where that came from."""
         return replace(self, fx=factor * self.fx, fy=factor * self.fy, origin=origin)
+
+    def to_picture(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+        """This camera's pixels ``(N, 2)`` as those of the pictures that were taken; NaN where the lens sees none."""
+        return xy if self.lens is None else self.lens.to_picture(xy)
+
+    def to_pinhole(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Pixels ``(N, 2)`` of the pictures that were taken as those of this camera; NaN where there are none."""
+        return xy if self.lens is None else self.lens.to_pinhole(xy)
+
+    def undistorted(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """A picture ``(H, W, 3)`` that was taken, as this camera sees it."""
+        return image if self.lens is None else self.lens.undistorted(image)
+
+    def mask_to_pinhole(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """A mask ``(H, W)`` of a picture that was taken, as one of what this camera sees."""
+        return mask if self.lens is None else self.lens.mask_to_pinhole(mask)
 
     @property
     def K(self) -> NDArray[np.float64]:

@@ -68,11 +68,12 @@ def _views(run: RunReader, source: str, most: int) -> tuple[TextureView, ...]:
                 f"{source} does not begin as the video of the run {run.folder} did; give that by --source."
             )
         if record.status is Status.TRACKED and record.confidence >= BELIEVED:
+            camera = run.camera_of(record)
             view = texture_view(
                 frame.index,
-                frame.image,
-                run.mask(frame.index),
-                run.camera_of(record),
+                camera.undistorted(frame.image),
+                run.pinhole_mask(frame.index),
+                camera,
                 np.asarray(record.T_cam_obj),
             )
             views = views if view is None else kept_views(views, view, most)

@@ -111,6 +111,7 @@ class SecondLook:
         return replace(view, K=view.K @ np.diag([factor, factor, 1.0]), T_cam_obj=record.T_cam_obj)
 
     def _view(self, T_cam_obj: _Pose, image: Image, mask: NDArray[np.bool_]) -> View | None:
+        image, mask = self.camera.undistorted(image), self.camera.mask_to_pinhole(mask)
         return open_view(image, mask, self.camera, T_cam_obj, self.vertices, self._faces, LONGEST_SIDE)
 
     def _through_lens(self, T_cam_obj: _Pose) -> _Pose:

@@ -75,8 +75,10 @@ def track_points(run: RunReader | Path, frame: int, xy: ArrayLike) -> PointTrack
     tolerance = DEPTH_TOLERANCE * float(np.linalg.norm(np.ptp(vertices, axis=0))) / 2
 
     screen, depth = project(run.camera_of(asked), asked.T_cam_obj, vertices)
-    face, barycentric = surface_under(screen, depth, faces, query)
-    on_object = (face >= 0) & in_frame(run.camera, query)
+    camera = run.camera_of(asked)
+    seen = camera.to_pinhole(query)
+    face, barycentric = surface_under(screen, depth, faces, np.nan_to_num(seen, nan=-1e6))
+    on_object = (face >= 0) & in_frame(run.camera, query) & np.isfinite(seen).all(1)
     face, barycentric = np.where(on_object, face, -1), np.where(on_object[:, None], barycentric, np.nan)
 
     corners = vertices[faces[face]]
@@ -88,13 +90,14 @@ def track_points(run: RunReader | Path, frame: int, xy: ArrayLike) -> PointTrack
         if not np.isfinite(record.T_cam_obj).all():
             continue
         camera = run.camera_of(record)
-        positions[row], distance = project(camera, record.T_cam_obj, points)
+        ahead, distance = project(camera, record.T_cam_obj, points)
+        positions[row] = camera.to_picture(ahead)
         if record.status == Status.LOST or record.area == 0:
             continue
         eye = -record.T_cam_obj[:3, :3].T @ record.T_cam_obj[:3, 3]
         facing = ((eye - points) * normals).sum(1) > 0
         screen, depth = project(camera, record.T_cam_obj, vertices)
-        behind = _deepest_around(camera, screen, depth, faces, positions[row])
+        behind = _deepest_around(camera, screen, depth, faces, ahead)
         visible[row] = on_object & facing & (distance > NEAR) & (distance <= behind + tolerance)
     indices = np.array([record.index for record in run.frames], dtype=np.int64)
     return PointTracks(
@@ -155,7 +158,8 @@ def grid_on_object(run: RunReader, frame: int, step: int) -> list[tuple[float, f
     screen, depth = project(camera, record.T_cam_obj, np.asarray(mesh.vertices))
     rows, columns = np.mgrid[step // 2 : camera.height : step, step // 2 : camera.width : step]
     pixels = np.stack([columns.ravel(), rows.ravel()], 1).astype(np.float64)
-    on = pixels[surface_under(screen, depth, np.asarray(mesh.faces), pixels)[0] >= 0]
+    seen = np.nan_to_num(camera.to_pinhole(pixels), nan=-1e6)
+    on = pixels[surface_under(screen, depth, np.asarray(mesh.faces), seen)[0] >= 0]
     if not len(on):
         raise InputError(
             f"No point of a grid of {step} pixels lies on the object in frame {frame}; give a smaller --grid."

@@ -33,6 +33,7 @@ def description_at_start(
     seed: int,
     fps: float | None,
     command: str | None,
+    source_notes: Sequence[str] = (),
     selection: str | None,
     renderer: Mapping[str, str | int] | None,
     given: Mapping[str, Any] | None = None,
@@ -40,8 +41,8 @@ def description_at_start(
 ) -> dict[str, Any]:
     """What is known of a run before its first frame.
 
-    ``given`` tells source and object apart from others; ``tracker_choice`` is why ``auto`` stood for the tracker of
-    ``config``.
+    ``source_notes`` say what was done to the pictures before anything else; ``given`` tells source and object apart
+    from others; ``tracker_choice`` is why ``auto`` stood for the tracker of ``config``.
     """
     return {
         "format": FORMAT,
@@ -57,6 +58,7 @@ def description_at_start(
         "given": given,
         "fps": fps,
         "command": command,
+        "source_notes": list(source_notes),
         "seed": seed,
         "config": config,
         "tracker_choice": tracker_choice,

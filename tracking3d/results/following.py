@@ -60,19 +60,21 @@ class RunScene:
         records = self.run.frames
         start = next(row for row, one in enumerate(records) if one is asked)
         inside = in_frame(self.run.camera, query)
-        found = follow_points(self.scene, start, np.where(inside[:, None], query, np.nan))
+        camera = self.run.camera_of(asked)
+        seen = camera.to_pinhole(query)
+        found = follow_points(self.scene, start, np.where(inside[:, None], seen, np.nan))
         on_object = np.asarray(np.isfinite(found.points).all(1))
         face, barycentric = np.full(len(query), -1), np.full((len(query), 3), np.nan)
         if (view := self.scene.views[start]) is not None and on_object.any():
             face[on_object], barycentric[on_object] = surface_under(
-                *view.project(self.scene.vertices), self.scene.faces, view.to_window(query[on_object])
+                *view.project(self.scene.vertices), self.scene.faces, view.to_window(seen[on_object])
             )
         lost = np.array([one.status == Status.LOST or one.area == 0 for one in records])
         return PointTracks(
             frame,
             query,
             np.array([one.index for one in records], dtype=np.int64),
-            found.positions,
+            camera.to_picture(found.positions.reshape(-1, 2)).reshape(found.positions.shape),
             found.visible & ~lost[:, None],
             on_object,
             face,
@@ -167,7 +169,8 @@ def _view(
         )
     if record.status == Status.LOST:
         return None
-    return open_view(image, run.mask(record.index), camera, record.T_cam_obj, vertices, faces)
+    image = camera.undistorted(image)
+    return open_view(image, run.pinhole_mask(record.index), camera, record.T_cam_obj, vertices, faces)
 
 
 def _key(run: RunReader, vertices: NDArray[np.float64], rounds: int) -> str:

@@ -2,20 +2,42 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from tracking3d.estimation.estimate import ObjectModel
+from tracking3d.results.records import FrameRecord
 
 MOSTLY = 0.5
 """Share of the surface never seen from which a note says so."""
+UNEVEN = 1.5
+"""How much longer than the shortest the longest time between two frames is, for a note to say so."""
 
 _CORNERS = 6  # points a side of a face at which the texture is asked
 
 
+def notes_of_run(run: dict[str, Any], model: ObjectModel | None, records: Sequence[FrameRecord]) -> list[str]:
+    """All notes of a run.
+
+    Args:
+        run: Its ``run.json``, before the notes are in it.
+        model: The object; None if there is none.
+        records: The answer for every frame, in order.
+    """
+    # Nobody expects frames to come evenly from a camera, which has no number of frames either.
+    counted = (run.get("given") or {}).get("frames") is not None
+    return [
+        *run["source_notes"],
+        *(notes_of_times(records) if counted else ()),
+        *notes_of(run["camera"], model),
+    ]
+
+
 def notes_of(camera: dict[str, Any], model: ObjectModel | None) -> list[str]:
-    """The notes of a run.
+    """What is known of lens and model.
 
     Args:
         camera: As ``run.json`` has it.
@@ -32,6 +54,29 @@ def notes_of(camera: dict[str, Any], model: ObjectModel | None) -> list[str]:
     if unseen > MOSTLY:
         notes.append(f"{100 * unseen:.0f} % of the mesh's surface was never seen; what is there is a guess")
     return notes
+
+
+def notes_of_times(records: Sequence[FrameRecord]) -> list[str]:
+    """What one should know of the times of a run's frames: that they do not come evenly.
+
+    Args:
+        records: The answer for every frame, in order.
+    """
+    timed = [(one.index, one.time) for one in records if one.time is not None]
+    steps = np.array(
+        [
+            (later - time) / (after - index)
+            for (index, time), (after, later) in pairwise(timed)
+            if after > index
+        ]
+    )
+    if len(steps) < 2 or not 0 < steps.min() * UNEVEN < steps.max():
+        return []
+    shortest, longest = 1000 * steps.min(), 1000 * steps.max()
+    return [
+        f"frames come {shortest:.0f} to {longest:.0f} ms apart (variable frame rate); time stamps are the video's, and "
+        "overlay.mp4 shows them evenly"
+    ]
 
 
 def unseen_share(model: ObjectModel) -> float:

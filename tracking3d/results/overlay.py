@@ -76,7 +76,10 @@ class ObjectAxes:
         rows, columns = np.nonzero(estimate.mask)
         if not len(rows) or not np.isfinite(estimate.T_cam_obj).all() or depth <= 0:
             return None
-        middle = depth * np.linalg.solve(camera.K, np.array([columns.mean(), rows.mean(), 1.0]))
+        pixel = camera.to_pinhole(np.array([[columns.mean(), rows.mean()]]))[0]
+        if not np.isfinite(pixel).all():
+            return None
+        middle = depth * np.linalg.solve(camera.K, np.array([*pixel, 1.0]))
         rotation, translation = estimate.T_cam_obj[:3, :3], estimate.T_cam_obj[:3, 3]
         return cls(rotation.T @ (middle - translation), math.sqrt(len(rows) / math.pi) * depth / camera.fx)
 
@@ -129,8 +132,8 @@ def _draw_axes(
     points = ends @ estimate.T_cam_obj[:3, :3].T + estimate.T_cam_obj[:3, 3]
     if not np.isfinite(points).all() or points[:, 2].min() <= 0:
         return
-    pixels = (points @ camera.K.T)[:, :2] / points[:, 2:]
-    if not _is_on(estimate.mask, pixels[0]):
+    pixels = camera.to_picture((points @ camera.K.T)[:, :2] / points[:, 2:])
+    if not np.isfinite(pixels).all() or not _is_on(estimate.mask, pixels[0]):
         return
     pixels = np.clip((pixels + 0.5) * scale - 0.5, -1e5, 1e5).round().astype(int)
     for axis in np.argsort(-points[1:, 2]):  # the nearest last, on top

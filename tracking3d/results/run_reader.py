@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from tracking3d.errors import InputError, argument
 from tracking3d.geometry.camera import Camera
 from tracking3d.results import layout
+from tracking3d.results.camera_record import read_camera
 from tracking3d.results.files import read_mask
 from tracking3d.results.lock import is_locked
 from tracking3d.results.mesh_export import load_mesh
@@ -74,9 +75,9 @@ class RunReader:
             InputError: If the run names none that can be.
         """
         try:
-            camera = Camera(**self.description["camera"])
+            camera = read_camera(self.description["camera"])
             fault = _camera_fault(camera)
-        except (KeyError, TypeError) as error:
+        except (KeyError, TypeError, ValueError) as error:
             fault = str(error)
         if fault:
             raise InputError(
@@ -172,6 +173,14 @@ class RunReader:
                 f"The run {self.folder} has no mask of frame {index}; {path.name} is missing or damaged."
             )
         return mask
+
+    def pinhole_mask(self, index: int) -> NDArray[np.bool_]:
+        """The answer's mask ``(H, W)`` as the camera of the poses sees it, without the distortion of a lens.
+
+        Raises:
+            InputError: If there is none.
+        """
+        return self.camera.mask_to_pinhole(self.mask(index))
 
     def initial_mask(self, index: int) -> NDArray[np.bool_] | None:
         """What the mask tracker gave for frame ``index``, ``(H, W)``, or None."""

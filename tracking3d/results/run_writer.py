@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -33,7 +33,7 @@ from tracking3d.results.files import (
 from tracking3d.results.frame_lines import FrameLines, WrittenSoFar
 from tracking3d.results.making_room import make_room
 from tracking3d.results.mesh_export import export_mesh
-from tracking3d.results.notes import notes_of
+from tracking3d.results.notes import notes_of_run
 from tracking3d.results.pictures import Pictures
 from tracking3d.results.records import FrameRecord, jsonable, latest
 from tracking3d.results.refinement_writer import RefinementWriter, clear_refinement
@@ -62,6 +62,7 @@ class RunWriter:
         renderer: What renders, and why.
         fps: Frames per second of the source, where known.
         command: The command line, where there was one.
+        source_notes: What the source did to its pictures, in clauses.
         given: What tells source and object apart from others, see `tracking3d.checkpoint.resuming.given_of`.
         tracker_choice: Why the mask tracker ``auto`` stood for that of ``config``; None where it was named.
         overwrite: Replace a run that is there. Only files a run writes are removed, only from a run folder.
@@ -82,6 +83,7 @@ class RunWriter:
         seed: int,
         fps: float | None,
         command: str | None,
+        source_notes: Sequence[str] = (),
         selection: str | None = None,
         renderer: Mapping[str, str | int] | None = None,
         given: Mapping[str, Any] | None = None,
@@ -104,6 +106,7 @@ class RunWriter:
             seed=seed,
             fps=fps,
             command=command,
+            source_notes=source_notes,
             selection=selection,
             renderer=renderer,
             given=given,
@@ -347,11 +350,10 @@ class RunWriter:
 
     def _finish(self, model: ObjectModel | None) -> None:
         records = list(read_records(self.folder / layout.FRAMES))
-        seconds = time.monotonic() - self._started
         figures = description.summary(
-            latest(records), len(self._description["skipped"]), seconds, latest(records, refined=False)
+            latest(records), len(self._description["skipped"]), self.seconds, latest(records, refined=False)
         )
-        self._description |= figures | {"notes": notes_of(self._description["camera"], model)}
+        self._description |= figures | {"notes": notes_of_run(self._description, model, latest(records))}
         replaced = {record.index for record in latest(records) if record.revision and not record.refined}
         sheet = self._pictures.contact_sheet(model, self._description, replaced)
         if sheet is not None:

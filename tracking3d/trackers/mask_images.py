@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,15 +45,20 @@ class ImageMasks:
     The object is where alpha is above half, if alpha varies; else where a palette's colour is not black; else
     where the brightest channel passes `binarize`.
 
+    With an ``object``, images hold numbers instead of colours, as those of DAVIS and YouTube-VOS do: the object is
+    where the palette's index, or the grey value, is that number.
+
     Args:
         path: What the user gave.
         files: The image files, in any order.
+        object: Number of the object; None takes all that is not background.
 
     Raises:
         InputError: If none of the files is a readable image.
     """
 
-    def __init__(self, path: Path, files: Sequence[Path]) -> None:
+    def __init__(self, path: Path, files: Sequence[Path], object: int | None = None) -> None:
+        self._object = object
         self._files = sorted(files, key=lambda file: natural_key(file.name))
         self.names: Sequence[str] = [file.stem for file in self._files]
         if not any(self.shape(position) for position in range(len(files))):
@@ -78,9 +84,57 @@ class ImageMasks:
             return None
         try:
             with warnings.catch_warnings(action="ignore"), Pillow.open(self._files[position]) as image:
-                return _object_in(image)
+                return _object_in(image) if self._object is None else _numbers_in(image) == self._object
         except Exception as error:  # decoders raise whatever a damaged file leads them to
             raise UnreadableMaskError(f"{self._files[position]} cannot be read") from error
+
+
+def split_object(path: Path) -> tuple[Path, int | None]:
+    """``FILE@N`` as file and number; the path as it is where it exists, or ends otherwise."""
+    name, at, number = str(path).rpartition("@")
+    if not at or not name or not re.fullmatch("[0-9]{1,9}", number) or path.exists():
+        return path, None
+    return Path(name), int(number)
+
+
+def of_objects(numbers: Collection[Any], chosen: int | None, path: Path) -> Any:
+    """Which of the objects of a file is meant; None where there is none at all.
+
+    Raises:
+        InputError: If the chosen one is not there, or there are several and none is chosen.
+    """
+    listed = ", ".join(str(one) for one in sorted(numbers, key=lambda one: natural_key(str(one)))[:12])
+    if chosen is not None and chosen not in numbers:
+        raise InputError(f"{path} has no object {chosen}; it has {listed or 'none'}.")
+    if chosen is None and len(numbers) > 1:
+        raise InputError(
+            f"{path} has several objects ({listed}); say which one, as in {path}@{min(numbers, key=str)}."
+        )
+    return chosen if chosen is not None else next(iter(numbers), None)
+
+
+def objects_in(path: Path) -> list[int]:
+    """The numbers in an indexed image, 0 and the 255 that marks borders left out.
+
+    Raises:
+        InputError: If it cannot be read, or has colours instead.
+    """
+    try:
+        with warnings.catch_warnings(action="ignore"), Pillow.open(path) as image:
+            found = np.unique(_numbers_in(image))
+    except Exception as error:  # decoders raise whatever a damaged file leads them to
+        raise InputError(f"{path} cannot be read as an image of numbered objects.") from error
+    return [int(number) for number in found if number not in (0, 255)]
+
+
+def _numbers_in(image: Pillow.Image) -> NDArray:
+    """``(H, W)`` palette indices or grey values."""
+    if image.mode not in ("1", "L", "P", "I", "I;16"):
+        values = np.asarray(image.convert("RGB"))
+        if not (values == values[..., :1]).all():
+            raise ValueError("colours")
+        return values[..., 0]
+    return np.asarray(image)
 
 
 def _object_in(image: Pillow.Image) -> NDArray[np.bool_]:

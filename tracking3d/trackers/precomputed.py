@@ -21,7 +21,9 @@ from tracking3d.trackers.mask_files import (
     natural_key,
     open_masks,
 )
+from tracking3d.trackers.precomputed_boxes import PrecomputedBoxes
 from tracking3d.trackers.protocol import Options
+from tracking3d.trackers.region_masks import RegionMasks
 
 _ASPECT_TOLERANCE = 0.02
 
@@ -36,7 +38,15 @@ class PrecomputedMasks:
         """Options of ``precomputed``."""
 
         path: str = Field(
-            description="Folder of images, video, .npz or .npy file; object where above half or above 0."
+            description=(
+                "Folder of images, video, .npz or .npy file; object where above half or above 0. Or COCO's JSON, or a "
+                "text file of VOT."
+            )
+        )
+        object: int | None = Field(
+            None,
+            ge=0,
+            description="Which object, where files hold several: its palette index, or COCO's number.",
         )
 
     def __init__(self, masks: MaskFiles) -> None:
@@ -44,11 +54,14 @@ class PrecomputedMasks:
         self._find: Callable[[Frame], int | None] | None = None
 
     @classmethod
-    def from_options(cls, options: BaseModel) -> Self:
-        """Open the masks at ``options.path``; raises `InputError` where there are none."""
+    def from_options(cls, options: BaseModel) -> Self | PrecomputedBoxes:
+        """Open the masks at ``options.path``, or boxes; raises `InputError` where there are none."""
         if not isinstance(options, PrecomputedMasks.Options):
             raise PluginError("The tracker precomputed was built with options that are not its own.")
-        return cls(open_masks(Path(options.path)))
+        masks = open_masks(Path(options.path), options.object)
+        if isinstance(masks, RegionMasks) and masks.has_rectangles:
+            return PrecomputedBoxes(masks)
+        return cls(masks)
 
     def init(self, frame: Frame, prompt: Prompt) -> MaskEstimate:
         """The first frame's mask; the prompt's where there is none.
@@ -56,7 +69,7 @@ class PrecomputedMasks:
         Raises:
             InputError: If a mask's proportions are not the frame's.
         """
-        self._find = match_masks(self._masks.names, frame)
+        self._match(frame)
         if isinstance(self._masks, ImageMasks):  # headers are cheap: complain now, not an hour into the run
             for position in range(len(self._masks.names)):
                 if shape := self._masks.shape(position):
@@ -95,7 +108,12 @@ class PrecomputedMasks:
 
     def restore(self, frame: Frame, prompt: Prompt, state: None) -> None:
         """Decide on the first frame again how masks belong to frames."""
-        self._find = match_masks(self._masks.names, frame)
+        self._match(frame)
+
+    def _match(self, first: Frame) -> None:
+        self._find = match_masks(self._masks.names, first)
+        if isinstance(self._masks, RegionMasks):
+            self._masks.in_frames(first.size)
 
     def _check(self, shape: tuple[int, ...], position: int, frame: Frame) -> None:
         (height, width), (frame_height, frame_width) = shape, frame.size

@@ -7,7 +7,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
-from typing import Protocol, cast
+from typing import Protocol
 
 import av
 from av.error import FFmpegError
@@ -16,10 +16,10 @@ from tracking3d.errors import InputError
 from tracking3d.frames import Frame, Image, SkippedFrame
 from tracking3d.video.image_file import read_image
 from tracking3d.video.image_sequence import ImageSequence
-from tracking3d.video.orientation import turn_upright
+from tracking3d.video.picture_conversion import PictureConverter
 from tracking3d.video.selection import EVERY_FRAME
 from tracking3d.video.source import FrameSource
-from tracking3d.video.video_file import VideoFile, orientation_of, video_stream
+from tracking3d.video.video_file import VideoFile, video_stream
 
 MOST_KEPT = 128 * 2**20
 """Bytes of decoded frames that are kept for when they are asked for again."""
@@ -109,7 +109,8 @@ class VideoPictures:
 
     def __init__(self, video: VideoFile) -> None:
         self._video = replace(video, selection=EVERY_FRAME)
-        self._container = av.open(f"file:{video.path}", metadata_errors="ignore")
+        self._container = video.container()
+        self._convert = PictureConverter()
         stream = video_stream(self._container)
         assert stream is not None  # VideoFile.open has made sure
         self._stream = stream
@@ -138,8 +139,8 @@ class VideoPictures:
 
     def _presentation_times(self) -> list[int]:
         """Of all pictures, in the order in which they are shown; none where they are not to be relied on."""
-        if not _INDEXED & set(self._container.format.name.split(",")):
-            return []
+        if self._video.interlaced or not _INDEXED & set(self._container.format.name.split(",")):
+            return []  # a picture that is made of its neighbours' lines is not found alone
         try:
             packets = [packet for packet in self._container.demux(self._stream) if packet.size]
         except FFmpegError:
@@ -158,14 +159,17 @@ class VideoPictures:
                 continue
             self._next = at + 1
             if at == index:
-                return self._upright(picture)
+                return self._converted(picture)
             if at > index:
                 break
         self._running = None
         return None
 
-    def _upright(self, picture: av.VideoFrame) -> Image:
-        return turn_upright(cast(Image, picture.to_ndarray(format="rgb24")), orientation_of(picture))
+    def _converted(self, picture: av.VideoFrame) -> Image | None:
+        try:
+            return self._convert(picture)
+        except ValueError:
+            return None
 
     def _pictures(self) -> Iterator[av.VideoFrame]:
         """From where the file stands, those that can be decoded."""

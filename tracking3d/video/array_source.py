@@ -19,15 +19,23 @@ from tracking3d.video.source import Intrinsics, checked
 class ArraySource:
     """Any iterable of ``(H, W, 3)`` uint8 RGB arrays, taken one at a time.
 
-    See `tracking3d.video.source.FrameSource` for the attributes.
+    See `tracking3d.video.source.FrameSource` for the other attributes.
+
+    Attributes:
+        rate: Arrays per second, which times are counted by; None where nobody knows.
     """
 
     arrays: Iterable[Any]
     selection: range = EVERY_FRAME
     name: str = "the frame iterable"
-    fps: float | None = None
+    rate: float | None = None
     intrinsics: Intrinsics | None = None
     intrinsics_origin: str = ""
+
+    @property
+    def fps(self) -> float | None:
+        """Selected arrays per second, where somebody has said."""
+        return None if self.rate is None else self.rate / self.selection.step
 
     @property
     def count(self) -> int | None:
@@ -57,7 +65,8 @@ class ArraySource:
                     f"Frame {index} of {self.name} is {_describe(array)}; give (H, W, 3) uint8 RGB arrays."
                 )
             # A copy, because callers like to decode every frame into one buffer.
-            yield Frame(index, array.copy(), name=f"frame {index}")
+            seconds = None if self.rate is None else index / self.rate
+            yield Frame(index, array.copy(), seconds, f"frame {index}")
 
 
 def _describe(item: Any) -> str:

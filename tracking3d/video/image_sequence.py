@@ -29,7 +29,11 @@ def images_among(paths: Iterable[Path]) -> list[Path]:
 class ImageSequence:
     """Image files as the frames of a video.
 
-    See `tracking3d.video.source.FrameSource` for the attributes.
+    See `tracking3d.video.source.FrameSource` for the other attributes.
+
+    Attributes:
+        rate: Images per second of all files, selected or not, which their times are counted by; None where nobody
+            knows.
     """
 
     name: str
@@ -37,7 +41,7 @@ class ImageSequence:
     selection: range
     intrinsics: Intrinsics | None = None
     intrinsics_origin: str = ""
-    fps: float | None = None
+    rate: float | None = None
     repeatable: bool = True
 
     @classmethod
@@ -67,6 +71,11 @@ class ImageSequence:
         return cls(name, files, wanted, intrinsics, origin)
 
     @property
+    def fps(self) -> float | None:
+        """Selected images per second, where somebody has said."""
+        return None if self.rate is None else self.rate / self.selection.step
+
+    @property
     def count(self) -> int:
         """Number of selected images."""
         return len(self.selection)
@@ -79,6 +88,7 @@ class ImageSequence:
         for index in self.selection:
             file = self.files[index]
             try:
-                yield Frame(index, read_image(file), name=file.name)
+                seconds = None if self.rate is None else index / self.rate
+                yield Frame(index, read_image(file), seconds, file.name)
             except InputError as error:
                 yield SkippedFrame(index, str(error).removesuffix("."))

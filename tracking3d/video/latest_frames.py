@@ -14,7 +14,7 @@ from numbers import Real
 
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, SkippedFrame
-from tracking3d.video.source import FrameSource, Intrinsics
+from tracking3d.video.source import FrameSource, Intrinsics, notes_of
 
 DROPPED = "dropped to keep up"
 """The reason of a frame that was overwritten before it was taken."""
@@ -73,6 +73,11 @@ class LatestFrames:
     def intrinsics_origin(self) -> str:
         """The source's."""
         return self.source.intrinsics_origin
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The source's."""
+        return notes_of(self.source)
 
     @property
     def repeatable(self) -> bool:

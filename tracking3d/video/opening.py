@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import glob
 from collections.abc import Iterable
+from dataclasses import replace
+from numbers import Real
 from pathlib import Path
 
-from tracking3d.errors import InputError
+from tracking3d.errors import InputError, argument
 from tracking3d.frames import Image
 from tracking3d.video.array_source import ArraySource
 from tracking3d.video.image_file import is_still_image
@@ -14,29 +16,54 @@ from tracking3d.video.image_sequence import ImageSequence
 from tracking3d.video.live_camera import LiveCamera
 from tracking3d.video.selection import parse_selection
 from tracking3d.video.source import FrameSource
+from tracking3d.video.stream import SCHEMES, open_stream, scheme_of
 from tracking3d.video.video_file import VideoFile
 
+_FPS = argument("fps=", "--fps")
+LEAST_FPS, MOST_FPS = 0.001, 100_000.0
+"""Images per second: from one in a quarter of an hour to the fastest cameras."""
 
-def open_source(source: str | Path | Iterable[Image], frames: str | None = None) -> FrameSource:
-    """Open a video file, a folder or glob pattern of images, a camera, or any iterable of arrays.
+
+def open_source(
+    source: str | Path | Iterable[Image], frames: str | None = None, fps: float | None = None
+) -> FrameSource:
+    """Open a video file, a folder or pattern of images, a camera, a video by its address, or any iterable of arrays.
 
     Args:
         source: A path; a pattern such as ``"shots/*.png"`` (``**`` for all subfolders); the number of a
-            camera, such as ``"0"``; or an iterable of ``(H, W, 3)`` uint8 RGB arrays. A text that exists as a
-            path is taken as a path.
+            camera, such as ``"0"``; an address that begins with http, https, rtsp or rtsps; or an iterable of
+            ``(H, W, 3)`` uint8 RGB arrays. A text that exists as a path is taken as a path.
         frames: ``START:STOP:STEP`` to select frames (see `parse_selection`); frames keep the source's index.
+        fps: Frames per second of images or arrays, which have no times of their own.
 
     Raises:
-        InputError: If there is nothing that can be read as frames, or the selection is bad or empty.
+        InputError: If there is nothing that can be read as frames, the selection is bad or empty, or ``fps`` is given
+            for a source that has times of its own.
     """
-    selection = parse_selection(frames)
+    selection, fps = parse_selection(frames), _checked_fps(fps)
     if isinstance(source, str | Path):
-        return _open_path(str(source), selection)
+        opened = _open_path(str(source), selection)
+        if fps is None:
+            return opened
+        if not isinstance(opened, ImageSequence):
+            raise InputError(f"{opened.name} has times of its own; {_FPS} is for images.")
+        return replace(opened, rate=fps)
     if isinstance(source, Iterable):
-        return ArraySource(source, selection)
+        return ArraySource(source, selection, rate=fps)
     raise InputError(
         f"A {type(source).__name__} is no source of frames; give a path or an iterable of RGB arrays."
     )
+
+
+def _checked_fps(fps: float | None) -> float | None:
+    if fps is None:
+        return None
+    number = isinstance(fps, Real) and not isinstance(fps, bool)
+    if not number or not LEAST_FPS <= fps <= MOST_FPS:
+        raise InputError(
+            f"{_FPS} {fps!r:.40} is no rate of a video; give images per second from {LEAST_FPS:g} to {MOST_FPS:g}."
+        )
+    return float(fps)
 
 
 def _open_path(name: str, selection: range) -> FrameSource:
@@ -54,6 +81,13 @@ def _open_path(name: str, selection: range) -> FrameSource:
         raise InputError(f"{name} cannot be opened: {getattr(error, 'strerror', None) or error}.") from error
     if name.isascii() and name.isdigit():
         return LiveCamera.open(int(name), selection)
+    if (scheme := scheme_of(name)) in SCHEMES:
+        return open_stream(name, selection)
+    if scheme is not None and not glob.has_magic(name):
+        raise InputError(
+            f"{name} does not exist, and addresses that begin with {scheme}: are not opened; give a path, or an "
+            f"address that begins with {', '.join(SCHEMES[:-1])} or {SCHEMES[-1]}."
+        )
     if glob.has_magic(name):
         found = glob.iglob(str(path), recursive=True)  # noqa: PTH207 (Path.glob takes no absolute pattern)
         return ImageSequence.open(name, map(Path, found), selection)

@@ -55,6 +55,11 @@ class FrameSource(Protocol):
         ...
 
 
+def notes_of(source: FrameSource) -> tuple[str, ...]:
+    """What a source did to its pictures, in clauses; sources that do nothing need not say so."""
+    return tuple(getattr(source, "notes", ()))
+
+
 def checked(frames: Iterable[Frame | SkippedFrame], name: str) -> Iterator[Frame | SkippedFrame]:
     """Pass ``frames`` on; skip those of another size than the first, and insist on at least one.
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
-from typing import Any, cast
 
 import av
 from av.container import InputContainer
@@ -13,8 +14,9 @@ from av.error import FFmpegError
 from av.video.stream import VideoStream
 
 from tracking3d.errors import InputError
-from tracking3d.frames import Frame, Image, SkippedFrame
-from tracking3d.video.orientation import UPRIGHT, orientation_from_display_matrix, turn_upright
+from tracking3d.frames import Frame, SkippedFrame
+from tracking3d.video.deinterlacing import deinterlaced
+from tracking3d.video.picture_conversion import PictureConverter, said_of
 from tracking3d.video.selection import EVERY_FRAME, within
 from tracking3d.video.source import Intrinsics, checked
 from tracking3d.video.video_decoding import decode_pictures
@@ -24,8 +26,13 @@ from tracking3d.video.video_decoding import decode_pictures
 class VideoFile:
     """A video file, decoded frame by frame.
 
-    See `tracking3d.video.source.FrameSource` for the attributes. Frames are turned upright as the file asks
-    for, and their times are the file's own, so that a variable frame rate is kept.
+    See `tracking3d.video.source.FrameSource` for the other attributes. Frames are turned upright as the file asks
+    for, deinterlaced, and tone-mapped to sRGB; their times are the file's own, so that a variable frame rate is kept.
+
+    Attributes:
+        path: Where it lies.
+        interlaced: Whether its first picture is interlaced.
+        notes: What was done to the pictures, in clauses.
     """
 
     name: str
@@ -36,6 +43,8 @@ class VideoFile:
     intrinsics: Intrinsics | None = None
     intrinsics_origin: str = ""
     repeatable: bool = True
+    interlaced: bool = False
+    notes: tuple[str, ...] = ()
 
     @classmethod
     def open(cls, name: str, path: Path, selection: range = EVERY_FRAME) -> VideoFile:
@@ -49,37 +58,27 @@ class VideoFile:
         Raises:
             InputError: If it is no video, or truncated beyond use.
         """
-        with _open(name, path) as container:
-            if container.format.name in ("tty", "image2") or container.format.name.endswith("_pipe"):
-                raise InputError(f"{name} is not a video; give a video file or a folder of images.")
-            stream = video_stream(container)
-            if stream is None:
-                raise InputError(f"{name} has no video in it; give a file with a video stream.")
-            if stream.codec_context is None:
-                raise InputError(
-                    f"{name} uses a video codec that is not known here; convert it to H.264 first."
-                )
-            frames = _announced_frames(container, stream)
-            rate = stream.average_rate or stream.guessed_rate
-        return cls(
-            name,
-            path,
-            selection,
-            len(within(selection, frames)) if frames else None,
-            float(rate) / selection.step if rate else None,
-        )
+        with open_container(name, path) as container:
+            return described(container, name, path, selection)
+
+    def container(self) -> InputContainer:
+        """The file, open at its beginning.
+
+        Raises:
+            InputError: If it cannot be opened.
+        """
+        return open_container(self.name, self.path)
 
     def __iter__(self) -> Iterator[Frame | SkippedFrame]:
         """Decode the selected frames; those that cannot be decoded are given as skipped."""
         return checked(self._frames(), self.name)
 
     def _frames(self) -> Iterator[Frame | SkippedFrame]:
-        with _open(self.name, self.path) as container:
+        with self.container() as container:
             stream = video_stream(container)
             assert stream is not None
-            start = stream.start_time
-            orientation: int | None = None
-            for index, picture in enumerate(decode_pictures(container, stream)):
+            start, convert = stream.start_time, PictureConverter()
+            for index, picture in enumerate(deinterlaced(decode_pictures(container, stream))):
                 seconds = None
                 if isinstance(picture, av.VideoFrame) and picture.pts is not None and stream.time_base:
                     start = picture.pts if start is None else min(start, picture.pts)
@@ -89,14 +88,40 @@ class VideoFile:
                 if isinstance(picture, str):
                     yield SkippedFrame(index, f"frame {index}: {picture}")
                 else:
-                    # Once, because asking PyAV for side data keeps the picture until Python collects cycles.
-                    orientation = orientation or orientation_of(picture)
-                    yield _frame(index, picture, seconds, orientation)
+                    yield frame_of(index, picture, seconds, convert)
                 if index + 1 >= self.selection.stop:
                     return
 
 
-def _open(name: str, path: Path) -> InputContainer:
+def described(container: InputContainer, name: str, path: Path, selection: range) -> VideoFile:
+    """What an open file's header and first picture tell; see `VideoFile.open`."""
+    if container.format.name in ("tty", "image2") or container.format.name.endswith("_pipe"):
+        raise InputError(f"{name} is not a video; give a video file or a folder of images.")
+    stream = video_stream(container)
+    if stream is None:
+        raise InputError(f"{name} has no video in it; give a file with a video stream.")
+    if stream.codec_context is None:
+        raise InputError(f"{name} uses a video codec that is not known here; convert it to H.264 first.")
+    frames = _announced_frames(container, stream)
+    rate = stream.average_rate or stream.guessed_rate
+    first = _first_picture(container, stream)
+    return VideoFile(
+        name,
+        path,
+        selection,
+        len(within(selection, frames)) if frames else None,
+        float(rate) / selection.step if rate else None,
+        interlaced=first is not None and first.interlaced_frame,
+        notes=() if first is None else said_of(first),
+    )
+
+
+def open_container(name: str, path: Path) -> InputContainer:
+    """A file on disk, open at its beginning.
+
+    Raises:
+        InputError: If it is no video.
+    """
     try:
         # "file:" keeps FFmpeg from taking a colon in the name for a protocol.
         return av.open(f"file:{path}", metadata_errors="ignore")
@@ -122,18 +147,20 @@ def _announced_frames(container: InputContainer, stream: VideoStream) -> int | N
     return round(duration * stream.average_rate) if duration > 0 and stream.average_rate else None
 
 
-def orientation_of(picture: av.VideoFrame) -> int:
-    """How the file asks for the picture to be turned, see `tracking3d.video.orientation`."""
-    matrix: Any = picture.side_data.get("DISPLAYMATRIX")
-    return UPRIGHT if matrix is None else orientation_from_display_matrix(bytes(matrix))
+def _first_picture(container: InputContainer, stream: VideoStream) -> av.VideoFrame | None:
+    """The first picture that can be decoded, if one of the first few can."""
+    with suppress(FFmpegError):
+        for picture in islice(container.decode(stream), 1):
+            return picture if isinstance(picture, av.VideoFrame) else None
+    return None
 
 
-def _frame(
-    index: int, picture: av.VideoFrame, seconds: float | None, orientation: int
+def frame_of(
+    index: int, picture: av.VideoFrame, seconds: float | None, convert: PictureConverter
 ) -> Frame | SkippedFrame:
+    """The frame of a decoded picture, or why there is none."""
     name = f"frame {index}"
     try:
-        image = cast(Image, picture.to_ndarray(format="rgb24"))
-    except (FFmpegError, ValueError) as error:
-        return SkippedFrame(index, f"{name}: its pixels cannot be converted to RGB: {error}")
-    return Frame(index, turn_upright(image, orientation), seconds, name)
+        return Frame(index, convert(picture), seconds, name)
+    except ValueError as error:
+        return SkippedFrame(index, f"{name}: {error}")

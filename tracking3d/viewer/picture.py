@@ -142,7 +142,9 @@ def _draw_axes(
     points = ends @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3]
     if not np.isfinite(points).all() or points[:, 2].min() <= 0:
         return
-    pixels = (points @ camera.K.T)[:, :2] / points[:, 2:]
+    pixels = camera.to_picture((points @ camera.K.T)[:, :2] / points[:, 2:])
+    if not np.isfinite(pixels).all():
+        return
     start, *tips = np.clip((pixels + 0.5) * scale - 0.5, -1e5, 1e5).round().astype(int)
     for axis in np.argsort(-points[1:, 2]):
         cv2.line(picture, start, tips[axis], _AXES[axis], thickness, cv2.LINE_AA)

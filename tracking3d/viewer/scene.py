@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from tracking3d.estimation.estimate import Status
 from tracking3d.frames import Image
+from tracking3d.geometry.camera import Camera
 from tracking3d.results import drawing, layout
 from tracking3d.results.records import FrameRecord
 from tracking3d.viewer.followed_run import FollowedRun
@@ -97,7 +98,7 @@ class ObjectScene:
             )
         self._here.scale = 3 * _FRUSTUM * self.distance
         self._here.color = drawing.STATUS[record.status]
-        self._here.image = image
+        self._here.image = None if image is None else _as_seen(camera, image)
         self._here.wxyz, self._here.position = _wxyz(T_obj_cam), T_obj_cam[:3, 3]
         if camera_stands_still:
             self._root.wxyz, self._root.position = _wxyz(T_cam_obj), T_cam_obj[:3, 3]
@@ -168,6 +169,11 @@ class ObjectScene:
             position=T_obj_cam[:3, 3],
         )
         handle.on_click(partial(self._clicked, record.index))
+
+
+def _as_seen(camera: Camera, image: Image) -> Image:
+    """The picture ``(H, W, 3)`` without the distortion of a lens; one that was made smaller is left as it is."""
+    return camera.undistorted(image) if image.shape[:2] == (camera.height, camera.width) else image
 
 
 def _spread(records: list[FrameRecord]) -> list[int]:

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from PIL import Image
 from small_ostrack import BOXES, save, write_constant_ostrack, write_ostrack, write_refine
+from tracking3d.datasets.vot_regions import encode_mask, format_region
 from tracking3d_ostrack import OsTracker
 from tracking3d_ostrack.network import OsTrackBoxes
 from tracking3d_ostrack.patches import Patch
 from tracking3d_ostrack.refinement import AlphaRefine
 
-from tracking3d.datasets.vot_regions import encode_mask, format_region
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, MaskEstimate, Prompt
 from tracking3d.networks.session import Network

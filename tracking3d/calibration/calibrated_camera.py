@@ -1,0 +1,86 @@
+"""A camera with its lens, as somebody measured it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+from tracking3d.errors import InputError
+from tracking3d.geometry.lens import COUNTS, Model, Pinhole
+
+
+@dataclass(frozen=True)
+class CalibratedCamera:
+    """A camera as somebody measured it.
+
+    Attributes:
+        intrinsics: ``(fx, fy, cx, cy)`` in pixels; (0, 0) is the centre of the top-left pixel.
+        model: Formula of the distortion, see `tracking3d.geometry.lens`.
+        coefficients: Its coefficients; empty where there is none.
+        size: ``(width, height)`` in pixels of the pictures that it was measured with; None where nobody says.
+        origin: Where it came from, in words.
+    """
+
+    intrinsics: Pinhole
+    model: Model = "radtan"
+    coefficients: tuple[float, ...] = ()
+    size: tuple[int, int] | None = None
+    origin: str = "given camera"
+
+    def for_frames(self, width: int, height: int) -> CalibratedCamera:
+        """The same camera for pictures of another size, which must have the same proportions.
+
+        Raises:
+            InputError: If they have not.
+        """
+        if self.size in (None, (width, height)):
+            return self
+        assert self.size is not None
+        across, down = width / self.size[0], height / self.size[1]
+        if abs(across / down - 1) > 0.01:
+            raise InputError(
+                f"{self.origin} is a camera of {self.size[0]} x {self.size[1]} pixels, and the frames have {width} x "
+                f"{height}, which is no enlargement of that; calibrate the camera in the mode that the video has."
+            )
+        fx, fy, cx, cy = self.intrinsics
+        scaled = (fx * across, fy * down, (cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5)
+        origin = f"{self.origin}, scaled from {self.size[0]} x {self.size[1]} pixels"
+        return CalibratedCamera(scaled, self.model, self.coefficients, (width, height), origin)
+
+
+def as_coefficients(model: Model, values: tuple[float, ...], what: str) -> tuple[float, ...]:
+    """As many coefficients as a model has; none where all are 0.
+
+    Args:
+        model: The model.
+        values: At most as many as it has, in OpenCV's order; what is left out is 0.
+        what: What sentences call them.
+
+    Raises:
+        InputError: If there are more.
+    """
+    if model == "radtan" and not any(values):
+        return ()  # a fisheye without coefficients is still no pinhole camera
+    count = next((count for count in COUNTS[model] if count >= len(values)), None)
+    if count is None:
+        raise InputError(
+            f"{what} has {len(values)} numbers; the model {model} has {' or '.join(map(str, COUNTS[model]))}."
+        )
+    if not values:
+        return ()
+    return (*values, *[0.0] * (count - len(values)))
+
+
+def checked_camera(camera: CalibratedCamera, path: Path) -> CalibratedCamera:
+    """The camera, with as many coefficients as its model has."""
+    fx, fy, *_ = camera.intrinsics
+    numbers = (*camera.intrinsics, *camera.coefficients)
+    if not all(map(math.isfinite, numbers)) or not min(fx, fy) > 0:
+        raise InputError(
+            f"The camera of {path} has no positive, finite focal lengths and numbers; restore the file."
+        )
+    if camera.size is not None and not min(camera.size) > 0:
+        raise InputError(f"The size of the pictures in {path} is not positive; restore the file.")
+    coefficients = as_coefficients(camera.model, camera.coefficients, f"The distortion in {path}")
+    return CalibratedCamera(camera.intrinsics, camera.model, coefficients, camera.size, camera.origin)

@@ -1,0 +1,171 @@
+"""``tracking3d calibrate``: a camera with its lens, from views of a printed board."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from tracking3d.cli.options import Debug, Quiet
+from tracking3d.errors import InputError, OutputError
+
+if TYPE_CHECKING:
+    from tracking3d.calibration.boards import Board
+    from tracking3d.calibration.calibrate import Calibration
+
+MOST_FRAMES = 150
+"""Of a video that the board is looked for in, spread over it."""
+_PIXELS = 320
+"""Of a printed square."""
+_MARGIN = 0.2
+"""Squares of white around a printed board, which its border has to be told from."""
+_MILLIMETRES_AN_INCH = 25.4
+
+
+class _VideoFirst(TyperGroup):
+    """A group whose command ``video`` need not be named."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Put ``video`` before what names no command, options too."""
+        return list(super().parse_args(ctx, self._named(args)))
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """The command that is meant, and its arguments."""
+        return super().resolve_command(ctx, self._named(args))
+
+    def _named(self, args: list[str]) -> list[str]:
+        return ["video", *args] if args and args[0] not in (*self.commands, "--help") else args
+
+
+app = typer.Typer(
+    cls=_VideoFirst,
+    help="Measure a camera and its lens: `calibrate board` prints a board, `calibrate VIDEO` reads views of it.",
+    no_args_is_help=True,
+)
+
+Kind = Annotated[str, typer.Option("--board", metavar="charuco|chessboard", help="Which board it is.")]
+Squares = Annotated[
+    str, typer.Option(metavar="COLUMNSxROWS", help="Squares of the board, black and white ones.")
+]
+Millimetres = Annotated[float, typer.Option("--square-mm", help="Side of a square in millimetres.")]
+
+
+@app.command(name="board")
+def print_board(
+    out: Annotated[Path, typer.Option(metavar="FILE.png|FILE.pdf", help="Where it is written.")],
+    kind: Kind = "charuco",
+    squares: Squares = "7x10",
+    square: Millimetres = 25.0,
+    debug: Debug = False,
+) -> None:
+    """Draw a board to be printed at its true size; the default fits on A4 and Letter."""
+    import numpy as np
+    from PIL import Image as Pillow
+
+    if out.suffix.casefold() not in (".png", ".pdf"):
+        raise InputError(f"--out {out} is neither a .png nor a .pdf file.")
+    board = _board(kind, squares, square)
+    drawn = np.pad(board.picture(_PIXELS), round(_MARGIN * _PIXELS), constant_values=255)
+    # So that a square is as long as it was asked for, whatever that is in whole pixels of usual resolutions.
+    resolution = _PIXELS / board.square * _MILLIMETRES_AN_INCH
+    page = Pillow.fromarray(drawn)
+    try:
+        if out.suffix.casefold() == ".pdf":
+            page.save(out, resolution=resolution)
+        else:
+            page.save(out, dpi=(resolution, resolution))
+    except OSError as error:
+        raise OutputError(f"{out} cannot be written: {error.strerror or error}.") from error
+    height, width = (side / _PIXELS * board.square for side in drawn.shape)
+    typer.echo(
+        f"{out}: {board.columns} x {board.rows} squares of {board.square:g} mm, {width:.0f} x {height:.0f} mm in all"
+    )
+    typer.echo(
+        "Print it at 100 %, fix it on something flat, and film it from near and far, tilted, up to the corners."
+    )
+
+
+@app.command(name="video")
+def video(
+    source: Annotated[
+        str, typer.Argument(metavar="SOURCE", help="Video or folder of pictures of the board.")
+    ],
+    out: Annotated[Path, typer.Option(metavar="FILE.yaml", help="Camera file that is written.")] = Path(
+        "camera.yaml"
+    ),
+    kind: Kind = "charuco",
+    squares: Squares = "7x10",
+    square: Millimetres = 25.0,
+    model: Annotated[
+        str, typer.Option(metavar="radtan|fisheye", help="Kind of lens; fisheye beyond about 120 degrees.")
+    ] = "radtan",
+    frames: Annotated[
+        str | None,
+        typer.Option(metavar="START:STOP:STEP", help="Which frames; 150 spread over the video if left out."),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there.")] = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Measure the camera that filmed SOURCE, and write it for `tracking3d run --camera`.
+
+    OpenCV's YAML is written: intrinsics, distortion, size, reprojection error and coverage.
+    """
+    from tracking3d.calibration.calibrate import calibrate
+    from tracking3d.calibration.camera_files import write_camera
+    from tracking3d.video import open_source
+
+    if model not in ("radtan", "fisheye"):
+        raise InputError(f"--model {model} is not known; give radtan or fisheye.")
+    board = _board(kind, squares, square)
+    if out.exists() and not overwrite:
+        raise OutputError(f"{out} is there already; give another --out, or --overwrite.")
+    if not out.absolute().parent.is_dir():
+        raise OutputError(f"{out} cannot be written: there is no folder {out.parent}; make it first.")
+    opened = open_source(source, frames)
+    if frames is None and opened.count is not None and opened.count > MOST_FRAMES:
+        opened = open_source(source, f"::{-(-opened.count // MOST_FRAMES)}")
+    elif opened.count is None and frames is None and not opened.repeatable:
+        raise InputError(f"{opened.name} goes on without an end; say by --frames how much of it is taken.")
+    found = calibrate(opened, board, "fisheye" if model == "fisheye" else "radtan", opened.name)
+    notes = {
+        "avg_reprojection_error": round(found.error, 4),
+        "views": len(found.errors),
+        "coverage": round(found.coverage, 3),
+    }
+    try:
+        write_camera(out, found.camera, notes)
+    except OSError as error:
+        raise OutputError(f"{out} cannot be written: {error.strerror}.") from error
+    if not quiet:
+        _print(found, out)
+
+
+def _board(kind: str, squares: str, square: float) -> Board:
+    from tracking3d.calibration.boards import Board, parse_squares
+
+    if kind not in ("charuco", "chessboard"):
+        raise InputError(f"--board {kind} is not known; give charuco or chessboard.")
+    columns, rows = parse_squares(squares)
+    return Board(columns, rows, "chessboard" if kind == "chessboard" else "charuco", square)
+
+
+def _print(found: Calibration, out: Path) -> None:
+    fx, fy, cx, cy = found.camera.intrinsics
+    give = "" if found.focal_deviation is None else f" (+- {found.focal_deviation:.2g})"
+    typer.echo(f"{out}: focal lengths {fx:.2f}, {fy:.2f}{give}, centre {cx:.2f}, {cy:.2f}")
+    typer.echo(
+        f"distortion ({found.camera.model}): " + ", ".join(f"{one:.5g}" for one in found.camera.coefficients)
+    )
+    worst = max(found.errors, key=lambda index: found.errors[index])
+    typer.echo(
+        f"{len(found.errors)} views, reprojection error {found.error:.3f} pixels (worst frame {worst}: "
+        f"{found.errors[worst]:.3f}), {100 * found.coverage:.0f} % of the picture covered"
+    )
+    for reason, count in Counter(found.left_out.values()).most_common():
+        which = [str(index) for index, why in found.left_out.items() if why == reason]
+        shown = ", ".join(which[:8]) + (" and more" if len(which) > 8 else "")
+        typer.echo(f"left out, {reason}: {count} frames ({shown})")

@@ -1,0 +1,200 @@
+"""Videos by their address: files on a web server, and streams that go on, over HTTP(S) and RTSP(S), through FFmpeg.
+
+A file (whose length the server tells) is read like one on disk; where the connection breaks off, it is taken up again
+where it was. A stream gives its newest frame, as a camera does; where it breaks off it is asked for again, a few times.
+Nothing but these protocols and the common video formats is followed, whatever an address leads to.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import ssl
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import count as counting
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import av
+import av.error
+from av.container import InputContainer
+from av.error import FFmpegError
+
+from tracking3d.errors import InputError
+from tracking3d.frames import Frame, SkippedFrame
+from tracking3d.video.deinterlacing import deinterlaced
+from tracking3d.video.latest_frames import newest
+from tracking3d.video.picture_conversion import PictureConverter
+from tracking3d.video.selection import EVERY_FRAME
+from tracking3d.video.source import Intrinsics, checked
+from tracking3d.video.video_decoding import decode_pictures
+from tracking3d.video.video_file import VideoFile, described, frame_of, video_stream
+
+SCHEMES = ("http", "https", "rtsp", "rtsps")
+"""Of the addresses that are opened."""
+OPENING, READING = 10.0, 10.0
+"""Seconds after which a server that says nothing is given up: at the beginning, and between two packets."""
+TRIES = 3
+"""How often a connection that was lost is asked for again, one after the other, before the video is over."""
+PAUSE = 1.0
+"""Seconds before the first of these; before each further one twice as long."""
+
+_PROTOCOLS = {
+    "http": "http,https,tcp,tls,httpproxy,crypto",
+    "https": "http,https,tcp,tls,httpproxy,crypto",
+    "rtsp": "rtsp,rtp,tcp,udp",
+    "rtsps": "rtsps,rtsp,rtp,tcp,udp,tls",
+}
+# Named, since FFmpeg also takes playlists of local files, lists of captions and pictures for videos.
+_FORMATS = (
+    "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,flv,mpegts,mpeg,mpegvideo,mpjpeg,mjpeg,hls,ogg,asf,m4v,h264,hevc,ivf,"
+    "nut,mxf,rtsp,sdp"
+)
+_SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
+_log = logging.getLogger(__name__)
+
+
+def scheme_of(name: str) -> str | None:
+    """The scheme of an address, in small letters; None of what is no address, such as a path."""
+    found = _SCHEME.match(name)
+    return found[1].lower() if found else None
+
+
+def without_password(address: str) -> str:
+    """An address without the user's name and password, as messages and records have it; a path as it is."""
+    if scheme_of(address) not in SCHEMES:
+        return address
+    scheme, slashes, rest = address.partition("//")
+    server, slash, path = rest.partition("/")
+    return "".join((scheme, slashes, server.rpartition("@")[2], slash, path))
+
+
+def open_stream(address: str, selection: range = EVERY_FRAME) -> NetworkFile | LiveStream:
+    """Open a video by its address.
+
+    Args:
+        address: Beginning with one of `SCHEMES`.
+        selection: Wanted frame indices.
+
+    Raises:
+        InputError: If there is no video to be had.
+    """
+    name, scheme = without_password(address), scheme_of(address)
+    try:
+        host = urlsplit(address).hostname
+    except ValueError:
+        host = None
+    if not host:
+        raise InputError(f"{name} names no server; write it as {scheme}://server/path.")
+    with _open(name, address) as container:
+        found = described(container, name, Path(address), selection)
+        if scheme in ("http", "https") and found.count is not None:
+            return NetworkFile(**vars(found), address=address)
+    return LiveStream(name, address, selection, found.fps, notes=found.notes)
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkFile(VideoFile):
+    """A file on a web server, read as often as it is gone through.
+
+    Attributes:
+        address: With what it takes to be let in.
+    """
+
+    address: str = ""
+
+    def container(self) -> InputContainer:
+        """See `VideoFile.container`."""
+        return _open(self.name, self.address)
+
+
+@dataclass(frozen=True, eq=False)
+class LiveStream:
+    """A stream that goes on; frames that come while the one before is still worked on are dropped.
+
+    See `tracking3d.video.source.FrameSource` for the attributes. Times are seconds since the first frame, as they came.
+    """
+
+    name: str
+    address: str
+    selection: range
+    fps: float | None
+    count: int | None = None
+    intrinsics: Intrinsics | None = None
+    intrinsics_origin: str = ""
+    repeatable: bool = False
+    notes: tuple[str, ...] = ()
+
+    def __iter__(self) -> Iterator[Frame | SkippedFrame]:
+        """Open the stream and give the newest frame whenever one is asked for, those dropped as `SkippedFrame`."""
+        return checked(newest(self._frames()), self.name)
+
+    def _frames(self) -> Iterator[Frame | SkippedFrame]:
+        indices, start, failed = counting(), None, 0
+        while True:
+            try:
+                for picture in self._pictures():
+                    index, now, failed = next(indices), time.monotonic(), 0
+                    if index >= self.selection.stop:
+                        return
+                    start = now if start is None else start
+                    if index not in self.selection:
+                        continue
+                    if isinstance(picture, str):
+                        yield SkippedFrame(index, f"frame {index}: {picture}")
+                    else:
+                        yield frame_of(index, picture[0], now - start, picture[1])
+                reason = "it ended"
+            except InputError as error:
+                if start is None:
+                    raise
+                reason = str(error)
+            failed += 1
+            if failed > TRIES:
+                _log.warning(
+                    "%s did not come back after %d tries; the run ends with what was seen.", self.name, TRIES
+                )
+                return
+            pause = PAUSE * 2 ** (failed - 1)
+            _log.warning(
+                "%s was lost (%s); trying again in %g s (%d of %d).", self.name, reason, pause, failed, TRIES
+            )
+            time.sleep(pause)
+
+    def _pictures(self) -> Iterator[tuple[av.VideoFrame, PictureConverter] | str]:
+        with _open(self.name, self.address) as container:
+            stream, convert = video_stream(container), PictureConverter()
+            if stream is None:
+                raise InputError(f"{self.name} has no video in it any more.")
+            for picture in deinterlaced(decode_pictures(container, stream)):
+                yield picture if isinstance(picture, str) else (picture, convert)
+
+
+def _open(name: str, address: str) -> InputContainer:
+    scheme = scheme_of(address) or ""
+    options = {"protocol_whitelist": _PROTOCOLS[scheme], "format_whitelist": _FORMATS}
+    if scheme.startswith("http"):
+        # What FFmpeg does by itself in the middle of a file, which it can go on with where it was.
+        options |= {
+            "reconnect": "1",
+            "reconnect_on_network_error": "0",
+            "reconnect_max_retries": str(TRIES),
+            "reconnect_delay_max": str(int(4 * PAUSE)),
+        }
+    else:
+        options |= {"rtsp_transport": "tcp"}
+    if scheme in ("https", "rtsps"):
+        options |= {"tls_verify": "1"}
+        if authorities := ssl.get_default_verify_paths().cafile:
+            options |= {"ca_file": authorities}
+    try:
+        return av.open(address, options=options, timeout=(OPENING, READING), metadata_errors="ignore")
+    except (FFmpegError, OSError, ValueError) as error:
+        late = isinstance(error, av.error.ExitError)  # what the time-out ends with
+        reason = "no answer" if late else getattr(error, "strerror", None) or error
+        raise InputError(
+            f"{name} cannot be opened ({reason}); look whether the address is right and the server answers within "
+            f"{OPENING:g} seconds."
+        ) from error
