@@ -105,7 +105,9 @@ def picture() -> str:
             x += width + gap
         y += ROOM_HEIGHT + GAP
     lines = [line(places[room], places[other]) for room, other in longest_ways(imports(rules))]
-    head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {y:g}" width="{WIDTH}" height="{y:g}">'
+    head = (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {y:g}" width="{WIDTH}" height="{y:g}">'
+    )
     title = "<title>The rooms of tracking3d by floor: lines lead down to what a room imports</title>"
     return "\n".join([head, title, f"<style>{STYLE}</style>", *lines, *drawn, "</svg>", ""])
 

@@ -32,7 +32,9 @@ def with_links(markdown: str, folder: str, repository: str | None) -> str:
         target = posixpath.normpath(posixpath.join(folder, link["target"]))
         if target.startswith("docs/"):
             return link[0]
-        return f"[{link['text']}]({repository.rstrip('/')}/blob/HEAD/{target})" if repository else link["text"]
+        return (
+            f"[{link['text']}]({repository.rstrip('/')}/blob/HEAD/{target})" if repository else link["text"]
+        )
 
     return _LINK.sub(rewritten, markdown)
 

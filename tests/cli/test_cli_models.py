@@ -95,7 +95,8 @@ def test_get_all_is_what_has_an_address_and_a_licence_for_everyone(call, catalog
 
 
 @pytest.mark.parametrize(
-    "arguments", [[], ["open", "--all"], ["--all", "--from", "fetched"], ["open", "closed", "--from", "fetched"]]
+    "arguments",
+    [[], ["open", "--all"], ["--all", "--from", "fetched"], ["open", "closed", "--from", "fetched"]],
 )
 def test_get_wants_names_or_all_and_one_name_for_a_file(refused, catalogue, arguments):
     assert "one or more NAMEs, or --all" in refused("models", "get", *arguments)

@@ -71,7 +71,9 @@ def test_links_out_of_the_documentation_lead_to_the_repository_or_nowhere(site):
 
 def test_what_belongs_to_an_item_is_indented_as_markdown_here_wants_it(site):
     four = hook(site, "page_text").with_four_spaces
-    assert four("1. Run:\n\n   ```console\n   $ a\n   ```\n") == "1. Run:\n\n    ```console\n    $ a\n    ```\n"
+    assert (
+        four("1. Run:\n\n   ```console\n   $ a\n   ```\n") == "1. Run:\n\n    ```console\n    $ a\n    ```\n"
+    )
     assert four("```text\n   a\n```\n") == "```text\n   a\n```\n"
 
 

@@ -91,7 +91,9 @@ def serve_and_note() -> Iterator[Callable[..., Served]]:
                 if start:
                     last = len(served.body) - 1
                     self.send_header("Content-Range", f"bytes {start}-{last}/{len(served.body)}")
-                self.send_header("Content-Length", str(len(body) if served.claimed is None else served.claimed))
+                self.send_header(
+                    "Content-Length", str(len(body) if served.claimed is None else served.claimed)
+                )
                 self.end_headers()
                 with suppress(ConnectionError):  # who has enough hangs up
                     self.wfile.write(body[:most])

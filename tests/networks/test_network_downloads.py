@@ -133,7 +133,9 @@ def test_a_server_without_ranges_is_asked_for_everything_again(cache, network, s
     assert sum(told) == len(BYTES)
 
 
-@pytest.mark.parametrize("kept", [b"other bytes" * 1000, BYTES[:-1] + b"!", BYTES * 2], ids=["part", "all", "more"])
+@pytest.mark.parametrize(
+    "kept", [b"other bytes" * 1000, BYTES[:-1] + b"!", BYTES * 2], ids=["part", "all", "more"]
+)
 def test_what_was_kept_of_other_bytes_is_thrown_away(cache, network, serve_and_note, kept):
     served = serve_and_note(ranges=True)
     net = network(address=served.address)

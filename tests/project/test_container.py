@@ -105,8 +105,20 @@ def test_every_step_is_one_that_is_tried_here():
 def test_the_step_that_removes_what_no_run_needs_leaves_the_rest(tmp_path):
     [command] = [rest for rest in of_kind(BUILD, "RUN") if rest.startswith("cd ")]
     packages = tmp_path / "site-packages"
-    keep = ["torch/__init__.py", "torch/testing/a.py", "torch/bin/torch_shm_manager", "torch/lib/libc10.so", "a/b.py"]
-    gone = ["torch/include/a.h", "torch/test/a", "torch/bin/protoc", "numpy/tests/a.py", "scipy/linalg/tests/a.py"]
+    keep = [
+        "torch/__init__.py",
+        "torch/testing/a.py",
+        "torch/bin/torch_shm_manager",
+        "torch/lib/libc10.so",
+        "a/b.py",
+    ]
+    gone = [
+        "torch/include/a.h",
+        "torch/test/a",
+        "torch/bin/protoc",
+        "numpy/tests/a.py",
+        "scipy/linalg/tests/a.py",
+    ]
     for name in keep + gone:
         (packages / name).parent.mkdir(parents=True, exist_ok=True)
         (packages / name).touch()
@@ -152,7 +164,9 @@ def test_what_the_image_holds_is_under_one_and_a_half_gigabytes():
         if name in sizes:
             continue
         distribution = metadata.distribution(name)
-        files = [file for file in distribution.files or [] if file.suffix != ".pyc" and not removed(file.parts)]
+        files = [
+            file for file in distribution.files or [] if file.suffix != ".pyc" and not removed(file.parts)
+        ]
         paths = [Path(distribution.locate_file(file)) for file in files]
         sizes[name] = sum(path.stat().st_size for path in paths if path.is_file())
         for text in distribution.requires or []:

@@ -61,7 +61,8 @@ def get(
     everything: Annotated[
         bool,
         typer.Option(
-            "--all", help="All that can be fetched; those under a non-commercial licence with --accept-licence."
+            "--all",
+            help="All that can be fetched; those under a non-commercial licence with --accept-licence.",
         ),
     ] = False,
     file: Annotated[
@@ -71,7 +72,8 @@ def get(
     mirror: Annotated[
         str | None,
         typer.Option(
-            envvar="TRACKING3D_MIRROR", help="Address of a folder that has NAME.onnx; tried before the known ones."
+            envvar="TRACKING3D_MIRROR",
+            help="Address of a folder that has NAME.onnx; tried before the known ones.",
         ),
     ] = None,
     accept_licence: Annotated[

@@ -29,7 +29,9 @@ class KnownNetwork(Section):
         pattern="^https?://",
         description="Address of the very file; none where that is not known for sure.",
     )
-    mirrors: tuple[str, ...] = Field((), description="Other addresses of the same bytes, in the order to try them.")
+    mirrors: tuple[str, ...] = Field(
+        (), description="Other addresses of the same bytes, in the order to try them."
+    )
     size: int | None = Field(None, gt=0, description="Bytes.")
     sha256: str | None = Field(None, pattern="^[0-9a-f]{64}$")
     non_commercial: bool = Field(False, description="Whether its licence forbids commercial use.")
