@@ -44,7 +44,7 @@ CONTAINERS = {b"ftyp": 4, b"\x1a\x45\xdf\xa3": 0, b"AVI ": 8}
 """MP4 and MOV, Matroska and WebM, AVI, and where that stands. Others, such as play lists, could name files of ours."""
 
 
-def service(limits: Limits = Limits()) -> FastAPI:  # noqa: B008 (frozen)
+def service(limits: Limits = Limits()) -> FastAPI:
     """The application."""
     app = FastAPI(title="tracking3d", version=tracking3d.__version__)
     one_at_a_time = threading.Semaphore(1)

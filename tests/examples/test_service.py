@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,13 +11,14 @@ import pytest
 pytest.importorskip("fastapi", reason="the extra `service` is not installed")
 pytest.importorskip("httpx", reason="the extra `service` is not installed")
 
-from example_modules import example  # noqa: E402
-from fastapi import HTTPException  # noqa: E402
-from fastapi.testclient import TestClient  # noqa: E402
+import anyio
+import httpx
+from example_modules import example
+from fastapi import HTTPException
 
-from tracking3d.estimation.estimate import FrameEstimate, Status  # noqa: E402
-from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize  # noqa: E402
-from tracking3d.video import VideoWriter  # noqa: E402
+from tracking3d.estimation.estimate import FrameEstimate, Status
+from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
+from tracking3d.video import VideoWriter
 
 service = example("service/app")
 URL = "/track?box=20,15,30,25"
@@ -62,8 +63,29 @@ def at_once(monkeypatch) -> None:
     monkeypatch.setattr(service.tracking3d, "track", track)
 
 
-def client(**limits) -> TestClient:
-    return TestClient(service.service(service.Limits(**limits)))
+class Client:
+    """Asks an application in this process, as a browser would."""
+
+    def __init__(self, app: Any) -> None:
+        self._app = app
+
+    def get(self, url: str) -> httpx.Response:
+        return self._ask("GET", url)
+
+    def post(self, url: str, content: bytes) -> httpx.Response:
+        return self._ask("POST", url, content=content)
+
+    def _ask(self, method: str, url: str, **given: Any) -> httpx.Response:
+        async def ask() -> httpx.Response:
+            transport = httpx.ASGITransport(app=self._app)
+            async with httpx.AsyncClient(transport=transport, base_url="http://service") as client:
+                return await client.request(method, url, **given)
+
+        return anyio.run(ask)
+
+
+def client(**limits: Any) -> Client:
+    return Client(service.service(service.Limits(**limits)))
 
 
 def test_every_frame_has_a_pose_and_the_better_answer(video, at_once):

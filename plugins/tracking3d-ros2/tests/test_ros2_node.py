@@ -20,8 +20,8 @@ from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 
 pytest.importorskip("tracking3d_ros2", reason="the plug-in tracking3d-ros2 is not installed")
 
-from tracking3d_ros2.node import TrackingNode, main  # noqa: E402
-from tracking3d_ros2.tracking import CHANNELS, ObjectTracking, rgb_of  # noqa: E402
+from tracking3d_ros2.node import TrackingNode, main
+from tracking3d_ros2.tracking import CHANNELS, ObjectTracking, rgb_of
 
 ROOT = Path(__file__).resolve().parents[1]
 P = [400.0, 0, 31.5, 0, 0, 410.0, 23.5, 0, 0, 0, 1, 0]
