@@ -138,7 +138,7 @@ def test_entries_are_frozen(network):
 def test_the_documentation_names_every_network_and_its_licence():
     page = (Path(__file__).resolve().parents[2] / "docs/models.md").read_text(encoding="utf-8")
     for name, network in known_networks().items():
-        [row] = [line for line in page.splitlines() if line.startswith("|") and f"`{name}`" in line]
+        [row, *_] = [line for line in page.splitlines() if line.startswith("|") and f"`{name}`" in line]
         assert network.licence.replace("page", "pages") in row or network.licence in row, name
         assert ("non-commercial" in row) == network.non_commercial, name
         assert ("export it" in row) == (network.address is None), name
