@@ -3,7 +3,7 @@
 The picture of the README is of a synthetic bottle that turns once around; its box is that of clip/masks/000000.png.
 
 $ tracking3d synth clip --object bottle --motion turntable --degrees 6 --frames 60 --size 400,300 --seed 5
-$ tracking3d run clip/frames --box BOX --out run
+$ tracking3d run clip/frames --box BOX --tracker flow --out run
 $ python docs/images/moving_picture.py run
 """
 
