@@ -1,8 +1,9 @@
 # make demo: track an object in a synthetic clip with known truth, into demo/
 # make test: linter, formatter, type checker and all tests
+# make docs: the documentation as a site, into build/site
 # make clean: remove everything that can be made again
 #
-# Both make their environment in .venv when it is needed. Another Python: make test PYTHON=python3.12
+# All make their environment in .venv when it is needed. Another Python: make test PYTHON=python3.12
 
 PYTHON ?= python3
 VENV := .venv
@@ -10,7 +11,7 @@ BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 TESTS := OPENBLAS_NUM_THREADS=1 $(BIN)/pytest tests plugins -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test clean
+.PHONY: demo test docs clean
 
 demo: $(VENV)/installed
 	$(BIN)/tracking3d demo --out demo
@@ -24,6 +25,11 @@ test: $(VENV)/installed-dev
 	echo "$(BIN)/mypy &"; $(BIN)/mypy >"$$said" 2>&1 & types=$$!; \
 	echo "$(TESTS)"; $(TESTS); tests=$$?; \
 	wait $$types; types=$$?; cat "$$said"; exit $$((tests || types))
+
+# Broken links are errors.
+docs: $(VENV)/installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+	@echo "Open build/site/index.html, or, for the search: $(BIN)/python -m http.server -d build/site"
 
 clean:
 	rm -rf $(VENV) demo build *.egg-info plugins/*/build plugins/*/*.egg-info
@@ -41,4 +47,8 @@ $(VENV)/installed: pyproject.toml constraints.txt
 
 $(VENV)/installed-dev: $(VENV)/installed $(wildcard plugins/*/pyproject.toml)
 	$(INSTALL) -e '.[dev]' $(patsubst %/pyproject.toml,-e ./%,$(wildcard plugins/*/pyproject.toml))
+	@touch $@
+
+$(VENV)/installed-docs: $(VENV)/installed
+	$(INSTALL) -e '.[docs]'
 	@touch $@

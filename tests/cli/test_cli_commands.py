@@ -294,6 +294,10 @@ def test_demo_writes_clip_run_and_summary(call, script, monkeypatch):
     assert all(name in result.stdout for name in names)
     assert Path("shown/run/run.json").exists()
     assert Path("shown/clip/poses.json").exists()
+    *_, opened, next_step = result.stdout.splitlines()
+    assert opened.startswith(f"Open {Path('shown/run/report.html')} in a browser")
+    assert Path("shown/run/report.html").is_file()
+    assert "tracking3d run VIDEO --box" in next_step
     config, prompt = script.built[-1]
     assert (config.tracker.name, config.features.name, config.runtime.seed) == ("csrt", "rgb", 3)
     assert prompt.mask is None

@@ -80,6 +80,34 @@ def test_get_asks_for_the_licence_to_be_accepted(call, refused, catalogue):
     assert call("models", "get", "closed", "--from", "fetched", "--accept-licence").exit_code == 0
 
 
+def test_get_takes_several_and_goes_on_after_one_that_fails(call, catalogue):
+    (catalogue / "closed.onnx").parent.mkdir(parents=True)
+    (catalogue / "closed.onnx").write_bytes(BYTES)
+    result = call("models", "get", "open", "closed")
+    assert result.exit_code == 2
+    assert result.stdout == f"{catalogue / 'closed.onnx'}: closed, mine\n"
+    assert "open could not be fetched" in result.stderr
+
+
+def test_get_all_is_what_has_an_address_and_a_licence_for_everyone(call, catalogue):
+    call("models", "get", "open", "--from", "fetched")
+    assert call("models", "get", "--all").stdout == f"{catalogue / 'open.onnx'}: open, MIT\n"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [[], ["open", "--all"], ["--all", "--from", "fetched"], ["open", "closed", "--from", "fetched"]],
+)
+def test_get_wants_names_or_all_and_one_name_for_a_file(refused, catalogue, arguments):
+    assert "one or more NAMEs, or --all" in refused("models", "get", *arguments)
+
+
+def test_get_asks_the_mirror_that_is_named(refused, catalogue, monkeypatch):
+    monkeypatch.setenv("TRACKING3D_MIRROR", "http://mirror.invalid/networks")
+    assert "http://mirror.invalid/networks/open.onnx" in refused("models", "get", "open")
+    assert "ftp://x is no address" in refused("models", "get", "open", "--mirror", "ftp://x")
+
+
 def test_get_says_how_to_come_by_what_it_cannot_fetch(refused, catalogue):
     assert "ask (https://example.org)" in refused("models", "get", "closed", "--accept-licence")
 

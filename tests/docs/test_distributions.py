@@ -76,12 +76,17 @@ def test_the_source_distribution_holds_the_project(sdist_names):
         "README.md",
         "CHANGELOG.md",
         "CITATION.cff",
+        "CONTRIBUTING.md",
+        "Dockerfile",
         "LICENSE",
         "Makefile",
+        "SECURITY.md",
         "constraints.txt",
+        "mkdocs.yml",
         "setup.py",
     }
-    folders = [files_of(name) for name in ("docs", "configs", "tests", "plugins", "training", "tracking3d")]
+    names = ("docs", "conda", "configs", "examples", "tests", "plugins", "training", "tracking3d")
+    folders = [files_of(name) for name in names]
     assert sorted(single.union(*folders) - sdist_names) == []
     assert [name for name in sdist_names if "__pycache__" in name or name.endswith(".pyc")] == []
 

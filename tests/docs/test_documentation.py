@@ -49,8 +49,9 @@ def test_the_readme_shows_a_picture_before_anything_is_installed():
 
 def test_every_page_is_in_the_index():
     index = (ROOT / "docs/index.md").read_text(encoding="utf-8")
-    for page in ROOT.glob("docs/*.md"):
-        assert page.name == "index.md" or f"({page.name})" in index
+    for page in ROOT.glob("docs/**/*.md"):
+        name = page.relative_to(ROOT / "docs").as_posix()
+        assert name == "index.md" or f"({name})" in index
 
 
 @pytest.mark.parametrize("page", PAGES, ids=label)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from documentation_pages import ROOT, blocks, label, pages_with
+from documentation_pages import HOW_TO, ROOT, blocks, label, pages_with
 from scipy.spatial.transform import Rotation
 
 from tracking3d.config.loading import load_config
@@ -19,7 +19,7 @@ from tracking3d.synthesis.convex_clips import SyntheticClip
 from tracking3d.trackers.protocol import MaskTracker
 
 
-@pytest.mark.parametrize("page", pages_with("python"), ids=label)
+@pytest.mark.parametrize("page", [page for page in pages_with("python") if page not in HOW_TO], ids=label)
 def test_python_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     program: dict = {"__name__": "documented"}

@@ -5,13 +5,16 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from tracking3d.datasets.pose_files import read_matrix_lines
-from tracking3d.export.exported_run import ExportedRun, longest_side
+from tracking3d.estimation.estimate import ObjectModel
+from tracking3d.export.exported_run import ExportedRun, longest_side, seen_side
 from tracking3d.export.exporter import ExportOptions
 from tracking3d.results.run_reader import RunReader
 
@@ -137,3 +140,18 @@ def test_a_rate_is_the_one_of_the_source_where_frames_were_selected(run, tmp_pat
     assert list(exported.span) == [0, 2, 4, 6]
     file.write_text(json.dumps(described | {"fps": None}))
     assert ExportedRun(RunReader(file.parent), ExportOptions()).fps == 30
+
+
+def test_only_what_the_video_has_shown_is_measured():
+    ball = trimesh.creation.icosphere(3)
+    seen = ball.vertices[:, 2] < 0.3  # the camera looks along z
+    deep = ball.vertices * np.where(seen, 1, 4)[:, None]  # a guess
+    uvs = np.stack([np.where(seen, 0.25, 0.75), np.full(len(seen), 0.5)], axis=-1)[ball.faces]
+    texture = np.zeros((8, 8, 3))
+    weight = np.zeros((8, 8), np.float32)
+    weight[:, :4] = 1
+    model = ObjectModel(deep, ball.faces, uvs, texture.astype(np.uint8), weight, texture)
+    assert longest_side(deep) > 4
+    assert seen_side(model) == pytest.approx(2, rel=0.02)
+    hardly = replace(model, texture_weight=np.zeros_like(weight))
+    assert seen_side(hardly) == longest_side(deep)

@@ -23,11 +23,13 @@ def test_every_network_says_what_it_is_for_and_under_which_licence():
 def test_what_can_be_fetched_comes_from_a_fixed_place_and_is_checked():
     for network in known_networks().values():
         if network.address:
-            assert network.address.startswith("https://")
             assert network.sha256 and network.size
-            assert not any(branch in network.address for branch in ("/main/", "/master/")), (
-                "a branch moves, so its bytes would change"
-            )
+            for address in network.addresses:
+                assert address.startswith("https://")
+                assert not any(branch in address for branch in ("/main/", "/master/")), (
+                    "a branch moves, so its bytes would change"
+                )
+            assert len(set(network.addresses)) == len(network.addresses)
         else:
             assert network.how
 
@@ -53,6 +55,7 @@ def test_the_catalogue_knows_the_development_files(shared_models: Path):
             "needs a size and a sha256",
         ),
         ("{purpose: p, licence: MIT, authors: 'https://a', how: h, sha256: abc}", "sha256"),
+        ("{purpose: p, licence: MIT, authors: 'https://a', how: h, mirrors: ['https://b']}", "mirrors"),
         ("{purpose: p, licence: MIT, authors: 'https://a', how: h, adress: x}", "did you mean 'address'"),
         ("{licence: MIT, authors: 'https://a', how: h}", "'purpose' is missing"),
         ("7", "net"),
@@ -135,7 +138,7 @@ def test_entries_are_frozen(network):
 def test_the_documentation_names_every_network_and_its_licence():
     page = (Path(__file__).resolve().parents[2] / "docs/models.md").read_text(encoding="utf-8")
     for name, network in known_networks().items():
-        [row] = [line for line in page.splitlines() if line.startswith("|") and f"`{name}`" in line]
+        [row, *_] = [line for line in page.splitlines() if line.startswith("|") and f"`{name}`" in line]
         assert network.licence.replace("page", "pages") in row or network.licence in row, name
         assert ("non-commercial" in row) == network.non_commercial, name
         assert ("export it" in row) == (network.address is None), name

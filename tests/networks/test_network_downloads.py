@@ -65,9 +65,14 @@ def test_a_page_that_is_not_there_is_told_with_its_number(cache, network, serve)
     refused(cache, InputError, r"404 Not Found", fetch, network(address=serve(b"gone", status=404)))
 
 
-def test_a_body_that_breaks_off_is_refused(cache, network, serve):
-    address = serve(BYTES[:1000], claimed=len(BYTES))
-    refused(cache, InputError, r"broke off|IncompleteRead", fetch, network(address=address))
+def test_a_body_that_breaks_off_is_refused_and_what_came_is_kept_beside_the_place(cache, network, serve):
+    net = network(address=serve(BYTES[:1000], claimed=len(BYTES)))
+    with pytest.raises(InputError, match=f"broke off after 1000 of {len(BYTES)} bytes"):
+        fetch(net)
+    assert not network_path(net).exists()
+    [kept] = files_in(cache)
+    assert kept == f"models/.tiny-net.onnx.{net.sha256[:12]}.part"
+    assert (cache / kept).read_bytes() == BYTES[:1000]
 
 
 def test_a_body_that_is_too_long_is_not_read_to_its_end(cache, network, serve):
@@ -92,13 +97,132 @@ def test_a_host_that_does_not_exist_is_told(cache, network):
     )
 
 
-def test_ctrl_c_leaves_nothing(cache, network, serve):
+def test_after_ctrl_c_the_next_one_asks_for_the_rest_only(cache, network, serve_and_note):
+    served = serve_and_note(ranges=True)
+    net = network(address=served.address)
+
     def interrupt(count: int) -> None:
-        raise KeyboardInterrupt
+        if count:
+            raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        fetch(network(address=serve()), listener=interrupt)
-    assert files_in(cache) == []
+        fetch(net, listener=interrupt)
+    [kept] = files_in(cache)
+    arrived = (cache / kept).stat().st_size
+    assert 0 < arrived < len(BYTES)
+    told: list[int] = []
+    assert fetch(net, listener=told.append).read_bytes() == BYTES
+    assert [wanted for _, wanted in served.asked] == ["", f"bytes={arrived}-"]
+    assert (told[0], sum(told)) == (arrived, len(BYTES))
+    assert files_in(cache) == ["models/tiny-net.onnx"]
+
+
+def test_a_connection_that_breaks_again_and_again_is_taken_up_where_it_broke(cache, network, serve_and_note):
+    served = serve_and_note(ranges=True, breaks=[300_000, 400_000, None])
+    told: list[int] = []
+    assert fetch(network(address=served.address), listener=told.append).read_bytes() == BYTES
+    assert [wanted for _, wanted in served.asked] == ["", "bytes=300000-", "bytes=700000-"]
+    assert sum(told) == len(BYTES)
+
+
+def test_a_server_without_ranges_is_asked_for_everything_again(cache, network, serve_and_note):
+    served = serve_and_note(breaks=[300_000, None])
+    told: list[int] = []
+    assert fetch(network(address=served.address), listener=told.append).read_bytes() == BYTES
+    assert len(served.asked) == 2
+    assert sum(told) == len(BYTES)
+
+
+@pytest.mark.parametrize(
+    "kept", [b"other bytes" * 1000, BYTES[:-1] + b"!", BYTES * 2], ids=["part", "all", "more"]
+)
+def test_what_was_kept_of_other_bytes_is_thrown_away(cache, network, serve_and_note, kept):
+    served = serve_and_note(ranges=True)
+    net = network(address=served.address)
+    part = cache / f"models/.tiny-net.onnx.{net.sha256[:12]}.part"
+    part.parent.mkdir(parents=True)
+    part.write_bytes(kept)
+    told: list[int] = []
+    assert fetch(net, listener=told.append).read_bytes() == BYTES
+    assert sum(told) == len(BYTES)
+    assert files_in(cache) == ["models/tiny-net.onnx"]
+
+
+def test_a_server_whose_file_is_shorter_than_what_was_kept_is_asked_anew(cache, network, serve_and_note):
+    served = serve_and_note(ranges=True, body=BYTES[:1000])
+    net = network(address=served.address)
+    part = cache / f"models/.tiny-net.onnx.{net.sha256[:12]}.part"
+    part.parent.mkdir(parents=True)
+    part.write_bytes(BYTES[:2000])
+    with pytest.raises(InputError, match="broke off after 1000"):
+        fetch(net)
+
+
+def test_mirrors_are_tried_in_order_until_one_has_the_known_bytes(cache, network, serve, serve_and_note):
+    absent, wrong = serve(b"gone", status=404), serve(b"!" * len(BYTES))
+    good, unasked = serve_and_note(), serve_and_note()
+    net = network(address=absent, mirrors=[wrong, good.address, unasked.address])
+    assert fetch(net).read_bytes() == BYTES
+    assert (len(good.asked), len(unasked.asked)) == (1, 0)
+
+
+def test_a_mirror_goes_on_with_what_the_first_address_gave(cache, network, serve_and_note):
+    first, second = serve_and_note(ranges=True, breaks=[500_000, 0]), serve_and_note(ranges=True)
+    assert fetch(network(address=first.address, mirrors=[second.address])).read_bytes() == BYTES
+    assert [wanted for _, wanted in second.asked] == ["bytes=500000-"]
+
+
+def test_where_no_mirror_helps_every_reason_is_told(cache, network, serve):
+    addresses = serve(b"gone", status=404), serve(b"!" * len(BYTES))
+    net = network(address=addresses[0], mirrors=addresses[1:])
+    told = refused(cache, InputError, "404 Not Found", fetch, net)
+    assert all(address in told for address in addresses)
+    assert "SHA-256" in told
+
+
+def test_a_mirror_of_ones_own_is_tried_first(cache, network, serve_and_note):
+    served, own = serve_and_note(), serve_and_note()
+    folder = own.address.removesuffix("/tiny-net.onnx") + "/networks/"
+    fetch(network(address=served.address), mirror=folder)
+    assert (served.asked, own.asked) == ([], [("/networks/tiny-net.onnx", "")])
+    exported = network(address=None, how="export net.pth")
+    assert fetch(exported, mirror=folder).read_bytes() == BYTES
+
+
+def test_a_mirror_of_ones_own_is_checked_like_any_other(cache, network, serve):
+    folder = serve(b"!" * len(BYTES)).rpartition("/")[0]
+    unknown = network(address=None, sha256=None, size=None, how="export net.pth")
+    exported = network(address=None, how="export net.pth")
+    refused(cache, InputError, "SHA-256 is", fetch, exported, mirror=folder)
+    refused(cache, InputError, "SHA-256 is not known", fetch, unknown, mirror=folder)
+    for wrong in ("ftp://mirror", "/etc", "file:///etc"):
+        refused(cache, InputError, "is no address", fetch, network(), mirror=wrong)
+
+
+def test_a_proxy_of_the_environment_is_asked_instead(cache, network, serve_and_note, monkeypatch):
+    proxy = serve_and_note()
+    monkeypatch.setenv("http_proxy", proxy.address.removesuffix("/tiny-net.onnx"))
+    address = "http://nowhere.invalid/tiny-net.onnx"
+    assert fetch(network(address=address)).read_bytes() == BYTES
+    assert proxy.asked == [(address, "")]
+
+
+def test_hosts_without_a_proxy_are_asked_directly(cache, network, serve_and_note, monkeypatch):
+    proxy, served = serve_and_note(), serve_and_note()
+    monkeypatch.setenv("http_proxy", proxy.address.removesuffix("/tiny-net.onnx"))
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+    fetch(network(address=served.address))
+    assert (len(served.asked), len(proxy.asked)) == (1, 0)
+
+
+def test_https_goes_through_a_tunnel_of_the_proxy_and_its_refusal_is_told(
+    cache, network, serve_and_note, monkeypatch
+):
+    proxy = serve_and_note()
+    monkeypatch.setenv("https_proxy", proxy.address.removesuffix("/tiny-net.onnx"))
+    secure = network(address="https://nowhere.invalid/tiny-net.onnx")
+    refused(cache, InputError, "Tunnel connection failed: 403", fetch, secure)
+    assert proxy.asked == [("nowhere.invalid:443", "CONNECT")]
 
 
 @pytest.mark.skipif(os.name == "nt" or os.geteuid() == 0, reason="the superuser may write everywhere")
@@ -125,8 +249,8 @@ def test_a_full_disk_is_told_and_leaves_nothing(cache, network, serve, monkeypat
         def write(self, chunk):
             raise OSError(28, "No space left on device")
 
-    copy = download._copy
-    monkeypatch.setattr(download, "_copy", lambda source, part, *rest: copy(source, Full(part), *rest))
+    write = download._write
+    monkeypatch.setattr(download, "_write", lambda part, chunk: write(Full(part), chunk))
     refused(cache, OutputError, "No space left", fetch, network(address=serve()))
 
 

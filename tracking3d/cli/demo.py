@@ -31,6 +31,7 @@ def demo(
     from tracking3d.evaluation.score import score_run
     from tracking3d.recording import record
     from tracking3d.results.files import write_atomic
+    from tracking3d.results.layout import REPORT
     from tracking3d.synthesis.convex_clips import make_demo_clip
     from tracking3d.video import open_source
 
@@ -54,3 +55,7 @@ def demo(
     if not quiet:
         print_summary(folder)
         print_figures(str(out / "summary.json"), summary)
+        typer.echo(
+            f"Open {folder / REPORT} in a browser: the frames, the model to turn, and what to doubt.\n"
+            "Your own video: tracking3d pick VIDEO, or tracking3d run VIDEO --box X,Y,WIDTH,HEIGHT --out runs/mine"
+        )

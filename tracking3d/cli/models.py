@@ -55,10 +55,26 @@ def list_networks(as_json: AsJson = False, debug: Debug = False) -> None:
 
 @app.command()
 def get(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="A name that `models list` shows.")],
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="NAME...", help="Names that `models list` shows.")
+    ] = None,
+    everything: Annotated[
+        bool,
+        typer.Option(
+            "--all",
+            help="All that can be fetched; those under a non-commercial licence with --accept-licence.",
+        ),
+    ] = False,
     file: Annotated[
         Path | None,
         typer.Option("--from", metavar="FILE", help="Take this file, fetched elsewhere, instead."),
+    ] = None,
+    mirror: Annotated[
+        str | None,
+        typer.Option(
+            envvar="TRACKING3D_MIRROR",
+            help="Address of a folder that has NAME.onnx; tried before the known ones.",
+        ),
     ] = None,
     accept_licence: Annotated[
         bool, typer.Option("--accept-licence", help="Accept a licence that forbids commercial use.")
@@ -66,21 +82,38 @@ def get(
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Fetch a network into your cache; what is not the known file, by its SHA-256, is refused."""
+    """Fetch networks into your cache; what is not the known file, by its SHA-256, is refused.
+
+    A download that was stopped goes on where it was. Proxies are taken from https_proxy and http_proxy.
+    """
+    from tracking3d.networks.catalogue import known_networks
     from tracking3d.networks.download import adopt, fetch
     from tracking3d.networks.store import State, find_known, network_path, state_of
 
-    network = find_known(name)
-    if file is not None:
-        path = adopt(network, file, accept_licence=accept_licence)
-    elif state_of(network) in (State.OK, State.UNCHECKED):
-        path = network_path(network)
-    else:
-        with _progress(network, quiet) as listener:
-            path = fetch(network, accept_licence=accept_licence, listener=listener)
-    if not quiet:
-        checked = "" if network.sha256 else ", whose SHA-256 is not known and was not checked"
-        typer.echo(f"{path}: {network.name}, {network.licence}{checked}")
+    if bool(names) == everything or (file is not None and len(names or ()) != 1):
+        raise InputError("Say which network: one or more NAMEs, or --all; with --from FILE exactly one NAME.")
+    chosen = [find_known(name) for name in names or ()]
+    if everything:
+        fetchable = [network for network in known_networks().values() if network.addresses]
+        chosen = [network for network in fetchable if accept_licence or not network.non_commercial]
+    failed: list[str] = []
+    for network in chosen:
+        try:
+            if file is not None:
+                path = adopt(network, file, accept_licence=accept_licence)
+            elif state_of(network) in (State.OK, State.UNCHECKED):
+                path = network_path(network)
+            else:
+                with _progress(network, quiet) as listener:
+                    path = fetch(network, accept_licence=accept_licence, listener=listener, mirror=mirror)
+        except InputError as error:
+            failed.append(str(error))
+            continue
+        if not quiet:
+            checked = "" if network.sha256 else ", whose SHA-256 is not known and was not checked"
+            typer.echo(f"{path}: {network.name}, {network.licence}{checked}")
+    if failed:
+        raise InputError(" ".join(failed))
 
 
 @app.command()

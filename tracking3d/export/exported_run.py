@@ -28,6 +28,9 @@ FRAMES_PER_SECOND = 30.0
 ARBITRARY = "arbitrary"
 """What the unit of a run is called whose object nobody measured."""
 
+_HARDLY_SEEN = 0.1
+"""Share of the faces below which nothing can be said about an object's length from those that were seen."""
+
 
 @dataclass(frozen=True, eq=False)
 class PosedFrame:
@@ -159,7 +162,7 @@ class ExportedRun:
         """
         if self.options.object_size is None:
             return 1.0
-        return self.options.object_size / longest_side(load_model(self.reader.mesh_folder).vertices)
+        return self.options.object_size / seen_side(load_model(self.reader.mesh_folder))
 
     @property
     def unit(self) -> str:
@@ -210,6 +213,22 @@ class ExportedRun:
         scaled = T_cam_obj.copy()
         scaled[:3, 3] *= self.scale
         return scaled
+
+
+def seen_side(model: ObjectModel) -> float:
+    """The longest side of what the video has shown of an object; what it has not is a guess, and often too deep.
+
+    Of an object that was hardly seen it is that of the whole mesh.
+
+    Raises:
+        InputError: If that has no extent.
+    """
+    height, width = model.texture_weight.shape
+    columns = (model.face_uvs[..., 0] * width).astype(int) % width
+    rows = (model.face_uvs[..., 1] * height).astype(int).clip(0, height - 1)
+    seen = (model.texture_weight[rows, columns] > 0).all(axis=1)
+    hardly = seen.mean() < _HARDLY_SEEN
+    return longest_side(model.vertices if hardly else model.vertices[np.unique(model.faces[seen])])
 
 
 def longest_side(vertices: NDArray[np.float64]) -> float:

@@ -29,6 +29,9 @@ class KnownNetwork(Section):
         pattern="^https?://",
         description="Address of the very file; none where that is not known for sure.",
     )
+    mirrors: tuple[str, ...] = Field(
+        (), description="Other addresses of the same bytes, in the order to try them."
+    )
     size: int | None = Field(None, gt=0, description="Bytes.")
     sha256: str | None = Field(None, pattern="^[0-9a-f]{64}$")
     non_commercial: bool = Field(False, description="Whether its licence forbids commercial use.")
@@ -38,9 +41,18 @@ class KnownNetwork(Section):
     def _fetched_or_explained(self) -> KnownNetwork:
         if self.address is not None and (self.sha256 is None or self.size is None):
             raise ValueError("an address needs a size and a sha256, for what is fetched is checked")
+        if self.address is None and self.mirrors:
+            raise ValueError("mirrors are further addresses; give the first one as address")
+        if any(not mirror.startswith(("http://", "https://")) for mirror in self.mirrors):
+            raise ValueError("mirrors begin with http:// or https://")
         if self.address is None and not self.how:
             raise ValueError("without an address it must say how to come by the file")
         return self
+
+    @property
+    def addresses(self) -> tuple[str, ...]:
+        """Where it can be fetched, in the order to try."""
+        return () if self.address is None else (self.address, *self.mirrors)
 
     @property
     def file(self) -> str:

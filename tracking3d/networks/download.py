@@ -1,17 +1,15 @@
-"""Known networks into the cache: from their address, or from a file that was fetched elsewhere.
+"""Known networks into the cache: from their address or a mirror, or from a file that was fetched elsewhere.
 
 What arrives is written beside its place, compared with the catalogue's SHA-256 and only then renamed into place:
-whatever goes wrong, nothing half or wrong is left. Files are never unpickled, and nothing in them is run.
+whatever goes wrong, nothing half or wrong is left in it. A download that was stopped is gone on with by the next one.
+Files are never unpickled, and nothing in them is run.
 """
 
 from __future__ import annotations
 
-import http.client
 import os
-import urllib.error
-import urllib.request
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from io import BufferedRandom
 from pathlib import Path
 from typing import IO
@@ -20,52 +18,94 @@ from tracking3d.errors import InputError, OutputError
 from tracking3d.networks.catalogue import KnownNetwork
 from tracking3d.networks.session import Network
 from tracking3d.networks.store import VARIABLE, network_path, sha256_of
-
-Listener = Callable[[int], None]
-"""Is told how many bytes have arrived since the last call."""
+from tracking3d.networks.transfer import Listener, TransferError, transfer
 
 _CHUNK = 1 << 18
-_PATIENCE = 30.0
-"""Seconds without a byte after which the other side counts as silent."""
 
 
 def fetch(
-    network: KnownNetwork, *, accept_licence: bool = False, listener: Listener = lambda count: None
+    network: KnownNetwork,
+    *,
+    accept_licence: bool = False,
+    listener: Listener = lambda count: None,
+    mirror: str | None = None,
 ) -> Path:
     """Download a known network into the cache, replacing what is there.
+
+    Its addresses are tried in order until one gives the known bytes. What had arrived of a download that was stopped
+    is not asked for again.
 
     Args:
         network: The network.
         accept_licence: Whether the user accepts a licence that forbids commercial use.
         listener: Is told of the bytes as they arrive.
+        mirror: Address of a folder that has it as ``NAME.onnx``; tried before all others.
 
     Returns:
         The file in the cache.
 
     Raises:
-        InputError: If its licence is not accepted, its address is not known or cannot be reached, or other bytes
+        InputError: If its licence is not accepted, no address of it is known or can be reached, or other bytes
             arrive than the catalogue knows. The message says what to download and where to put it.
         OutputError: If the cache cannot be written.
     """
     _check_licence(network, accept_licence)
-    if network.address is None:
+    addresses = network.addresses
+    if mirror is not None:
+        addresses = (_in_mirror(network, mirror), *addresses)
+    if not addresses:
         raise InputError(
             f"{network.name} cannot be fetched: {network.how} ({network.authors}), {_by_hand(network)}."
         )
-    request = urllib.request.Request(network.address, headers={"User-Agent": "tracking3d"})
-    with _arriving(network) as part:
-        try:
-            with urllib.request.urlopen(request, timeout=_PATIENCE) as response:
-                count = _copy(response, part, network.size, listener)
-        except urllib.error.HTTPError as error:
-            error.close()
-            raise _unreachable(network, f"the server answered {error.code} {error.reason}") from error
-        except (OSError, http.client.HTTPException) as error:
-            raise _unreachable(network, _told(error)) from error
-        if network.size and count < network.size:
-            raise _unreachable(network, f"the connection broke off after {count} of {network.size} bytes")
-        _check(network, Path(part.name), f"what {network.address} gave", f"; {_instead(network)}")
+    with _arriving(network, keep=True) as part:
+        reasons = []
+        for address in addresses:
+            if not (reason := _fetch_from(address, network, part, listener)):
+                break
+            reasons.append(reason if len(addresses) == 1 else f"{address}: {reason}")
+        else:
+            raise InputError(
+                f"{network.name} could not be fetched ({'; '.join(reasons)}): download {addresses[-1]} elsewhere, "
+                f"{_by_hand(network)}."
+            )
     return network_path(network)
+
+
+def _in_mirror(network: KnownNetwork, mirror: str) -> str:
+    if not mirror.startswith(("http://", "https://")):
+        raise InputError(f"The mirror {mirror} is no address; give one that begins with http:// or https://.")
+    if network.sha256 is None or network.size is None:
+        raise InputError(
+            f"{network.name} is not taken from a mirror, for its SHA-256 is not known: {network.how} "
+            f"({network.authors}), {_by_hand(network)}."
+        )
+    return f"{mirror.rstrip('/')}/{network.file}"
+
+
+def _fetch_from(address: str, network: KnownNetwork, part: BufferedRandom, listener: Listener) -> str:
+    """Let the part be the network from one address; returns why it is not, or nothing if it is.
+
+    What was kept of an earlier download may be of other bytes: then everything is asked for once more.
+    """
+    size = network.size or 0
+    kept = part.seek(0, 2)
+    listener(kept)
+    while True:
+        try:
+            transfer(address, part, size, lambda chunk: _write(part, chunk), listener)
+        except TransferError as error:
+            listener(-part.tell())
+            return str(error)
+        with _writing(Path(part.name)):
+            part.flush()
+        difference = _difference(network, Path(part.name))
+        if not difference:
+            return ""
+        listener(-part.tell())
+        part.truncate(0)
+        if not kept:
+            return f"what {address} gave {difference}"
+        kept = 0
 
 
 def adopt(network: KnownNetwork, file: Path, *, accept_licence: bool = False) -> Path:
@@ -91,9 +131,11 @@ def adopt(network: KnownNetwork, file: Path, *, accept_licence: bool = False) ->
     except OSError as error:
         raise InputError(f"{file} cannot be read: {error.strerror or error}.") from error
     with source, _arriving(network) as part:
-        _copy(source, part, network.size, lambda count: None)
-        own = "; a network that you exported yourself is used by its path and needs no name"
-        _check(network, Path(part.name), str(file), own)
+        _copy(source, part, network.size)
+        if difference := _difference(network, Path(part.name)):
+            raise InputError(
+                f"{file} {difference}; a network that you exported yourself is used by its path and needs no name."
+            )
         if network.sha256 is None:
             try:
                 Network(Path(part.name))
@@ -113,61 +155,56 @@ def _check_licence(network: KnownNetwork, accepted: bool) -> None:
 
 
 @contextmanager
-def _arriving(network: KnownNetwork) -> Iterator[BufferedRandom]:
-    """A file beside the network's place; renamed there if the block ends well, and gone if it does not."""
+def _arriving(network: KnownNetwork, keep: bool = False) -> Iterator[BufferedRandom]:
+    """A file beside the network's place; renamed there if the block ends well, else gone.
+
+    Args:
+        network: The network.
+        keep: Go on with what an earlier block left, and leave what there is to a later one. A block has the file for
+            itself: whoever fetches the same network meanwhile begins one of his own.
+    """
     path = network_path(network)
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    own = path.with_name(f".{path.name}.{os.getpid()}")
+    kept = path.with_name(f".{path.name}.{(network.sha256 or '')[:12]}.part")
     with _writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        part = partial.open("w+b")
+        if keep:
+            with suppress(FileNotFoundError):
+                kept.replace(own)
+        part = own.open("r+b" if own.exists() and keep else "w+b")
     try:
         with part:
             yield part
         with _writing(path):
-            partial.replace(path)
+            own.replace(path)
     finally:
-        partial.unlink(missing_ok=True)
+        if keep and own.exists() and own.stat().st_size:
+            own.replace(kept)
+        own.unlink(missing_ok=True)
 
 
-def _copy(source: IO[bytes], part: BufferedRandom, size: int | None, listener: Listener) -> int:
-    """Copy the bytes and count them; more than ``size`` are not copied to the end."""
-    count = 0
-    while (size is None or count <= size) and (chunk := source.read(_CHUNK)):
-        with _writing(Path(part.name)):
-            part.write(chunk)
-        count += len(chunk)
-        listener(len(chunk))
+def _write(part: BufferedRandom, chunk: bytes) -> None:
     with _writing(Path(part.name)):
-        part.flush()
-    return count
+        part.write(chunk)
 
 
-def _check(network: KnownNetwork, file: Path, origin: str, advice: str) -> None:
-    """Compare a file with what the catalogue knows of the network.
-
-    Raises:
-        InputError: If they differ.
-    """
+def _difference(network: KnownNetwork, file: Path) -> str:
+    """In what a file is not what the catalogue knows of the network, as a sentence goes on; nothing if it is."""
     size = file.stat().st_size
     if network.size is not None and size != network.size:
-        many = (
-            f"more than {network.size} bytes"
-            if size > network.size
-            else f"{size} instead of {network.size} bytes"
-        )
-        raise InputError(f"{origin} is not {network.name}: it has {many}{advice}.")
+        most = f"more than {network.size}" if size > network.size else f"{size} instead of {network.size}"
+        return f"is not {network.name}: it has {most} bytes"
     if network.sha256 is not None and (found := sha256_of(file)) != network.sha256:
-        raise InputError(
-            f"{origin} is not {network.name}: its SHA-256 is {found} instead of {network.sha256}{advice}."
-        )
+        return f"is not {network.name}: its SHA-256 is {found} instead of {network.sha256}"
+    return ""
 
 
-def _unreachable(network: KnownNetwork, reason: str) -> InputError:
-    return InputError(f"{network.name} could not be fetched ({reason}): {_instead(network)}.")
-
-
-def _instead(network: KnownNetwork) -> str:
-    return f"download {network.address} elsewhere, {_by_hand(network)}"
+def _copy(source: IO[bytes], part: BufferedRandom, size: int | None) -> None:
+    """Copy the bytes; more than ``size`` are not copied to the end."""
+    while (size is None or part.tell() <= size) and (chunk := source.read(_CHUNK)):
+        _write(part, chunk)
+    with _writing(Path(part.name)):
+        part.flush()
 
 
 def _by_hand(network: KnownNetwork) -> str:
@@ -187,12 +224,3 @@ def _writing(path: Path) -> Iterator[None]:
             f"{path} cannot be written: {error.strerror or error}; make room there, or name another folder with "
             f"the environment variable {VARIABLE}."
         ) from error
-
-
-def _told(error: object) -> str:
-    """The reason of a failed connection in a few words."""
-    if isinstance(error, urllib.error.URLError):
-        return _told(error.reason)
-    if isinstance(error, OSError) and error.strerror:
-        return error.strerror
-    return " ".join(str(error).split()) or type(error).__name__

@@ -1,0 +1,106 @@
+"""The documentation as a site: every page is in it, and it asks nobody else for anything."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import yaml
+from documentation_pages import ROOT
+
+
+class WithPythonNames(yaml.SafeLoader):
+    """mkdocs.yml names functions of Python; here they are their names."""
+
+
+WithPythonNames.add_multi_constructor("tag:yaml.org,2002:python/", lambda loader, suffix, node: suffix)
+
+
+@pytest.fixture(scope="module")
+def site() -> dict[str, Any]:
+    return yaml.load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"), WithPythonNames)
+
+
+def pages_of(nav: list[Any]) -> Iterator[str]:
+    for entry in nav:
+        for target in entry.values():
+            yield from [target] if isinstance(target, str) else pages_of(target)
+
+
+def test_every_page_is_in_the_navigation_once(site):
+    pages = sorted(path.relative_to(ROOT / "docs").as_posix() for path in ROOT.glob("docs/**/*.md"))
+    assert sorted(pages_of(site["nav"])) == pages
+
+
+def test_the_reference_names_what_there_is():
+    page = (ROOT / "docs/reference.md").read_text(encoding="utf-8")
+    names = re.findall(r"^::: (\S+)$", page, re.M)
+    assert len(names) > 20
+    for name in names:
+        module, _, attribute = name.rpartition(".")
+        if importlib.util.find_spec(module + "." + attribute if module == "tracking3d" else module) is None:
+            pytest.fail(name)
+        if module != "tracking3d":
+            assert getattr(importlib.import_module(module), attribute).__doc__, name
+
+
+def hook(site: dict[str, Any], name: str) -> ModuleType:
+    [path] = [ROOT / hook for hook in site["hooks"] if Path(hook).stem == name]
+    specification = importlib.util.spec_from_file_location(name, path)
+    module = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(module)
+    return module
+
+
+def test_links_out_of_the_documentation_lead_to_the_repository_or_nowhere(site):
+    with_links = hook(site, "page_text").with_links
+    text = "See [the kcf](../plugins/kcf/README.md), [masks](../masks.md#auto) and [it](https://a.org)."
+    assert with_links(text, "docs/how-to", None) == text  # both are pages' neighbours there
+    told = with_links("[`kcf`](../plugins/kcf/README.md) and [masks](masks.md)", "docs", None)
+    assert told == "`kcf` and [masks](masks.md)"
+    assert with_links("[a](../b.py)", "docs", "https://h.org/o/r/") == "[a](https://h.org/o/r/blob/HEAD/b.py)"
+
+
+def test_what_belongs_to_an_item_is_indented_as_markdown_here_wants_it(site):
+    four = hook(site, "page_text").with_four_spaces
+    assert (
+        four("1. Run:\n\n   ```console\n   $ a\n   ```\n") == "1. Run:\n\n    ```console\n    $ a\n    ```\n"
+    )
+    assert four("```text\n   a\n```\n") == "```text\n   a\n```\n"
+
+
+def test_equations_become_what_browsers_draw_by_themselves(site):
+    pytest.importorskip("latex2mathml", reason="the extra `docs` is not installed")
+    drawn = hook(site, "equations").on_page_content(r'<p><span class="arithmatex">\(a_1 &lt; b\)</span></p>')
+    assert drawn.startswith("<p><math") and "<msub>" in drawn and "&lt;" in drawn.replace("&#x0003C;", "&lt;")
+
+
+@pytest.mark.slow
+def test_the_site_is_built_without_a_broken_link_and_fetches_nothing(tmp_path):
+    pytest.importorskip("material", reason="the extra `docs` is not installed")
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")],
+        cwd=ROOT,
+        env=os.environ | {"NO_MKDOCS_2_WARNING": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    built = sorted((tmp_path / "site").rglob("*.html"))
+    assert len(built) > 30
+    for page in built:
+        text = page.read_text(encoding="utf-8")
+        assert re.findall(r"<(?:script|img|iframe|source)[^>]+src=\"?https?:[^>]*", text) == [], page.name
+        assert re.findall(r"<link(?![^>]*rel=\"?canonical)[^>]+href=\"?https?:[^>]*", text) == [], page.name
+        assert "arithmatex" not in text, page.name
+    reference = (tmp_path / "site/reference.html").read_text(encoding="utf-8")
+    assert 'id="tracking3d.pipeline.track"' in reference

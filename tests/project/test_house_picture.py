@@ -1,0 +1,34 @@
+"""The picture of the house in CONTRIBUTING.md is that of the present imports."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def house():
+    specification = importlib.util.spec_from_file_location("house", ROOT / "docs/images/house.py")
+    module = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(module)
+    return module
+
+
+def test_the_picture_is_up_to_date(house):
+    drawn = house.PICTURE.read_text(encoding="utf-8")
+    assert drawn == house.picture(), "draw it anew: python docs/images/house.py"
+
+
+def test_every_room_is_in_it(house):
+    rooms = set().union(*house.architecture().FLOORS)
+    assert rooms <= set(re.findall(r">([a-z_]+)</text>", house.picture()))
+
+
+def test_only_the_longest_ways_are_drawn(house):
+    used = {"cli": {"results", "errors"}, "results": {"errors", "frames"}, "errors": set(), "frames": set()}
+    assert house.longest_ways(used) == [("cli", "results"), ("results", "errors"), ("results", "frames")]

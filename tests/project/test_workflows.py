@@ -1,0 +1,88 @@
+"""The workflow files: what they run is there, and what they name exists."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parents[2]
+WORKFLOWS = sorted((ROOT / ".github/workflows").glob("*.yml"))
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+SYSTEMS = {"ubuntu-24.04", "macos-14", "windows-2022"}
+
+
+def jobs() -> list:
+    return [
+        pytest.param(job, workflow["jobs"], id=f"{path.stem}-{name}")
+        for path in WORKFLOWS
+        for workflow in [yaml.safe_load(path.read_text(encoding="utf-8"))]
+        for name, job in workflow["jobs"].items()
+    ]
+
+
+@pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.stem)
+def test_a_workflow_reads_only_and_says_when(path):
+    workflow = yaml.safe_load(path.read_text(encoding="utf-8"))
+    assert workflow["permissions"] == {"contents": "read"}
+    assert {"push", "pull_request"} <= set(workflow[True])  # YAML's `on` is true
+
+
+@pytest.mark.parametrize(("job", "jobs"), jobs())
+def test_a_job_names_systems_jobs_and_variables_that_exist(job, jobs):
+    matrix = job.get("strategy", {}).get("matrix", {})
+    systems = matrix["os"] if "matrix.os" in job["runs-on"] else [job["runs-on"]]
+    assert set(systems) <= SYSTEMS
+    assert job["timeout-minutes"] <= 300
+    needs = job.get("needs", [])
+    assert set([needs] if isinstance(needs, str) else needs) <= set(jobs)
+    assert set(re.findall(r"\$\{\{ matrix\.(\w+) }}", str(job))) <= set(matrix)
+
+
+@pytest.mark.parametrize(("job", "jobs"), jobs())
+def test_a_step_is_an_action_of_a_version_or_commands_that_are_there(job, jobs):
+    targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.M))
+    for step in job["steps"]:
+        assert ("uses" in step) != ("run" in step)
+        if "uses" in step:
+            assert re.fullmatch(r"actions/[a-z-]+@v\d+", step["uses"])
+            continue
+        for line in step["run"].splitlines():
+            if line.startswith("make "):
+                assert set(line.split()[1:]) <= targets
+            if found := re.search(r'"\.\[([\w,]+)\]"', line):
+                assert set(found[1].split(",")) <= set(PROJECT["optional-dependencies"])
+            if line.startswith("."):
+                assert (ROOT / line).is_file()
+
+
+def test_wheels_are_tried_on_every_system_and_tests_run_there():
+    for name, job in (("wheels", "install"), ("tests", "systems")):
+        workflow = yaml.safe_load((ROOT / f".github/workflows/{name}.yml").read_text(encoding="utf-8"))
+        assert set(workflow["jobs"][job]["strategy"]["matrix"]["os"]) == SYSTEMS
+
+
+def test_actionlint_has_nothing_to_say():
+    program = shutil.which("actionlint")
+    if program is None:
+        pytest.skip("actionlint is not installed")
+    done = subprocess.run([program, *map(str, WORKFLOWS)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+
+
+FORMS = sorted(path for path in (ROOT / ".github/ISSUE_TEMPLATE").glob("*.yml") if path.stem != "config")
+
+
+@pytest.mark.parametrize("path", FORMS, ids=lambda path: path.stem)
+def test_a_form_asks_for_something(path):
+    form = yaml.safe_load(path.read_text(encoding="utf-8"))
+    assert form["name"] and form["description"] and form["body"]
+    asked = [field for field in form["body"] if field["type"] != "markdown"]
+    assert len({field["id"] for field in asked}) == len(asked)
+    assert all(field["attributes"]["label"] for field in asked)
+    assert any(field.get("validations", {}).get("required") for field in asked)
