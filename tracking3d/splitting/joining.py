@@ -1,0 +1,169 @@
+"""The parts of a video as one object: how each lies in the first, and what they know together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tracking3d.checkpoint.folder import Checkpoint
+from tracking3d.config.models import PipelineConfig
+from tracking3d.config.solvers import OnlineConfig
+from tracking3d.estimation.online.belief import Belief, ObjectMap
+from tracking3d.estimation.online.final_refinement import keyframe_cost
+from tracking3d.estimation.online.mapping import pose_arrays
+from tracking3d.features.protocol import FeatureEncoder
+from tracking3d.geometry.camera import Camera
+from tracking3d.parts import build_encoder
+from tracking3d.presented import Presented
+from tracking3d.results.run_reader import RunReader
+from tracking3d.session import Session
+from tracking3d.splitting.agreement import DisagreementError, Joint, by_lens, joint_of
+from tracking3d.splitting.joined_run import PartRun
+from tracking3d.splitting.map_joining import joined, moved
+from tracking3d.splitting.plan import Plan, part_folder
+from tracking3d.splitting.similarity import Similarity, fit_similarity
+
+MOST_DEARER = 1.5
+"""How many times what the parts' keyframes cost by themselves they may cost together; see `keyframe_cost`."""
+_FEWEST_KEYFRAMES = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Whole:
+    """All parts as one.
+
+    Attributes:
+        runs: The parts, with how each lies in the joined object.
+        session: The state of a session that has seen all of them.
+        camera: Of the causal answers.
+        joints: What is known of each joint, for the record.
+    """
+
+    runs: Sequence[PartRun]
+    session: Mapping[str, Any]
+    camera: Camera
+    joints: Sequence[Mapping[str, Any]]
+
+
+def joined_parts(session: Session, config: PipelineConfig, plan: Plan, folder: Path) -> Whole:
+    """Join the parts that are tracked.
+
+    Args:
+        session: For the whole video, which has seen nothing yet.
+        config: The pipeline.
+        plan: The parts.
+        folder: The run folder.
+
+    Raises:
+        DisagreementError: If they cannot be joined.
+        InputError: If a part's folder is damaged.
+    """
+    assert isinstance(config.solver, OnlineConfig)
+    runs, beliefs = _read(session, config, plan, folder)
+    joints = [
+        _joint(number, beliefs[number - 1 : number + 1], runs[number - 1 : number + 1])
+        for number in range(1, len(runs))
+    ]
+    similarities = [Similarity.identity()]
+    for joint in joints:
+        similarities.append(similarities[-1].after(joint.fit.similarity))
+    belief = join_beliefs(beliefs, similarities, config.solver, build_encoder(config))
+    settled = [
+        replace(run, similarity=_settled(belief.known, own.known, similarity))
+        for run, own, similarity in zip(runs, beliefs, similarities, strict=True)
+    ]
+    first, last = runs[0].kept.session, max(record.index for run in runs for record in run.records)
+    first_pose, presented, _, anew = first["steering"]
+    state = {
+        **first,
+        "solver": belief,
+        "camera": belief.camera,
+        "steering": (first_pose, Presented(presented.first), last, anew),
+    }
+    return Whole(settled, state, belief.camera, [_told(joint) for joint in joints])
+
+
+def join_beliefs(
+    beliefs: Sequence[Belief],
+    similarities: Sequence[Similarity],
+    config: OnlineConfig,
+    encoder: FeatureEncoder,
+) -> Belief:
+    """What the parts know as one; see `tracking3d.splitting.map_joining.joined`.
+
+    Raises:
+        DisagreementError: If together they explain what was seen far worse than each by itself.
+    """
+    own = float(np.mean([keyframe_cost(belief.known) for belief in beliefs]))
+    belief = joined(beliefs, similarities, config, encoder)
+    together = keyframe_cost(belief.known)
+    if together > MOST_DEARER * own:
+        raise DisagreementError(
+            f"one object explains what they show {together / own:.1f} times as badly as one each does"
+        )
+    return belief
+
+
+def _read(
+    session: Session, config: PipelineConfig, plan: Plan, folder: Path
+) -> tuple[list[PartRun], list[Belief]]:
+    """The parts with what each knows, all by the first one's lens."""
+    runs: list[PartRun] = []
+    beliefs: list[Belief] = []
+    for part in plan.parts:
+        own = part_folder(folder, part)
+        kept = Checkpoint(own, session.state_classes, config.runtime.device).read()
+        belief = kept.session["solver"]
+        if belief.waiting is not None:
+            why = belief.waits_for or "the object did not move enough in it"
+            raise DisagreementError(f"the shape was never told in part {part.number + 1} ({why})")
+        records = RunReader(own, refined=False).frames
+        belief, records = by_lens(belief, records, beliefs[0] if beliefs else belief)
+        beliefs.append(belief)
+        runs.append(PartRun(part, own, kept, records, Similarity.identity()))
+    return runs, beliefs
+
+
+def _joint(number: int, beliefs: Sequence[Belief], runs: Sequence[PartRun]) -> Joint:
+    try:
+        return joint_of(beliefs[0], beliefs[1], runs[0].records, runs[1].records)
+    except DisagreementError as error:
+        raise DisagreementError(f"parts {number} and {number + 1}: {error}") from error
+
+
+def _settled(known: ObjectMap, own: ObjectMap, similarity: Similarity) -> Similarity:
+    """How a part lies in the joined object after the refinement moved its keyframes."""
+    after = {view.index: view.pose for view in known.keyframes}
+    before = {view.index: view.pose for view in moved(own, similarity).keyframes}
+    common = sorted(before.keys() & after.keys())
+    if len(common) < _FEWEST_KEYFRAMES:
+        return similarity
+    poses = []
+    for side in (after, before):
+        T = np.tile(np.eye(4), (len(common), 1, 1))
+        for n, index in enumerate(common):
+            T[n, :3, :3], T[n, :3, 3] = pose_arrays(side[index])
+        poses.append(T)
+    fit = fit_similarity(poses[0], poses[1], own_points(known), own_points(known))
+    return fit.similarity.after(similarity)
+
+
+def own_points(known: ObjectMap) -> np.ndarray:
+    """``(V, 3)`` vertices of a map: what holds a small change of coordinates to where the object is."""
+    return np.asarray(known.vertices.double().cpu().numpy())
+
+
+def _told(joint: Joint) -> dict[str, Any]:
+    fit = joint.fit
+    return {
+        "frames": joint.frames,
+        "landmarks": joint.landmarks,
+        "degrees": float(np.median(fit.angles)),
+        "distance": float(np.median(fit.distances)),
+        "scale": fit.similarity.scale,
+        "scale_error": fit.scale_error,
+    }
