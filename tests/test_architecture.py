@@ -34,7 +34,7 @@ FLOORS = [
         "tracker_choice",
     },
     {"datasets"},
-    {"evaluation", "export", "picker", "report", "speed", "synthesis", "viewer"},
+    {"evaluation", "export", "picker", "report", "speed", "splitting", "synthesis", "viewer"},
     {"benchmark"},
     {"cli", "vot", "__main__"},
 ]

@@ -67,7 +67,7 @@ def parse_length(text: str, fps: float | None) -> int:
     Raises:
         InputError: If it is neither, not positive, or in seconds where the source has no rate.
     """
-    match = re.fullmatch(r"\s*([-+]?[\d.]+(?:e[-+]?\d+)?)\s*(f|s)?\s*", text, re.IGNORECASE)
+    match = re.fullmatch(r"\s*([-+]?[\d.]+(?:e[-+]?\d+)?)\s*(f|s)?\s*", text, re.IGNORECASE | re.ASCII)
     try:
         value = math.nan if match is None else float(match[1])
     except ValueError:
@@ -125,17 +125,16 @@ def _qualities(sightings: Sequence[Sighting]) -> list[float]:
 
     A mask much smaller than is usual nearby is hidden in part, and one whose area just changed was, or will be.
     """
-    areas = [one.area for one in sightings if one.area > 0]
-    usual = float(np.median(areas)) if areas else 1.0
+    areas = [one.area for one in sightings]
+    usual = float(np.median([area for area in areas if area])) if any(areas) else 1.0
     qualities = []
-    before = None
-    for one in sightings:
+    for n, one in enumerate(sightings):
         quality = 0.0
-        if one.area > 0 and not one.touches_border:
-            change = abs(math.log(one.area / before)) if before else 0.0
+        if one.area and not one.touches_border:
+            beside = [area for area in areas[max(n - 1, 0) : n + 2] if area]
+            change = math.log(max(beside) / min(beside))
             quality = one.score * min(one.area / usual, 1.0) * max(1.0 - _CHANGE * change, 0.0)
         qualities.append(quality)
-        before = one.area or None
     return qualities
 
 

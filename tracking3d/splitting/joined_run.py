@@ -106,9 +106,7 @@ def write_causal_mesh(folder: Path, session: Session) -> None:
     export_mesh(folder, session.result())
 
 
-def take_second_answers(
-    folder: Path, session: Session, made: Sequence[Path], seconds: float
-) -> None:
+def take_second_answers(folder: Path, session: Session, made: Sequence[Path], seconds: float) -> None:
     """Put the second answers of all parts where the run looks for what it has looked at again.
 
     Args:
@@ -131,7 +129,10 @@ def take_second_answers(
     checkpoint = Checkpoint(folder, session.state_classes, session.config.runtime.device)
     before = checkpoint.read()
     done = replace(
-        before.progress, last_refined=before.progress.last, refined_lines=len(lines), refinement_seconds=seconds
+        before.progress,
+        last_refined=before.progress.last,
+        refined_lines=len(lines),
+        refinement_seconds=seconds,
     )
     checkpoint.save(done, before.session)
     checkpoint.clear_strangers()
@@ -142,8 +143,7 @@ def _moved(records: Sequence[FrameRecord], similarity: Similarity) -> list[Frame
         return []
     poses = similarity.poses(np.stack([record.T_cam_obj for record in records]))
     return [
-        replace(record, T_cam_obj=pose, revision=False)
-        for record, pose in zip(records, poses, strict=True)
+        replace(record, T_cam_obj=pose, revision=False) for record, pose in zip(records, poses, strict=True)
     ]
 
 

@@ -27,7 +27,7 @@ from tracking3d.splitting.map_joining import joined, moved
 from tracking3d.splitting.plan import Plan, part_folder
 from tracking3d.splitting.similarity import Similarity, fit_similarity
 
-MOST_DEARER = 1.5
+MOST_DEARER = 1.25
 """How many times what the parts' keyframes cost by themselves they may cost together; see `keyframe_cost`."""
 _FEWEST_KEYFRAMES = 3
 
@@ -41,12 +41,14 @@ class Whole:
         session: The state of a session that has seen all of them.
         camera: Of the causal answers.
         joints: What is known of each joint, for the record.
+        dearer: How many times what they cost by themselves the keyframes cost together.
     """
 
     runs: Sequence[PartRun]
     session: Mapping[str, Any]
     camera: Camera
     joints: Sequence[Mapping[str, Any]]
+    dearer: float
 
 
 def joined_parts(session: Session, config: PipelineConfig, plan: Plan, folder: Path) -> Whole:
@@ -71,7 +73,7 @@ def joined_parts(session: Session, config: PipelineConfig, plan: Plan, folder: P
     similarities = [Similarity.identity()]
     for joint in joints:
         similarities.append(similarities[-1].after(joint.fit.similarity))
-    belief = join_beliefs(beliefs, similarities, config.solver, build_encoder(config))
+    belief, dearer = join_beliefs(beliefs, similarities, config.solver, build_encoder(config))
     settled = [
         replace(run, similarity=_settled(belief.known, own.known, similarity))
         for run, own, similarity in zip(runs, beliefs, similarities, strict=True)
@@ -84,7 +86,7 @@ def joined_parts(session: Session, config: PipelineConfig, plan: Plan, folder: P
         "camera": belief.camera,
         "steering": (first_pose, Presented(presented.first), last, anew),
     }
-    return Whole(settled, state, belief.camera, [_told(joint) for joint in joints])
+    return Whole(settled, state, belief.camera, [_told(joint) for joint in joints], dearer)
 
 
 def join_beliefs(
@@ -92,8 +94,8 @@ def join_beliefs(
     similarities: Sequence[Similarity],
     config: OnlineConfig,
     encoder: FeatureEncoder,
-) -> Belief:
-    """What the parts know as one; see `tracking3d.splitting.map_joining.joined`.
+) -> tuple[Belief, float]:
+    """What the parts know as one, and how many times as much their keyframes cost so; see `map_joining.joined`.
 
     Raises:
         DisagreementError: If together they explain what was seen far worse than each by itself.
@@ -105,7 +107,7 @@ def join_beliefs(
         raise DisagreementError(
             f"one object explains what they show {together / own:.1f} times as badly as one each does"
         )
-    return belief
+    return belief, together / own
 
 
 def _read(

@@ -114,8 +114,6 @@ def _scaled(prompt: Prompt | None, frame: Frame, small: Frame) -> Prompt | None:
     box = (prompt.box[0] * x, prompt.box[1] * y, prompt.box[2] * x, prompt.box[3] * y)
     mask = None
     if prompt.mask is not None:
-        shrunk = cv2.resize(
-            prompt.mask.astype(np.float32), small.size[::-1], interpolation=cv2.INTER_AREA
-        )
+        shrunk = cv2.resize(prompt.mask.astype(np.float32), small.size[::-1], interpolation=cv2.INTER_AREA)
         mask = np.asarray(shrunk >= 0.5, dtype=np.bool_)
     return Prompt(box, mask if mask is not None and mask.any() else None)

@@ -121,10 +121,19 @@ def _renamed(view: View, names: NDArray[np.int64]) -> View:
     return replace(view, points=points, keypoint_landmark=label)
 
 
-def in_space(known: ObjectMap, space: FeatureSpace | None, encoder: FeatureEncoder) -> ObjectMap:
-    """A map whose features are those of another map's space: encoded once more, as `observe` does."""
+def in_space(
+    known: ObjectMap, own: FeatureSpace | None, space: FeatureSpace | None, encoder: FeatureEncoder
+) -> ObjectMap:
+    """A map whose features are of its ``own`` space, with those of another map's: turned, or encoded once more.
+
+    Where a space keeps all channels nothing was lost, and what is exact is also cheaper.
+    """
 
     def encoded(observation: Observation) -> Observation:
+        if own is not None and space is not None and own.components.shape[0] == own.components.shape[1]:
+            flat = observation.features.flatten(1)
+            whole = torch.linalg.solve(own.components, flat).view_as(observation.features)
+            return replace(observation, features=space.project(whole + own.mean[:, None, None]))
         size = (observation.window.size,) * 2
         image = functional.interpolate(observation.image[None], size=size, mode="bilinear", antialias=True)
         features = encoder.encode(image if encoder.stride == 1 else observation.image[None])
@@ -152,7 +161,7 @@ def joined(beliefs: Sequence[Belief], similarities: Sequence[Similarity], config
     first, camera = beliefs[0], beliefs[0].camera
     known = first.known
     for belief, similarity in zip(beliefs[1:], similarities[1:], strict=True):
-        second = in_space(moved(belief.known, similarity), first.space, encoder)
+        second = in_space(moved(belief.known, similarity), belief.space, first.space, encoder)
         pairs = same_landmarks(known, second, camera)
         most = max(config.most_keyframes, len(known.keyframes))
         known = united(known, second, pairs, most)

@@ -195,4 +195,3 @@ def _second_answer(
         record_ = FrameRecord.of(estimate, frame.name, mask, revision=True)
         write_mask(layout.mask_path(job.out, frame.index), estimate.mask)
     return record_.and_wrote(watch.times.write)
-

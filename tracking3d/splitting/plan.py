@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -133,6 +134,12 @@ def kept_plan(
             f"or start anew with {layout.OVERWRITE}."
         )
     return found
+
+
+def remove_parts(folder: Path) -> None:
+    """Remove the parts of a run, where a plan says that they are some."""
+    if (folder / PARTS / _PLAN).is_file():
+        shutil.rmtree(folder / PARTS, ignore_errors=True)
 
 
 def put_cut_mask(folder: Path, part: Part, mask: Any) -> None:

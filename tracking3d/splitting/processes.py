@@ -47,7 +47,9 @@ def side_by_side(
     context = get_context("spawn")
     queue = context.Queue()
     before = os.environ.get("OMP_NUM_THREADS")
-    os.environ["OMP_NUM_THREADS"] = before or "1"  # processes that share a machine must not each take all of it
+    os.environ["OMP_NUM_THREADS"] = (
+        before or "1"
+    )  # processes that share a machine must not each take all of it
     pool = ProcessPoolExecutor(
         min(workers, len(jobs)), mp_context=context, initializer=_begin, initargs=(queue,)
     )
@@ -61,7 +63,9 @@ def side_by_side(
             "command with --resume goes on."
         ) from error
     except BaseException:
-        for process in list((pool._processes or {}).values()):  # a pool has no word for this before Python 3.14
+        for process in list(
+            (pool._processes or {}).values()
+        ):  # a pool has no word for this before Python 3.14
             process.terminate()
         raise
     finally:

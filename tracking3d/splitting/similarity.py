@@ -24,6 +24,8 @@ from tracking3d.evaluation.metrics import rotation_alignment
 Array = NDArray[np.float64]
 _STEPS = 50
 _CLOSE = 1e-9
+_OUTLYING = 3.0  # times the median
+_RIGHT = 2.0  # degrees that no frame is left out for
 _FLOOR = 1e-3  # of the median distance, so that no single row takes all the weight
 
 
@@ -103,8 +105,11 @@ def fit_similarity(
     R_first, R_second = T_cam_first[:, :3, :3], T_cam_second[:, :3, :3]
     t_first, t_second = T_cam_first[:, :3, 3], T_cam_second[:, :3, 3]
     R = rotation_alignment(R_first, R_second)
-    rows = np.concatenate([R_first, -t_second[..., None]], axis=2)
-    values, weight = -t_first, np.full(len(rows), 1 / len(rows))
+    angles = np.degrees(Rotation.from_matrix(np.swapaxes(R_first @ R, 1, 2) @ R_second).magnitude())
+    # A frame whose rotation is wrong has a wrong translation too, and by it more say than others.
+    sound = angles <= max(_OUTLYING * float(np.median(angles)), _RIGHT)
+    rows = np.concatenate([R_first, -t_second[..., None]], axis=2)[sound]
+    values, weight = -t_first[sound], np.full(len(rows), 1 / len(rows))
     if x_first is not None and x_second is not None and len(x_first):
         if x_first.shape != x_second.shape:
             raise ValueError(f"points need equal shapes (N, 3), got {x_first.shape} and {x_second.shape}")
@@ -115,8 +120,6 @@ def fit_similarity(
     solution, spread = _least_distances(rows, values, weight)
     similarity = Similarity(R, float(solution[3]), solution[:3])
     moved = similarity.poses(T_cam_second)
-    turned = np.swapaxes(moved[:, :3, :3], 1, 2) @ R_first
-    angles = np.degrees(Rotation.from_matrix(turned).magnitude())
     distances = np.linalg.norm(moved[:, :3, 3] - t_first, axis=1)
     scale_error = float(np.sqrt(spread[3, 3]) / max(abs(similarity.scale), 1e-12))
     return Fit(similarity, angles, distances, scale_error, float(np.sqrt(np.trace(spread[:3, :3]))))

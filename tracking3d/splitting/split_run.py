@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +10,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from tracking3d.checkpoint.folder import Checkpoint
 from tracking3d.checkpoint.resuming import given_of
 from tracking3d.config.models import PipelineConfig
 from tracking3d.config.solvers import OnlineConfig
@@ -51,11 +49,12 @@ from tracking3d.splitting.plan import (
     make_plan,
     part_folder,
     put_cut_mask,
+    remove_parts,
     selection_of,
 )
 from tracking3d.splitting.processes import side_by_side
 from tracking3d.video import open_source
-from tracking3d.video.selection import EVERY_FRAME, parse_selection
+from tracking3d.video.selection import parse_selection
 from tracking3d.video.source import FrameSource
 
 _log = logging.getLogger(__name__)
@@ -66,7 +65,7 @@ SideBySide = Callable[..., list[Any]]
 """See `side_by_side`."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Ended:
     """What became of a video that was to be split.
 
@@ -159,7 +158,7 @@ def record_in_parts(
         return Ended((folder,), 1)
     if not resume:
         make_room(folder, overwrite)
-        shutil.rmtree(folder / PARTS, ignore_errors=True)
+        remove_parts(folder)
     first, _ = begin_session(opened, config, given)
     prompt = None if given.untold else make_prompt(first, given.box, given.mask, points=given.points)
     own, choice = with_tracker(config, opened, first, prompt, folder, resume)
@@ -170,7 +169,7 @@ def record_in_parts(
     resume = plan is not None
     plan = plan or make_plan(opened, own, folder, **asked)
     if len(plan.parts) == 1:
-        shutil.rmtree(folder / PARTS, ignore_errors=True)
+        remove_parts(folder)
         one_part()
         return Ended((folder,), 1, "no frame near to where it was to be cut shows the object well")
     wanted = parse_selection(selection)
@@ -219,6 +218,8 @@ def _tracked(video: _Video, plan: Plan, began: float, workers: int) -> Ended:
     seconds = {"look_ahead": plan.seconds}
     clock = time.monotonic()
     jobs = _part_jobs(video, plan, video.resume)
+    if video.resume and all(is_finished(job.folder) for job in jobs):
+        return Ended(tuple(job.folder for job in jobs), len(jobs), "that was found when they were tracked")
     video.map(track_part, jobs, told=video.listener)
     again = _begun_elsewhere(video, plan, jobs)
     seconds["parts"], clock = time.monotonic() - clock, time.monotonic()
@@ -236,6 +237,7 @@ def _tracked(video: _Video, plan: Plan, began: float, workers: int) -> Ended:
         "looked_at": plan.looked_at,
         "tracked_again": again,
         "joints": whole.joints,
+        "dearer": whole.dearer,
     }
     writer = _begin_writing(video, session, whole)
     owned = _owned(video, plan)
@@ -251,7 +253,7 @@ def _tracked(video: _Video, plan: Plan, began: float, workers: int) -> Ended:
     note_in_run(video.folder, {"split": {**about, "seconds": seconds}})
     take_second_answers(video.folder, session, [look.out for look in looks], time.monotonic() - refining)
     _finish(video)
-    shutil.rmtree(video.folder / PARTS, ignore_errors=True)
+    remove_parts(video.folder)
     return Ended((video.folder,), len(plan.parts))
 
 
