@@ -12,7 +12,9 @@ from tracking3d.splitting.similarity import Similarity
 
 def record_of(index: int, T_cam_obj: np.ndarray, status: Status = Status.TRACKED) -> FrameRecord:
     """An answer."""
-    return FrameRecord(index, None, f"{index:03d}.png", T_cam_obj, status, "", 0.9, {}, 1, False, 0.1, 0.9, 100)
+    return FrameRecord(
+        index, None, f"{index:03d}.png", T_cam_obj, status, "", 0.9, {}, 1, False, 0.1, 0.9, 100
+    )
 
 
 def records_of(indices: range, poses: np.ndarray, status: Status = Status.TRACKED) -> list[FrameRecord]:

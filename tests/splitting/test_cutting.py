@@ -16,7 +16,9 @@ def steady(count: int, **changed: dict[int, object]) -> list[Sighting]:
     sightings = []
     for position in range(count):
         own = {name: values[position] for name, values in changed.items() if position in values}
-        sightings.append(Sighting(**{"position": position, "area": 900, "touches_border": False, "score": 0.9, **own}))
+        sightings.append(
+            Sighting(**{"position": position, "area": 900, "touches_border": False, "score": 0.9, **own})
+        )
     return sightings
 
 
@@ -27,7 +29,9 @@ def test_a_length_is_in_seconds_or_in_frames(text, fps, frames):
     assert parse_length(text, fps) == frames
 
 
-@pytest.mark.parametrize("text", ["0", "-3", "-0", "nan", "inf", "1e999", "ten", "", "5m", "1.2.3", "f", "0f", "٣"])
+@pytest.mark.parametrize(
+    "text", ["0", "-3", "-0", "nan", "inf", "1e999", "ten", "", "5m", "1.2.3", "f", "0f", "٣"]
+)
 def test_what_is_no_length_is_refused_in_one_sentence(text):
     with pytest.raises(InputError, match=r"\.$") as refused:
         parse_length(text, 30.0)
@@ -44,7 +48,9 @@ def test_a_part_too_short_to_tell_a_shape_is_refused():
         parse_length("0.1", 30.0)
 
 
-@pytest.mark.parametrize(("count", "length"), [(1000, 100), (1000, 999), (97, 24), (30, 1000), (1, 24), (149, 100)])
+@pytest.mark.parametrize(
+    ("count", "length"), [(1000, 100), (1000, 999), (97, 24), (30, 1000), (1, 24), (149, 100)]
+)
 def test_parts_are_of_one_length_and_cover_every_frame(count, length):
     cuts = [window[len(window) // 2] for window in windows(count, length)]
     parts = parts_at(cuts, count, overlap_of(length))
@@ -64,7 +70,7 @@ def test_a_video_shorter_than_a_part_is_not_cut():
 
 def test_a_cut_is_made_where_the_object_is_seen_best():
     [window] = windows(100, 50)
-    hidden = {position: 300 for position in range(46, 57)}
+    hidden = dict.fromkeys(range(46, 57), 300)
     border = dict.fromkeys([*range(38, 42), 57, 58], True)
     doubted = dict.fromkeys(range(59, 64), 0.4)
     [cut] = cuts_in(steady(100, area=hidden, touches_border=border, score=doubted), [window])
@@ -83,14 +89,14 @@ def test_of_frames_alike_the_one_in_the_middle_is_cut_at():
 def test_a_frame_in_which_the_mask_jumps_is_no_place_to_cut():
     [window] = windows(100, 50)
     jumps = {position: 900 if position % 2 else 2000 for position in range(100) if position != 45}
-    flat = {position: 900 for position in (44, 45, 46)}
+    flat = dict.fromkeys((44, 45, 46), 900)
     [cut] = cuts_in(steady(100, area=jumps | flat), [window])
     assert cut.position in (44, 45, 46)
 
 
 def test_there_is_no_cut_where_the_object_is_nowhere_well_seen():
     allowed = windows(300, 100)
-    gone = {position: 0 for position in allowed[0]}
+    gone = dict.fromkeys(allowed[0], 0)
     cuts = cuts_in(steady(300, area=gone), allowed)
     assert [cut.position in allowed[1] for cut in cuts] == [True]
     assert cuts_in([], allowed) == []

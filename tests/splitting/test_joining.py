@@ -85,7 +85,9 @@ def test_the_joint_of_two_runs_is_found_by_poses_and_landmarks(solved):
     first, poses = solved
     stack = np.stack([poses[index] for index in range(9)])
     other = inverse(TURN).poses(stack)
-    joint = joint_of(first, seen_otherwise(first, TURN), records_of(range(9), stack), records_of(range(9), other))
+    joint = joint_of(
+        first, seen_otherwise(first, TURN), records_of(range(9), stack), records_of(range(9), other)
+    )
     assert joint.frames == 9
     assert joint.landmarks > 20
     assert degrees_between(joint.fit.similarity.R, TURN.R) < 0.1
@@ -112,7 +114,8 @@ def test_keyframes_of_the_second_part_join_with_its_landmarks_named_anew(solved)
     """The second part has later frames: half of the landmarks are the first's, half new."""
     first = solved[0].known
     later = tuple(
-        replace(view, observation=replace(view.observation, index=view.index + 100)) for view in first.keyframes
+        replace(view, observation=replace(view.observation, index=view.index + 100))
+        for view in first.keyframes
     )
     second = replace(first, keyframes=later)
     own = np.flatnonzero(~first.candidate)
@@ -121,10 +124,13 @@ def test_keyframes_of_the_second_part_join_with_its_landmarks_named_anew(solved)
     assert [view.index for view in both.keyframes] == [view.index for view in (*first.keyframes, *later)]
     for view, same in zip(both.keyframes, (*first.keyframes, *later), strict=True):
         places = {tuple(place) for place in both.landmarks[view.points.landmark][::5].round(9)}
-        assert places <= {tuple(place) for place in first.landmarks[same.points.landmark].round(9)} or np.isnan(
-            both.landmarks[view.points.landmark]
-        ).any()
-    shared = set(both.keyframes[0].points.landmark) & set(both.keyframes[len(first.keyframes)].points.landmark)
+        assert (
+            places <= {tuple(place) for place in first.landmarks[same.points.landmark].round(9)}
+            or np.isnan(both.landmarks[view.points.landmark]).any()
+        )
+    shared = set(both.keyframes[0].points.landmark) & set(
+        both.keyframes[len(first.keyframes)].points.landmark
+    )
     assert 0 < len(shared) < len(first.keyframes[0].points)
 
 

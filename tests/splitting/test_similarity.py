@@ -13,7 +13,9 @@ from tracking3d.splitting.similarity import Similarity, fit_similarity
 def known(seed: int) -> Similarity:
     random = np.random.default_rng(seed)
     return Similarity(
-        Rotation.random(random_state=seed).as_matrix(), float(random.uniform(0.4, 2.5)), random.normal(0, 0.3, 3)
+        Rotation.random(random_state=seed).as_matrix(),
+        float(random.uniform(0.4, 2.5)),
+        random.normal(0, 0.3, 3),
     )
 
 

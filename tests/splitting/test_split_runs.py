@@ -74,7 +74,9 @@ def test_what_cannot_be_joined_is_not_split(override, short, tmp_path):
 def test_a_video_shorter_than_a_part_is_one_run(short, tmp_path, monkeypatch):
     asked = []
     monkeypatch.setattr(split_run, "record", lambda *given, **named: asked.append(named))
-    ended = record_in_parts(short, settings(short), tmp_path / "run", Given(), length="1000f", selection="0:40")
+    ended = record_in_parts(
+        short, settings(short), tmp_path / "run", Given(), length="1000f", selection="0:40"
+    )
     assert (ended.folders, ended.parts) == ((tmp_path / "run",), 1)
     assert "one part" in ended.reason
     assert [one["selection"] for one in asked] == ["0:40"]
@@ -178,10 +180,16 @@ def test_a_video_in_two_parts_is_one_run_as_good_as_a_whole_one(workers, clip, t
     assert split["given"] == whole["given"]
     assert split["refinement"]["frames"] == LONG
     assert split["split"]["joints"][0]["frames"] >= 5
-    files = {path.relative_to(tmp_path / "whole") for path in (tmp_path / "whole").rglob("*") if path.is_file()}
-    assert {path.relative_to(tmp_path / "split") for path in (tmp_path / "split").rglob("*") if path.is_file()} == files
+    files = {
+        path.relative_to(tmp_path / "whole") for path in (tmp_path / "whole").rglob("*") if path.is_file()
+    }
+    assert {
+        path.relative_to(tmp_path / "split") for path in (tmp_path / "split").rglob("*") if path.is_file()
+    } == files
     assert len(load_model(tmp_path / "split").vertices) == len(load_model(tmp_path / "whole").vertices)
-    record_in_parts(frames, settings(frames), tmp_path / "split", Given(), length="30f", resume=True)  # done already
+    record_in_parts(
+        frames, settings(frames), tmp_path / "split", Given(), length="30f", resume=True
+    )  # done already
 
 
 @pytest.mark.slow
@@ -192,12 +200,21 @@ def test_a_split_run_that_was_stopped_anywhere_goes_on(clip, tmp_path, monkeypat
         return record_in_parts(frames, settings(frames), run, Given(), length="30f", workers=1, resume=True)
 
     saves, save = [0], Checkpoint.save
+    due = {"in the first part", "in the second", "joined", "looked at again"}
 
-    def stopped_now_and_then(self, *given, **named):
+    def stopped_now_and_then(self, progress, *given):
         saves[0] += 1
-        if saves[0] in (10, 45, 90):
-            raise KeyboardInterrupt
-        save(self, *given, **named)
+        moments = {
+            "in the first part": saves[0] >= 10,
+            "in the second": saves[0] >= 50,
+            "joined": progress.refining,
+            "looked at again": progress.last_refined >= 0,
+        }
+        for moment in sorted(due):
+            if moments[moment]:
+                due.remove(moment)
+                raise KeyboardInterrupt
+        save(self, progress, *given)
 
     monkeypatch.setattr(Checkpoint, "save", stopped_now_and_then)
     stops = 0
@@ -207,7 +224,7 @@ def test_a_split_run_that_was_stopped_anywhere_goes_on(clip, tmp_path, monkeypat
             break
         except KeyboardInterrupt:
             stops += 1
-    assert stops == 3
+    assert (stops, due) == (4, set())
     assert ended == Ended((run,), ended.parts)
     assert RunReader(run).state == "finished"
     assert json.loads((run / layout.RUN).read_bytes())["split"]["parts"]

@@ -129,7 +129,9 @@ def run(
     workers: Annotated[
         int | None,
         typer.Option(
-            metavar="N", help="With --split: parts at a time; default all processors.", rich_help_panel=_RUNNING
+            metavar="N",
+            help="With --split: parts at a time; default all processors.",
+            rich_help_panel=_RUNNING,
         ),
     ] = None,
     config: ConfigFile = None,
@@ -255,7 +257,16 @@ def run(
     }
     if split is not None:
         track_in_parts(
-            source, settings, folder, given, about, split, workers=workers, quiet=quiet, report=report, view=view
+            source,
+            settings,
+            folder,
+            given,
+            about,
+            split,
+            workers=workers,
+            quiet=quiet,
+            report=report,
+            view=view,
         )
     else:
         track(source, settings, folder, given, about, quiet=quiet, report=report, view=view, host=host)

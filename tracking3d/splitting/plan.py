@@ -136,9 +136,14 @@ def kept_plan(
     return found
 
 
+def has_plan(folder: Path) -> bool:
+    """Whether there are parts of a run in its folder, and not something else of that name."""
+    return (folder / PARTS / _PLAN).is_file()
+
+
 def remove_parts(folder: Path) -> None:
-    """Remove the parts of a run, where a plan says that they are some."""
-    if (folder / PARTS / _PLAN).is_file():
+    """Remove the parts of a run, where there are some."""
+    if has_plan(folder):
         shutil.rmtree(folder / PARTS, ignore_errors=True)
 
 

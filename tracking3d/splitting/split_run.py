@@ -45,6 +45,7 @@ from tracking3d.splitting.plan import (
     PARTS,
     Plan,
     given_at,
+    has_plan,
     kept_plan,
     make_plan,
     part_folder,
@@ -153,8 +154,9 @@ def record_in_parts(
     if not windows(count, frames):
         one_part()
         return Ended((folder,), 1, f"{opened.name} has {count} frames, which is one part")
-    if resume and (folder / layout.RUN).is_file():  # joined already
+    if resume and (layout.has_state(folder) or is_there(folder)):  # joined already
         one_part()
+        remove_parts(folder)
         return Ended((folder,), 1)
     if not resume:
         make_room(folder, overwrite)
@@ -179,6 +181,11 @@ def record_in_parts(
         map_jobs or partial(side_by_side, workers=workers), _once(listener), resume,
     )  # fmt: skip
     return _tracked(video, plan, began, workers)
+
+
+def is_there(folder: Path) -> bool:
+    """Whether a folder holds a run that parts have nothing more to add to."""
+    return (folder / layout.RUN).is_file() and not has_plan(folder)
 
 
 def _frames_of_part(source: FrameSource, config: PipelineConfig, length: str) -> int:
