@@ -22,7 +22,7 @@ def track(video: str, box: tuple[float, ...], folder: str) -> str:
 
 
 def read_videos(table: Path) -> list[tuple[str, tuple[float, ...]]]:
-    """The videos and their boxes, the largest file first: it takes longest, and nothing is to wait for it at the end."""
+    """The videos and their boxes, the largest file first: it takes longest and is not to begin last."""
     with table.open(newline="", encoding="utf-8") as file:
         rows = [
             (row["video"], tuple(float(side) for side in row["box"].split(",")))

@@ -34,6 +34,13 @@ def format_outcomes(outcomes: Mapping[str, Outcome]) -> Table:
     return table
 
 
+def markdown(outcomes: Mapping[str, Outcome]) -> str:
+    """The same as a table of Markdown."""
+    head = "| order | hours | busy | last 1 % of videos | done twice | tasks | given up |\n"
+    head += "|---|---|---|---|---|---|---|\n"
+    return head + "".join(f"| {name} | {' | '.join(row_of(one))} |\n" for name, one in outcomes.items())
+
+
 def row_of(outcome: Outcome) -> list[str]:
     """An outcome in words."""
     return [

@@ -16,23 +16,25 @@ from tracking3d.results.run_reader import RunReader
 
 @dataclass(frozen=True)
 class RunFigures:
-    """What one run took, a frame.
+    """What one run took.
 
     Attributes:
-        seconds: Of one processor, both passes and what is made at the end included.
-        decoding: Of these, reading frames, both times.
-        bytes_read: Of the video.
-        bytes_written: Of the run folder.
-        memory: Most bytes that the process held; of the run, not of a frame.
-        start: Seconds that a process takes before its first frame; of the run, too.
+        seconds: Of one processor a frame, both passes.
+        decoding: Of these, reading the frame, both times.
+        seconds_once: Beside the frames: the start, solving everything once more, mesh, texture, pictures.
+        bytes_read: Of the video, a frame.
+        bytes_written: Of masks, lines and overlay, a frame.
+        bytes_once: Of the rest of the run folder.
+        memory: Most bytes that the process held.
     """
 
     seconds: float
     decoding: float
+    seconds_once: float
     bytes_read: float
     bytes_written: float
+    bytes_once: float
     memory: float
-    start: float = 5.0
 
 
 @dataclass(frozen=True)
@@ -87,17 +89,30 @@ def figures_of(run: Path, video: Path | None = None) -> RunFigures:
     reader = RunReader(run)
     if reader.state != "finished" or not reader.frames:
         raise InputError(f"{run} is not finished; its figures say nothing of a whole run.")
-    description, count = reader.description, len(reader.frames)
-    timings = description["timings"]
+    timings, count = reader.description["timings"], len(reader.frames)
     decoding = float((timings.get("stages") or {}).get("decode") or 0.0)
+    again = sum(one.seconds for one in reader.frames if one.refined and math.isfinite(one.seconds))
     if stages := reader.refinement_stages:
         decoding += stages.decode
+    each = float(timings["seconds_per_frame_mean"]) + again / count
+    written = sum(
+        _size(run / name)
+        for name in (
+            layout.MASKS,
+            layout.INITIAL_MASKS,
+            f"{layout.CAUSAL}/{layout.MASKS}",
+            layout.FRAMES,
+            layout.OVERLAY,
+        )
+    )
     return RunFigures(
-        seconds=float(timings["seconds_total"]) / count,
+        seconds=each,
         decoding=decoding / count,
+        seconds_once=max(float(timings["seconds_total"]) - each * count, 0.0),
         bytes_read=(_size(video) if video else 0) / count,
-        bytes_written=_size(run) / count,
-        memory=1e6 * float(description.get("peak_memory_mb") or math.nan),
+        bytes_written=written / count,
+        bytes_once=_size(run) - written,
+        memory=1e6 * float(reader.description.get("peak_memory_mb") or 0.0),
     )
 
 
@@ -111,7 +126,7 @@ def cost_of(
         figures: Of one run.
         machine: One of those that do it.
         fps: Frames a second of the videos.
-        minutes: Mean length of a video; each costs one start.
+        minutes: Mean length of a video.
 
     Raises:
         InputError: If a number makes no sense.
@@ -119,21 +134,22 @@ def cost_of(
     for name, value in {"hours": hours, "fps": fps, "minutes": minutes, "seconds": figures.seconds}.items():
         if not (math.isfinite(value) and value > 0):
             raise InputError(f"{name} is {value}; it has to be more than 0.")
-    frames = 3600 * fps * hours
-    seconds = figures.seconds + figures.start / (60 * fps * minutes)
+    frames, in_a_video = 3600 * fps * hours, 60 * fps * minutes
+    seconds = figures.seconds + figures.seconds_once / in_a_video
+    written = figures.bytes_written + figures.bytes_once / in_a_video
     fit = int(machine.memory // figures.memory) if figures.memory > 0 else machine.processors
     if fit < 1:
         raise InputError("One run needs more memory than the machine has.")
     limits = {
         "processors": machine.processors / seconds,
         "memory": fit / seconds,
-        "disk": machine.disk / figures.bytes_written if figures.bytes_written else math.inf,
+        "disk": machine.disk / written if written else math.inf,
         "network": machine.network / (2 * figures.bytes_read) if figures.bytes_read else math.inf,
     }
     rate = min(limits.values())
     return Cost(
         processor_hours=frames * seconds / 3600,
-        written=frames * figures.bytes_written,
+        written=frames * written,
         read=frames * figures.bytes_read,
         workers=min(machine.processors, fit),
         machine_hours=frames / rate / 3600,
@@ -151,7 +167,8 @@ def format_costs(costs: Mapping[str, Cost]) -> Table:
 
 def markdown(costs: Mapping[str, Cost]) -> str:
     """The same as a table of Markdown."""
-    head = "| | processor hours | workers a machine | machine hours | written | read | bottleneck |\n|---|---|---|---|---|---|---|\n"
+    head = "| | processor hours | workers a machine | machine hours | written | read | bottleneck |\n"
+    head += "|---|---|---|---|---|---|---|\n"
     return head + "".join(f"| {name} | {' | '.join(row_of(cost))} |\n" for name, cost in costs.items())
 
 
@@ -161,8 +178,8 @@ def row_of(cost: Cost) -> list[str]:
         f"{cost.processor_hours:,.0f}",
         str(cost.workers),
         f"{cost.machine_hours:,.0f}",
-        f"{cost.written / 1e12:.2f} TB",
-        f"{cost.read / 1e12:.2f} TB",
+        f"{cost.written / 1e12:.1f} TB",
+        f"{cost.read / 1e12:.1f} TB",
         cost.bottleneck,
     ]
 
@@ -176,6 +193,8 @@ def _size(path: Path) -> int:
     if path.is_file():
         return path.stat().st_size
     kept = {layout.STATE, layout.REFINING}
+    if not path.is_dir():
+        return 0
     return sum(
         file.stat().st_size for file in path.rglob("*") if file.is_file() and not kept & set(file.parts)
     )
