@@ -11,8 +11,10 @@ import csv
 import sys
 from pathlib import Path
 
+Box = tuple[float, float, float, float]
 
-def track(video: str, box: tuple[float, ...], folder: str) -> str:
+
+def track(video: str, box: Box, folder: str) -> str:
     """Track one video; what a lost worker had done is gone on with."""
     from tracking3d.recording import record
     from tracking3d.video import open_source
@@ -21,13 +23,13 @@ def track(video: str, box: tuple[float, ...], folder: str) -> str:
     return folder
 
 
-def read_videos(table: Path) -> list[tuple[str, tuple[float, ...]]]:
+def read_videos(table: Path) -> list[tuple[str, Box]]:
     """The videos and their boxes, the largest file first: it takes longest and is not to begin last."""
+    rows: list[tuple[str, Box]] = []
     with table.open(newline="", encoding="utf-8") as file:
-        rows = [
-            (row["video"], tuple(float(side) for side in row["box"].split(",")))
-            for row in csv.DictReader(file)
-        ]
+        for row in csv.DictReader(file):
+            x, y, width, height = (float(side) for side in row["box"].split(","))
+            rows.append((row["video"], (x, y, width, height)))
     return sorted(rows, key=lambda row: Path(row[0]).stat().st_size, reverse=True)
 
 

@@ -80,8 +80,10 @@ def write_joined(
     finally:
         lines.close()
     checkpoint = Checkpoint(folder, session.state_classes, session.config.runtime.device)
-    for frame in (*taken, *skipped):
+    for frame in taken:
         checkpoint.note(frame)
+    for one in skipped:
+        checkpoint.note(one)
     last = records[-1].index if records else -1
     checkpoint.save(Progress(last, size, refining=True, seconds=seconds), session.kept())
 

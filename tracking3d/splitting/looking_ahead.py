@@ -23,8 +23,8 @@ _WIDTH = 320  # pixels of the longer side
 _RATE = 12.0  # frames a second that are looked at, at least
 _MOST_STRIDE = 4
 _BORDER = 2  # pixels
-_CSRT = {"segmentation_size": 128, "template_size": 100.0, "number_of_scales": 17, "use_color_names": False}
-_FLOW = {"segmentation_size": 128}
+_CSRT = {"segmentation_size": 96, "template_size": 64.0, "number_of_scales": 9, "use_color_names": False}
+_FLOW = {"segmentation_size": 96}
 
 
 def tracker_for_looking(own: PluginChoice) -> PluginChoice:
@@ -94,7 +94,7 @@ def _sighting(position: int, mask: NDArray[np.bool_] | None, score: float, keep:
     if mask is None:
         return Sighting(position, 0, False, 0.0)
     inner = mask[_BORDER:-_BORDER, _BORDER:-_BORDER]
-    touches = np.count_nonzero(inner) < np.count_nonzero(mask)
+    touches = bool(np.count_nonzero(inner) < np.count_nonzero(mask))
     return Sighting(position, int(np.count_nonzero(mask)), touches, float(score), mask if keep else None)
 
 
