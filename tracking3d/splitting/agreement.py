@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.online.belief import Belief
+from tracking3d.geometry.camera import Camera
 from tracking3d.results.records import FrameRecord
 from tracking3d.splitting.map_joining import moved, same_landmarks, through_lens
 from tracking3d.splitting.similarity import Fit, fit_similarity
@@ -134,14 +135,13 @@ def joint_of(
 
 
 def by_lens(
-    belief: Belief, records: Sequence[FrameRecord], first: Belief
+    belief: Belief, records: Sequence[FrameRecord], camera: Camera
 ) -> tuple[Belief, list[FrameRecord]]:
-    """A part's knowledge and answers as the first part's lens would have them."""
+    """A part's knowledge and answers as another lens would have them."""
+    lens = (camera.fx, camera.fy, camera.cx, camera.cy)
     seen = []
     for record in records:
-        camera = record.through(belief.camera)
         T = record.T_cam_obj.copy()
-        T[2, 3] *= first.camera.fy / camera.fy
-        lens = (first.camera.fx, first.camera.fy, first.camera.cx, first.camera.cy)
+        T[2, 3] *= camera.fy / record.through(belief.camera).fy
         seen.append(replace(record, T_cam_obj=T, camera=lens))
-    return through_lens(belief, first.camera), seen
+    return through_lens(belief, camera), seen

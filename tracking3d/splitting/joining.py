@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,9 +28,10 @@ from tracking3d.splitting.map_joining import joined, moved
 from tracking3d.splitting.plan import Plan, part_folder
 from tracking3d.splitting.similarity import Similarity, fit_similarity
 
-MOST_DEARER = 1.25
+MOST_DEARER = 1.75
 """How many times what the parts' keyframes cost by themselves they may cost together; see `keyframe_cost`."""
 _FEWEST_KEYFRAMES = 3
+_SAME_LENS = math.log(1.05)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,14 +68,22 @@ def joined_parts(session: Session, config: PipelineConfig, plan: Plan, folder: P
     """
     assert isinstance(config.solver, OnlineConfig)
     runs, beliefs = _read(session, config, plan, folder)
-    joints = [
-        _joint(number, beliefs[number - 1 : number + 1], runs[number - 1 : number + 1])
-        for number in range(1, len(runs))
-    ]
-    similarities = [Similarity.identity()]
-    for joint in joints:
-        similarities.append(similarities[-1].after(joint.fit.similarity))
-    belief, dearer = join_beliefs(beliefs, similarities, config.solver, build_encoder(config))
+    encoder = build_encoder(config)
+    tried: list[tuple[float, _Try]] = []
+    refused: DisagreementError | None = None
+    for camera in _lenses(beliefs):
+        try:
+            one = _joined_by(camera, runs, beliefs, config.solver, encoder)
+        except DisagreementError as error:
+            refused = refused or error
+        else:
+            tried.append((one.dearer, one))
+    if not tried:
+        assert refused is not None
+        raise refused
+    _, best = min(tried, key=lambda one: one[0])
+    runs, beliefs, joints, similarities = best.runs, best.beliefs, best.joints, best.similarities
+    belief, dearer = best.belief, best.dearer
     settled = [
         replace(run, similarity=_settled(belief.known, own.known, similarity))
         for run, own, similarity in zip(runs, beliefs, similarities, strict=True)
@@ -89,18 +99,68 @@ def joined_parts(session: Session, config: PipelineConfig, plan: Plan, folder: P
     return Whole(settled, state, belief.camera, [_told(joint) for joint in joints], dearer)
 
 
+@dataclass(frozen=True, eq=False)
+class _Try:
+    """The parts joined by one lens; runs and beliefs are those that it makes of them."""
+
+    runs: Sequence[PartRun]
+    beliefs: Sequence[Belief]
+    joints: Sequence[Joint]
+    similarities: Sequence[Similarity]
+    belief: Belief
+    dearer: float
+
+
+def _lenses(beliefs: Sequence[Belief]) -> list[Camera]:
+    """The cameras of the parts, those that are about the same once: where nobody gave the lens, each solved its own."""
+    lenses: list[Camera] = []
+    for belief in beliefs:
+        if all(abs(math.log(belief.camera.fy / other.fy)) > _SAME_LENS for other in lenses):
+            lenses.append(belief.camera)
+    return lenses
+
+
+def _joined_by(
+    camera: Camera,
+    runs: Sequence[PartRun],
+    beliefs: Sequence[Belief],
+    config: OnlineConfig,
+    encoder: FeatureEncoder,
+) -> _Try:
+    seen = [by_lens(belief, run.records, camera) for belief, run in zip(beliefs, runs, strict=True)]
+    by_it = [belief for belief, _ in seen]
+    own = [replace(run, records=records) for run, (_, records) in zip(runs, seen, strict=True)]
+    joints = [
+        _joint(number, by_it[number - 1 : number + 1], own[number - 1 : number + 1])
+        for number in range(1, len(own))
+    ]
+    similarities = [Similarity.identity()]
+    for joint in joints:
+        similarities.append(similarities[-1].after(joint.fit.similarity))
+    belief, dearer = join_beliefs(by_it, similarities, config, encoder, beliefs)
+    return _Try(own, by_it, joints, similarities, belief, dearer)
+
+
 def join_beliefs(
     beliefs: Sequence[Belief],
     similarities: Sequence[Similarity],
     config: OnlineConfig,
     encoder: FeatureEncoder,
+    before: Sequence[Belief] | None = None,
 ) -> tuple[Belief, float]:
     """What the parts know as one, and how many times as much their keyframes cost so; see `map_joining.joined`.
+
+    Args:
+        beliefs: Of the parts, all by one lens.
+        similarities: From each part's object to the first one's.
+        config: Of the solver.
+        encoder: Of the features.
+        before: The parts as they were solved, each by its own lens, which tell what they cost by themselves.
 
     Raises:
         DisagreementError: If together they explain what was seen far worse than each by itself.
     """
-    own = float(np.mean([keyframe_cost(belief.known) for belief in beliefs]))
+    own = float(np.mean([keyframe_cost(belief.known) for belief in before or beliefs]))
     belief = joined(beliefs, similarities, config, encoder)
     together = keyframe_cost(belief.known)
     if together > MOST_DEARER * own:
@@ -113,7 +173,7 @@ def join_beliefs(
 def _read(
     session: Session, config: PipelineConfig, plan: Plan, folder: Path
 ) -> tuple[list[PartRun], list[Belief]]:
-    """The parts with what each knows, all by the first one's lens."""
+    """The parts with what each knows, by its own lens."""
     runs: list[PartRun] = []
     beliefs: list[Belief] = []
     for part in plan.parts:
@@ -124,7 +184,6 @@ def _read(
             why = belief.waits_for or "the object did not move enough in it"
             raise DisagreementError(f"the shape was never told in part {part.number + 1} ({why})")
         records = RunReader(own, refined=False).frames
-        belief, records = by_lens(belief, records, beliefs[0] if beliefs else belief)
         beliefs.append(belief)
         runs.append(PartRun(part, own, kept, records, Similarity.identity()))
     return runs, beliefs

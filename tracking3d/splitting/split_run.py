@@ -10,6 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from tracking3d.checkpoint.resuming import given_of
 from tracking3d.config.models import PipelineConfig
 from tracking3d.config.solvers import OnlineConfig
@@ -20,7 +22,7 @@ from tracking3d.prompts import make_prompt
 from tracking3d.recording import record, with_tracker
 from tracking3d.results import layout
 from tracking3d.results.making_room import make_room
-from tracking3d.results.records import FrameRecord, mask_iou
+from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader, is_finished
 from tracking3d.results.run_writer import RunWriter
 from tracking3d.session import Session
@@ -60,7 +62,8 @@ from tracking3d.video.source import FrameSource
 
 _log = logging.getLogger(__name__)
 _SAME_OBJECT = 0.5
-"""IoU of the mask that a part began with and the answer of the part before, below which it began on something else."""
+"""Share of the smaller one of two masks that lies within the other, below which a part began on something else than the
+part before ends with. One of them may well have lost a side of the object."""
 
 SideBySide = Callable[..., list[Any]]
 """See `side_by_side`."""
@@ -294,8 +297,8 @@ def _begun_elsewhere(video: _Video, plan: Plan, jobs: list[PartJob]) -> list[int
         if cut not in answers or answers[cut].status != "tracked" or begun is None or isinstance(begun, Path):
             continue
         answer = earlier.mask(cut)
-        overlap = mask_iou(answer, begun)
-        if overlap is not None and overlap < _SAME_OBJECT:
+        smaller = min(answer.sum(), begun.sum())
+        if smaller and np.count_nonzero(answer & begun) < _SAME_OBJECT * smaller:
             _log.warning("Part %d began on something else and is tracked again.", part.number + 1)
             put_cut_mask(video.folder, part, answer)
             jobs[part.number] = replace(jobs[part.number], given=Given(mask=answer), resume=False)
