@@ -67,26 +67,22 @@ def joined_parts(session: Session, config: PipelineConfig, plan: Plan, folder: P
         InputError: If a part's folder is damaged.
     """
     assert isinstance(config.solver, OnlineConfig)
-    runs, beliefs = _read(session, config, plan, folder)
+    tracked, known = _read(session, config, plan, folder)
     encoder = build_encoder(config)
-    tried: list[tuple[float, _Try]] = []
-    refused: DisagreementError | None = None
-    for camera in _lenses(beliefs):
+    tried: list[_Try] = []
+    refused: list[DisagreementError] = []
+    for camera in _lenses(known):
         try:
-            one = _joined_by(camera, runs, beliefs, config.solver, encoder)
+            tried.append(_joined_by(camera, tracked, known, config.solver, encoder))
         except DisagreementError as error:
-            refused = refused or error
-        else:
-            tried.append((one.dearer, one))
+            refused.append(error)
     if not tried:
-        assert refused is not None
-        raise refused
-    _, best = min(tried, key=lambda one: one[0])
-    runs, beliefs, joints, similarities = best.runs, best.beliefs, best.joints, best.similarities
-    belief, dearer = best.belief, best.dearer
+        raise refused[0]
+    best = min(tried, key=lambda one: one.dearer)
+    runs, belief = best.runs, best.belief
     settled = [
         replace(run, similarity=_settled(belief.known, own.known, similarity))
-        for run, own, similarity in zip(runs, beliefs, similarities, strict=True)
+        for run, own, similarity in zip(runs, best.beliefs, best.similarities, strict=True)
     ]
     first, last = runs[0].kept.session, max(record.index for run in runs for record in run.records)
     first_pose, presented, _, anew = first["steering"]
@@ -96,7 +92,7 @@ def joined_parts(session: Session, config: PipelineConfig, plan: Plan, folder: P
         "camera": belief.camera,
         "steering": (first_pose, Presented(presented.first), last, anew),
     }
-    return Whole(settled, state, belief.camera, [_told(joint) for joint in joints], dearer)
+    return Whole(settled, state, belief.camera, [_told(joint) for joint in best.joints], best.dearer)
 
 
 @dataclass(frozen=True, eq=False)
