@@ -47,7 +47,7 @@ FLOORS = [
         "tracker_choice",
     },
     {"datasets"},
-    {"evaluation", "export", "picker", "report", "speed", "synthesis", "viewer"},
+    {"evaluation", "export", "picker", "report", "speed", "splitting", "synthesis", "viewer"},
     {"benchmark"},
     {"batch"},
     {"cli", "vot", "__main__"},

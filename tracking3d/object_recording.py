@@ -229,6 +229,10 @@ class ObjectRecording:
         if self._checkpoint:
             self._checkpoint.remove()
 
+    def pause(self) -> None:
+        """Stop here; the folder is that of a stopped run, which can go on."""
+        self._writer.finish(_model(self._session), "interrupted")
+
     def give_up(self, error: BaseException) -> None:
         """Keep what is finished when ``error`` ends the run, and let ``error`` say so."""
         failed = isinstance(error, Exception)

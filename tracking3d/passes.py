@@ -22,6 +22,7 @@ def go_through(
     frames: Iterable[Frame | SkippedFrame],
     recordings: list[ObjectRecording],
     listener: Listener,
+    first_pass_only: bool = False,
 ) -> None:
     """Take every recording through the frames, and through them again where it refines.
 
@@ -32,6 +33,7 @@ def go_through(
         frames: Its frames, begun already.
         recordings: One an object.
         listener: Is told of every frame of every object.
+        first_pass_only: Stop when every frame has its causal answer.
 
     Raises:
         Tracking3dError: The first failure, at the end or as soon as no recording is left.
@@ -54,6 +56,9 @@ def go_through(
     try:
         for frame in frames if any(recording.takes for recording in going_on) else ():
             each(partial(ObjectRecording.take, frame=_shared(frame, share)))
+        if first_pass_only:
+            each(ObjectRecording.pause)
+            return
         each(partial(ObjectRecording.begin_refinement, source=source))
         for frame in timed(source) if any(recording.looks_again for recording in going_on) else ():
             if isinstance(frame, Frame):

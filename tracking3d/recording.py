@@ -53,6 +53,7 @@ def record(
     overwrite: bool = False,
     skip_damaged: bool = False,
     resume: bool = False,
+    first_pass_only: bool = False,
     listener: Listener = lambda frame: None,
 ) -> None:
     """Track the object through ``source`` and write the run folder.
@@ -79,6 +80,7 @@ def record(
         resume: Go on with the run that is in the folder, from the last frame that it finished; begin one where there
             is none. With a finished run nothing is done. Where a frame that is answered is corrected, all is computed
             again: only the state after the latest frame is kept.
+        first_pass_only: Stop when every frame has its causal answer; ``resume`` goes on from there.
         listener: Is told of every frame, those finished before included.
 
     Raises:
@@ -103,7 +105,7 @@ def record(
             session, prompt, choice=choice, first=first, folder=folder, writers=writers, corrections=told
         )
         if recording is not None:
-            go_through(source, chain(skipped, [first], frames), [recording], listener)
+            go_through(source, chain(skipped, [first], frames), [recording], listener, first_pass_only)
 
 
 def record_objects(

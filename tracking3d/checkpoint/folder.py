@@ -45,9 +45,9 @@ class Checkpoint:
         self._journal = 0
         self._waiting = b""
 
-    def note(self, skipped: SkippedFrame) -> None:
-        """Remember a frame that was not taken; it is kept with the next one that is."""
-        self._waiting += journal_line(skipped)
+    def note(self, frame: SkippedFrame | TakenFrame) -> None:
+        """Remember a frame that was not taken, or whose state is of no use; it is kept with the next state."""
+        self._waiting += journal_line(frame)
 
     def save(self, progress: Progress, session: dict[str, Any], taken: TakenFrame | None = None) -> None:
         """Keep the state after a frame.

@@ -20,6 +20,7 @@ from tracking3d.cli.options import (
     camera_settings,
     configure,
 )
+from tracking3d.cli.split import track_in_parts
 from tracking3d.cli.tracking import Given, a_person_is_there, default_folder, track
 from tracking3d.cli.view import Host
 from tracking3d.errors import InputError
@@ -149,6 +150,22 @@ def run(
             rich_help_panel=_RUNNING,
         ),
     ] = False,
+    split: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SECONDS",
+            help="Track a long video in parts of such a length side by side, and join them.",
+            rich_help_panel=_RUNNING,
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="With --split: parts at a time; default all processors.",
+            rich_help_panel=_RUNNING,
+        ),
+    ] = None,
     config: ConfigFile = None,
     preset: Preset = None,
     quality: Quality = None,
@@ -217,6 +234,8 @@ def run(
         raise InputError("Give either --box, --mask or --points, not more than one of them.")
     if host is not None and not view:
         raise InputError("--host is where --view serves its page; give both.")
+    if workers is not None and split is None:
+        raise InputError("--workers is how many parts of --split are tracked at a time; give both.")
     chosen: dict[str, Any] = {"name": tracker}
     if masks is not None:
         if tracker not in (None, "precomputed", "auto"):
@@ -273,4 +292,21 @@ def run(
         "start_frame": start_frame,
         "corrections": corrections,
     }
-    track(source, settings, folder, given, about, fps=fps, quiet=quiet, report=report, view=view, host=host)
+    if split is not None:
+        track_in_parts(
+            source,
+            settings,
+            folder,
+            given,
+            about,
+            split,
+            workers=workers,
+            fps=fps,
+            quiet=quiet,
+            report=report,
+            view=view,
+        )
+    else:
+        track(
+            source, settings, folder, given, about, fps=fps, quiet=quiet, report=report, view=view, host=host
+        )

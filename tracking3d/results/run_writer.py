@@ -44,6 +44,7 @@ SKIPS_EVERY = 1.0
 """Seconds between two writes of ``run.json`` for skipped frames; the last ones are written at the end."""
 RESERVE = 2048
 """Bytes that ``run.json`` has to spare for saying, on a full disk, how the run ended."""
+_LASTING = ("created", "refinement", "split")  # what a run that goes on keeps of what it said of itself
 DEFAULT_FPS = 10.0
 """Speed of the overlay video where the source has none, such as a folder of images."""
 
@@ -94,11 +95,9 @@ class RunWriter:
         self.folder = Path(folder)
         self._camera = camera
         self._fps = fps or DEFAULT_FPS
-        self._started = time.monotonic()
+        self._started, self._drawing, self._over = time.monotonic(), 0.0, False
         self._pictures = Pictures(self.folder / layout.OVERLAY, camera, self._fps)
         self._refinement: RefinementWriter | None = None
-        self._over = False
-        self._drawing = 0.0
         self._description = description.description_at_start(
             config=config,
             camera=camera,
@@ -313,7 +312,7 @@ class RunWriter:
         self._lines.go_on(so_far.lines)
         self._kept = {record.index: record for record in known}
         self._started -= so_far.seconds
-        self._description |= {key: earlier[key] for key in ("created", "refinement") if key in earlier}
+        self._description |= {key: earlier[key] for key in _LASTING if key in earlier}
         self._description["resumed"] = [
             *earlier.get("resumed", ()),
             {"at": description.now(), "frames": len(known)},

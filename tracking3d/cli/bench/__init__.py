@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from tracking3d.cli.bench import batch, live, masks, matching, points, render, soak
+from tracking3d.cli.bench import batch, cost, live, masks, matching, points, render, schedule, soak, split
 
 app = typer.Typer(
     help="Measure how fast, and how good by themselves, the parts are on this machine.",
@@ -17,3 +17,6 @@ app.command(name="matching")(matching.matching)
 app.command(name="points")(points.points)
 app.command(name="batch")(batch.batch)
 app.command(name="soak")(soak.soak)
+app.command(name="split")(split.split)
+app.command(name="schedule")(schedule.schedule)
+app.command(name="cost")(cost.cost)

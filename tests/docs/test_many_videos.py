@@ -1,0 +1,25 @@
+"""The tables of docs/many-videos.md are what the program makes of the numbers beside them."""
+
+from __future__ import annotations
+
+from documentation_pages import ROOT, blocks
+
+from tracking3d.benchmark.scheduling import Fleet, Splitting, skewed_lengths
+from tracking3d.benchmark.scheduling_plot import compared, markdown
+
+PAGE = ROOT / "docs/many-videos.md"
+
+
+def test_the_costs_are_those_of_the_stated_figures(capsys):
+    for block in blocks(PAGE, "python"):
+        exec(compile(block, "docs/many-videos.md", "exec"), {})
+    printed = capsys.readouterr().out.strip()
+    assert printed.count("\n") == 5
+    assert printed in PAGE.read_text(encoding="utf-8")
+
+
+def test_the_schedules_are_those_of_the_simulation():
+    work = 15 * skewed_lengths(10_000)
+    for workers in (100, 1000):
+        table = markdown(compared(work, Fleet(workers), Splitting(15 * 120.0)))
+        assert table in PAGE.read_text(encoding="utf-8")
