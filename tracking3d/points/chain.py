@@ -45,17 +45,25 @@ def follow_chain(warps: Warps, start: int, xy: Array, steps: Sequence[int] = STE
             if warps.views[target] is None:
                 continue
             before = [target - direction * step for step in steps]
-            _extend(chain, warps, target, [one for one in before if (one - start) * direction >= 0])
+            extend(chain, warps, target, [one for one in before if (one - start) * direction >= 0])
             missing = ~np.isfinite(chain.variance[target])
             if missing.any() and start not in before:
-                _extend(chain, warps, target, [start], missing)
+                extend(chain, warps, target, [start], missing)
     return chain
 
 
-def _extend(
+def extend(
     chain: Chain, warps: Warps, target: int, sources: list[int], of: np.ndarray | None = None
 ) -> None:
-    """Write what the templates of some views say about one more view."""
+    """Write what the templates of some views say about one more view.
+
+    Args:
+        chain: Is written to.
+        warps: The views.
+        target: Index of the view.
+        sources: Those of the templates; points that they do not hold are left as they are.
+        of: ``(N,)`` which points; None for all.
+    """
     count = chain.variance.shape[1]
     total, weights = np.zeros((count, 2)), np.zeros(count)
     for source in sources:
