@@ -121,10 +121,16 @@ class CapturedFrames:
             InputError: If it is not open.
         """
         if not capture.isOpened():
-            raise InputError("frames= is a VideoCapture that is not open; open it on a file or camera that can be read.")
-        length, start = (int(capture.get(what)) for what in (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_POS_FRAMES))
+            raise InputError(
+                "frames= is a VideoCapture that is not open; open it on a file or camera."
+            )
+        length, start = (
+            int(capture.get(what)) for what in (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_POS_FRAMES)
+        )
         rate = capture.get(cv2.CAP_PROP_FPS)
-        return cls(capture, max(start, 0), length - start if length > start else None, rate if rate > 0 else None)
+        return cls(
+            capture, max(start, 0), length - start if length > start else None, rate if rate > 0 else None
+        )
 
     @property
     def repeatable(self) -> bool:

@@ -41,7 +41,9 @@ def checked_queries(follow: Any) -> Array | None:
             "or (frame, x, y)."
         )
     if not np.isfinite(queries).all():
-        raise InputError("follow= has values that are no finite numbers; give (x, y) or (frame, x, y) of each point.")
+        raise InputError(
+            "follow= has values that are no finite numbers; give (x, y) or (frame, x, y) of each point."
+        )
     if queries.shape[1] == 2:
         return np.insert(queries, 0, -1.0, axis=1)
     if (queries[:, 0] < 0).any() or (queries[:, 0] % 1).any():
@@ -83,7 +85,9 @@ class PointFollowing:
         if poses:
             for number, group in self._asked.items():
                 for index, answer in group.again(radius).items():
-                    self._place(earlier.setdefault(index, PointAnswers.unknown(len(self._queries))), number, answer)
+                    self._place(
+                        earlier.setdefault(index, PointAnswers.unknown(len(self._queries))), number, answer
+                    )
         view = None
         if estimate.status is not Status.LOST:
             camera = estimate.camera or session.camera

@@ -31,12 +31,16 @@ def config_of_result(
     if refine is not None and not isinstance(refine, bool):
         raise InputError(f"refine={shown(refine)} is neither True nor False.")
     if model is not None and model not in get_args(ModelChoice):
-        raise InputError(f"model={shown(model)} is unknown; give {' or '.join(map(repr, get_args(ModelChoice)))}.")
+        raise InputError(
+            f"model={shown(model)} is unknown; give {' or '.join(map(repr, get_args(ModelChoice)))}."
+        )
     solver, shape = config.solver, config.object
     if refine is not None:
         solver = solver.model_copy(update={"final_refine": refine})
     if refine and not hasattr(SOLVERS[solver.name], "refine"):
-        raise InputError(f"refine=True: the solver {solver.name} gives causal answers only; choose solver.name online.")
+        raise InputError(
+            f"refine=True: the solver {solver.name} gives causal answers only; choose solver.name online."
+        )
     if refine and not source.repeatable:
         raise InputError(
             f"refine=True: {source.name} comes once only, and all frames are needed a second time; give a list or a path."

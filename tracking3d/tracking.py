@@ -98,6 +98,7 @@ class Tracking(Iterator[FrameEstimate]):
 
         Where the task is cancelled, the frame in work is finished, and then the source is closed.
         """
+        self._begun(True)
         async with _Worker(self) as worker:
             async for _ in worker.all():
                 pass
@@ -147,7 +148,7 @@ class _Worker:
     async def __aexit__(self, *error: object) -> None:
         if any(error):
             await asyncio.shield(self.of(self._tracking.close))
-        self._thread.shutdown(wait=False)
+        self._thread.shutdown()  # has nothing left to do
 
     def of(self, function: Callable[[], _T]) -> asyncio.Future[_T]:
         """What a function gives in the thread."""

@@ -165,10 +165,9 @@ def test_a_session_takes_views_too(clip, quick):
         np.zeros((64, 80, 3), np.float32),
         np.zeros((64, 80, 3), np.uint16),
         np.zeros((0, 0, 3), np.uint8),
-        "frame.png",
         None,
     ],
-    ids=["grey", "alpha", "channels first", "float", "16 bit", "empty", "text", "none"],
+    ids=["grey", "alpha", "channels first", "float", "16 bit", "empty", "none"],
 )
 def test_an_image_of_another_form_is_refused_by_its_number(clip, quick, bad):
     frames = track([clip.images[0], bad], mask=clip.masks[0], config=quick)

@@ -1,7 +1,9 @@
 """Points followed while the views come: each is answered by those until then.
 
-As many views are kept as the templates reach back and a point in space is settled by; what is kept does not grow. When
-surface or poses of the past become known better, the kept views are drawn and gone through anew.
+As many views are kept as the templates reach back and a point in space is settled by; what is kept does not grow.
+Poses that are answered at the time are some pixels off, so that points of a grid on the object are followed beside those
+that were asked for, and the poses of the kept views are bundled with them. When surface or poses of the past become
+known better, the kept views are drawn and gone through anew.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from numpy.typing import NDArray
 
 from tracking3d.geometry.camera import Camera
 from tracking3d.points.answers import PointAnswers
+from tracking3d.points.bundle import bundle
 from tracking3d.points.carrying import Warps
 from tracking3d.points.chain import STEPS, Chain, extend
 from tracking3d.points.follow import RIM, agreed
@@ -23,6 +26,10 @@ from tracking3d.points.view import Array, View, draw, sample
 KEPT = 16
 """Views that are kept; no fewer than the templates reach back."""
 assert max(STEPS) <= KEPT
+_GRID = 8  # along either side of the window
+_SETTLING = (1.0, 0.3, 0.1)  # pixels that a measurement is off at best: first all have a say, then those that agree
+_TURNS = 3
+_POINT, _ROTATION, _TRANSLATION = 0.1, 0.03, 0.03  # priors of the bundle: radii, radians, radii
 
 Known = Callable[[int], tuple[Camera, Array] | None]
 """Camera and ``(4, 4)`` ``T_cam_obj`` of the frame with an index; None where they are not known better than before."""
@@ -48,6 +55,7 @@ class CausalPoints:
 
     def __init__(self, xy: Array) -> None:
         self.xy = xy
+        self._all = xy
         self._rows: list[_Row] = []
         self._first: _Row | None = None
 
@@ -59,11 +67,13 @@ class CausalPoints:
             view: Of the object in it; None where it is lost.
             radius: Of the object.
         """
-        size = len(self.xy)
+        if self._first is None and view is not None:
+            self._all = np.concatenate([self.xy, _grid(view)])
+        size = len(self._all)
         row = _Row(index, view, np.full((size, 2), np.nan), np.full(size, np.inf), np.full(size, -1.0))
         if self._first is None:
             if view is not None:
-                row.measured, row.variance[:], row.likeness[:] = view.to_window(self.xy), 0.0, 1.0
+                row.measured, row.variance[:], row.likeness[:] = view.to_window(self._all), 0.0, 1.0
             self._first = row
         elif self._turns(index):
             self._rows = [self._first]
@@ -110,14 +120,15 @@ class CausalPoints:
         return (index - last) * (last - before) < 0
 
     def _answer(self, row: _Row, radius: float) -> PointAnswers:
-        answer = PointAnswers.unknown(len(self.xy))
-        first = self._first
+        first, count = self._first, len(self.xy)
+        answer = PointAnswers.unknown(count)
         if row.view is None or first is None or first.view is None:
             return answer
-        pixels = first.view.to_window(self.xy)
+        pixels = first.view.to_window(self._all)
         points = first.view.surface(pixels)
         on = np.flatnonzero(np.isfinite(points).all(1) & (sample(first.view.beyond, pixels) < RIM))
-        if not len(on):
+        asked = int((on < count).sum())
+        if not asked:
             return answer
         if row is not first:
             self._measure(row, radius)
@@ -128,8 +139,10 @@ class CausalPoints:
                 for parts in zip(*((one.measured, one.variance, one.likeness) for one in rows), strict=True)
             )
         )
+        views = _bundled([one.view for one in rows if one.view is not None], points[on], chain, radius)
         gap = np.array([abs(one.index - first.index) for one in rows])
-        views = [one.view for one in rows if one.view is not None]
+        chain = Chain(chain.measured[:, :asked], chain.variance[:, :asked], chain.likeness[:, :asked])
+        on = on[:asked]
         seen = agreed(views, points[on], chain, first.view.slant(pixels[on]), gap, radius)
         answer.positions[on], answer.visible[on] = seen.positions[-1], seen.visible[-1]
         answer.uncertainty[on], answer.points[on] = seen.uncertainty[-1], seen.points
@@ -162,3 +175,22 @@ class CausalPoints:
             chain.variance[target],
             chain.likeness[target],
         )
+
+
+def _bundled(views: list[View], points: Array, chain: Chain, radius: float) -> list[View]:
+    """The views in poses that agree with what the images say of the points; as they are drawn otherwise."""
+    intrinsics, poses = np.stack([one.intrinsics for one in views]), np.stack([one.T_cam_obj for one in views])
+    held = _POINT * radius, _ROTATION, _TRANSLATION * radius
+    for least in _SETTLING:
+        deviation = np.sqrt(chain.variance + least**2)
+        points, poses, _ = bundle(points, intrinsics, poses, chain.measured, deviation, *held, turns=_TURNS)
+    return [replace(one, T_cam_obj=T) for one, T in zip(views, poses, strict=True)]
+
+
+def _grid(view: View) -> Array:
+    """``(N, 2)`` pixels of the frame, all over the object."""
+    height, width = view.beyond.shape
+    steps = (np.arange(_GRID) + 0.5) / _GRID
+    x, y = (one.ravel() for one in np.meshgrid(steps * width - 0.5, steps * height - 0.5))
+    pixels = np.stack([x, y], 1)
+    return view.to_frame(pixels[sample(view.beyond, pixels) == 0])

@@ -52,9 +52,7 @@ def follow_chain(warps: Warps, start: int, xy: Array, steps: Sequence[int] = STE
     return chain
 
 
-def extend(
-    chain: Chain, warps: Warps, target: int, sources: list[int], of: np.ndarray | None = None
-) -> None:
+def extend(chain: Chain, warps: Warps, target: int, sources: list[int], of: np.ndarray | None = None) -> None:
     """Write what the templates of some views say about one more view.
 
     Args:
