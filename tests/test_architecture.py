@@ -24,6 +24,7 @@ FLOORS = [
         "given_frames",
         "images",
         "mask_tracking",
+        "modules",
         "object_recording",
         "parts",
         "point_following",
