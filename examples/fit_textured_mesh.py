@@ -1,6 +1,6 @@
 """Fit a textured mesh to images whose cameras and poses are known: shape and colour from a sphere, in plain torch.
 
-    python examples/fit_textured_mesh.py [STEPS]
+python examples/fit_textured_mesh.py [STEPS]
 """
 
 import sys
@@ -21,7 +21,9 @@ from tracking3d.rendering import SoftBand
 from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
 
 
-def fit(images: torch.Tensor, masks: torch.Tensor, camera, pose, steps: int) -> tuple[TexturedMesh, list[float]]:
+def fit(
+    images: torch.Tensor, masks: torch.Tensor, camera, pose, steps: int
+) -> tuple[TexturedMesh, list[float]]:
     """Fit to ``images`` (B, 3, H, W) and ``masks`` (B, 1, H, W); gives the mesh and the loss of every step."""
     mesh = TexturedMesh.of(sphere(frequency=8), torch.full((3, 96, 96), 0.5))
     renderer = MeshRenderer(SoftBand(sigma=2000.0, boxlen=0.05))

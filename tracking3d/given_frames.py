@@ -121,9 +121,7 @@ class CapturedFrames:
             InputError: If it is not open.
         """
         if not capture.isOpened():
-            raise InputError(
-                "frames= is a VideoCapture that is not open; open it on a file or camera."
-            )
+            raise InputError("frames= is a VideoCapture that is not open; open it on a file or camera.")
         length, start = (
             int(capture.get(what)) for what in (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_POS_FRAMES)
         )

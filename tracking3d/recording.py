@@ -197,10 +197,8 @@ def opened(
         InputError: If the source or the solver cannot go both ways.
     """
     check_order(source, config, start_frame)
-    if start_frame is None:
-        frames = timed(source)
-    else:
-        frames = both_ways(partial(timed, source), start_frame, source.name)
+    once = partial(timed, source)
+    frames = once() if start_frame is None else both_ways(once, start_frame, source.name)
     try:
         yield frames
     finally:

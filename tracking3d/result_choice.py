@@ -43,7 +43,7 @@ def config_of_result(
         )
     if refine and not source.repeatable:
         raise InputError(
-            f"refine=True: {source.name} comes once only, and all frames are needed a second time; give a list or a path."
+            f"refine=True: {source.name} comes once only, and all frames are needed a second time; give a list or path."
         )
     if model == "fast":
         if not solver.final_refine or not source.repeatable:

@@ -131,7 +131,7 @@ class Tracking(Iterator[FrameEstimate]):
         if self._answers is None:
             if keeps:
                 self._kept = TemporaryRun()
-            self._answers = _answers(self._task, self._kept and self._kept.folder)
+            self._answers = _answers(self._task, self._kept.folder if self._kept else None)
         return self._answers
 
 
@@ -161,7 +161,7 @@ class _Worker:
 
 
 def _answers(task: Task, folder: Path | None) -> Generator[FrameEstimate]:
-    """The answers, frame by frame; where there is a folder they are kept, and when the last is taken all is finished."""
+    """The answers, frame by frame; where there is a folder they are kept, and after the last all is finished."""
     session: Session | None = None
     recording: ObjectRecording | None = None
     following = None if task.queries is None else PointFollowing(task.queries)

@@ -42,7 +42,12 @@ def weights(tmp_path_factory):
     """Networks that were never trained: what is tested is what is made of them."""
     torch.manual_seed(0)
     folder = tmp_path_factory.mktemp("weights")
-    networks = {"hardnet": HardNet(False), "sosnet": SOSNet(False), "tfeat": TFeat(False), "hynet": HyNet(False)}
+    networks = {
+        "hardnet": HardNet(False),
+        "sosnet": SOSNet(False),
+        "tfeat": TFeat(False),
+        "hynet": HyNet(False),
+    }
     for name, network in {**networks, "disk": DISK()}.items():
         state = network.state_dict()
         torch.save({"extractor": state} if name == "disk" else {"state_dict": state}, folder / f"{name}.pth")
@@ -53,7 +58,9 @@ def test_dense_sift_is_a_whole_encoder_without_weights():
     check_encoder(KorniaEncoder)
 
 
-@pytest.mark.parametrize(("name", "stride"), [("disk", 1), ("hardnet", 8), ("sosnet", 8), ("tfeat", 8), ("hynet", 8)])
+@pytest.mark.parametrize(
+    ("name", "stride"), [("disk", 1), ("hardnet", 8), ("sosnet", 8), ("tfeat", 8), ("hynet", 8)]
+)
 def test_features_have_their_stride_and_length_one(weights, name, stride):
     made = encoder(descriptor=name, weights=str(weights / f"{name}.pth"), stride=8)
     features = made.encode(torch.rand(2, 3, 49, 66, generator=torch.Generator().manual_seed(1)))
@@ -94,7 +101,10 @@ def test_patches_lie_around_the_middle_of_their_pixels(symmetric, stride):
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"descriptor": "hardnet"}, r"^features.weights: hardnet needs the file of its weights, and nothing is fetched"),
+        (
+            {"descriptor": "hardnet"},
+            r"^features.weights: hardnet needs the file of .* nothing is fetched",
+        ),
         ({"descriptor": "disk"}, r"^features.weights: disk needs the file"),
         ({"weights": "x.pth"}, r"^features.weights: dense-sift has no weights"),
         ({"descriptor": "hardnet", "weights": "nowhere.pth"}, r"^The weights nowhere.pth do not exist"),
@@ -106,7 +116,9 @@ def test_weights_that_are_not_there_are_asked_for(options, sentence):
 
 
 def test_weights_of_another_network_and_other_files_are_refused(weights, tmp_path):
-    with pytest.raises(InputError, match=r"tfeat\.pth does not hold the weights of hardnet: features\.0\.weight"):
+    with pytest.raises(
+        InputError, match=r"tfeat\.pth does not hold the weights of hardnet: features\.0\.weight"
+    ):
         encoder(descriptor="hardnet", weights=str(weights / "tfeat.pth"))
     text, other = tmp_path / "text.pth", tmp_path / "other.pth"
     text.write_text("no weights")

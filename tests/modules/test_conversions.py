@@ -94,7 +94,10 @@ def test_gradients_go_through(pose):
 
 @pytest.mark.parametrize(
     ("K", "size", "sentence"),
-    [([[1.0, 0.5], [0, 1]], (4, 5), r"^pinhole= has a skew of 0.5"), ([[1.0, 0], [0, 1]], (4.5, 5), r"^pinhole= is 5 x 4.5")],
+    [
+        ([[1.0, 0.5], [0, 1]], (4, 5), r"^pinhole= has a skew of 0.5"),
+        ([[1.0, 0], [0, 1]], (4.5, 5), r"^pinhole= is 5 x 4.5"),
+    ],
 )
 def test_what_is_no_camera_of_ours_is_refused(K, size, sentence):
     intrinsics = torch.eye(4)[None].clone()

@@ -83,7 +83,9 @@ class KorniaEncoder:
         given = cls.Options.model_validate(options.model_dump())
         if given.descriptor == "dense-sift":
             if given.weights is not None:
-                raise InputError("features.weights: dense-sift has no weights; name another features.descriptor.")
+                raise InputError(
+                    "features.weights: dense-sift has no weights; name another features.descriptor."
+                )
             return cls(given.descriptor)
         if given.weights is None:
             raise InputError(

@@ -31,7 +31,9 @@ def read_weights(file: Path) -> dict[str, Tensor]:
             return safetensors.torch.load_file(file)
         loaded = torch.load(file, map_location="cpu", weights_only=True)
     except ImportError as error:
-        raise InputError(f"{file} is read by the package safetensors; install it, or give a .pth file.") from error
+        raise InputError(
+            f"{file} is read by the package safetensors; install it, or give a .pth file."
+        ) from error
     except Exception as error:  # damaged files make the readers raise many kinds
         raise InputError(
             f"{file} cannot be read as weights, or holds more than tensors, which is not loaded; give a .safetensors "
@@ -60,7 +62,8 @@ def load_weights(network: nn.Module, file: Path, name: str) -> None:
     wrong = [
         key
         for key, value in wanted.items()
-        if not key.endswith("num_batches_tracked") and (key not in weights or weights[key].shape != value.shape)
+        if not key.endswith("num_batches_tracked")
+        and (key not in weights or weights[key].shape != value.shape)
     ]
     if wrong:
         raise InputError(

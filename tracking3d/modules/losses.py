@@ -64,7 +64,7 @@ class OutlineLoss(_PerFrame):
         self.scale = scale
 
     def forward(self, views: Views, mask: Tensor) -> Tensor:
-        """Compare outlines; differentiable in what was drawn.
+        """Compare outlines; differentiable in where the outline's points are, their number and weights held fixed.
 
         Args:
             views: Of `MeshRenderer`.

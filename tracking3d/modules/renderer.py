@@ -37,9 +37,8 @@ class TexturedMesh(nn.Module):
 
     @classmethod
     def of(cls, mesh: Mesh, texture: Tensor) -> Self:
-        """A mesh such as `tracking3d.geometry.prototypes.sphere` with a texture ``(C, T, T)``, in the texture's type."""
-        as_given = (torch.tensor(part).to(texture) for part in (mesh.vertices, mesh.face_uvs))
-        vertices, face_uvs = as_given
+        """A mesh such as `tracking3d.geometry.prototypes.sphere` with a texture ``(C, T, T)``, of the same type."""
+        vertices, face_uvs = (torch.tensor(part).to(texture) for part in (mesh.vertices, mesh.face_uvs))
         return cls(vertices, torch.tensor(mesh.faces, device=texture.device), face_uvs, texture)
 
     def forward(self) -> tuple[Tensor, Tensor]:
@@ -54,7 +53,6 @@ class Views:
     Attributes:
         image: ``(B, C, H, W)`` texture, zero where uncovered.
         silhouette: ``(B, 1, H, W)`` soft, in [0, 1].
-        depth: ``(B, 1, H, W)`` z in camera coordinates, zero where uncovered; differentiable.
         drawn: All that the renderer answers.
     """
 
@@ -64,6 +62,7 @@ class Views:
 
     @property
     def depth(self) -> Tensor:
+        """``(B, 1, H, W)`` z in camera coordinates, zero where uncovered; differentiable."""
         return self.drawn.image(self.drawn.points[:, 2:])
 
 
@@ -149,7 +148,9 @@ def _frames(camera: PinholeCamera, pose: Se3) -> tuple[Tensor, Tensor, Tensor, t
     K, extrinsics = camera.intrinsics[:, :3, :3], camera.extrinsics
     views = max(len(matrix), len(K))
     if len(matrix) not in (1, views) or len(K) not in (1, views):
-        raise ValueError(f"camera has {len(K)} frames and pose {len(matrix)}; give as many of both, or one of either")
+        raise ValueError(
+            f"camera has {len(K)} frames and pose {len(matrix)}; give as many of both, or one of either"
+        )
     if K.detach()[:, [0, 1], [1, 0]].any():
         raise ValueError("camera has a skew, which is not rendered; give fx, fy, cx and cy alone")
     sizes = {(int(height), int(width)) for height, width in zip(camera.height, camera.width, strict=True)}

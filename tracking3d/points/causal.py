@@ -1,9 +1,9 @@
 """Points followed while the views come: each is answered by those until then.
 
 As many views are kept as the templates reach back and a point in space is settled by; what is kept does not grow.
-Poses that are answered at the time are some pixels off, so that points of a grid on the object are followed beside those
-that were asked for, and the poses of the kept views are bundled with them. When surface or poses of the past become
-known better, the kept views are drawn and gone through anew.
+Poses that are answered at the time are some pixels off, so that points of a grid on the object are followed beside
+those that were asked for, and the poses of the kept views are bundled with them. When surface or poses of the past
+become known better, the kept views are drawn and gone through anew.
 """
 
 from __future__ import annotations
@@ -27,7 +27,11 @@ KEPT = 16
 """Views that are kept; no fewer than the templates reach back."""
 assert max(STEPS) <= KEPT
 _GRID = 8  # along either side of the window
-_SETTLING = (1.0, 0.3, 0.1)  # pixels that a measurement is off at best: first all have a say, then those that agree
+_SETTLING = (
+    1.0,
+    0.3,
+    0.1,
+)  # pixels that a measurement is off at best: first all have a say, then those that agree
 _TURNS = 3
 _POINT, _ROTATION, _TRANSLATION = 0.1, 0.03, 0.03  # priors of the bundle: radii, radians, radii
 
@@ -179,7 +183,10 @@ class CausalPoints:
 
 def _bundled(views: list[View], points: Array, chain: Chain, radius: float) -> list[View]:
     """The views in poses that agree with what the images say of the points; as they are drawn otherwise."""
-    intrinsics, poses = np.stack([one.intrinsics for one in views]), np.stack([one.T_cam_obj for one in views])
+    intrinsics, poses = (
+        np.stack([one.intrinsics for one in views]),
+        np.stack([one.T_cam_obj for one in views]),
+    )
     held = _POINT * radius, _ROTATION, _TRANSLATION * radius
     for least in _SETTLING:
         deviation = np.sqrt(chain.variance + least**2)
