@@ -197,7 +197,9 @@ def _shown(default: Any) -> str:
 
 def written_surface() -> str:
     held = {name: found for name, thing in surface() if (found := arguments_of(thing)) is not None}
-    return "{\n" + ",\n".join(f"{json.dumps(name)}: {json.dumps(held[name])}" for name in sorted(held)) + "\n}\n"
+    return (
+        "{\n" + ",\n".join(f"{json.dumps(name)}: {json.dumps(held[name])}" for name in sorted(held)) + "\n}\n"
+    )
 
 
 HELD = json.loads(SIGNATURES.read_text(encoding="utf-8")) if SIGNATURES.is_file() else {}
@@ -216,7 +218,9 @@ def test_arguments_keep_their_names_order_kinds_and_defaults(name):
     by_name = {one[0]: one for one in now}
     assert [by_name.get(one[0]) for one in held] == held
     added = [one for one in now if one[0] not in {old[0] for old in held}]
-    assert all(one[2] != "needed" or one[1].startswith("VAR") for one in added), "a new argument has a default"
+    assert all(one[2] != "needed" or one[1].startswith("VAR") for one in added), (
+        "a new argument has a default"
+    )
     in_order = [one[0] for one in now if one[1] != "KEYWORD_ONLY"]
     assert in_order[: sum(one[1] != "KEYWORD_ONLY" for one in held)] == [
         one[0] for one in held if one[1] != "KEYWORD_ONLY"
