@@ -70,6 +70,9 @@ def tensors() -> None:
         lambda: project(vertices, R, pose.translation, K[:, :3, :3]),
         lambda: camera.project(vertices.expand(VIEWS, -1, -1)),
     )
+    texture, uv = torch.rand(16, 150, 150, generator=generator), torch.rand(8000, 2, generator=generator)
+    x, y = 150 * uv.T[:, None, None]
+    row("texture at places", lambda: sample_texture(texture, uv), lambda: remap(texture[None], x, y))
     kernel = torch.ones(3, 3)
     for views in (VIEWS, 1):
         soft = torch.rand(views, 128, 128, generator=generator)
@@ -81,9 +84,6 @@ def tensors() -> None:
     mask = torch.zeros(128, 128)
     mask[40:90, 50:100] = 1
     row("distance to a mask", lambda: mask_distance(mask), lambda: distance_transform(mask[None, None]))
-    texture, uv = torch.rand(16, 150, 150, generator=generator), torch.rand(8000, 2, generator=generator)
-    x, y = 150 * uv.T[:, None, None]
-    row("texture at places", lambda: sample_texture(texture, uv), lambda: remap(texture[None], x, y))
 
 
 def pictures() -> None:
