@@ -238,7 +238,7 @@ def test_without_a_configuration_the_default_preset_is_used(clip, monkeypatch):
     used: list[PipelineConfig] = []
 
     class Recorder:
-        def __init__(self, config, prompt):
+        def __init__(self, config, prompt, intrinsics, origin):
             used.append(config)
 
         def step(self, frame):
