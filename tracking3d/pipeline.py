@@ -178,6 +178,7 @@ def _answers_of_objects(
             for theirs in corrections:
                 check_corrections_fit(theirs.values(), frame, config.tracker.name)
             poses = [np.eye(4) for _ in sessions]
+        frame = replace(frame, decoding=frame.decoding / len(sessions))
         answers = []
         for number, session in enumerate(sessions):
             if number not in failures:
