@@ -1,21 +1,34 @@
-"""What users of the library rely on: removing or renaming any of it fails here, and needs a new major version."""
+"""What users of the library rely on: removing or renaming any of it fails here, see "What stays" in docs/library.md.
+
+``api_surface.json`` holds the arguments of all that is listed here, with their kinds and defaults. Arguments may be
+added if they have a default; then, and where something was taken back as the policy says, write it anew with
+``python tests/test_api_surface.py``.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import inspect
+import json
 import subprocess
 import sys
+from collections.abc import Iterator
 from importlib import import_module
+from pathlib import Path
+from typing import Any
 
 import pytest
 
 import tracking3d
 from tracking3d.evaluation.score import Scores
+from tracking3d.results.run_reader import RunReader
 
 EXACT = {
     "tracking3d": """Frame FrameEstimate ObjectModel PipelineConfig Prompt Session Status __version__ export_run
-        load_config track track_objects""",
+        load_config track track_objects Tracking TrackingResult""",
+    "tracking3d.modules": """LaplacianLoss MeshRenderer OutlineLoss Silhouette SilhouetteLoss TextureLoss
+        TexturedMesh Views camera_from_pinhole pinhole_of_camera pose_from_se3 quaternion_from_kornia
+        quaternion_of_pose se3_from_matrix se3_of_pose""",
     "tracking3d.plugins": """FEATURES PluginInfo TRACKERS VARIABLE build_plugin check_options list_plugins
         load_plugin plugin_label""",
     "tracking3d.testing": "check_encoder check_tracker",
@@ -75,12 +88,15 @@ AT_LEAST = {
     "tracking3d.export.supervision_detections": "detections",
     "tracking3d.features.protocol": "FeatureEncoder",
     "tracking3d.features.rgb": "RgbEncoder",
+    "tracking3d.features.kornia_descriptors": "KorniaEncoder",
     "tracking3d.frames": "Box Frame Image MaskEstimate Prompt SkippedFrame",
     "tracking3d.geometry.camera": "Camera Window",
     "tracking3d.geometry.mesh": "Mesh",
     "tracking3d.geometry.pose": "Pose",
     "tracking3d.geometry.prototypes": "ellipsoid from_file icosphere sphere",
+    "tracking3d.given_frames": "open_frames",
     "tracking3d.pipeline": "Session track track_objects",
+    "tracking3d.points.answers": "PointAnswers",
     "tracking3d.networks.download": "adopt fetch",
     "tracking3d.networks.session": "Network TensorInfo",
     "tracking3d.networks.store": "find_network",
@@ -110,7 +126,7 @@ FIELDS = {
     tracking3d.Frame: "index image time name",
     tracking3d.Prompt: "box mask points",
     tracking3d.FrameEstimate: """index time T_cam_obj mask initial_mask status reason confidence losses
-        iterations keyframe seconds failure revised""",
+        iterations keyframe seconds failure revised camera points""",
     tracking3d.ObjectModel: "vertices faces face_uvs texture texture_weight features",
     Scores: """iou_initial_mean iou_mean rotation_error_mean_deg rotation_error_median_deg
         rotation_error_anchored_median_deg share_under_5_deg share_worse_than_initial frames""",
@@ -143,13 +159,72 @@ def test_settings_keep_their_sections():
     assert set(SETTINGS.split()) <= set(tracking3d.PipelineConfig.model_fields)
 
 
-def test_track_is_called_as_documented():
-    parameters = inspect.signature(tracking3d.track).parameters
-    assert list(parameters)[:1] == ["frames"]
-    for name in ("box", "mask", "points", "start_frame", "config"):
-        assert parameters[name].kind is inspect.Parameter.KEYWORD_ONLY
-        assert parameters[name].default is None
-    assert parameters["corrections"].default == ()
+SIGNATURES = Path(__file__).with_name("api_surface.json")
+METHODS = {tracking3d.Session, tracking3d.Tracking, tracking3d.TrackingResult, RunReader}
+"""Classes whose public methods are held too."""
+
+
+def surface() -> Iterator[tuple[str, Any]]:
+    """All public functions, classes and methods by name."""
+    for module, names in {**AT_LEAST, **EXACT}.items():
+        for name in names.split():
+            thing = getattr(import_module(module), name)
+            thing = getattr(thing, "_function", thing)  # the tests make some things once, see `made_once`
+            if inspect.isfunction(thing) or (inspect.isclass(thing) and not issubclass(thing, str)):
+                yield f"{module}.{name}", thing
+            if inspect.isclass(thing) and thing in METHODS:
+                for method, function in inspect.getmembers(thing, inspect.isfunction):
+                    if not method.startswith("_"):
+                        yield f"{module}.{name}.{method}", function
+
+
+def arguments_of(thing: Any) -> list[list[str]] | None:
+    """Name, kind and default of each argument; None of what takes none of its own, such as a protocol."""
+    if inspect.isclass(thing) and (getattr(thing, "_is_protocol", False) or hasattr(thing, "model_fields")):
+        return None
+    try:
+        parameters = inspect.signature(thing).parameters.values()
+    except ValueError:  # a class of C
+        return None
+    return [[one.name, one.kind.name, _shown(one.default)] for one in parameters]
+
+
+def _shown(default: Any) -> str:
+    if default is inspect.Parameter.empty:
+        return "needed"
+    return "a function" if inspect.isfunction(default) else repr(default)
+
+
+def written_surface() -> str:
+    held = {name: found for name, thing in surface() if (found := arguments_of(thing)) is not None}
+    return (
+        "{\n" + ",\n".join(f"{json.dumps(name)}: {json.dumps(held[name])}" for name in sorted(held)) + "\n}\n"
+    )
+
+
+HELD = json.loads(SIGNATURES.read_text(encoding="utf-8")) if SIGNATURES.is_file() else {}
+
+
+def test_everything_public_has_its_arguments_held():
+    known = {name for name, thing in surface() if arguments_of(thing) is not None}
+    assert known - set(HELD) == set(), "new: python tests/test_api_surface.py writes it down"
+    assert set(HELD) - known == set(), "taken away"
+
+
+@pytest.mark.parametrize("name", HELD)
+def test_arguments_keep_their_names_order_kinds_and_defaults(name):
+    held, now = HELD[name], arguments_of(dict(surface())[name])
+    assert now is not None
+    by_name = {one[0]: one for one in now}
+    assert [by_name.get(one[0]) for one in held] == held
+    added = [one for one in now if one[0] not in {old[0] for old in held}]
+    assert all(one[2] != "needed" or one[1].startswith("VAR") for one in added), (
+        "a new argument has a default"
+    )
+    in_order = [one[0] for one in now if one[1] != "KEYWORD_ONLY"]
+    assert in_order[: sum(one[1] != "KEYWORD_ONLY" for one in held)] == [
+        one[0] for one in held if one[1] != "KEYWORD_ONLY"
+    ], "those that are given by place keep it"
 
 
 def test_statuses_are_their_names():
@@ -178,3 +253,7 @@ def test_the_package_is_typed():
     from importlib.resources import files
 
     assert (files("tracking3d") / "py.typed").is_file()
+
+
+if __name__ == "__main__":
+    SIGNATURES.write_text(written_surface(), encoding="utf-8")

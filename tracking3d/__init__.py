@@ -18,6 +18,8 @@ __all__ = [
     "Prompt",
     "Session",
     "Status",
+    "Tracking",
+    "TrackingResult",
     "__version__",
     "export_run",
     "load_config",
@@ -32,6 +34,8 @@ if TYPE_CHECKING:
     from tracking3d.export.exporting import export_run
     from tracking3d.frames import Frame, Prompt
     from tracking3d.pipeline import Session, track, track_objects
+    from tracking3d.tracking import Tracking
+    from tracking3d.tracking_result import TrackingResult
 
 _HOME = {
     "Frame": "tracking3d.frames",
@@ -41,6 +45,8 @@ _HOME = {
     "Prompt": "tracking3d.frames",
     "Session": "tracking3d.pipeline",
     "Status": "tracking3d.estimation.estimate",
+    "Tracking": "tracking3d.tracking",
+    "TrackingResult": "tracking3d.tracking_result",
     "export_run": "tracking3d.export.exporting",
     "load_config": "tracking3d.config.loading",
     "track": "tracking3d.pipeline",

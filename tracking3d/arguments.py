@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from tracking3d.config.explain import a_kind, shown
 from tracking3d.config.loading import load_config
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError
-from tracking3d.frames import Frame, Image, Prompt, SkippedFrame
+from tracking3d.frames import Frame, Prompt
+from tracking3d.images import check_image
 from tracking3d.prompts import checked_box, checked_mask
 from tracking3d.tracker_choice import AUTO
 from tracking3d.video.source import FrameSource
-
-_WANTED = "(H, W, 3) arrays of uint8, RGB"
 
 
 def checked_config(config: Any) -> PipelineConfig:
@@ -34,62 +30,6 @@ def checked_config(config: Any) -> PipelineConfig:
             f"config= is {a_kind(config)}; give a PipelineConfig (see load_config) or a YAML file."
         )
     return load_config(Path(config) if config is not None else None)
-
-
-def check_frames(frames: Any) -> None:
-    """Make sure that frames can be gone through, as far as that can be seen without taking one.
-
-    Args:
-        frames: What `tracking3d.track` was given.
-
-    Raises:
-        InputError: If they cannot.
-    """
-    if isinstance(frames, str | bytes | Path):
-        raise InputError(
-            f"frames={shown(str(frames))} is {a_kind(frames)}; give {_WANTED}, "
-            "or what tracking3d.video.open_source makes of a path."
-        )
-    shape = getattr(frames, "shape", None)
-    if shape is not None and (len(shape) != 4 or shape[3] != 3 or not _is_uint8(frames)):
-        raise InputError(
-            f"frames= is {a_kind(frames)} of shape {tuple(shape)} and type {getattr(frames, 'dtype', '?')}; "
-            f"give {_WANTED}, one after the other or as one array (N, H, W, 3)."
-        )
-    if not isinstance(frames, Iterable) or isinstance(frames, Mapping | type):
-        raise InputError(
-            f"frames= is {a_kind(frames)}; give {_WANTED}, or what tracking3d.video.open_source opens."
-        )
-    if isinstance(frames, Sequence) and frames and not isinstance(frames[0], Frame | SkippedFrame):
-        checked_image(frames[0], 0)
-
-
-def checked_image(image: Any, position: int) -> Image:
-    """A copy of an image that is ``(H, W, 3)`` uint8; callers like to decode every frame into one buffer.
-
-    Raises:
-        InputError: If it is not.
-    """
-    try:
-        copy = np.array(np.asarray(image), order="C")
-    except Exception as error:  # what a class makes of itself as an array can fail in any way
-        raise InputError(f"Frame {position} is {a_kind(image)}; give {_WANTED}.") from error
-    if copy.ndim == 0:
-        raise InputError(f"Frame {position} is {a_kind(image)}; give {_WANTED}.")
-    check_image(copy, f"Frame {position}")
-    return copy
-
-
-def check_image(image: Any, label: str) -> None:
-    """Make sure that an image is ``(H, W, 3)`` uint8.
-
-    Raises:
-        InputError: If it is not.
-    """
-    if not isinstance(image, np.ndarray):
-        raise InputError(f"{label} is {a_kind(image)}; give {_WANTED}.")
-    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or not image.size:
-        raise InputError(f"{label} has shape {image.shape} and type {image.dtype}; give {_WANTED}.")
 
 
 def check_frame(frame: Any) -> None:
@@ -155,7 +95,3 @@ def checked_folder(folder: Any) -> Path:
     if not isinstance(folder, str | Path):
         raise InputError(f"folder= is {a_kind(folder)}; give the path of the run folder.")
     return Path(folder)
-
-
-def _is_uint8(array: Any) -> bool:
-    return str(getattr(array, "dtype", "")).rpartition(".")[2] == "uint8"

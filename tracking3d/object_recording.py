@@ -14,7 +14,7 @@ from tracking3d.checkpoint.progress import Kept, Progress, TakenFrame, checksum
 from tracking3d.checkpoint.trees import UnkeptError
 from tracking3d.corrections import Correction, prompts_in
 from tracking3d.errors import InputError, OutputError, PluginError
-from tracking3d.estimation.estimate import ObjectModel, Status
+from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.frames import Frame, MaskEstimate, SkippedFrame
 from tracking3d.reconstruction import BELIEVED, TextureView, kept_views, texture_view, textured
 from tracking3d.reconstruction.second_look import SecondLook
@@ -39,6 +39,9 @@ class ObjectRecording:
         kept: The state of a stopped run that this one goes on with, which ``session`` was given.
         corrections: What the user has said of the object in later frames, by their index.
         redraw: Whether frames come in another order than that of time, and are drawn once more in that order.
+
+    Attributes:
+        latest: The answer for the frame that was taken last.
     """
 
     def __init__(
@@ -54,6 +57,7 @@ class ObjectRecording:
         self._corrections, self._unmet = corrections or {}, set(corrections or {})
         self._redraw = redraw
         self._kept = kept
+        self.latest: FrameEstimate | None = None
         self._progress = kept.progress if kept else Progress()
         self._until = self._progress  # what was done before
         self._past = {*kept.taken, *(one.index for one in kept.skipped)} if kept else set()
@@ -80,7 +84,7 @@ class ObjectRecording:
             return frame
         estimate = self._session.step(frame, *prompts_in(frame, self._corrections))
         answer = self._writer.write(estimate, frame)
-        self._answered = True
+        self._answered, self.latest = True, estimate
         initial = self._session.initial_mask
         if self._session.config.solver.final_refine:
             self._initial[frame.index] = initial.score, initial.reason

@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,24 +15,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.arguments import check_frames, checked_config, checked_image
+from tracking3d.arguments import checked_config
 from tracking3d.config.camera import choose_camera
 from tracking3d.config.models import PipelineConfig
 from tracking3d.corrections import Correction, check_corrections_fit, checked_corrections, prompts_in
 from tracking3d.errors import PluginError
 from tracking3d.estimation.estimate import FrameEstimate, unanswered
-from tracking3d.frames import Box, Frame, Image, MaskEstimate, Prompt, SkippedFrame
-from tracking3d.parts import SOLVERS, build_encoder, check_turns
+from tracking3d.frames import Box, Frame, MaskEstimate, Prompt, SkippedFrame
+from tracking3d.given_frames import open_frames
+from tracking3d.images import checked_image
+from tracking3d.parts import SOLVERS, build_encoder
+from tracking3d.point_following import checked_queries
 from tracking3d.prompts import check_prompt, check_prompts, damaged_start, make_prompt, make_prompts
+from tracking3d.recording import check_order, opened
+from tracking3d.result_choice import ModelChoice, config_of_result
 from tracking3d.session import Session
 from tracking3d.tracker_choice import choose_tracker
-from tracking3d.video.both_ways import both_ways, check_start_frame
+from tracking3d.tracking import Task, Tracking
+from tracking3d.video.source import FrameSource
 
-__all__ = ["SOLVERS", "Session", "checked_image", "choose_camera", "track", "track_objects"]
+__all__ = ["SOLVERS", "Session", "Tracking", "checked_image", "choose_camera", "track", "track_objects"]
 
 
 def track(
-    frames: Iterable[Image | Frame | SkippedFrame],
+    frames: Any,
     *,
     box: Box | None = None,
     mask: NDArray[np.bool_] | None = None,
@@ -41,12 +47,17 @@ def track(
     corrections: Iterable[Correction] = (),
     config: PipelineConfig | Path | str | None = None,
     skip_damaged: bool = False,
-) -> Iterator[FrameEstimate]:
+    follow: Any = None,
+    refine: bool | None = None,
+    model: ModelChoice | None = None,
+) -> Tracking:
     """Track an object through frames; answers come as the frames do, memory is bounded by the keyframes.
 
     Args:
-        frames: ``(H, W, 3)`` uint8 RGB arrays, or `Frame` objects; frames that could not be read are passed over,
-            but not the first.
+        frames: What `open_source` opens by a path; ``(N, H, W, 3)`` uint8 RGB; a tensor ``(N, 3, H, W)`` or ``(N, H, W,
+            3)`` of uint8 or of floats in [0, 1]; a ``cv2.VideoCapture``; a `FrameSource`; or any iterable of such
+            images, pictures of Pillow, paths of images and `Frame` objects. Frames that could not be read are passed
+            over, but not the first.
         box: The object in the first frame, ``(x, y, width, height)`` in pixels.
         mask: The object in the first frame, ``(H, W)`` bool.
         points: The object in the first frame by ``(N, 3)`` points: x, y in pixels, and 1 on it or 0 beside it. One of
@@ -56,42 +67,41 @@ def track(
         corrections: What the object is in later frames: there the mask tracker is set on it, and the mask is trusted.
         config: The pipeline, or a YAML file of one; the default preset if None.
         skip_damaged: Where the first frame could not be read, take the box or mask for the first one that could.
+        follow: Surface points to follow: ``(N, 2)`` pixels of the frame in which the object is given, or ``(N, 3)`` of
+            frame, x, y. Each answer says in ``points`` where they are, by the frames until then; the result in
+            ``tracks``, by the whole video.
+        refine: Whether the `Tracking.result` looks at the whole video once more; None leaves that to the configuration,
+            as the command line does.
+        model: Where the texture of the result's model comes from: ``fast`` takes it from the video at its resolution,
+            ``none`` leaves what was learnt on the way; None leaves that to the configuration.
 
     Returns:
-        An iterator of one estimate a frame.
+        An iterator of one estimate a frame, whose `Tracking.result` is all of it.
 
     Raises:
         Tracking3dError: If an argument cannot be used; on the way, if a frame cannot, or the first one does not fit
             the box or mask.
     """
-    check_frames(frames)
-    config = checked_config(config)
+    source, config = open_frames(frames), checked_config(config)
+    config = config_of_result(config, source, refine, model)
     check_prompt(box, mask, needed=config.tracker.name != "precomputed", points=points)
     [told] = checked_corrections(corrections)
-    if box is None and mask is None and points is None:
-        return _track(_in_order(frames, start_frame, config, True), None, told, config, _count(frames))
-    prompt = partial(make_prompt, box=box, mask=mask, points=points)
-    return _track(_in_order(frames, start_frame, config, skip_damaged), prompt, told, config, _count(frames))
-
-
-def _track(
-    frames: Iterator[Frame],
-    prompt: Callable[[Frame], Prompt] | None,
-    corrections: Mapping[int, Correction],
-    config: PipelineConfig,
-    count: int | None,
-) -> Iterator[FrameEstimate]:
-    session: Session | None = None
-    for frame in frames:
-        if session is None:
-            its_prompt = prompt and prompt(frame)
-            session = Session(_with_tracker(config, count, frame, its_prompt), its_prompt)
-            check_corrections_fit(corrections.values(), frame, config.tracker.name)
-        yield session.step(frame, *prompts_in(frame, corrections))
+    check_order(source, config, start_frame)
+    untold = box is None and mask is None and points is None
+    task = Task(
+        source=source,
+        config=config,
+        prompt=None if untold else partial(make_prompt, box=box, mask=mask, points=points),
+        corrections=told,
+        start_frame=start_frame,
+        skip_damaged=skip_damaged or untold,
+        queries=checked_queries(follow),
+    )
+    return Tracking(task, keeps=refine is not None or model is not None)
 
 
 def track_objects(
-    frames: Iterable[Image | Frame | SkippedFrame],
+    frames: Any,
     *,
     boxes: Sequence[Box] = (),
     masks: Sequence[NDArray[np.bool_]] = (),
@@ -123,35 +133,52 @@ def track_objects(
         Tracking3dError: If an argument cannot be used; on the way, if a frame cannot, the first one does not fit a box
             or mask, or the last object has failed.
     """
-    check_frames(frames)
-    config = checked_config(config)
+    source, config = open_frames(frames), checked_config(config)
+    check_order(source, config, start_frame)
     check_prompts(boxes, masks, points)
     told = checked_corrections(corrections, len(boxes) + len(masks) + len(points))
     prompts = partial(make_prompts, boxes=boxes, masks=masks, tracker=config.tracker.name, points=points)
-    return _track_objects(
-        _in_order(frames, start_frame, config, skip_damaged), prompts, told, config, _count(frames)
-    )
+    return _track_objects(source, prompts, told, config, start_frame, skip_damaged)
 
 
 def _track_objects(
-    frames: Iterator[Frame],
+    source: FrameSource,
     prompts: Callable[[Frame], list[Prompt]],
     corrections: Sequence[Mapping[int, Correction]],
     config: PipelineConfig,
-    count: int | None,
+    start_frame: int | None,
+    skip_damaged: bool,
+) -> Iterator[tuple[FrameEstimate, ...]]:
+    with opened(source, config, start_frame) as frames:
+        yield from _answers_of_objects(source, frames, prompts, corrections, config, skip_damaged)
+
+
+def _answers_of_objects(
+    source: FrameSource,
+    frames: Iterator[Frame | SkippedFrame],
+    prompts: Callable[[Frame], list[Prompt]],
+    corrections: Sequence[Mapping[int, Correction]],
+    config: PipelineConfig,
+    skip_damaged: bool,
 ) -> Iterator[tuple[FrameEstimate, ...]]:
     sessions: list[Session] = []
     failures: dict[int, PluginError] = {}
     poses: list[NDArray[np.float64]] = []
     for frame in frames:
+        if isinstance(frame, SkippedFrame):
+            if not sessions and not skip_damaged:
+                raise damaged_start(frame)
+            continue
         if not sessions:
             encoder = build_encoder(config)
             given = prompts(frame)
-            config = _with_tracker(config, count, frame, given[0])
-            sessions = [Session(config, prompt, encoder=encoder) for prompt in given]
+            config, _ = choose_tracker(config, source.count, not source.repeatable, frame, given[0])
+            lens = source.intrinsics, source.intrinsics_origin
+            sessions = [Session(config, prompt, *lens, encoder) for prompt in given]
             for theirs in corrections:
                 check_corrections_fit(theirs.values(), frame, config.tracker.name)
             poses = [np.eye(4) for _ in sessions]
+        frame = replace(frame, decoding=frame.decoding / len(sessions))
         answers = []
         for number, session in enumerate(sessions):
             if number not in failures:
@@ -167,52 +194,3 @@ def _track_objects(
             answer = unanswered(frame, MaskEstimate(None), poses[number])
             answers.append(replace(answer, reason=why, failure=why))
         yield tuple(answers)
-
-
-def _with_tracker(
-    config: PipelineConfig, count: int | None, first: Frame, prompt: Prompt | None
-) -> PipelineConfig:
-    return config if prompt is None else choose_tracker(config, count, False, first, prompt)[0]
-
-
-def _count(frames: Any) -> int | None:
-    """How many frames there are, where that is known."""
-    return len(frames) if isinstance(frames, Sized) else getattr(frames, "count", None)
-
-
-def _in_order(
-    frames: Iterable[Image | Frame | SkippedFrame],
-    start_frame: int | None,
-    config: PipelineConfig,
-    skip_damaged: bool,
-) -> Iterator[Frame]:
-    """The frames in the order in which they are tracked.
-
-    Raises:
-        InputError: If they, or the solver, cannot go both ways though that is asked for.
-    """
-    if start_frame is None:
-        return _checked_frames(frames, skip_damaged)
-    name = getattr(frames, "name", "the frame iterable")
-    repeatable = getattr(frames, "repeatable", not isinstance(frames, Iterator))
-    check_start_frame(start_frame, repeatable, name)
-    check_turns(config)
-    return _checked_frames(both_ways(lambda: _numbered(frames), start_frame, name), skip_damaged)
-
-
-def _numbered(frames: Iterable[Image | Frame | SkippedFrame]) -> Iterator[Frame | SkippedFrame]:
-    for position, item in enumerate(frames):
-        yield (
-            item if isinstance(item, Frame | SkippedFrame) else Frame(position, checked_image(item, position))
-        )
-
-
-def _checked_frames(frames: Iterable[Image | Frame | SkippedFrame], skip_damaged: bool) -> Iterator[Frame]:
-    """The frames that could be read, counted, their images copied."""
-    for position, item in enumerate(frames):
-        if isinstance(item, SkippedFrame):
-            if position == 0 and not skip_damaged:
-                raise damaged_start(item)
-        else:
-            frame = item if isinstance(item, Frame) else Frame(position, item)
-            yield replace(frame, image=checked_image(frame.image, frame.index))

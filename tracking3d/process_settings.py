@@ -1,8 +1,14 @@
-"""A session's threads and random numbers: in force while it works, and the caller's own in between."""
+"""A session's threads and random numbers: in force while it works, and the caller's own in between.
+
+The process has one set of random generators for all its threads. A session that works in another thread than the main
+one leaves them alone, for other code would draw from them at the same time; what draws from them there, which only
+plug-ins do, is not repeatable.
+"""
 
 from __future__ import annotations
 
 import random
+import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -77,6 +83,9 @@ class OwnSettings:
         """
         with threads_kept(), process_kept(self._device):
             give_threads(self._renderer)
+            if not _generators_are_ours():
+                yield
+                return
             if self.random is None:
                 random.seed(self._seed)
                 np.random.seed(self._seed % 2**32)
@@ -91,20 +100,29 @@ class OwnSettings:
                     self.random = now
 
 
+def _generators_are_ours() -> bool:
+    return threading.current_thread() is threading.main_thread()
+
+
 def _same(a: Tensor | None, b: Tensor | None) -> bool:
     return a is b if a is None or b is None else torch.equal(a, b)
 
 
 @contextmanager
 def process_kept(device: torch.device) -> Iterator[None]:
-    """Afterwards the random generators are as before, and OpenCV has as many threads."""
-    before, threads = RandomState.now(device), cv2.getNumThreads()
+    """Afterwards the random generators are as before, and OpenCV has as many threads.
+
+    OpenCV's generator is a thread's own; the others are left alone in another thread than the main one.
+    """
+    before = RandomState.now(device) if _generators_are_ours() else None
+    threads = cv2.getNumThreads()
     drawn = np.zeros(1, np.int32)
     cv2.randu(drawn, -(2**31), 2**31 - 1)
     try:
         yield
     finally:
-        before.put(device)
+        if before is not None:
+            before.put(device)
         cv2.setRNGSeed(int(drawn[0]))
         if cv2.getNumThreads() != threads:
             cv2.setNumThreads(threads)

@@ -55,7 +55,7 @@ def record(
     resume: bool = False,
     first_pass_only: bool = False,
     listener: Listener = lambda frame: None,
-) -> None:
+) -> RunReader:
     """Track the object through ``source`` and write the run folder.
 
     With ``solver.final_refine`` the frames are gone through a second time, where the solver can use that and the
@@ -83,6 +83,9 @@ def record(
         first_pass_only: Stop when every frame has its causal answer; ``resume`` goes on from there.
         listener: Is told of every frame, those finished before included.
 
+    Returns:
+        The reader of the run folder.
+
     Raises:
         InputError: If the run in the folder is of other settings or another source; the difference is named.
         Tracking3dError: What was finished until then is kept in the folder, as it is on Ctrl-C.
@@ -106,6 +109,7 @@ def record(
         )
         if recording is not None:
             go_through(source, chain(skipped, [first], frames), [recording], listener, first_pass_only)
+    return RunReader(folder)
 
 
 def record_objects(
@@ -124,7 +128,7 @@ def record_objects(
     skip_damaged: bool = False,
     resume: bool = False,
     listener: Listener = lambda frame: None,
-) -> None:
+) -> list[RunReader]:
     """Track several objects through ``source`` in one pass; each has a run folder of its own within ``folder``.
 
     An object that fails is ended and the others go on; the first failure is raised at the end.
@@ -144,6 +148,9 @@ def record_objects(
         skip_damaged: Where the first frame cannot be read, take the boxes and masks for the first one that can.
         resume: Go on with the runs that are in those folders; those that are finished stay as they are.
         listener: Is told of every frame of every object.
+
+    Returns:
+        The readers of the run folders, in the order of the objects.
 
     Raises:
         InputError: If a run in those folders is of other settings or another source; the difference is named.
@@ -175,6 +182,7 @@ def record_objects(
         ]
         if unfinished := [recording for recording in recordings if recording is not None]:
             go_through(source, chain(skipped, [first], frames), unfinished, listener)
+    return [RunReader(one) for one in folders]
 
 
 @contextmanager
@@ -191,16 +199,24 @@ def opened(
     Raises:
         InputError: If the source or the solver cannot go both ways.
     """
-    if start_frame is None:
-        frames = timed(source)
-    else:
-        check_start_frame(start_frame, source.repeatable, source.name)
-        check_turns(config)
-        frames = both_ways(partial(timed, source), start_frame, source.name)
+    check_order(source, config, start_frame)
+    once = partial(timed, source)
+    frames = once() if start_frame is None else both_ways(once, start_frame, source.name)
     try:
         yield frames
     finally:
         frames.close()
+
+
+def check_order(source: FrameSource, config: PipelineConfig, start_frame: int | None) -> None:
+    """Make sure that source and solver can go both ways, where that is asked for; see `opened`.
+
+    Raises:
+        InputError: If not.
+    """
+    if start_frame is not None:
+        check_start_frame(start_frame, source.repeatable, source.name)
+        check_turns(config)
 
 
 def begun(
@@ -218,8 +234,11 @@ def begun(
     writers: ExitStack,
     start_frame: int | None = None,
     corrections: Mapping[int, Correction] | None = None,
+    resumable: bool = True,
 ) -> ObjectRecording | None:
     """One object's recording, begun or resumed; None where its run is finished. See `record` for the arguments.
+
+    Where it is not to be ``resumable``, no state is kept on the way.
 
     Raises:
         OutputError: If the folder is in use, holds a run already, or cannot be written.
@@ -273,7 +292,7 @@ def begun(
         failures = {index: frame.failure for index, frame in kept.taken.items() if frame.failure}
         session.resume(first, kept.session, failures)
         writer.use_camera(session.camera)
-    elif source.repeatable:
+    elif resumable and source.repeatable:
         checkpoint = Checkpoint(folder, session.state_classes, device)
     return ObjectRecording(session, writer, checkpoint, kept, corrections, redraw=start_frame is not None)
 

@@ -28,21 +28,25 @@ def config() -> PipelineConfig:
 
 
 WRONG_FRAMES = {
-    "a path": (Path("clip.mp4"), r"^frames='clip.mp4' is a PosixPath; .*open_source"),
-    "a text": ("clip.mp4", r"^frames='clip.mp4' is text; .*open_source"),
+    "a path that is not there": (Path("clip.mp4"), r"^clip.mp4 does not exist; give a video file"),
+    "a text that is no path": ("clip.mp4", r"^clip.mp4 does not exist; give a video file"),
+    "bytes": (b"clip.mp4", r"^frames= is a bytes; give .*uint8"),
     "none": (None, r"^frames= is None; give .*uint8"),
     "a number": (3, r"^frames= is an int; "),
-    "a capture": (cv2.VideoCapture(), r"^frames= is a VideoCapture; .*open_source"),
+    "a capture": (cv2.VideoCapture(), r"^frames= is a VideoCapture that is not open; open it"),
     "one image": (IMAGE, r"^frames= is an array of shape \(48, 64, 3\) and type uint8; .*\(N, H, W, 3\)"),
     "floats": (np.zeros((2, 48, 64, 3)), r"^frames= is an array of shape \(2, 48, 64, 3\) and type float64"),
     "grey": (np.zeros((2, 48, 64), np.uint8), r"^frames= is an array of shape \(2, 48, 64\)"),
-    "a tensor": (torch.zeros(2, 3, 48, 64), r"^frames= is a Tensor of shape \(2, 3, 48, 64\) and type torch.float"),
+    "a tensor of one image": (torch.zeros(3, 48, 64), r"^frames= is a Tensor of shape \(3, 48, 64\); .*\(N, 3, H, W\)"),
+    "a tensor to 255": (torch.full((2, 3, 48, 64), 255.0), r"^Frame 0 is a Tensor of floats from 255 to 255; "),
+    "a tensor of nan": (torch.full((2, 3, 48, 64), math.nan), r"^Frame 0 is a Tensor of floats from nan to nan"),
+    "a tensor of int": (torch.zeros(2, 3, 48, 64, dtype=torch.int32), r"^Frame 0 is a Tensor of type torch.int32"),
     "a dictionary": ({"a": IMAGE}, r"^frames= is a dict; "),
     "a class": (list, r"^frames= is the class list; "),
     "grey images": ([IMAGE[..., 0]], r"^Frame 0 has shape \(48, 64\) and type uint8; give .*uint8, RGB"),
     "float images": ([IMAGE / 255], r"^Frame 0 has shape \(48, 64, 3\) and type float64; "),
     "nothings": ([None], r"^Frame 0 is None; "),
-    "texts": (["frame.png"], r"^Frame 0 is text; "),
+    "paths that are not there": (["frame.png"], r"^frame.png cannot be read as an image \(No such file"),
     "ragged lists": ([[[1], [1, 2]]], r"^Frame 0 is a list; "),
 }  # fmt: skip
 

@@ -165,10 +165,9 @@ def test_a_session_takes_views_too(clip, quick):
         np.zeros((64, 80, 3), np.float32),
         np.zeros((64, 80, 3), np.uint16),
         np.zeros((0, 0, 3), np.uint8),
-        "frame.png",
         None,
     ],
-    ids=["grey", "alpha", "channels first", "float", "16 bit", "empty", "text", "none"],
+    ids=["grey", "alpha", "channels first", "float", "16 bit", "empty", "none"],
 )
 def test_an_image_of_another_form_is_refused_by_its_number(clip, quick, bad):
     frames = track([clip.images[0], bad], mask=clip.masks[0], config=quick)
@@ -239,13 +238,13 @@ def test_without_a_configuration_the_default_preset_is_used(clip, monkeypatch):
     used: list[PipelineConfig] = []
 
     class Recorder:
-        def __init__(self, config, prompt):
+        def __init__(self, config, prompt, intrinsics, origin):
             used.append(config)
 
         def step(self, frame):
             return frame.index
 
-    monkeypatch.setattr("tracking3d.pipeline.Session", Recorder)
+    monkeypatch.setattr("tracking3d.tracking.Session", Recorder)
     assert list(track(clip.images, box=clip.box)) == [0, 1, 2, 3]
     assert used == [load_config(preset="default")]
     assert used[0].solver.name == "online"

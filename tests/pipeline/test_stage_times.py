@@ -145,12 +145,12 @@ def test_several_objects_share_what_a_frame_takes_to_decode(source, clip, tmp_pa
 
 
 @PRESETS
-def test_track_times_what_it_does_itself(preset, clip):
+def test_track_times_what_it_does_itself_and_the_reading(preset, clip):
     answers = list(track(clip.images, mask=clip.masks[0], config=settings(preset)))
     for answer in answers:
         assert slept(answer.stages.track, TRACKING)
         assert answer.stages.encode >= ENCODING
-        assert (answer.stages.decode, answer.stages.write) == (0, 0)
+        assert answer.stages.decode > 0 == answer.stages.write
         assert answer.seconds == answer.stages.whole
 
 

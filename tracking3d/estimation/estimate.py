@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.camera import Camera
+from tracking3d.points.answers import PointAnswers
 from tracking3d.stages import StageTimes
 
 
@@ -77,6 +78,7 @@ class FrameEstimate:
         revised: Better answers for earlier frames that this frame made possible; they replace those given before.
         camera: The camera of the full frame that the pose is of. Where nobody gave the lens it changes with what is
             known. None where the answer does not say: the camera that was known from the first frame on.
+        points: Where the points are that `tracking3d.track` was asked to follow; None where it was asked for none.
     """
 
     index: int
@@ -98,6 +100,7 @@ class FrameEstimate:
     mask_source: MaskSource | None = None
     revised: tuple[FrameEstimate, ...] = ()
     camera: Camera | None = None
+    points: PointAnswers | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -52,9 +52,9 @@ def follow_chain(warps: Warps, start: NDArray[np.integer], xy: Array, steps: Seq
                 for step in steps
                 if 0 <= target - direction * step < views
             ]
-            _extend(chain, warps, target, before)
+            extend(chain, warps, target, before)
             missing = ~np.isfinite(chain.variance[target]) & (behind > 0)
-            _extend(
+            extend(
                 chain,
                 warps,
                 target,
@@ -67,10 +67,16 @@ def follow_chain(warps: Warps, start: NDArray[np.integer], xy: Array, steps: Seq
     return chain
 
 
-def _extend(
-    chain: Chain, warps: Warps, target: int, sources: Sequence[tuple[int, NDArray[np.bool_]]]
-) -> None:
-    """Write what the templates of some views say about some points ``(N,)`` in one more view."""
+def extend(chain: Chain, warps: Warps, target: int, sources: Sequence[tuple[int, NDArray[np.bool_]]]) -> None:
+    """Write what the templates of some views say about one more view.
+
+    Args:
+        chain: Is written to.
+        warps: The views.
+        target: Index of the view.
+        sources: Those of the templates, and ``(N,)`` which points each is asked for; points that it does not hold are
+            left as they are.
+    """
     count = chain.variance.shape[1]
     total, weights = np.zeros((count, 2)), np.zeros(count)
     for source, of in sources:

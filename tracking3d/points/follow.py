@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.points.bundle import intersect
-from tracking3d.points.chain import follow_chain
+from tracking3d.points.chain import Chain, follow_chain
 from tracking3d.points.landmarks import Scene
 from tracking3d.points.uncertainty import FEATURES, Evidence, expected_error, features
 from tracking3d.points.view import Array, View, sample
 
-_RIM = 3.0  # pixels beside the drawn surface that are still on its rim
+RIM = 3.0
+"""Pixels beside the drawn surface that are still on its rim."""
 _HELD = 0.06  # deviation in radii of a point's way off the surface
 _DEVIATION = 0.03  # pixels that the best measurement is off
 _BELIEVED = 0.25  # share of its full weight from which a measurement counts
@@ -67,42 +68,67 @@ def follow_points(scene: Scene, start: int, xy: Array) -> Followed:
         return found
     pixels = view.to_window(xy)
     points = view.surface(pixels)
-    on = np.flatnonzero(np.isfinite(points).all(1) & (sample(view.beyond, pixels) < _RIM))
+    on = np.flatnonzero(np.isfinite(points).all(1) & (sample(view.beyond, pixels) < RIM))
     if not len(on):
         return found
     chain = follow_chain(scene.warps(), np.full(len(on), start), pixels[on])
     there = [index for index, one in enumerate(scene.views) if one is not None]
     views = [one for one in scene.views if one is not None]
-    variance, measured = chain.variance[there], chain.measured[there]
-    moved, share = _landmarks(views, points[on], measured, variance, _HELD * scene.radius)
+    seen = agreed(
+        views,
+        points[on],
+        Chain(chain.measured[there], chain.variance[there], chain.likeness[there]),
+        view.slant(pixels[on]),
+        np.abs(np.array(there) - start),
+        scene.radius,
+    )
+    placed = np.ix_(np.array(there), on)
+    found.positions[placed], found.visible[placed] = seen.positions, seen.visible
+    found.uncertainty[placed], found.measured[placed] = seen.uncertainty, seen.measured
+    found.features[placed] = seen.features
+    found.points[on] = seen.points
+    found.positions[start, on], found.visible[start, on] = xy[on], True
+    return found
+
+
+def agreed(
+    views: list[View], points: Array, chain: Chain, slant: Array, gap: NDArray[np.int64], radius: float
+) -> Followed:
+    """Surface points brought together with what the images say of them.
+
+    Args:
+        views: T views.
+        points: ``(N, 3)`` on the surface as it is drawn.
+        chain: What the images say.
+        slant: ``(N,)`` cosine between ray and surface where the points were asked for.
+        gap: ``(T,)`` views from there.
+        radius: Of the object.
+    """
+    variance, measured = chain.variance, chain.measured
+    moved, share = _landmarks(views, points, measured, variance, _HELD * radius)
     predicted, seen = (
-        np.stack(part) for part in zip(*(one.sees(moved, _SEEN * scene.radius) for one in views), strict=True)
+        np.stack(part) for part in zip(*(one.sees(moved, _SEEN * radius) for one in views), strict=True)
     )
     believed = (share > _BELIEVED) & np.isfinite(predicted).all(2)
     left = np.where(believed[..., None], measured - predicted, 0.0)
     spread = (left**2).sum((0, 2)) / 2 / np.maximum(believed.sum(0), 1)
     own = np.maximum(spread, _LEAST_DEVIATION**2)
     gain = np.where(believed, own / (own + np.where(believed, variance, 1.0)), 0.0)
-    unlike = (chain.likeness[there] > -1) & (chain.likeness[there] < _UNLIKE)
+    unlike = (chain.likeness > -1) & (chain.likeness < _UNLIKE)
     evidence = Evidence(
         variance=np.where(believed, variance, np.inf),
         spread=spread,
         views=believed.sum(0),
-        slant=view.slant(pixels[on]),
-        gap=np.abs(np.array(there) - start),
+        slant=slant,
+        gap=gap,
     )
-    placed = np.ix_(np.array(there), on)
     scales = np.stack([one.scale.mean() for one in views])[:, None]
-    found.positions[placed] = np.stack(
+    positions = np.stack(
         [one.to_frame(xy) for one, xy in zip(views, predicted + gain[..., None] * left, strict=True)]
     )
-    found.visible[placed] = seen & ~unlike
-    found.uncertainty[placed] = expected_error(evidence) / scales
-    found.measured[placed] = believed
-    found.features[placed] = features(evidence)
-    found.points[on] = moved
-    found.positions[start, on], found.visible[start, on] = xy[on], True
-    return found
+    return Followed(
+        positions, seen & ~unlike, expected_error(evidence) / scales, believed, moved, features(evidence)
+    )
 
 
 def _landmarks(

@@ -56,6 +56,11 @@ class View:
         """Pixels ``(..., 2)`` of the window as pixels of the frame."""
         return (xy + 0.5) / self.scale - 0.5 + np.array(self.corner)
 
+    def intrinsics_of(self, camera: Camera) -> Array:
+        """``(4,)`` fx, fy, cx, cy of a camera of the frame in this window."""
+        focal = np.array([camera.fx, camera.fy]) * self.scale
+        return np.concatenate([focal, self.to_window(np.array([camera.cx, camera.cy]))])
+
     def project(self, points: Array) -> tuple[Array, Array]:
         """Object points ``(N, 3)`` as ``(N, 2)`` pixels, NaN behind the camera, and ``(N,)`` depths."""
         seen = points @ self.T_cam_obj[:3, :3].T + self.T_cam_obj[:3, 3]

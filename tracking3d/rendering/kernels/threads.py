@@ -1,7 +1,8 @@
 """Sharing a kernel's work among threads.
 
 Their number is a setting of the process, as torch's is, and independent of it: threads of torch that wait for
-work keep their cores busy, so that both together are slower than either.
+work keep their cores busy, so that both together are slower than either. What a thread other than the main one sets
+holds for itself alone, so that two may track without knowing of each other.
 """
 
 from __future__ import annotations
@@ -9,12 +10,14 @@ from __future__ import annotations
 import functools
 import itertools
 import os
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from tracking3d.rendering.kernels.compilation import Kernel
 
 _threads = 1
+_of_thread = threading.local()
 
 
 def set_num_threads(threads: int) -> None:
@@ -26,12 +29,16 @@ def set_num_threads(threads: int) -> None:
     global _threads
     if threads < 1:
         raise ValueError(f"the number of threads is {threads}; give one or more")
-    _threads = threads
+    if threading.current_thread() is threading.main_thread():
+        _threads = threads
+    else:
+        _of_thread.threads = threads
 
 
 def get_num_threads() -> int:
     """How many threads kernels may use."""
-    return _threads
+    own: int = getattr(_of_thread, "threads", _threads)
+    return own
 
 
 def share(kernel: Kernel, count: int, least: int, *arguments: Any) -> None:
@@ -43,7 +50,7 @@ def share(kernel: Kernel, count: int, least: int, *arguments: Any) -> None:
         least: Fewest items for which waking another thread pays.
         *arguments: Come before the range.
     """
-    threads = min(_threads, count // least)
+    threads = min(get_num_threads(), count // least)
     if threads <= 1:
         kernel(*arguments, 0, count)
         return

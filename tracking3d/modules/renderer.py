@@ -1,0 +1,165 @@
+"""The differentiable renderer as modules that take kornia's cameras and poses and give ``(B, C, H, W)`` tensors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import torch
+from kornia.geometry.camera import PinholeCamera
+from kornia.geometry.liegroup import Se3
+from torch import Tensor, nn
+
+from tracking3d.geometry.mesh import Mesh
+from tracking3d.rendering import Rendering, SoftBand, rasterize, render, soft_silhouette
+from tracking3d.rendering.renderer import to_camera, to_screen
+
+
+class TexturedMesh(nn.Module):
+    """A mesh whose vertices and texture can be learnt.
+
+    Args:
+        vertices: ``(V, 3)`` in object coordinates; a parameter.
+        faces: ``(F, 3)`` int64, counter-clockwise seen from outside.
+        face_uvs: ``(F, 3, 2)``, one per face corner; v runs down the texture, u wraps at 1.
+        texture: ``(C, T, T)``; a parameter.
+    """
+
+    faces: Tensor
+    face_uvs: Tensor
+
+    def __init__(self, vertices: Tensor, faces: Tensor, face_uvs: Tensor, texture: Tensor) -> None:
+        super().__init__()
+        self.vertices = nn.Parameter(vertices.detach().clone())
+        self.texture = nn.Parameter(texture.detach().clone())
+        self.register_buffer("faces", faces.detach().clone())
+        self.register_buffer("face_uvs", face_uvs.detach().clone())
+
+    @classmethod
+    def of(cls, mesh: Mesh, texture: Tensor) -> Self:
+        """A mesh such as `tracking3d.geometry.prototypes.sphere` with a texture ``(C, T, T)``, of the same type."""
+        vertices, face_uvs = (torch.tensor(part).to(texture) for part in (mesh.vertices, mesh.face_uvs))
+        return cls(vertices, torch.tensor(mesh.faces, device=texture.device), face_uvs, texture)
+
+    def forward(self) -> tuple[Tensor, Tensor]:
+        """Vertices and texture."""
+        return self.vertices, self.texture
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """What a mesh looks like in B frames.
+
+    Attributes:
+        image: ``(B, C, H, W)`` texture, zero where uncovered.
+        silhouette: ``(B, 1, H, W)`` soft, in [0, 1].
+        drawn: All that the renderer answers.
+    """
+
+    image: Tensor
+    silhouette: Tensor
+    drawn: Rendering
+
+    @property
+    def depth(self) -> Tensor:
+        """``(B, 1, H, W)`` z in camera coordinates, zero where uncovered; differentiable."""
+        return self.drawn.image(self.drawn.points[:, 2:])
+
+
+class MeshRenderer(nn.Module):
+    """Draws a textured mesh; differentiable in vertices, texture, poses and cameras, see `tracking3d.rendering.render`.
+
+    Args:
+        band: Kernel of the soft silhouette; DIB-R's constants if None.
+        backend: ``auto``, ``torch`` or ``numba``, see `tracking3d.rendering.backend`.
+    """
+
+    def __init__(self, band: SoftBand | None = None, backend: str = "auto") -> None:
+        super().__init__()
+        self.band, self.backend = band or SoftBand(), backend
+
+    def forward(self, mesh: TexturedMesh, camera: PinholeCamera, pose: Se3) -> Views:
+        """Draw the mesh.
+
+        Args:
+            mesh: The mesh.
+            camera: Of each of B frames, or one for all; all of one size. Its extrinsics follow the pose: where they
+                are the identity the pose maps object to camera, else object to world.
+            pose: Of each of B frames, or one for all.
+
+        Raises:
+            ValueError: If cameras and poses are not as many, sizes differ, or a camera has a skew.
+        """
+        R, t, K, size = _frames(camera, pose)
+        vertices, texture = mesh()
+        drawn = render(
+            vertices, mesh.faces, mesh.face_uvs, texture, R, t, K, size, self.band, self.backend
+        )  # fmt: skip
+        return Views(drawn.image(), drawn.silhouette[:, None], drawn)
+
+    def extra_repr(self) -> str:
+        """Band and backend."""
+        return f"band={self.band}, backend={self.backend!r}"
+
+
+class Silhouette(nn.Module):
+    """Draws the soft silhouette alone, see `tracking3d.rendering.soft_silhouette`.
+
+    Args:
+        band: Its kernel; DIB-R's constants if None.
+        backend: See `MeshRenderer`.
+    """
+
+    def __init__(self, band: SoftBand | None = None, backend: str = "auto") -> None:
+        super().__init__()
+        self.band, self.backend = band or SoftBand(), backend
+
+    def forward(self, vertices: Tensor, faces: Tensor, camera: PinholeCamera, pose: Se3) -> Tensor:
+        """``(B, 1, H, W)`` in [0, 1]; differentiable in vertices, poses and cameras.
+
+        Args:
+            vertices: ``(V, 3)``, or ``(B, V, 3)`` with one mesh a frame.
+            faces: ``(F, 3)`` int64.
+            camera: See `MeshRenderer`.
+            pose: See `MeshRenderer`.
+
+        Raises:
+            ValueError: As there.
+        """
+        R, t, K, size = _frames(camera, pose)
+        x_cam = to_camera(vertices, R, t)
+        screen, depth = to_screen(x_cam, K), x_cam[..., 2]
+        index = rasterize(screen, depth, faces, size, self.backend).face_index
+        band = self.band
+        soft = soft_silhouette(
+            screen, depth, faces, index, band.sigma, band.boxlen, band.knum, self.backend
+        )  # fmt: skip
+        return soft[:, None]
+
+    def extra_repr(self) -> str:
+        """Band and backend."""
+        return f"band={self.band}, backend={self.backend!r}"
+
+
+def _frames(camera: PinholeCamera, pose: Se3) -> tuple[Tensor, Tensor, Tensor, tuple[int, int]]:
+    """``(B, 3, 3)`` rotations and ``(B, 3)`` translations to the camera, ``(B, 3, 3)`` intrinsics, and the size."""
+    matrix: Tensor = pose.matrix()
+    matrix = matrix[None] if matrix.dim() == 2 else matrix
+    K, extrinsics = camera.intrinsics[:, :3, :3], camera.extrinsics
+    views = max(len(matrix), len(K))
+    if len(matrix) not in (1, views) or len(K) not in (1, views):
+        raise ValueError(
+            f"camera has {len(K)} frames and pose {len(matrix)}; give as many of both, or one of either"
+        )
+    if K.detach()[:, [0, 1], [1, 0]].any():
+        raise ValueError("camera has a skew, which is not rendered; give fx, fy, cx and cy alone")
+    sizes = {(int(height), int(width)) for height, width in zip(camera.height, camera.width, strict=True)}
+    if len(sizes) > 1:
+        raise ValueError(f"camera has frames of the sizes {sorted(sizes)}; draw those of one size at a time")
+    T = extrinsics @ matrix
+    return (
+        T[:, :3, :3].expand(views, 3, 3).contiguous(),
+        T[:, :3, 3].expand(views, 3).contiguous(),
+        K.expand(views, 3, 3).contiguous(),
+        sizes.pop(),
+    )

@@ -1,0 +1,39 @@
+"""What is said of followed points when a frame is answered."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class PointAnswers:
+    """N points in one frame, by that frame and those before it.
+
+    Attributes:
+        positions: ``(N, 2)`` pixels of the frame; NaN before a point was asked for, beside the object, where the object
+            is lost and behind the camera.
+        visible: ``(N,)`` bool.
+        uncertainty: ``(N,)`` pixels; twice as much is meant to hold 19 of 20 errors. NaN where there is no position.
+        points: ``(N, 3)`` in object coordinates, as they are known now; NaN where a point is not known.
+        measured: ``(N,)`` bool: whether the image had a say.
+    """
+
+    positions: NDArray[np.float64]
+    visible: NDArray[np.bool_]
+    uncertainty: NDArray[np.float64]
+    points: NDArray[np.float64]
+    measured: NDArray[np.bool_]
+
+    @classmethod
+    def unknown(cls, count: int) -> PointAnswers:
+        """Nothing is known of ``count`` points."""
+        return cls(
+            np.full((count, 2), np.nan),
+            np.zeros(count, bool),
+            np.full(count, np.nan),
+            np.full((count, 3), np.nan),
+            np.zeros(count, bool),
+        )

@@ -1,0 +1,59 @@
+"""What the result of a tracking is to be, where the caller says so beside the configuration."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+from tracking3d.config.explain import shown
+from tracking3d.config.models import ObjectConfig, PipelineConfig
+from tracking3d.errors import InputError
+from tracking3d.parts import SOLVERS
+from tracking3d.video.source import FrameSource
+
+ModelChoice = Literal["none", "fast"]
+"""Where the texture of the final model comes from."""
+
+
+def config_of_result(
+    config: PipelineConfig, source: FrameSource, refine: bool | None, model: ModelChoice | None
+) -> PipelineConfig:
+    """The configuration with what the caller says of the result.
+
+    Args:
+        config: The pipeline.
+        source: The frames.
+        refine: Whether everything is solved once more; None as configured.
+        model: Where the texture of the model comes from; None as configured.
+
+    Raises:
+        InputError: If that is not possible with this solver or these frames.
+    """
+    if refine is not None and not isinstance(refine, bool):
+        raise InputError(f"refine={shown(refine)} is neither True nor False.")
+    if model is not None and model not in get_args(ModelChoice):
+        raise InputError(
+            f"model={shown(model)} is unknown; give {' or '.join(map(repr, get_args(ModelChoice)))}."
+        )
+    solver, shape = config.solver, config.object
+    if refine is not None:
+        solver = solver.model_copy(update={"final_refine": refine})
+    if refine and not hasattr(SOLVERS[solver.name], "refine"):
+        raise InputError(
+            f"refine=True: the solver {solver.name} gives causal answers only; choose solver.name online."
+        )
+    if refine and not source.repeatable:
+        raise InputError(
+            f"refine=True: {source.name} comes once only, and all frames are needed a second time; give a list or path."
+        )
+    if model == "fast":
+        if not solver.final_refine or not source.repeatable:
+            raise InputError(
+                f"model='fast' takes the texture from the frames as they are answered a second time, which "
+                f"{'they are not without the final refinement' if source.repeatable else f'{source.name} cannot'}; "
+                "leave it out."
+            )
+        least = ObjectConfig.model_fields["texture_views"].default
+        shape = shape.model_copy(update={"texture_views": shape.texture_views or least})
+    elif model == "none":
+        shape = shape.model_copy(update={"texture_views": 0})
+    return config.model_copy(update={"solver": solver, "object": shape})
