@@ -21,6 +21,7 @@ FLOORS = [
     {
         "arguments",
         "checkpoint",
+        "corrected_run",
         "mask_tracking",
         "object_recording",
         "parts",

@@ -99,7 +99,7 @@ class ObjectRecording:
                 self._session.failure_at(frame.index),
             )
             self._progress = replace(self._progress, last=frame.index, lines=self._writer.lines)
-            self._keep(taken)
+            self._keep(taken, [one.index for one in estimate.revised])
         return answer
 
     @property
@@ -193,7 +193,7 @@ class ObjectRecording:
             self._causal_model = None
         self._writer.finish(model, "finished")
         if self._checkpoint:
-            self._checkpoint.remove()
+            self._checkpoint.finish()
 
     def give_up(self, error: BaseException) -> None:
         """Keep what is finished when ``error`` ends the run, and let ``error`` say so."""
@@ -250,7 +250,7 @@ class ObjectRecording:
                 "on with the same source only."
             )
 
-    def _keep(self, taken: TakenFrame | None = None) -> None:
+    def _keep(self, taken: TakenFrame | None = None, revised: Iterable[int] = ()) -> None:
         """Keep the state as it is now."""
         if self._checkpoint is None:
             return
@@ -260,7 +260,7 @@ class ObjectRecording:
             refinement_seconds=self._refinement.seconds if self._refinement else 0.0,
         )
         try:
-            self._checkpoint.save(self._progress, self._session.kept(), taken)
+            self._checkpoint.save(self._progress, self._session.kept(), taken, revised)
         except UnkeptError as error:
             _log.warning("This run cannot be resumed when it is stopped: %s.", error)
             self._checkpoint.remove()

@@ -11,6 +11,7 @@ from tracking3d.cli import (
     bench,
     compare,
     config,
+    correct,
     demo,
     evaluate,
     export,
@@ -39,6 +40,7 @@ app.command(name="demo")(demo.demo)
 app.command(name="synth")(synth.synth)
 app.command(name="pick")(pick.pick)
 app.command(name="view")(view.view)
+app.command(name="correct")(correct.correct)
 app.command(name="points")(points.points)
 app.command(name="model")(model.model)
 app.command(name="export")(export.export)

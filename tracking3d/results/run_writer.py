@@ -310,7 +310,7 @@ class RunWriter:
         self._lines.go_on(so_far.lines)
         self._kept = {record.index: record for record in known}
         self._started -= so_far.seconds
-        self._description |= {key: earlier[key] for key in ("created", "refinement") if key in earlier}
+        self._description |= {key: earlier[key] for key in ("created", "refinement", "tracker_choice") if key in earlier}
         self._description["resumed"] = [
             *earlier.get("resumed", ()),
             {"at": description.now(), "frames": len(known)},
