@@ -109,7 +109,5 @@ def _earlier(folder: Path, given: dict[str, Any]) -> list[Correction]:
     for one in given.get("corrections") or ():
         frame, box = one["frame"], one["box"]
         mask = None if one["mask"] is None else given_mask(folder, frame)
-        found.append(
-            Correction(frame, None if box is None else tuple(box), mask, points=one["points"])
-        )
+        found.append(Correction(frame, None if box is None else tuple(box), mask, points=one["points"]))
     return found

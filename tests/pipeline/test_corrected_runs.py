@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,6 @@ from tracking3d.corrected_run import correct_run, object_folders_of
 from tracking3d.corrections import Correction
 from tracking3d.errors import InputError, OutputError
 from tracking3d.estimation.online.solver import OnlineSolver
-from tracking3d.prompts import make_prompt
 from tracking3d.recording import record, record_objects
 from tracking3d.results import layout
 from tracking3d.results.files import write_image
@@ -83,11 +83,11 @@ def run(clip, images, folder: Path, *overrides: str, **given) -> Path:
 
 def told(clip, frame: int = CORRECTED) -> list[Correction]:
     """A box beside the object, which changes what follows."""
-    x, y, width, height = make_prompt_box(clip, frame)
+    x, y, width, height = box_of(clip, frame)
     return [Correction(frame, box=(x + 3, y + 2, width, height))]
 
 
-def make_prompt_box(clip, frame: int):
+def box_of(clip, frame: int):
     rows, columns = np.nonzero(clip.masks[frame])
     return (
         float(columns.min()),
@@ -102,25 +102,25 @@ def contents(folder: Path) -> dict[Path, bytes]:
 
 
 @pytest.mark.parametrize(
-    ("solver", "tracker"), [(StandInSolver, "flow"), (OnlineSolver, "flow"), (StandInSolver, "csrt")]
+    ("solver", "given"),
+    [
+        (StandInSolver, {}),
+        pytest.param(OnlineSolver, {}, marks=pytest.mark.slow),  # the solver itself, three times
+        (
+            StandInSolver,
+            {"tracker": "csrt"},
+        ),  # which knows no other way to go on than to see the frames again
+    ],
+    ids=["memory kept", "online", "frames seen again"],
 )
 def test_a_finished_run_is_computed_again_from_the_corrected_frame_on(
-    clip, images, tmp_path, monkeypatch, stepped, solver, tracker
+    clip, images, tmp_path, monkeypatch, stepped, solver, given
 ):
     monkeypatch.setitem(SOLVERS, "online", solver)
-    tracked = [f"tracker={tracker}"] if tracker == "csrt" else []
-    overrides = [*tracked, "window.size=32"]
-    if tracker == "csrt":
-        pytest.importorskip("cv2").TrackerCSRT_create()
-        config = load_config(overrides=["tracker.name=csrt", "window.size=32"])
-        record(open_source(str(images)), config, tmp_path / "run", box=make_prompt_box(clip, 0))
-        record(
-            open_source(str(images)), config, tmp_path / "whole", box=make_prompt_box(clip, 0),
-            corrections=told(clip),
-        )  # fmt: skip
-    else:
-        run(clip, images, tmp_path / "run", *overrides[len(tracked) :])
-        run(clip, images, tmp_path / "whole", *overrides[len(tracked) :], corrections=told(clip))
+    config = load_config(overrides=["tracker.name=csrt", "window.size=32"]) if given else settings()
+    prompt = {"box": box_of(clip, 0)} if given else {"mask": clip.masks[0]}
+    record(open_source(str(images)), config, tmp_path / "run", **prompt)
+    record(open_source(str(images)), config, tmp_path / "whole", **prompt, corrections=told(clip))
     before = RunReader(tmp_path / "run", refined=False)
     poses = {one.index: one.T_cam_obj for one in before.frames}
     stepped.clear()
@@ -166,7 +166,7 @@ def test_a_run_both_ways_goes_on_in_the_direction_of_the_corrected_frame(clip, i
 
 
 def test_of_several_objects_one_is_corrected(clip, images, tmp_path):
-    boxes = [make_prompt_box(clip, 0), (0.0, 0.0, 12.0, 12.0)]
+    boxes = [box_of(clip, 0), (0.0, 0.0, 12.0, 12.0)]
     record_objects(open_source(str(images)), settings(), tmp_path / "run", boxes=boxes)
     first = contents(tmp_path / "run" / "object_0")
     given = [Correction(CORRECTED, mask=clip.masks[CORRECTED], object=1)]
@@ -197,7 +197,9 @@ def test_whatever_ends_a_correction_the_run_is_as_it_was_and_the_same_call_goes_
     assert_alike(tmp_path / "run", tmp_path / "whole")
 
 
-def test_another_correction_than_the_one_that_was_stopped_begins_anew(clip, images, tmp_path, monkeypatch, stepped):
+def test_another_correction_than_the_one_that_was_stopped_begins_anew(
+    clip, images, tmp_path, monkeypatch, stepped
+):
     run(clip, images, tmp_path / "run")
     with monkeypatch.context() as patch:
         patch.setattr(CausalSolver, "faults", {6: Stopped()})
@@ -215,14 +217,14 @@ def test_a_kill_while_the_copy_takes_its_place_is_made_good(clip, images, tmp_pa
     run(clip, images, tmp_path / "run")
     run(clip, images, tmp_path / "whole", corrections=told(clip))
     (tmp_path / "run" / "my_notes.txt").write_text("mine")
-    replace, done = Path.replace, []
+    move, done = Path.replace, []
 
     def killed(self, target):
         if layout.CORRECTING in self.parts and layout.CORRECTING not in Path(target).parts:
             done.append(self)
             if len(done) > moves:
                 raise Stopped
-        return replace(self, target)
+        return move(self, target)
 
     with monkeypatch.context() as patch:
         patch.setattr(Path, "replace", killed)
@@ -238,7 +240,7 @@ def test_two_corrections_at_a_time_are_refused(clip, images, tmp_path):
     run(clip, images, tmp_path / "run")
 
     def again(frame):
-        with pytest.raises(OutputError, match="in use|being corrected at this moment"):
+        with pytest.raises(OutputError, match=r"in use|being corrected at this moment"):
             correct_run(tmp_path / "run", told(clip, 5))
 
     correct_run(tmp_path / "run", told(clip), listener=again)
@@ -253,8 +255,7 @@ def test_milestones_are_few_and_evenly_spread(clip, images, tmp_path):
     assert not (tmp_path / "none" / layout.STATE).exists()
 
 
-def test_nothing_is_kept_that_no_milestone_needs(clip, images, tmp_path, monkeypatch):
-    monkeypatch.setitem(SOLVERS, "online", OnlineSolver)
+def test_nothing_is_kept_that_no_milestone_needs(clip, images, tmp_path):
     run(clip, images, tmp_path / "run", "runtime.milestones=2")
     state = tmp_path / "run" / layout.STATE
     kept = milestones.milestones_in(state)
@@ -281,8 +282,6 @@ def test_no_milestone_stands_between_a_frame_and_what_revised_it(clip, images, t
     def revising(self, state, frame, mask):
         state, answer = step(self, state, frame, mask)
         if frame.index == 5:
-            from dataclasses import replace
-
             answer = replace(answer, revised=(replace(answer, index=2, keyframe=False),))
         return state, answer
 

@@ -172,14 +172,18 @@ class Checkpoint:
         remove_state(self._folder.parent)
 
 
-def finish_state(folder: Path) -> None:
+def finish_state(folder: Path, most: int | None = None) -> None:
     """Leave of the state of a finished run what a correction goes on from, where that is not too large.
+
+    Args:
+        folder: The run folder.
+        most: Bytes that it may take; `MOST_KEPT` if None.
 
     Raises:
         OutputError: If something cannot be removed.
     """
     with writing(folder / layout.STATE):
-        keep_milestones_only(folder, MOST_KEPT)
+        keep_milestones_only(folder, MOST_KEPT if most is None else most)
         _remove_empty(folder / layout.STATE)
 
 

@@ -135,7 +135,7 @@ def keep_milestones_only(folder: Path, most_bytes: int) -> None:
     if kept:
         needed |= {layout.JOURNAL}
     for path in layout.state_files(folder):
-        if path.parent == inner and path.name not in needed or not kept:
+        if (path.parent == inner and path.name not in needed) or not kept:
             path.unlink(missing_ok=True)
 
 

@@ -95,7 +95,9 @@ def remove_run(folder: Path) -> None:
 
 def remove_empty(folder: Path) -> None:
     """Remove the folders within a folder that are empty, and itself."""
-    inner = sorted((path for path in folder.rglob("*") if path.is_dir()), reverse=True) if folder.is_dir() else []
+    inner = (
+        sorted((path for path in folder.rglob("*") if path.is_dir()), reverse=True) if folder.is_dir() else []
+    )
     for path in (*inner, folder):
         try:
             path.rmdir()

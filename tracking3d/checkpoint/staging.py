@@ -98,9 +98,7 @@ def take_over(folder: Path) -> None:
     remove_empty(stage)
 
 
-def _goes_on(
-    stage: Path, config: Mapping[str, Any], selection: str | None, given: Mapping[str, Any]
-) -> bool:
+def _goes_on(stage: Path, config: Mapping[str, Any], selection: str | None, given: Mapping[str, Any]) -> bool:
     """Whether the same correction was begun before, and stopped."""
     try:
         return layout.has_state(stage) and earlier_run(stage, config, selection, given) == "stopped"

@@ -59,7 +59,9 @@ def correct(
             try:
                 correct_run(folder, theirs, source=source, listener=listener)
             except BaseException as error:
-                error.add_note(f"The run {folder} is as it was; the same command goes on with the correction.")
+                error.add_note(
+                    f"The run {folder} is as it was; the same command goes on with the correction."
+                )
                 raise
         if not quiet:
             print_summary(folder)

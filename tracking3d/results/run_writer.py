@@ -44,6 +44,7 @@ SKIPS_EVERY = 1.0
 """Seconds between two writes of ``run.json`` for skipped frames; the last ones are written at the end."""
 RESERVE = 2048
 """Bytes that ``run.json`` has to spare for saying, on a full disk, how the run ended."""
+_STAYS = {"created", "refinement", "tracker_choice"}  # of a run that goes on
 DEFAULT_FPS = 10.0
 """Speed of the overlay video where the source has none, such as a folder of images."""
 
@@ -306,11 +307,11 @@ class RunWriter:
     def _go_on(self, so_far: WrittenSoFar) -> None:
         """Be the writer of the run that is there."""
         earlier = RunReader(self.folder).description
-        known = latest(read_records(self.folder / layout.FRAMES, so_far.lines), refined=False)
         self._lines.go_on(so_far.lines)
+        known = latest(read_records(self.folder / layout.FRAMES, so_far.lines), refined=False)
         self._kept = {record.index: record for record in known}
         self._started -= so_far.seconds
-        self._description |= {key: earlier[key] for key in ("created", "refinement", "tracker_choice") if key in earlier}
+        self._description |= {key: earlier[key] for key in _STAYS & earlier.keys()}
         self._description["resumed"] = [
             *earlier.get("resumed", ()),
             {"at": description.now(), "frames": len(known)},

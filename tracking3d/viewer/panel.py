@@ -49,6 +49,8 @@ class Panel:
             )
         with tabs.add_tab("Doubts"):
             self.doubts = gui.add_html("")
+        with tabs.add_tab("Correct"):
+            self.correct = gui.add_html("")
         with tabs.add_tab("Run"):
             self.about = gui.add_html("")
         gui.main_panel.dock_right()

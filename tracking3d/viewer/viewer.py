@@ -21,6 +21,7 @@ from tracking3d.results.overlay import ObjectAxes
 from tracking3d.video.any_frame import FrameImages
 from tracking3d.viewer import timeline
 from tracking3d.viewer.browser_camera import look_from_aside, look_through
+from tracking3d.viewer.correcting import Corrections
 from tracking3d.viewer.followed_run import FollowedRun
 from tracking3d.viewer.guarded_server import start_server
 from tracking3d.viewer.kept_landmarks import kept_landmarks
@@ -59,14 +60,15 @@ class Viewer:
         videos: What to show.
         access: Where to listen, and whom to answer.
         port: The port, or the next one that is free; 0 for any.
+        corrections: Lets the runs be corrected.
 
     Raises:
         PluginError: If this version of viser cannot be guarded.
         InputError: If a run is damaged.
     """
 
-    def __init__(self, videos: Sequence[Video], access: Access, port: int) -> None:
-        self._videos = list(videos)
+    def __init__(self, videos: Sequence[Video], access: Access, port: int, corrections: Corrections) -> None:
+        self._videos, self._corrections = list(videos), corrections
         self._runs = [run for video in videos for run in video.runs]
         for run in self._runs:
             run.look_again()
@@ -105,6 +107,7 @@ class Viewer:
             self._changed.notify_all()
         for thread in self._threads:
             thread.join(5)
+        self._corrections.close()
         with redirect_stdout(io.StringIO()):  # it says so
             self._server.stop()
 
@@ -227,6 +230,7 @@ class Viewer:
                 describe(run, run.frames.get(index), timeline.colour_of(number, len(self._runs)))
                 for number, run in enumerate(self._runs)
             )
+            self._offer_correction(index)
             panel.told.content = (
                 f'<div class="told" data-frame="{index}" style="font-size:12px;line-height:1.4;margin:4px 12px">'
                 f"frame {index}{told}{self._fault}</div>"
@@ -247,6 +251,7 @@ class Viewer:
                 self._fault = f"<p>{html.escape(str(error))}</p>"
                 self._want()
                 continue
+            self._offer_correction(self._shown)
             waiting = waiting or any(news)
             going_on = any(run.going_on for run in self._runs)
             if waiting and (time.monotonic() - drawn > _DRAW_ANEW or not going_on):
@@ -254,6 +259,11 @@ class Viewer:
                 self._take_news(draw=True)
             elif any(news):
                 self._take_news(draw=False)
+
+    def _offer_correction(self, index: int) -> None:
+        offered = self._corrections.offered(max(index, 0))
+        if offered != self._panel.correct.content:
+            self._panel.correct.content = offered
 
     def _take_news(self, draw: bool) -> None:
         self._indices = sorted({index for run in self._runs for index in run.frames})
