@@ -160,6 +160,8 @@ class RunCorrection:
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()
+        with self._busy:
+            self.progress()  # lets go of what belongs to a process that has ended
 
     def _end(self, code: int) -> CorrectionProgress:
         assert self._errors is not None
