@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -262,6 +263,9 @@ def test_nothing_is_kept_that_no_milestone_needs(clip, images, tmp_path):
     assert 1 <= len(kept) <= 2
     named = {name for one in kept for name in one.arrays}
     assert {path.name for path in state.glob("*.npz")} == named
+    for path in state.glob("*.npz"):
+        with zipfile.ZipFile(path) as file:
+            assert {one.compress_type for one in file.infolist()} == {zipfile.ZIP_DEFLATED}
 
 
 def test_milestones_that_are_too_large_go(clip, images, tmp_path, monkeypatch, caplog, stepped):

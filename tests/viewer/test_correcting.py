@@ -56,7 +56,7 @@ def commands(monkeypatch):
             script = "import time; time.sleep(60)"
         return popen([sys.executable, "-c", script], **options)
 
-    monkeypatch.setattr(correcting.subprocess, "Popen", start)
+    monkeypatch.setattr(correcting, "Popen", start)
     return started
 
 

@@ -6,14 +6,17 @@ around it, so that few of them, spread evenly over the run, cost little.
 
 from __future__ import annotations
 
+import io
 import math
 import os
 import re
 import shutil
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
 from tracking3d.results import layout
+from tracking3d.results.files import write_atomic
 
 _FIRST_GAP = 4
 """Frames from one to the next in a short run; it is doubled whenever there are too many."""
@@ -116,7 +119,8 @@ def keep_milestones_only(folder: Path, most_bytes: int) -> None:
 
     Args:
         folder: The run folder.
-        most_bytes: Every second milestone goes until the rest is no larger; the last one stays longest.
+        most_bytes: Before they are compressed. Every second milestone goes until the rest is no larger; the last one
+            stays longest.
 
     Raises:
         OSError: If a file cannot be removed.
@@ -135,8 +139,10 @@ def keep_milestones_only(folder: Path, most_bytes: int) -> None:
     if kept:
         needed |= {layout.JOURNAL}
     for path in layout.state_files(folder):
-        if (path.parent == inner and path.name not in needed) or not kept:
+        if not kept or (path.parent == inner and path.name not in needed):
             path.unlink(missing_ok=True)
+        elif path.suffix == ".npz":
+            _compress(path)
 
 
 def link_or_copy(source: Path, target: Path) -> None:
@@ -150,6 +156,19 @@ def link_or_copy(source: Path, target: Path) -> None:
         os.link(source, target)
     except OSError:
         shutil.copyfile(source, target)
+
+
+def _compress(path: Path) -> None:
+    """Write an array file anew, a third as large; while the run goes on there is no time for that."""
+    with zipfile.ZipFile(path) as file:
+        if all(one.compress_type == zipfile.ZIP_DEFLATED for one in file.infolist()):
+            return
+        parts = {name: file.read(name) for name in file.namelist()}
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file:
+        for name, part in parts.items():
+            file.writestr(name, part)
+    write_atomic(path, data.getvalue())
 
 
 def _bytes(inner: Path, kept: list[Milestone]) -> int:

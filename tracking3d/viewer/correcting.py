@@ -7,12 +7,12 @@ drawn, as numbers that were checked.
 from __future__ import annotations
 
 import html
-import subprocess
 import sys
 import tempfile
 import threading
 from collections.abc import Sequence
 from pathlib import Path
+from subprocess import DEVNULL, Popen, TimeoutExpired
 from typing import IO
 
 from pydantic import ValidationError
@@ -49,7 +49,7 @@ class RunCorrection:
     ) -> None:
         self.run, self._images, self._source, self._access = run, images, source, access
         self._page: CorrectionPage | None = None
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: Popen[bytes] | None = None
         self._errors: IO[bytes] | None = None
         self._frame = 0
         self._ended = CorrectionProgress()
@@ -126,9 +126,7 @@ class RunCorrection:
             command += ["--source", self._source] if self._source else []
             self._errors = tempfile.TemporaryFile()  # noqa: SIM115 (until the process has ended)
             self._frame = drawn.frame
-            self._process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=self._errors
-            )
+            self._process = Popen(command, stdin=DEVNULL, stdout=DEVNULL, stderr=self._errors)
 
     def progress(self) -> CorrectionProgress:
         """How far it is."""
@@ -157,7 +155,7 @@ class RunCorrection:
             self._process.terminate()
             try:
                 self._process.wait(_PATIENCE)
-            except subprocess.TimeoutExpired:
+            except TimeoutExpired:
                 self._process.kill()
                 self._process.wait()
         with self._busy:
