@@ -12,7 +12,7 @@ from tracking3d.viewer.scene import ObjectScene
 
 _FOV = 0.8  # radians
 _TILT = 0.5  # of the look onto a path's plane, so that it is seen from aside, too
-_AWAY = 3.0  # distances between object and camera, so that both are in view
+_AWAY = 3.7  # distances between object and camera, so that both are in view
 
 
 def look_from_aside(server: viser.ViserServer, scenes: Sequence[ObjectScene]) -> None:
@@ -21,7 +21,7 @@ def look_from_aside(server: viser.ViserServer, scenes: Sequence[ObjectScene]) ->
     aside, middle = aside_of(scenes[0].path)
     camera = server.initial_camera
     camera.look_at = middle + row / 2
-    reach = scenes[0].distance + 0.7 * float(np.linalg.norm(row))
+    reach = scenes[0].distance + 0.4 * float(np.linalg.norm(row))
     camera.position = camera.look_at + _AWAY * reach * aside
     camera.fov = _FOV
 

@@ -57,13 +57,13 @@ class ObjectScene:
         self.distance = 4.0
         self.path = np.array([[0.0, 0.0, -4.0]])
 
-    def draw_again(self, place: float) -> None:
-        """Show what is new in the run.
+    @property
+    def reach(self) -> float:
+        """How far below or above the object the path reaches."""
+        return float(np.abs(self.path[:, 1]).max())
 
-        Args:
-            place: How far below the first object it stands.
-        """
-        self.place = np.array([0.0, place, 0.0])
+    def draw_again(self) -> None:
+        """Show what is new in the run."""
         self._draw_mesh()
         records = [record for record in self._run.frames.values() if np.isfinite(record.T_cam_obj).all()]
         if records:

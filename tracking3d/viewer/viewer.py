@@ -286,10 +286,13 @@ class Viewer:
             self.go_to(first)
 
     def _draw_scene(self) -> None:
-        place, any_landmarks = 0.0, False
+        place = above = 0.0
+        any_landmarks = False
         for scene, run in zip(self._scenes, self._runs, strict=True):
-            scene.draw_again(place)
-            place += 1.2 * scene.distance
+            scene.draw_again()
+            if scene is not self._scenes[0]:
+                place += max(1.2 * scene.distance, 1.1 * (above + scene.reach))
+            scene.place, above = np.array([0.0, place, 0.0]), scene.reach
             # Of the state of a run that goes on: the final refinement may scale and turn the object.
             points = None if run.refined else kept_landmarks(run.folder)
             scene.draw_landmarks(points)
