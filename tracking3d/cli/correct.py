@@ -46,6 +46,7 @@ def correct(
     from tracking3d.cli.report import reported
     from tracking3d.corrected_run import correct_run, object_folders_of
     from tracking3d.corrections import parse_correction
+    from tracking3d.results.layout import CORRECTING, RUN, has_state
     from tracking3d.results.run_reader import RunReader
 
     if quiet:
@@ -59,9 +60,10 @@ def correct(
             try:
                 correct_run(folder, theirs, source=source, listener=listener)
             except BaseException as error:
-                error.add_note(
-                    f"The run {folder} is as it was; the same command goes on with the correction."
-                )
+                stage = folder / CORRECTING
+                if (stage / RUN).is_file():
+                    then = "goes on with the correction" if has_state(stage) else "tries again"
+                    error.add_note(f"The run {folder} is as it was; the same command {then}.")
                 raise
         if not quiet:
             print_summary(folder)
