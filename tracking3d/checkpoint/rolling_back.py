@@ -56,12 +56,15 @@ def _copy_run(folder: Path, stage: Path, milestones: list[Milestone], journal: b
         for inner in (layout.MASKS, layout.INITIAL_MASKS, layout.STATE):
             (stage / inner).mkdir(parents=True, exist_ok=True)
         (stage / layout.STATE / layout.MASKS).mkdir(exist_ok=True)
+        if (folder / layout.PROBABILITIES).is_dir():
+            (stage / layout.PROBABILITIES).mkdir(exist_ok=True)
         (stage / layout.FRAMES).write_bytes((folder / layout.FRAMES).read_bytes()[:lines])
         for record in records:
             answers = [layout.mask_path(causal, record.index), layout.mask_path(folder, record.index)]
             initial = layout.initial_mask_path(folder, record.index)
             corrected = layout.mask_path(folder / layout.STATE, record.index)
-            for file in ([one for one in answers if one.is_file()][:1], [initial], [corrected]):
+            likely = layout.probability_path(folder, record.index)
+            for file in ([one for one in answers if one.is_file()][:1], [initial], [corrected], [likely]):
                 if file and file[0].is_file():
                     place = file[0].relative_to(causal if file[0].is_relative_to(causal) else folder)
                     link_or_copy(file[0], stage / place)

@@ -125,6 +125,9 @@ class RuntimeConfig(Section):
             "0 for none."
         ),
     )
+    probabilities: bool = Field(
+        False, description="Write the object's probability in every pixel beside the masks, as 8-bit PNG."
+    )
     on_plugin_failure: Literal["continue", "stop"] = Field(
         "continue",
         description=(

@@ -6,6 +6,7 @@
     frames.jsonl        one line a frame, flushed; a better answer for an earlier frame is a further line
     masks/              the answers, 0/255 PNG at full resolution, named by frame index
     initial_masks/      what the mask tracker gave
+    probabilities/      the object's in every pixel of the answers, where that was asked for
     overlay.mp4         the video with outlines and axes
     contact_sheet.png   the run at a glance
     report.html         the run to look at, in one file
@@ -33,6 +34,7 @@ RUN = "run.json"
 FRAMES = "frames.jsonl"
 MASKS = "masks"
 INITIAL_MASKS = "initial_masks"
+PROBABILITIES = "probabilities"
 CAUSAL = "causal"
 REFINING = ".refining"
 STATE = ".state"
@@ -128,6 +130,8 @@ def run_files(folder: Path) -> list[Path]:
     for masks in (
         folder / MASKS,
         folder / INITIAL_MASKS,
+        folder / PROBABILITIES,
+        folder / REFINING / PROBABILITIES,
         folder / PROMPTS,
         folder / CAUSAL / MASKS,
         folder / REFINING / MASKS,
@@ -142,6 +146,11 @@ def correction_files(folder: Path) -> list[Path]:
     """Those of a correction that was not finished."""
     stage = folder / CORRECTING
     return run_files(stage) if stage.is_dir() else []
+
+
+def probability_path(folder: Path, index: int) -> Path:
+    """Where the object's probability in frame ``index`` lies: in the run folder, or in `REFINING` within it."""
+    return folder / PROBABILITIES / f"{index:06d}.png"
 
 
 def prompt_path(folder: Path, index: int) -> Path:

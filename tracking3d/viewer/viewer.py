@@ -17,6 +17,7 @@ import numpy as np
 
 from tracking3d.errors import Tracking3dError
 from tracking3d.frames import Image
+from tracking3d.results import layout
 from tracking3d.results.overlay import ObjectAxes
 from tracking3d.video.any_frame import FrameImages
 from tracking3d.viewer import timeline
@@ -123,7 +124,8 @@ class Viewer:
         panel.steps.on_click(lambda event: self._step(event.target.value))
         panel.quantity.on_update(lambda _: self._redraw_timeline())
         panel.look.on_click(lambda _: self._look_through())
-        boxes = [*panel.layers.values(), panel.axes, panel.mesh, panel.path, panel.landmarks, panel.still]
+        boxes = [*panel.layers.values(), panel.axes, panel.probability]
+        boxes += [panel.mesh, panel.path, panel.landmarks, panel.still]
         for box in boxes:
             box.on_update(lambda _: self._want())
         keys: dict[str, tuple[str, Callable[[], None]]] = {
@@ -272,6 +274,7 @@ class Viewer:
         panel.slider.min, panel.slider.max = first, max(last, first + 1)
         if any(run.refined for run in self._runs):
             panel.show_causal()
+        panel.probability.visible = any((run.folder / layout.PROBABILITIES).is_dir() for run in self._runs)
         offered = tuple(timeline.quantities(self._runs))
         if offered != tuple(panel.quantity.options):
             panel.quantity.options = offered
