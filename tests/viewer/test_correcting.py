@@ -155,7 +155,7 @@ def test_a_person_draws_a_box_and_the_viewer_shows_how_it_goes(described, comman
             with page.context.expect_page() as opened:
                 page.click("a.correct:has-text('frame 7')")
             drawing = opened.value
-            drawing.wait_for_selector("h1:has-text('What is run here?')")
+            drawing.wait_for_selector("h1:has-text('What is the object here?')")
             assert drawing.input_value("#number") == "7"
             area = drawing.locator("#canvas").bounding_box()
             drawing.mouse.move(area["x"] + area["width"] * 0.3, area["y"] + area["height"] * 0.3)

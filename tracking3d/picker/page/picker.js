@@ -392,8 +392,8 @@ byId("start").addEventListener("click", async () => {
 // ---- a run that is there is corrected ----
 
 function offerCorrection() {
-  document.title = "tracking3d correct";
-  document.querySelector("h1").textContent = `What is ${session.correcting} here?`;
+  document.title = `tracking3d correct ${session.correcting}`;
+  document.querySelector("h1").textContent = "What is the object here?";
   for (const id of ["objects", "objects-title", "add", "save", "yaml"]) byId(id).hidden = true;
   byId("start").textContent = "Correct the run from here on";
   follow();
