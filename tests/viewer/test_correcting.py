@@ -18,10 +18,12 @@ from tracking3d.config.loading import load_config
 from tracking3d.errors import InputError
 from tracking3d.picker.correction import DrawnCorrection
 from tracking3d.results import layout
+from tracking3d.video import open_source
 from tracking3d.viewer import correcting
 from tracking3d.viewer.correcting import RunCorrection
 from tracking3d.viewer.followed_run import FollowedRun
 from tracking3d.viewer.opening import open_viewer
+from tracking3d.viewer.run_images import LatestImages
 from tracking3d.web.access import Access
 
 
@@ -129,7 +131,6 @@ def test_frames_that_cannot_be_corrected_are_refused(correction, commands, frame
     ("change", "why"),
     [
         ({"given": None}, "earlier version"),
-        ({"source": "0"}, "of a camera"),
         ({"config": {"tracker": {"name": "precomputed"}}}, "masks were made elsewhere"),
     ],
 )
@@ -138,7 +139,13 @@ def test_runs_that_cannot_be_corrected_say_why(described, change, why):
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
     one = RunCorrection(FollowedRun(described, "run"), Frames(), None, Access())
     assert why in one.why_not
-    assert "--source" in RunCorrection(FollowedRun(described, "run"), None, None, Access()).why_not
+
+
+def test_a_run_whose_frames_are_gone_says_so(described):
+    run = FollowedRun(described, "run")
+    assert "--source" in RunCorrection(run, None, None, Access()).why_not
+    passed = LatestImages(open_source(iter([frame_of(0).image])))
+    assert "of a camera" in RunCorrection(run, passed, None, Access()).why_not
 
 
 @pytest.mark.slow

@@ -65,7 +65,7 @@ class RunCorrection:
             return "Its video is not at hand; open the viewer with --source."
         if not isinstance(given, dict) or "first_frame" not in given:
             return "It is of an earlier version, which did not keep what it was begun with."
-        if str(run.description.get("source", "")).isdigit():
+        if not getattr(self._images, "repeatable", True):
             return "It is of a camera, whose frames are gone."
         tracker = run.description.get("config", {}).get("tracker")
         if isinstance(tracker, dict) and tracker.get("name") == "precomputed":

@@ -48,6 +48,7 @@ def draw_picture(
     index: int,
     shown: Shown,
     axes: Sequence[ObjectAxes | None],
+    colours: Sequence[drawing.Colour] = (),
 ) -> Image:
     """One frame with the outlines and axes of all its objects.
 
@@ -57,6 +58,7 @@ def draw_picture(
         index: The frame.
         shown: What to draw.
         axes: Of each object, or None.
+        colours: Of each object's final mask, where several are to be told apart.
 
     Returns:
         ``(H, W, 3)``, at most `WIDEST` wide.
@@ -70,15 +72,16 @@ def draw_picture(
     else:
         picture = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8)
     thin = max(round(width / 640), 1)
-    for run, placed in zip(runs, axes, strict=True):
+    for number, (run, placed) in enumerate(zip(runs, axes, strict=True)):
         record = run.frames.get(index)
         if shown.probability and (likely := run.reader.probability(index)) is not None:
             _tint(picture, likely)
         for layer, colour in LAYERS.items():
             if layer in shown.layers and (mask := run.mask(index, layer)) is not None:
+                own = colours[number] if colours and layer == "refined" else colour
                 small = cv2.resize(mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
                 drawing.draw_outline(
-                    picture, small.astype(bool), colour, thin if layer == "initial" else thin + 1
+                    picture, small.astype(bool), own, thin if layer == "initial" else thin + 1
                 )
         if shown.axes and placed is not None and record is not None and record.status != Status.LOST:
             _draw_axes(picture, record.T_cam_obj, record.through(camera), placed, scale, thin + 1)

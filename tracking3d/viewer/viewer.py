@@ -18,6 +18,7 @@ import numpy as np
 from tracking3d.errors import Tracking3dError
 from tracking3d.frames import Image
 from tracking3d.results import layout
+from tracking3d.results.drawing import Colour
 from tracking3d.results.overlay import ObjectAxes
 from tracking3d.video.any_frame import FrameImages
 from tracking3d.viewer import timeline
@@ -218,7 +219,9 @@ class Viewer:
         for video in self._videos:
             image = video.images.image(index) if video.images is not None else None
             fits = image is not None and _fits(image, video.runs[0])
-            picture = draw_picture(image if fits else None, video.runs, index, panel.shown, video.axes)
+            picture = draw_picture(
+                image if fits else None, video.runs, index, panel.shown, video.axes, self._colours(video)
+            )
             pictures.update(dict.fromkeys(video.runs, picture))
             drawn.append(picture)
         with self._server.atomic():
@@ -262,6 +265,13 @@ class Viewer:
             elif any(news):
                 self._take_news(draw=False)
 
+    def _colours(self, video: Video) -> list[Colour]:
+        """Of each object's outline, those of its curve, where a video has several."""
+        if len(video.runs) < 2:
+            return []
+        colours = timeline.RUN_COLOURS
+        return [colours[self._runs.index(run) % len(colours)] for run in video.runs]
+
     def _offer_correction(self, index: int) -> None:
         offered = self._corrections.offered(max(index, 0))
         if offered != self._panel.correct.content:
@@ -294,7 +304,7 @@ class Viewer:
         for scene, run in zip(self._scenes, self._runs, strict=True):
             scene.draw_again()
             if scene is not self._scenes[0]:
-                place += max(1.2 * scene.distance, 1.1 * (above + scene.reach))
+                place += max(1.6 * scene.distance, 1.1 * (above + scene.reach))
             scene.place, above = np.array([0.0, place, 0.0]), scene.reach
             # Of the state of a run that goes on: the final refinement may scale and turn the object.
             points = None if run.refined else kept_landmarks(run.folder)
