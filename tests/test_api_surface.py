@@ -56,6 +56,7 @@ AT_LEAST = {
     "tracking3d.benchmark.suite": "run_suite",
     "tracking3d.benchmark.tables": "TABLES",
     "tracking3d.benchmark.variant": "Variant",
+    "tracking3d.corrected_run": "correct_run",
     "tracking3d.corrections": "Correction parse_correction",
     "tracking3d.datasets.answers": "Answers PointTracker",
     "tracking3d.datasets.bop_export": "write_bop",

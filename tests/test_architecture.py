@@ -33,6 +33,7 @@ FLOORS = [
     {
         "arguments",
         "checkpoint",
+        "corrected_run",
         "given_frames",
         "images",
         "mask_tracking",

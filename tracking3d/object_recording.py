@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 
@@ -100,7 +100,7 @@ class ObjectRecording:
                 self._session.failure_at(frame.index),
             )
             self._progress = replace(self._progress, last=frame.index, lines=self._writer.lines)
-            self._keep(taken)
+            self._keep(taken, [one.index for one in estimate.revised])
         return answer
 
     @property
@@ -231,7 +231,7 @@ class ObjectRecording:
             self._causal_model = None
         self._writer.finish(model, "finished")
         if self._checkpoint:
-            self._checkpoint.remove()
+            self._checkpoint.finish()
 
     def pause(self) -> None:
         """Stop here; the folder is that of a stopped run, which can go on."""
@@ -292,7 +292,7 @@ class ObjectRecording:
                 "on with the same source only."
             )
 
-    def _keep(self, taken: TakenFrame | None = None) -> None:
+    def _keep(self, taken: TakenFrame | None = None, revised: Iterable[int] = ()) -> None:
         """Keep the state as it is now."""
         if self._checkpoint is None:
             return
@@ -302,7 +302,7 @@ class ObjectRecording:
             refinement_seconds=self._refinement.seconds if self._refinement else 0.0,
         )
         try:
-            self._checkpoint.save(self._progress, self._session.kept(), taken)
+            self._checkpoint.save(self._progress, self._session.kept(), taken, revised)
         except UnkeptError as error:
             _log.warning("This run cannot be resumed when it is stopped: %s.", error)
             self._checkpoint.remove()

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.arguments import check_source, checked_config, checked_folder
-from tracking3d.checkpoint.folder import Checkpoint, remove_state
+from tracking3d.checkpoint.folder import Checkpoint, finish_state
 from tracking3d.checkpoint.resuming import earlier_run, given_of
+from tracking3d.checkpoint.staging import corrected_aside, take_over
 from tracking3d.config.camera import choose_camera
 from tracking3d.config.models import PipelineConfig, PluginChoice
 from tracking3d.corrections import Correction, check_corrections_fit, checked_corrections
@@ -25,6 +26,7 @@ from tracking3d.object_recording import ObjectRecording
 from tracking3d.parts import build_encoder, check_turns
 from tracking3d.passes import Listener, go_through, timed
 from tracking3d.prompts import check_prompt, check_prompts, damaged_start, make_prompt, make_prompts
+from tracking3d.results.given_masks import keep_given_masks
 from tracking3d.results.layout import RUN, object_folders
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_writer import RunWriter, WrittenSoFar
@@ -78,8 +80,9 @@ def record(
         overwrite: Replace a run that is in the folder.
         skip_damaged: Where the first frame cannot be read, take the box or mask for the first one that can.
         resume: Go on with the run that is in the folder, from the last frame that it finished; begin one where there
-            is none. With a finished run nothing is done. Where a frame that is answered is corrected, all is computed
-            again: only the state after the latest frame is kept.
+            is none. With a finished run nothing is done. Where a frame that is answered is corrected, what depends on
+            it is computed again, from the last state of before it that was kept, in a copy within the folder; until
+            that is finished the run stays as it is.
         first_pass_only: Stop when every frame has its causal answer; ``resume`` goes on from there.
         listener: Is told of every frame, those finished before included.
 
@@ -254,20 +257,19 @@ def begun(
         raise InputError(
             f"{source.name} cannot be read again from its start, so that no run of it can be resumed."
         )
+    if resume:
+        take_over(folder)
     earlier = earlier_run(folder, config, selection, given) if resume else "none"
     if earlier == "finished":
-        remove_state(folder)
+        finish_state(folder)
         return None
     if earlier == "outdated":
-        _log.warning(
-            "%s holds answers for a frame that is corrected now. Only the state after the latest frame is kept, so "
-            "that all is computed again; frames before the correction get the answers that they had.",
-            folder,
-        )
-    device = session.config.runtime.device
+        folder, earlier = corrected_aside(folder, config, selection, given, writers)
+    runtime = session.config.runtime
+    keeps = runtime.device, runtime.milestones
     checkpoint = kept = None
     if earlier == "stopped":
-        checkpoint = Checkpoint(folder, session.state_classes, device)
+        checkpoint = Checkpoint(folder, session.state_classes, *keeps)
         kept = checkpoint.read()
     (height, width), camera = first.size, session.config.camera
     writer = RunWriter(
@@ -287,13 +289,14 @@ def begun(
         resume=WrittenSoFar(kept.progress.lines, kept.progress.seconds, kept.skipped) if kept else None,
     )
     writers.enter_context(writer)
+    keep_given_masks(folder, first.index, prompt, corrections.values())
     if checkpoint is not None and kept is not None:
         checkpoint.clear_strangers()
         failures = {index: frame.failure for index, frame in kept.taken.items() if frame.failure}
         session.resume(first, kept.session, failures)
         writer.use_camera(session.camera)
     elif resumable and source.repeatable:
-        checkpoint = Checkpoint(folder, session.state_classes, device)
+        checkpoint = Checkpoint(folder, session.state_classes, *keeps)
     return ObjectRecording(session, writer, checkpoint, kept, corrections, redraw=start_frame is not None)
 
 

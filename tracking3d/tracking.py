@@ -19,7 +19,8 @@ from tracking3d.corrections import Correction, check_corrections_fit, prompts_in
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.frames import Frame, Prompt, SkippedFrame
-from tracking3d.object_recording import ObjectRecording, timed
+from tracking3d.object_recording import ObjectRecording
+from tracking3d.passes import timed
 from tracking3d.point_following import PointFollowing
 from tracking3d.prompts import damaged_start
 from tracking3d.recording import begun, opened

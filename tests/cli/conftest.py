@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
@@ -26,6 +28,13 @@ class Script:
 
     faults: dict[int, BaseException] = field(default_factory=dict)
     built: list[tuple] = field(default_factory=list)
+
+
+@pytest.fixture(autouse=True)
+def heard_again() -> Iterator[None]:
+    """What ``--quiet`` silences in one command is heard in the next."""
+    yield
+    logging.getLogger("tracking3d").setLevel(logging.NOTSET)
 
 
 @pytest.fixture(autouse=True)

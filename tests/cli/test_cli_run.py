@@ -219,6 +219,47 @@ def test_a_run_of_other_settings_is_not_resumed(call, clip, script):
     assert "either --resume or --overwrite" in both.stderr
 
 
+def test_a_run_is_corrected_with_its_own_settings(call, clip, script):
+    assert call("run", clip, *BOX, "--fov", "30", "--out", "run").exit_code == 0
+    result = call("correct", "run", "3:21,11,20,20", "--no-report")
+    assert result.exit_code == 0, result.output
+    description = json.loads(Path("run/run.json").read_text())
+    assert description["given"]["corrections"][0]["box"] == [21, 11, 20, 20]
+    assert (description["config"]["camera"]["fov"], description["state"]) == (30, "finished")
+    assert not Path("run/.correcting").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["nowhere", "3:1,1,9,9"], "nowhere is not a run folder"),
+        (["run", "3;1,1,9,9"], "is not FRAME:X,Y,W,H"),
+        (["run", "77:1,1,9,9"], "there is no frame 77"),
+        (["run", "3@2:1,1,9,9"], "is of object 2, but there are 1"),
+        (["run", "0:1,1,9,9"], "is the one in which the object is given"),
+        (["run", "3:mask.png"], "mask.png"),
+        (["run", "3:1,1,9,9", "--source", "gone.mp4"], "gone.mp4"),
+    ],
+)
+def test_what_cannot_be_corrected_is_refused_and_the_run_is_as_it_was(
+    call, refused, clip, script, words, told
+):
+    call("run", clip, *BOX, "--out", "run")
+    before = Path("run/run.json").read_bytes()
+    assert told in refused("correct", *words)
+    assert Path("run/run.json").read_bytes() == before
+
+
+def test_a_correction_that_fails_says_how_to_go_on(call, clip, script):
+    call("run", clip, *BOX, "--out", "run")
+    before = Path("run/run.json").read_bytes()
+    script.faults[3] = PluginError("The tracker gave up.")
+    result = call("correct", "run", "3:21,11,20,20")
+    assert result.exit_code == 2
+    assert "The run run is as it was; the same command " in result.stderr
+    assert Path("run/run.json").read_bytes() == before
+
+
 def test_failing_plugin_ends_the_run_with_a_sentence_and_keeps_what_was_finished(call, clip, script):
     script.faults[2] = PluginError("The tracker gave up.")
     result = call("run", clip, *BOX, "--out", "run")

@@ -12,6 +12,7 @@ from resumable_runs import assert_alike
 
 import tracking3d
 from tracking3d import load_config
+from tracking3d.checkpoint.folder import finish_state
 from tracking3d.corrections import Correction
 from tracking3d.errors import InputError
 from tracking3d.estimation.online.solver import OnlineSolver
@@ -339,8 +340,9 @@ def test_a_finished_run_is_computed_again_where_a_frame_is_corrected(clip, image
     wrong, given = wrong_place(clip), [Correction(CORRECTED, mask=clip.masks[CORRECTED])]
     run(clip, images, tmp_path / "whole", CAUSAL, mask=wrong, corrections=given)
     run(clip, images, tmp_path / "run", CAUSAL, mask=wrong)
+    finish_state(tmp_path / "run", 0)
     run(clip, images, tmp_path / "run", CAUSAL, mask=wrong, corrections=given, resume=True)
-    assert "Only the state after the latest frame is kept, so that all is computed again" in caplog.text
+    assert "No state of before frame 4 was kept" in caplog.text
     assert_alike(tmp_path / "run", tmp_path / "whole")
     created = RunReader(tmp_path / "run").description["created"]
     run(clip, images, tmp_path / "run", CAUSAL, mask=wrong, corrections=given, resume=True)

@@ -178,3 +178,31 @@ def test_the_page_shows_the_frames_that_differ_most_in_every_run(run_of, tmp_pat
     assert "<i>" not in page
     assert "None: all runs have the same settings." in page
     assert json.dumps(comparison.as_json())
+
+
+def test_any_run_may_be_the_one_that_others_are_held_against(run_of):
+    a, b, c = (run_of(name) for name in "abc")
+    comparison = compare_runs([a, b, c], against=b)
+    assert comparison.names == ["b", "a", "c"]
+    assert compare_runs([a], against=c).names == ["c", "a"]
+    with pytest.raises(InputError, match="nothing to compare one run with"):
+        compare_runs([a], against=a)
+
+
+def test_every_two_runs_are_compared(run_of, tmp_path):
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("y", 20, degrees=True).as_matrix()
+
+    def change(estimate):  # one that a turn of the object does not explain
+        return moved(estimate, estimate.T_cam_obj @ turn if estimate.index % 2 else estimate.T_cam_obj)
+
+    comparison = compare_runs([run_of("a"), run_of("b", change), run_of("c", change)])
+    between = comparison.rotation_between
+    assert between[0, 1] == pytest.approx(between[1, 0])
+    assert between[0, 1] == pytest.approx(comparison.differences[0].summary["rotation_median_deg"])
+    assert between[0, 1] > 5 > 0.01 > between[1, 2]
+    assert comparison.iou_between == pytest.approx(np.ones((3, 3)))
+    told = comparison.as_json()["every_pair"]
+    assert [one["runs"] for one in told] == [["a", "b"], ["a", "c"], ["b", "c"]]
+    write_comparison(comparison, tmp_path / "page.html")
+    assert "Every two of them" in (tmp_path / "page.html").read_text()

@@ -53,6 +53,14 @@ def test_each_layer_is_drawn_where_it_is_asked_for(follower, layer):
     assert not has(picture, CAUSAL)
 
 
+def test_the_outlines_of_several_objects_have_colours_of_their_own(follower):
+    blank = np.zeros_like(frame_of(0).image)
+    shown = Shown(frozenset({"initial", "refined"}), axes=False)
+    picture = draw_picture(blank, [follower, follower], 0, shown, [None, None], [(9, 200, 9), (200, 9, 9)])
+    assert (picture == (200, 9, 9)).all(-1).any()
+    assert not (picture == LAYERS["refined"]).all(-1).any()
+
+
 def test_a_doubt_frames_the_picture_in_its_colour(follower):
     for index, colour in ((0, None), (3, (250, 200, 60)), (5, (255, 85, 85))):
         picture = draw_picture(frame_of(index).image, [follower], index, Shown(frozenset(), False), [None])

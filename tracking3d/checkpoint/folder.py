@@ -7,6 +7,7 @@ that the state names is removed only once another state has taken its place.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tracking3d.checkpoint.milestones import Milestones, keep_milestones_only
 from tracking3d.checkpoint.progress import Kept, Progress, TakenFrame, journal_line, read_journal
 from tracking3d.checkpoint.trees import TreeFolder
 from tracking3d.errors import InputError
@@ -23,6 +25,8 @@ from tracking3d.results import layout
 from tracking3d.results.files import read_mask, write_atomic, write_mask, writing
 
 VERSION = 1
+MOST_KEPT = 200 * 10**6
+"""Bytes that milestones may take in the folder of a run that is finished."""
 
 
 class Checkpoint:
@@ -32,16 +36,21 @@ class Checkpoint:
         folder: The run folder.
         classes: See `TreeFolder`.
         device: See `TreeFolder`.
+        milestones: How many states of earlier frames may be kept, see `tracking3d.checkpoint.milestones`.
 
     Raises:
         OutputError: If the folder cannot be written.
     """
 
-    def __init__(self, folder: Path, classes: tuple[type, ...], device: str = "cpu") -> None:
+    def __init__(
+        self, folder: Path, classes: tuple[type, ...], device: str = "cpu", milestones: int = 0
+    ) -> None:
         self._folder = folder / layout.STATE
         with writing(self._folder):
             self._folder.mkdir(exist_ok=True)
         self._trees = TreeFolder(self._folder, classes, device)
+        self._milestones = Milestones(self._folder, milestones)
+        self._taken: dict[int, int] = {}  # how many frames were taken when each of them was
         self._journal = 0
         self._waiting = b""
 
@@ -49,13 +58,20 @@ class Checkpoint:
         """Remember a frame that was not taken, or whose state is of no use; it is kept with the next state."""
         self._waiting += journal_line(frame)
 
-    def save(self, progress: Progress, session: dict[str, Any], taken: TakenFrame | None = None) -> None:
+    def save(
+        self,
+        progress: Progress,
+        session: dict[str, Any],
+        taken: TakenFrame | None = None,
+        revised: Iterable[int] = (),
+    ) -> None:
         """Keep the state after a frame.
 
         Args:
             progress: Where the run stands.
             session: The session's state.
             taken: The frame, where it was taken for the first time.
+            revised: Earlier frames whose answers are others since it: no correction can go on from between.
 
         Raises:
             OutputError: If it cannot be written; the state before is then still there.
@@ -73,7 +89,14 @@ class Checkpoint:
             text = f'{json.dumps(head)[:-1]}, "session": {tree}}}\n'
             write_atomic(self._folder / layout.STATE_FILE, text.encode("ascii"))
             self._journal, self._waiting = length, b""
-            self._trees.tidy()
+            self._milestones.forget_after(
+                min((self._taken.get(one, 0) - 1 for one in revised), default=len(self._taken))
+            )
+            if taken:
+                self._taken[taken.index] = len(self._taken) + 1
+                if self._milestones.due(count := len(self._taken)):
+                    self._milestones.keep(self._folder / layout.STATE_FILE, count, self._trees.arrays)
+            self._trees.tidy(self._milestones.arrays)
 
     def read(self) -> Kept:
         """What was kept last.
@@ -94,6 +117,7 @@ class Checkpoint:
             if len(text) < self._journal:
                 raise ValueError(f"{journal.name} is too short")
             taken, skipped = read_journal(text)
+            self._taken = {index: number for number, index in enumerate(taken, 1)}
             kept = Kept(Progress(**state["progress"]), self._trees.read(state["session"]), taken, skipped)
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise InputError(f"{path} is damaged ({error}); start anew with {layout.OVERWRITE}.") from error
@@ -106,7 +130,8 @@ class Checkpoint:
             OutputError: If they cannot be removed.
         """
         with writing(self._folder):
-            self._trees.clear_strangers()
+            self._milestones.read(len(self._taken))
+            self._trees.clear_strangers(self._milestones.arrays)
 
     def keep_correction(self, index: int, mask: NDArray[np.bool_]) -> None:
         """Keep the mask ``(H, W)`` that was handed back to the mask tracker in frame ``index``.
@@ -130,6 +155,14 @@ class Checkpoint:
             raise InputError(f"{path} is missing or damaged; start anew with {layout.OVERWRITE}.")
         return mask
 
+    def finish(self) -> None:
+        """The run is finished: keep its milestones only, see `finish_state`.
+
+        Raises:
+            OutputError: If something cannot be removed.
+        """
+        finish_state(self._folder.parent)
+
     def remove(self) -> None:
         """Remove what was kept.
 
@@ -137,6 +170,21 @@ class Checkpoint:
             OutputError: If it cannot be removed.
         """
         remove_state(self._folder.parent)
+
+
+def finish_state(folder: Path, most: int | None = None) -> None:
+    """Leave of the state of a finished run what a correction goes on from, where that is not too large.
+
+    Args:
+        folder: The run folder.
+        most: Bytes that it may take; `MOST_KEPT` if None.
+
+    Raises:
+        OutputError: If something cannot be removed.
+    """
+    with writing(folder / layout.STATE):
+        keep_milestones_only(folder, MOST_KEPT if most is None else most)
+        _remove_empty(folder / layout.STATE)
 
 
 def remove_state(folder: Path) -> None:
@@ -151,6 +199,10 @@ def remove_state(folder: Path) -> None:
         files = sorted(layout.state_files(folder), key=lambda path: path.name != layout.STATE_FILE)
         for path in files:
             path.unlink(missing_ok=True)
-        for empty in (inner / layout.MASKS, inner):
-            with suppress(OSError):
-                empty.rmdir()
+        _remove_empty(inner)
+
+
+def _remove_empty(inner: Path) -> None:
+    for empty in (inner / layout.MASKS, inner):
+        with suppress(OSError):
+            empty.rmdir()

@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from pydantic import ValidationError
 
 from tracking3d.checkpoint.progress import checksum
+from tracking3d.config.models import PipelineConfig
 from tracking3d.corrections import Correction
 from tracking3d.errors import InputError, OutputError
 from tracking3d.frames import Frame, Prompt
@@ -118,6 +120,15 @@ def earlier_run(
     return "finished" if finished else "stopped"
 
 
+def changed_frames(folder: Path, given: Mapping[str, Any]) -> set[int]:
+    """The frames of the run in a folder that are corrected now and were not, or otherwise.
+
+    Raises:
+        InputError: If the run is damaged.
+    """
+    return _changed(RunReader(folder).description, given)
+
+
 def _changed(before: Mapping[str, Any], given: Mapping[str, Any]) -> set[int]:
     """Frames that are corrected now and were not, or otherwise."""
     then, now = _by_frame(before.get("given") or {}), _by_frame(given)
@@ -134,7 +145,7 @@ def _differences(
     """What is not as it was, in words."""
     if before.get("selection") != selection:
         yield f"the selection of frames was {before.get('selection')} and is {selection}"
-    then, now = _flat(before["config"]), _flat(jsonable(config))
+    then, now = _flat(_complete(before["config"])), _flat(jsonable(config))
     for key in sorted(then.keys() | now.keys()):
         if then.get(key) != now.get(key):
             yield f"{key} was {then.get(key)} and is {now.get(key)}"
@@ -145,6 +156,14 @@ def _differences(
         if earlier.get(key) != given[key]:
             was = "is another one" if key in _CHECKSUMS else f"was {earlier.get(key)} and is {given[key]}"
             yield f"the {name} {was}"
+
+
+def _complete(config: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The configuration with the defaults of keys that an older version did not know."""
+    try:
+        return PipelineConfig.model_validate(config).model_dump(mode="json")
+    except ValidationError:  # of a newer one, or by hand: what differs is told
+        return config
 
 
 def _frames(indices: list[int]) -> str:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import base64
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from enum import Enum
 from io import BytesIO
@@ -77,6 +77,7 @@ class TreeFolder:
         numbers = [int(path.stem) for path in folder.glob(f"*{SUFFIX}") if path.stem.isdigit()]
         self._next = max(numbers, default=-1) + 1
         self._root = _Part(None, "null")
+        self._spared: set[str] = set()  # files of earlier trees that are needed still
 
     def text(self, tree: Any) -> str:
         """The tree as JSON text; arrays that are not in a file yet are written.
@@ -103,20 +104,33 @@ class TreeFolder:
         finally:
             self._by_text.clear()
 
-    def tidy(self) -> None:
-        """Remove the files of what is not in the latest tree."""
+    @property
+    def arrays(self) -> frozenset[str]:
+        """Names of the files that the latest tree needs."""
+        return frozenset(part.file for part in self._root.within() if part.file)
+
+    def tidy(self, needed: Collection[str] = ()) -> None:
+        """Remove the files of what is not in the latest tree, but not those that are ``needed`` otherwise.
+
+        A file that was needed is removed as soon as it is not.
+        """
         used = {id(part): part for part in self._root.within()}
         for part in self._known.values():
             if id(part) not in used and part.file:
-                (self._folder / part.file).unlink(missing_ok=True)
+                self._spared.add(part.file)
+        gone = self._spared - set(needed)
+        for name in gone:
+            (self._folder / name).unlink(missing_ok=True)
+        self._spared -= gone
         used.pop(id(self._root), None)
         self._known = {id(part.value): part for part in used.values()}
 
-    def clear_strangers(self) -> None:
-        """Remove array files that the latest tree does not name, such as those that a kill left."""
-        named = {part.file for part in self._root.within()}
+    def clear_strangers(self, needed: Collection[str] = ()) -> None:
+        """Remove array files that neither the latest tree names nor are ``needed``, such as those that a kill left."""
+        named = self.arrays
+        self._spared = set(needed) - named
         for path in self._folder.glob(f"*{SUFFIX}"):
-            if path.name not in named:
+            if path.name not in named and path.name not in self._spared:
                 path.unlink(missing_ok=True)
 
     def _encoded(self, value: Any, within: _Part) -> str:

@@ -13,6 +13,7 @@ from tracking3d.cli import (
     calibrate,
     compare,
     config,
+    correct,
     demo,
     evaluate,
     export,
@@ -41,6 +42,7 @@ app.command(name="demo")(demo.demo)
 app.command(name="synth")(synth.synth)
 app.command(name="pick")(pick.pick)
 app.command(name="view")(view.view)
+app.command(name="correct")(correct.correct)
 app.command(name="points")(points.points)
 app.command(name="model")(model.model)
 app.command(name="export")(export.export)

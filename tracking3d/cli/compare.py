@@ -16,8 +16,12 @@ if TYPE_CHECKING:
 def compare(
     runs: Annotated[
         list[Path],
-        typer.Argument(metavar="RUN RUN...", help="Run folders; the others are held against the first."),
+        typer.Argument(metavar="RUN RUN...", help="Run folders over one video."),
     ],
+    against: Annotated[
+        Path | None,
+        typer.Option(metavar="RUN", help="The run that the others are held against; the first if left out."),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(metavar="FILE.html", help="Write a page too, with the frames that differ most."),
@@ -30,7 +34,7 @@ def compare(
 
     from tracking3d.report.differences import compare_runs
 
-    comparison = compare_runs(runs)
+    comparison = compare_runs(runs, against)
     if out is not None:
         from tracking3d.report.comparison import write_comparison
 
@@ -71,11 +75,26 @@ def _print(comparison: Comparison) -> None:
     summaries = [one.summary for one in comparison.differences]
     apart = {_LABELS[key]: [one[key] for one in summaries] for key in summaries[0]}
     table(f"against {names[0]}", apart, names[1:])
+    if len(names) > 2:
+        table("every two: IoU of masks, mean; rotation, median", _every_two(comparison), names)
     worst = {
         f"frame {index}": [_at(one, index) for one in comparison.differences] for index in comparison.worst
     }
     if worst:
         table("frames that differ most", worst, names[1:])
+
+
+def _every_two(comparison: Comparison) -> dict[str, list[Any]]:
+    iou, turn = comparison.iou_between, comparison.rotation_between
+    return {
+        name: [
+            None
+            if row == column
+            else f"{iou[row, column]:.3f}, {turn[row, column]:.1f}°".replace("nan°", "-").replace("nan", "-")
+            for column in range(len(comparison.names))
+        ]
+        for row, name in enumerate(comparison.names)
+    }
 
 
 def _at(one: Any, index: int) -> str | None:

@@ -98,12 +98,12 @@ def a_person_is_there() -> bool:
 @contextmanager
 def resumable(folders: list[Path]) -> Iterator[None]:
     """Whatever stops a run, it says how to go on, where that is possible."""
-    from tracking3d.results.layout import has_state
+    from tracking3d.results.layout import CORRECTING, has_state
 
     try:
         yield
     except BaseException as error:
-        if any(has_state(folder) for folder in folders):
+        if any(has_state(folder) or has_state(folder / CORRECTING) for folder in folders):
             error.add_note("The same command with --resume goes on from there.")
         raise
 

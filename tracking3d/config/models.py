@@ -158,6 +158,18 @@ class RuntimeConfig(Section):
         "auto",
         description="What renders: torch everywhere, numba on the CPU, or the fastest that can be used here.",
     )
+    milestones: int = Field(
+        8,
+        ge=0,
+        le=64,
+        description=(
+            "States of earlier frames that are kept for corrections to go on from, also when the run is finished; "
+            "0 for none."
+        ),
+    )
+    probabilities: bool = Field(
+        False, description="Write the object's probability in every pixel beside the masks, as 8-bit PNG."
+    )
     on_plugin_failure: Literal["continue", "stop"] = Field(
         "continue",
         description=(

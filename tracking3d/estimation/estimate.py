@@ -71,6 +71,8 @@ class FrameEstimate:
         seconds: Wall time spent on the frame, all stages together.
         stages: The same stage by stage, as far as they are over; None where nobody timed them.
         mask_source: Where the mask comes from; None where it is not known.
+        probability: ``(H, W)`` float32 of the object, pixel by pixel, where the mask was weighed against the image: the
+            mask is where it is above a half. It orders pixels and is not calibrated. None otherwise.
         failure: Which plug-in failed at this frame, and why, in words; empty where none did.
         hypothesis: Which start of the pose won, in a word or two; empty where there was no choice.
         refined: Whether this is the answer of the final refinement, which looks at the whole video, and not the
@@ -101,6 +103,7 @@ class FrameEstimate:
     revised: tuple[FrameEstimate, ...] = ()
     camera: Camera | None = None
     points: PointAnswers | None = None
+    probability: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True, eq=False)

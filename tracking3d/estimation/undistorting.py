@@ -65,6 +65,9 @@ class UndistortingSolver(Generic[State]):
             estimate,
             mask=answered,
             initial_mask=initial,
+            probability=None
+            if estimate.probability is None
+            else self._lens.mask_to_picture(estimate.probability),
             revised=tuple(self._answer(earlier) for earlier in estimate.revised),
         )
 

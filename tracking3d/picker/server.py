@@ -6,6 +6,7 @@ import json
 import re
 import threading
 from collections.abc import Callable
+from functools import partial
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
@@ -69,6 +70,34 @@ class Picker:
         assert self.picked is not None
         return self.picked
 
+    def told(self, path: str) -> Any | None:
+        """What is answered to a question of the page, as JSON has it; None where it is none."""
+        return _told(self.session) if path == "/session.json" else None
+
+    def ordered(self, path: str, body: bytes) -> tuple[Any, Callable[[], None]] | None:
+        """Do what the page orders.
+
+        Args:
+            path: What it asks for.
+            body: What it brings.
+
+        Returns:
+            The answer as JSON has it, and what is to be done when it is sent; None where there is no such order.
+
+        Raises:
+            Tracking3dError: If it cannot be done.
+        """
+        if path == "/mask":
+            drawn = read_object(body)
+            mask = self.session.mask(drawn)
+            return {"veil": self.session.veil(mask, drawn.colour), "area": int(mask.sum())}, _nothing
+        if path not in ("/save", "/start"):
+            return None
+        picked = self.session.picked(read_drawing(body))
+        command, settings = self.save(picked)
+        then = partial(self.start, picked) if path == "/start" else _nothing
+        return {"command": command, "settings": settings}, then
+
     def start(self, picked: Picked) -> None:
         """The run is to start with that."""
         self.picked = picked
@@ -128,8 +157,8 @@ class _Handler(BaseHTTPRequestHandler):
         elif path in _PAGE:
             name, kind = _PAGE[path]
             self._send(HTTPStatus.OK, (files("tracking3d.picker") / "page" / name).read_bytes(), kind)
-        elif path == "/session.json":
-            self._send_json(_told(picker.session))
+        elif (told := picker.told(path)) is not None:
+            self._send_json(told)
         elif found := _FRAME.fullmatch(path):
             picture = picker.session.picture(int(found[1]))
             if picture is None:
@@ -142,22 +171,15 @@ class _Handler(BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         if not self._may(from_page=True) or (body := self._body()) is None:
             return
-        picker = self.server.picker
         try:
-            if self.path == "/mask":
-                drawn = read_object(body)
-                mask = picker.session.mask(drawn)
-                self._send_json({"veil": picker.session.veil(mask, drawn.colour), "area": int(mask.sum())})
-            elif self.path in ("/save", "/start"):
-                picked = picker.session.picked(read_drawing(body))
-                command, settings = picker.save(picked)
-                self._send_json({"command": command, "settings": settings})
-                if self.path == "/start":
-                    picker.start(picked)
-            else:
-                self._refuse(HTTPStatus.NOT_FOUND, "There is no such page.")
+            done = self.server.picker.ordered(self.path, body)
         except Tracking3dError as error:
-            self._refuse(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
+            return self._refuse(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
+        if done is None:
+            return self._refuse(HTTPStatus.NOT_FOUND, "There is no such page.")
+        told, then = done
+        self._send_json(told)
+        then()
 
     def _may(self, from_page: bool) -> bool:
         """Whether the request is answered; where not, it is refused."""
@@ -221,6 +243,10 @@ def _listening(picker: Picker, host: str, port: int) -> _Server:
     raise InputError(
         f"No page can be served on {host}, port {port}: {problem.strerror}; choose another --host or --port."
     )
+
+
+def _nothing() -> None:
+    pass
 
 
 def _told(session: PickingSession) -> dict[str, Any]:

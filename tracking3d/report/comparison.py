@@ -43,6 +43,7 @@ def write_comparison(comparison: Comparison, path: Path) -> None:
         facts=[("Source", str(first.description.get("source", ""))), ("Held against", comparison.names[0])],
         notes=comparison.notes,
         settings=comparison.settings,
+        pairs=_pairs(comparison),
         summaries=[(one.name, one.summary) for one in comparison.differences],
         plots=_plots(comparison),
         strips=_strips(comparison),
@@ -53,6 +54,24 @@ def write_comparison(comparison: Comparison, path: Path) -> None:
         frames=_pictures(comparison),
     )
     write_atomic(path, page)
+
+
+def _pairs(comparison: Comparison) -> list[tuple[str, list[dict[str, str] | None]]]:
+    """Of every run its row in the table of every two, where there are more than two."""
+    if len(comparison.runs) < 3:
+        return []
+    rows = []
+    for row, name in enumerate(comparison.names):
+        cells: list[dict[str, str] | None] = []
+        for column in range(len(comparison.names)):
+            iou, turn = comparison.iou_between[row, column], comparison.rotation_between[row, column]
+            told = {
+                "iou": f"{iou:.3f}" if np.isfinite(iou) else "–",
+                "rotation": f"{turn:.1f}°" if np.isfinite(turn) else "–",
+            }
+            cells.append(None if row == column else told)
+        rows.append((name, cells))
+    return rows
 
 
 def _frames(comparison: Comparison) -> list[int]:

@@ -1,12 +1,13 @@
 """What differs between runs over one video: settings, masks, poses, statuses, time.
 
-The first run is the one that the others are held against; none of them is the truth.
+One run is what the others are held against; none of them is the truth.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +73,8 @@ class Comparison:
         differences: Of each run but the first.
         worst: Indices of the frames that differ most, in order of time.
         notes: What to know, in sentences.
+        iou_between: ``(R, R)`` mean IoU of the masks of every two runs; NaN where there is none.
+        rotation_between: ``(R, R)`` degrees between their poses, in the median; NaN likewise.
     """
 
     runs: list[RunReader]
@@ -80,6 +83,8 @@ class Comparison:
     differences: list[Difference]
     worst: list[int]
     notes: list[str]
+    iou_between: NDArray[np.float64]
+    rotation_between: NDArray[np.float64]
 
     def as_json(self) -> dict[str, Any]:
         """All of it in JSON's types, frame by frame too."""
@@ -105,24 +110,35 @@ class Comparison:
                     for one in self.differences
                 ],
                 "worst_frames": self.worst,
+                "every_pair": [
+                    {
+                        "runs": [self.names[row], self.names[column]],
+                        "iou_mean": _known(self.iou_between[row, column]),
+                        "rotation_median_deg": _known(self.rotation_between[row, column]),
+                    }
+                    for row, column in combinations(range(len(self.runs)), 2)
+                ],
                 "notes": self.notes,
             }
         )
         return told
 
 
-def compare_runs(folders: Sequence[Path]) -> Comparison:
-    """Hold runs against the first of them.
+def compare_runs(folders: Sequence[Path], against: Path | None = None) -> Comparison:
+    """Hold runs against one of them, and every two against each other.
 
     Poses are compared after the similarity that fits best, since object frame and unit of a run are its own.
 
     Args:
-        folders: Two run folders or more.
+        folders: Two run folders or more; one is enough where ``against`` is another.
+        against: The run that the others are held against, among them or not; the first if None.
 
     Raises:
         InputError: If one is no run folder, or damaged; if there are fewer than two; if they are of different videos,
             as far as their sizes and frames tell.
     """
+    if against is not None:
+        folders = [against, *(folder for folder in folders if folder.resolve() != against.resolve())]
     if len(folders) < 2:
         raise InputError("There is nothing to compare one run with; give two run folders or more.")
     runs = [RunReader(folder) for folder in folders]
@@ -131,6 +147,7 @@ def compare_runs(folders: Sequence[Path]) -> Comparison:
         _check_same_video(first, other)
     names = _names([run.folder for run in runs])
     differences = [_difference(name, first, other) for name, other in zip(names[1:], others, strict=True)]
+    iou, rotation = _between(runs, differences)
     configs = [flat(run.config) for run in runs]
     keys = dict.fromkeys(key for config in configs for key in config)
     values = {key: [config.get(key) for config in configs] for key in keys}
@@ -141,6 +158,8 @@ def compare_runs(folders: Sequence[Path]) -> Comparison:
         differences=differences,
         worst=worst_frames(differences),
         notes=_notes(runs, names, differences),
+        iou_between=iou,
+        rotation_between=rotation,
     )
 
 
@@ -193,6 +212,22 @@ def _difference(name: str, first: RunReader, other: RunReader) -> Difference:
         translation=translation,
         scale=scale,
     )
+
+
+def _between(
+    runs: list[RunReader], differences: list[Difference]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Mean IoU and median rotation of every two runs, ``(R, R)`` each; ``differences`` are those from the first."""
+    iou, rotation = np.ones((len(runs), len(runs))), np.zeros((len(runs), len(runs)))
+    for row, column in combinations(range(len(runs)), 2):
+        one = differences[column - 1] if not row else _difference("", runs[row], runs[column])
+        for table, figure in ((iou, one.summary["iou_mean"]), (rotation, one.summary["rotation_median_deg"])):
+            table[row, column] = table[column, row] = np.nan if figure is None else figure
+    return iou, rotation
+
+
+def _known(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
 
 
 def _iou(first: RunReader, other: RunReader, index: int) -> float:

@@ -117,3 +117,11 @@ def stage_times(run: RunReader) -> tuple[StageTimes | None, StageTimes]:
     """What the causal answers took, stage by stage, and what the final refinement did."""
     causal = stages_of(RunReader(run.folder, refined=False).frames)
     return causal if run.frames else None, run.refinement_stages or StageTimes()
+
+
+def corrected_frames(run: RunReader) -> list[int]:
+    """Indices of the frames in which somebody has said what the object is, but the first."""
+    given = run.description.get("given")
+    told = given.get("corrections") if isinstance(given, dict) else None
+    indices = [one.get("frame") for one in told if isinstance(one, dict)] if isinstance(told, list) else []
+    return sorted(index for index in indices if isinstance(index, int))

@@ -204,6 +204,7 @@ def _facts(run: RunReader) -> list[tuple[str, str]]:
         ("Solver", names[2]),
         ("State", run.state_in_words),
         ("Time", _time_per_frame(run)),
+        ("Corrected in", ", ".join(f"frame {index}" for index in figures.corrected_frames(run))),
         ("Begun", str(about.get("created", "")).replace("T", " ").replace("+00:00", " UTC")),
     ]
     return [(name, str(value)) for name, value in facts if value]

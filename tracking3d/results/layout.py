@@ -6,6 +6,7 @@
     frames.jsonl        one line a frame, flushed; a better answer for an earlier frame is a further line
     masks/              the answers, 0/255 PNG at full resolution, named by frame index
     initial_masks/      what the mask tracker gave
+    probabilities/      the object's in every pixel of the answers, where that was asked for
     overlay.mp4         the video with outlines and axes
     contact_sheet.png   the run at a glance
     report.html         the run to look at, in one file
@@ -14,7 +15,9 @@
     landmarks.npz       surface and poses as points were followed by, once they were
     causal/             masks and mesh as they were before the final refinement
     .refining/          what the final refinement has made so far, until it has ended
-    .state/             what a stopped run goes on from, until it is finished
+    .state/             what a stopped run goes on from; when it is finished, what a correction goes on from
+    prompts/            the masks that were given of the object, named by frame index
+    .correcting/        a run folder: the run as it is corrected, until that is finished
 """
 
 from __future__ import annotations
@@ -31,9 +34,14 @@ RUN = "run.json"
 FRAMES = "frames.jsonl"
 MASKS = "masks"
 INITIAL_MASKS = "initial_masks"
+PROBABILITIES = "probabilities"
 CAUSAL = "causal"
 REFINING = ".refining"
 STATE = ".state"
+PROMPTS = "prompts"
+CORRECTING = ".correcting"
+DRAWN = ".drawn.png"
+"""A mask that was drawn in the viewer, until the correction by it has begun."""
 STATE_FILE = "state.json"
 JOURNAL = "journal.jsonl"
 OVERLAY = "overlay.mp4"
@@ -67,9 +75,9 @@ CONVENTIONS = {
 
 MESH_FILES = (OBJ, MTL, TEXTURE, GLB, FEATURES)
 _OF_MESH = (*MESH_FILES, LANDMARKS)
-_FILES = (RUN, FRAMES, OVERLAY, CONTACT_SHEET, REPORT, TURNTABLE, *_OF_MESH)
+_FILES = (RUN, FRAMES, OVERLAY, CONTACT_SHEET, REPORT, TURNTABLE, DRAWN, *_OF_MESH)
 _MASK_NAME = re.compile(r"\d{6,}\.png")
-_ARRAY_NAME = re.compile(r"\d{8,}\.npz")
+_OF_STATE = re.compile(r"\d{8,}\.npz|milestone_\d{6,}\.json")
 
 
 def mask_path(folder: Path, index: int) -> Path:
@@ -122,13 +130,32 @@ def run_files(folder: Path) -> list[Path]:
     for masks in (
         folder / MASKS,
         folder / INITIAL_MASKS,
+        folder / PROBABILITIES,
+        folder / REFINING / PROBABILITIES,
+        folder / PROMPTS,
         folder / CAUSAL / MASKS,
         folder / REFINING / MASKS,
     ):
         if masks.is_dir():
             names = {path.name.removeprefix(".").removesuffix(".part") for path in masks.iterdir()}
             named += [masks / name for name in sorted(names) if _MASK_NAME.fullmatch(name)]
-    return _with_unfinished(named) + state_files(folder)
+    return _with_unfinished(named) + state_files(folder) + correction_files(folder)
+
+
+def correction_files(folder: Path) -> list[Path]:
+    """Those of a correction that was not finished."""
+    stage = folder / CORRECTING
+    return run_files(stage) if stage.is_dir() else []
+
+
+def probability_path(folder: Path, index: int) -> Path:
+    """Where the object's probability in frame ``index`` lies: in the run folder, or in `REFINING` within it."""
+    return folder / PROBABILITIES / f"{index:06d}.png"
+
+
+def prompt_path(folder: Path, index: int) -> Path:
+    """Where the mask lies that was given of the object in frame ``index``."""
+    return folder / PROMPTS / f"{index:06d}.png"
 
 
 def has_state(folder: Path) -> bool:
@@ -141,7 +168,7 @@ def state_files(folder: Path) -> list[Path]:
     inner = folder / STATE
     named = [inner / STATE_FILE, inner / JOURNAL]
     if inner.is_dir():
-        named += sorted(path for path in inner.iterdir() if _ARRAY_NAME.fullmatch(path.name))
+        named += sorted(path for path in inner.iterdir() if _OF_STATE.fullmatch(path.name))
     if (inner / MASKS).is_dir():
         names = {path.name.removeprefix(".").removesuffix(".part") for path in (inner / MASKS).iterdir()}
         named += [inner / MASKS / name for name in sorted(names) if _MASK_NAME.fullmatch(name)]

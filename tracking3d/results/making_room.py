@@ -38,5 +38,5 @@ def make_room(folder: Path, overwrite: bool) -> None:
     with writing(folder):
         for path in there:
             # These two are replaced in place, so that a kill in between leaves a run folder.
-            if path.name not in (layout.RUN, layout.FRAMES):
+            if path not in (folder / layout.RUN, folder / layout.FRAMES):
                 path.unlink()

@@ -21,6 +21,7 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.results import description, layout
 from tracking3d.results.files import read_mask, write_mask, writing
 from tracking3d.results.pictures import Pictures
+from tracking3d.results.probabilities import take_over_probability, write_probability
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import read_records
 from tracking3d.stages import StageTimes, measured
@@ -121,6 +122,8 @@ class RefinementWriter:
         with measured("write") as watch:
             record = FrameRecord.of(estimate, frame.name, initial, revision=True)
             write_mask(layout.mask_path(self._aside, frame.index), estimate.mask)
+            if (self._folder / layout.PROBABILITIES).is_dir():
+                write_probability(self._aside, frame.index, estimate.probability)
         record = record.and_wrote(watch.times.write)
         with writing(self._aside), (self._aside / layout.FRAMES).open("ab") as lines:
             lines.write(record.to_json().encode() + b"\n")
@@ -165,6 +168,8 @@ class RefinementWriter:
         append(list(self._records.values()))
         self._taken_over = True
         with writing(self._folder):
+            for record in self._records.values():
+                take_over_probability(self._aside, self._folder, record.index)
             if (self._aside / layout.OVERLAY).is_file():
                 (self._aside / layout.OVERLAY).replace(self._folder / layout.OVERLAY)
 
@@ -219,7 +224,8 @@ def _undo_taking_over(folder: Path) -> None:
 
 
 def _remove_folders(folder: Path) -> None:
-    """Remove the emptied folder and its folder of masks."""
-    with suppress(FileNotFoundError):
-        (folder / layout.MASKS).rmdir()
+    """Remove the emptied folder and its folders of masks."""
+    for inner in (layout.MASKS, layout.PROBABILITIES):
+        with suppress(FileNotFoundError):
+            (folder / inner).rmdir()
     folder.rmdir()

@@ -20,6 +20,7 @@ from tracking3d.results.camera_record import read_camera
 from tracking3d.results.files import read_mask
 from tracking3d.results.lock import is_locked
 from tracking3d.results.mesh_export import load_mesh
+from tracking3d.results.probabilities import read_probability
 from tracking3d.results.process import is_gone
 from tracking3d.results.records import FrameRecord, latest, read_stages
 from tracking3d.stages import StageTimes
@@ -181,6 +182,10 @@ class RunReader:
             InputError: If there is none.
         """
         return self.camera.mask_to_pinhole(self.mask(index))
+
+    def probability(self, index: int) -> NDArray[np.float32] | None:
+        """The object's probability ``(H, W)`` in every pixel of the final answer, where it was asked for, or None."""
+        return read_probability(self.folder, index) if self.refined else None
 
     def initial_mask(self, index: int) -> NDArray[np.bool_] | None:
         """What the mask tracker gave for frame ``index``, ``(H, W)``, or None."""

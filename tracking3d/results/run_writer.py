@@ -35,6 +35,7 @@ from tracking3d.results.making_room import make_room
 from tracking3d.results.mesh_export import export_mesh
 from tracking3d.results.notes import notes_of_run
 from tracking3d.results.pictures import Pictures
+from tracking3d.results.probabilities import write_probability
 from tracking3d.results.records import FrameRecord, jsonable, latest
 from tracking3d.results.refinement_writer import RefinementWriter, clear_refinement
 from tracking3d.results.run_reader import RunReader, read_records
@@ -42,9 +43,8 @@ from tracking3d.results.run_reader import RunReader, read_records
 FinalState = Literal["finished", "interrupted", "failed"]
 SKIPS_EVERY = 1.0
 """Seconds between two writes of ``run.json`` for skipped frames; the last ones are written at the end."""
-RESERVE = 2048
-"""Bytes that ``run.json`` has to spare for saying, on a full disk, how the run ended."""
-_LASTING = ("created", "refinement", "split")  # what a run that goes on keeps of what it said of itself
+RESERVE = 2048  # bytes that ``run.json`` has to spare for saying, on a full disk, how the run ended
+_STAYS = {"created", "refinement", "split", "tracker_choice"}  # of a run that goes on
 DEFAULT_FPS = 10.0
 """Speed of the overlay video where the source has none, such as a folder of images."""
 
@@ -98,6 +98,7 @@ class RunWriter:
         self._started, self._drawing, self._over = time.monotonic(), 0.0, False
         self._pictures = Pictures(self.folder / layout.OVERLAY, camera, self._fps)
         self._refinement: RefinementWriter | None = None
+        self._probabilities = bool(config.get("runtime", {}).get("probabilities"))
         self._description = description.description_at_start(
             config=config,
             camera=camera,
@@ -171,8 +172,7 @@ class RunWriter:
         Raises:
             OutputError: If it cannot be written; what was written before stays whole.
         """
-        # A picture is drawn when its frame's line is safe; so its time is in the next frame's line.
-        started = time.perf_counter() - self._drawing
+        started = time.perf_counter() - self._drawing  # of the picture before, drawn when its line was safe
         for revised in estimate.revised:
             self._record(revised, "", revision=True)
         record = self._record(estimate, frame.name, revision=False, started=started)
@@ -183,11 +183,7 @@ class RunWriter:
         return record
 
     def skip(self, skipped: SkippedFrame) -> None:
-        """Record a frame that could not be decoded, or was dropped to keep up with a camera.
-
-        Raises:
-            OutputError: If it cannot be written.
-        """
+        """Record a frame that could not be decoded or was dropped; an `OutputError` says that it cannot be."""
         self._description["skipped"].append({"index": skipped.index, "reason": skipped.reason})
         # A camera drops many frames a second, and the file is written whole.
         if time.monotonic() - self._described >= SKIPS_EVERY:
@@ -308,11 +304,11 @@ class RunWriter:
     def _go_on(self, so_far: WrittenSoFar) -> None:
         """Be the writer of the run that is there."""
         earlier = RunReader(self.folder).description
-        known = latest(read_records(self.folder / layout.FRAMES, so_far.lines), refined=False)
         self._lines.go_on(so_far.lines)
+        known = latest(read_records(self.folder / layout.FRAMES, so_far.lines), refined=False)
         self._kept = {record.index: record for record in known}
         self._started -= so_far.seconds
-        self._description |= {key: earlier[key] for key in _LASTING if key in earlier}
+        self._description |= {key: earlier[key] for key in _STAYS & earlier.keys()}
         self._description["resumed"] = [
             *earlier.get("resumed", ()),
             {"at": description.now(), "frames": len(known)},
@@ -330,6 +326,8 @@ class RunWriter:
             initial = read_mask(initial_path)
         record = FrameRecord.of(estimate, name, initial, revision)
         write_mask(layout.mask_path(self.folder, estimate.index), estimate.mask)
+        if self._probabilities:
+            write_probability(self.folder, estimate.index, estimate.probability)
         if started is not None:
             record = record.and_wrote(time.perf_counter() - started)
         self._lines.append([record])

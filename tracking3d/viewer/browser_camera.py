@@ -10,19 +10,40 @@ from numpy.typing import NDArray
 
 from tracking3d.viewer.scene import ObjectScene
 
+_FOV = 0.8  # radians
+_TILT = 0.5  # of the look onto a path's plane, so that it is seen from aside, too
+_AWAY = 3.7  # distances between object and camera, so that both are in view
+
 
 def look_from_aside(server: viser.ViserServer, scenes: Sequence[ObjectScene]) -> None:
-    """Where a browser looks from at first: from the side and a little above, at objects and paths together."""
-    first, last = scenes[0], scenes[-1]
-    row = last.place - first.place
-    to_path = first.middle_of_path
-    aside = np.cross(to_path, [0.0, 1.0, 0.0])
-    aside = aside / max(float(np.linalg.norm(aside)), 1e-9)
-    reach = first.distance + 0.7 * float(np.linalg.norm(row))
+    """Where a browser looks from at first: onto the plane of the camera's path, at objects and paths together."""
+    row = scenes[-1].place - scenes[0].place
+    aside, middle = aside_of(scenes[0].path)
     camera = server.initial_camera
-    camera.look_at = 0.45 * to_path + row / 2
-    camera.position = camera.look_at + 0.5 * to_path + reach * (2.2 * aside - [0.0, 0.8, 0.0])
-    camera.fov = 0.8
+    camera.look_at = middle + row / 2
+    reach = scenes[0].distance + 0.4 * float(np.linalg.norm(row))
+    camera.position = camera.look_at + _AWAY * reach * aside
+    camera.fov = _FOV
+
+
+def aside_of(path: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """A direction ``(3,)`` of length 1 from which a path ``(N, 3)`` around the origin is seen well, and its middle.
+
+    It is the normal of the plane that holds path and object, from above (y points down) and tilted. A path of next
+    to no length has many such planes: of them it is the one that stands upright.
+    """
+    middle = 0.5 * path.mean(axis=0)
+    onto = path - middle
+    # A little of the plane that is upright: what the path does not say is said by that.
+    upright = 0.05 * float(np.abs(path).max()) * np.array([0.0, 1.0, 0.0])
+    normal = np.linalg.svd(np.concatenate([onto, [-middle, upright, -upright]]))[2][2]
+    normal = -normal if normal[1] > 0 else normal
+    tilted = normal + _TILT * (np.array([0.0, -1.0, 0.0]) if abs(normal[1]) < 0.7 else _towards(path))
+    return tilted / np.linalg.norm(tilted), middle
+
+
+def _towards(path: NDArray[np.float64]) -> NDArray[np.float64]:
+    return path[0] / max(float(np.linalg.norm(path[0])), 1e-9)
 
 
 def look_through(server: viser.ViserServer, T_world_cam: NDArray[np.floating], fov: float) -> None:

@@ -66,7 +66,7 @@ class FollowedRun:
 
     def __post_init__(self) -> None:
         self._lines: list[FrameRecord] = []
-        self._read = 0
+        self._read = self._inode = 0
         self._model_time = 0.0
         self.reader = RunReader(self.folder)
         self.description = self.reader.description
@@ -143,10 +143,12 @@ class FollowedRun:
     def _look_at_lines(self) -> bool:
         path = self.folder / layout.FRAMES
         try:
-            size = path.stat().st_size
-            if size < self._read:  # begun anew, or cut back to where a stopped run goes on
+            told = path.stat()
+            size = told.st_size
+            # Begun anew, cut back to where a stopped run goes on, or replaced by a corrected one.
+            if size < self._read or told.st_ino != self._inode:
                 self._lines.clear()
-                self._read = 0
+                self._read, self._inode = 0, told.st_ino
             if size == self._read:
                 return False
             with path.open("rb") as file:

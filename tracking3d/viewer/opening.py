@@ -55,24 +55,24 @@ def open_viewer(
         PluginError: If viser is not installed, or cannot be guarded.
     """
     check_viser("The viewer")
+    from tracking3d.viewer.correcting import Corrections, RunCorrection
     from tracking3d.viewer.viewer import Video, Viewer
 
     if images is None and source is not None:
         images = frame_images(open_source(source))
-    videos = []
+    videos, corrections = [], list[RunCorrection]()
     for folder in folders:
         runs = runs_in(folder)
         if not runs:
             raise InputError(f"{folder} holds no run; give a folder that --out of `tracking3d run` was.")
-        videos.append(Video(folder.name or str(folder), runs, images or _images_of(runs[0])))
-    return Viewer(videos, access, port)
+        own = images or images_of_run(str(runs[0].description.get("source", "")), runs[0].folder)
+        corrections += [RunCorrection(run, own, source, access) for run in runs]
+        videos.append(Video(folder.name or str(folder), runs, own or _drawn_images_of(runs[0])))
+    return Viewer(videos, access, port, Corrections(corrections, access))
 
 
-def _images_of(run: FollowedRun) -> FrameImages | None:
-    """The frames of a run, or those in its overlay video."""
-    found = images_of_run(str(run.description.get("source", "")), run.folder)
-    if found is not None:
-        return found
+def _drawn_images_of(run: FollowedRun) -> FrameImages | None:
+    """The frames in the overlay video of a run."""
     run.look_again()
     try:
         return OverlayPictures(run.folder, list(run.frames), run.camera.height, run.camera.width)

@@ -49,6 +49,8 @@ class Panel:
             )
         with tabs.add_tab("Doubts"):
             self.doubts = gui.add_html("")
+        with tabs.add_tab("Correct"):
+            self.correct = gui.add_html("")
         with tabs.add_tab("Run"):
             self.about = gui.add_html("")
         gui.main_panel.dock_right()
@@ -70,6 +72,9 @@ class Panel:
             }
             self.legend = gui.add_html(_legend(names if causal else {**names, "causal": ""}))
             self.axes = gui.add_checkbox("axes", True)
+            self.probability = gui.add_checkbox(
+                "probability", False, visible=False, hint="Of the object: yellow is sure, blue is hardly."
+            )
         with gui.add_folder("In space"):
             self.mesh = gui.add_checkbox("model", True)
             self.path = gui.add_checkbox(
@@ -92,7 +97,7 @@ class Panel:
     def shown(self) -> Shown:
         """What is to be drawn into the video."""
         chosen = frozenset(layer for layer, box in self.layers.items() if box.value)
-        return Shown(chosen, self.axes.value)
+        return Shown(chosen, self.axes.value, self.probability.value)
 
     def play_or_pause(self, playing: bool) -> None:
         """What the button says."""

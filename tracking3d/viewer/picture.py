@@ -24,6 +24,7 @@ LAYERS = {"initial": drawing.INITIAL, "causal": CAUSAL, "refined": drawing.REFIN
 """The masks whose outlines can be drawn, and their colours, from the lowest to the uppermost."""
 _AXES: tuple[drawing.Colour, ...] = ((255, 60, 60), (60, 220, 60), (80, 120, 255))
 _GREY = 70
+_UNLIKELY = 0.02  # probability up to which a pixel is left as it is
 
 
 @dataclass(frozen=True)
@@ -33,10 +34,12 @@ class Shown:
     Attributes:
         layers: Names of those of `LAYERS`.
         axes: Whether the object's axes are.
+        probability: Whether the object's probability is, where it was kept.
     """
 
     layers: frozenset[str] = frozenset({"refined"})
     axes: bool = True
+    probability: bool = False
 
 
 def draw_picture(
@@ -45,6 +48,7 @@ def draw_picture(
     index: int,
     shown: Shown,
     axes: Sequence[ObjectAxes | None],
+    colours: Sequence[drawing.Colour] = (),
 ) -> Image:
     """One frame with the outlines and axes of all its objects.
 
@@ -54,6 +58,7 @@ def draw_picture(
         index: The frame.
         shown: What to draw.
         axes: Of each object, or None.
+        colours: Of each object's final mask, where several are to be told apart.
 
     Returns:
         ``(H, W, 3)``, at most `WIDEST` wide.
@@ -67,13 +72,16 @@ def draw_picture(
     else:
         picture = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8)
     thin = max(round(width / 640), 1)
-    for run, placed in zip(runs, axes, strict=True):
+    for number, (run, placed) in enumerate(zip(runs, axes, strict=True)):
         record = run.frames.get(index)
+        if shown.probability and (likely := run.reader.probability(index)) is not None:
+            _tint(picture, likely)
         for layer, colour in LAYERS.items():
             if layer in shown.layers and (mask := run.mask(index, layer)) is not None:
+                own = colours[number] if colours and layer == "refined" else colour
                 small = cv2.resize(mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
                 drawing.draw_outline(
-                    picture, small.astype(bool), colour, thin if layer == "initial" else thin + 1
+                    picture, small.astype(bool), own, thin if layer == "initial" else thin + 1
                 )
         if shown.axes and placed is not None and record is not None and record.status != Status.LOST:
             _draw_axes(picture, record.T_cam_obj, record.through(camera), placed, scale, thin + 1)
@@ -127,6 +135,15 @@ def _estimate(record: FrameRecord, mask: NDArray[np.bool_]) -> FrameEstimate:
         record.reason,
         record.confidence,
     )
+
+
+def _tint(picture: Image, probability: NDArray[np.float32]) -> None:
+    """Colour what may be the object, from blue (hardly) over green (open) to yellow (surely)."""
+    height, width = picture.shape[:2]
+    likely = cv2.resize(probability, (width, height), interpolation=cv2.INTER_AREA)
+    colours = cv2.applyColorMap(np.rint(255 * likely).clip(0, 255).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
+    share = np.where(likely > _UNLIKELY, 0.55, 0.0)[..., None]
+    picture[:] = ((1 - share) * picture + share * colours[..., ::-1]).astype(np.uint8)
 
 
 def _draw_axes(

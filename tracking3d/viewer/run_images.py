@@ -10,6 +10,7 @@ from pathlib import Path
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, Image, SkippedFrame
 from tracking3d.results import layout
+from tracking3d.results.following import places_of
 from tracking3d.video.any_frame import MOST_KEPT, FrameImages, VideoPictures, frame_images
 from tracking3d.video.opening import open_source
 from tracking3d.video.source import FrameSource, Intrinsics, notes_of
@@ -24,9 +25,7 @@ def images_of_run(source: str, folder: Path) -> FrameImages | None:
             present folder and from those above the run's.
         folder: The run folder.
     """
-    name = Path(source).expanduser()
-    places = [name] if name.is_absolute() else [name, *(above / name for above in folder.resolve().parents)]
-    for place in places:
+    for place in places_of(source, folder):
         if not source.isdigit() and (place.exists() or "*" in source):
             try:
                 return frame_images(open_source(str(place)))

@@ -34,7 +34,7 @@ class ObjectScene:
     Attributes:
         distance: From the object to the camera, in the median.
         place: ``(3,)`` where the object stands.
-        middle_of_path: ``(3,)`` the camera's mean place, in object coordinates.
+        path: ``(N, 3)`` the camera's places, in object coordinates.
 
     Args:
         server: Shows it.
@@ -48,7 +48,7 @@ class ObjectScene:
     ) -> None:
         self._server, self._run, self._jump = server, run, jump
         self._root = server.scene.add_frame(f"/object_{number}", show_axes=False)
-        self._path = server.scene.add_frame(f"/object_{number}/path", show_axes=False)
+        self._way = server.scene.add_frame(f"/object_{number}/path", show_axes=False)
         self._landmarks = server.scene.add_frame(f"/object_{number}/landmarks", show_axes=False)
         self._here: viser.CameraFrustumHandle | None = None
         self._mesh: viser.GlbHandle | None = None
@@ -56,15 +56,15 @@ class ObjectScene:
         self._mesh_written = 0.0
         self.place = np.zeros(3)
         self.distance = 4.0
-        self.middle_of_path = np.array([0.0, 0.0, -4.0])
+        self.path = np.array([[0.0, 0.0, -4.0]])
 
-    def draw_again(self, place: float) -> None:
-        """Show what is new in the run.
+    @property
+    def reach(self) -> float:
+        """How far below or above the object the path reaches."""
+        return float(np.abs(self.path[:, 1]).max())
 
-        Args:
-            place: How far below the first object it stands.
-        """
-        self.place = np.array([0.0, place, 0.0])
+    def draw_again(self) -> None:
+        """Show what is new in the run."""
         self._draw_mesh()
         records = [record for record in self._run.frames.values() if np.isfinite(record.T_cam_obj).all()]
         if records:
@@ -107,7 +107,7 @@ class ObjectScene:
 
     def show(self, mesh: bool, path: bool, landmarks: bool) -> None:
         """Which parts are to be seen."""
-        self._path.visible, self._landmarks.visible = path, landmarks
+        self._way.visible, self._landmarks.visible = path, landmarks
         if self._mesh is not None:
             self._mesh.visible = mesh
 
@@ -139,11 +139,11 @@ class ObjectScene:
         T_obj_cam: NDArray[np.float64] = np.linalg.inv(np.stack([record.T_cam_obj for record in records]))
         places = T_obj_cam[:, :3, 3]
         self.distance = float(np.median(np.linalg.norm(places, axis=1)))
-        self.middle_of_path = places.mean(axis=0)
+        self.path = places
         colours = np.array([drawing.STATUS[record.status] for record in records], np.uint8)
         if len(records) > 1:
             self._server.scene.add_line_segments(
-                f"{self._path.name}/line",
+                f"{self._way.name}/line",
                 np.stack([places[:-1], places[1:]], axis=1).astype(np.float32),
                 np.stack([colours[:-1], colours[1:]], axis=1),
                 thickness=2.0,
@@ -158,7 +158,7 @@ class ObjectScene:
     def _draw_frustum(self, slot: int, record: FrameRecord, T_obj_cam: NDArray[np.float64]) -> None:
         camera = record.through(self._run.camera)
         handle = self._server.scene.add_camera_frustum(
-            f"{self._path.name}/frustum_{slot:03d}",
+            f"{self._way.name}/frustum_{slot:03d}",
             fov=math.radians(camera.fov),
             aspect=camera.width / camera.height,
             scale=_FRUSTUM * self.distance * (1.0 if record.keyframe else 0.6),

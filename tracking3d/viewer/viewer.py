@@ -17,10 +17,13 @@ import numpy as np
 
 from tracking3d.errors import Tracking3dError
 from tracking3d.frames import Image
+from tracking3d.results import layout
+from tracking3d.results.drawing import Colour
 from tracking3d.results.overlay import ObjectAxes
 from tracking3d.video.any_frame import FrameImages
 from tracking3d.viewer import timeline
 from tracking3d.viewer.browser_camera import look_from_aside, look_through
+from tracking3d.viewer.correcting import Corrections
 from tracking3d.viewer.followed_run import FollowedRun
 from tracking3d.viewer.guarded_server import start_server
 from tracking3d.viewer.kept_landmarks import kept_landmarks
@@ -59,14 +62,15 @@ class Viewer:
         videos: What to show.
         access: Where to listen, and whom to answer.
         port: The port, or the next one that is free; 0 for any.
+        corrections: Lets the runs be corrected.
 
     Raises:
         PluginError: If this version of viser cannot be guarded.
         InputError: If a run is damaged.
     """
 
-    def __init__(self, videos: Sequence[Video], access: Access, port: int) -> None:
-        self._videos = list(videos)
+    def __init__(self, videos: Sequence[Video], access: Access, port: int, corrections: Corrections) -> None:
+        self._videos, self._corrections = list(videos), corrections
         self._runs = [run for video in videos for run in video.runs]
         for run in self._runs:
             run.look_again()
@@ -105,6 +109,7 @@ class Viewer:
             self._changed.notify_all()
         for thread in self._threads:
             thread.join(5)
+        self._corrections.close()
         with redirect_stdout(io.StringIO()):  # it says so
             self._server.stop()
 
@@ -120,7 +125,8 @@ class Viewer:
         panel.steps.on_click(lambda event: self._step(event.target.value))
         panel.quantity.on_update(lambda _: self._redraw_timeline())
         panel.look.on_click(lambda _: self._look_through())
-        boxes = [*panel.layers.values(), panel.axes, panel.mesh, panel.path, panel.landmarks, panel.still]
+        boxes = [*panel.layers.values(), panel.axes, panel.probability]
+        boxes += [panel.mesh, panel.path, panel.landmarks, panel.still]
         for box in boxes:
             box.on_update(lambda _: self._want())
         keys: dict[str, tuple[str, Callable[[], None]]] = {
@@ -213,7 +219,9 @@ class Viewer:
         for video in self._videos:
             image = video.images.image(index) if video.images is not None else None
             fits = image is not None and _fits(image, video.runs[0])
-            picture = draw_picture(image if fits else None, video.runs, index, panel.shown, video.axes)
+            picture = draw_picture(
+                image if fits else None, video.runs, index, panel.shown, video.axes, self._colours(video)
+            )
             pictures.update(dict.fromkeys(video.runs, picture))
             drawn.append(picture)
         with self._server.atomic():
@@ -227,6 +235,7 @@ class Viewer:
                 describe(run, run.frames.get(index), timeline.colour_of(number, len(self._runs)))
                 for number, run in enumerate(self._runs)
             )
+            self._offer_correction(index)
             panel.told.content = (
                 f'<div class="told" data-frame="{index}" style="font-size:12px;line-height:1.4;margin:4px 12px">'
                 f"frame {index}{told}{self._fault}</div>"
@@ -247,6 +256,7 @@ class Viewer:
                 self._fault = f"<p>{html.escape(str(error))}</p>"
                 self._want()
                 continue
+            self._offer_correction(self._shown)
             waiting = waiting or any(news)
             going_on = any(run.going_on for run in self._runs)
             if waiting and (time.monotonic() - drawn > _DRAW_ANEW or not going_on):
@@ -255,6 +265,18 @@ class Viewer:
             elif any(news):
                 self._take_news(draw=False)
 
+    def _colours(self, video: Video) -> list[Colour]:
+        """Of each object's outline, those of its curve, where a video has several."""
+        if len(video.runs) < 2:
+            return []
+        colours = timeline.RUN_COLOURS
+        return [colours[self._runs.index(run) % len(colours)] for run in video.runs]
+
+    def _offer_correction(self, index: int) -> None:
+        offered = self._corrections.offered(max(index, 0))
+        if offered != self._panel.correct.content:
+            self._panel.correct.content = offered
+
     def _take_news(self, draw: bool) -> None:
         self._indices = sorted({index for run in self._runs for index in run.frames})
         first, last = self._ends()
@@ -262,6 +284,7 @@ class Viewer:
         panel.slider.min, panel.slider.max = first, max(last, first + 1)
         if any(run.refined for run in self._runs):
             panel.show_causal()
+        panel.probability.visible = any((run.folder / layout.PROBABILITIES).is_dir() for run in self._runs)
         offered = tuple(timeline.quantities(self._runs))
         if offered != tuple(panel.quantity.options):
             panel.quantity.options = offered
@@ -276,10 +299,13 @@ class Viewer:
             self.go_to(first)
 
     def _draw_scene(self) -> None:
-        place, any_landmarks = 0.0, False
+        place = above = 0.0
+        any_landmarks = False
         for scene, run in zip(self._scenes, self._runs, strict=True):
-            scene.draw_again(place)
-            place += 1.2 * scene.distance
+            scene.draw_again()
+            if scene is not self._scenes[0]:
+                place += max(1.6 * scene.distance, 1.1 * (above + scene.reach))
+            scene.place, above = np.array([0.0, place, 0.0]), scene.reach
             # Of the state of a run that goes on: the final refinement may scale and turn the object.
             points = None if run.refined else kept_landmarks(run.folder)
             scene.draw_landmarks(points)

@@ -33,13 +33,22 @@ def iou(a, b):
 
 
 def answer(truth, rendered, initial, window=None, confidence=0.8):
-    return answer_mask(rendered, initial, observed(truth, initial, window), confidence, None)
+    return answer_mask(rendered, initial, observed(truth, initial, window), confidence, None)[:2]
 
 
 def test_without_an_initial_mask_it_is_the_silhouette():
     mask, source = answer(TRUTH, TRUTH, None)
     np.testing.assert_array_equal(mask, TRUTH)
     assert source is MaskSource.RENDERED
+
+
+def test_the_mask_is_where_the_probability_is_above_a_half():
+    aside = disc(SIZE, (114, 80), 50)
+    mask, _, probability = answer_mask(TRUTH, aside, observed(TRUTH, aside, None), 0.8, None)
+    np.testing.assert_array_equal(mask, probability > 0.5)
+    assert 0 <= probability.min() < 0.1 and 0.9 < probability.max() <= 1
+    undecided = (probability > 0.3) & (probability < 0.7)
+    assert 0 < undecided.mean() < 0.1
 
 
 def test_two_masks_that_are_right_are_kept():

@@ -32,8 +32,10 @@ def answer_mask(
     observation: Observation,
     confidence: float,
     colours: Colours | None,
-) -> tuple[NDArray[np.bool_], MaskSource]:
-    """The mask ``(H, W)`` that the evidence is for, and where it comes from.
+) -> tuple[NDArray[np.bool_], MaskSource, NDArray[np.float32] | None]:
+    """The mask ``(H, W)`` that the evidence is for, where it comes from, and the object's probability ``(H, W)``.
+
+    The mask is where the probability is above a half; where the mask is not weighed there is none.
 
     Args:
         rendered: ``(H, W)`` the silhouette at the frame's pose.
@@ -43,7 +45,7 @@ def answer_mask(
         colours: What earlier frames showed, or None.
     """
     if initial is None:
-        return rendered, MaskSource.RENDERED
+        return rendered, MaskSource.RENDERED, None
     window, image = finer(observation)
     sources = features(
         as_lab(image), seen_through(initial, window), seen_through(rendered, window), confidence, colours
@@ -51,9 +53,11 @@ def answer_mask(
     support = tidied(along_edges(image, log_odds(sources), in_question(sources)))
     support[~inside_frame(initial.shape, window)] = -1
     # The window is the initial mask's: beyond it the silhouette alone says where the object is.
-    mask = _pasted(support, window, np.where(rendered, 1.0, -1.0).astype(np.float32)) > 0
-    # A mask of nothing says that the evidence is for neither.
-    return (mask, MaskSource.WEIGHED) if mask.any() else (initial, MaskSource.INITIAL)
+    full = _pasted(support, window, np.where(rendered, 1.0, -1.0).astype(np.float32))
+    mask = full > 0
+    if not mask.any():  # a mask of nothing says that the evidence is for neither
+        return initial, MaskSource.INITIAL, None
+    return mask, MaskSource.WEIGHED, 0.5 + 0.5 * full
 
 
 def learnt(colours: Colours | None, observation: Observation, mask: NDArray[np.bool_]) -> Colours | None:

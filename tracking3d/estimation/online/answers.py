@@ -53,9 +53,9 @@ def solved(state: Belief, answer: FrameEstimate, found: Attempt) -> FrameEstimat
     view, fit, judgement = found.view, found.fit, found.judgement
     if found.lost:
         mask = view.mask if view.mask is not None else np.zeros_like(answer.mask)
-        source = MaskSource.handed_back(view.mask)
+        source, probability = MaskSource.handed_back(view.mask), None
     else:
-        mask, source = answer_mask(
+        mask, source, probability = answer_mask(
             state.known.silhouette(fit.pose, state.camera),
             view.mask,
             view.observation,
@@ -68,6 +68,7 @@ def solved(state: Belief, answer: FrameEstimate, found: Attempt) -> FrameEstimat
         camera=state.camera,
         mask=mask,
         mask_source=source,
+        probability=probability,
         status=judgement.status,
         reason=judgement.reason,
         confidence=judgement.confidence,

@@ -227,7 +227,7 @@ async function showMask() {
     await image.decode();
     object.veil = image;
     object.told = `${area} px`;
-    say("That is the mask that the run begins with.");
+    say(session.correcting ? "That is the mask that the run goes on with." : "That is the mask that the run begins with.");
   } catch (error) {
     if (number !== asked) return;
     object.veil = null;
@@ -379,6 +379,7 @@ byId("yaml").addEventListener("click", async () => {
   if (told) copy(told.settings, "The YAML file");
 });
 byId("start").addEventListener("click", async () => {
+  if (session.correcting) return correct();
   const told = await end("start");
   if (!told) return;
   for (const control of document.querySelectorAll("button, input")) control.disabled = true;
@@ -387,6 +388,43 @@ byId("start").addEventListener("click", async () => {
   byId("told").textContent = told.command;
   say("The run has started; the terminal shows how it goes. This page can be closed.");
 });
+
+// ---- a run that is there is corrected ----
+
+function offerCorrection() {
+  document.title = `tracking3d correct ${session.correcting}`;
+  document.querySelector("h1").textContent = "What is the object here?";
+  for (const id of ["objects", "objects-title", "add", "save", "yaml"]) byId(id).hidden = true;
+  byId("start").textContent = "Correct the run from here on";
+  follow();
+}
+
+async function follow() {
+  let told;
+  try {
+    told = await (await fetch("progress.json")).json();
+  } catch {
+    return say("The viewer has ended; a correction that it had begun was stopped.", true);
+  }
+  byId("start").disabled = told.running || isEmpty(one());
+  if (told.sentence) say(told.sentence, told.failed);
+  byId("progress").hidden = !told.running;
+  if (told.share === null) byId("progress").removeAttribute("value");
+  else byId("progress").value = told.share;
+  if (told.running) setTimeout(follow, 700);
+}
+
+async function correct() {
+  byId("start").disabled = true;
+  say("One moment …");
+  try {
+    await ask("correct", plain(one()));
+  } catch (error) {
+    byId("start").disabled = false;
+    return say(error.message, true);
+  }
+  follow();
+}
 
 async function open() {
   session = await (await fetch("session.json")).json();
@@ -398,8 +436,9 @@ async function open() {
   objects = [newObject()];
   take("box");
   resize();
-  goTo(frame);
+  goTo(Number(/^#frame=(\d{1,9})$/.exec(location.hash)?.[1] ?? frame));
   window.addEventListener("resize", resize);
+  if (session.correcting) offerCorrection();
 }
 
 open();

@@ -1,0 +1,177 @@
+"""States of earlier frames that are kept beside the latest, for a correction of a frame to go on from.
+
+A milestone is the state's text as it was after a frame; what it names stays. Its arrays are mostly those of the states
+around it, so that few of them, spread evenly over the run, cost little.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import re
+import shutil
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from tracking3d.results import layout
+from tracking3d.results.files import write_atomic
+
+_FIRST_GAP = 4
+"""Frames from one to the next in a short run; it is doubled whenever there are too many."""
+_ARRAYS = re.compile(r'"file": "(\d{8,}\.npz)"')
+_NAME = re.compile(r"milestone_(\d{6,})\.json")
+
+
+@dataclass(frozen=True)
+class Milestone:
+    """The state after a frame.
+
+    Attributes:
+        taken: How many frames were taken until then.
+        path: The file of its text.
+        arrays: Names of the array files that it needs.
+    """
+
+    taken: int
+    path: Path
+    arrays: frozenset[str]
+
+    @property
+    def bytes(self) -> int:
+        """Of its text; arrays are shared."""
+        return self.path.stat().st_size
+
+
+class Milestones:
+    """Those of one run, at most so many, spread evenly over its frames.
+
+    Args:
+        folder: Where the state lies.
+        most: How many there may be; 0 for none.
+    """
+
+    def __init__(self, folder: Path, most: int) -> None:
+        self._folder, self._most = folder, most
+        self._kept: list[Milestone] = []
+        self._gap = _FIRST_GAP
+
+    def read(self, taken: int) -> None:
+        """Take those that are there, of a run that goes on after so many frames; later ones are removed."""
+        self._kept = milestones_in(self._folder)
+        self.forget_after(taken)
+        self._gap = math.gcd(*(one.taken for one in self._kept)) or _FIRST_GAP
+
+    @property
+    def arrays(self) -> frozenset[str]:
+        """Names of the array files that any of them needs."""
+        return frozenset().union(*(one.arrays for one in self._kept))
+
+    def due(self, taken: int) -> bool:
+        """Whether the state after so many frames is to be kept."""
+        return self._most > 0 and taken % self._gap == 0
+
+    def keep(self, state: Path, taken: int, arrays: frozenset[str]) -> None:
+        """Keep the state that is in a file.
+
+        Args:
+            state: The file; it is replaced by another one for the next state, never written over.
+            taken: How many frames were taken until then.
+            arrays: Names of the array files that the state needs.
+
+        Raises:
+            OSError: If it cannot be written.
+        """
+        path = self._folder / f"milestone_{taken:06d}.json"
+        link_or_copy(state, path)
+        self._kept.append(Milestone(taken, path, arrays))
+        while len(self._kept) > self._most:
+            self._gap *= 2
+            self._drop([one for one in self._kept if one.taken % self._gap])
+
+    def forget_after(self, taken: int) -> None:
+        """Remove those of after so many frames: an answer from before them is another one now.
+
+        Raises:
+            OSError: If one cannot be removed.
+        """
+        self._drop([one for one in self._kept if one.taken > taken])
+
+    def _drop(self, gone: list[Milestone]) -> None:
+        for one in gone:
+            one.path.unlink(missing_ok=True)
+        self._kept = [one for one in self._kept if one not in gone]
+
+
+def milestones_in(folder: Path) -> list[Milestone]:
+    """The milestones in the folder of a state, the earliest first."""
+    found = []
+    for path in sorted(folder.glob("milestone_*.json")) if folder.is_dir() else ():
+        if name := _NAME.fullmatch(path.name):
+            text = path.read_text(encoding="ascii", errors="replace")
+            found.append(Milestone(int(name[1]), path, frozenset(_ARRAYS.findall(text))))
+    return sorted(found, key=lambda one: one.taken)
+
+
+def keep_milestones_only(folder: Path, most_bytes: int) -> None:
+    """Leave of the state in a run folder what its milestones need, and of these no more than take so many bytes.
+
+    Args:
+        folder: The run folder.
+        most_bytes: Before they are compressed. Every second milestone goes until the rest is no larger; the last one
+            stays longest.
+
+    Raises:
+        OSError: If a file cannot be removed.
+    """
+    inner = folder / layout.STATE
+    # The state first: without it nobody takes the run for one that was stopped.
+    (inner / layout.STATE_FILE).unlink(missing_ok=True)
+    kept = milestones_in(inner)
+    while kept and _bytes(inner, kept) > most_bytes:
+        thinner = kept[1::2] or ([] if len(kept) < 2 else kept[:1])
+        for one in kept:
+            if one not in thinner:
+                one.path.unlink()
+        kept = thinner
+    needed = {name for one in kept for name in one.arrays} | {one.path.name for one in kept}
+    if kept:
+        needed |= {layout.JOURNAL}
+    for path in layout.state_files(folder):
+        if not kept or (path.parent == inner and path.name not in needed):
+            path.unlink(missing_ok=True)
+        elif path.suffix == ".npz":
+            _compress(path)
+
+
+def link_or_copy(source: Path, target: Path) -> None:
+    """Give a file that is never written over a second name, or where that cannot be, copy it.
+
+    Raises:
+        OSError: If it cannot be written.
+    """
+    target.unlink(missing_ok=True)
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copyfile(source, target)
+
+
+def _compress(path: Path) -> None:
+    """Write an array file anew, a third as large; while the run goes on there is no time for that."""
+    with zipfile.ZipFile(path) as file:
+        if all(one.compress_type == zipfile.ZIP_DEFLATED for one in file.infolist()):
+            return
+        parts = {name: file.read(name) for name in file.namelist()}
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file:
+        for name, part in parts.items():
+            file.writestr(name, part)
+    write_atomic(path, data.getvalue())
+
+
+def _bytes(inner: Path, kept: list[Milestone]) -> int:
+    names = {name for one in kept for name in one.arrays}
+    sizes = [(inner / name).stat().st_size for name in names if (inner / name).is_file()]
+    return sum(sizes) + sum(one.bytes for one in kept)

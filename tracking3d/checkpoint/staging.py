@@ -1,0 +1,106 @@
+"""A run is corrected in a copy within its folder, which takes its place when it is finished, and not before.
+
+Until then the run is as it was, whatever ends the correction. A kill while the copy takes its place leaves the rest
+of that to the next call.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from tracking3d.checkpoint.resuming import Earlier, changed_frames, earlier_run
+from tracking3d.checkpoint.rolling_back import remove_empty, remove_run, rolled_back
+from tracking3d.errors import InputError, OutputError
+from tracking3d.results import layout
+from tracking3d.results.files import writing
+from tracking3d.results.lock import is_locked, try_lock
+from tracking3d.results.run_reader import is_finished
+
+_log = logging.getLogger(__name__)
+
+
+def corrected_aside(
+    folder: Path,
+    config: Mapping[str, Any],
+    selection: str | None,
+    given: Mapping[str, Any],
+    ends: ExitStack,
+) -> tuple[Path, Earlier]:
+    """Where a run is computed in which an answered frame is corrected: from the last state before it, if one was kept.
+
+    Args:
+        folder: The run folder.
+        config: See `tracking3d.checkpoint.resuming.earlier_run`.
+        selection: See there.
+        given: See there.
+        ends: When it is left, the corrected run, if it is finished, takes the place of the other one.
+
+    Returns:
+        A folder within, and what is in it: ``none``, or ``stopped``.
+
+    Raises:
+        OutputError: If the run is being corrected at this moment, or something cannot be written.
+        InputError: If it is damaged.
+    """
+    stage = folder / layout.CORRECTING
+    if is_locked(stage / layout.FRAMES):
+        raise OutputError(f"{folder} is being corrected at this moment; wait for that.")
+    ends.callback(take_over, folder)
+    lock = ends.enter_context((folder / layout.FRAMES).open("rb"))
+    if not try_lock(lock.fileno()):
+        raise OutputError(f"{folder} is in use by another run; wait for it.")
+    if _goes_on(stage, config, selection, given):
+        _log.info("The correction that was stopped goes on.")
+        return stage, "stopped"
+    remove_run(stage)
+    changed = changed_frames(folder, given)
+    answered = rolled_back(folder, stage, changed)
+    if answered is None:
+        _log.warning(
+            "No state of before frame %d was kept in %s, so that all is computed again; frames before the correction "
+            "get the answers that they had.",
+            min(changed),
+            folder,
+        )
+        return stage, "none"
+    return stage, "stopped"
+
+
+def take_over(folder: Path) -> None:
+    """Let a corrected run that is finished take the place of the one that it corrects.
+
+    Raises:
+        OutputError: If a file cannot be moved.
+    """
+    stage = folder / layout.CORRECTING
+    try:
+        if not is_finished(stage) or is_locked(stage / layout.FRAMES):
+            return
+    except InputError:  # damaged: the next correction makes it anew
+        return
+    with writing(folder):
+        new = [path.relative_to(stage) for path in layout.run_files(stage)]
+        if (stage / layout.FRAMES).is_file():  # else this was begun before, and is almost done
+            old = {path.relative_to(folder) for path in layout.run_files(folder)}
+            gone = {path for path in old if path.parts[0] != layout.CORRECTING} - set(new)
+            for path in gone:
+                (folder / path).unlink(missing_ok=True)
+        # The lines first, which say that it was begun; the description last, which says that it is not done.
+        order = {Path(layout.FRAMES): 0, Path(layout.RUN): 2}
+        for path in sorted(new, key=lambda one: order.get(one, 1)):
+            (folder / path).parent.mkdir(parents=True, exist_ok=True)
+            (stage / path).replace(folder / path)
+            (stage / path).unlink(missing_ok=True)  # of two names of one file nothing is renamed
+    remove_empty(stage)
+
+
+def _goes_on(stage: Path, config: Mapping[str, Any], selection: str | None, given: Mapping[str, Any]) -> bool:
+    """Whether the same correction was begun before, and stopped."""
+    try:
+        return layout.has_state(stage) and earlier_run(stage, config, selection, given) == "stopped"
+    except (InputError, OutputError):
+        return False

@@ -1,0 +1,54 @@
+"""The masks that a person gave of the object, kept so that a correction can begin from what the run began with."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.corrections import Correction
+from tracking3d.errors import InputError
+from tracking3d.frames import Prompt
+from tracking3d.results import layout
+from tracking3d.results.files import read_mask, write_mask, writing
+
+
+def keep_given_masks(
+    folder: Path, first: int, prompt: Prompt | None, corrections: Iterable[Correction] = ()
+) -> None:
+    """Write the masks of the first frame and of corrections, where they were given as such.
+
+    Args:
+        folder: The run folder.
+        first: Index of the frame that the prompt is of.
+        prompt: The object in it.
+        corrections: What it is in later frames.
+
+    Raises:
+        OutputError: If one cannot be written.
+    """
+    given = {one.frame: one.mask for one in corrections if isinstance(one.mask, np.ndarray)}
+    if prompt is not None and prompt.mask is not None and prompt.points is None:
+        given[first] = prompt.mask
+    if given:
+        with writing(folder):
+            (folder / layout.PROMPTS).mkdir(exist_ok=True)
+    for index, mask in given.items():
+        write_mask(layout.prompt_path(folder, index), mask)
+
+
+def given_mask(folder: Path, index: int) -> NDArray[np.bool_]:
+    """The mask ``(H, W)`` that was given of a frame.
+
+    Raises:
+        InputError: If it is not there, as of an earlier version, or damaged.
+    """
+    mask = read_mask(path := layout.prompt_path(folder, index))
+    if mask is None:
+        raise InputError(
+            f"{path} is missing or damaged, the mask that the run was given; say it again by `tracking3d run` with "
+            "--resume, --mask and --correct."
+        )
+    return mask
