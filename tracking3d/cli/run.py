@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -15,6 +16,14 @@ from tracking3d.cli.view import Host
 from tracking3d.errors import InputError
 
 _TRACKING, _CAMERA, _RUNNING = "The object and how to track it", "The camera", "Running"
+
+
+class ModelChoice(StrEnum):
+    """What is made of the object at the end."""
+
+    NONE = "none"
+    FAST = "fast"
+    FINE = "fine"
 
 
 def run(
@@ -161,6 +170,14 @@ def run(
         ),
     ] = False,
     host: Host = None,
+    model: Annotated[
+        ModelChoice | None,
+        typer.Option(
+            help="The mesh at the end: none takes no texture from the video, fast does, fine makes the shape anew too.",
+            show_default="fast",
+            rich_help_panel=_RUNNING,
+        ),
+    ] = None,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
@@ -185,6 +202,8 @@ def run(
         raise InputError("Give either --box, --mask or --points, not more than one of them.")
     if host is not None and not view:
         raise InputError("--host is where --view serves its page; give both.")
+    if model is ModelChoice.FINE:
+        _check_fine(source)
     chosen: dict[str, str | None] = {"name": tracker}
     if masks is not None:
         if tracker not in (None, "precomputed", "auto"):
@@ -201,7 +220,11 @@ def run(
         tracker=chosen,
         features=features,
         camera={"fov": fov, "intrinsics": camera},
-        object={"flat": flat or None, "prototype": prototype},
+        object={
+            "flat": flat or None,
+            "prototype": prototype,
+            "texture_views": 0 if model is ModelChoice.NONE else None,
+        },
         window={"size": size},
         solver={"final_refine": final_refine},
         runtime={"device": device, "seed": seed, "on_plugin_failure": on_plugin_failure},
@@ -236,4 +259,14 @@ def run(
         "start_frame": start_frame,
         "corrections": corrections,
     }
-    track(source, settings, folder, given, about, quiet=quiet, report=report, view=view, host=host)
+    fine = model is ModelChoice.FINE
+    track(source, settings, folder, given, about, quiet=quiet, report=report, view=view, host=host, fine=fine)
+
+
+def _check_fine(source: str) -> None:
+    """Make sure, before anything is tracked, that a shape can be made anew at the end."""
+    from tracking3d.reconstruction.of_run import check_packages
+
+    if source.isdigit() and not Path(source).exists():
+        raise InputError("--model fine goes through the video once more, which a camera cannot; leave it out.")
+    check_packages()

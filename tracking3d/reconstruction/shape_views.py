@@ -13,7 +13,7 @@ from tracking3d.frames import Image
 from tracking3d.geometry.camera import Camera, Window
 from tracking3d.trackers.crops import box_of, cut, inside_frame
 
-SIDE = 256
+SIDE = 192
 """Pixels of a view's side; a smaller window is seen larger."""
 _MARGIN = 0.08  # beside the mask, relative to its longer side
 

@@ -13,6 +13,7 @@
     mesh.obj, mesh.mtl, texture.png, mesh.glb, features.npz
     landmarks.npz       surface and poses as points were followed by, once they were
     causal/             masks and mesh as they were before the final refinement
+    online/             the mesh of the online map, where its shape was made anew
     .refining/          what the final refinement has made so far, until it has ended
     .state/             what a stopped run goes on from, until it is finished
 """
@@ -32,6 +33,7 @@ FRAMES = "frames.jsonl"
 MASKS = "masks"
 INITIAL_MASKS = "initial_masks"
 CAUSAL = "causal"
+ONLINE = "online"
 REFINING = ".refining"
 STATE = ".state"
 STATE_FILE = "state.json"
@@ -118,6 +120,7 @@ def run_files(folder: Path) -> list[Path]:
     """The files in ``folder`` that bear the names a run writes, unfinished ones included."""
     named = [folder / name for name in _FILES]
     named += [folder / CAUSAL / name for name in _OF_MESH]
+    named += [folder / ONLINE / name for name in MESH_FILES]
     named += [folder / REFINING / name for name in (OVERLAY, FRAMES)]
     for masks in (
         folder / MASKS,
