@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rendered_views import CAMERA, ball, pattern, pose, seen
+from rendered_views import CAMERA, pattern, pose, seen
 
 from tracking3d.geometry.prototypes import sphere
 from tracking3d.reconstruction.depth_maps import DepthMap, Guide, depth_maps, patch_scores

@@ -268,5 +268,7 @@ def _check_fine(source: str) -> None:
     from tracking3d.reconstruction.of_run import check_packages
 
     if source.isdigit() and not Path(source).exists():
-        raise InputError("--model fine goes through the video once more, which a camera cannot; leave it out.")
+        raise InputError(
+            "--model fine goes through the video once more, which a camera cannot; leave it out."
+        )
     check_packages()

@@ -155,9 +155,7 @@ def _depth_map(
     normal = np.where((facing > _STEEPEST)[:, None], normal, normal + towards)
     offsets = np.linspace(-reach, reach, 2 * steps + 1)
     T_cam_obj = view.T_cam_obj
-    P = np.stack(
-        [other.K @ (other.T_cam_obj @ np.linalg.inv(T_cam_obj))[:3] for other in neighbours]
-    )
+    P = np.stack([other.K @ (other.T_cam_obj @ np.linalg.inv(T_cam_obj))[:3] for other in neighbours])
     scores, contrast = patch_scores(
         grey[view.index],
         view.mask.astype(np.float32),
@@ -210,9 +208,7 @@ def patch_scores(
     """
     agreeing = min(AGREEING, len(others))
     if not use_numba(backend, torch.empty(0, dtype=torch.float32)):
-        return _scores_together(
-            image, inside, K_inverse, others, P, pixels, depth, normal, offsets, agreeing
-        )
+        return _scores_together(image, inside, K_inverse, others, P, pixels, depth, normal, offsets, agreeing)
     from tracking3d.reconstruction.kernels.plane_sweep import sweep
 
     scores = np.empty((len(pixels), len(offsets)), np.float32)
@@ -260,7 +256,9 @@ def _scores_together(
     z = torch.from_numpy(depth)[chosen, None] + torch.from_numpy(offsets)  # (n, D)
     w, T, cover, variance = w[chosen, None], T[chosen, None], cover[chosen], variance[chosen, None]
     of_views = torch.full((len(others), len(chosen), depths), -1.0, dtype=torch.float64)
-    for view, (other, projection) in enumerate(zip(torch.from_numpy(others), torch.from_numpy(P), strict=True)):
+    for view, (other, projection) in enumerate(
+        zip(torch.from_numpy(others), torch.from_numpy(P), strict=True)
+    ):
         A, b = projection[:, :3], projection[:, 3]
         at = z[..., None] * (ray @ A.T)[:, None] + b  # (n, D, 3)
         u = at[..., :2] / at[..., 2:]

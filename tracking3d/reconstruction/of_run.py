@@ -72,9 +72,7 @@ def texture_run(
     return model, len(views)
 
 
-def shape_run(
-    folder: Path, source: str | None = None, most: int = 24, largest: int = 2048
-) -> ShapedRun:
+def shape_run(folder: Path, source: str | None = None, most: int = 24, largest: int = 2048) -> ShapedRun:
     """Make the shape of a run's object anew from all its frames, and write the mesh if that explains them better.
 
     The mesh of the online map is kept in `layout.ONLINE`.

@@ -1,7 +1,7 @@
 """Poses fitted once more, to the surface at hand at the views' resolution.
 
 Each view is compared with what all of them together show of the surface: a few Levenberg-Marquardt steps on colours
-within the mask and on the outline. The gauge stays: the mean turn and the mean shift of all views are taken out again.
+within the mask and on the outline. The surface holds the gauge; `mean_motion` says how far all poses went together.
 """
 
 from __future__ import annotations
@@ -17,7 +17,15 @@ from scipy.spatial.transform import Rotation
 
 from tracking3d.reconstruction.shape_views import ShapeView
 from tracking3d.reconstruction.surface import cell_atlas
-from tracking3d.rendering import BackProjection, PoseTarget, Scales, Surface, TexelMap, back_project, pose_terms
+from tracking3d.rendering import (
+    BackProjection,
+    PoseTarget,
+    Scales,
+    Surface,
+    TexelMap,
+    back_project,
+    pose_terms,
+)
 
 COLOUR, OUTLINE = 0.1, 2.0
 """Difference of colours in [0, 1], and pixels, from which on a disagreement counts less."""
@@ -57,33 +65,28 @@ def coloured_surface(
 
 
 def polished(surface: Surface, views: Sequence[ShapeView]) -> list[ShapeView]:
-    """The views with poses that fit the surface better, in the gauge that they had.
+    """The views with poses that fit the surface better.
 
     Args:
         surface: From `coloured_surface`.
         views: The frames.
     """
-    moved = [_fitted(surface, view) for view in views]
-    turns = Rotation.from_matrix(
-        np.stack([b[:3, :3].T @ a.T_cam_obj[:3, :3] for a, b in zip(views, moved, strict=True)])
-    )
-    turn = turns.mean().as_matrix()
-    # A turn of the object's axes that gives all views, in the mean, the rotation back that they had.
-    poses = []
-    for pose in moved:
-        back = pose.copy()
-        back[:3, :3] = pose[:3, :3] @ turn
-        poses.append(back)
-    shift = np.mean(
-        [
-            b[:3, :3].T @ (a.T_cam_obj[:3, 3] - b[:3, 3])
-            for a, b in zip(views, poses, strict=True)
-        ],
-        0,
-    )
-    for pose in poses:
-        pose[:3, 3] += pose[:3, :3] @ shift
-    return [replace(view, T_cam_obj=pose) for view, pose in zip(views, poses, strict=True)]
+    return [replace(view, T_cam_obj=_fitted(surface, view)) for view in views]
+
+
+def mean_motion(before: Sequence[ShapeView], after: Sequence[ShapeView]) -> NDArray[np.float64]:
+    """``(4, 4)`` T_after_before: how the object moved in its own coordinates when its poses were fitted, in the mean.
+
+    Args:
+        before: The frames as they were.
+        after: The same with other poses.
+    """
+    pairs = [(a.T_cam_obj, b.T_cam_obj) for a, b in zip(before, after, strict=True)]
+    turn = Rotation.from_matrix(np.stack([b[:3, :3].T @ a[:3, :3] for a, b in pairs])).mean()
+    T_after_before = np.eye(4)
+    T_after_before[:3, :3] = turn.as_matrix()
+    T_after_before[:3, 3] = np.mean([b[:3, :3].T @ (a[:3, 3] - b[:3, 3]) for a, b in pairs], 0)
+    return T_after_before
 
 
 def _fitted(surface: Surface, view: ShapeView) -> NDArray[np.float64]:

@@ -22,7 +22,8 @@ from tracking3d.reconstruction.grid import FloatArray, Grid
 from tracking3d.reconstruction.hull import robust_hull
 from tracking3d.reconstruction.judged import EVERY, Explained, explained
 from tracking3d.reconstruction.mesh_distance import mesh_distance
-from tracking3d.reconstruction.pose_polish import coloured_surface, polished
+from tracking3d.reconstruction.outline_fit import fitted_to_outlines
+from tracking3d.reconstruction.pose_polish import coloured_surface, mean_motion, polished
 from tracking3d.reconstruction.shape_views import ShapeView, turned_apart
 from tracking3d.reconstruction.surface import extracted, is_sound, main_pieces, roughly, simplified
 
@@ -78,7 +79,7 @@ def reconstructed(
     if (turn := _turn(used)) < LEAST_TURN:
         return _kept(f"the object turns by {turn:.0f} degrees only, and {LEAST_TURN:.0f} are needed")
     start = trimesh.Trimesh(vertices, faces, process=False)
-    guide = start
+    guide, given = start, used
     for cells, reach, steps in _ROUNDS:
         used = polished(coloured_surface(guide.vertices, guide.faces, used), used)
         grid, inside = _volume(start, guide, used, cells, reach, steps)
@@ -89,18 +90,24 @@ def reconstructed(
     mesh = _sound(grid, inside)
     if mesh is None:
         return _kept("what is seen contradicts itself: the new surface is full of holes")
-    old = explained(vertices, faces, used, left_out)
-    new = explained(np.asarray(mesh.vertices), np.asarray(mesh.faces), used, left_out)
+    used = polished(coloured_surface(mesh.vertices, mesh.faces, used), used)
+    fitted = fitted_to_outlines(
+        np.asarray(mesh.vertices), np.asarray(mesh.faces), turned_apart(used, _REFERENCES_APART, _REFERENCES)
+    )
+    new_faces = np.asarray(mesh.faces, np.int64)
+    old = explained(vertices, faces, polished(coloured_surface(vertices, faces, given), given), left_out)
+    new = explained(fitted, new_faces, used, left_out)
     told = (
         f"silhouettes of {len(left_out)} frames that were left out agree by {new.iou:.3f} instead of {old.iou:.3f}, "
         f"colours differ by {new.colour:.3f} instead of {old.colour:.3f}"
     )
     if not new.better_than(old):
         return _kept(f"the new one is no better ({told})", old, new)
-    poses = {view.index: view.T_cam_obj for view in used}
-    return Shape(
-        np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64), poses, told, old, new
-    )
+    # Back to where the object was: poses of the run and new shape belong together.
+    T_after_before = mean_motion(given, used)
+    poses = {view.index: view.T_cam_obj @ T_after_before for view in used}
+    back = (fitted - T_after_before[:3, 3]) @ T_after_before[:3, :3]
+    return Shape(back, new_faces, poses, told, old, new)
 
 
 def _volume(

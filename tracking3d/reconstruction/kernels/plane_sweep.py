@@ -86,9 +86,13 @@ def sweep(
                     continue
                 wx = z * (P[o, 2, 0] * right[0] + P[o, 2, 1] * right[1] + P[o, 2, 2] * right[2])
                 wy = z * (P[o, 2, 0] * down[0] + P[o, 2, 1] * down[1] + P[o, 2, 2] * down[2])
-                ux = (z * (P[o, 0, 0] * right[0] + P[o, 0, 1] * right[1] + P[o, 0, 2] * right[2]) - u0 * wx) / w0
+                ux = (
+                    z * (P[o, 0, 0] * right[0] + P[o, 0, 1] * right[1] + P[o, 0, 2] * right[2]) - u0 * wx
+                ) / w0
                 uy = (z * (P[o, 0, 0] * down[0] + P[o, 0, 1] * down[1] + P[o, 0, 2] * down[2]) - u0 * wy) / w0
-                vx = (z * (P[o, 1, 0] * right[0] + P[o, 1, 1] * right[1] + P[o, 1, 2] * right[2]) - v0 * wx) / w0
+                vx = (
+                    z * (P[o, 1, 0] * right[0] + P[o, 1, 1] * right[1] + P[o, 1, 2] * right[2]) - v0 * wx
+                ) / w0
                 vy = (z * (P[o, 1, 0] * down[0] + P[o, 1, 1] * down[1] + P[o, 1, 2] * down[2]) - v0 * wy) / w0
                 if ux * vy - uy * vx <= 0.2:  # seen from behind, or too slanted to be compared
                     continue
