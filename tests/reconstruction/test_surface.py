@@ -61,5 +61,5 @@ def test_every_face_has_texels_of_its_own(ring, made_by):
         uvs, size = unwrapped(np.asarray(mesh.vertices), np.asarray(mesh.faces)), 512
     assert uvs.min() >= 0 and uvs.max() <= 1
     texels = TexelMap.of(torch.from_numpy(uvs).float(), size)
-    assert len(np.unique(texels.face.numpy())) > 0.98 * len(mesh.faces)
+    assert len(np.unique(texels.face.numpy())) > 0.97 * len(mesh.faces)
     assert (texels.barycentric > -1e-3).all()

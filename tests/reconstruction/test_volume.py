@@ -38,8 +38,9 @@ def test_the_hull_of_a_ball_is_the_ball(around):
     hull, known = robust_hull(points, around, 0.4, 0.0, 0)
     radius = np.linalg.norm(points, axis=1)
     inside = radius < 0.95
-    assert (hull[inside] > 0).all() and (hull[radius > 1.25] < 0).all()
-    assert (known == len(around)).all()
+    beside = (np.hypot(*points[:, [0, 2]].T) > 1.1) & (np.abs(points[:, 1]) < 0.8)
+    assert (hull[inside] > 0).all() and (hull[beside] < 0).all()
+    assert (known[inside] == len(around)).all()
 
 
 def test_wrong_masks_carve_nothing_as_long_as_they_are_few(around):
@@ -82,9 +83,9 @@ def test_patches_find_the_depth_of_a_ball():
     maps = depth_maps(views, views[1:4], guide, 0.12, 8)
     true, _ = Guide(small.vertices, small.faces).seen_by(maps[1].view)
     known = np.isfinite(maps[1].depth) & np.isfinite(true)
-    assert known.sum() > 200
+    assert known.sum() > 100
     at_first, _ = guide.seen_by(maps[1].view)
-    error, before = (np.abs(depth - true)[known] for depth in (maps[1].depth, at_first))
+    error, before = (np.abs(depth[known] - true[known]) for depth in (maps[1].depth, at_first))
     assert np.median(error) < 0.3 * np.median(before)
 
 

@@ -12,8 +12,6 @@ SMALLEST_PIECE = 0.02
 """Share of the largest piece's volume below which a piece is a crumb."""
 
 
-_FRONT = -1
-"""Sign of the area of a front face where the second axis points down, see `tracking3d.rendering.rasterize`."""
 CELL = 8
 """Texels along the side of a cell of the `cell_atlas`."""
 
@@ -44,7 +42,9 @@ def main_pieces(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         return mesh
     largest = max(piece.volume for piece in solid)
     kept = [piece for piece in solid if piece.volume >= SMALLEST_PIECE * largest]
-    return trimesh.util.concatenate(kept) if len(kept) > 1 else kept[0]
+    whole = trimesh.util.concatenate(kept)
+    assert isinstance(whole, trimesh.Trimesh)
+    return whole
 
 
 def is_sound(mesh: trimesh.Trimesh) -> bool:
@@ -104,9 +104,4 @@ def unwrapped(
     vertex, corner, uv = atlas[0]
     if not np.array_equal(vertex[corner], faces):
         raise ValueError("the atlas has other faces than the mesh")
-    uvs = np.asarray(uv, np.float64)[corner]
-    a, b, c = uvs.transpose(1, 0, 2)
-    ab, ac = b - a, c - a
-    # A texel is on a face that turns its front to it, and xatlas may count v upwards.
-    upside_down = (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]).sum() * _FRONT < 0
-    return np.stack([uvs[..., 0], 1 - uvs[..., 1]], 2) if upside_down else uvs
+    return np.asarray(uv, np.float64)[corner]
