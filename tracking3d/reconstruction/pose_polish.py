@@ -85,7 +85,14 @@ def mean_motion(before: Sequence[ShapeView], after: Sequence[ShapeView]) -> NDAr
     turn = Rotation.from_matrix(np.stack([b[:3, :3].T @ a[:3, :3] for a, b in pairs])).mean()
     T_after_before = np.eye(4)
     T_after_before[:3, :3] = turn.as_matrix()
-    T_after_before[:3, 3] = np.mean([b[:3, :3].T @ (a[:3, 3] - b[:3, 3]) for a, b in pairs], 0)
+    # A long lens hardly tells how far away the object is: only shifts across the line of sight have a say.
+    matrix, target = 1e-6 * np.eye(3), np.zeros(3)
+    for a, b in pairs:
+        ray = a[:3, 3] / np.linalg.norm(a[:3, 3])
+        across = np.eye(3) - np.outer(ray, ray)
+        matrix += b[:3, :3].T @ across @ b[:3, :3]
+        target += b[:3, :3].T @ across @ (a[:3, 3] - b[:3, 3])
+    T_after_before[:3, 3] = np.linalg.solve(matrix, target)
     return T_after_before
 
 
