@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -59,21 +59,37 @@ def go_through(
         if first_pass_only:
             each(ObjectRecording.pause)
             return
-        each(partial(ObjectRecording.begin_refinement, source=source))
-        for frame in timed(source) if any(recording.looks_again for recording in going_on) else ():
-            if isinstance(frame, Frame):
-                each(partial(ObjectRecording.take_again, frame=_shared(frame, share)))
-        each(ObjectRecording.settle)
-        for frame in timed(source) if any(recording.draws for recording in going_on) else ():
-            if isinstance(frame, Frame):
-                each(partial(ObjectRecording.draw, frame=frame))
-        each(ObjectRecording.finish)
+        look_again(source, going_on, each)
     except BaseException as error:
         for recording in going_on:
             recording.give_up(error)
         raise
     if errors:
         raise errors[0]
+
+
+def look_again(
+    source: FrameSource,
+    recordings: Sequence[ObjectRecording],
+    each: Callable[[Callable[[ObjectRecording], FrameRecord | SkippedFrame | None]], None],
+) -> None:
+    """All frames are answered: the final refinement where it is asked for and possible, the pictures, and the end.
+
+    Args:
+        source: Where the frames come from.
+        recordings: One an object; some may be taken out on the way.
+        each: Does something with every one of them.
+    """
+    share = 1 / len(recordings)
+    each(partial(ObjectRecording.begin_refinement, source=source))
+    for frame in timed(source) if any(recording.looks_again for recording in recordings) else ():
+        if isinstance(frame, Frame):
+            each(partial(ObjectRecording.take_again, frame=_shared(frame, share)))
+    each(ObjectRecording.settle)
+    for frame in timed(source) if any(recording.draws for recording in recordings) else ():
+        if isinstance(frame, Frame):
+            each(partial(ObjectRecording.draw, frame=frame))
+    each(ObjectRecording.finish)
 
 
 def timed(source: FrameSource) -> Generator[Frame | SkippedFrame]:

@@ -20,7 +20,7 @@ from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.frames import Frame, Prompt, SkippedFrame
 from tracking3d.object_recording import ObjectRecording
-from tracking3d.passes import timed
+from tracking3d.passes import look_again
 from tracking3d.point_following import PointFollowing
 from tracking3d.prompts import damaged_start
 from tracking3d.recording import begun, opened
@@ -213,12 +213,7 @@ def _started(
 
 def _finish(recording: ObjectRecording, source: FrameSource) -> None:
     """The final refinement, where the configuration asks for it and it is possible, and the model."""
-    recording.begin_refinement(source)
-    if recording.looks_again:
-        for frame in timed(source):
-            if isinstance(frame, Frame):
-                recording.take_again(frame)
-    recording.finish()
+    look_again(source, [recording], lambda action: action(recording))
 
 
 def _nothing() -> Generator[FrameEstimate]:

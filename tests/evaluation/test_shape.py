@@ -124,3 +124,26 @@ def test_meshes_without_a_surface_are_refused():
 def test_a_similarity_of_another_shape_is_refused():
     with pytest.raises(ValueError, match=r"\(4, 4\), got \(3, 4\)"):
         shape_scores(sphere(), sphere(), 2.0, np.eye(4)[:3])
+
+
+def test_what_was_not_seen_can_be_left_out():
+    wrong_behind = sphere()
+    vertices = wrong_behind.vertices.copy()
+    vertices[vertices[:, 2] > 0] *= 1.2
+    wrong_behind = trimesh.Trimesh(vertices, wrong_behind.faces, process=False)
+    scores = shape_scores(
+        wrong_behind, sphere(), 2.0, samples=SAMPLES, seen=lambda points, normals: points[:, 2] < -0.1
+    )
+    assert min(scores.f_score_seen, scores.f_score_fine_seen) > 0.995
+    assert scores.f_score < 0.7
+    assert shape_scores(sphere(), sphere(), 2.0, samples=SAMPLES).f_score_seen is None
+
+
+def test_a_handle_is_counted_and_a_wrong_normal_shows():
+    ring = trimesh.creation.torus(1.0, 0.3)
+    scores = shape_scores(sphere(), ring, 2.6, samples=SAMPLES)
+    assert scores.genus_error == 1 and shape_scores(ring, ring, 2.6, samples=SAMPLES).genus_error == 0
+    assert shape_scores(sheet(0.0), ring, 2.6, samples=SAMPLES).genus_error is None
+    inside_out = sphere()
+    inside_out.invert()
+    assert shape_scores(inside_out, sphere(), 2.0, samples=SAMPLES).normals < -0.99

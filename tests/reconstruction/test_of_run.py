@@ -15,7 +15,9 @@ from tracking3d.cli import app
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import FrameEstimate, Status
 from tracking3d.frames import Frame
-from tracking3d.reconstruction.of_run import texture_run
+from tracking3d.reconstruction import of_run
+from tracking3d.reconstruction.of_run import shape_run, texture_run
+from tracking3d.reconstruction.shape import Shape
 from tracking3d.results.files import write_image
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.run_writer import RunWriter
@@ -93,3 +95,36 @@ def test_the_command_says_what_it_did(tmp_path):
     assert "texture of 128 x 128 texels from 3 frames" in result.output.replace("\n", "")
     assert len(load_model(run).texture) == 128
     assert CliRunner().invoke(app, ["model", str(tmp_path / "absent")]).exit_code == 2
+
+
+def test_a_shape_that_cannot_be_told_leaves_the_mesh_and_its_texture(tmp_path):
+    run = written(tmp_path)
+    result = CliRunner().invoke(app, ["model", str(run), "--quality", "fine"])
+    assert result.exit_code == 0, result.output
+    assert "The mesh keeps its shape: only" in result.output
+    assert len(load_model(run).texture) > 16 and not (run / "online").exists()
+
+
+def test_a_new_shape_takes_the_place_of_the_old_one_which_is_kept(tmp_path, monkeypatch):
+    run = written(tmp_path)
+    before, smaller = load_model(run), ball().vertices * 0.97
+    made = Shape(smaller, ball().faces, {}, "it is better", None, None)
+    monkeypatch.setattr(of_run, "reconstructed", lambda vertices, faces, views: made)
+    shaped = shape_run(run)
+    after = load_model(run)
+    assert shaped.new and shaped.views == len(YAWS)
+    np.testing.assert_array_equal(after.vertices, smaller)
+    assert after.seen.any() and not after.seen.all()
+    assert after.features.shape == before.features.shape
+    assert after.texture[after.texture_weight > 0.3].std() > 20
+    np.testing.assert_array_equal(load_model(run / "online").vertices, before.vertices)
+    texture_run(run)  # the fast model again
+    np.testing.assert_array_equal(load_model(run).vertices, before.vertices)
+
+
+def test_a_missing_package_is_named(tmp_path, monkeypatch):
+    run = written(tmp_path)
+    monkeypatch.setattr(of_run, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"tracking3d\[model\]"):
+        shape_run(run)
+    assert len(load_model(run).texture) == 16

@@ -174,9 +174,12 @@ def test_a_mesh_makes_the_round_trip(tmp_path, turning_sphere):
 
 def test_the_exact_model_makes_the_round_trip(tmp_path, turning_sphere):
     export_mesh(tmp_path, turning_sphere.model)
+    assert load_model(tmp_path).seen is None
+    whole = dataclasses.replace(turning_sphere.model, seen=turning_sphere.model.vertices[:, 2] < 0)
+    export_mesh(tmp_path, whole)
     model = load_model(tmp_path)
     for field in dataclasses.fields(model):
-        written, read = getattr(turning_sphere.model, field.name), getattr(model, field.name)
+        written, read = getattr(whole, field.name), getattr(model, field.name)
         assert np.array_equal(written, read), field.name
         assert written.dtype == read.dtype, field.name
 

@@ -1,7 +1,8 @@
-"""``tracking3d model``: the mesh of a run with a texture at the resolution of its video."""
+"""``tracking3d model``: the mesh of a run made anew, its shape and its texture."""
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -10,8 +11,19 @@ import typer
 from tracking3d.cli.options import Debug
 
 
+class ModelQuality(StrEnum):
+    """How much work a model is worth."""
+
+    FAST = "fast"
+    FINE = "fine"
+
+
 def model(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder.")],
+    quality: Annotated[
+        ModelQuality,
+        typer.Option(help="fast: the mesh of the online map; fine: its shape made anew from all frames."),
+    ] = ModelQuality.FAST,
     source: Annotated[
         str | None, typer.Option(help="The video, where it is no longer where the run names it.")
     ] = None,
@@ -19,12 +31,17 @@ def model(
     largest: Annotated[int, typer.Option(min=64, max=8192, help="Most texels along a side.")] = 2048,
     debug: Debug = False,
 ) -> None:
-    """Take the texture of a run's mesh from its video anew, at the video's resolution.
+    """Take the texture of a run's mesh from its video anew, and with --quality fine make its shape anew too.
 
-    `tracking3d run` does so at its end where there is a final refinement.
+    `tracking3d run` takes the texture at its end where there is a final refinement.
     """
-    from tracking3d.reconstruction.of_run import texture_run
+    from tracking3d.reconstruction.of_run import shape_run, texture_run
 
-    made, taken = texture_run(run, source, views, largest)
+    if quality is ModelQuality.FINE:
+        shaped = shape_run(run, source, views, largest)
+        made, taken = shaped.model, shaped.views
+        typer.echo(f"{run}: {len(made.faces)} faces; {shaped.sentence}" if shaped.new else shaped.sentence)
+    else:
+        made, taken = texture_run(run, source, views, largest)
     size = len(made.texture)
     typer.echo(f"{run}: texture of {size} x {size} texels from {taken} frames")

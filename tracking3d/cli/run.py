@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -26,6 +27,14 @@ from tracking3d.cli.view import Host
 from tracking3d.errors import InputError
 
 _TRACKING, _CAMERA, _RUNNING = "The object and how to track it", "The camera", "Running"
+
+
+class ModelChoice(StrEnum):
+    """What is made of the object at the end."""
+
+    NONE = "none"
+    FAST = "fast"
+    FINE = "fine"
 
 
 def run(
@@ -210,6 +219,14 @@ def run(
         ),
     ] = False,
     host: Host = None,
+    model: Annotated[
+        ModelChoice | None,
+        typer.Option(
+            help="The mesh at the end: none takes no texture from the video, fast does, fine makes the shape anew too.",
+            show_default="fast",
+            rich_help_panel=_RUNNING,
+        ),
+    ] = None,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
@@ -236,6 +253,9 @@ def run(
         raise InputError("--host is where --view serves its page; give both.")
     if workers is not None and split is None:
         raise InputError("--workers is how many parts of --split are tracked at a time; give both.")
+    fine = model is ModelChoice.FINE
+    if fine:
+        _check_fine(source, split)
     chosen: dict[str, Any] = {"name": tracker}
     if masks is not None:
         if tracker not in (None, "precomputed", "auto"):
@@ -253,7 +273,11 @@ def run(
         tracker=chosen,
         features=features,
         camera=camera,
-        object={"flat": flat or None, "prototype": prototype},
+        object={
+            "flat": flat or None,
+            "prototype": prototype,
+            "texture_views": 0 if model is ModelChoice.NONE else None,
+        },
         window={"size": size},
         solver={"final_refine": final_refine},
         runtime={"device": device, "seed": seed, "on_plugin_failure": on_plugin_failure},
@@ -308,5 +332,30 @@ def run(
         )
     else:
         track(
-            source, settings, folder, given, about, fps=fps, quiet=quiet, report=report, view=view, host=host
+            source,
+            settings,
+            folder,
+            given,
+            about,
+            fps=fps,
+            quiet=quiet,
+            report=report,
+            view=view,
+            host=host,
+            fine=fine,
         )
+
+
+def _check_fine(source: str, split: str | None) -> None:
+    """Make sure, before anything is tracked, that a shape can be made anew at the end."""
+    from tracking3d.reconstruction.of_run import check_packages
+
+    if split is not None:
+        raise InputError(
+            "--model fine and --split do not go together; run `tracking3d model RUN --quality fine` after it."
+        )
+    if source.isdigit() and not Path(source).exists():
+        raise InputError(
+            "--model fine goes through the video once more, which a camera cannot; leave it out."
+        )
+    check_packages()

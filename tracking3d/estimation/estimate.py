@@ -118,6 +118,7 @@ class ObjectModel:
         texture: ``(T, T, 3)`` uint8 RGB, back-projected from the video.
         texture_weight: ``(T, T)`` float32, how much each texel was seen; 0 = never.
         features: ``(T, T, C)`` float32 feature texture the poses were estimated with.
+        seen: ``(V,)`` bool, whether a frame shows a vertex; None where nobody asked, as of the online map's mesh.
     """
 
     vertices: NDArray[np.float64]
@@ -126,6 +127,7 @@ class ObjectModel:
     texture: NDArray[np.uint8]
     texture_weight: NDArray[np.float32]
     features: NDArray[np.float32]
+    seen: NDArray[np.bool_] | None = None
 
 
 def unanswered(frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]) -> FrameEstimate:

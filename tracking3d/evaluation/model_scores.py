@@ -12,7 +12,8 @@ from tracking3d.datasets.truth import Truth
 from tracking3d.evaluation.alignment import ObjectAlignment, align_on_frame
 from tracking3d.evaluation.bop import AverageRecall, average_recall, mspd, mssd
 from tracking3d.evaluation.pose_scores import PosePairs
-from tracking3d.evaluation.shape import shape_scores
+from tracking3d.evaluation.seen_surface import seen_surface
+from tracking3d.evaluation.shape import ShapeScores, shape_scores
 from tracking3d.evaluation.vsd import TOLERANCES, VISIBILITY_TOLERANCE, model_depth, vsd
 
 SAMPLES = 30_000
@@ -30,6 +31,13 @@ class ModelScores:
         bop_ar_mspd: Of the maximum projection distance; needs the camera.
         chamfer_percent: Symmetric Chamfer distance in percent of the object's diameter.
         shape_f_score: F-score at 2 percent of the diameter.
+        shape_f_score_fine: At 1 percent.
+        shape_f_score_seen: At 2 percent, of the surface that the frames show; needs the camera.
+        shape_f_score_fine_seen: The same at 1 percent.
+        shape_accuracy_percent: Mean distance of the estimated from the true surface in percent of the diameter.
+        shape_completeness_percent: Of the true from the estimated surface.
+        shape_normals: Mean cosine between normals of the two surfaces.
+        shape_genus_error: By how many handles they differ; None unless both are one closed surface.
     """
 
     bop_ar: float | None = None
@@ -38,6 +46,13 @@ class ModelScores:
     bop_ar_mspd: float | None = None
     chamfer_percent: float | None = None
     shape_f_score: float | None = None
+    shape_f_score_fine: float | None = None
+    shape_f_score_seen: float | None = None
+    shape_f_score_fine_seen: float | None = None
+    shape_accuracy_percent: float | None = None
+    shape_completeness_percent: float | None = None
+    shape_normals: float | None = None
+    shape_genus_error: float | None = None
 
 
 def score_model(
@@ -69,7 +84,10 @@ def score_model(
     shape = None
     if alignment is not None and answers.mesh is not None:
         try:
-            shape = shape_scores(answers.mesh(), mesh, diameter, alignment.T_true_est, SAMPLES)
+            seen = None
+            if truth.camera is not None:
+                seen = seen_surface(mesh, diameter, list(truth.T_cam_obj.values()), truth.camera)
+            shape = shape_scores(answers.mesh(), mesh, diameter, alignment.T_true_est, SAMPLES, seen=seen)
         except ValueError:  # the method has no surface: there is nothing to measure
             shape = None
     return ModelScores(
@@ -78,8 +96,21 @@ def score_model(
         bop_ar_mssd=recall.mssd,
         bop_ar_mspd=recall.mspd,
         chamfer_percent=100 * shape.chamfer if shape else None,
-        shape_f_score=shape.f_score if shape else None,
+        **(_of_shape(shape) if shape else {}),
     )
+
+
+def _of_shape(shape: ShapeScores) -> dict[str, float | None]:
+    return {
+        "shape_f_score": shape.f_score,
+        "shape_f_score_fine": shape.f_score_fine,
+        "shape_f_score_seen": shape.f_score_seen,
+        "shape_f_score_fine_seen": shape.f_score_fine_seen,
+        "shape_accuracy_percent": 100 * shape.accuracy,
+        "shape_completeness_percent": 100 * shape.completeness,
+        "shape_normals": shape.normals,
+        "shape_genus_error": shape.genus_error,
+    }
 
 
 def _recall(

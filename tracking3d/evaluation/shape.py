@@ -1,4 +1,4 @@
-"""How far an estimated surface is from the true one.
+"""How far an estimated surface is from the true one, on all of it and on what the frames showed.
 
 Distances run from points spread evenly over one mesh to the surface of the other. Figures are in object diameters. The
 alignment is given (`tracking3d.evaluation.alignment`); none is searched here.
@@ -6,6 +6,7 @@ alignment is given (`tracking3d.evaluation.alignment`); none is searched here.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,9 @@ from tracking3d.evaluation.arrays import finite
 
 TOLERANCE = 0.02
 """Distance in diameters below which a point of one surface is on the other."""
+
+FINE_TOLERANCE = 0.01
+"""The same, for what is to be right in detail."""
 
 SAMPLES = 100_000
 """Points on each surface."""
@@ -30,15 +34,30 @@ class ShapeScores:
 
     Attributes:
         chamfer: Mean distance from the estimated to the true surface and back, half of their sum, in diameters.
+        accuracy: Mean distance from the estimated to the true surface, in diameters.
+        completeness: Mean distance from the true to the estimated surface, in diameters.
         precision: Share of the estimated surface that is on the true one.
         recall: Share of the true surface that is on the estimated one.
         f_score: Harmonic mean of the two.
+        f_score_fine: The same at `FINE_TOLERANCE`.
+        f_score_seen: `f_score` of what was seen: of the true surface, and of what lies nearest to that; None where
+            nobody says what was seen.
+        f_score_fine_seen: The same at `FINE_TOLERANCE`.
+        normals: Mean cosine between the normals of points of either surface and those of the nearest of the other.
+        genus_error: By how many handles the estimate differs; None unless both are one closed surface.
     """
 
     chamfer: float
+    accuracy: float
+    completeness: float
     precision: float
     recall: float
     f_score: float
+    f_score_fine: float
+    f_score_seen: float | None
+    f_score_fine_seen: float | None
+    normals: float
+    genus_error: int | None
 
 
 def shape_scores(
@@ -48,6 +67,7 @@ def shape_scores(
     T_true_est: NDArray[np.float64] | None = None,
     samples: int = SAMPLES,
     seed: int = 0,
+    seen: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.bool_]] | None = None,
 ) -> ShapeScores:
     """Chamfer distance and F-score (Knapitsch et al., "Tanks and temples", 2017) of two meshes.
 
@@ -58,6 +78,7 @@ def shape_scores(
         T_true_est: ``(4, 4)`` similarity from estimated to true coordinates; None if they are the same.
         samples: Points on each surface.
         seed: Of the points.
+        seen: Says of points ``(N, 3)`` of the true surface with normals ``(N, 3)`` which were seen.
 
     Raises:
         ValueError: If a mesh has no area, or the diameter is not positive, or the similarity is not finite.
@@ -73,13 +94,44 @@ def shape_scores(
     true_points, true_faces = _sample(true, samples, seed + 1)
     to_true = _distances(points, true_points, true.triangles[true_faces]) / diameter
     to_estimated = _distances(true_points, points, aligned.triangles[faces]) / diameter
-    precision, recall = (float(np.mean(one < TOLERANCE)) for one in (to_true, to_estimated))
+    nearest_true, nearest = cKDTree(true_points).query(points)[1], cKDTree(points).query(true_points)[1]
+    normals, true_normals = aligned.face_normals[faces], true.face_normals[true_faces]
+    agree = [
+        (normals * true_normals[nearest_true]).sum(1).mean(),
+        (true_normals * normals[nearest]).sum(1).mean(),
+    ]
+    on_seen = None
+    if seen is not None and (shown := seen(true_points, true_normals)).any() and shown[nearest_true].any():
+        on_seen = to_true[shown[nearest_true]], to_estimated[shown]
     return ShapeScores(
         chamfer=float(to_true.mean() + to_estimated.mean()) / 2,
-        precision=precision,
-        recall=recall,
-        f_score=2 * precision * recall / (precision + recall) if precision + recall else 0.0,
+        accuracy=float(to_true.mean()),
+        completeness=float(to_estimated.mean()),
+        precision=float(np.mean(to_true < TOLERANCE)),
+        recall=float(np.mean(to_estimated < TOLERANCE)),
+        f_score=_f_score(to_true, to_estimated, TOLERANCE),
+        f_score_fine=_f_score(to_true, to_estimated, FINE_TOLERANCE),
+        f_score_seen=None if on_seen is None else _f_score(*on_seen, TOLERANCE),
+        f_score_fine_seen=None if on_seen is None else _f_score(*on_seen, FINE_TOLERANCE),
+        normals=float(np.mean(agree)),
+        genus_error=_genus_error(aligned, true),
     )
+
+
+def _f_score(to_true: NDArray[np.float64], to_estimated: NDArray[np.float64], tolerance: float) -> float:
+    precision, recall = (float(np.mean(one < tolerance)) for one in (to_true, to_estimated))
+    return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
+
+
+def _genus_error(estimated: trimesh.Trimesh, true: trimesh.Trimesh) -> int | None:
+    genera = []
+    for mesh in (estimated, true):
+        whole = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+        whole.merge_vertices()
+        if not whole.is_watertight or whole.body_count != 1:
+            return None
+        genera.append((2 - whole.euler_number) // 2)
+    return int(abs(genera[0] - genera[1]))
 
 
 def _sample(mesh: trimesh.Trimesh, count: int, seed: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

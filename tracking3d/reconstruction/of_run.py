@@ -1,26 +1,49 @@
-"""The texture of a run that exists, from its answers and the video that it was made of."""
+"""The texture, and the shape, of a run that exists, from its answers and the video that it was made of."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 
-from tracking3d.checkpoint.progress import checksum
 from tracking3d.errors import InputError
-from tracking3d.estimation.estimate import ObjectModel, Status
-from tracking3d.frames import Frame, pixels
+from tracking3d.estimation.estimate import ObjectModel
+from tracking3d.reconstruction.believed_frames import believed_frames, none_believed
+from tracking3d.reconstruction.new_atlas import with_shape
+from tracking3d.reconstruction.shape import MOST, reconstructed
+from tracking3d.reconstruction.shape_views import ShapeView, shape_view, turned_apart
 from tracking3d.reconstruction.texturing import textured
-from tracking3d.reconstruction.views import BELIEVED, TextureView, kept_views, texture_view
+from tracking3d.reconstruction.views import TextureView, kept_views, texture_view
+from tracking3d.results import layout
 from tracking3d.results.mesh_export import export_mesh, load_model
 from tracking3d.results.run_reader import RunReader
-from tracking3d.video.opening import open_source
+
+_NEEDED = ("skimage", "xatlas", "fast_simplification")
+
+
+@dataclass(frozen=True, eq=False)
+class ShapedRun:
+    """What came of a reconstruction.
+
+    Attributes:
+        model: The run's mesh as it is now.
+        views: Frames that its texture was taken from.
+        new: Whether it has a new shape.
+        sentence: How much better that is, or why the old one stays.
+    """
+
+    model: ObjectModel
+    views: int
+    new: bool
+    sentence: str
 
 
 def texture_run(
     folder: Path, source: str | None = None, most: int = 24, largest: int = 2048
 ) -> tuple[ObjectModel, int]:
-    """Write the mesh of a run anew, with a texture at the resolution of its video.
+    """Write the mesh of the online map of a run anew, with a texture at the resolution of its video.
 
     Args:
         folder: The run folder.
@@ -36,45 +59,85 @@ def texture_run(
         OutputError: If the mesh cannot be written.
     """
     run = RunReader(folder)
-    if run.state == "running":
-        raise InputError(f"The run {folder} is still going; wait for its end.")
-    model = load_model(run.mesh_folder)
-    views = _views(run, source or str(run.description.get("source", "")), most)
+    model = _online_model(run)
+    views: tuple[TextureView, ...] = ()
+    for frame, record in believed_frames(run, source):
+        mask, camera = run.pinhole_mask(frame.index), run.camera_of(record)
+        view = texture_view(frame.index, frame.image, mask, camera, np.asarray(record.T_cam_obj))
+        views = views if view is None else kept_views(views, view, most)
     if not views:
-        raise InputError(
-            f"No frame of the run {folder} is tracked with a confidence of {BELIEVED} or more; its mesh stays as it is."
-        )
+        raise none_believed(run)
     model = textured(model, views, largest)
     export_mesh(run.mesh_folder, model)
     return model, len(views)
 
 
-def _views(run: RunReader, source: str, most: int) -> tuple[TextureView, ...]:
-    records = {record.index: record for record in run.frames}
-    given = run.description.get("given") or {}
+def shape_run(folder: Path, source: str | None = None, most: int = 24, largest: int = 2048) -> ShapedRun:
+    """Make the shape of a run's object anew from all its frames, and write the mesh if that explains them better.
+
+    The mesh of the online map is kept in `layout.ONLINE`.
+
+    Args:
+        folder: The run folder.
+        source: The video; None for the one that the run names.
+        most: Frames that the texture is taken from.
+        largest: Most texels along a side.
+
+    Raises:
+        InputError: If a package is missing, the run goes on, has no mesh or no frame that is believed, or the video
+            is another one.
+        OutputError: If the mesh cannot be written.
+    """
+    check_packages()
+    run = RunReader(folder)
+    online = _online_model(run)
+    shapes: list[ShapeView] = []
     views: tuple[TextureView, ...] = ()
-    for frame in open_source(source, run.description.get("selection")):
-        record = records.get(frame.index)
-        if not isinstance(frame, Frame) or record is None:
+    for frame, record in believed_frames(run, source):
+        mask, camera, pose = (
+            run.pinhole_mask(frame.index),
+            run.camera_of(record),
+            np.asarray(record.T_cam_obj),
+        )
+        shape = shape_view(frame.index, frame.image, mask, camera, pose)
+        view = texture_view(frame.index, frame.image, mask, camera, pose)
+        if shape is None or view is None:
             continue
-        expected = (run.camera.height, run.camera.width)
-        if frame.size != expected:
-            raise InputError(
-                f"{source} has frames of {pixels(frame.size)} pixels but the run {run.folder} of "
-                f"{pixels(expected)}; give its video by --source."
-            )
-        if frame.index == given.get("first_frame") and checksum(frame.image) != given.get("first_picture"):
-            raise InputError(
-                f"{source} does not begin as the video of the run {run.folder} did; give that by --source."
-            )
-        if record.status is Status.TRACKED and record.confidence >= BELIEVED:
-            camera = run.camera_of(record)
-            view = texture_view(
-                frame.index,
-                camera.undistorted(frame.image),
-                run.pinhole_mask(frame.index),
-                camera,
-                np.asarray(record.T_cam_obj),
-            )
-            views = views if view is None else kept_views(views, view, most)
-    return views
+        shapes.append(shape)
+        views = kept_views(views, view, most)
+        if len(shapes) > 4 * MOST:  # memory does not grow with the video
+            shapes = turned_apart(shapes, 0.5, 2 * MOST)
+    if not views:
+        raise none_believed(run)
+    made = reconstructed(online.vertices, online.faces, shapes)
+    if made.vertices is None or made.faces is None:
+        model = textured(online, views, largest)
+        export_mesh(run.mesh_folder, model)
+        return ShapedRun(model, len(views), False, made.sentence)
+    poses = made.T_cam_obj
+    fitted = [replace(view, T_cam_obj=poses.get(view.index, view.T_cam_obj)) for view in views]
+    model = textured(with_shape(online, made.vertices, made.faces, shapes), fitted, largest)
+    kept = run.mesh_folder / layout.ONLINE
+    if not (kept / layout.FEATURES).is_file():
+        kept.mkdir(exist_ok=True)
+        export_mesh(kept, online)
+    export_mesh(run.mesh_folder, model)
+    return ShapedRun(model, len(views), True, made.sentence)
+
+
+def check_packages() -> None:
+    """Make sure that what a shape is made with is installed.
+
+    Raises:
+        InputError: If something is missing; says what to install.
+    """
+    if any(find_spec(name) is None for name in _NEEDED):
+        raise InputError(
+            "A shape is made anew with scikit-image, fast-simplification and xatlas: pip install 'tracking3d[model]', "
+            "or leave the mesh as it is."
+        )
+
+
+def _online_model(run: RunReader) -> ObjectModel:
+    kept = run.mesh_folder / layout.ONLINE
+    return load_model(kept if (kept / layout.FEATURES).is_file() else run.mesh_folder)

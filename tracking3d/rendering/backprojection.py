@@ -46,6 +46,10 @@ class TexelMap:
         corner = face_uvs * size - 0.5
         both = torch.cat([corner, corner - corner.new_tensor([float(size), 0.0])])
         triangles = torch.arange(6 * count, device=corner.device).reshape(-1, 3)
+        # An atlas may hold charts that are mirrored; drawn they are from whichever side shows.
+        ab, ac = both[:, 1] - both[:, 0], both[:, 2] - both[:, 0]
+        mirrored = ab[:, 0] * ac[:, 1] > ab[:, 1] * ac[:, 0]
+        triangles[mirrored] = triangles[mirrored].flip(1)
         flat = both.reshape(1, -1, 2)
         index = rasterize(flat, torch.ones_like(flat[..., 0]), triangles, (size, size)).face_index.reshape(-1)
         texel = torch.nonzero(index >= 0)[:, 0]

@@ -14,6 +14,7 @@
     mesh.obj, mesh.mtl, texture.png, mesh.glb, features.npz
     landmarks.npz       surface and poses as points were followed by, once they were
     causal/             masks and mesh as they were before the final refinement
+    online/             the mesh of the online map, where its shape was made anew
     .refining/          what the final refinement has made so far, until it has ended
     .state/             what a stopped run goes on from; when it is finished, what a correction goes on from
     prompts/            the masks that were given of the object, named by frame index
@@ -36,6 +37,7 @@ MASKS = "masks"
 INITIAL_MASKS = "initial_masks"
 PROBABILITIES = "probabilities"
 CAUSAL = "causal"
+ONLINE = "online"
 REFINING = ".refining"
 STATE = ".state"
 PROMPTS = "prompts"
@@ -126,6 +128,7 @@ def run_files(folder: Path) -> list[Path]:
     """The files in ``folder`` that bear the names a run writes, unfinished ones included."""
     named = [folder / name for name in _FILES]
     named += [folder / CAUSAL / name for name in _OF_MESH]
+    named += [folder / ONLINE / name for name in MESH_FILES]
     named += [folder / REFINING / name for name in (OVERLAY, FRAMES)]
     for masks in (
         folder / MASKS,

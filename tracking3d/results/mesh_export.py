@@ -44,6 +44,7 @@ def export_mesh(folder: Path, model: ObjectModel) -> None:
         write_atomic(folder / name, data)
     write_atomic(folder / GLB, glb_file(model))
     exact = io.BytesIO()
+    seen: dict[str, Any] = {} if model.seen is None else {"seen": model.seen}
     np.savez_compressed(
         exact,
         vertices=model.vertices,
@@ -51,6 +52,7 @@ def export_mesh(folder: Path, model: ObjectModel) -> None:
         face_uvs=model.face_uvs,
         texture_weight=model.texture_weight,
         features=model.features,
+        **seen,
     )
     write_atomic(folder / FEATURES, exact.getvalue())
 
@@ -123,11 +125,15 @@ def split_mesh(model: ObjectModel, material: trimesh.visual.material.Material) -
     vertex = corner[first]
     whole = trimesh.Trimesh(model.vertices, model.faces, process=False)
     uv = np.stack([face_uvs[first, 0], 1.0 - face_uvs[first, 1]], axis=1)
+    attributes: dict[str, Any] = (
+        {} if model.seen is None else {"_seen": model.seen[vertex].astype(np.float32)}
+    )
     return trimesh.Trimesh(
         model.vertices[vertex],
         inverse.reshape(-1, 3),
         vertex_normals=whole.vertex_normals[vertex],
         visual=trimesh.visual.TextureVisuals(uv, material=material),
+        vertex_attributes=attributes,
         process=False,
     )
 

@@ -1,0 +1,80 @@
+"""A shape made anew replaces the old one only where it explains frames better that it has not seen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rendered_views import ball
+from scipy.spatial.transform import Rotation
+from test_volume import shape_views
+
+from tracking3d.reconstruction.judged import Explained, explained
+from tracking3d.reconstruction.outline_fit import fitted_to_outlines
+from tracking3d.reconstruction.pose_polish import coloured_surface, mean_motion, polished
+from tracking3d.reconstruction.seen_vertices import seen_vertices
+from tracking3d.reconstruction.shape import reconstructed
+
+
+def turned(view, degrees: float):
+    pose = view.T_cam_obj.copy()
+    pose[:3, :3] = Rotation.from_euler("y", degrees, degrees=True).as_matrix() @ pose[:3, :3]
+    return replace(view, T_cam_obj=pose)
+
+
+@pytest.mark.parametrize(
+    ("yaws", "words"), [(range(0, 30, 10), "frames differ enough"), (np.arange(0, 14, 1.1), "turns by")]
+)
+def test_too_little_is_said_and_the_shape_stays(yaws, words):
+    model = ball()
+    made = reconstructed(model.vertices, model.faces, shape_views(yaws))
+    assert made.vertices is None and words in made.sentence and made.T_cam_obj == {}
+
+
+def test_no_outline_is_given_for_colours():
+    old = Explained(0.95, 0.05)
+    assert Explained(0.96, 0.05).better_than(old) and Explained(0.95, 0.04).better_than(old)
+    assert not old.better_than(old)
+    assert not Explained(0.93, 0.01).better_than(old)
+
+
+def test_the_true_shape_explains_frames_best():
+    model, views = ball(), shape_views(range(0, 60, 12))
+    right = explained(model.vertices, model.faces, views[::2], views[1::2])
+    wrong = explained(0.8 * model.vertices, model.faces, views[::2], views[1::2])
+    assert right.iou > 0.95 and right.better_than(wrong)
+
+
+def test_a_pose_that_is_off_is_brought_back():
+    model, views = ball(), shape_views(range(0, 72, 8))
+    off = [*views[:4], turned(views[4], 2.0), *views[5:]]
+    found = polished(coloured_surface(model.vertices, model.faces, views), off)
+    left = Rotation.from_matrix(found[4].T_cam_obj[:3, :3] @ views[4].T_cam_obj[:3, :3].T).magnitude()
+    assert np.degrees(left) < 0.5
+
+
+def test_the_back_is_not_seen():
+    model, (view,) = ball(), shape_views([0])
+    seen = seen_vertices(model.vertices, model.faces, [view])
+    towards = -model.vertices[:, 2]  # the camera stands at negative z
+    assert seen[towards > 0.4].all() and not seen[towards < 0].any()
+
+
+def test_vertices_go_to_where_the_outlines_are():
+    model, views = ball(), shape_views(range(0, 180, 20))
+    small = 0.95 * model.vertices
+    fitted = fitted_to_outlines(small, model.faces, views)
+    # All views look along the horizon: the ring that they see goes out, and the poles with it.
+    radius = np.linalg.norm(fitted, axis=1)
+    assert np.abs(radius - 1).mean() < 0.5 * 0.05
+    assert explained(fitted, model.faces, views[::2], views[1::2]).iou > 0.97
+
+
+def test_how_poses_went_together_is_taken_back():
+    views = shape_views((0, 40, 80))
+    T_after_before = np.eye(4)
+    T_after_before[:3, :3] = Rotation.from_rotvec([0.02, 0.05, -0.03]).as_matrix()
+    T_after_before[:3, 3] = (0.1, -0.2, 0.05)
+    after = [replace(view, T_cam_obj=view.T_cam_obj @ np.linalg.inv(T_after_before)) for view in views]
+    np.testing.assert_allclose(mean_motion(views, after), T_after_before, atol=1e-6)

@@ -1,0 +1,122 @@
+"""Silhouettes, a mesh and depths in a volume, against what is known of a ball; kernels against their twins."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rendered_views import CAMERA, pattern, pose, seen
+
+from tracking3d.geometry.prototypes import sphere
+from tracking3d.reconstruction.depth_maps import DepthMap, Guide, depth_maps, patch_scores
+from tracking3d.reconstruction.fusion import depth_evidence, fused
+from tracking3d.reconstruction.grid import Grid
+from tracking3d.reconstruction.hull import robust_hull
+from tracking3d.reconstruction.mesh_distance import mesh_distance
+from tracking3d.reconstruction.shape_views import ShapeView, shape_view, turned_apart
+
+SIDE = 96
+
+
+def shape_views(yaws, pitch: float = 0.0) -> list[ShapeView]:
+    """The ball with its pattern, turned by these degrees."""
+    views = []
+    for index, yaw in enumerate(yaws):
+        image, mask = seen(pose(yaw, pitch), pattern())
+        views.append(shape_view(index, image, mask, CAMERA, pose(yaw, pitch), SIDE))
+    return views
+
+
+@pytest.fixture(scope="module")
+def around() -> list[ShapeView]:
+    return shape_views(range(0, 360, 30)) + shape_views((0, 90, 180, 270), 60)
+
+
+def test_the_hull_of_a_ball_is_the_ball(around):
+    points = np.random.default_rng(1).uniform(-1.3, 1.3, (2000, 3)).astype(np.float32)
+    hull, known = robust_hull(points, around, 0.4, 0.0, 0)
+    radius = np.linalg.norm(points, axis=1)
+    inside = radius < 0.95
+    beside = (np.hypot(*points[:, [0, 2]].T) > 1.1) & (np.abs(points[:, 1]) < 0.8)
+    assert (hull[inside] > 0).all() and (hull[beside] < 0).all()
+    assert (known[inside] == len(around)).all()
+
+
+def test_wrong_masks_carve_nothing_as_long_as_they_are_few(around):
+    nothing = replace(around[3], depth_inside=np.full_like(around[3].depth_inside, -5.0))
+    middle = np.zeros((1, 3), np.float32)
+    views = [*around[:3], nothing, *around[4:]]
+    assert robust_hull(middle, views, 0.4, 0.0, 1)[0] > 0
+    assert robust_hull(middle, views, 0.4, 0.0, 0)[0] < 0
+
+
+def test_nothing_is_known_beyond_the_frame(around):
+    half = replace(around[0], within=np.array([SIDE / 2, SIDE, 0, SIDE], np.float32))
+    left = np.array([[-0.5, 0, 0]], np.float32)
+    assert robust_hull(left, [half], 0.4)[1] == 0
+    assert robust_hull(left, [around[0]], 0.4)[1] == 1
+
+
+def test_kernel_and_twin_of_the_hull_agree(around):
+    points = np.random.default_rng(2).uniform(-1.3, 1.3, (500, 3)).astype(np.float32)
+    kernel, twin = (robust_hull(points, around, 0.4, 0.1, 1, backend) for backend in ("numba", "torch"))
+    np.testing.assert_allclose(kernel[0], twin[0], atol=1e-5)
+    np.testing.assert_array_equal(kernel[1], twin[1])
+
+
+def test_the_distance_of_a_mesh_is_exact_and_signed():
+    mesh = sphere(6)
+    grid = Grid.around(mesh.vertices, 16, 0.2)
+    distance = mesh_distance(grid, mesh.vertices, mesh.faces, 0.5)
+    expected = 1 - np.linalg.norm(grid.points, axis=1)
+    assert np.abs(distance - np.clip(expected, -0.5, 0.5)).max() < 0.04  # flat faces lie within the ball
+    assert ((distance > 0) == (expected > 0))[np.abs(expected) > 0.04].all()
+
+
+def test_patches_find_the_depth_of_a_ball():
+    views = shape_views((-24, -12, 0, 12, 24))
+    small = sphere(8)
+    guide = Guide(0.94 * small.vertices, small.faces)
+    (found,) = depth_maps(views, [views[2]], guide, 0.12, 8)[:1] or [None]
+    assert not np.isfinite(found.depth).any()  # nobody confirms the only map
+    maps = depth_maps(views, views[1:4], guide, 0.12, 8)
+    true, _ = Guide(small.vertices, small.faces).seen_by(maps[1].view)
+    known = np.isfinite(maps[1].depth) & np.isfinite(true)
+    assert known.sum() > 100
+    at_first, _ = guide.seen_by(maps[1].view)
+    error, before = (np.abs(depth[known] - true[known]) for depth in (maps[1].depth, at_first))
+    assert np.median(error) < 0.3 * np.median(before)
+
+
+def test_kernel_and_twin_of_the_sweep_agree():
+    random = np.random.default_rng(3)
+    image, *others = random.uniform(0, 255, (3, 40, 40)).astype(np.float32)
+    K_inverse = np.linalg.inv(np.array([[60.0, 0, 20], [0, 60, 20], [0, 0, 1]]))
+    P = np.stack([np.array([[60.0, 0, 20, shift], [0, 60, 20, 1], [0, 0, 1, 0.1]]) for shift in (2, -3)])
+    pixels = random.integers(0, 40, (60, 2))
+    normal = random.normal(size=(60, 3)) * 0.3 - (0, 0, 1)
+    given = (image, np.ones_like(image), K_inverse, np.stack(others), P, pixels, np.full(60, 3.0), normal)
+    offsets = np.linspace(-0.5, 0.5, 5)
+    kernel, twin = (patch_scores(*given, offsets, backend) for backend in ("numba", "torch"))
+    assert (kernel[0] > -1).any() and (kernel[0] == -1).any()
+    for one, other in zip(kernel, twin, strict=True):
+        np.testing.assert_allclose(one, other, atol=2e-3)
+
+
+def test_a_depth_is_a_surface_and_free_space_before_it(around):
+    view = around[0]
+    one = DepthMap(view, np.full((SIDE, SIDE), 4.5, np.float32), np.ones((SIDE, SIDE), np.float32))
+    points = np.array([[0, 0, -1.0], [0, 0, -0.5], [0, 0, 0.5]], np.float32)  # z of the camera: 4, 4.5, 5.5
+    total, weight = depth_evidence(points, [one], 0.2)
+    assert total[0] < 0 and abs(total[1]) < 1e-6 and weight[1] == 1 and weight[2] == 0
+    everywhere = np.full(3, 0.1, np.float32)
+    inside = fused(everywhere, everywhere, 5 * total, 5 * weight, 0.2)
+    assert inside[0] < 0 < inside[2]
+    assert (fused(-everywhere, everywhere, total, weight, 0.2) < 0).all()  # nothing is beyond the hull
+
+
+def test_views_that_show_the_same_are_one(around):
+    assert len(turned_apart([around[0]] * 5, 1.0, 10)) == 1
+    assert len(turned_apart(around, 1.0, 100)) == len(around)
+    assert len(turned_apart(around, 1.0, 5)) <= 5

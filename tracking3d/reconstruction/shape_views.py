@@ -1,0 +1,116 @@
+"""The frames that a shape is made from: from all sides that were seen, and some that are kept to judge it by."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.frames import Image
+from tracking3d.geometry.camera import Camera, Window
+from tracking3d.trackers.crops import box_of, cut, inside_frame
+
+SIDE = 192
+"""Pixels of a view's side; a smaller window is seen larger."""
+_MARGIN = 0.08  # beside the mask, relative to its longer side
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeView:
+    """A frame with a pose and a mask that are believed, cut out around the object.
+
+    Attributes:
+        index: Of the frame.
+        image: ``(S, S, 3)`` uint8 RGB.
+        depth_inside: ``(S, S)`` float32, pixels from the mask's outline, positive inside.
+        within: ``(4,)`` left, right, top and bottom edge of the frame in the window's pixels; beyond them nothing
+            is known.
+        K: ``(3, 3)`` intrinsics of the window.
+        T_cam_obj: ``(4, 4)``.
+    """
+
+    index: int
+    image: NDArray[np.uint8]
+    depth_inside: NDArray[np.float32]
+    within: NDArray[np.float32]
+    K: NDArray[np.float64]
+    T_cam_obj: NDArray[np.float64]
+
+    @property
+    def mask(self) -> NDArray[np.bool_]:
+        """``(S, S)`` the object."""
+        return self.depth_inside > 0
+
+    @property
+    def in_frame(self) -> NDArray[np.bool_]:
+        """``(S, S)`` the pixels of the window that the frame has."""
+        left, right, top, bottom = self.within
+        place = np.arange(len(self.mask))
+        return ((place >= top) & (place <= bottom))[:, None] & ((place >= left) & (place <= right))
+
+    @property
+    def P(self) -> NDArray[np.float64]:
+        """``(3, 4)`` from object coordinates to pixels of the window, times the depth."""
+        return np.asarray(self.K @ self.T_cam_obj[:3])
+
+
+def shape_view(
+    index: int,
+    image: Image,
+    mask: NDArray[np.bool_],
+    camera: Camera,
+    T_cam_obj: NDArray[np.float64],
+    side: int = SIDE,
+) -> ShapeView | None:
+    """A frame as a shape is made from it; None where its mask is empty.
+
+    Args:
+        index: Of the frame.
+        image: ``(H, W, 3)`` RGB.
+        mask: ``(H, W)`` the object.
+        camera: Of the full frame.
+        T_cam_obj: ``(4, 4)``.
+        side: Pixels of the view's side.
+    """
+    box = box_of(mask)
+    if box is None:
+        return None
+    window = Window.around(box, _MARGIN, side)
+    inside = (cut(mask.astype(np.float32), window) > 0.5) & inside_frame(mask.shape, window)
+    if not inside.any():
+        return None
+    height, width = mask.shape
+    edges = np.array([-window.left, width - window.left, -window.top, height - window.top]) * window.scale
+    return ShapeView(
+        index,
+        cut(image, window),
+        _depth_inside(inside),
+        (edges - 0.5).astype(np.float32),
+        window.K(camera),
+        np.array(T_cam_obj, np.float64),
+    )
+
+
+def turned_apart(views: Sequence[ShapeView], degrees: float, most: int) -> list[ShapeView]:
+    """Those views that differ by at least ``degrees`` from all chosen before; by more, where they are too many."""
+    rotations = np.stack([view.T_cam_obj[:3, :3] for view in views]) if views else np.zeros((0, 3, 3))
+    while True:
+        chosen: list[int] = []
+        nearest = 1 + 2 * np.cos(np.radians(degrees))  # trace of a rotation by that angle
+        for n, rotation in enumerate(rotations):
+            traces = np.einsum("nij,ij->n", rotations[chosen], rotation)
+            if not len(traces) or traces.max() <= nearest:
+                chosen.append(n)
+        if len(chosen) <= most:
+            return [views[n] for n in chosen]
+        degrees = max(1.2 * degrees, 0.1)
+
+
+def _depth_inside(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Signed distance to the outline, which runs half-way between pixels inside and outside."""
+    inward = cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    outward = cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.where(inside, inward - 0.5, 0.5 - outward).astype(np.float32)
