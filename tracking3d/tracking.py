@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Self, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -213,7 +213,11 @@ def _started(
 
 def _finish(recording: ObjectRecording, source: FrameSource) -> None:
     """The final refinement, where the configuration asks for it and it is possible, and the model."""
-    look_again(source, [recording], lambda action: action(recording))
+
+    def does(action: Callable[[ObjectRecording], Any]) -> None:
+        action(recording)
+
+    look_again(source, [recording], does)
 
 
 def _nothing() -> Generator[FrameEstimate]:

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
+from tracking3d.cli.model import check_fine
 from tracking3d.cli.objects import given_box, given_masks
 from tracking3d.cli.options import (
     ConfigFile,
@@ -255,7 +256,7 @@ def run(
         raise InputError("--workers is how many parts of --split are tracked at a time; give both.")
     fine = model is ModelChoice.FINE
     if fine:
-        _check_fine(source, split)
+        check_fine(source, split)
     chosen: dict[str, Any] = {"name": tracker}
     if masks is not None:
         if tracker not in (None, "precomputed", "auto"):
@@ -344,18 +345,3 @@ def run(
             host=host,
             fine=fine,
         )
-
-
-def _check_fine(source: str, split: str | None) -> None:
-    """Make sure, before anything is tracked, that a shape can be made anew at the end."""
-    from tracking3d.reconstruction.of_run import check_packages
-
-    if split is not None:
-        raise InputError(
-            "--model fine and --split do not go together; run `tracking3d model RUN --quality fine` after it."
-        )
-    if source.isdigit() and not Path(source).exists():
-        raise InputError(
-            "--model fine goes through the video once more, which a camera cannot; leave it out."
-        )
-    check_packages()

@@ -146,7 +146,7 @@ def _depth_map(
     pixels = np.stack([rows[asked], columns[asked]], 1).astype(np.int64)
     first = drawn[pixels[:, 0], pixels[:, 1]].astype(np.float64)
     normal = normals[pixels[:, 0], pixels[:, 1]].astype(np.float64)
-    K_inverse = np.linalg.inv(view.K)
+    K_inverse: NDArray[np.float64] = np.asarray(np.linalg.inv(view.K), np.float64)
     rays = np.column_stack([pixels[:, 1], pixels[:, 0], np.ones(len(pixels))]) @ K_inverse.T
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
     facing = -(normal * rays).sum(1) / np.linalg.norm(rays, axis=1)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from PIL import Image
 from small_ostrack import BOXES, save, write_constant_ostrack, write_ostrack, write_refine
-from tracking3d.datasets.vot_regions import encode_mask, format_region
 from tracking3d_ostrack import OsTracker
 from tracking3d_ostrack.network import OsTrackBoxes
 from tracking3d_ostrack.patches import Patch
@@ -19,6 +18,7 @@ from tracking3d.frames import Frame, MaskEstimate, Prompt
 from tracking3d.networks.session import Network
 from tracking3d.testing import check_tracker
 from tracking3d.trackers.protocol import MaskTracker
+from tracking3d.trackers.vot_regions import encode_mask, format_region
 
 BOX = (20.0, 30.0, 60.0, 60.0)
 
