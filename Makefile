@@ -16,13 +16,15 @@ TESTS := OPENBLAS_NUM_THREADS=1 $(BIN)/pytest tests plugins -n logical --maxproc
 demo: $(VENV)/installed
 	$(BIN)/tracking3d demo --out demo
 
-# The types are checked beside the tests, and what that says is printed after them. A worker takes up to a
-# gigabyte, hence no more than eight; a file's tests share its fixtures, so one worker runs them all.
+# The types are checked beside the tests, and what that says is printed after them. Kernels are compiled once, before
+# the workers would each do so. A worker takes up to a gigabyte, hence no more than eight; a file's tests share its
+# fixtures, so one worker runs them all.
 test: $(VENV)/installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	@said=$$(mktemp); trap 'rm -f "$$said"' EXIT; \
 	echo "$(BIN)/mypy &"; $(BIN)/mypy >"$$said" 2>&1 & types=$$!; \
+	$(BIN)/python -m tracking3d.speed.kernels_ahead 2>/dev/null; \
 	echo "$(TESTS)"; $(TESTS); tests=$$?; \
 	wait $$types; types=$$?; cat "$$said"; exit $$((tests || types))
 

@@ -69,6 +69,7 @@ def test_a_length_or_rate_that_makes_no_sense_is_refused(clips, seconds, rate):
         live.play_live(load_config(), read_truth(clips / "narrow"), seconds, rate)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("session")
 def test_the_command_prints_what_it_found(clips):
     arguments = ["bench", "live", str(clips / "narrow"), "--seconds", "1", "--rate", "30"]

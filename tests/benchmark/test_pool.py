@@ -24,6 +24,7 @@ def jobs(clips, tmp_path):
     return make
 
 
+@pytest.mark.slow
 def test_a_crash_and_a_failure_cost_their_own_sequence_only_and_the_rest_is_found_again(jobs, scripted):
     told = []
     narrow, wide = run_jobs(jobs(scripted(crash=70)), 2, told.append)

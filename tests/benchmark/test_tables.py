@@ -204,6 +204,7 @@ def test_a_table_is_the_same_in_every_format(asked, tmp_path):
     assert {file.suffix for file in write_table(filled, tmp_path / "t")} == {".md", ".csv", ".json"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".svg", ".png"])
 def test_a_table_is_drawn_the_same_every_time(asked, tmp_path, suffix):
     pytest.importorskip("matplotlib", reason="the extra plots is not installed")

@@ -190,6 +190,7 @@ def test_a_damaged_array_is_told(tmp_path):
         TreeFolder(tmp_path, CLASSES).read(json.loads(text))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("preset", "frames"), [("default", 7), ("rerendering", 3)])
 def test_in_every_frame_what_is_kept_is_the_solvers_state(tmp_path, preset, frames):
     clip = synthesize(SyntheticSpec(frames=frames, size=(96, 72), supersample=1, degrees_per_frame=5))

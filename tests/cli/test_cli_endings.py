@@ -36,6 +36,7 @@ def test_a_closed_pipe_ends_in_silence():
     assert (done.returncode, done.stderr) == (program.UNREAD, b"")
 
 
+@pytest.mark.slow
 def test_letters_that_a_terminal_has_not_are_no_fault(tmp_path):
     file = tmp_path / "ünïcode.yaml"
     file.write_text("preset: default")

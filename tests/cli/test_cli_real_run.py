@@ -63,6 +63,7 @@ def test_real_run_from_a_box(real_clip, box, tmp_path):
     assert json.loads(scores.stdout)["iou_initial_mean"] > 0.5
 
 
+@pytest.mark.slow
 def test_real_run_from_masks_alone(real_clip, tmp_path):
     masks = ("--masks", real_clip / "masks")
     result = forked_program(

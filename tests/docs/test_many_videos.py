@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from documentation_pages import ROOT, blocks
 
 from tracking3d.benchmark.scheduling import Fleet, Splitting, skewed_lengths
@@ -18,6 +19,7 @@ def test_the_costs_are_those_of_the_stated_figures(capsys):
     assert printed in PAGE.read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_the_schedules_are_those_of_the_simulation():
     work = 15 * skewed_lengths(10_000)
     for workers in (100, 1000):

@@ -128,6 +128,7 @@ def test_a_lost_frame_leaves_shape_and_texture_as_they_were():
     assert torch.equal(after.texture, before.texture)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("broken", [0, 1, 2])
 @PRESETS
 def test_a_broken_frame_among_the_first_does_not_spoil_the_others(preset, broken):

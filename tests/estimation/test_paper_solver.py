@@ -166,6 +166,7 @@ def observations_in(value: object, seen: set[int] | None = None) -> Iterator[Obs
             yield from observations_in(item, seen)
 
 
+@pytest.mark.slow
 @PRESETS
 def test_memory_is_bounded_by_keyframes(preset):
     settings = {
@@ -184,6 +185,7 @@ def test_memory_is_bounded_by_keyframes(preset):
     assert not list(observations_in(answers))
 
 
+@pytest.mark.slow
 def test_memory_during_the_joint_start_is_bounded_by_its_frames():
     solver = quick_solver(
         "rerendering", solver={"start_frames": 5, "keyframes": {"maximum": 2, "rotation": 0}}
@@ -199,6 +201,7 @@ def test_memory_during_the_joint_start_is_bounded_by_its_frames():
     assert len(list(observations_in(state))) <= 2
 
 
+@pytest.mark.slow
 def test_frames_that_stay_lost_do_not_pile_up():
     _, state = run(quick_solver("rerendering", solver=FAILS), range(12))
     assert len(list(observations_in(state))) <= 3

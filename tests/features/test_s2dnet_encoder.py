@@ -78,6 +78,7 @@ def test_it_finds_more_in_another_light_than_colours_do(encoder):
     assert deep.nearby > 0.8
 
 
+@pytest.mark.slow
 def test_alike_n_finds_no_more_on_photographs_that_neither_saw(encoder, shared_models):
     data = pytest.importorskip("skimage.data", reason="scikit-image's photographs are not installed")
     photographs = [data.astronaut(), data.chelsea(), data.coffee(), data.rocket()]

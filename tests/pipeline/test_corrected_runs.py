@@ -136,6 +136,7 @@ def test_a_finished_run_is_computed_again_from_the_corrected_frame_on(
     assert_alike(tmp_path / "run", tmp_path / "whole")
 
 
+@pytest.mark.slow
 def test_corrections_add_up_and_one_of_the_same_frame_replaces_the_earlier(clip, images, tmp_path, stepped):
     run(clip, images, tmp_path / "run")
     correct_run(tmp_path / "run", [Correction(5, mask=clip.masks[5])])
@@ -157,6 +158,7 @@ def test_resume_with_one_more_correction_does_the_same(clip, images, tmp_path, s
     assert stepped == [6, 7]
 
 
+@pytest.mark.slow
 def test_a_run_both_ways_goes_on_in_the_direction_of_the_corrected_frame(clip, images, tmp_path, stepped):
     run(clip, images, tmp_path / "run", start_frame=4)
     stepped.clear()
@@ -166,6 +168,7 @@ def test_a_run_both_ways_goes_on_in_the_direction_of_the_corrected_frame(clip, i
     assert_alike(tmp_path / "run", tmp_path / "whole")
 
 
+@pytest.mark.slow
 def test_of_several_objects_one_is_corrected(clip, images, tmp_path):
     boxes = [box_of(clip, 0), (0.0, 0.0, 12.0, 12.0)]
     record_objects(open_source(str(images)), settings(), tmp_path / "run", boxes=boxes)
@@ -198,6 +201,7 @@ def test_whatever_ends_a_correction_the_run_is_as_it_was_and_the_same_call_goes_
     assert_alike(tmp_path / "run", tmp_path / "whole")
 
 
+@pytest.mark.slow
 def test_another_correction_than_the_one_that_was_stopped_begins_anew(
     clip, images, tmp_path, monkeypatch, stepped
 ):
@@ -213,6 +217,7 @@ def test_another_correction_than_the_one_that_was_stopped_begins_anew(
     assert one["frame"] == 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moves", [0, 1, 5, 20])
 def test_a_kill_while_the_copy_takes_its_place_is_made_good(clip, images, tmp_path, monkeypatch, moves):
     run(clip, images, tmp_path / "run")
@@ -268,6 +273,7 @@ def test_nothing_is_kept_that_no_milestone_needs(clip, images, tmp_path):
             assert {one.compress_type for one in file.infolist()} == {zipfile.ZIP_DEFLATED}
 
 
+@pytest.mark.slow
 def test_milestones_that_are_too_large_go(clip, images, tmp_path, monkeypatch, caplog, stepped):
     monkeypatch.setattr(checkpoint_folder, "MOST_KEPT", 0)
     run(clip, images, tmp_path / "run")

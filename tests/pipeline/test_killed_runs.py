@@ -159,6 +159,7 @@ def kill_runs(clip, images, tmp_path, kills: int, quick: bool) -> int:
     return done
 
 
+@pytest.mark.slow
 def test_a_few_kills_cost_no_answer(clip, images, tmp_path):
     assert kill_runs(clip, images, tmp_path, 3, quick=True) >= 3
 

@@ -106,6 +106,7 @@ def test_answers_come_as_the_frames_do(clip, quick):
         assert taken == list(range(number + 1))
 
 
+@pytest.mark.slow
 def test_frames_are_not_kept(clip, quick):
     """Of ten images that go through, only those in the optimization may stay, as tensors of their own."""
     alive: list[weakref.ref] = []

@@ -180,6 +180,7 @@ def test_all_later_frames_may_fail(clip, settings):
         np.testing.assert_array_equal(answer.mask, clip.masks[0])
 
 
+@pytest.mark.slow
 def test_a_failed_frame_among_the_first_keeps_its_reason_when_it_is_answered_anew(clip):
     config = load_config(
         preset="rerendering",

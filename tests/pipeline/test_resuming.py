@@ -161,6 +161,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_end(
         assert sum(1 for _ in video.decode(video=0)) == FRAMES
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("owner", "name", "call"), [(Session, "step", 4), (Session, "revisit", 3)], ids=["tracked", "refined"]
 )

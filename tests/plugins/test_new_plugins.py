@@ -53,6 +53,7 @@ def test_a_new_package_has_everything_and_nothing_unfilled(tmp_path, kind):
     assert "## Licence" in files["README.md"]
 
 
+@pytest.mark.slow
 def test_new_packages_pass_their_own_tests(tmp_path):
     folders = [write_plugin(f"my-{kind}", kind, tmp_path) for kind in ("tracker", "features")]
     path = Path(os.pathsep.join(map(str, folders)))

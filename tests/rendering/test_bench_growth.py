@@ -147,6 +147,7 @@ def test_json_is_one_object_and_nothing_else(few_points):
     assert "growth" not in json.loads(bench("--json").stdout)
 
 
+@pytest.mark.slow
 @needs_matplotlib
 @pytest.mark.parametrize("name", ["growth.svg", "growth.png", "growth.pdf"])
 def test_the_plot_shows_what_was_measured(name, tmp_path):

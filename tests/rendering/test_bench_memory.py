@@ -48,6 +48,7 @@ def test_where_nobody_tells_there_is_no_answer(monkeypatch):
     assert peak_memory("torch", Problem(), CPU) is None
 
 
+@pytest.mark.slow
 @needs_proc
 def test_a_backend_needs_at_least_the_gradient_of_the_texture():
     problem = Problem(size=32, frames=1, channels=32, texture=256)

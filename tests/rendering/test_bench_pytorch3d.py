@@ -74,6 +74,7 @@ def test_an_installation_without_a_part_is_broken_and_not_absent(stand_in, monke
     assert f"import of {part} halted" in left_out(CPU)["pytorch3d"]
 
 
+@pytest.mark.slow
 @torch.no_grad()
 def test_covered_pixels_stay_covered_only_with_enough_faces(stand_in, monkeypatch):
     scene = Scene.make(Problem(size=24, frames=1, texture=24, frequency=14), CPU)

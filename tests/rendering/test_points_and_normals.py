@@ -55,6 +55,7 @@ def test_normals_are_unit_vectors_that_face_outward(by):
     assert ((result.normals * away).sum(1) > 0.5).all()
 
 
+@pytest.mark.slow
 @MEASURED
 def test_gradients_of_points_and_normals_are_those_of_finite_differences(name):
     scene = bumpy_sphere((10, 11), frequency=2)

@@ -156,6 +156,7 @@ def recovered(shape: str, backend: str = "auto") -> dict[Start, Pose]:
     return {start: Pose(*part) for start, part in zip(starts, parts, strict=True)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", SHAPES)
 def test_a_moved_object_finds_back(shape, truth):
     assert_found(recovered(shape)[0.0, "tilted", AWAY], truth)

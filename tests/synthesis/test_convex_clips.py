@@ -81,6 +81,7 @@ def test_the_object_drifts_by_the_asked_distance_in_radii():
     assert clip.masks[-1].sum() < clip.masks[0].sum()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", SURFACES)
 def test_the_texture_sticks_to_the_surface(shape):
     clip = synthesize(

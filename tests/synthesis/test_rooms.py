@@ -50,6 +50,7 @@ def test_only_a_camera_that_walks_has_a_room():
     assert make_scene(walk(motion="tumble")).room is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fov", [8.0, 25.0, 75.0])
 def test_the_whole_image_shows_the_room_or_the_object(scenes, fov):
     scene = scenes[fov]
@@ -69,6 +70,7 @@ def test_nothing_of_the_room_is_before_the_object(scenes, fov):
         assert (depth > seen.depth[y, x] - 1e-3).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degrees", [1.0, 9.0])
 def test_nothing_is_before_the_object_however_far_the_camera_goes_round(degrees):
     scene = make_scene(walk(degrees_per_frame=degrees, fov=20.0, object="organic", seed=9007))
@@ -110,6 +112,7 @@ def test_points_of_the_room_move_with_the_objects_pose_and_by_parallax(scenes, f
     assert np.median(np.linalg.norm(moved[far] - object_moved, axis=1)) > 3
 
 
+@pytest.mark.slow
 def test_the_images_background_moves_with_the_room():
     """A patch of wall looks the same where the poses say that it has gone."""
     scene = make_scene(walk(size=(160, 120), fov=60.0, frames=10, degrees_per_frame=2.0, supersample=3))
@@ -128,6 +131,7 @@ def test_the_images_background_moves_with_the_room():
     assert moved < 0.6 * stayed
 
 
+@pytest.mark.slow
 def test_the_lamp_stays_in_the_room():
     """The same point of a plain object is as bright from everywhere: nothing shines along with the camera."""
     scene = make_scene(walk(object="organic", textured=False, size=(160, 120), frames=20, supersample=3))

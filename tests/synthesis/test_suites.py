@@ -138,6 +138,7 @@ def test_a_suite_that_does_not_exist_is_refused_with_the_nearest_name():
         load_suite("standart")
 
 
+@pytest.mark.slow
 def test_the_smoke_suite_is_made_and_every_sequence_opens(tmp_path):
     told: list[str] = []
     folders = make_suite("smoke", tmp_path / "new" / "suite", listener=told.append)
@@ -163,6 +164,7 @@ def test_only_what_is_missing_or_different_is_made_again(tiny, tmp_path):
     assert make(overwrite=True) == ["box", "blob", "card"]
 
 
+@pytest.mark.slow
 def test_two_processes_make_the_same_bytes_as_one(tiny, tmp_path):
     make_suite("smoke", tmp_path / "one")
     told: list[str] = []

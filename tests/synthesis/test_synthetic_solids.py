@@ -74,6 +74,7 @@ def test_the_sides_of_a_card_differ():
 SHAPES_OF_THE_SEED = {"blob", "organic", "assembly", "stick", "knob", "bowl"}
 
 
+@pytest.mark.slow
 def test_the_seed_changes_every_texture_and_the_shapes_that_are_drawn():
     for name in PROCEDURAL:
         one, same, other = (solid(name, seed=seed) for seed in (1, 1, 2))

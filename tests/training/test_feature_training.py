@@ -168,6 +168,7 @@ def test_the_network_has_the_shape_and_the_length_that_it_says():
     torch.testing.assert_close(features.norm(dim=1), torch.ones(2, 48 // STRIDE, 80 // STRIDE))
 
 
+@pytest.mark.slow
 def test_a_short_training_writes_a_network_that_the_encoder_can_run(tmp_path):
     pytest.importorskip("embreex", reason="rendering needs the extra 'synth'")
     pytest.importorskip("onnx", reason="the export needs the package onnx")

@@ -102,6 +102,7 @@ def test_a_moving_disc_is_followed(networks: dict[str, str], every: int) -> None
         assert iou(mask, np.roll(clip.mask, 2 * index, axis=1)) > 0.85
 
 
+@pytest.mark.slow
 def test_it_conforms(networks: dict[str, str]) -> None:
     check_tracker(SamTracker, sizes=((90, 120),), frames=2, **networks)
 
@@ -112,6 +113,7 @@ def test_missing_networks_are_one_sentence(tmp_path: Path, monkeypatch: pytest.M
         SamTracker.from_options(SamTracker.Options())
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not (SHARED / "models").is_dir(), reason="MobileSAM's files are absent")
 def test_mobile_sam_sees_the_car() -> None:
     folder = SHARED / "data" / "car_shadow"

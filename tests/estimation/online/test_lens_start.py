@@ -54,6 +54,7 @@ def error(assumed: bool) -> float:
     return float(np.mean(aligned_rotation_errors(found, truth)))
 
 
+@pytest.mark.slow
 def test_a_longer_lens_is_chosen_and_the_poses_are_better_with_it():
     camera = answers(True)[-1].camera
     assert camera is not None and camera.assumed

@@ -129,6 +129,7 @@ def test_a_step_does_not_change_the_state_it_starts_from():
     assert bool((state.known.vertices == vertices).all())
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("made_anew")
 def test_the_same_video_gives_the_same_start():
     answers = whole_run()[1]
@@ -144,6 +145,7 @@ def test_a_revisit_does_not_change_the_state_either():
     assert same(one, other)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("at", "missing"),
     [(1, None), (8, np.zeros((120, 160), bool))],

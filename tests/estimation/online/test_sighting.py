@@ -40,6 +40,7 @@ def lost_for(frames: int):
     return state
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frames", [1, 7])
 def test_what_comes_back_elsewhere_is_found_while_the_mask_clings_to_the_wall(frames):
     aside = 12

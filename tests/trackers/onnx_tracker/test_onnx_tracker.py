@@ -340,6 +340,7 @@ def test_what_is_no_network_is_refused(saliency, tmp_path):
             build({**saliency, **wrong})
 
 
+@pytest.mark.slow
 def test_real_networks_reach_what_the_docs_promise_on_a_short_clip(shared_data: Path, shared_models: Path):
     pytest.importorskip("onnx")
     folder = shared_data / "car_shadow"

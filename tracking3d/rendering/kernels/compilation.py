@@ -47,10 +47,14 @@ class Kernel:
 
     def __call__(self, *arguments: Any) -> Any:
         """Run it."""
+        return (self._compiled or self.compile())(*arguments)
+
+    def compile(self) -> Callable[..., Any]:
+        """Compile it now, unless it is compiled."""
         if self._compiled is None:
             with _compiling:
                 self._compiled = self._compiled or self._compile()
-        return self._compiled(*arguments)
+        return self._compiled
 
     def _compile(self) -> Callable[..., Any]:
         dispatcher = self._with_cache()
