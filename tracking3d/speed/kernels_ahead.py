@@ -10,15 +10,15 @@ import importlib
 import multiprocessing
 import os
 import pkgutil
+from pathlib import Path
 from types import ModuleType
 
-import tracking3d
 from tracking3d.rendering.kernels.compilation import Kernel
 
 
 def kernel_modules() -> list[str]:
     """Full names of the modules that hold kernels: those in rooms' folders ``kernels``."""
-    found = pkgutil.walk_packages(tracking3d.__path__, "tracking3d.")
+    found = pkgutil.walk_packages([str(Path(__file__).parents[1])], "tracking3d.")
     return sorted(one.name for one in found if ".kernels." in one.name)
 
 
