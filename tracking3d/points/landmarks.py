@@ -32,7 +32,7 @@ DEVIATION = 0.1
 """Pixels that a measurement is off at best."""
 _BETWEEN = 7.0  # pixels between seeds
 _LEAST_VIEWS = 6  # of a landmark that moves the surface
-_SETTLED = np.deg2rad(0.03)
+_SETTLED = np.deg2rad(0.06)
 _HELD = 0.1  # deviation of landmarks from the surface, in radii
 
 

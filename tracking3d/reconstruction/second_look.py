@@ -23,7 +23,7 @@ from tracking3d.points.view import View, open_view
 from tracking3d.reconstruction.views import TextureView
 from tracking3d.results.records import FrameRecord
 
-ROUNDS = 5
+ROUNDS = 4
 LONGEST_SIDE = 240
 """Pixels of the windows in which points are followed."""
 _LEAST_VIEWS = 4
