@@ -74,14 +74,22 @@ def side_by_side(
             os.environ.pop("OMP_NUM_THREADS", None)
 
 
+class _Ended:
+    """The last that a job tells. A process hands its words on in a thread of its own, after the job has returned."""
+
+
 def _follow(futures: Sequence[Future[Any]], queue: Any, told: Callable[[Any], None]) -> None:
-    """Pass on what is told until all is done, or something fails."""
-    waiting: set[Future[Any]] = set(futures)
-    while waiting:
+    """Pass on what is told until all is done and told, or something fails."""
+    waiting, telling = set(futures), len(futures)
+    while waiting or telling:
         done, waiting = wait(waiting, timeout=_LOOK, return_when=FIRST_COMPLETED)
         with suppress(Empty):
-            while True:
-                told(queue.get_nowait())
+            while telling:
+                content = queue.get(timeout=0 if waiting else _LOOK)
+                if isinstance(content, _Ended):
+                    telling -= 1
+                else:
+                    told(content)
         for future in done:
             future.result()
 
@@ -93,4 +101,7 @@ def _begin(queue: Any) -> None:
 
 
 def _run(function: Callable[[Tell, Job], Result], job: Job) -> Result:
-    return function(_queue.put, job)
+    try:
+        return function(_queue.put, job)
+    finally:
+        _queue.put(_Ended())
