@@ -32,6 +32,7 @@ DEVIATION = 0.1
 """Pixels that a measurement is off at best."""
 _BETWEEN = 7.0  # pixels between seeds
 _LEAST_VIEWS = 6  # of a landmark that moves the surface
+_LEAST_SUPPORT = 60  # points in half of the views; with fewer, poses were wrong more often than put right
 _SETTLED = np.deg2rad(0.06)
 _HELD = 0.1  # deviation of landmarks from the surface, in radii
 
@@ -81,6 +82,9 @@ def refine_scene(
 ) -> Scene:
     """Put surface and poses right, as far as the images say how, until the poses hardly turn any more.
 
+    Where the images say little, as of a plain object, or where poses are so wrong that views do not show each other's
+    points, everything stays as it is.
+
     Args:
         scene: As a run left it.
         rounds: How many times at most.
@@ -124,6 +128,8 @@ def _refine_once(scene: Scene, free_focal: bool) -> Scene:
     points = np.einsum("nk,nkd->nd", barycentric, scene.vertices[scene.faces[face]])
     intrinsics, T = np.stack([v.intrinsics for v in views]), np.stack([v.T_cam_obj for v in views])
     measured = chain.measured[there]
+    if np.median(np.isfinite(measured).all(2).sum(1)) < _LEAST_SUPPORT:
+        return scene
     deviation = np.sqrt(chain.variance[there] + DEVIATION**2)
     radius = scene.radius
     found = bundle(points, intrinsics, T, measured, deviation, _HELD * radius, free_focal)
