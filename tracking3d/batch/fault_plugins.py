@@ -7,6 +7,7 @@ first time only: the system then refuses what any program is refused on a full d
 from __future__ import annotations
 
 import os
+from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Any, Self
 
@@ -18,7 +19,7 @@ from tracking3d.trackers.csrt import CsrtTracker
 _FRAME = 2
 
 
-class _Faulty(CsrtTracker):
+class _Faulty(CsrtTracker, ABC):
     """``csrt`` until its third frame."""
 
     class Options(CsrtTracker.Options):
@@ -47,8 +48,9 @@ class _Faulty(CsrtTracker):
             self._fail()
         return super().step(frame)
 
+    @abstractmethod
     def _fail(self) -> None:
-        raise NotImplementedError
+        """End badly."""
 
 
 class Aborting(_Faulty):
