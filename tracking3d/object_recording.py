@@ -214,8 +214,8 @@ class ObjectRecording:
             return
         answer = refinement.answer(frame.index)
         if self._look and answer.refined:
-            T_cam_obj = self._look.pose(answer, frame.image, refinement.mask(answer))
-            refinement.put_right(frame.index, T_cam_obj)
+            T_cam_obj, landmarks = self._look.pose(answer, frame.image, refinement.mask(answer))
+            refinement.put_right(frame.index, T_cam_obj, landmarks)
         refinement.draw(frame)
 
     def finish(self) -> None:

@@ -40,7 +40,7 @@ def settled(T: np.ndarray, most: int = 20, camera=CAMERA) -> tuple[SecondLook, n
     for index, (image, mask) in enumerate(FRAMES):
         look.see(answer(index, T[index]), image, mask)
     look.settle()
-    poses = [look.pose(answer(index, T[index]), *FRAMES[index]) for index in range(len(T))]
+    poses = [look.pose(answer(index, T[index]), *FRAMES[index])[0] for index in range(len(T))]
     return look, np.stack(poses)
 
 
@@ -75,7 +75,8 @@ def test_a_lost_frame_is_not_looked_at_but_goes_with_the_object():
         record = answer(index, off[index], Status.LOST if lost else Status.TRACKED)
         look.see(record, nothing if lost else image, mask)
     look.settle()
-    found = look.pose(answer(4, off[4], Status.LOST), nothing, FRAMES[4][1])
+    found, landmarks = look.pose(answer(4, off[4], Status.LOST), nothing, FRAMES[4][1])
+    assert landmarks is None
     assert np.isfinite(found).all()
     assert np.rad2deg(Rotation.from_matrix(found[:3, :3] @ off[4, :3, :3].T).magnitude()) < 6
 
@@ -95,4 +96,16 @@ def test_too_few_frames_or_poses_that_are_no_numbers_change_nothing():
 def test_without_frames_there_is_nothing_to_settle():
     look = SecondLook(ball(), CAMERA, (), 20)
     look.settle()
-    assert np.array_equal(look.pose(answer(0, TRUE[0]), *FRAMES[0]), TRUE[0])
+    T_cam_obj, landmarks = look.pose(answer(0, TRUE[0]), *FRAMES[0])
+    assert np.array_equal(T_cam_obj, TRUE[0])
+    assert landmarks is None
+
+
+@pytest.mark.parametrize("most", [20, 5])
+def test_landmarks_speak_for_poses_that_were_put_right_and_few_for_an_object_in_other_poses(most):
+    look, _ = settled(disturbed(), most)
+    right = [look.pose(answer(index, T), *FRAMES[index])[1] for index, T in enumerate(disturbed())]
+    assert min(right) > 60
+    other, _ = settled(TRUE[::-1].copy(), most)
+    wrong = [other.pose(answer(index, T), *FRAMES[index])[1] for index, T in enumerate(TRUE[::-1])]
+    assert np.median(wrong) < 0.5 * np.median(right)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tracking3d.bundle_adjustment import Structure, Tracks, adjust
 from tracking3d.points.view import Array
@@ -32,6 +33,7 @@ class Bundled:
         weight: ``(T, N)`` that the measurements had in the end: 0 where there is none.
         focal_factor: By which all focal lengths are to be multiplied.
         cost: Mean robust loss of the measurements, by weight.
+        agreeing: ``(T, N)`` bool, the measurements that the points and poses explain.
     """
 
     points: Array
@@ -39,6 +41,7 @@ class Bundled:
     weight: Array
     focal_factor: float
     cost: float
+    agreeing: NDArray[np.bool_]
 
 
 def intersect(
@@ -90,7 +93,7 @@ def bundle(
     known = np.isfinite(deviation) & np.isfinite(measured).all(2)
     known &= (known.sum(1) >= LEAST_MEASURED)[:, None]
     if not known.any():
-        return Bundled(points, T_cam_obj.copy(), np.zeros(deviation.shape), 1.0, math.inf)
+        return Bundled(points, T_cam_obj.copy(), np.zeros(deviation.shape), 1.0, math.inf, known)
     # One camera for all views: its pixels are those of the middle one.
     focal = float(np.median(intrinsics[:, :2]))
     pixels = focal * (measured - intrinsics[:, None, 2:]) / intrinsics[:, None, :2]
@@ -117,7 +120,7 @@ def bundle(
     T[:, :3, :3], T[:, :3, 3] = found.R, found.t
     far = np.where(known, found.residual, 0.0) / (_OUTLIER * np.where(known, spread, 1.0))
     weight = np.where(known, 1 / (1 + far**2) ** 2 / spread**2, 0.0)
-    return Bundled(found.points, T, weight, found.focal_factor, found.cost)
+    return Bundled(found.points, T, weight, found.focal_factor, found.cost, known & (far < 1))
 
 
 def _move_points(

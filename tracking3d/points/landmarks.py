@@ -8,7 +8,7 @@ points are followed better: it is done several times.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -46,12 +46,15 @@ class Scene:
         vertices: ``(V, 3)`` in object coordinates.
         faces: ``(F, 3)``.
         focal_factor: By which the views' focal lengths are those that they were opened with.
+        support: How many landmarks each view shows where surface and poses put them; empty before they were looked
+            for. Where they are too few to be bundled, how many could be followed into it.
     """
 
     views: list[View | None]
     vertices: Array
     faces: NDArray[np.int64]
     focal_factor: float = 1.0
+    support: Mapping[int, int] = field(default_factory=dict)
 
     @property
     def radius(self) -> float:
@@ -128,14 +131,17 @@ def _refine_once(scene: Scene, free_focal: bool) -> Scene:
     points = np.einsum("nk,nkd->nd", barycentric, scene.vertices[scene.faces[face]])
     intrinsics, T = np.stack([v.intrinsics for v in views]), np.stack([v.T_cam_obj for v in views])
     measured = chain.measured[there]
-    if np.median(np.isfinite(measured).all(2).sum(1)) < _LEAST_SUPPORT:
-        return scene
+    followed = np.isfinite(measured).all(2).sum(1)
+    if np.median(followed) < _LEAST_SUPPORT:
+        return replace(scene, support=dict(zip(there, followed.tolist(), strict=True)))
     deviation = np.sqrt(chain.variance[there] + DEVIATION**2)
     radius = scene.radius
     found = bundle(points, intrinsics, T, measured, deviation, _HELD * radius, free_focal)
     kept = (found.weight > 0).sum(0) >= min(_LEAST_VIEWS, len(there))
     vertices = move_surface(scene.vertices, scene.faces, face[kept], barycentric[kept], found.points[kept])
-    return scene.redrawn(vertices, dict(zip(there, found.T_cam_obj, strict=True)), found.focal_factor)
+    support = dict(zip(there, found.agreeing.sum(1).tolist(), strict=True))
+    redrawn = scene.redrawn(vertices, dict(zip(there, found.T_cam_obj, strict=True)), found.focal_factor)
+    return replace(redrawn, support=support)
 
 
 def seeds(view: View, vertices: Array, faces: NDArray[np.int64]) -> tuple[NDArray[np.int64], Array, Array]:

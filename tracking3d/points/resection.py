@@ -15,14 +15,17 @@ TURNS = 2
 _FIXED = 1e-6  # deviation in radii of points that stay where they are
 
 
-def resect(scene: Scene, view: View, known: Sequence[int]) -> View:
-    """A view drawn at the pose at which it shows what other views show.
+def resect(scene: Scene, view: View, known: Sequence[int]) -> tuple[View, float]:
+    """A view drawn at the pose at which it shows what other views show, and how much of that it shows there.
+
+    The second is in [0, 1]: the share of their points that it shows where surface and pose put them.
 
     Args:
         scene: Surface and views, put right; see `tracking3d.points.landmarks.refine_scene`.
         view: The further one, drawn at about its pose.
         known: Which views of the scene are looked at; those near in time show most of what it shows.
     """
+    share = 0.0
     for _ in range(TURNS):
         others = [scene.views[index] for index in known]
         warps = Warps([*others, view], TOLERANCE * scene.radius)
@@ -30,18 +33,19 @@ def resect(scene: Scene, view: View, known: Sequence[int]) -> View:
             _carried(scene, warps, source) for source in range(len(others)) if others[source] is not None
         ]
         if not found:
-            return view
+            return view, share
         points, measured, deviation = (np.concatenate(part) for part in zip(*found, strict=True))
-        T = bundle(
+        placed = bundle(
             points,
             view.intrinsics[None],
             view.T_cam_obj[None],
             measured[None],
             deviation[None],
             _FIXED * scene.radius,
-        ).T_cam_obj[0]
-        view = draw(view, scene.vertices, scene.faces, T)
-    return view
+        )
+        share = float(placed.agreeing[0].mean()) if len(points) else 0.0
+        view = draw(view, scene.vertices, scene.faces, placed.T_cam_obj[0])
+    return view, share
 
 
 def _carried(scene: Scene, warps: Warps, source: int) -> tuple[Array, Array, Array]:

@@ -75,8 +75,8 @@ class SecondLook:
         factor = scene.focal_factor
         self.camera = replace(self.camera, fx=factor * self.camera.fx, fy=factor * self.camera.fy)
 
-    def pose(self, record: FrameRecord, image: Image, mask: NDArray[np.bool_]) -> _Pose:
-        """The pose ``(4, 4)`` of any frame, after `settle`.
+    def pose(self, record: FrameRecord, image: Image, mask: NDArray[np.bool_]) -> tuple[_Pose, int | None]:
+        """The pose ``(4, 4)`` of any frame after `settle`, and how many landmarks speak for it; None is unknown.
 
         Args:
             record: Its answer.
@@ -85,21 +85,24 @@ class SecondLook:
         """
         scene = self._scene
         if scene is None or not np.isfinite(record.T_cam_obj).all():
-            return record.T_cam_obj
+            return record.T_cam_obj, None
         after = bisect(self._bundled, record.index)
         around = [at for at in (after - 1, after) if 0 <= at < len(self._bundled)]
         nearest = min(around, key=lambda at: abs(self._bundled[at] - record.index))
         kept = scene.views[nearest]
         assert kept is not None
         if self._bundled[nearest] == record.index:
-            return kept.T_cam_obj
+            return kept.T_cam_obj, scene.support.get(nearest)
         # What the nearest frame's pose was moved by in object coordinates: mostly, the object frame itself moved.
         T_before_now = (
             np.linalg.inv(self._through_lens(self._before[self._bundled[nearest]])) @ kept.T_cam_obj
         )
         predicted = self._through_lens(record.T_cam_obj) @ T_before_now
         view = None if record.status is Status.LOST else self._view(predicted, image, mask)
-        return predicted if view is None else resect(scene, view, around).T_cam_obj
+        if view is None:
+            return predicted, None
+        resected, share = resect(scene, view, around)
+        return resected.T_cam_obj, round(share * max(scene.support.get(at, 0) for at in around))
 
     def moved(self, model: ObjectModel) -> ObjectModel:
         """The model with the surface that was found."""

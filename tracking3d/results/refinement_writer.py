@@ -84,13 +84,16 @@ class RefinementWriter:
         """The answer for frame ``index`` as it is now: the second one, or the causal one where there is none."""
         return self._records.get(index) or self.causal[index]
 
-    def put_right(self, index: int, T_cam_obj: NDArray[np.float64]) -> None:
+    def put_right(self, index: int, T_cam_obj: NDArray[np.float64], landmarks: int | None) -> None:
         """Give a second answer the pose ``T_cam_obj`` ``(4, 4)``, that of the camera of the end; causal ones stand.
 
-        It is not kept for a run that is stopped here and goes on later: that finds it anew.
+        ``landmarks`` says how many points speak for the pose, where that is known. It is not kept for a run
+        that is stopped here and goes on later: that finds it anew.
         """
         if (record := self._records.get(index)) is not None:
-            self._records[index] = replace(record, T_cam_obj=T_cam_obj, camera=None)
+            known = {} if landmarks is None else {"landmarks": float(landmarks)}
+            losses = record.losses | known
+            self._records[index] = replace(record, T_cam_obj=T_cam_obj, camera=None, losses=losses)
 
     def draw(self, frame: Frame) -> None:
         """Draw the answer for a frame.

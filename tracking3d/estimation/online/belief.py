@@ -142,6 +142,7 @@ class Belief:
         followed: Points in the last frame.
         waiting: First frames that wait for the start, with their answers so far; None once it is done.
         space: What is made of the encoder's features; None leaves them as they are.
+        strength: Of the object's texture, the largest that a waiting frame has shown; see `texture_strength`.
         due: Motion at which the next start is tried.
         waits_for: Why the start waits, where that is not lack of motion.
         usual: What tracked frames have cost.
@@ -160,6 +161,7 @@ class Belief:
     followed: FollowedPoints
     waiting: tuple[tuple[View, FrameEstimate], ...] | None = ()
     space: FeatureSpace | None = None
+    strength: float = 0.0
     due: float = 0.0
     waits_for: str = ""
     usual: Usual = field(default_factory=Usual)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from tracking3d.config.solvers import OnlineConfig
 from tracking3d.estimation.estimate import FrameEstimate
@@ -18,6 +20,8 @@ from tracking3d.estimation.online.points import MOST_POINTS, FollowedPoints, new
 from tracking3d.estimation.online.start import Start, by_turning, solve_start
 from tracking3d.estimation.online.structure import motion_enough
 from tracking3d.estimation.online.surface_fit import FitWeights
+from tracking3d.estimation.online.texture_strength import PLAIN, texture_strength
+from tracking3d.geometry.pose import Pose
 
 MOTION = 0.03
 """Change of form at which a start is tried first, see `motion_enough`."""
@@ -34,6 +38,12 @@ _SPARSE = 0.6  # of `MOST_POINTS`, below which new points are looked for
 _SAME_PLACE = 1.5  # pixels
 _MATCHED_WITH = 3  # frames before
 _LIKE_NOISE = 1.3  # times the change between neighbours that is none
+_DECIDED = (
+    0.02  # logarithm of two costs' ratio, times the change of form, from which the better start is believed
+)
+_MOTION_ENOUGH = 0.3  # change of form from which more of it decides nothing
+_SAME_AXIS = 0.87  # cosine of 30 degrees
+_TWO_WAYS = "the first frames can be explained in two ways, as when near and far are exchanged, until it turns further"
 _STILL = "nothing shows that the object turns: it is still, or turns about an axis of its symmetry"
 
 
@@ -85,8 +95,14 @@ def solved_start(state: Belief, config: OnlineConfig) -> tuple[Belief, Start | N
     """The start, where the waiting frames can tell; else None, and when it is tried next."""
     waiting = state.waiting or ()
     views = [view for view, _ in waiting if view.mask is not None]
+    if waiting and (mask := waiting[-1][0].mask) is not None:
+        state = replace(state, strength=max(state.strength, texture_strength(state.grey, mask)))
     if len(views) < _FEWEST:
         return state, None
+    if state.strength < PLAIN:
+        if len(views) < _FEWEST_BY_TURNING or (len(views) - _FEWEST_BY_TURNING) % _AGAIN:
+            return state, None
+        return _start_without_points(state, views, config)
     names = np.unique(np.concatenate([view.points.landmark for view in views]))
     motion = motion_enough(tracks_of(views, names[~state.known.candidate[names]]))
     still_there = np.isin(views[0].points.landmark, views[-1].points.landmark)
@@ -104,15 +120,44 @@ def solved_start(state: Belief, config: OnlineConfig) -> tuple[Belief, Start | N
     if motion >= MOTION:
         cameras = lens_hypotheses(state.camera)
         starts = solve_start(state.known, cameras, views, weights, config.surface_prior)
+    if not waited and shared > _LEAST_SHARED and motion < _MOTION_ENOUGH and _undecided(starts, motion):
+        return replace(state, waits_for=_TWO_WAYS), None
     if not starts or starts[0].bundle > _DOUBTFUL:
         if not waited and not wild and (shared > _LASTING or len(views) < _FEWEST_BY_TURNING):
             return state, None
-        if not _changed(views):
-            kept = _fewer(waiting) if waited else waiting
-            return replace(state, waiting=kept, waits_for=_STILL), None
-        turning = by_turning(state.known, state.camera, views, weights)
-        starts = sorted([*starts, *turning], key=lambda start: start.cost)
+        state, turning = _start_without_points(state, views, config)
+        if turning is None:
+            return state, None
+        starts = sorted([*starts, turning], key=lambda start: start.cost)
     return state, starts[0] if starts else None
+
+
+def _start_without_points(
+    state: Belief, views: list[View], config: OnlineConfig
+) -> tuple[Belief, Start | None]:
+    """The start from pixels and outlines alone; None where nothing shows that the object turns."""
+    waiting = state.waiting or ()
+    if not _changed(views):
+        kept = _fewer(waiting) if len(views) >= _MOST else waiting
+        return replace(state, waiting=kept, waits_for=_STILL), None
+    return state, by_turning(state.known, state.camera, views, FitWeights(smoothness=config.smoothness))[0]
+
+
+def _undecided(starts: list[Start], motion: float) -> bool:
+    """Whether another start, whose object turns otherwise, costs hardly more than the best for so little motion."""
+    rivals = [start for start in starts[1:] if _otherwise(starts[0], start)]
+    return bool(rivals) and motion * math.log(rivals[0].cost / max(starts[0].cost, 1e-9)) < _DECIDED
+
+
+def _otherwise(one: Start, other: Start) -> bool:
+    """Whether the object turns about another axis in two starts; by how much depends on the lens and on the relief."""
+    a, b = (_turn(start.known.keyframes[0].pose, start.known.keyframes[-1].pose) for start in (one, other))
+    return bool(a @ b < _SAME_AXIS * np.linalg.norm(a) * np.linalg.norm(b))
+
+
+def _turn(before: Pose, after: Pose) -> NDArray[np.float64]:
+    """``(3,)`` rotation vector in camera coordinates."""
+    return Rotation.from_matrix((after.R @ before.R.T).cpu().numpy()).as_rotvec()
 
 
 def _changed(views: list[View]) -> bool:
