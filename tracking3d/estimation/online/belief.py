@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -35,6 +36,7 @@ class View:
         keypoints: For matching; ``keypoint_landmark`` ``(M,)`` says which landmark each is.
         texture: What the frame shows of the feature texture, as last computed; None before.
         mask_weight: How far the mask is believed, in [0, 1].
+        strength: Of the texture inside the mask, as far as it was asked for; see `texture_strength`.
     """
 
     observation: Observation
@@ -45,6 +47,7 @@ class View:
     keypoint_landmark: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     texture: BackProjection | None = None
     mask_weight: float = 1.0
+    strength: float = math.inf
 
     @property
     def index(self) -> int:
@@ -142,7 +145,6 @@ class Belief:
         followed: Points in the last frame.
         waiting: First frames that wait for the start, with their answers so far; None once it is done.
         space: What is made of the encoder's features; None leaves them as they are.
-        strength: Of the object's texture, the largest that a waiting frame has shown; see `texture_strength`.
         due: Motion at which the next start is tried.
         waits_for: Why the start waits, where that is not lack of motion.
         usual: What tracked frames have cost.
@@ -161,7 +163,6 @@ class Belief:
     followed: FollowedPoints
     waiting: tuple[tuple[View, FrameEstimate], ...] | None = ()
     space: FeatureSpace | None = None
-    strength: float = 0.0
     due: float = 0.0
     waits_for: str = ""
     usual: Usual = field(default_factory=Usual)

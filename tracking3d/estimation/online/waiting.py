@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -37,6 +38,7 @@ _LEAST_SHARED = 0.1  # share below which nothing more will be learned of the fir
 _SPARSE = 0.6  # of `MOST_POINTS`, below which new points are looked for
 _SAME_PLACE = 1.5  # pixels
 _MATCHED_WITH = 3  # frames before
+_SLIP = 3  # frames
 _LIKE_NOISE = 1.3  # times the change between neighbours that is none
 _DECIDED = (
     0.02  # logarithm of two costs' ratio, times the change of form, from which the better start is believed
@@ -51,9 +53,12 @@ def waiting_view(
     known: ObjectMap, earlier: tuple[View, ...], view: View, image: NDArray[np.uint8]
 ) -> tuple[ObjectMap, View]:
     """A view whose points are followed, or found again, in it; their depth is not known yet."""
-    if len(view.points) >= _SPARSE * MOST_POINTS:
+    if _gone((*earlier, view)):
+        return known, replace(view, points=FollowedPoints.none())
+    if (inside := view.mask) is not None:
+        view = replace(view, strength=texture_strength(image, inside))
+    if inside is None or len(view.points) >= _SPARSE * MOST_POINTS:
         return known, view
-    inside = view.mask if view.mask is not None else np.ones(image.shape, bool)
     keypoints = detect(image, inside)
     label = np.full(len(keypoints), -1, np.int64)
     if len(view.points) and len(keypoints):
@@ -95,19 +100,19 @@ def solved_start(state: Belief, config: OnlineConfig) -> tuple[Belief, Start | N
     """The start, where the waiting frames can tell; else None, and when it is tried next."""
     waiting = state.waiting or ()
     views = [view for view, _ in waiting if view.mask is not None]
-    if waiting and (mask := waiting[-1][0].mask) is not None:
-        state = replace(state, strength=max(state.strength, texture_strength(state.grey, mask)))
     if len(views) < _FEWEST:
         return state, None
-    if state.strength < PLAIN:
-        if len(views) < _FEWEST_BY_TURNING or (len(views) - _FEWEST_BY_TURNING) % _AGAIN:
+    gone = _gone([view for view, _ in waiting])  # what was seen until then has to do
+    if np.median([view.strength for view in views]) < PLAIN:
+        enough = len(views) >= _FEWEST_BY_TURNING and (len(views) - _FEWEST_BY_TURNING) % _AGAIN == 0
+        if not enough and not gone:
             return state, None
         return _start_without_points(state, views, config)
     names = np.unique(np.concatenate([view.points.landmark for view in views]))
     motion = motion_enough(tracks_of(views, names[~state.known.candidate[names]]))
     still_there = np.isin(views[0].points.landmark, views[-1].points.landmark)
     shared = float(still_there.mean()) if len(still_there) else 0.0
-    waited = len(views) >= _MOST
+    waited = gone or len(views) >= _MOST
     # Points that run wild show no more motion when there is more of it: then pixels and outlines are asked.
     wild = motion > _WILD and len(views) >= _FEWEST_BY_TURNING
     due = max(state.due, MOTION)
@@ -158,6 +163,11 @@ def _otherwise(one: Start, other: Start) -> bool:
 def _turn(before: Pose, after: Pose) -> NDArray[np.float64]:
     """``(3,)`` rotation vector in camera coordinates."""
     return Rotation.from_matrix((after.R @ before.R.T).cpu().numpy()).as_rotvec()
+
+
+def _gone(views: Sequence[View]) -> bool:
+    """Whether the object is out of sight for longer than a mask tracker's slip."""
+    return len(views) > _SLIP and all(view.mask is None for view in views[-_SLIP:])
 
 
 def _changed(views: list[View]) -> bool:
