@@ -202,3 +202,73 @@ def test_points_that_run_wild_give_way_to_turning_without_more_motion(asked):
     _, start = solved_start(replace(given, due=9.0), CONFIG)
     assert start is not None and start.origin == "turning"
     assert asked["turning"] == [15]
+
+
+def test_a_plain_object_is_started_without_points_once_it_had_time_to_turn(asked):
+    given = belief_of(list(np.linspace(0, 60, 13)))
+    plain = [(replace(view, strength=0.1), answer) for view, answer in given.waiting]
+    early = replace(given, waiting=tuple(plain[:12]))
+    assert solved_start(early, CONFIG) == (early, None)
+    _, start = solved_start(replace(given, waiting=tuple(plain)), CONFIG)
+    assert start is not None and start.origin == "turning"
+    assert not asked["points"]
+
+
+def test_one_frame_that_looks_plain_or_printed_does_not_decide(asked):
+    given = belief_of(STEADY)
+    first, *others = given.waiting
+    mixed = ((replace(first[0], strength=0.1), first[1]), *others)
+    assert solved_start(replace(given, waiting=mixed), CONFIG)[1].origin == "points"
+
+
+def test_an_object_that_has_left_is_solved_with_what_was_seen_of_it(asked):
+    asked["bundle"] = 0.6
+    given = belief_of([*STEADY, 30.0, 30.0, 30.0])
+    slip = replace(given, waiting=hidden(given.waiting[:7], 1))
+    assert solved_start(slip, CONFIG)[1] is None
+    assert solved_start(replace(given, waiting=hidden(given.waiting, 3)), CONFIG)[1].origin == "turning"
+
+
+def hidden(waiting, last: int):
+    return (*waiting[:-last], *((replace(view, mask=None), answer) for view, answer in waiting[-last:]))
+
+
+@pytest.mark.parametrize(
+    ("degrees", "cost", "decided"),
+    [(-1.0, 1.05, False), (-1.0, 3.0, True), (1.6, 1.05, True)],
+    ids=["reversed", "reversed but costly", "further about the same axis"],
+)
+def test_a_start_waits_while_another_that_turns_otherwise_costs_hardly_more(
+    monkeypatch, degrees, cost, decided
+):
+    def solve_start(known, cameras, views, weights, prior):
+        return [
+            Start(replace(known, keyframes=turned_views(views, sign)), price, 0.05, "points", cameras[0])
+            for sign, price in ((1.0, 1.0), (degrees, cost))
+        ]
+
+    def turned_views(views, sign):
+        return tuple(replace(view, pose=turned(sign * 2.0 * place)) for place, view in enumerate(views))
+
+    monkeypatch.setattr(waiting, "solve_start", solve_start)
+    state, start = solved_start(belief_of([0.0, 3.0, 6.0, 9.0, 12.0]), CONFIG)
+    assert (start is not None) is decided
+    assert ("two ways" in state.waits_for) is not decided
+
+
+def test_points_do_not_stay_where_an_object_was_that_has_left(first):
+    known, view = first
+    away = replace(view, mask=None)
+    _, slipped = waiting_view(known, (view,), away, IMAGE)
+    assert len(slipped.points) == len(view.points)
+    _, gone = waiting_view(known, (view, away, away), away, IMAGE)
+    assert len(gone.points) == 0
+
+
+def test_points_that_are_followed_badly_decide_at_once(asked, monkeypatch):
+    asked["bundle"] = 0.4
+    monkeypatch.setattr(waiting, "_otherwise", lambda one, other: True)
+    known = belief_of(STEADY)
+    one = waiting.solve_start(known.known, [CAMERA], [], None, 0.0)[0]
+    assert not waiting._undecided([one, one], 0.04)
+    assert waiting._undecided([replace(one, bundle=0.1), one], 0.04)

@@ -44,6 +44,7 @@ _DECIDED = (
     0.02  # logarithm of two costs' ratio, times the change of form, from which the better start is believed
 )
 _MOTION_ENOUGH = 0.3  # change of form from which more of it decides nothing
+_WELL_FOLLOWED = 0.25  # bundle cost of points that go on to be
 _SAME_AXIS = 0.87  # cosine of 30 degrees
 _TWO_WAYS = "the first frames can be explained in two ways, as when near and far are exchanged, until it turns further"
 _STILL = "nothing shows that the object turns: it is still, or turns about an axis of its symmetry"
@@ -149,7 +150,12 @@ def _start_without_points(
 
 
 def _undecided(starts: list[Start], motion: float) -> bool:
-    """Whether another start, whose object turns otherwise, costs hardly more than the best for so little motion."""
+    """Whether another start, whose object turns otherwise, costs hardly more than the best for so little motion.
+
+    Only points that are followed well tell more when there is more motion.
+    """
+    if not starts or starts[0].bundle > _WELL_FOLLOWED:
+        return False
     rivals = [start for start in starts[1:] if _otherwise(starts[0], start)]
     return bool(rivals) and motion * math.log(rivals[0].cost / max(starts[0].cost, 1e-9)) < _DECIDED
 
