@@ -214,8 +214,7 @@ class ObjectRecording:
             return
         answer = refinement.answer(frame.index)
         if self._look and answer.refined:
-            T_cam_obj, landmarks = self._look.pose(answer, frame.image, refinement.mask(answer))
-            refinement.put_right(frame.index, T_cam_obj, landmarks)
+            refinement.put_right(frame.index, *self._look.pose(answer, frame.image, refinement.mask(answer)))
         refinement.draw(frame)
 
     def finish(self) -> None:

@@ -105,7 +105,8 @@ def test_without_frames_there_is_nothing_to_settle():
 def test_landmarks_speak_for_poses_that_were_put_right_and_few_for_an_object_in_other_poses(most):
     look, _ = settled(disturbed(), most)
     right = [look.pose(answer(index, T), *FRAMES[index])[1] for index, T in enumerate(disturbed())]
-    assert min(right) > 60
+    assert min(one.agreeing for one in right) > 60
+    assert min(one.agreeing / one.followed for one in right) > 0.6
     other, _ = settled(TRUE[::-1].copy(), most)
     wrong = [other.pose(answer(index, T), *FRAMES[index])[1] for index, T in enumerate(TRUE[::-1])]
-    assert np.median(wrong) < 0.5 * np.median(right)
+    assert np.median([one.agreeing for one in wrong]) < 0.5 * np.median([one.agreeing for one in right])

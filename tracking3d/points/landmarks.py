@@ -37,6 +37,19 @@ _SETTLED = np.deg2rad(0.06)
 _HELD = 0.1  # deviation of landmarks from the surface, in radii
 
 
+@dataclass(frozen=True)
+class Support:
+    """What landmarks say of a view's pose.
+
+    Attributes:
+        followed: How many of them were found in the view.
+        agreeing: How many of those where surface and pose put them; 0 where they were too few to be asked.
+    """
+
+    followed: int
+    agreeing: int
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """A rigid surface in T views.
@@ -46,15 +59,14 @@ class Scene:
         vertices: ``(V, 3)`` in object coordinates.
         faces: ``(F, 3)``.
         focal_factor: By which the views' focal lengths are those that they were opened with.
-        support: How many landmarks each view shows where surface and poses put them; empty before they were looked
-            for. Where they are too few to be bundled, how many could be followed into it.
+        support: What landmarks say of each view's pose; empty before they were looked for.
     """
 
     views: list[View | None]
     vertices: Array
     faces: NDArray[np.int64]
     focal_factor: float = 1.0
-    support: Mapping[int, int] = field(default_factory=dict)
+    support: Mapping[int, Support] = field(default_factory=dict)
 
     @property
     def radius(self) -> float:
@@ -131,15 +143,18 @@ def _refine_once(scene: Scene, free_focal: bool) -> Scene:
     points = np.einsum("nk,nkd->nd", barycentric, scene.vertices[scene.faces[face]])
     intrinsics, T = np.stack([v.intrinsics for v in views]), np.stack([v.T_cam_obj for v in views])
     measured = chain.measured[there]
-    followed = np.isfinite(measured).all(2).sum(1)
+    followed = np.isfinite(measured).all(2).sum(1).tolist()
     if np.median(followed) < _LEAST_SUPPORT:
-        return replace(scene, support=dict(zip(there, followed.tolist(), strict=True)))
+        return replace(
+            scene, support={at: Support(count, 0) for at, count in zip(there, followed, strict=True)}
+        )
     deviation = np.sqrt(chain.variance[there] + DEVIATION**2)
     radius = scene.radius
     found = bundle(points, intrinsics, T, measured, deviation, _HELD * radius, free_focal)
     kept = (found.weight > 0).sum(0) >= min(_LEAST_VIEWS, len(there))
     vertices = move_surface(scene.vertices, scene.faces, face[kept], barycentric[kept], found.points[kept])
-    support = dict(zip(there, found.agreeing.sum(1).tolist(), strict=True))
+    counts = zip(there, followed, found.agreeing.sum(1).tolist(), strict=True)
+    support = {at: Support(count, agreeing) for at, count, agreeing in counts}
     redrawn = scene.redrawn(vertices, dict(zip(there, found.T_cam_obj, strict=True)), found.focal_factor)
     return replace(redrawn, support=support)
 

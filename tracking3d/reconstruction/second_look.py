@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tracking3d.estimation.estimate import ObjectModel, Status
 from tracking3d.frames import Image
 from tracking3d.geometry.camera import Camera
-from tracking3d.points.landmarks import Scene, refine_scene
+from tracking3d.points.landmarks import Scene, Support, refine_scene
 from tracking3d.points.resection import resect
 from tracking3d.points.view import View, open_view
 from tracking3d.reconstruction.views import TextureView
@@ -75,8 +75,10 @@ class SecondLook:
         factor = scene.focal_factor
         self.camera = replace(self.camera, fx=factor * self.camera.fx, fy=factor * self.camera.fy)
 
-    def pose(self, record: FrameRecord, image: Image, mask: NDArray[np.bool_]) -> tuple[_Pose, int | None]:
-        """The pose ``(4, 4)`` of any frame after `settle`, and how many landmarks speak for it; None is unknown.
+    def pose(
+        self, record: FrameRecord, image: Image, mask: NDArray[np.bool_]
+    ) -> tuple[_Pose, Support | None]:
+        """The pose ``(4, 4)`` of any frame after `settle`, and what landmarks say of it; None where nothing does.
 
         Args:
             record: Its answer.
@@ -102,7 +104,9 @@ class SecondLook:
         if view is None:
             return predicted, None
         resected, share = resect(scene, view, around)
-        return resected.T_cam_obj, round(share * max(scene.support.get(at, 0) for at in around))
+        there = [scene.support[at] for at in around if at in scene.support]
+        followed = max((one.followed for one in there), default=0)
+        return resected.T_cam_obj, Support(followed, round(share * followed))
 
     def moved(self, model: ObjectModel) -> ObjectModel:
         """The model with the surface that was found."""

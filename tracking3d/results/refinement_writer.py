@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
+from tracking3d.points.landmarks import Support
 from tracking3d.results import description, layout
 from tracking3d.results.files import read_mask, write_mask, writing
 from tracking3d.results.pictures import Pictures
@@ -84,15 +85,16 @@ class RefinementWriter:
         """The answer for frame ``index`` as it is now: the second one, or the causal one where there is none."""
         return self._records.get(index) or self.causal[index]
 
-    def put_right(self, index: int, T_cam_obj: NDArray[np.float64], landmarks: int | None) -> None:
+    def put_right(self, index: int, T_cam_obj: NDArray[np.float64], support: Support | None) -> None:
         """Give a second answer the pose ``T_cam_obj`` ``(4, 4)``, that of the camera of the end; causal ones stand.
 
-        ``landmarks`` says how many points speak for the pose, where that is known. It is not kept for a run
-        that is stopped here and goes on later: that finds it anew.
+        ``support`` is what landmarks say of it, where they say anything. It is not kept for a run that is stopped here
+        and goes on later: that finds it anew.
         """
         if (record := self._records.get(index)) is not None:
-            known = {} if landmarks is None else {"landmarks": float(landmarks)}
-            losses = record.losses | known
+            losses = record.losses
+            if support is not None:
+                losses = losses | {"landmarks": float(support.agreeing), "followed": float(support.followed)}
             self._records[index] = replace(record, T_cam_obj=T_cam_obj, camera=None, losses=losses)
 
     def draw(self, frame: Frame) -> None:
