@@ -18,6 +18,7 @@ from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.frames import Frame, MaskEstimate, SkippedFrame
 from tracking3d.reconstruction import BELIEVED, TextureView, kept_views, texture_view, textured
 from tracking3d.reconstruction.second_look import SecondLook
+from tracking3d.reconstruction.support import supported_answer
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.refinement_writer import RefinementWriter
@@ -214,7 +215,9 @@ class ObjectRecording:
             return
         answer = refinement.answer(frame.index)
         if self._look and answer.refined:
-            refinement.put_right(frame.index, *self._look.pose(answer, frame.image, refinement.mask(answer)))
+            T_cam_obj, support = self._look.pose(answer, frame.image, refinement.mask(answer))
+            judged = () if support is None else supported_answer(answer, support)
+            refinement.put_right(frame.index, T_cam_obj, *judged)
         refinement.draw(frame)
 
     def finish(self) -> None:

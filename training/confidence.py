@@ -3,7 +3,8 @@
 ``python training/confidence.py BENCHMARK ... --evidence silhouette,features,matching`` reads every run in the folders
 ``--out`` of ``tracking3d evaluate suite``. Evidence are names of losses in ``frames.jsonl``, and ``has_mask``,
 ``iou_initial`` and ``recorded`` (the confidence that the run said itself), and of the online solver's runs what its
-confidence is made of (`tracking3d.estimation.online.judgement.weighed`). Without ``--evidence`` all losses count. A
+confidence is made of (`tracking3d.estimation.online.judgement.weighed`), and of refined answers what landmarks say of
+them (`tracking3d.reconstruction.support.weighed`). Without ``--evidence`` all losses count. A
 name with a sign, ``--evidence=-silhouette,+matching``, can only speak against an answer, or for it.
 """
 
@@ -27,6 +28,9 @@ from tracking3d.evaluation.confidence_fit import PENALTY, LogisticConfidence, fi
 from tracking3d.evaluation.confidence_scores import right_frames
 from tracking3d.evaluation.mask_scores import compare_masks
 from tracking3d.evaluation.pose_scores import pair_poses, rotation_errors
+from tracking3d.points.landmarks import Support
+from tracking3d.reconstruction.support import weighed as supported_by
+from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
 
 
@@ -68,8 +72,17 @@ def judged_frames(benchmark: Path, solver: str | None, refined: bool) -> Iterato
                     "has_mask": float(known),
                     "iou_initial": record.iou_initial if record.iou_initial is not None else np.nan,
                     "recorded": record.confidence,
+                    **_of_landmarks(record),
                 }
                 yield Judged(truth.name, evidence, right[record.index])
+
+
+def _of_landmarks(record: FrameRecord) -> dict[str, float]:
+    """What landmarks say of a refined answer, beside what was believed before they were asked."""
+    if "followed" not in record.losses:
+        return {}
+    support = Support(int(record.losses["followed"]), int(record.losses["landmarks"]))
+    return supported_by(record.losses.get("rendering", record.confidence), support)
 
 
 def table(frames: list[Judged], names: list[str]) -> tuple[dict[str, np.ndarray], np.ndarray]:

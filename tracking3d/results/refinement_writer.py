@@ -6,7 +6,7 @@ Until then the run folder holds the causal answers whole, whatever ends the refi
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tracking3d.estimation.assessment import Assessment
 from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
-from tracking3d.points.landmarks import Support
 from tracking3d.results import description, layout
 from tracking3d.results.files import read_mask, write_mask, writing
 from tracking3d.results.pictures import Pictures
@@ -85,17 +85,33 @@ class RefinementWriter:
         """The answer for frame ``index`` as it is now: the second one, or the causal one where there is none."""
         return self._records.get(index) or self.causal[index]
 
-    def put_right(self, index: int, T_cam_obj: NDArray[np.float64], support: Support | None) -> None:
-        """Give a second answer the pose ``T_cam_obj`` ``(4, 4)``, that of the camera of the end; causal ones stand.
+    def put_right(
+        self,
+        index: int,
+        T_cam_obj: NDArray[np.float64],
+        judgement: Assessment | None = None,
+        evidence: Mapping[str, float] | None = None,
+    ) -> None:
+        """Give a second answer the pose that it has in the end; causal ones stand.
 
-        ``support`` is what landmarks say of it, where they say anything. It is not kept for a run that is stopped here
-        and goes on later: that finds it anew.
+        It is not kept for a run that is stopped here and goes on later: that finds it anew.
+
+        Args:
+            index: Of the frame.
+            T_cam_obj: ``(4, 4)``, of the camera of the end.
+            judgement: How far it is believed in the end; as before, if left out.
+            evidence: What that comes from, kept among the losses.
         """
-        if (record := self._records.get(index)) is not None:
-            losses = record.losses
-            if support is not None:
-                losses = losses | {"landmarks": float(support.agreeing), "followed": float(support.followed)}
-            self._records[index] = replace(record, T_cam_obj=T_cam_obj, camera=None, losses=losses)
+        if (record := self._records.get(index)) is None:
+            return
+        record = replace(
+            record, T_cam_obj=T_cam_obj, camera=None, losses=record.losses | dict(evidence or {})
+        )
+        if judgement is not None:
+            record = replace(
+                record, status=judgement.status, reason=judgement.reason, confidence=judgement.confidence
+            )
+        self._records[index] = record
 
     def draw(self, frame: Frame) -> None:
         """Draw the answer for a frame.

@@ -1,0 +1,47 @@
+"""How far a refined answer is believed, by what is rendered and by landmarks."""
+
+from __future__ import annotations
+
+import pytest
+
+from tracking3d.estimation.assessment import Assessment
+from tracking3d.estimation.estimate import Status
+from tracking3d.points.landmarks import Support
+from tracking3d.reconstruction.support import BELIEVED, supported, weighed
+
+TRACKED = Assessment(Status.TRACKED, "", 0.9)
+DOUBTED = Assessment(Status.UNCERTAIN, "points agree, pixels do not", 0.3)
+
+
+def test_the_more_landmarks_agree_the_more_an_answer_is_believed():
+    said = [supported(TRACKED, Support(300, count)).confidence for count in (0, 5, 30, 100, 300)]
+    assert said == sorted(said)
+    assert said[0] < BELIEVED < said[-1]
+
+
+def test_what_was_believed_before_counts_too():
+    support = Support(200, 120)
+    assert supported(DOUBTED, support).confidence <= supported(TRACKED, support).confidence
+
+
+def test_a_frame_is_tracked_from_the_confidence_on_at_which_it_is_believed():
+    for agreeing in range(0, 400, 10):
+        for before in (TRACKED, DOUBTED):
+            after = supported(before, Support(400, agreeing))
+            assert (after.status is Status.TRACKED) is (after.confidence >= BELIEVED)
+            assert (after.reason == "") is (after.status is Status.TRACKED)
+
+
+def test_doubt_says_why():
+    assert "landmarks (3 agree of 40" in supported(TRACKED, Support(40, 3)).reason.replace("pose ", "")
+    assert supported(DOUBTED, Support(40, 3)).reason == DOUBTED.reason
+
+
+def test_what_is_lost_stays_lost():
+    lost = Assessment(Status.LOST, "out of sight", 0.05)
+    assert supported(lost, Support(300, 300)) is lost
+
+
+@pytest.mark.parametrize("before", [0.0, 1.0])
+def test_certainty_and_nothing_followed_are_numbers(before):
+    assert all(abs(value) < 10 for value in weighed(before, Support(0, 0)).values())

