@@ -66,7 +66,7 @@ def test_a_lens_that_was_assumed_is_put_right_with_them_and_one_that_was_given_s
     assert rotation_errors(found).mean() < 0.5
 
 
-def test_a_lost_frame_is_not_looked_at_but_goes_with_the_object():
+def test_a_lost_frame_is_not_looked_at_but_goes_on_from_the_view_before_to_the_one_after():
     off = disturbed()
     look = SecondLook(ball(), CAMERA, range(9), 20)
     nothing = np.zeros_like(FRAMES[4][0])
@@ -75,10 +75,13 @@ def test_a_lost_frame_is_not_looked_at_but_goes_with_the_object():
         record = answer(index, off[index], Status.LOST if lost else Status.TRACKED)
         look.see(record, nothing if lost else image, mask)
     look.settle()
-    found, landmarks = look.pose(answer(4, off[4], Status.LOST), nothing, FRAMES[4][1])
+    beside = [look.pose(answer(index, off[index]), *FRAMES[index])[0] for index in (3, 5)]
+    found, landmarks = look.pose(answer(4, np.eye(4), Status.LOST), nothing, FRAMES[4][1])
     assert landmarks is None
     assert np.isfinite(found).all()
-    assert np.rad2deg(Rotation.from_matrix(found[:3, :3] @ off[4, :3, :3].T).magnitude()) < 6
+    turned = [np.rad2deg(Rotation.from_matrix(found[:3, :3] @ T[:3, :3].T).magnitude()) for T in beside]
+    assert turned[0] == pytest.approx(turned[1], abs=1e-6)
+    np.testing.assert_allclose(found[:3, 3], np.mean(beside, 0)[:3, 3])
 
 
 def test_too_few_frames_or_poses_that_are_no_numbers_change_nothing():

@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
 
 from tracking3d.estimation.estimate import ObjectModel, Status
 from tracking3d.frames import Image
@@ -90,6 +91,8 @@ class SecondLook:
             return record.T_cam_obj, None
         after = bisect(self._bundled, record.index)
         around = [at for at in (after - 1, after) if 0 <= at < len(self._bundled)]
+        if record.status is Status.LOST and len(around) == 2:
+            return self._between(record.index, *around), None
         nearest = min(around, key=lambda at: abs(self._bundled[at] - record.index))
         kept = scene.views[nearest]
         assert kept is not None
@@ -116,6 +119,17 @@ class SecondLook:
         """What the texture is taken from, with the pose that its frame has in the end."""
         factor = self.camera.fx / self._lens
         return replace(view, K=view.K @ np.diag([factor, factor, 1.0]), T_cam_obj=record.T_cam_obj)
+
+    def _between(self, index: int, before: int, after: int) -> _Pose:
+        """The pose of a frame in which the object was not found: it goes on steadily from one view to the next."""
+        kept = [self._scene.views[at] for at in (before, after)] if self._scene else []
+        poses = np.stack([view.T_cam_obj for view in kept if view is not None])
+        times = self._bundled[before], self._bundled[after]
+        T = np.eye(4)
+        T[:3, :3] = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(index).as_matrix()
+        share = (index - times[0]) / (times[1] - times[0])
+        T[:3, 3] = (1 - share) * poses[0, :3, 3] + share * poses[1, :3, 3]
+        return T
 
     def _view(self, T_cam_obj: _Pose, image: Image, mask: NDArray[np.bool_]) -> View | None:
         image, mask = self.camera.undistorted(image), self.camera.mask_to_pinhole(mask)

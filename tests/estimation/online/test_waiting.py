@@ -272,3 +272,22 @@ def test_points_that_are_followed_badly_decide_at_once(asked, monkeypatch):
     one = waiting.solve_start(known.known, [CAMERA], [], None, 0.0)[0]
     assert not waiting._undecided([one, one], 0.04)
     assert waiting._undecided([replace(one, bundle=0.1), one], 0.04)
+
+
+def test_where_points_get_worse_the_start_of_before_is_taken_up_again(monkeypatch):
+    asked = []
+
+    def solve_start(known, cameras, views, weights, prior):
+        asked.append(len(views))
+        bundle = 0.1 if len(views) < 6 else 0.4
+        return [Start(known, 1.0, bundle, str(len(views)), cameras[0])] * 2
+
+    monkeypatch.setattr(waiting, "solve_start", solve_start)
+    monkeypatch.setattr(waiting, "_otherwise", lambda one, other: True)
+    given = belief_of(STEADY)
+    state, start = solved_start(replace(given, waiting=given.waiting[:5]), CONFIG)
+    assert start is None
+    assert state.undecided == 5
+    _, start = solved_start(replace(state, waiting=given.waiting, due=0.0), CONFIG)
+    assert start is not None and start.origin == "5"
+    assert asked == [5, 6, 5]

@@ -146,6 +146,7 @@ class Belief:
         waiting: First frames that wait for the start, with their answers so far; None once it is done.
         space: What is made of the encoder's features; None leaves them as they are.
         due: Motion at which the next start is tried.
+        undecided: How many frames the last start had that could not be told from another; 0 if there was none.
         waits_for: Why the start waits, where that is not lack of motion.
         usual: What tracked frames have cost.
         lost_for: How many frames in a row the object has been lost.
@@ -164,6 +165,7 @@ class Belief:
     waiting: tuple[tuple[View, FrameEstimate], ...] | None = ()
     space: FeatureSpace | None = None
     due: float = 0.0
+    undecided: int = 0
     waits_for: str = ""
     usual: Usual = field(default_factory=Usual)
     lost_for: int = 0

@@ -127,7 +127,10 @@ def solved_start(state: Belief, config: OnlineConfig) -> tuple[Belief, Start | N
         cameras = lens_hypotheses(state.camera)
         starts = solve_start(state.known, cameras, views, weights, config.surface_prior)
     if not waited and shared > _LEAST_SHARED and motion < _MOTION_ENOUGH and _undecided(starts, motion):
-        return replace(state, waits_for=_TWO_WAYS), None
+        return replace(state, waits_for=_TWO_WAYS, undecided=len(views)), None
+    if state.undecided and starts and starts[0].bundle > _WELL_FOLLOWED:
+        known, before = state.known, views[: state.undecided]
+        starts = solve_start(known, lens_hypotheses(state.camera), before, weights, config.surface_prior)
     if not starts or starts[0].bundle > _DOUBTFUL:
         if not waited and not wild and (shared > _LASTING or len(views) < _FEWEST_BY_TURNING):
             return state, None
@@ -145,7 +148,7 @@ def _start_without_points(
     waiting = state.waiting or ()
     if not _changed(views):
         kept = _fewer(waiting) if len(views) >= _MOST else waiting
-        return replace(state, waiting=kept, waits_for=_STILL), None
+        return replace(state, waiting=kept, waits_for=_STILL, undecided=0), None
     return state, by_turning(state.known, state.camera, views, FitWeights(smoothness=config.smoothness))[0]
 
 
