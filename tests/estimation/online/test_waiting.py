@@ -267,11 +267,11 @@ def test_points_do_not_stay_where_an_object_was_that_has_left(first):
 
 def test_points_that_are_followed_badly_decide_at_once(asked, monkeypatch):
     asked["bundle"] = 0.4
-    monkeypatch.setattr(waiting, "_otherwise", lambda one, other: True)
-    known = belief_of(STEADY)
-    one = waiting.solve_start(known.known, [CAMERA], [], None, 0.0)[0]
-    assert not waiting._undecided([one, one], 0.04)
-    assert waiting._undecided([replace(one, bundle=0.1), one], 0.04)
+    monkeypatch.setattr(waiting, "_same_axis", lambda one, other: False)
+    turning = map_with_points(STEADY)
+    one = waiting.solve_start(turning, [CAMERA], [], None, 0.0)[0]
+    assert not waiting._undecided([one, one], 0.04, None)
+    assert waiting._undecided([replace(one, bundle=0.1), one], 0.04, None)
 
 
 def test_where_points_get_worse_the_start_of_before_is_taken_up_again(monkeypatch):
@@ -280,10 +280,11 @@ def test_where_points_get_worse_the_start_of_before_is_taken_up_again(monkeypatc
     def solve_start(known, cameras, views, weights, prior):
         asked.append(len(views))
         bundle = 0.1 if len(views) < 6 else 0.4
+        known = map_with_points(STEADY)
         return [Start(known, 1.0, bundle, str(len(views)), cameras[0])] * 2
 
     monkeypatch.setattr(waiting, "solve_start", solve_start)
-    monkeypatch.setattr(waiting, "_otherwise", lambda one, other: True)
+    monkeypatch.setattr(waiting, "_same_axis", lambda one, other: False)
     given = belief_of(STEADY)
     state, start = solved_start(replace(given, waiting=given.waiting[:5]), CONFIG)
     assert start is None

@@ -147,6 +147,7 @@ class Belief:
         space: What is made of the encoder's features; None leaves them as they are.
         due: Motion at which the next start is tried.
         undecided: How many frames the last start had that could not be told from another; 0 if there was none.
+        leaning: ``(3,)`` how the object turns in that start, as a rotation vector; None if there was none.
         waits_for: Why the start waits, where that is not lack of motion.
         usual: What tracked frames have cost.
         lost_for: How many frames in a row the object has been lost.
@@ -166,6 +167,7 @@ class Belief:
     space: FeatureSpace | None = None
     due: float = 0.0
     undecided: int = 0
+    leaning: NDArray[np.float64] | None = None
     waits_for: str = ""
     usual: Usual = field(default_factory=Usual)
     lost_for: int = 0

@@ -22,7 +22,6 @@ from tracking3d.estimation.online.start import Start, by_turning, solve_start
 from tracking3d.estimation.online.structure import motion_enough
 from tracking3d.estimation.online.surface_fit import FitWeights
 from tracking3d.estimation.online.texture_strength import PLAIN, texture_strength
-from tracking3d.geometry.pose import Pose
 
 MOTION = 0.03
 """Change of form at which a start is tried first, see `motion_enough`."""
@@ -40,9 +39,9 @@ _SAME_PLACE = 1.5  # pixels
 _MATCHED_WITH = 3  # frames before
 _SLIP = 3  # frames
 _LIKE_NOISE = 1.3  # times the change between neighbours that is none
-_DECIDED = (
-    0.02  # logarithm of two costs' ratio, times the change of form, from which the better start is believed
-)
+# Logarithm of two costs' ratio, times the change of form, from which the better start is believed; and where it is
+# the better one for the second time.
+_LEAD, _LEAD_AGAIN = 0.04, 0.02
 _MOTION_ENOUGH = 0.3  # change of form from which more of it decides nothing
 _WELL_FOLLOWED = 0.25  # bundle cost of points that go on to be
 _SAME_AXIS = 0.87  # cosine of 30 degrees
@@ -120,17 +119,13 @@ def solved_start(state: Belief, config: OnlineConfig) -> tuple[Belief, Start | N
     if motion < due and not waited and shared > _LEAST_SHARED and not (wild and len(views) % _AGAIN == 0):
         return state, None
     state = replace(state, due=motion * _MORE_MOTION)
-    weights = FitWeights(smoothness=config.smoothness)
+    may_wait = not waited and shared > _LEAST_SHARED and motion < _MOTION_ENOUGH
     # Without motion any shape explains the points.
-    starts: list[Start] = []
-    if motion >= MOTION:
-        cameras = lens_hypotheses(state.camera)
-        starts = solve_start(state.known, cameras, views, weights, config.surface_prior)
-    if not waited and shared > _LEAST_SHARED and motion < _MOTION_ENOUGH and _undecided(starts, motion):
-        return replace(state, waits_for=_TWO_WAYS, undecided=len(views)), None
+    starts = _starts_from_points(state, views, config) if motion >= MOTION else []
+    if may_wait and _undecided(starts, motion, state.leaning):
+        return replace(state, waits_for=_TWO_WAYS, undecided=len(views), leaning=_turn(starts[0])), None
     if state.undecided and starts and starts[0].bundle > _WELL_FOLLOWED:
-        known, before = state.known, views[: state.undecided]
-        starts = solve_start(known, lens_hypotheses(state.camera), before, weights, config.surface_prior)
+        starts = _starts_from_points(state, views[: state.undecided], config)
     if not starts or starts[0].bundle > _DOUBTFUL:
         if not waited and not wild and (shared > _LASTING or len(views) < _FEWEST_BY_TURNING):
             return state, None
@@ -139,6 +134,11 @@ def solved_start(state: Belief, config: OnlineConfig) -> tuple[Belief, Start | N
             return state, None
         starts = sorted([*starts, turning], key=lambda start: start.cost)
     return state, starts[0] if starts else None
+
+
+def _starts_from_points(state: Belief, views: list[View], config: OnlineConfig) -> list[Start]:
+    weights = FitWeights(smoothness=config.smoothness)
+    return solve_start(state.known, lens_hypotheses(state.camera), views, weights, config.surface_prior)
 
 
 def _start_without_points(
@@ -152,26 +152,36 @@ def _start_without_points(
     return state, by_turning(state.known, state.camera, views, FitWeights(smoothness=config.smoothness))[0]
 
 
-def _undecided(starts: list[Start], motion: float) -> bool:
+def _undecided(starts: list[Start], motion: float, leaning: NDArray[np.float64] | None) -> bool:
     """Whether another start, whose object turns otherwise, costs hardly more than the best for so little motion.
 
     Only points that are followed well tell more when there is more motion.
+
+    Args:
+        starts: By rising cost.
+        motion: See `motion_enough`.
+        leaning: How the object turned in the best start when it was tried last: what wins twice needs to win by less.
     """
-    if not starts or starts[0].bundle > _WELL_FOLLOWED:
+    if len(starts) < 2 or starts[0].bundle > _WELL_FOLLOWED:
         return False
-    rivals = [start for start in starts[1:] if _otherwise(starts[0], start)]
-    return bool(rivals) and motion * math.log(rivals[0].cost / max(starts[0].cost, 1e-9)) < _DECIDED
+    best = _turn(starts[0])
+    rivals = [start for start in starts[1:] if not _same_axis(best, _turn(start))]
+    if not rivals:
+        return False
+    lead = motion * math.log(rivals[0].cost / max(starts[0].cost, 1e-9))
+    again = leaning is not None and _same_axis(best, leaning)
+    return lead < (_LEAD_AGAIN if again else _LEAD)
 
 
-def _otherwise(one: Start, other: Start) -> bool:
-    """Whether the object turns about another axis in two starts; by how much depends on the lens and on the relief."""
-    a, b = (_turn(start.known.keyframes[0].pose, start.known.keyframes[-1].pose) for start in (one, other))
-    return bool(a @ b < _SAME_AXIS * np.linalg.norm(a) * np.linalg.norm(b))
+def _turn(start: Start) -> NDArray[np.float64]:
+    """``(3,)`` rotation vector from the first view of a start to the last, in camera coordinates."""
+    first, *_, last = start.known.keyframes
+    return Rotation.from_matrix((last.pose.R @ first.pose.R.T).cpu().numpy()).as_rotvec()
 
 
-def _turn(before: Pose, after: Pose) -> NDArray[np.float64]:
-    """``(3,)`` rotation vector in camera coordinates."""
-    return Rotation.from_matrix((after.R @ before.R.T).cpu().numpy()).as_rotvec()
+def _same_axis(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
+    """Whether two turns are about the same axis; by how much depends on the lens and on the relief."""
+    return bool(a @ b >= _SAME_AXIS * np.linalg.norm(a) * np.linalg.norm(b))
 
 
 def _gone(views: Sequence[View]) -> bool:
