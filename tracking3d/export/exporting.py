@@ -108,8 +108,7 @@ def export_run(
     _check_place(path, exporter, overwrite)
     if path in (file.resolve() for file in run_files(reader.folder)):
         raise OutputError(f"{path} is a file of the run itself; choose another {_OUT}.")
-    needs_poses = exporter.kind not in ("masks", "model")
-    answered = {one.index for one in exported.poses} if needs_poses else set(exported.records)
+    answered = _answered(exporter, exported)
     without = tuple(index for index in exported.span if index not in answered)
     with _placed(path) as place:
         exporter.write(exported, place)
@@ -130,6 +129,13 @@ def _check(options: ExportOptions) -> None:
         raise InputError(f"There are no answers '{options.answers}'; say final or causal.")
     if options.of not in ("object", "camera"):
         raise InputError(f"Poses cannot be of '{options.of}'; {_NAMED['of']} is object or camera.")
+
+
+def _answered(exporter: Exporter, run: ExportedRun) -> set[int]:
+    """The frames that have what the format is about."""
+    if exporter.kind in ("masks", "model"):
+        return set(run.records)
+    return set(run.with_probability) if exporter.kind == "probabilities" else {one.index for one in run.poses}
 
 
 def _label(exporter: Exporter, run: ExportedRun, without: tuple[int, ...]) -> dict[str, object]:
