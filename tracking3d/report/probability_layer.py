@@ -20,7 +20,7 @@ BUDGET = 1_200_000
 WIDEST = 320
 """Pixels across a layer; the page stretches it over the picture."""
 _STEPS = 16
-_OPACITY = 150  # of 255
+_FAINTEST, _STRONGEST = 40, 150  # of 255; what is hardly the object's is hardly covered
 
 
 def probability_layers(
@@ -63,7 +63,7 @@ def _encoded(grey: NDArray[np.uint8] | None) -> bytes | None:
     image = Pillow.fromarray(np.rint(grey / 255 * (_STEPS - 1)).astype(np.uint8))
     image.putpalette(_palette())
     written = io.BytesIO()
-    transparency = bytes([0] + [_OPACITY] * (_STEPS - 1))
+    transparency = bytes([0, *np.linspace(_FAINTEST, _STRONGEST, _STEPS - 1).astype(np.uint8)])
     image.save(written, "PNG", bits=4, transparency=transparency, optimize=True)
     return written.getvalue()
 

@@ -183,7 +183,7 @@ def _curves(records: list[FrameRecord], model: ObjectModel | None) -> list[Curve
     drawn = [
         curve("Confidence", [record.confidence for record in records], "", (0.0, 1.0)),
         curve("Turned against the first frame", figures.turns(poses), "°", digits=1),
-        curve("Distance, of that in the first frame", figures.distances(poses, middle), "", digits=3),
+        curve("Distance, 1 in the first frame", figures.distances(poses, middle), "", digits=3),
         curve("Overlap of answer and mask tracker (IoU)", ious, "", digits=3),
     ]
     return [one for one in drawn if one is not None]
