@@ -44,9 +44,10 @@ class Export:
     Attributes:
         path: The file or folder.
         unit: The unit of lengths, in words; None where the format has none.
-        frames: How many frames have what the format is about, a pose or a mask.
+        frames: How many frames have what the format is about, a pose or a mask; of a model, those it is of.
         without: Frames between the first and the last that have none: skipped, and of poses, lost.
         not_finished: A sentence about a run that has not come to its end; empty for one that has.
+        of_model: Whether it is the model and nothing of single frames.
     """
 
     path: Path
@@ -54,13 +55,14 @@ class Export:
     frames: int
     without: tuple[int, ...]
     not_finished: str = ""
+    of_model: bool = False
 
     @property
     def in_words(self) -> str:
-        """How many frames there are, and the unit where it is arbitrary."""
+        """How many frames there are, where it is not the model alone, and the unit where it is arbitrary."""
         left_out = f", {len(self.without)} without an answer" if self.without else ""
         unit = ", lengths in the run's own unit" if self.unit == ARBITRARY else ""
-        return f"{self.frames} frames{left_out}{unit}"
+        return f"the model{unit}" if self.of_model else f"{self.frames} frames{left_out}{unit}"
 
 
 def find_format(name: str) -> Exporter:
@@ -117,7 +119,7 @@ def export_run(
             (place / LABEL).write_text(json.dumps(label, indent=1) + "\n", encoding="utf-8")
     unit = exported.unit if "object_size" in exporter.options else None
     given = path if out is None else Path(out)
-    return Export(given, unit, len(answered), without, reader.not_finished)
+    return Export(given, unit, len(answered), without, reader.not_finished, exporter.kind == "model")
 
 
 def _check(options: ExportOptions) -> None:
