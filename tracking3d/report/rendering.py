@@ -14,7 +14,6 @@ from markupsafe import Markup, escape
 
 from tracking3d.results.description import versions
 
-
 _OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]*[a-z]")
 
 
