@@ -341,3 +341,11 @@ def test_a_damaged_probability_is_one_that_is_not_there(run_folder):
     layers = probability_layers(run, (0, 1))
     assert layers[0] is not None
     assert layers[1] is None
+
+
+def test_options_in_a_doubt_are_not_broken_over_lines_and_nothing_in_it_is_markup(run_folder, described):
+    described(run_folder, notes=["nobody gave the lens; give --fov or --intrinsics <b>now</b>"])
+    page = report_of(run_folder)
+    assert (
+        '<span class="whole">--fov</span> or <span class="whole">--intrinsics</span> &lt;b&gt;' in page.source
+    )

@@ -54,7 +54,7 @@ def _environment() -> jinja2.Environment:
 
 def _options_whole(text: str) -> Markup:
     """A sentence, escaped, whose options such as ``--fov`` are not broken over lines."""
-    return Markup(_OPTION.sub(r'<span class="whole">\g<0></span>', escape(text)))
+    return Markup(_OPTION.sub(r'<span class="whole">\g<0></span>', str(escape(text))))
 
 
 def _file(name: str) -> str:
