@@ -72,8 +72,9 @@ def track(
             ``tracks``, by the whole video.
         refine: Whether the `Tracking.result` looks at the whole video once more; None leaves that to the configuration,
             as the command line does.
-        model: Where the texture of the result's model comes from: ``fast`` takes it from the video at its resolution,
-            ``none`` leaves what was learnt on the way; None leaves that to the configuration.
+        model: What is made of the object for the result: ``none`` leaves what was learnt on the way, ``fast`` takes the
+            texture from the video at its resolution, ``fine`` then makes the shape anew too from all frames, and keeps
+            it if it explains them better; None leaves that to the configuration.
 
     Returns:
         An iterator of one estimate a frame, whose `Tracking.result` is all of it.
@@ -96,6 +97,7 @@ def track(
         start_frame=start_frame,
         skip_damaged=skip_damaged or untold,
         queries=checked_queries(follow),
+        fine=model == "fine",
     )
     return Tracking(task, keeps=refine is not None or model is not None)
 

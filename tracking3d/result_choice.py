@@ -8,10 +8,11 @@ from tracking3d.config.explain import shown
 from tracking3d.config.models import ObjectConfig, PipelineConfig
 from tracking3d.errors import InputError
 from tracking3d.parts import SOLVERS
+from tracking3d.reconstruction.of_run import check_packages
 from tracking3d.video.source import FrameSource
 
-ModelChoice = Literal["none", "fast"]
-"""Where the texture of the final model comes from."""
+ModelChoice = Literal["none", "fast", "fine"]
+"""What is made of the object at the end."""
 
 
 def config_of_result(
@@ -23,17 +24,15 @@ def config_of_result(
         config: The pipeline.
         source: The frames.
         refine: Whether everything is solved once more; None as configured.
-        model: Where the texture of the model comes from; None as configured.
+        model: What is made of the object at the end; None as configured.
 
     Raises:
-        InputError: If that is not possible with this solver or these frames.
+        InputError: If that is not possible with this solver or these frames, or a package is missing.
     """
     if refine is not None and not isinstance(refine, bool):
         raise InputError(f"refine={shown(refine)} is neither True nor False.")
     if model is not None and model not in get_args(ModelChoice):
-        raise InputError(
-            f"model={shown(model)} is unknown; give {' or '.join(map(repr, get_args(ModelChoice)))}."
-        )
+        raise InputError(f"model={shown(model)} is unknown; give 'none', 'fast' or 'fine'.")
     solver, shape = config.solver, config.object
     if refine is not None:
         solver = solver.model_copy(update={"final_refine": refine})
@@ -45,6 +44,13 @@ def config_of_result(
         raise InputError(
             f"refine=True: {source.name} comes once only, and all frames are needed a second time; give a list or path."
         )
+    if model == "fine":
+        if not source.repeatable:
+            raise InputError(
+                f"model='fine' makes the shape anew from all frames, and {source.name} comes once only; give a list "
+                "or path, or leave it out."
+            )
+        check_packages()
     if model == "fast":
         if not solver.final_refine or not source.repeatable:
             raise InputError(

@@ -23,6 +23,7 @@ from tracking3d.object_recording import ObjectRecording
 from tracking3d.passes import look_again
 from tracking3d.point_following import PointFollowing
 from tracking3d.prompts import damaged_start
+from tracking3d.reconstruction.of_run import shape_run
 from tracking3d.recording import begun, opened
 from tracking3d.session import Session
 from tracking3d.tracker_choice import choose_tracker
@@ -44,6 +45,7 @@ class Task:
         start_frame: The frame in which the object is given; None for the first.
         skip_damaged: Whether frames before the first that can be read are passed over.
         queries: Points to follow, see `tracking3d.point_following.checked_queries`.
+        fine: Whether the shape is made anew from all frames when they are answered.
     """
 
     source: FrameSource
@@ -53,6 +55,7 @@ class Task:
     start_frame: int | None
     skip_damaged: bool
     queries: NDArray[np.float64] | None
+    fine: bool = False
 
 
 class Tracking(Iterator[FrameEstimate]):
@@ -132,7 +135,7 @@ class Tracking(Iterator[FrameEstimate]):
         if self._answers is None:
             if keeps:
                 self._kept = TemporaryRun()
-            self._answers = _answers(self._task, self._kept.folder if self._kept else None)
+            self._answers = _answers(self._task, self._kept)
         return self._answers
 
 
@@ -161,8 +164,9 @@ class _Worker:
             yield answer
 
 
-def _answers(task: Task, folder: Path | None) -> Generator[FrameEstimate]:
-    """The answers, frame by frame; where there is a folder they are kept, and after the last all is finished."""
+def _answers(task: Task, kept: TemporaryRun | None) -> Generator[FrameEstimate]:
+    """The answers, frame by frame; where there is a run they are kept in it, and after the last all is finished."""
+    folder = None if kept is None else kept.folder
     session: Session | None = None
     recording: ObjectRecording | None = None
     following = None if task.queries is None else PointFollowing(task.queries)
@@ -190,6 +194,8 @@ def _answers(task: Task, folder: Path | None) -> Generator[FrameEstimate]:
             _finish(recording, task.source)
         elif folder is not None:
             raise InputError(f"{task.source.name} has no frame that can be decoded.")
+    if kept is not None and task.fine:
+        kept.about_shape = _shape_anew(kept.folder, task.source)
 
 
 def _started(
@@ -218,6 +224,14 @@ def _finish(recording: ObjectRecording, source: FrameSource) -> None:
         action(recording)
 
     look_again(source, [recording], does)
+
+
+def _shape_anew(folder: Path, source: FrameSource) -> str:
+    """Make the shape anew; where that cannot be, the model stays. What came of it, in a sentence."""
+    try:
+        return shape_run(folder, source).sentence
+    except InputError as error:
+        return str(error)
 
 
 def _nothing() -> Generator[FrameEstimate]:

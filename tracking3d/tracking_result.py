@@ -33,9 +33,15 @@ from tracking3d.video.source import FrameSource
 
 
 class TemporaryRun:
-    """A folder for a run that goes when nobody has it any more, or when the process ends."""
+    """A folder for a run that goes when nobody has it any more, or when the process ends.
+
+    Attributes:
+        folder: The run folder.
+        about_shape: What came of making the shape anew, in a sentence; empty where that was not done.
+    """
 
     def __init__(self) -> None:
+        self.about_shape = ""
         self.folder = Path(tempfile.mkdtemp(prefix="tracking3d-"))
         weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)
 
@@ -151,6 +157,11 @@ class TrackingResult:
             InputError: If there is none, since tracking ended early.
         """
         return load_model(self.run.mesh_folder)
+
+    @property
+    def about_shape(self) -> str:
+        """How much better the shape is that ``model="fine"`` made, or why the old one stays; else empty."""
+        return self._kept.about_shape
 
     @property
     def mesh(self) -> trimesh.Trimesh:

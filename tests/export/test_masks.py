@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import av
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
 from tracking3d.datasets.region_files import read_regions
+from tracking3d.errors import InputError
+from tracking3d.results.probabilities import write_probability
 from tracking3d.results.run_reader import RunReader
 from tracking3d.trackers.vot_regions import rasterise
 
@@ -109,3 +113,38 @@ def test_videos_have_the_masks_as_alpha(export, run, to, suffix, decoder):
             # The pictures are noise, which a codec cannot keep; the colours on the whole it can.
             colours = np.asarray(Image.open(run.parent / "video" / f"{index:03d}.png"))
             np.testing.assert_allclose(picture[mask][:, :3].mean(0), colours[mask].mean(0), atol=2)
+
+
+@pytest.fixture
+def likely_run(run, tmp_path):
+    """A copy of the run with probabilities in two of its frames, which rise from left to right."""
+    folder = shutil.copytree(run, tmp_path / "likely")
+    for index in (1, 5):
+        write_probability(folder, index, np.tile(np.linspace(0, 1, SIZE[1], dtype=np.float32), (SIZE[0], 1)))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("to", "kind", "white"), [("probabilities", np.uint8, 255), ("probabilities-16", np.uint16, 65535)]
+)
+def test_probabilities_are_grey_pictures_of_the_frames_that_have_them(export, likely_run, to, kind, white):
+    folder = export(likely_run, to)
+    assert sorted(path.name for path in folder.glob("*.png")) == ["00001.png", "00005.png"]
+    picture = cv2.imread(str(folder / "00005.png"), cv2.IMREAD_UNCHANGED)  # another reader than what wrote it
+    assert picture.dtype == kind
+    assert (picture.min(), picture.max()) == (0, white)
+    np.testing.assert_allclose(picture / white, RunReader(likely_run).probability(5), atol=1e-5)
+    assert json.loads((folder / "export.json").read_text())["frames_without_answer"] == [0, 2, 3, 4, 6]
+
+
+def test_what_a_run_has_no_probabilities_for_is_said(export, run, likely_run):
+    with pytest.raises(
+        InputError, match=r"kept no probabilities; track again with runtime.probabilities=true"
+    ):
+        export(run, "probabilities")
+    with pytest.raises(InputError, match="of its final answers only"):
+        export(likely_run, "probabilities", answers="causal")
+    shutil.rmtree(likely_run / "probabilities")
+    (likely_run / "probabilities").mkdir()
+    with pytest.raises(InputError, match="no frame whose mask was weighed"):
+        export(likely_run, "probabilities-16")

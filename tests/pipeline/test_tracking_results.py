@@ -7,6 +7,7 @@ import gc
 import random
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,6 +18,8 @@ from refining_solver import CausalSolver, StandInSolver
 import tracking3d
 from tracking3d import Status, TrackingResult, load_config, track
 from tracking3d.errors import InputError, OutputError
+from tracking3d.reconstruction import of_run
+from tracking3d.reconstruction.shape import Shape
 from tracking3d.recording import record, record_objects
 from tracking3d.rendering.kernels import threads as kernels
 from tracking3d.results.mesh_export import load_model
@@ -117,17 +120,51 @@ def test_the_model_is_what_was_asked_for(clip, config):
     assert plain.run.config["object"]["texture_views"] == 0
 
 
+def test_a_fine_model_has_a_new_shape_where_that_explains_the_frames_better(clip, config, monkeypatch):
+    given: list[int] = []
+
+    def smaller(vertices, faces, views):
+        given.extend(view.index for view in views)
+        return Shape(vertices * 0.9, faces, {}, "It is better.", None, None)
+
+    def reshaped(model, vertices, faces, views):  # the stand-in's texture is too small to be taken apart
+        return replace(model, vertices=vertices)
+
+    monkeypatch.setattr(of_run, "reconstructed", smaller)
+    monkeypatch.setattr(of_run, "with_shape", reshaped)
+    result = track(clip.images, mask=clip.masks[0], config=config, model="fine").result()
+    assert result.about_shape == "It is better."
+    assert given == [record.index for record in result.frames if record.status is Status.TRACKED]
+    online = load_model(result.run.folder / "online")
+    np.testing.assert_allclose(result.model.vertices, 0.9 * online.vertices)
+
+
+def test_a_shape_that_cannot_be_told_stays_and_the_result_says_why(clip, config):
+    few = track(clip.images[:2], mask=clip.masks[0], config=config, model="fine").result()
+    assert few.about_shape.startswith("The mesh keeps its shape: ")
+    assert len(few.model.vertices)
+    plain = track(clip.images[:2], mask=clip.masks[0], config=config, model="fast").result()
+    assert plain.about_shape == ""
+
+
+def test_a_fine_model_needs_packages_and_says_which(clip, config, monkeypatch):
+    monkeypatch.setattr(of_run, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"pip install 'tracking3d\[model\]'"):
+        track(clip.images, mask=clip.masks[0], config=config, model="fine")
+
+
 @pytest.mark.parametrize(
     ("asked", "sentence"),
     [
         ({"refine": "yes"}, r"^refine='yes' is neither True nor False"),
-        ({"model": "finest"}, r"^model='finest' is unknown; give 'none' or 'fast'"),
+        ({"model": "finest"}, r"^model='finest' is unknown; give 'none', 'fast' or 'fine'"),
         (
             {"refine": False, "model": "fast"},
             r"^model='fast' takes the texture .* without the final refinement",
         ),
         ({"frames": iter(()), "refine": True}, r"^refine=True: the frame iterable comes once only"),
         ({"frames": iter(()), "model": "fast"}, r"^model='fast' takes .* the frame iterable cannot"),
+        ({"frames": iter(()), "model": "fine"}, r"^model='fine' makes .* the frame iterable comes once only"),
         ({"config": "paper", "refine": True}, r"^refine=True: the solver .* gives causal answers only"),
     ],
 )

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hostile import HOSTILE
 
@@ -16,6 +17,8 @@ from tracking3d.report import run_report
 from tracking3d.report.comparison import write_comparison
 from tracking3d.report.differences import compare_runs
 from tracking3d.report.run_report import write_report
+from tracking3d.results.probabilities import write_probability
+from tracking3d.results.run_reader import RunReader
 
 PHONE = {"width": 390, "height": 844}
 WHITE, DARK = "rgb(251, 251, 249)", "rgb(19, 20, 22)"
@@ -190,3 +193,24 @@ def test_the_policy_of_a_page_holds_even_if_something_got_into_it(browser, repor
     assert page.evaluate("window.taken") is None
     assert left == []
     page.close()
+
+
+def test_probabilities_are_laid_over_the_picture_when_asked_for(browser, run_folder, monkeypatch):
+    monkeypatch.setattr(run_report, "write_turntable", lambda *_: None)
+    camera = RunReader(run_folder).camera
+    for index in (0, 2):
+        write_probability(run_folder, index, np.full((camera.height, camera.width), 0.9, np.float32))
+    with opened(browser, write_report(run_folder)) as page:
+        assert not page.is_visible("#probability")
+        page.focus("#likely")
+        page.keyboard.press("Enter")
+        assert page.locator("#probability").bounding_box() == page.locator("#picture").bounding_box()
+        assert page.is_visible("#ramp")
+        page.keyboard.press("ArrowRight")
+        assert not page.is_visible("#probability")
+        assert "no probability" in page.inner_text("#said")
+        page.keyboard.press("ArrowRight")
+        assert page.is_visible("#probability")
+        page.click("#likely")
+        assert not page.is_visible("#probability")
+        assert not page.is_visible("#ramp")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import io
 import json
 import re
 from html.parser import HTMLParser
@@ -12,14 +13,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hostile import HOSTILE
+from PIL import Image
 
 from tracking3d.errors import InputError, OutputError
 from tracking3d.estimation.estimate import Status
-from tracking3d.report import run_report
+from tracking3d.report import model_data, run_report
 from tracking3d.report.doubts import doubts_of
+from tracking3d.report.probability_layer import probability_layers
 from tracking3d.report.run_report import write_report
 from tracking3d.report.several import write_reports
 from tracking3d.results.layout import runs_in
+from tracking3d.results.probabilities import write_probability
 from tracking3d.results.run_reader import RunReader
 from tracking3d.video import open_source
 
@@ -285,3 +289,75 @@ def test_several_objects_have_a_page_that_links_to_their_reports(make_turning_ru
 
 def test_statuses_that_the_page_knows_are_all_that_there_are():
     assert {status.value[0] for status in Status} == {"t", "u", "l"}
+
+
+def ramp(run: RunReader, column: int) -> np.ndarray:
+    """Probabilities that rise from left to right, and are none left of a column."""
+    rising = np.tile(np.linspace(0, 1, run.camera.width, dtype=np.float32), (run.camera.height, 1))
+    rising[:, :column] = 0
+    return rising
+
+
+def test_probabilities_are_a_layer_where_the_run_has_them(run_folder):
+    run = RunReader(run_folder)
+    for index in (0, 3):
+        write_probability(run_folder, index, ramp(run, 40))
+    data = report_of(run_folder).data
+    assert [n for n, layer in enumerate(data["probabilities"]) if layer] == [0, 3]
+    layer = Image.open(io.BytesIO(base64.b64decode(data["probabilities"][3])))
+    assert len(layer.getcolors()) <= 16
+    shown = np.asarray(layer.convert("RGBA"))
+    scale = layer.width / run.camera.width
+    assert (shown[:, : int(38 * scale), 3] == 0).all()  # what is not the object's is left as it is
+    assert (shown[:, int(42 * scale) :, 3] > 0).all()
+    red, _, blue = shown[0, -1, :3]
+    assert red > 200 > 100 > blue  # surely: yellow
+
+
+def test_without_probabilities_there_is_nothing_of_them(run_folder):
+    page = report_of(run_folder)
+    assert page.data["probabilities"] == []
+    assert not {"likely", "probability"} & {about.get("id") for _, about in page.tags}
+
+
+def test_layers_get_smaller_until_they_fit(run_folder):
+    run = RunReader(run_folder)
+    rng = np.random.default_rng(0)
+    shape = run.camera.height, run.camera.width
+    for index in range(12):
+        write_probability(run_folder, index, rng.random(shape, dtype=np.float32))
+    free = probability_layers(run, range(12))
+    bound = probability_layers(run, range(12), budget=sum(map(len, free)) // 4)
+    assert sum(map(len, bound)) <= sum(map(len, free)) // 4
+    small = Image.open(io.BytesIO(bound[0]))
+    assert abs(small.width / small.height - run.camera.width / run.camera.height) < 0.05
+
+
+def test_a_damaged_probability_is_one_that_is_not_there(run_folder):
+    run = RunReader(run_folder)
+    write_probability(run_folder, 0, ramp(run, 0))
+    write_probability(run_folder, 1, ramp(run, 0))
+    (run_folder / "probabilities" / "000001.png").write_bytes(b"no picture")
+    layers = probability_layers(run, (0, 1))
+    assert layers[0] is not None
+    assert layers[1] is None
+
+
+def test_options_in_a_doubt_are_not_broken_over_lines_and_nothing_in_it_is_markup(run_folder, described):
+    described(run_folder, notes=["nobody gave the lens; give --fov or --intrinsics <b>now</b>"])
+    page = report_of(run_folder)
+    assert (
+        '<span class="whole">--fov</span> or <span class="whole">--intrinsics</span> &lt;b&gt;' in page.source
+    )
+
+
+def test_a_large_texture_is_made_small_and_a_small_one_loses_nothing(run_folder, monkeypatch):
+    small = model_data.model_data(model_data.read_model(run_folder))["texture"]
+    assert small.startswith("data:image/png;base64,")
+    monkeypatch.setattr(model_data, "_LARGE", 100)
+    monkeypatch.setattr(model_data, "MOST_TEXTURE", 1500)
+    large = model_data.model_data(model_data.read_model(run_folder))["texture"]
+    assert large.startswith("data:image/webp;base64,")
+    pictures = [Image.open(io.BytesIO(base64.b64decode(one.partition(",")[2]))) for one in (small, large)]
+    assert pictures[0].size == pictures[1].size
+    assert len(large) < len(small)

@@ -33,14 +33,16 @@ from tracking3d.video import open_source
 
 def poses_of(video: Path) -> NDArray[np.float64]:
     """One call."""
-    result: TrackingResult = tracking3d.track(video, box=(10, 20, 30, 40), refine=True, model="fast").result()
+    result: TrackingResult = tracking3d.track(video, box=(10, 20, 30, 40), refine=True, model="fine").result()
     masks: NDArray[np.bool_] = result.masks[0]
     statuses: tuple[Status, ...] = result.statuses
     model: ObjectModel = result.model
     tracks: tuple[PointTracks, ...] = result.tracks
     reader: RunReader = result.save("run", overwrite=True)
     done: Path = result.export("tum", "poses.txt", options=ExportOptions(object_size=0.2)).path
-    print(masks.shape, statuses[0].value, model.faces.shape, len(tracks), reader.state, done)
+    print(
+        masks.shape, statuses[0].value, result.about_shape, model.faces.shape, len(tracks), reader.state, done
+    )
     return result.poses
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from tracking3d.errors import InputError
 from tracking3d.web.access import Access
 
 PORT = 8080
@@ -104,3 +105,9 @@ def test_only_a_host_that_others_reach_has_a_token_and_each_its_own():
     assert first.address(80).endswith(first.token)
     assert first.token not in repr(first)
     assert Access.on("::1").address(80).startswith("http://[::1]:80/")
+
+
+@pytest.mark.parametrize("host", ["", "no such name", "192.0.2.1", "a" * 300, "::zz", "12.34"])
+def test_a_host_that_is_not_this_machine_is_refused_at_once(host):
+    with pytest.raises(InputError, match="is no address of this machine"):
+        Access.on(host)

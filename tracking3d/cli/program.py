@@ -12,6 +12,7 @@ import re
 import signal
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -61,16 +62,23 @@ class Program(TyperGroup):
             raise typer.Exit(INTERRUPTED) from error
 
 
+_AT_ONCE = 5.0
+"""Seconds after a first SIGTERM in which others mean the same."""
+
+
 @contextmanager
 def _ended_as_by_ctrl_c() -> Iterator[None]:
     """Let SIGTERM, which containers and batch systems stop with, end the command as Ctrl-C does.
 
-    A second one, which some send at once, does not end what is written at the end.
+    A second one, which some send at once, does not end what is written at the end. One that comes later does: a library
+    that is imported may have caught the first.
     """
+    first: list[float] = []
 
     def stop(number: int, frame: FrameType | None) -> None:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
-        raise KeyboardInterrupt
+        first.append(time.monotonic())
+        if len(first) == 1 or first[-1] - first[0] > _AT_ONCE:
+            raise KeyboardInterrupt
 
     if threading.current_thread() is not threading.main_thread():
         yield  # where no signal can be handled

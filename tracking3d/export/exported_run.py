@@ -191,6 +191,18 @@ class ExportedRun:
             return np.zeros((self.camera.height, self.camera.width), bool)
         return self.reader.pinhole_mask(index)
 
+    @cached_property
+    def with_probability(self) -> list[int]:
+        """The frames whose answer has a probability in every pixel."""
+        return [index for index in self.records if self.reader.probability(index) is not None]
+
+    def probability(self, index: int) -> NDArray[np.float32] | None:
+        """``(H, W)``: the object's in every pixel of a frame's answer, or None where it has none."""
+        found = self.reader.probability(index)
+        if found is None or not self.options.undistorted:
+            return found
+        return self.camera.probability_to_pinhole(found)
+
     def pinhole_pictures(self) -> Iterator[Frame]:
         """The pictures as the camera of the poses sees them, without the distortion of a lens; see `pictures`."""
         for frame in self._read_pictures():

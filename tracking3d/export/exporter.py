@@ -57,7 +57,8 @@ class Exporter:
 
     Attributes:
         name: What selects it.
-        kind: What it is about: ``poses``, ``cameras``, ``masks``, ``points``, ``model`` or ``scene``.
+        kind: What it is about: ``poses``, ``cameras``, ``masks``, ``probabilities``, ``points``, ``model`` or
+            ``scene``.
         writes: What it writes, in a few words.
         write: Writes a run to a path that does not exist yet: a file if there is a ``suffix``, else a folder.
         suffix: Of the file; empty where a folder is written.

@@ -44,9 +44,10 @@ class Export:
     Attributes:
         path: The file or folder.
         unit: The unit of lengths, in words; None where the format has none.
-        frames: How many frames have what the format is about, a pose or a mask.
+        frames: How many frames have what the format is about, a pose or a mask; of a model, those it is of.
         without: Frames between the first and the last that have none: skipped, and of poses, lost.
         not_finished: A sentence about a run that has not come to its end; empty for one that has.
+        of_model: Whether it is the model and nothing of single frames.
     """
 
     path: Path
@@ -54,13 +55,14 @@ class Export:
     frames: int
     without: tuple[int, ...]
     not_finished: str = ""
+    of_model: bool = False
 
     @property
     def in_words(self) -> str:
-        """How many frames there are, and the unit where it is arbitrary."""
+        """How many frames there are, where it is not the model alone, and the unit where it is arbitrary."""
         left_out = f", {len(self.without)} without an answer" if self.without else ""
         unit = ", lengths in the run's own unit" if self.unit == ARBITRARY else ""
-        return f"{self.frames} frames{left_out}{unit}"
+        return f"the model{unit}" if self.of_model else f"{self.frames} frames{left_out}{unit}"
 
 
 def find_format(name: str) -> Exporter:
@@ -108,8 +110,7 @@ def export_run(
     _check_place(path, exporter, overwrite)
     if path in (file.resolve() for file in run_files(reader.folder)):
         raise OutputError(f"{path} is a file of the run itself; choose another {_OUT}.")
-    needs_poses = exporter.kind not in ("masks", "model")
-    answered = {one.index for one in exported.poses} if needs_poses else set(exported.records)
+    answered = _answered(exporter, exported)
     without = tuple(index for index in exported.span if index not in answered)
     with _placed(path) as place:
         exporter.write(exported, place)
@@ -118,7 +119,7 @@ def export_run(
             (place / LABEL).write_text(json.dumps(label, indent=1) + "\n", encoding="utf-8")
     unit = exported.unit if "object_size" in exporter.options else None
     given = path if out is None else Path(out)
-    return Export(given, unit, len(answered), without, reader.not_finished)
+    return Export(given, unit, len(answered), without, reader.not_finished, exporter.kind == "model")
 
 
 def _check(options: ExportOptions) -> None:
@@ -130,6 +131,13 @@ def _check(options: ExportOptions) -> None:
         raise InputError(f"There are no answers '{options.answers}'; say final or causal.")
     if options.of not in ("object", "camera"):
         raise InputError(f"Poses cannot be of '{options.of}'; {_NAMED['of']} is object or camera.")
+
+
+def _answered(exporter: Exporter, run: ExportedRun) -> set[int]:
+    """The frames that have what the format is about."""
+    if exporter.kind in ("masks", "model"):
+        return set(run.records)
+    return set(run.with_probability) if exporter.kind == "probabilities" else {one.index for one in run.poses}
 
 
 def _label(exporter: Exporter, run: ExportedRun, without: tuple[int, ...]) -> dict[str, object]:

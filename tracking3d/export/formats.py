@@ -17,6 +17,7 @@ from tracking3d.export.nerfstudio import write_nerfstudio
 from tracking3d.export.nuke import write_nuke
 from tracking3d.export.point_tracks import write_points_csv, write_tapvid
 from tracking3d.export.pose_table import write_csv, write_parquet
+from tracking3d.export.probability_pictures import write_probabilities, write_probabilities_16
 from tracking3d.export.rerun_recording import write_rerun
 from tracking3d.export.ros_bag import write_ros_bag
 from tracking3d.export.tum import write_tum
@@ -91,6 +92,20 @@ _ALL = (
         write_prores,
         ".mov",
         options=_PICTURES | _MASKS | {"fps"},
+    ),
+    Exporter(
+        "probabilities",
+        "probabilities",
+        "the object's in every pixel, grey PNG",
+        write_probabilities,
+        options=_MASKS,
+    ),
+    Exporter(
+        "probabilities-16",
+        "probabilities",
+        "the same with 16 bits",
+        write_probabilities_16,
+        options=_MASKS,
     ),
     Exporter("tapvid", "points", "point tracks as TAP-Vid's arrays", write_tapvid, ".npz", options=_POINTS),
     Exporter("points-csv", "points", "point tracks as a table", write_points_csv, ".csv", options=_POINTS),

@@ -79,6 +79,10 @@ class Camera:
         """A mask ``(H, W)`` of a picture that was taken, as one of what this camera sees."""
         return mask if self.lens is None else self.lens.mask_to_pinhole(mask)
 
+    def probability_to_pinhole(self, probability: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Probabilities ``(H, W)`` in a picture that was taken, as those in what this camera sees."""
+        return probability if self.lens is None else self.lens.mask_to_pinhole(probability)
+
     @property
     def K(self) -> NDArray[np.float64]:
         """``(3, 3)`` intrinsic matrix of the full frame."""

@@ -19,6 +19,7 @@ from tracking3d.reconstruction.views import TextureView, kept_views, texture_vie
 from tracking3d.results import layout
 from tracking3d.results.mesh_export import export_mesh, load_model
 from tracking3d.results.run_reader import RunReader
+from tracking3d.video.source import FrameSource
 
 _NEEDED = ("skimage", "xatlas", "fast_simplification")
 
@@ -72,14 +73,16 @@ def texture_run(
     return model, len(views)
 
 
-def shape_run(folder: Path, source: str | None = None, most: int = 24, largest: int = 2048) -> ShapedRun:
+def shape_run(
+    folder: Path, source: str | FrameSource | None = None, most: int = 24, largest: int = 2048
+) -> ShapedRun:
     """Make the shape of a run's object anew from all its frames, and write the mesh if that explains them better.
 
     The mesh of the online map is kept in `layout.ONLINE`.
 
     Args:
         folder: The run folder.
-        source: The video; None for the one that the run names.
+        source: The video, or where that is; None for the one that the run names.
         most: Frames that the texture is taken from.
         largest: Most texels along a side.
 

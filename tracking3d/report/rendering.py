@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import re
 from functools import cache
 from importlib import resources
 from typing import Any
 
 import jinja2
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from tracking3d.results.description import versions
+
+_OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]*[a-z]")
 
 
 def render_page(template: str, scripts: tuple[str, ...] = (), **values: Any) -> bytes:
@@ -38,13 +41,20 @@ def render_page(template: str, scripts: tuple[str, ...] = (), **values: Any) -> 
 
 @cache
 def _environment() -> jinja2.Environment:
-    return jinja2.Environment(
+    environment = jinja2.Environment(
         loader=jinja2.PackageLoader("tracking3d.report", "page"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["options_whole"] = _options_whole
+    return environment
+
+
+def _options_whole(text: str) -> Markup:
+    """A sentence, escaped, whose options such as ``--fov`` are not broken over lines."""
+    return Markup(_OPTION.sub(r'<span class="whole">\g<0></span>', str(escape(text))))
 
 
 def _file(name: str) -> str:

@@ -19,6 +19,7 @@ from tracking3d.report.curves import Curve, Stretch, curve, stretches
 from tracking3d.report.doubts import doubts_of
 from tracking3d.report.frame_pictures import FramePictures, frame_pictures, jpeg_of
 from tracking3d.report.model_data import middle_of, model_data, read_model
+from tracking3d.report.probability_layer import probability_layers
 from tracking3d.report.rendering import render_page
 from tracking3d.report.settings import settings_of
 from tracking3d.report.turntable import write_turntable
@@ -78,6 +79,7 @@ def _model_of(run: RunReader) -> tuple[ObjectModel | None, str]:
 def _page(run: RunReader, model: ObjectModel | None, front: NDArray[np.float64], no_model: str) -> bytes:
     records = run.frames
     pictures = frame_pictures(run)
+    likely = probability_layers(run, pictures.positions)
     parts = stretches(
         [record.index for record in records],
         [record.status.value for record in records],
@@ -97,6 +99,7 @@ def _page(run: RunReader, model: ObjectModel | None, front: NDArray[np.float64],
         doubts=doubts_of(run),
         count=len(records),
         pictures=pictures if pictures.jpegs else None,
+        probabilities=sum(layer is not None for layer in likely),
         first_picture=_text(pictures.jpegs[0]) if pictures.jpegs else "",
         model=model is not None,
         no_model=no_model,
@@ -117,12 +120,16 @@ def _page(run: RunReader, model: ObjectModel | None, front: NDArray[np.float64],
         settings=settings_of(run.config),
         machine=_machine(run),
         conventions=list((run.description.get("conventions") or {}).items()),
-        data=_data(run, model, pictures, doubtful),
+        data=_data(run, model, pictures, likely, doubtful),
     )
 
 
 def _data(
-    run: RunReader, model: ObjectModel | None, pictures: FramePictures, doubtful: list[Stretch]
+    run: RunReader,
+    model: ObjectModel | None,
+    pictures: FramePictures,
+    likely: tuple[bytes | None, ...],
+    doubtful: list[Stretch],
 ) -> dict[str, Any]:
     """What the page's script needs, as short as it goes: a run may have a hundred thousand frames."""
     records = run.frames
@@ -140,6 +147,7 @@ def _data(
         "doubts": [part.first for part in doubtful],
         "pictured": pictures.positions,
         "pictures": [_text(jpeg) for jpeg in pictures.jpegs],
+        "probabilities": [None if layer is None else _text(layer) for layer in likely],
         "speed": min(fps, _FASTEST) if isinstance(fps, int | float) and fps > 0 else 10,
         "model": None if model is None else model_data(model),
         "rotations": [] if model is None else _rotations(records, middle_of(model), pictures),
@@ -175,7 +183,7 @@ def _curves(records: list[FrameRecord], model: ObjectModel | None) -> list[Curve
     drawn = [
         curve("Confidence", [record.confidence for record in records], "", (0.0, 1.0)),
         curve("Turned against the first frame", figures.turns(poses), "°", digits=1),
-        curve("Distance, of that in the first frame", figures.distances(poses, middle), "", digits=3),
+        curve("Distance, 1 in the first frame", figures.distances(poses, middle), "", digits=3),
         curve("Overlap of answer and mask tracker (IoU)", ious, "", digits=3),
     ]
     return [one for one in drawn if one is not None]

@@ -28,33 +28,32 @@ class Panel:
 
     def __init__(self, server: viser.ViserServer, videos: int, live: bool, causal: bool) -> None:
         self._gui = gui = server.gui
-        gui.configure_theme(control_width="medium", dark_mode=True, show_logo=False, show_share_button=False)
+        gui.configure_theme(control_width="large", dark_mode=True, show_logo=False, show_share_button=False)
         gui.set_panel_label("tracking3d")
+        # The video is in viser's own panel, which a phone shows open; there the others are a tap away.
+        blank: Image = np.full((9, 16, 3), 40, np.uint8)
+        self.picture = gui.add_image(blank, format="jpeg", jpeg_quality=85)
+        self.timeline = gui.add_html("")
+        self.slider = gui.add_slider(timeline.SLIDER, 0, 1, 1, 0)
+        self.play = gui.add_button("Play", hint="Key P.")
+        self.steps = gui.add_button_group("go to", _STEPS, hint=_STEP_HINT)
+        self.told = gui.add_html("")
+        gui.main_panel.dock_left()
+        gui.main_panel.set_width(VIDEO_WIDTH if videos == 1 else VIDEOS_WIDTH)
         panel = gui.add_panel()
-        with panel.add_tab("Video"):
-            blank: Image = np.full((9, 16, 3), 40, np.uint8)
-            self.picture = gui.add_image(blank, format="jpeg", jpeg_quality=85)
-            self.timeline = gui.add_html("")
-            self.slider = gui.add_slider(timeline.SLIDER, 0, 1, 1, 0)
-            self.play = gui.add_button("Play", hint="Key P.")
-            self.steps = gui.add_button_group("go to", _STEPS, hint=_STEP_HINT)
-            self.told = gui.add_html("")
-        panel.dock_left()
-        panel.set_width(VIDEO_WIDTH if videos == 1 else VIDEOS_WIDTH)
-        tabs = gui.add_tab_group()
-        with tabs.add_tab("Show"):
+        with panel.add_tab("Show"):
             self._add_choices(causal)
             self.follow = gui.add_checkbox(
                 "newest frame", live, visible=live, hint="Stay at the end of the run."
             )
-        with tabs.add_tab("Doubts"):
+        with panel.add_tab("Doubts"):
             self.doubts = gui.add_html("")
-        with tabs.add_tab("Correct"):
+        with panel.add_tab("Correct"):
             self.correct = gui.add_html("")
-        with tabs.add_tab("Run"):
+        with panel.add_tab("Run"):
             self.about = gui.add_html("")
-        gui.main_panel.dock_right()
-        gui.main_panel.set_width(330)
+        panel.dock_right()
+        panel.set_width(330)
 
     def _add_choices(self, causal: bool) -> None:
         gui = self._gui

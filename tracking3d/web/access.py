@@ -11,11 +11,14 @@ from __future__ import annotations
 import hmac
 import re
 import secrets
+import socket
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
 from typing import NamedTuple, Self
 from urllib.parse import parse_qs, urlsplit
+
+from tracking3d.errors import InputError
 
 LOOPBACK = "127.0.0.1"
 _OUR_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
@@ -57,8 +60,15 @@ class Access:
 
     @classmethod
     def on(cls, host: str | None) -> Self:
-        """This machine only where ``host`` is None, else ``host``, with a new token."""
-        return cls() if host is None else cls(host, secrets.token_urlsafe(24))
+        """This machine only where ``host`` is None, else ``host``, with a new token.
+
+        Raises:
+            InputError: If this machine cannot listen on ``host``.
+        """
+        if host is None:
+            return cls()
+        _check_own(host)
+        return cls(host, secrets.token_urlsafe(24))
 
     def address(self, port: int) -> str:
         """What to open in the browser, the token included."""
@@ -111,6 +121,18 @@ class Access:
     def _matches(self, told: str) -> bool:
         # In constant time, so that nobody finds the token letter by letter.
         return hmac.compare_digest(told.encode("utf-8", "replace"), self.token.encode())
+
+
+def _check_own(host: str) -> None:
+    """Make sure that a server can listen there; one that cannot may try for ever."""
+    try:
+        family, *_, place = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+        with socket.socket(family, socket.SOCK_STREAM) as probe:
+            probe.bind(place)
+    except (OSError, UnicodeError) as error:
+        raise InputError(
+            f"--host {host} is no address of this machine ({error}); 0.0.0.0 is all of them."
+        ) from error
 
 
 def _name(host: str) -> str:

@@ -132,13 +132,13 @@ class _Announcer(event.Listener):
         self._folder = folder
 
     def on_start(self, event: event.Event) -> None:
-        _announce(self._folder)
+        _announce(self._folder is not None)
 
     def on_end(self, event: event.Event) -> None:
         pass
 
 
 @functools.cache
-def _announce(folder: str | None) -> None:
-    kept = f"the result is kept in {folder}" if folder else "no folder can be written to keep the result in"
-    _log.warning("Compiling the renderer's kernels for this processor takes some seconds; %s.", kept)
+def _announce(is_kept: bool) -> None:
+    kept = "the result is kept" if is_kept else "no folder can be written to keep the result in"
+    _log.warning("Compiling kernels for this processor takes some seconds; %s.", kept)

@@ -183,7 +183,7 @@ function showModel(canvas, model) {
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR);
     later();
   });
-  picture.src = "data:image/png;base64," + model.texture;
+  picture.src = model.texture;
   new ResizeObserver(later).observe(canvas);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", later);
   return view;

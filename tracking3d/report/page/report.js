@@ -35,6 +35,8 @@
       const picture = pictureOf(at);
       byId("picture").src = "data:image/jpeg;base64," + data.pictures[picture];
       byId("picture").alt = `Frame ${data.indices[data.pictured[picture]]} with what the tracker answered drawn into it`;
+      const none = showProbability(picture);
+      if (none) words.push(none);
       if (data.pictured[picture] !== at) words.push(`picture of frame ${data.indices[data.pictured[picture]]}`);
     }
     const said = byId("said"), strong = document.createElement("span");
@@ -45,6 +47,17 @@
     if (reason) said.append(document.createElement("br"), reason);
     slider.setAttribute("aria-valuetext", `frame ${data.indices[at]}, ${status}`);
     if (viewer) viewer.showAs(data.rotations[data.pictured.length ? pictureOf(at) : 0]);
+  }
+
+  // Why there is none to be shown, if one was asked for.
+  function showProbability(picture) {
+    const layer = byId("probability");
+    if (!layer) return "";
+    const asked = byId("likely").getAttribute("aria-pressed") === "true", found = data.probabilities[picture];
+    layer.hidden = !(asked && found);
+    byId("ramp").hidden = !asked;
+    if (!layer.hidden) layer.src = "data:image/png;base64," + found;
+    return asked && !found ? "no probability, the mask was not weighed" : "";
   }
 
   function go(to) {
@@ -76,6 +89,11 @@
   byId("play").addEventListener("click", () => playing ? pause() : play());
   byId("before").addEventListener("click", () => { pause(); doubt(-1); });
   byId("after").addEventListener("click", () => { pause(); doubt(1); });
+  byId("likely")?.addEventListener("click", (event) => {
+    const pressed = event.currentTarget.getAttribute("aria-pressed") === "true";
+    event.currentTarget.setAttribute("aria-pressed", String(!pressed));
+    show();
+  });
   byId("before").disabled = byId("after").disabled = !data.doubts.length;
 
   for (const plot of document.querySelectorAll("[data-plot] svg")) {
