@@ -75,7 +75,11 @@ class _BitsOfTensors(pickle.Pickler):
         if type(value) is not torch.Tensor:
             return NotImplemented
         if value.layout == torch.sparse_coo:
-            return torch.sparse_coo_tensor, (value.coalesce().indices(), value.coalesce().values(), value.shape)
+            return torch.sparse_coo_tensor, (
+                value.coalesce().indices(),
+                value.coalesce().values(),
+                value.shape,
+            )
         return torch.as_strided, (value.detach().numpy(), value.stride(), value.requires_grad)
 
 
