@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
-import os
 import pickle
 import tempfile
 from collections.abc import Callable
@@ -64,7 +63,7 @@ class MadeOnce:
         if self.folder is not None:
             with tempfile.NamedTemporaryFile(dir=self.folder, delete=False) as file:
                 file.write(data)
-            os.replace(file.name, self.folder / name)
+            Path(file.name).replace(self.folder / name)
         return data
 
 
