@@ -11,6 +11,9 @@ BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 TESTS := OPENBLAS_NUM_THREADS=1 $(BIN)/pytest tests plugins -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
+# Modules and what pytest makes of tests are compiled once, and not by every process.
+export PYTHONDONTWRITEBYTECODE :=
+
 .PHONY: demo test docs clean
 
 demo: $(VENV)/installed
@@ -38,17 +41,23 @@ clean:
 	rm -rf .pytest_cache .mypy_cache .ruff_cache
 	find tracking3d tests plugins -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# Editable, so that what runs is what lies here, without installing again after a change.
-$(VENV)/installed: pyproject.toml constraints.txt
+# Editable, so that what runs is what lies here, without installing again after a change. Plug-ins are built with what
+# `dev` installs, and not each in an environment of its own.
+$(VENV)/created:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { echo \
 	"$(PYTHON) is not Python 3.11 or newer; name one that is, such as: make demo PYTHON=python3.12" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
+	@touch $@
+
+$(VENV)/installed: $(VENV)/created pyproject.toml constraints.txt
 	@echo "Installing into $(VENV); the first time this downloads torch and takes a minute or more."
 	$(INSTALL) -e .
 	@touch $@
 
-$(VENV)/installed-dev: $(VENV)/installed $(wildcard plugins/*/pyproject.toml)
-	$(INSTALL) -e '.[dev]' $(patsubst %/pyproject.toml,-e ./%,$(wildcard plugins/*/pyproject.toml))
+$(VENV)/installed-dev: $(VENV)/created pyproject.toml constraints.txt $(wildcard plugins/*/pyproject.toml)
+	@echo "Installing into $(VENV); the first time this downloads torch and takes a minute or more."
+	$(INSTALL) -e '.[dev]'
+	$(INSTALL) --no-build-isolation $(patsubst %/pyproject.toml,-e ./%,$(wildcard plugins/*/pyproject.toml))
 	@touch $@
 
 $(VENV)/installed-docs: $(VENV)/installed

@@ -58,11 +58,13 @@ def made_anew(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def one_compilation(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """In a fresh clone, one worker compiles a kernel and the others wait for what it keeps."""
+def made_together(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """What one worker has made is there for the others; in a fresh clone that holds for compiled kernels, too."""
     if "PYTEST_XDIST_WORKER" not in os.environ:
         return
     folder, compile_one = tmp_path_factory.getbasetemp().parent, Kernel._compile
+    MadeOnce.folder = folder / "made"
+    MadeOnce.folder.mkdir(exist_ok=True)
 
     def compile_once(kernel: Kernel):
         with FileLock(folder / f"{kernel.__module__}.{kernel.__qualname__}.lock"):

@@ -1,14 +1,22 @@
-"""What many tests ask for and what takes long, such as the same synthetic clip, is made once in a process."""
+"""What many tests ask for and what takes long, such as the same synthetic clip, is made once in a test run.
+
+That is once for all workers: what one of them has made, the others find in the run's folder.
+"""
 
 from __future__ import annotations
 
-import copy
+import contextlib
 import hashlib
-from collections.abc import Callable, Hashable
+import io
+import pickle
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any, ClassVar
 
-import numpy as np
+import torch
 
+from tracking3d.estimation.online import solver, waiting
 from tracking3d.synthesis import convex_clips, scene
 from tracking3d.trackers import first_mask
 
@@ -17,40 +25,70 @@ class MadeOnce:
     """A function that computes nothing twice; every caller has a copy of his own.
 
     Args:
-        function: Whose result depends on nothing but its arguments.
+        function: Whose result depends on nothing but its arguments; both can be pickled.
         key: Of the same arguments, what the result depends on.
     """
 
     anew: ClassVar[bool] = False
     """Compute everything twice all the same; see the fixture `made_anew`."""
+    folder: ClassVar[Path | None] = None
+    """Where workers leave what they have made for the others."""
 
-    def __init__(self, function: Callable[..., Any], key: Callable[..., Hashable]) -> None:
+    def __init__(self, function: Callable[..., Any], key: Callable[..., Any] = lambda *given: given) -> None:
         self._function, self._key = function, key
-        self._made: dict[Hashable, Any] = {}
+        self._made: dict[str, bytes] = {}
 
-    def __call__(self, *arguments: Any) -> Any:
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
         if self.anew:
-            return self._function(*arguments)
-        key = self._key(*arguments)
-        if key not in self._made:
-            self._made[key] = self._function(*arguments)
-        return copy.deepcopy(self._made[key])
+            return self._function(*arguments, **named)
+        name = self._name((self._key(*arguments), sorted(named.items())))
+        if name not in self._made:
+            self._made[name] = self._found(name) or self._kept(name, self._function(*arguments, **named))
+        return pickle.loads(self._made[name])
+
+    def _name(self, key: Any) -> str:
+        told = io.BytesIO()
+        told.write(f"{self._function.__module__}.{self._function.__qualname__}:".encode())
+        _BitsOfTensors(told).dump(key)
+        return hashlib.sha256(told.getbuffer()).hexdigest()
+
+    def _found(self, name: str) -> bytes | None:
+        if self.folder is not None:
+            with contextlib.suppress(FileNotFoundError):
+                return (self.folder / name).read_bytes()
+        return None
+
+    def _kept(self, name: str, result: Any) -> bytes:
+        data = pickle.dumps(result)
+        if self.folder is not None:
+            with tempfile.NamedTemporaryFile(dir=self.folder, delete=False) as file:
+                file.write(data)
+            Path(file.name).replace(self.folder / name)
+        return data
+
+
+class _BitsOfTensors(pickle.Pickler):
+    """Writes the same for the same tensors; torch itself writes where they lie in memory, too."""
+
+    def reducer_override(self, value: Any) -> Any:
+        if type(value) is not torch.Tensor:
+            return NotImplemented
+        if value.layout == torch.sparse_coo:
+            return torch.sparse_coo_tensor, (
+                value.coalesce().indices(),
+                value.coalesce().values(),
+                value.shape,
+            )
+        return torch.as_strided, (value.detach().numpy(), value.stride(), value.requires_grad)
 
 
 def make_once() -> None:
-    """Let it be so for GrabCut, the synthetic clips and the procedural objects."""
-    first_mask._grab_cut = MadeOnce(first_mask._grab_cut, _of_bytes)
-    convex_clips.synthesize = MadeOnce(convex_clips.synthesize, lambda spec: spec)
+    """Let it be so for GrabCut, synthetic clips, procedural objects, and starts and maps that a run solves."""
+    first_mask._grab_cut = MadeOnce(first_mask._grab_cut)
+    convex_clips.synthesize = MadeOnce(convex_clips.synthesize)
     scene.make_procedural_solid = MadeOnce(
         scene.make_procedural_solid,
         lambda spec: (spec.object, spec.textured, spec.print_strength == 0, spec.seed),
     )
-
-
-def _of_bytes(*arguments: Any) -> Hashable:
-    return tuple(
-        (one.shape, hashlib.sha256(np.ascontiguousarray(one)).digest())
-        if isinstance(one, np.ndarray)
-        else one
-        for one in arguments
-    )
+    waiting.solve_start = MadeOnce(waiting.solve_start)
+    solver.refined_once_more = MadeOnce(solver.refined_once_more)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -68,6 +69,7 @@ def floor(room: str) -> int:
     raise AssertionError(f"tracking3d.{room} has no floor yet: give it one in {Path(__file__).name}")
 
 
+@cache
 def modules() -> list[Path]:
     return sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
 
@@ -76,6 +78,7 @@ def room_of(path: Path) -> str:
     return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
 
 
+@cache
 def imported_modules(path: Path) -> set[str]:
     """Full names of what a module imports from the package, within functions too."""
     names = set()
@@ -88,15 +91,17 @@ def imported_modules(path: Path) -> set[str]:
     return {name for name in names if name.split(".")[0] == "tracking3d"}
 
 
-@pytest.mark.parametrize("path", modules(), ids=lambda path: path.relative_to(PACKAGE).as_posix())
-def test_a_module_imports_from_below_only(path):
-    own = room_of(path)
-    for name in imported_modules(path):
-        room = name.split(".")[1] if "." in name else ""
-        if not (PACKAGE / room).is_dir() and not (PACKAGE / f"{room}.py").is_file():
-            continue  # a name of the front door, such as the version
-        if room != own:
-            assert floor(room) <= floor(own), f"{own} (floor {floor(own) + 1}) imports {name} from above"
+def test_a_module_imports_from_below_only():
+    above = []
+    for path in modules():
+        own = room_of(path)
+        for name in imported_modules(path):
+            room = name.split(".")[1] if "." in name else ""
+            if not (PACKAGE / room).is_dir() and not (PACKAGE / f"{room}.py").is_file():
+                continue  # a name of the front door, such as the version
+            if room != own and floor(room) > floor(own):
+                above.append(f"{path} (floor {floor(own) + 1}) imports {name} from above")
+    assert not above
 
 
 def test_rooms_of_one_floor_do_not_import_each_other_in_circles():
@@ -144,11 +149,16 @@ def test_the_solvers_are_tenants_that_never_import_each_other():
                 )
 
 
-@pytest.mark.parametrize("path", modules(), ids=lambda path: path.relative_to(PACKAGE).as_posix())
-def test_no_module_is_longer_than_a_reader_keeps_in_mind(path):
-    assert len(path.read_text(encoding="utf-8").splitlines()) <= LONGEST_MODULE
+def test_no_module_is_longer_than_a_reader_keeps_in_mind():
+    assert not [path for path, lines in lengths().items() if lines > LONGEST_MODULE]
 
 
 def test_half_of_the_modules_are_short():
-    lengths = sorted(len(path.read_text(encoding="utf-8").splitlines()) for path in modules())
-    assert lengths[len(lengths) // 2] <= 150
+    found = sorted(lengths().values())
+    assert found[len(found) // 2] <= 150
+
+
+@cache
+def lengths() -> dict[Path, int]:
+    """Of every module, in lines."""
+    return {path: len(path.read_text(encoding="utf-8").splitlines()) for path in modules()}

@@ -33,7 +33,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning"),
 ]
 
-QUICK = ["window.size=32", "object.frequency=2", "solver.final_refine=false"]
+QUICK = ["window.size=32", "object.frequency=2", "camera.fov=45", "solver.final_refine=false"]
 
 
 @pytest.fixture

@@ -196,7 +196,13 @@ def test_in_every_frame_what_is_kept_is_the_solvers_state(tmp_path, preset, fram
     clip = synthesize(SyntheticSpec(frames=frames, size=(96, 72), supersample=1, degrees_per_frame=5))
     config = load_config(
         preset=preset,
-        overrides=["window.size=32", "object.frequency=2", "object.texture_size=32", "tracker.name=flow"],
+        overrides=[
+            "window.size=32",
+            "object.frequency=2",
+            "object.texture_size=32",
+            "camera.fov=45",
+            "tracker.name=flow",
+        ],
     )
     first = Frame(0, clip.images[0])
     session = Session(config, make_prompt(first, mask=clip.masks[0]))

@@ -17,7 +17,7 @@ from tracking3d.cli import app
 from tracking3d.results.run_reader import RunReader
 from tracking3d.synthesis.convex_clips import make_demo_clip
 
-QUICK = ["--size", "32", "--set", "object.frequency=2"]
+QUICK = ["--size", "32", "--set", "object.frequency=2", "--set", "camera.fov=45"]
 
 STOPPING_TRACKER = """
 import os

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import distance_transform_edt
 from small_scenes import observed, pose_of, small_shape
 
 from tracking3d.estimation.observation import Batch, crop, halved, mask_distance, observe
@@ -149,6 +150,14 @@ def test_mask_distance_is_euclidean_and_half_the_window_is_one():
     assert distance[10, 30].item() == pytest.approx(20 * 2 / 40)
     assert distance[13, 14].item() == pytest.approx(5 * 2 / 40)
     assert distance[4, 2].item() == pytest.approx(10 * 2 / 40)
+
+
+@pytest.mark.parametrize("size", [32, 64])
+def test_mask_distance_is_exact_to_the_last_bit_so_that_runs_can_be_repeated(size):
+    for seed in range(20):
+        mask = np.random.default_rng(seed).random((size, size)) > 0.98
+        exact = distance_transform_edt(~mask).astype(np.float32) * np.float32(2 / size)
+        np.testing.assert_array_equal(mask_distance(torch.from_numpy(mask).float()).numpy(), exact)
 
 
 def test_mask_distance_is_zero_inside_and_for_an_empty_mask():

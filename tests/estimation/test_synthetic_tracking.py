@@ -57,7 +57,7 @@ def tracked(preset: str, spec: SyntheticSpec) -> Tracked:
     return Tracked(clip, list(final.values()))
 
 
-@pytest.fixture(scope="module", params=PRESETS)
+@pytest.fixture(scope="module", params=["default", pytest.param("rerendering", marks=pytest.mark.slow)])
 def run(request) -> Tracked:
     """A box with cut corners, which turns by 32 degrees; fewer frames for the solver that takes longer."""
     frames = 9 if request.param == "default" else 7

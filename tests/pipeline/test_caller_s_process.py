@@ -18,7 +18,13 @@ from tracking3d.prompts import make_prompt
 from tracking3d.rendering.kernels import threads as kernels
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 
-SETTINGS = ["window.size=32", "object.frequency=2", "object.texture_size=16", "runtime.threads=2"]
+SETTINGS = [
+    "window.size=32",
+    "object.frequency=2",
+    "object.texture_size=16",
+    "camera.fov=45",
+    "runtime.threads=2",
+]
 
 
 class RestlessTracker:

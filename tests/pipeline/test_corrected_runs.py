@@ -70,7 +70,13 @@ def stepped(monkeypatch) -> list[int]:
 
 
 def settings(*overrides: str):
-    quick = ["tracker.name=flow", "tracker.segmentation_size=64", "window.size=32", "object.frequency=2"]
+    quick = [
+        "tracker.name=flow",
+        "tracker.segmentation_size=64",
+        "window.size=32",
+        "object.frequency=2",
+        "camera.fov=45",
+    ]
     return load_config(
         overrides=[*quick, "object.texture_size=32", *overrides], runtime={"on_plugin_failure": "stop"}
     )

@@ -37,6 +37,7 @@ QUICK = [
     "tracker.segmentation_size=64",
     "window.size=32",
     "object.frequency=2",
+    "camera.fov=45",
     "object.texture_size=48",
     "solver.window=4",
     "solver.keyframe_rotation=25",

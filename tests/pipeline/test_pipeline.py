@@ -23,6 +23,7 @@ from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synt
 QUICK = [
     "window.size=32",
     "object.frequency=2",
+    "camera.fov=45",
     "object.texture_size=16",
 ]
 QUICK_PRESETS = {
@@ -46,7 +47,8 @@ def clip() -> SyntheticClip:
 @pytest.fixture(scope="module", params=sorted(QUICK_PRESETS))
 def quick(request) -> PipelineConfig:
     """A preset of either solver."""
-    return load_config(preset=request.param, overrides=QUICK_PRESETS[request.param])
+    overrides = [*QUICK_PRESETS[request.param], "tracker.segmentation_size=64"]
+    return load_config(preset=request.param, overrides=overrides)
 
 
 @pytest.fixture(scope="module")
@@ -323,7 +325,8 @@ def test_without_any_knowledge_the_field_of_view_is_45_degrees_vertically():
 
 def test_a_session_gives_the_camera_and_the_object_at_any_time(clip, quick):
     first = Frame(0, clip.images[0])
-    session = Session(quick, make_prompt(first, mask=clip.masks[0]), (90.0, 91.0, 40.0, 32.0), "EXIF")
+    untold = quick.model_copy(update={"camera": CameraConfig()})
+    session = Session(untold, make_prompt(first, mask=clip.masks[0]), (90.0, 91.0, 40.0, 32.0), "EXIF")
     with pytest.raises(RuntimeError):
         _ = session.camera
     with pytest.raises(RuntimeError):

@@ -24,6 +24,7 @@ REGISTERED = f"tracking3d.trackers:bad={FILE}:FailingTracker;tracking3d.features
 QUICK = [
     "window.size=32",
     "object.frequency=2",
+    "camera.fov=45",
     "object.texture_size=16",
 ]
 QUICK_PRESETS = {

@@ -65,7 +65,14 @@ def online(monkeypatch) -> None:
 def settings(*overrides: str):
     quick = ["tracker.name=flow", "tracker.segmentation_size=64"]
     return load_config(
-        overrides=[*quick, "window.size=32", "object.frequency=2", "object.texture_size=32", *overrides],
+        overrides=[
+            *quick,
+            "window.size=32",
+            "object.frequency=2",
+            "object.texture_size=32",
+            "camera.fov=45",
+            *overrides,
+        ],
         runtime={"on_plugin_failure": "stop"},
     )
 

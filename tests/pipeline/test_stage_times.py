@@ -22,7 +22,7 @@ from tracking3d.video import open_source
 from tracking3d.video.image_sequence import ImageSequence
 
 HERE = Path(__file__).parent
-QUICK = ["window.size=32", "object.frequency=2", "object.texture_size=16"]
+QUICK = ["window.size=32", "object.frequency=2", "object.texture_size=16", "camera.fov=45"]
 QUICK_PRESETS = {
     "default": QUICK,
     "rerendering": [

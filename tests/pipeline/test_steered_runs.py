@@ -69,7 +69,14 @@ def settings(*overrides: str):
     precomputed = any("precomputed" in override for override in overrides)
     quick = [] if precomputed else ["tracker.name=flow", "tracker.segmentation_size=64"]
     return load_config(
-        overrides=[*quick, "window.size=32", "object.frequency=2", "object.texture_size=32", *overrides],
+        overrides=[
+            *quick,
+            "window.size=32",
+            "object.frequency=2",
+            "object.texture_size=32",
+            "camera.fov=45",
+            *overrides,
+        ],
         runtime={"on_plugin_failure": "stop"},
     )
 

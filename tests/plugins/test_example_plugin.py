@@ -58,7 +58,7 @@ def test_the_installed_plugin_is_listed(program):
 def test_the_installed_plugin_tracks_a_clip(program, tmp_path):
     clip = make_demo_clip(tmp_path / "clip", frames=3, size=(96, 72))
     box = ",".join(str(value) for value in json.loads((clip / "init.json").read_text())["bbox_xywh"])
-    quick = ["--size", "32", "--set", "object.frequency=2"]
+    quick = ["--size", "32", "--set", "object.frequency=2", "--set", "camera.fov=45"]
     option = ["--set", "tracker.threshold=0.4"]
     program(
         *("run", clip / "frames", "--box", box, "--tracker", "kcf", *option, *quick),

@@ -5,7 +5,9 @@ Every test starts processes of its own, with a folder of their own for what they
 
 from __future__ import annotations
 
+import importlib.util
 import json
+import logging
 import os
 import shutil
 import site
@@ -15,10 +17,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numba
 import pytest
 
 import tracking3d
-from tracking3d.rendering.kernels.compilation import Kernel, kernel
+from tracking3d.rendering.kernels.compilation import Kernel, _announce, kernel
 
 RENDER = """
 import json, logging
@@ -106,6 +109,40 @@ def files_in(cache: Path) -> list[Path]:
     return [path for path in cache.rglob("*") if path.is_file()]
 
 
+SMALL = """
+from tracking3d.rendering.kernels.compilation import kernel
+
+@kernel("float64(float64)")
+def twice(value):
+    return 2 * value
+"""
+
+
+def small_kernel(file: Path) -> Kernel:
+    """The kernel as a process that has just started finds it."""
+    _announce.cache_clear()
+    spec = importlib.util.spec_from_file_location("small_kernel", file)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.twice
+
+
+def test_a_kernel_is_compiled_once_and_kept_and_that_is_told_once(tmp_path, cache, monkeypatch, caplog):
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(cache))
+    file = tmp_path / "small.py"
+    file.write_text(SMALL)
+    with caplog.at_level(logging.WARNING):
+        assert small_kernel(file)(1.5) == 3
+        (folder,) = {path.parent for path in files_in(cache)}
+        assert caplog.messages == [f"{ANNOUNCED.partition(': ')[2]}the result is kept in {folder}."]
+        assert small_kernel(file)(2.5) == 5
+        assert len(caplog.messages) == 1
+        file.write_text(SMALL.replace("2 *", "4 *"))
+        assert small_kernel(file)(1.5) == 6
+        assert len(caplog.messages) == 2
+
+
+@pytest.mark.slow
 def test_the_first_process_announces_itself_once_and_the_second_is_silent(processes, cache):
     first = processes.run()
     assert first.answer == EXPECTED

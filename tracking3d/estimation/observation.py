@@ -167,10 +167,12 @@ def mask_distance(mask: Tensor) -> Tensor:
     """Distance of every pixel of ``(S, S)`` to the mask, in NDC (half the window's side is 1).
 
     OpenCV's exact transform: the target is constant, so nothing is differentiated through it, and kornia's
-    differentiable one is an approximation.
+    differentiable one is an approximation. The last bit of OpenCV's roots depends on where the image lies in memory;
+    the squares are whole numbers, so they are taken once more.
     """
     outside = (mask < 0.5).cpu().numpy().astype(np.uint8)
     if outside.all():
         return torch.zeros_like(mask)
     pixels = cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return torch.from_numpy(pixels).to(mask) * (2.0 / mask.shape[-1])
+    exact = np.sqrt(np.rint(np.square(pixels)))
+    return torch.from_numpy(exact).to(mask) * (2.0 / mask.shape[-1])
