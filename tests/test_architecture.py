@@ -25,6 +25,7 @@ FLOORS = [
         "geometry",
         "networks",
         "process_memory",
+        "side_by_side",
         "stages",
         "web",
     },

@@ -92,12 +92,14 @@ class RefinementWriter:
         if (record := self._records.get(index)) is not None:
             self._records[index] = replace(record, T_cam_obj=T_cam_obj, camera=None)
 
-    def draw(self, frame: Frame) -> None:
-        """Draw the answer for a frame.
+    def draw(self, frame: Frame, T_cam_obj: NDArray[np.float64] | None = None) -> None:
+        """Draw the answer for a frame; where a pose is given, that is put right before, see `put_right`.
 
         Raises:
             OutputError: If the video cannot be written.
         """
+        if T_cam_obj is not None:
+            self.put_right(frame.index, T_cam_obj)
         record = self.answer(frame.index)
         with measured("write") as watch:
             self.pictures.add_kept(frame, record, self.mask(record), self.initial_mask(frame.index))
