@@ -106,8 +106,9 @@ class ObjectRecording:
             return self._take_kept(self._kept, frame)
         if isinstance(frame, SkippedFrame):
             return self._work.do(partial(self._skip, frame))
-        following = coming if isinstance(coming, Frame) and coming.index not in self._past else None
-        estimate = self._session.step(frame, *prompts_in(frame, self._corrections), coming=following)
+        is_new = isinstance(coming, Frame) and coming.index not in self._past
+        self._session.coming = coming if is_new else None
+        estimate = self._session.step(frame, *prompts_in(frame, self._corrections))
         self._answered, self.latest = True, estimate
         initial = self._session.initial_mask
         if self._session.config.solver.final_refine:

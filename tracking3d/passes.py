@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -50,6 +50,9 @@ def go_through(
                     listener(told)
             except Exception as error:
                 going_on.remove(recording)
+                with suppress(Exception):  # the first error is the one to tell
+                    if told := recording.written():
+                        listener(told)
                 recording.give_up(error)
                 errors.append(error)
         if not going_on:

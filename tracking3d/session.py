@@ -48,6 +48,7 @@ class Session:
         renderer: What renders, and why, see `tracking3d.rendering.backend.choose_backend`.
         initial_mask: What the solver was given for the latest frame: the mask tracker's answer, or what stands in.
         corrected: Whether the latest answer was handed back to the mask tracker.
+        coming: The frame of the ``step`` after the next, where it is there: the mask tracker may begin with it.
         refining: What ``refine`` took.
 
     Raises:
@@ -87,6 +88,7 @@ class Session:
         self._presented, self._latest = Presented(0), 0
         self.initial_mask = MaskEstimate(None)
         self.corrected = False
+        self.coming: Frame | None = None
         self._last_pose = self._first_pose = np.eye(4)
         self._failures: dict[int, str] = {}
         self._refined = False
@@ -99,7 +101,7 @@ class Session:
             raise RuntimeError("the camera is known after the first step")
         return self._camera
 
-    def step(self, frame: Frame, prompt: Prompt | None = None, coming: Frame | None = None) -> FrameEstimate:
+    def step(self, frame: Frame, prompt: Prompt | None = None) -> FrameEstimate:
         """Track the object in the next frame; the first call starts on it.
 
         Frames from before the first one may follow the last, the nearest first: they are tracked backwards from the
@@ -109,7 +111,6 @@ class Session:
             frame: The frame.
             prompt: What the object is in this frame, where somebody has said so: the mask tracker is set on
                 it, and the solver trusts the mask that it makes. Not for the first frame.
-            coming: The frame of the next call, where it is there already: the mask tracker may begin with it.
 
         Raises:
             InputError: If this is no `Frame` of uint8 RGB, the first one has no object, another size than the first, or
@@ -123,7 +124,7 @@ class Session:
         check_frame(frame)
         try:
             with self._settings.in_force(), measured("solve") as watch:
-                estimate = self._start(frame) if self._solver is None else self._go_on(frame, prompt, coming)
+                estimate = self._start(frame) if self._solver is None else self._go_on(frame, prompt)
         except PluginFailure as error:
             raise error.at(frame.label) from error.__cause__
         return with_times(estimate, watch, frame)
@@ -222,7 +223,7 @@ class Session:
                 raise error.at(frame.label) from error.__cause__
         return answer
 
-    def _go_on(self, frame: Frame, prompt: Prompt | None, coming: Frame | None) -> FrameEstimate:
+    def _go_on(self, frame: Frame, prompt: Prompt | None) -> FrameEstimate:
         if frame.size != (self.camera.height, self.camera.width):
             raise InputError(
                 f"{frame.label} has {pixels(frame.size)} pixels but the first frame "
@@ -232,7 +233,7 @@ class Session:
         self.corrected, solver = False, self._facing(frame)
         try:
             mask = self._tracker.step(frame, prompt)
-            self._tracker.announce(coming)
+            self._tracker.announce(self.coming)
         except PluginFailure as error:
             failures.append(self._excused(error))
             mask = replace(self.initial_mask, score=0.0, reason=error.reason)
