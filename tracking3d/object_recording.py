@@ -106,8 +106,9 @@ class ObjectRecording:
             return self._take_kept(self._kept, frame)
         if isinstance(frame, SkippedFrame):
             return self._work.do(partial(self._skip, frame))
-        is_new = isinstance(coming, Frame) and coming.index not in self._past
-        self._session.coming = coming if is_new else None
+        if not isinstance(coming, Frame) or coming.index in self._past:
+            coming = None
+        self._session.coming = coming
         estimate = self._session.step(frame, *prompts_in(frame, self._corrections))
         self._answered, self.latest = True, estimate
         initial = self._session.initial_mask
