@@ -26,6 +26,7 @@ FLOORS = [
         "geometry",
         "networks",
         "process_memory",
+        "side_by_side",
         "stages",
         "web",
     },

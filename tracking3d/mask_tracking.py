@@ -62,6 +62,16 @@ class PromptedTracker:
             self._tracker.init(self._first, self._first_prompt)
         return self._tracker.step(frame) if prompt is None else self._set_on(frame, prompt)
 
+    def announce(self, coming: Frame | None) -> None:
+        """Let the tracker begin with the frame that it is asked for next, see `GuardedTracker.announce`.
+
+        Raises:
+            PluginError: If the tracker fails.
+        """
+        assert self._first is not None
+        if coming is not None and coming.index > self._first.index:  # else it may be another tracker's
+            self._tracker.announce(coming)
+
     def _set_on(self, frame: Frame, prompt: Prompt) -> MaskEstimate:
         other = self._new()
         told = other.init(frame, prompt)

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 from tracking3d.checkpoint.folder import Checkpoint
-from tracking3d.checkpoint.progress import Kept, Progress, TakenFrame, checksum
+from tracking3d.checkpoint.progress import Kept, Progress, TakenFrame, check_picture, checksum
 from tracking3d.checkpoint.trees import UnkeptError
 from tracking3d.corrections import Correction, prompts_in
-from tracking3d.errors import InputError, OutputError, PluginError
+from tracking3d.errors import OutputError, PluginError
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.frames import Frame, MaskEstimate, SkippedFrame
 from tracking3d.reconstruction import BELIEVED, TextureView, kept_views, texture_view, textured
@@ -21,9 +23,10 @@ from tracking3d.reconstruction.second_look import SecondLook
 from tracking3d.reconstruction.support import supported_answer
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord
-from tracking3d.results.refinement_writer import RefinementWriter
+from tracking3d.results.refinement_writer import PutRight, RefinementWriter
 from tracking3d.results.run_writer import RunWriter
 from tracking3d.session import Session
+from tracking3d.side_by_side import WorkBehind
 from tracking3d.stages import measured
 from tracking3d.video.source import FrameSource
 
@@ -58,6 +61,7 @@ class ObjectRecording:
         self._corrections, self._unmet = corrections or {}, set(corrections or {})
         self._redraw = redraw
         self._kept = kept
+        self._work = WorkBehind()  # all that touches writer and checkpoint while frames come
         self.latest: FrameEstimate | None = None
         self._progress = kept.progress if kept else Progress()
         self._until = self._progress  # what was done before
@@ -72,26 +76,47 @@ class ObjectRecording:
         self._look: SecondLook | None = None
         self._views: tuple[TextureView, ...] = ()
 
-    def take(self, frame: Frame | SkippedFrame) -> FrameRecord | SkippedFrame | None:
-        """Answer for the next frame and keep the answer; what was answered before the run was stopped stands."""
+    @contextmanager
+    def writing_beside(self) -> Iterator[None]:
+        """Within, answers are kept by another thread while the next frame is solved, one at a time."""
+        self._work.threaded = True
+        try:
+            yield
+        finally:
+            self._work.end()
+
+    def written(self) -> Any:
+        """Wait until all answers are kept; what is to be told of the last one."""
+        return self._work.wait()
+
+    def take(
+        self, frame: Frame | SkippedFrame, coming: Frame | SkippedFrame | None = None
+    ) -> FrameRecord | SkippedFrame | None:
+        """Answer for the next frame and keep the answer; what was answered before the run was stopped stands.
+
+        Args:
+            frame: The frame.
+            coming: The one that will be taken next, where that is known.
+
+        Returns:
+            What is to be told: of this frame, or of the one before while `writing_beside`.
+        """
         if isinstance(frame, Frame):
             self._unmet.discard(frame.index)
         if self._kept and frame.index in self._past:
             return self._take_kept(self._kept, frame)
         if isinstance(frame, SkippedFrame):
-            self._writer.skip(frame)
-            if self._checkpoint:
-                self._checkpoint.note(frame)
-            return frame
+            return self._work.do(partial(self._skip, frame))
+        if not isinstance(coming, Frame) or coming.index in self._past:
+            coming = None
+        self._session.coming = coming
         estimate = self._session.step(frame, *prompts_in(frame, self._corrections))
-        answer = self._writer.write(estimate, frame)
         self._answered, self.latest = True, estimate
         initial = self._session.initial_mask
         if self._session.config.solver.final_refine:
             self._initial[frame.index] = initial.score, initial.reason
+        taken = state = None
         if self._checkpoint:
-            if self._session.corrected:
-                self._checkpoint.keep_correction(frame.index, estimate.mask)
             taken = TakenFrame(
                 frame.index,
                 checksum(frame.image),
@@ -100,8 +125,24 @@ class ObjectRecording:
                 self._session.corrected,
                 self._session.failure_at(frame.index),
             )
+            state = self._session.kept()
+        return self._work.do(partial(self._keep_answer, estimate, frame, taken, state))
+
+    def _skip(self, frame: SkippedFrame) -> SkippedFrame:
+        self._writer.skip(frame)
+        if self._checkpoint:
+            self._checkpoint.note(frame)
+        return frame
+
+    def _keep_answer(
+        self, estimate: FrameEstimate, frame: Frame, taken: TakenFrame | None, state: dict[str, Any] | None
+    ) -> FrameRecord:
+        answer = self._writer.write(estimate, frame)
+        if self._checkpoint and taken and state:
+            if taken.corrected:
+                self._checkpoint.keep_correction(frame.index, estimate.mask)
             self._progress = replace(self._progress, last=frame.index, lines=self._writer.lines)
-            self._keep(taken, [one.index for one in estimate.revised])
+            self._keep(state, taken, [one.index for one in estimate.revised])
         return answer
 
     @property
@@ -153,7 +194,7 @@ class ObjectRecording:
         self._refinement.together = self._session.refining
         self._writer.refine_camera(self._session.camera)
         self._progress = replace(self._progress, refining=True)
-        self._keep()
+        self._keep(self._session.kept())
 
     def take_again(self, frame: Frame) -> FrameRecord | None:
         """Answer for a frame once more; None where it has no causal answer or there is no refinement."""
@@ -164,22 +205,32 @@ class ObjectRecording:
         if frame.index not in refinement.causal:
             return None
         if self._kept:
-            self._check(self._kept, frame)
+            check_picture(self._kept, frame)
             if frame.index <= self._until.last_refined:
-                return self._seen_again(refinement, refinement.answer(frame.index), frame)
+                answer = refinement.answer(frame.index)
+                return self._work.do(partial(self._seen_again, refinement, answer, frame))
         mask = refinement.initial_mask(frame.index)
         score, reason = self._initial.get(frame.index, (1.0, ""))
         initial = MaskEstimate(None if mask is None else mask.astype(np.float32), score, reason)
+        estimate = None
         try:
             estimate = self._session.revisit(frame, initial, refinement.causal[frame.index].T_cam_obj)
         except PluginError:
             if self._session.config.runtime.on_plugin_failure == "stop":
                 raise
-            answer = refinement.write(None, frame)
-        else:
-            answer = refinement.write(estimate, frame)
+        state = self._session.kept() if self._checkpoint else {}
+        return self._work.do(partial(self._keep_second, refinement, estimate, frame, state))
+
+    def _keep_second(
+        self,
+        refinement: RefinementWriter,
+        estimate: FrameEstimate | None,
+        frame: Frame,
+        state: dict[str, Any],
+    ) -> FrameRecord:
+        answer = refinement.write(estimate, frame)
         self._progress = replace(self._progress, last_refined=frame.index, refined_lines=refinement.lines)
-        self._keep()
+        self._keep(state)
         return self._seen_again(refinement, answer, frame)
 
     def _seen_again(self, refinement: RefinementWriter, answer: FrameRecord, frame: Frame) -> FrameRecord:
@@ -213,12 +264,11 @@ class ObjectRecording:
         refinement = self._refinement
         if refinement is None or frame.index not in refinement.causal:
             return
-        answer = refinement.answer(frame.index)
+        answer, put_right = refinement.answer(frame.index), None
         if self._look and answer.refined:
             T_cam_obj, support = self._look.pose(answer, frame.image, refinement.mask(answer))
-            judged = () if support is None else supported_answer(answer, support)
-            refinement.put_right(frame.index, T_cam_obj, *judged)
-        refinement.draw(frame)
+            put_right = PutRight(T_cam_obj, *(() if support is None else supported_answer(answer, support)))
+        self._work.do(partial(refinement.draw, frame, put_right))
 
     def finish(self) -> None:
         """Write what is made at the end."""
@@ -241,6 +291,7 @@ class ObjectRecording:
 
     def give_up(self, error: BaseException) -> None:
         """Keep what is finished when ``error`` ends the run, and let ``error`` say so."""
+        self._work.end()
         failed = isinstance(error, Exception)
         folder = self._writer.folder
         if self._causal_model is not None:
@@ -259,7 +310,7 @@ class ObjectRecording:
             return frame
         if frame.index not in kept.taken or self._until.refining:
             return None
-        self._check(kept, frame)
+        check_picture(kept, frame)
         assert isinstance(frame, Frame)
         if self._session.replays:
             taken, first = kept.taken[frame.index], frame.index == next(iter(kept.taken))
@@ -281,21 +332,10 @@ class ObjectRecording:
                 )
         return self._writer.draw_again(frame)
 
-    def _check(self, kept: Kept, frame: Frame | SkippedFrame) -> None:
-        """Make sure that a frame is the one that was answered before the run was stopped."""
-        taken = kept.taken.get(frame.index)
-        if isinstance(frame, SkippedFrame):
-            raise InputError(
-                f"Frame {frame.index} was read before the run was stopped, but cannot be now ({frame.reason})."
-            )
-        if taken is not None and taken.picture != checksum(frame.image):
-            raise InputError(
-                f"{frame.name or f'frame {frame.index}'} shows another picture than when it was answered; a run goes "
-                "on with the same source only."
-            )
-
-    def _keep(self, taken: TakenFrame | None = None, revised: Iterable[int] = ()) -> None:
-        """Keep the state as it is now."""
+    def _keep(
+        self, state: dict[str, Any], taken: TakenFrame | None = None, revised: Iterable[int] = ()
+    ) -> None:
+        """Keep the session's state."""
         if self._checkpoint is None:
             return
         self._progress = replace(
@@ -304,7 +344,7 @@ class ObjectRecording:
             refinement_seconds=self._refinement.seconds if self._refinement else 0.0,
         )
         try:
-            self._checkpoint.save(self._progress, self._session.kept(), taken, revised)
+            self._checkpoint.save(self._progress, state, taken, revised)
         except UnkeptError as error:
             _log.warning("This run cannot be resumed when it is stopped: %s.", error)
             self._checkpoint.remove()

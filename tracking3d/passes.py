@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 from tracking3d.frames import Frame, SkippedFrame
 from tracking3d.object_recording import ObjectRecording
 from tracking3d.results.records import FrameRecord
+from tracking3d.side_by_side import read_ahead, with_next
 from tracking3d.video.source import FrameSource
 
 Listener = Callable[[FrameRecord | SkippedFrame], None]
@@ -48,22 +50,31 @@ def go_through(
                     listener(told)
             except Exception as error:
                 going_on.remove(recording)
+                with suppress(Exception):  # the first error is the one to tell
+                    if told := recording.written():
+                        listener(told)
                 recording.give_up(error)
                 errors.append(error)
         if not going_on:
             raise errors[0]
 
-    try:
-        for frame in frames if any(recording.takes for recording in going_on) else ():
-            each(partial(ObjectRecording.take, frame=_shared(frame, share)))
-        if first_pass_only:
-            each(ObjectRecording.pause)
-            return
-        look_again(source, going_on, each)
-    except BaseException as error:
-        for recording in going_on:
-            recording.give_up(error)
-        raise
+    with ExitStack() as threads:
+        for recording in (
+            recordings if source.repeatable else ()
+        ):  # of a live source, answers are told at once
+            threads.enter_context(recording.writing_beside())
+        try:
+            for frame, coming in _in_turn(source, frames) if any(one.takes for one in going_on) else ():
+                each(partial(ObjectRecording.take, frame=_shared(frame, share), coming=coming))
+            each(ObjectRecording.written)
+            if first_pass_only:
+                each(ObjectRecording.pause)
+                return
+            look_again(source, going_on, each)
+        except BaseException as error:
+            for recording in going_on:
+                recording.give_up(error)
+            raise
     if errors:
         raise errors[0]
 
@@ -82,14 +93,34 @@ def look_again(
     """
     share = 1 / len(recordings)
     each(partial(ObjectRecording.begin_refinement, source=source))
-    for frame in timed(source) if any(recording.looks_again for recording in recordings) else ():
-        if isinstance(frame, Frame):
-            each(partial(ObjectRecording.take_again, frame=_shared(frame, share)))
+    for frame in _once_more(source) if any(recording.looks_again for recording in recordings) else ():
+        each(partial(ObjectRecording.take_again, frame=_shared(frame, share)))
+    each(ObjectRecording.written)
     each(ObjectRecording.settle)
-    for frame in timed(source) if any(recording.draws for recording in recordings) else ():
-        if isinstance(frame, Frame):
-            each(partial(ObjectRecording.draw, frame=frame))
+    for frame in _once_more(source) if any(recording.draws for recording in recordings) else ():
+        each(partial(ObjectRecording.draw, frame=frame))
+    each(ObjectRecording.written)
     each(ObjectRecording.finish)
+
+
+def _in_turn(
+    source: FrameSource, frames: Iterable[Frame | SkippedFrame]
+) -> Iterator[tuple[Frame | SkippedFrame, Frame | SkippedFrame | None]]:
+    """The frames, each with the one that comes next, which is read meanwhile; that of a live source is not known."""
+    if not source.repeatable:
+        for frame in frames:
+            yield frame, None
+        return
+    with closing(read_ahead(frames)) as ahead:
+        yield from with_next(ahead)
+
+
+def _once_more(source: FrameSource) -> Iterator[Frame]:
+    """The frames that can be read, read once more."""
+    with closing(timed(source)) as frames, closing(read_ahead(frames)) as ahead:
+        for frame in ahead:
+            if isinstance(frame, Frame):
+                yield frame
 
 
 def timed(source: FrameSource) -> Generator[Frame | SkippedFrame]:

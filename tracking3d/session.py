@@ -48,6 +48,7 @@ class Session:
         renderer: What renders, and why, see `tracking3d.rendering.backend.choose_backend`.
         initial_mask: What the solver was given for the latest frame: the mask tracker's answer, or what stands in.
         corrected: Whether the latest answer was handed back to the mask tracker.
+        coming: The frame of the ``step`` after the next, where it is there: the mask tracker may begin with it.
         refining: What ``refine`` took.
 
     Raises:
@@ -87,6 +88,7 @@ class Session:
         self._presented, self._latest = Presented(0), 0
         self.initial_mask = MaskEstimate(None)
         self.corrected = False
+        self.coming: Frame | None = None
         self._last_pose = self._first_pose = np.eye(4)
         self._failures: dict[int, str] = {}
         self._refined = False
@@ -231,6 +233,7 @@ class Session:
         self.corrected, solver = False, self._facing(frame)
         try:
             mask = self._tracker.step(frame, prompt)
+            self._tracker.announce(self.coming)
         except PluginFailure as error:
             failures.append(self._excused(error))
             mask = replace(self.initial_mask, score=0.0, reason=error.reason)

@@ -7,8 +7,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from kornia.geometry.conversions import quaternion_to_rotation_matrix, rotation_matrix_to_quaternion
 from scipy.spatial.transform import Rotation
 from torch.autograd import gradcheck
+from torch.nn import functional
 
 from tracking3d.geometry.pose import Pose, extrapolate, from_matrix, rotation_about, rotation_angle
 
@@ -139,3 +141,23 @@ def test_extrapolation_over_and_over_keeps_rotations_rotations():
 def test_a_rotation_about_an_axis_is_by_the_right_hand():
     turned = rotation_about(torch.tensor([0.0, 0.0, 2.0]), 90.0) @ torch.tensor([1.0, 0.0, 0.0])
     torch.testing.assert_close(turned, torch.tensor([0.0, 1.0, 0.0]), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_single_rotation_is_converted_to_the_same_digits_as_by_kornia(dtype):
+    drawn = torch.randn(200, 4, dtype=dtype, generator=torch.Generator().manual_seed(5))
+    drawn[:40] = functional.normalize(drawn[:40], dim=1)
+    drawn[40:60, 0] *= 1e-3  # half turns
+    drawn[60] = 0
+    drawn[61] = 1e-13
+    drawn[62] = math.nan
+    matrices = quaternion_to_rotation_matrix(drawn)
+    for one, R, again in zip(drawn, matrices, rotation_matrix_to_quaternion(matrices), strict=True):
+        assert torch.equal(Pose(torch.zeros(3), one).R.nan_to_num(9), R.nan_to_num(9))
+        assert torch.equal(from_matrix(R, torch.zeros(3)).quaternion.nan_to_num(9), again.nan_to_num(9))
+
+
+def test_a_rotation_that_is_solved_for_has_gradients():
+    quaternion = torch.tensor([1.0, 0.1, 0.0, 0.0], requires_grad=True)
+    Pose(torch.zeros(3), quaternion).R.sum().backward()
+    assert quaternion.grad is not None and quaternion.grad.abs().sum() > 0

@@ -273,3 +273,29 @@ def test_a_kernel_takes_what_it_was_compiled_for_and_nothing_else():
     assert twice(1.5) == 3.0
     with pytest.raises(TypeError, match="No matching definition"):
         twice("1.5")
+
+
+SUM = """
+from tracking3d.rendering.kernels.compilation import kernel
+
+@kernel("float64(float64, float64)")
+def summed(a, b):
+    return a + b
+"""
+
+
+def test_a_kernel_is_loaded_ahead_where_it_is_kept_and_compiled_only_when_it_is_called(tmp_path, monkeypatch):
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    (tmp_path / "sums.py").write_text(SUM)
+
+    def imported():
+        spec = importlib.util.spec_from_file_location("sums", tmp_path / "sums.py")
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        return module.summed
+
+    first = imported()
+    assert not first.load()
+    assert first(1.0, 2.0) == 3.0 and first.load()
+    again = imported()
+    assert again.load() and again(1.0, 2.0) == 3.0

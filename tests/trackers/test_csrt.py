@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from tracking3d.errors import InputError, PluginError
 from tracking3d.frames import Frame, MaskEstimate, Prompt
 from tracking3d.trackers.csrt import CsrtTracker
-from tracking3d.trackers.protocol import CorrectableTracker, MaskTracker, Options
+from tracking3d.trackers.protocol import CorrectableTracker, ForewarnedTracker, MaskTracker, Options
 from tracking3d.trackers.segmentation import ColourSegmentation
 
 
@@ -68,6 +68,40 @@ def test_the_same_video_gives_the_same_masks_whatever_the_random_state() -> None
     for a, b in zip(once, again, strict=True):
         np.testing.assert_array_equal(a.mask, b.mask)
         assert a.score == b.score
+
+
+@pytest.mark.parametrize("turns_up", [True, False])
+def test_frames_that_are_announced_change_no_answer(turns_up: bool) -> None:
+    frames, truth = moving_shape(6)
+    prompt = Prompt(box_around(truth[0]))
+    csrt, forewarned = tracker(), tracker()
+    assert isinstance(forewarned, ForewarnedTracker)
+    for one in (csrt, forewarned):
+        one.init(frames[0], prompt)
+    for frame in frames[1:]:
+        forewarned.announce(frame if turns_up else Frame(frame.index, frame.image.copy()))
+        a, b = csrt.step(frame), forewarned.step(frame)
+        if turns_up:
+            np.testing.assert_array_equal(a.mask, b.mask)
+            assert a.score == b.score
+        else:  # it has seen the frame twice, and goes on
+            assert_valid(b, SIZE)
+
+
+def test_a_correction_forgets_the_box_that_was_looked_for_beside() -> None:
+    frames, truth = moving_shape(6)
+    elsewhere = np.roll(truth[1], 40, axis=1)
+    answers = []
+    for announces in (False, True):
+        csrt = tracker()
+        csrt.init(frames[0], Prompt(box_around(truth[0])))
+        csrt.step(frames[1])
+        if announces:
+            csrt.announce(frames[2])
+        csrt.correct(frames[1], elsewhere)
+        answers.append(csrt.step(frames[2]))
+    np.testing.assert_array_equal(answers[0].mask, answers[1].mask)
+    assert answers[0].score == answers[1].score
 
 
 def test_answers_do_not_depend_on_later_frames() -> None:

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.frames import SkippedFrame
+from tracking3d.errors import InputError
+from tracking3d.frames import Frame, SkippedFrame
 
 
 @dataclass(frozen=True)
@@ -104,3 +105,21 @@ def read_journal(text: bytes) -> tuple[dict[int, TakenFrame], tuple[SkippedFrame
         except (TypeError, AttributeError) as error:
             raise ValueError(f"not a frame of the journal: {error}") from error
     return taken, tuple(skipped)
+
+
+def check_picture(kept: Kept, frame: Frame | SkippedFrame) -> None:
+    """Make sure that a frame is the one that was answered before the run was stopped.
+
+    Raises:
+        InputError: If it is not.
+    """
+    taken = kept.taken.get(frame.index)
+    if isinstance(frame, SkippedFrame):
+        raise InputError(
+            f"Frame {frame.index} was read before the run was stopped, but cannot be now ({frame.reason})."
+        )
+    if taken is not None and taken.picture != checksum(frame.image):
+        raise InputError(
+            f"{frame.name or f'frame {frame.index}'} shows another picture than when it was answered; a run goes "
+            "on with the same source only."
+        )

@@ -32,8 +32,11 @@ PRELOADED = [
     "tracking3d.trackers.csrt",
     "tracking3d.trackers.flow",
     "tracking3d.trackers.precomputed",
+    "tracking3d.features.rgb",
+    "tracking3d.batch.one_video",
+    "tracking3d.speed.kernels_loaded",
 ]
-"""What takes seconds to import, and is imported once."""
+"""What takes seconds to import or to load, and is so once; every task then begins with it."""
 
 
 @dataclass

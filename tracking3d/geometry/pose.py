@@ -1,4 +1,4 @@
-"""Poses as translation and unit quaternion (w, x, y, z); conversions are kornia's.
+"""Poses as translation and unit quaternion (w, x, y, z); conversions are kornia's, or give the same digits.
 
 ``T_cam_obj`` maps object to camera coordinates: ``x_cam = R x_obj + t``.
 """
@@ -9,9 +9,10 @@ import math
 from dataclasses import dataclass
 
 import torch
-from kornia.geometry.conversions import quaternion_to_rotation_matrix, rotation_matrix_to_quaternion
 from torch import Tensor
 from torch.nn import functional
+
+from tracking3d.geometry.single_rotation import is_single, matrix_of, quaternion_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +50,12 @@ class Pose:
     @property
     def R(self) -> Tensor:
         """``(..., 3, 3)`` rotation matrix."""
-        return quaternion_to_rotation_matrix(self.quaternion)
+        if is_single(self.quaternion, 1):
+            return matrix_of(self.quaternion)
+        from kornia.geometry.conversions import quaternion_to_rotation_matrix
+
+        result: Tensor = quaternion_to_rotation_matrix(self.quaternion)
+        return result
 
     def matrix(self) -> Tensor:
         """``(4, 4)`` float64 ``T_cam_obj`` of a single pose, on the CPU."""
@@ -62,6 +68,10 @@ class Pose:
 
 def from_matrix(R: Tensor, translation: Tensor) -> Pose:
     """A pose from a rotation matrix ``(3, 3)`` and a translation ``(3,)``."""
+    if is_single(R, 2):
+        return Pose(translation, quaternion_of(R))
+    from kornia.geometry.conversions import rotation_matrix_to_quaternion
+
     return Pose(translation, rotation_matrix_to_quaternion(R))
 
 

@@ -20,7 +20,7 @@ from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame, MaskEstimate, Prompt
 from tracking3d.plugins.registration import told
 from tracking3d.stages import in_stage
-from tracking3d.trackers.protocol import CorrectableTracker, MaskTracker, ResumableTracker
+from tracking3d.trackers.protocol import CorrectableTracker, ForewarnedTracker, MaskTracker, ResumableTracker
 
 
 class PluginFailure(PluginError):
@@ -94,6 +94,16 @@ class GuardedTracker:
         if isinstance(self._tracker, CorrectableTracker):
             with in_stage("track"), _blamed(self._label):
                 self._tracker.correct(frame, mask.copy())
+
+    def announce(self, frame: Frame) -> None:
+        """Say which frame ``step`` is called with next; see `tracking3d.trackers.protocol.ForewarnedTracker`.
+
+        Raises:
+            PluginFailure: If the tracker fails.
+        """
+        if isinstance(self._tracker, ForewarnedTracker):
+            with in_stage("track"), _blamed(self._label):
+                self._tracker.announce(frame)
 
     @property
     def can_resume(self) -> bool:

@@ -26,6 +26,7 @@ NOISE = 4.0
 LEAST_COVER = 0.2
 """Share of the window in which the template has to be known."""
 STEPS = 8
+_LEAST_SHARED = 64  # points for which another thread pays
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,10 +71,12 @@ def align(
     if not use_numba(backend, torch.empty(0, dtype=torch.float32)):
         return _align_together(planes[0], planes[1], planes[2], points, window, prior)
     from tracking3d.points.kernels.alignment import align as compiled
+    from tracking3d.rendering.kernels.threads import share
 
     count = len(points)
     shift, covariance, agreement = np.empty((count, 2)), np.empty((count, 3)), np.empty((count, 2))
-    compiled(*planes, points, window, prior, NOISE, LEAST_COVER, STEPS, shift, covariance, agreement)
+    out = shift, covariance, agreement
+    share(compiled, count, _LEAST_SHARED, *planes, points, window, prior, NOISE, LEAST_COVER, STEPS, *out)
     return Alignment(shift, covariance, agreement[:, 0], agreement[:, 1])
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 
-from kornia.losses import cauchy_loss
 from torch import Tensor
 
 from tracking3d.rendering.backend import use_numba
@@ -70,6 +69,8 @@ def channels_last(image: Tensor) -> Tensor:
 def cauchy(a: Tensor, b: Tensor, scale: float) -> Tensor:
     """Cauchy loss ``log(1 + ((a - b) / scale)^2)``, element by element."""
     factor = math.sqrt(2.0) / scale  # kornia's is log(1 + (a - b)^2 / 2)
+    from kornia.losses import cauchy_loss  # takes a second to import, and kernels do without
+
     return cauchy_loss(a * factor, b * factor, reduction="none")
 
 

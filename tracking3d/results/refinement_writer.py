@@ -6,9 +6,9 @@ Until then the run folder holds the causal answers whole, whatever ends the refi
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,21 @@ from tracking3d.results.probabilities import take_over_probability, write_probab
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import read_records
 from tracking3d.stages import StageTimes, measured
+
+
+@dataclass(frozen=True, eq=False)
+class PutRight:
+    """What a second answer says in the end, once all frames have been looked at again.
+
+    Attributes:
+        T_cam_obj: ``(4, 4)``, of the camera of the end.
+        judgement: How far it is believed; None is as before.
+        evidence: What that comes from, kept among the losses.
+    """
+
+    T_cam_obj: NDArray[np.float64]
+    judgement: Assessment | None = None
+    evidence: dict[str, float] = field(default_factory=dict)
 
 
 class RefinementWriter:
@@ -85,40 +100,30 @@ class RefinementWriter:
         """The answer for frame ``index`` as it is now: the second one, or the causal one where there is none."""
         return self._records.get(index) or self.causal[index]
 
-    def put_right(
-        self,
-        index: int,
-        T_cam_obj: NDArray[np.float64],
-        judgement: Assessment | None = None,
-        evidence: Mapping[str, float] | None = None,
-    ) -> None:
-        """Give a second answer the pose that it has in the end; causal ones stand.
+    def put_right(self, index: int, put_right: PutRight) -> None:
+        """Give a second answer what it says in the end; causal ones stand.
 
         It is not kept for a run that is stopped here and goes on later: that finds it anew.
-
-        Args:
-            index: Of the frame.
-            T_cam_obj: ``(4, 4)``, of the camera of the end.
-            judgement: How far it is believed in the end; as before, if left out.
-            evidence: What that comes from, kept among the losses.
         """
         if (record := self._records.get(index)) is None:
             return
-        record = replace(
-            record, T_cam_obj=T_cam_obj, camera=None, losses=record.losses | dict(evidence or {})
-        )
+        T_cam_obj, judgement = put_right.T_cam_obj, put_right.judgement
+        losses = record.losses | put_right.evidence
+        record = replace(record, T_cam_obj=T_cam_obj, camera=None, losses=losses)
         if judgement is not None:
             record = replace(
                 record, status=judgement.status, reason=judgement.reason, confidence=judgement.confidence
             )
         self._records[index] = record
 
-    def draw(self, frame: Frame) -> None:
-        """Draw the answer for a frame.
+    def draw(self, frame: Frame, put_right: PutRight | None = None) -> None:
+        """Draw the answer for a frame, put right before where it is said how.
 
         Raises:
             OutputError: If the video cannot be written.
         """
+        if put_right is not None:
+            self.put_right(frame.index, put_right)
         record = self.answer(frame.index)
         with measured("write") as watch:
             self.pictures.add_kept(frame, record, self.mask(record), self.initial_mask(frame.index))

@@ -99,6 +99,11 @@ class CsrtTracker:
             return MaskEstimate(estimate.mask, estimate.score / 2, "CSR-DCF has lost the object")
         return estimate
 
+    def announce(self, frame: Frame) -> None:
+        """Look for the box of the frame that comes next beside; a correction that moves the box forgets it."""
+        if self._boxes is not None:
+            self._boxes.announce(frame.image)
+
     def correct(self, frame: Frame, mask: NDArray[np.bool_]) -> None:
         """Re-anchor the segmentation on ``mask`` ``(H, W)`` in ``frame``, and the box tracker if it has strayed."""
         box = box_of(mask)

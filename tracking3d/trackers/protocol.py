@@ -53,6 +53,15 @@ class CorrectableTracker(Protocol):
 
 
 @runtime_checkable
+class ForewarnedTracker(Protocol):
+    """A mask tracker that can begin with a frame while the answer for the one before is still worked on."""
+
+    def announce(self, frame: Frame) -> None:
+        """``step`` will be called with ``frame`` next, if at all; a correction may come before."""
+        ...
+
+
+@runtime_checkable
 class ResumableTracker(Protocol):
     """A mask tracker that can be asked for its memory, and be given it again in another process.
 

@@ -4,13 +4,26 @@ from __future__ import annotations
 
 import typer
 
-from tracking3d.cli.bench import batch, cost, live, masks, matching, points, render, schedule, soak, split
+from tracking3d.cli.bench import (
+    batch,
+    cost,
+    live,
+    masks,
+    matching,
+    points,
+    render,
+    schedule,
+    soak,
+    split,
+    track,
+)
 
 app = typer.Typer(
     help="Measure how fast, and how good by themselves, the parts are on this machine.",
     no_args_is_help=True,
 )
 app.command(name="render")(render.render)
+app.command(name="track")(track.track)
 app.command(name="live")(live.live)
 app.command(name="masks")(masks.masks)
 app.command(name="matching")(matching.matching)

@@ -24,9 +24,34 @@ def _between(plane: NDArray[Any], x: float, y: float) -> Any:
     return upper * (1 - down) + lower * down
 
 
+@numba.njit(inline="always", fastmath=REORDER, **OPTIONS)
+def _patch(plane: NDArray[Any], x: float, y: float, half: int, values: NDArray[Any]) -> bool:
+    """Fill ``values`` ((2 half + 1)^2) around ``x, y``, where all of it lies within the plane; all pixels lie alike
+    between those of the plane."""
+    height, width = plane.shape
+    if not (x >= half and y >= half and x + half <= width - 1.001 and y + half <= height - 1.001):
+        return False
+    row, column = int(y), int(x)
+    right, down = x - column, y - row
+    left_up, right_up = (1 - right) * (1 - down), right * (1 - down)
+    left_down, right_down = (1 - right) * down, right * down
+    side = 2 * half + 1
+    for i in range(side):
+        upper, lower = plane[row - half + i], plane[row - half + i + 1]
+        for j in range(side):
+            at = column - half + j
+            values[i * side + j] = (
+                left_up * upper[at]
+                + right_up * upper[at + 1]
+                + left_down * lower[at]
+                + right_down * lower[at + 1]
+            )
+    return True
+
+
 @kernel(
     "void(float32[:,::1], float32[:,::1], float32[:,::1], float64[:,::1], float64[:,::1], float64, float64, float64,"
-    " int64, float64[:,::1], float64[:,::1], float64[:,::1])",
+    " int64, float64[:,::1], float64[:,::1], float64[:,::1], int64, int64)",
     fastmath=REORDER,
 )
 def align(
@@ -42,35 +67,47 @@ def align(
     shift: NDArray[Any],
     covariance: NDArray[Any],
     agreement: NDArray[Any],
+    first: int,
+    last: int,
 ) -> None:
     """Fill ``shift`` (N, 2), ``covariance`` (N, 3) as xx, xy, yy, and ``agreement`` (N, 2): correlation, and
-    contrast of the template."""
+    contrast of the template; of the points from ``first`` to before ``last``."""
     side = window.shape[0]
     radius, count = side // 2, side * side
     T, w = np.empty(count), np.empty(count)
     gx, gy = np.empty(count), np.empty(count)
-    here = np.empty(count)
+    here, known, wider = np.empty(count), np.empty(count), np.empty((side + 2) ** 2)
     total = window.sum()
     height, width = template.shape
-    for p in range(len(xy)):
+    for p in range(first, last):
         px, py = xy[p, 0], xy[p, 1]
         shift[p] = 0.0
         covariance[p] = np.inf
         agreement[p, 0], agreement[p, 1] = -1.0, 0.0
         if not (-radius < px < width + radius and -radius < py < height + radius):
             continue
-        cover, mean, k = 0.0, 0.0, 0
-        for i in range(side):
-            for j in range(side):
-                x, y = px + j - radius, py + i - radius
-                within = 1.0 <= x <= width - 2.0 and 1.0 <= y <= height - 2.0
-                w[k] = window[i, j] * _between(weight, x, y) if within else 0.0
-                T[k] = _between(template, x, y)
-                gx[k] = 0.5 * (_between(template, x + 1, y) - _between(template, x - 1, y))
-                gy[k] = 0.5 * (_between(template, x, y + 1) - _between(template, x, y - 1))
-                cover += w[k]
-                mean += w[k] * T[k]
-                k += 1
+        cover, mean = 0.0, 0.0
+        if _patch(template, px, py, radius + 1, wider) and _patch(weight, px, py, radius, known):
+            for i in range(side):
+                for j in range(side):
+                    k, at = i * side + j, (i + 1) * (side + 2) + j + 1
+                    w[k] = window[i, j] * known[k]
+                    T[k] = wider[at]
+                    gx[k] = 0.5 * (wider[at + 1] - wider[at - 1])
+                    gy[k] = 0.5 * (wider[at + side + 2] - wider[at - side - 2])
+        else:
+            for i in range(side):
+                for j in range(side):
+                    k = i * side + j
+                    x, y = px + j - radius, py + i - radius
+                    within = 1.0 <= x <= width - 2.0 and 1.0 <= y <= height - 2.0
+                    w[k] = window[i, j] * _between(weight, x, y) if within else 0.0
+                    T[k] = _between(template, x, y)
+                    gx[k] = 0.5 * (_between(template, x + 1, y) - _between(template, x - 1, y))
+                    gy[k] = 0.5 * (_between(template, x, y + 1) - _between(template, x, y - 1))
+        for k in range(count):
+            cover += w[k]
+            mean += w[k] * T[k]
         if cover < least_cover * total:
             continue
         mean /= cover
@@ -88,33 +125,31 @@ def align(
         dx, dy = 0.0, 0.0
         step = 0
         while True:
+            if not _patch(image, px + dx, py + dy, radius, here):
+                for i in range(side):
+                    for j in range(side):
+                        here[i * side + j] = _between(image, px + j - radius + dx, py + i - radius + dy)
             mean_here = 0.0
-            for i in range(side):
-                for j in range(side):
-                    k = i * side + j
-                    if w[k] > 0:
-                        here[k] = _between(image, px + j - radius + dx, py + i - radius + dy)
-                        mean_here += w[k] * here[k]
+            for k in range(count):
+                mean_here += w[k] * here[k]
             variance_here, together = 0.0, 0.0
             for k in range(count):
-                if w[k] > 0:
-                    here[k] -= mean_here
-                    variance_here += w[k] * here[k] * here[k]
-                    together += w[k] * here[k] * T[k]
+                here[k] -= mean_here
+                variance_here += w[k] * here[k] * here[k]
+                together += w[k] * here[k] * T[k]
             gain = min(max(together / (variance + 1e-6), 0.4), 2.5)
             hxx, hxy, hyy, bx, by, residual = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
             for k in range(count):
-                if w[k] > 0:
-                    r = here[k] - gain * T[k]
-                    ax, ay = gain * gx[k], gain * gy[k]
-                    robust = 9 * noise * noise / (9 * noise * noise + r * r)
-                    u = w[k] * robust * robust
-                    hxx += u * ax * ax
-                    hxy += u * ax * ay
-                    hyy += u * ay * ay
-                    bx -= u * ax * r
-                    by -= u * ay * r
-                    residual += w[k] * r * r
+                r = here[k] - gain * T[k]
+                ax, ay = gain * gx[k], gain * gy[k]
+                robust = 9 * noise * noise / (9 * noise * noise + r * r)
+                u = w[k] * robust * robust
+                hxx += u * ax * ax
+                hxy += u * ax * ay
+                hyy += u * ay * ay
+                bx -= u * ax * r
+                by -= u * ay * r
+                residual += w[k] * r * r
             if step < 0:
                 break
             hold = noise * noise / (cover * prior * prior) * 6

@@ -56,6 +56,20 @@ class Kernel:
                 self._compiled = self._compiled or self._compile()
         return self._compiled
 
+    def load(self) -> bool:
+        """Load it now if it is kept on disk, and say whether it is there; else it is compiled when it is called."""
+        if self._compiled is None and self._is_kept():
+            self.compile()
+        return self._compiled is not None
+
+    def _is_kept(self) -> bool:
+        try:
+            folder = numba.njit(cache=True, **self._options)(self._function).stats.cache_path
+            _drop_stale(folder, self._function)
+        except (RuntimeError, OSError):
+            return False
+        return any(Path(folder).glob(f"*.{self._function.__name__}-*.nbi"))
+
     def _compile(self) -> Callable[..., Any]:
         dispatcher = self._with_cache()
         if dispatcher is None:
