@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tracking3d.checkpoint.folder import Checkpoint
 from tracking3d.checkpoint.progress import Kept, Progress, TakenFrame, checksum
@@ -18,6 +19,7 @@ from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.frames import Frame, MaskEstimate, SkippedFrame
 from tracking3d.reconstruction import BELIEVED, TextureView, kept_views, texture_view, textured
 from tracking3d.reconstruction.second_look import SecondLook
+from tracking3d.reconstruction.second_masks import Decision, Masked, SecondMasks
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.refinement_writer import RefinementWriter
@@ -69,6 +71,8 @@ class ObjectRecording:
         self._causal_model: ObjectModel | None = None
         self._refinement: RefinementWriter | None = None
         self._look: SecondLook | None = None
+        self._faces: NDArray[np.int64] = np.zeros((0, 3), np.int64)
+        self._masks: SecondMasks | None = None
         self._views: tuple[TextureView, ...] = ()
 
     def take(self, frame: Frame | SkippedFrame) -> FrameRecord | SkippedFrame | None:
@@ -123,7 +127,9 @@ class ObjectRecording:
         if self._refinement is not None:
             answered = sorted(self._refinement.causal)
             most = self._session.config.object.landmark_views
-            self._look = SecondLook(self._session.result(), self._session.camera, answered, most)
+            model = self._session.result()
+            self._look = SecondLook(model, self._session.camera, answered, most)
+            self._faces = model.faces
         elif self._redraw:
             self._writer.begin_drawing_anew()
 
@@ -206,20 +212,49 @@ class ObjectRecording:
             self._look.settle()
         self._refinement.together += watch.times
         self._writer.refine_camera(self._look.camera)
+        if self._session.config.object.evidence:
+            answers = [self._refinement.answer(index) for index in self._refinement.causal]
+            self._masks = SecondMasks(self._look.camera, self._look.vertices, self._faces, answers)
+
+    def put_right(self, frame: Frame) -> None:
+        """Give the final answer for a frame the pose that all frames together say."""
+        refinement = self._refinement
+        if refinement is None or self._look is None or frame.index not in refinement.causal:
+            return
+        answer = refinement.answer(frame.index)
+        if answer.refined:
+            T_cam_obj = self._look.pose(answer, frame.image, refinement.mask(answer))
+            refinement.put_right(frame.index, T_cam_obj)
+        if self._masks:
+            self._masks.see(self._masked(refinement, frame))
 
     def draw(self, frame: Frame) -> None:
-        """Draw the final answer for a frame, its pose put right."""
+        """Draw the final answer for a frame, its mask weighed once more; some frames late, with those around them."""
         refinement = self._refinement
         if refinement is None or frame.index not in refinement.causal:
             return
+        if self._masks is None:
+            refinement.draw(frame)
+        else:
+            self._draw(refinement, self._masks.decide(self._masked(refinement, frame)))
+
+    def _masked(self, refinement: RefinementWriter, frame: Frame) -> Masked:
         answer = refinement.answer(frame.index)
-        if self._look and answer.refined:
-            T_cam_obj = self._look.pose(answer, frame.image, refinement.mask(answer))
-            refinement.put_right(frame.index, T_cam_obj)
-        refinement.draw(frame)
+        initial, fixed = refinement.initial_mask(frame.index), frame.index in self._corrections
+        return Masked(frame, answer, initial, refinement.mask(answer), fixed)
+
+    def _draw(self, refinement: RefinementWriter, decisions: Iterator[Decision]) -> None:
+        with measured("map") as watch:
+            for frame, decided in decisions:
+                if decided is not None:
+                    refinement.put_mask(frame.index, decided.mask, decided.probability)
+                refinement.draw(frame)
+        refinement.together += watch.times
 
     def finish(self) -> None:
         """Write what is made at the end."""
+        if self._refinement is not None and self._masks is not None:
+            self._draw(self._refinement, self._masks.rest())
         model, views = self._session.result(), self._views
         if self._refinement is not None and self._look is not None:
             answers = [self._refinement.answer(view.index) for view in views]

@@ -75,6 +75,8 @@ def look_again(
 ) -> None:
     """All frames are answered: the final refinement where it is asked for and possible, the pictures, and the end.
 
+    A refinement takes three passes: every frame solved again, its pose put right by all of them, its mask likewise.
+
     Args:
         source: Where the frames come from.
         recordings: One an object; some may be taken out on the way.
@@ -86,9 +88,10 @@ def look_again(
         if isinstance(frame, Frame):
             each(partial(ObjectRecording.take_again, frame=_shared(frame, share)))
     each(ObjectRecording.settle)
-    for frame in timed(source) if any(recording.draws for recording in recordings) else ():
-        if isinstance(frame, Frame):
-            each(partial(ObjectRecording.draw, frame=frame))
+    for action in (ObjectRecording.put_right, ObjectRecording.draw):
+        for frame in timed(source) if any(recording.draws for recording in recordings) else ():
+            if isinstance(frame, Frame):
+                each(partial(action, frame=frame))
     each(ObjectRecording.finish)
 
 

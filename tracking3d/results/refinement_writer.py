@@ -12,17 +12,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.estimation.estimate import FrameEstimate
+from tracking3d.estimation.estimate import FrameEstimate, MaskSource
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.results import description, layout
 from tracking3d.results.files import read_mask, write_mask, writing
 from tracking3d.results.pictures import Pictures
 from tracking3d.results.probabilities import take_over_probability, write_probability
-from tracking3d.results.records import FrameRecord
+from tracking3d.results.records import FrameRecord, mask_iou
 from tracking3d.results.run_reader import read_records
 from tracking3d.stages import StageTimes, measured
 
@@ -69,6 +70,7 @@ class RefinementWriter:
                 lines.truncate(kept)
         kept_records = read_records(self._aside / layout.FRAMES)
         self._records = {record.index: record for record in kept_records}
+        self._decided: dict[int, bytes] = {}  # masks as PNG
 
     @property
     def lines(self) -> int:
@@ -91,6 +93,31 @@ class RefinementWriter:
         """
         if (record := self._records.get(index)) is not None:
             self._records[index] = replace(record, T_cam_obj=T_cam_obj, camera=None)
+
+    def put_mask(self, index: int, mask: NDArray[np.bool_], probability: NDArray[np.float32]) -> None:
+        """Give a second answer another mask ``(H, W)``, weighed against the image; causal ones stand.
+
+        Like a pose that is put right it is not kept for a run that is stopped here.
+
+        Args:
+            index: Of the frame.
+            mask: ``(H, W)``.
+            probability: ``(H, W)`` of the object.
+
+        Raises:
+            OutputError: If the probability cannot be written.
+        """
+        if (record := self._records.get(index)) is None:
+            return
+        self._records[index] = replace(
+            record,
+            area=int(np.count_nonzero(mask)),
+            iou_initial=mask_iou(mask, self.initial_mask(index)),
+            mask_source=MaskSource.WEIGHED,
+        )
+        self._decided[index] = cv2.imencode(".png", np.where(mask, 255, 0).astype(np.uint8))[1].tobytes()
+        if (self._folder / layout.PROBABILITIES).is_dir():
+            write_probability(self._aside, index, probability)
 
     def draw(self, frame: Frame) -> None:
         """Draw the answer for a frame.
@@ -132,6 +159,8 @@ class RefinementWriter:
 
     def mask(self, record: FrameRecord) -> NDArray[np.bool_]:
         """The mask ``(H, W)`` of an answer, empty where it cannot be read."""
+        if record.refined and (decided := self._decided.get(record.index)) is not None:
+            return _decoded(decided)
         mask = read_mask(layout.mask_path(self._aside if record.refined else self._folder, record.index))
         return (
             np.zeros((self.pictures.camera.height, self.pictures.camera.width), bool)
@@ -160,6 +189,8 @@ class RefinementWriter:
             (causal / layout.MASKS).mkdir(parents=True, exist_ok=True)
             for record in self._records.values():
                 place = layout.mask_path(self._folder, record.index)
+                if (decided := self._decided.get(record.index)) is not None:
+                    write_mask(layout.mask_path(self._aside, record.index), _decoded(decided))
                 place.replace(layout.mask_path(causal, record.index))
                 layout.mask_path(self._aside, record.index).replace(place)
             for name in layout.MESH_FILES:
@@ -191,6 +222,10 @@ class RefinementWriter:
         refined = list(self._records.values()) if self._taken_over else []
         causal = list(self.causal.values())
         return description.refinement(state, reason, causal, refined, self.seconds, self.together)
+
+
+def _decoded(mask: bytes) -> NDArray[np.bool_]:
+    return np.asarray(cv2.imdecode(np.frombuffer(mask, np.uint8), cv2.IMREAD_GRAYSCALE) > 0)
 
 
 def clear_refinement(folder: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import MaskSource
-from tracking3d.estimation.evidence import (
+from tracking3d.evidence import (
     Colours,
     along_edges,
     as_lab,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tracking3d.estimation.estimate import FrameEstimate
-from tracking3d.estimation.evidence import Colours
+from tracking3d.evidence import Colours
 from tracking3d.estimation.feature_space import FeatureSpace
 from tracking3d.estimation.observation import Observation
 from tracking3d.estimation.online.judgement import Usual

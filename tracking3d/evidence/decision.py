@@ -27,7 +27,7 @@ def along_edges(
     Args:
         image: ``(S, S, 3)`` RGB.
         log_odds: ``(S, S)``.
-        share: How far the image has to be asked, see `tracking3d.estimation.evidence.in_question`.
+        share: How far the image has to be asked, see `tracking3d.evidence.in_question`.
     """
     support = np.tanh(log_odds / 2).astype(np.float32)
     if why_no_contrib(SMOOTHER):

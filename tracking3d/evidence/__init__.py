@@ -3,8 +3,8 @@
 `features` says what the sources see, `log_odds` weighs it, `along_edges` and `tidied` decide.
 """
 
-from tracking3d.estimation.evidence.colours import Colours, as_lab
-from tracking3d.estimation.evidence.decision import along_edges, tidied
-from tracking3d.estimation.evidence.weighing import SOURCES, features, in_question, log_odds
+from tracking3d.evidence.colours import Colours, as_lab
+from tracking3d.evidence.decision import along_edges, tidied
+from tracking3d.evidence.weighing import SOURCES, features, in_question, log_odds
 
 __all__ = ["SOURCES", "Colours", "along_edges", "as_lab", "features", "in_question", "log_odds", "tidied"]
