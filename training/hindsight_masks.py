@@ -69,7 +69,10 @@ def asked(run: RunReader, clip: Path, every: int) -> Iterator[tuple[Answered, ND
 
     def said(frame: Answered) -> Iterator[tuple[Answered, NDArray[np.bool_], Said]]:
         exact = read_mask(clip / "masks" / f"{frame.index:06d}.png") if frame.index in wanted else None
-        if exact is None or max(_overlap(mask, exact) for mask in (frame.initial, frame.answer)) < _LEAST_OVERLAP:
+        if (
+            exact is None
+            or max(_overlap(mask, exact) for mask in (frame.initial, frame.answer)) < _LEAST_OVERLAP
+        ):
             return
         if (found := hindsight.said(frame)) is not None:
             yield frame, cut(exact.astype(np.float32), found[0].window) > 0.5, found[1]
@@ -99,9 +102,14 @@ def collected(runs: list[tuple[Path, Path]], every: int) -> tuple[list[str], Sam
             exact.append(np.full(len(chosen), run.config["tracker"]["name"] == "precomputed"))
         print(f"{folder}: {sum(map(len, inside))} pixels", file=sys.stderr, flush=True)
     if not rows:
-        raise InputError("There is no run of these sequences; give the folder that `evaluate suite --out` wrote.")
+        raise InputError(
+            "There is no run of these sequences; give the folder that `evaluate suite --out` wrote."
+        )
     X = np.concatenate(
-        [np.stack([row.get(name, np.zeros(len(y))) for name in names], -1) for row, y in zip(rows, inside, strict=True)]
+        [
+            np.stack([row.get(name, np.zeros(len(y))) for name in names], -1)
+            for row, y in zip(rows, inside, strict=True)
+        ]
     ).astype(np.float64)
     true = np.concatenate(exact)
     weight = np.concatenate([np.full(len(one), 1 / max(len(one), 1)) for one in inside])
@@ -114,8 +122,12 @@ def main(words: list[str]) -> None:
     """Read, fit, test and write."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, help="folder of the sequences")
-    parser.add_argument("--runs", type=Path, nargs="+", required=True, help="folders of `evaluate suite --out`")
-    parser.add_argument("--every", type=int, default=6, help="how many frames are passed from one to the next")
+    parser.add_argument(
+        "--runs", type=Path, nargs="+", required=True, help="folders of `evaluate suite --out`"
+    )
+    parser.add_argument(
+        "--every", type=int, default=6, help="how many frames are passed from one to the next"
+    )
     parser.add_argument("--folds", type=int, default=3, help="of the sequences, to test on")
     parser.add_argument("--samples", type=Path, help="keep what was read in this file")
     options = parser.parse_args(words)
@@ -143,7 +155,9 @@ def _sampled(said: Said, seed: int) -> NDArray[np.intp]:
     random = np.random.default_rng(seed)
     near = np.min([np.abs(one) for name, one in said.distances.items() if "hull" not in name], 0) < _NEAR
     band, anywhere = np.flatnonzero(near & said.in_reach), np.flatnonzero(said.in_reach)
-    return np.concatenate([random.permutation(band)[: 3 * PIXELS // 4], random.permutation(anywhere)[: PIXELS // 4]])
+    return np.concatenate(
+        [random.permutation(band)[: 3 * PIXELS // 4], random.permutation(anywhere)[: PIXELS // 4]]
+    )
 
 
 def _overlap(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:

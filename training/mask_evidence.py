@@ -25,9 +25,9 @@ from tracking3d import load_config
 from tracking3d.benchmark.job import Job, run_job
 from tracking3d.benchmark.variant import Variant
 from tracking3d.errors import InputError
-from tracking3d.evidence import SOURCES, as_lab, features, weighing
 from tracking3d.estimation.online import answers
 from tracking3d.estimation.online.answer_mask import finer, seen_through
+from tracking3d.evidence import SOURCES, as_lab, features, weighing
 
 PIXELS = 500
 """Of a frame, at most; each frame counts the same."""

@@ -115,8 +115,8 @@ class ObjectConfig(Section):
     evidence: bool = Field(
         True,
         description=(
-            "Masks are weighed once more, against the image, at the end of the final refinement: by shapes, colours and "
-            "motion in all frames together."
+            "Masks are weighed once more, against the image, at the end of the final refinement: by shapes, colours "
+            "and motion in all frames together."
         ),
     )
     texture_views: int = Field(

@@ -17,7 +17,7 @@ _MOST = 1.5
 
 
 def edge_strength(lab: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """``(S, S)`` how much the colours of a crop ``(S, S, 3)`` in 8-bit Lab change at each pixel, strong edges limited."""
+    """``(S, S)`` how much the colours of a crop ``(S, S, 3)`` in 8-bit Lab change at each pixel, as a root."""
     smooth = cv2.GaussianBlur(lab, (0, 0), 0.8).astype(np.float32)
     total = np.zeros(lab.shape[:2], np.float32)
     for channel in range(3):
@@ -41,7 +41,10 @@ def alignment(edges: NDArray[np.float32], mask: NDArray[np.bool_]) -> tuple[NDAr
     if area in (0, mask.size):
         return np.zeros(mask.shape, np.float32), 0.0
     distance = np.abs(signed_distance(mask))
-    on, off = (distance <= _ON).astype(np.float32), ((distance >= _OFF[0]) & (distance <= _OFF[1])).astype(np.float32)
+    on, off = (
+        (distance <= _ON).astype(np.float32),
+        ((distance >= _OFF[0]) & (distance <= _OFF[1])).astype(np.float32),
+    )
     side = (2 * max(round(_NEIGHBOURHOOD * math.sqrt(area)), 2) + 1,) * 2
     floor = 0.05
     sums = [cv2.blur(plane, side) for plane in (edges * on, on, edges * off, off)]

@@ -51,11 +51,19 @@ class Consensus:
         if (depth <= 1e-3).any():
             return
         x, y = ((seen[:, i] / depth).reshape(CELLS, -1) for i in (0, 1))
-        distance = signed_distance(scene.answer)
+        size = scene.window.size
+        distance = np.clip(signed_distance(scene.answer), -size, size)
         # Beyond the window nothing is the object, beyond the frame nothing is known.
-        far = np.float32(-scene.window.size)
-        value = cv2.remap(distance, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=float(far)).ravel()
-        unknown = cv2.remap((~scene.valid).astype(np.float32), x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT).ravel() > 0
+        far = np.float32(-size)
+        value = cv2.remap(
+            distance, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=float(far)
+        ).ravel()
+        unknown = (
+            cv2.remap(
+                (~scene.valid).astype(np.float32), x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT
+            ).ravel()
+            > 0
+        )
         value = value * depth / np.float32(scene.K[0, 0]) / np.float32(self._unit)
         value = np.clip(np.rint(value), -_UNKNOWN + 1, _UNKNOWN - 1)
         value[unknown] = _UNKNOWN

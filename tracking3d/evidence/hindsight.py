@@ -11,23 +11,24 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.evidence.colours import Colours, as_lab
 from tracking3d.evidence.consensus import Consensus
-from tracking3d.evidence.decision import along_edges, tidied
+from tracking3d.evidence.decision import along_edges, pasted, tidied
 from tracking3d.evidence.hindsight_weights import WEIGHTS
 from tracking3d.evidence.motion import motion_cue
 from tracking3d.evidence.order import REACH, InOrder
 from tracking3d.evidence.scene import Answered, Mask, Plane, Scene
 from tracking3d.evidence.sources import Said
-from tracking3d.geometry.camera import Camera, Window
+from tracking3d.geometry.camera import Camera
 
 MOST_VIEWS = 60
 """Frames that are put together, spread over those that are believed."""
 _BELIEVED = 0.5
+_ASKED = 0.4
+"""How far the image smooths what is said, see `along_edges`: in an even one outlines would creep."""
 _MOST_CHANGE = 0.35  # of the union of both masks; a mask that changes more is another object's
 
 
@@ -125,25 +126,16 @@ class Hindsight:
         if asked is None:
             return frame.index, None
         scene, said = asked
-        support = tidied(along_edges(scene.image, said.log_odds(WEIGHTS)))
+        support = tidied(along_edges(scene.image, said.log_odds(WEIGHTS), _ASKED))
         support = np.where(scene.valid, support, -1).astype(np.float32)
         full = pasted(support, scene.window, np.full(frame.answer.shape, -1, np.float32))
         mask = full > 0
-        common, either = (np.count_nonzero(way(mask, frame.answer)) for way in (np.logical_and, np.logical_or))
+        common, either = (
+            np.count_nonzero(way(mask, frame.answer)) for way in (np.logical_and, np.logical_or)
+        )
         if common < (1 - _MOST_CHANGE) * either:
             return frame.index, None
         return frame.index, Decided(frame.index, mask, 0.5 + 0.5 * full)
-
-
-def pasted(support: Plane, window: Window, beyond: Plane) -> Plane:
-    """``(H, W)`` support in the frame: the window's ``(S, S)``, and that ``beyond`` it ``(H, W)``."""
-    shape, full = beyond.shape, beyond.copy()
-    region = cv2.resize(support, (window.side, window.side), interpolation=cv2.INTER_LINEAR)
-    x0, y0 = max(window.left, 0), max(window.top, 0)
-    x1, y1 = min(window.left + window.side, shape[1]), min(window.top + window.side, shape[0])
-    if x1 > x0 and y1 > y0:
-        full[y0:y1, x0:x1] = region[y0 - window.top : y1 - window.top, x0 - window.left : x1 - window.left]
-    return full
 
 
 def all_decided(hindsight: Hindsight, frames: Iterable[Answered]) -> Iterator[tuple[int, Decided | None]]:

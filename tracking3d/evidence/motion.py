@@ -72,7 +72,9 @@ def background_motion(
 def apart(scene: Scene, camera: Camera, target: Target) -> float:
     """Median of the frame pixels by which the two motions part in the answer; 0 where it cannot be told."""
     step = max(scene.window.size // 24, 1)
-    parted = np.linalg.norm(_object_flow(scene, camera, target[1], step) - _background_flow(scene, target[2], step), axis=-1)
+    parted = np.linalg.norm(
+        _object_flow(scene, camera, target[1], step) - _background_flow(scene, target[2], step), axis=-1
+    )
     parted = parted[scene.answer[::step, ::step] & np.isfinite(parted)]
     return float(np.median(parted)) if parted.size else 0.0
 

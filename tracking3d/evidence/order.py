@@ -55,7 +55,7 @@ class InOrder:
         for step in STEPS:
             while at != place + side * step:
                 link = at if side > 0 else at - 1
-                if not (0 <= link and at + side < len(self._links)):
+                if not (link >= 0 and at + side < len(self._links)):
                     return found
                 to_next = self._links[link].to_next
                 if to_next is None:

@@ -97,7 +97,16 @@ class Scene:
         drawn, inverse_depth = surface_in(K, T_cam_obj, vertices, faces, window.size)
         image = cut(frame.image, window)
         return cls(
-            window, image, K, T_cam_obj, initial, answer, drawn & valid, inverse_depth, frame.confidence, valid
+            window,
+            image,
+            K,
+            T_cam_obj,
+            initial,
+            answer,
+            drawn & valid,
+            inverse_depth,
+            frame.confidence,
+            valid,
         )
 
 
@@ -108,7 +117,7 @@ def surface_in(
     faces: NDArray[np.int64],
     size: int,
 ) -> tuple[Mask, Plane]:
-    """The silhouette ``(S, S)``, and one over the depth, beyond it that of the nearest pixel; empty and 0 without pose."""
+    """The silhouette ``(S, S)`` and one over its depth, beyond it the nearest pixel's; empty and 0 without a pose."""
     nothing = np.zeros((size, size), bool), np.zeros((size, size), np.float32)
     if not np.isfinite(T_cam_obj).all() or not np.isfinite(vertices).all():
         return nothing

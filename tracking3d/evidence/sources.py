@@ -79,7 +79,11 @@ class Said:
         for name, distance in self.distances.items():
             near, at = np.clip(distance / _NEAR, -_MOST, _MOST), np.tanh(distance / _AT_OUTLINE)
             around, whole = self.alignments[name]
-            beliefs = {"": 1.0, " on edges": np.clip(around, -1, 1), " on edges as a whole": np.clip(whole, -0.5, 1.5)}
+            beliefs = {
+                "": 1.0,
+                " on edges": np.clip(around, -1, 1),
+                " on edges as a whole": np.clip(whole, -0.5, 1.5),
+            }
             beliefs |= {} if name == "initial" else {" by confidence": self.confidence}
             for how, belief in beliefs.items():
                 yield f"{name}, near{how}", near * belief
@@ -91,7 +95,9 @@ class Said:
         yield "initial, near by doubt", doubt * np.clip(initial / _NEAR, -_MOST, _MOST)
         yield "initial, at the outline by doubt", doubt * np.tanh(initial / _AT_OUTLINE)
         whole = float(np.clip(self.alignments["initial"][1], -0.5, 1.5))
-        for name, plane in zip(("beside the outline", "remembered"), self.colours / _SCALE_OF_LOGS, strict=True):
+        for name, plane in zip(
+            ("beside the outline", "remembered"), self.colours / _SCALE_OF_LOGS, strict=True
+        ):
             yield f"colours {name}", plane
             yield f"colours {name} by doubt", doubt * plane
             yield f"colours {name} by the initial mask's edges", whole * plane
