@@ -18,16 +18,14 @@ from tracking3d.corrections import Correction, prompts_in
 from tracking3d.errors import OutputError, PluginError
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.frames import Frame, MaskEstimate, SkippedFrame
+from tracking3d.last_passes import LastPasses
 from tracking3d.reconstruction import BELIEVED, TextureView, kept_views, texture_view, textured
-from tracking3d.reconstruction.second_look import SecondLook
-from tracking3d.reconstruction.support import supported_answer
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord
-from tracking3d.results.refinement_writer import PutRight, RefinementWriter
+from tracking3d.results.refinement_writer import RefinementWriter
 from tracking3d.results.run_writer import RunWriter
 from tracking3d.session import Session
 from tracking3d.side_by_side import WorkBehind
-from tracking3d.stages import measured
 from tracking3d.video.source import FrameSource
 
 _log = logging.getLogger(__name__)
@@ -73,7 +71,7 @@ class ObjectRecording:
             self._initial = {one.index: (one.score, one.reason) for one in kept.taken.values()}
         self._causal_model: ObjectModel | None = None
         self._refinement: RefinementWriter | None = None
-        self._look: SecondLook | None = None
+        self._last: LastPasses | None = None
         self._views: tuple[TextureView, ...] = ()
 
     @contextmanager
@@ -163,9 +161,11 @@ class ObjectRecording:
             )
         self._begin_refinement(source)
         if self._refinement is not None:
-            answered = sorted(self._refinement.causal)
-            most = self._session.config.object.landmark_views
-            self._look = SecondLook(self._session.result(), self._session.camera, answered, most)
+            wanted, camera = self._session.config.object, self._session.camera
+            self._last = LastPasses(
+                self._refinement, self._session.result(), camera, wanted.landmark_views, wanted.evidence,
+                self._corrections,
+            )  # fmt: skip
         elif self._redraw:
             self._writer.begin_drawing_anew()
 
@@ -236,8 +236,8 @@ class ObjectRecording:
     def _seen_again(self, refinement: RefinementWriter, answer: FrameRecord, frame: Frame) -> FrameRecord:
         """Keep what poses, surface and texture of the end can be taken from; the answer as it is."""
         most, mask = self._session.config.object.texture_views, refinement.mask(answer)
-        if self._look and answer.refined:
-            self._look.see(answer, frame.image, mask)
+        if self._last:
+            self._last.see(answer, frame.image)
         if most and answer.status is Status.TRACKED and answer.confidence >= BELIEVED:
             camera = answer.through(self._session.camera)
             image, seen = camera.undistorted(frame.image), camera.mask_to_pinhole(mask)
@@ -250,33 +250,33 @@ class ObjectRecording:
         """Whether the frames are to come a last time, to be drawn as they are answered in the end."""
         return self._refinement is not None
 
+    @property
+    def weighs_masks(self) -> bool:
+        """Whether they are to come once before that, for their masks to be weighed together."""
+        return self._last is not None and self._last.weighs_masks
+
     def settle(self) -> None:
         """All frames were looked at again: put right together what they say."""
-        if self._refinement is None or self._look is None:
-            return
-        with measured("map") as watch:
-            self._look.settle()
-        self._refinement.together += watch.times
-        self._writer.refine_camera(self._look.camera)
+        if self._last:
+            self._writer.refine_camera(self._last.settle())
+
+    def put_right(self, frame: Frame) -> None:
+        """Give the final answer for a frame the pose that all frames together say."""
+        if self._last:
+            self._last.put_right(frame)
 
     def draw(self, frame: Frame) -> None:
-        """Draw the final answer for a frame, its pose put right."""
-        refinement = self._refinement
-        if refinement is None or frame.index not in refinement.causal:
-            return
-        answer, put_right = refinement.answer(frame.index), None
-        if self._look and answer.refined:
-            T_cam_obj, support = self._look.pose(answer, frame.image, refinement.mask(answer))
-            put_right = PutRight(T_cam_obj, *(() if support is None else supported_answer(answer, support)))
-        self._work.do(partial(refinement.draw, frame, put_right))
+        """Draw the final answer for a frame."""
+        if self._last:
+            self._last.draw(frame, self._work.do)
 
     def finish(self) -> None:
         """Write what is made at the end."""
         model, views = self._session.result(), self._views
-        if self._refinement is not None and self._look is not None:
-            answers = [self._refinement.answer(view.index) for view in views]
-            model = self._look.moved(model)
-            views = tuple(map(self._look.seen_by, views, answers))
+        if self._last:
+            self._last.rest(self._work.do)
+            self._work.wait()
+            model, views = self._last.moved(model, views)
         model = textured(model, views, self._session.config.object.largest_texture)
         if self._refinement is not None:
             self._writer.end_refinement()

@@ -97,6 +97,8 @@ def look_again(
         each(partial(ObjectRecording.take_again, frame=_shared(frame, share)))
     each(ObjectRecording.written)
     each(ObjectRecording.settle)
+    for frame in _once_more(source) if any(recording.weighs_masks for recording in recordings) else ():
+        each(partial(ObjectRecording.put_right, frame=frame))
     for frame in _once_more(source) if any(recording.draws for recording in recordings) else ():
         each(partial(ObjectRecording.draw, frame=frame))
     each(ObjectRecording.written)

@@ -3,7 +3,7 @@
 ``python training/mask_evidence.py FOLDER ... --out DIR`` tracks every sequence (clips as ``tracking3d synth`` writes
 them) causally with the masks of a tracker, asks at pixels near either outline what the sources said and whether the
 object is there, fits a logistic regression without a constant, and prints what
-`tracking3d.estimation.evidence.weighing` holds: first the weights of the shapes alone, by which the outline is guessed
+`tracking3d.evidence.weighing` holds: first the weights of the shapes alone, by which the outline is guessed
 whose colours are compared, then all. ``--folds N`` prints before how good fits on other sequences are.
 """
 
@@ -25,9 +25,9 @@ from tracking3d import load_config
 from tracking3d.benchmark.job import Job, run_job
 from tracking3d.benchmark.variant import Variant
 from tracking3d.errors import InputError
-from tracking3d.estimation.evidence import SOURCES, as_lab, features, weighing
 from tracking3d.estimation.online import answers
 from tracking3d.estimation.online.answer_mask import finer, seen_through
+from tracking3d.evidence import SOURCES, as_lab, features, weighing
 
 PIXELS = 500
 """Of a frame, at most; each frame counts the same."""

@@ -13,6 +13,7 @@ from refining_solver import CausalSolver, StandInSolver
 
 from tracking3d import Frame, Session, Status, load_config
 from tracking3d.errors import InputError, PluginError
+from tracking3d.estimation.estimate import MaskSource
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.estimation.paper.solver import PaperSolver
 from tracking3d.estimation.solver import RefiningSolver
@@ -56,8 +57,9 @@ def source(clip, tmp_path):
     return open_source(str(folder))
 
 
-def settings(solver: str = "online", refine: bool = True, policy: str = "continue"):
+def settings(solver: str = "online", refine: bool = True, policy: str = "continue", evidence: bool = False):
     overrides = [
+        f"object.evidence={str(evidence).lower()}",
         f"solver.name={solver}",
         f"solver.final_refine={str(refine).lower()}",
         "tracker.name=flow",
@@ -153,6 +155,18 @@ def test_both_answers_of_every_frame_are_kept(clip, source, tmp_path):
     np.testing.assert_allclose(refined.mesh().vertices, 2 * causal.mesh().vertices, atol=1e-6)
     sizes = [np.ptp(load_model(run.mesh_folder).vertices) for run in (refined, causal)]
     assert sizes == [4, 2]
+
+
+def test_masks_are_weighed_once_more_and_the_causal_ones_stand(clip, source, tmp_path):
+    record(source, settings(evidence=True), tmp_path / "run", mask=clip.masks[0])
+    final, causal = RunReader(tmp_path / "run"), RunReader(tmp_path / "run", refined=False)
+    for frame, before in zip(final.frames, causal.frames, strict=True):
+        mask = final.mask(frame.index)
+        assert frame.area == np.count_nonzero(mask)
+        assert before.mask_source is not MaskSource.WEIGHED
+        assert before.area == np.count_nonzero(causal.mask(frame.index))
+    assert any(frame.mask_source is MaskSource.WEIGHED for frame in final.frames)
+    assert final.config["object"]["evidence"]
 
 
 def test_the_mask_tracker_runs_once_and_its_masks_come_again_as_they_were(

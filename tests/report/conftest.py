@@ -56,7 +56,9 @@ def described() -> Callable[..., None]:
     return change
 
 
-@pytest.fixture(scope="module")  # no longer: what drives it runs an event loop, beside which asyncio.run refuses
+@pytest.fixture(
+    scope="module"
+)  # no longer: what drives it runs an event loop, beside which asyncio.run refuses
 def browser() -> Iterator[Any]:
     """A Chromium without a window; the test is skipped where there is none, or nothing to drive it with."""
     path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")

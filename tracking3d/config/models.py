@@ -112,6 +112,13 @@ class ObjectConfig(Section):
             "final refinement; the others follow them. 0 leaves them as rendering has them."
         ),
     )
+    evidence: bool = Field(
+        True,
+        description=(
+            "Masks are weighed once more, against the image, at the end of the final refinement: by shapes, colours "
+            "and motion in all frames together."
+        ),
+    )
     texture_views: int = Field(
         24,
         ge=0,

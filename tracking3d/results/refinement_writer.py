@@ -6,41 +6,27 @@ Until then the run folder holds the causal answers whole, whatever ends the refi
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.estimation.assessment import Assessment
-from tracking3d.estimation.estimate import FrameEstimate
+from tracking3d.estimation.estimate import FrameEstimate, MaskSource
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.results import description, layout
 from tracking3d.results.files import read_mask, write_mask, writing
 from tracking3d.results.pictures import Pictures
 from tracking3d.results.probabilities import take_over_probability, write_probability
-from tracking3d.results.records import FrameRecord
+from tracking3d.results.records import FrameRecord, mask_iou
 from tracking3d.results.run_reader import read_records
 from tracking3d.stages import StageTimes, measured
-
-
-@dataclass(frozen=True, eq=False)
-class PutRight:
-    """What a second answer says in the end, once all frames have been looked at again.
-
-    Attributes:
-        T_cam_obj: ``(4, 4)``, of the camera of the end.
-        judgement: How far it is believed; None is as before.
-        evidence: What that comes from, kept among the losses.
-    """
-
-    T_cam_obj: NDArray[np.float64]
-    judgement: Assessment | None = None
-    evidence: dict[str, float] = field(default_factory=dict)
 
 
 class RefinementWriter:
@@ -85,6 +71,7 @@ class RefinementWriter:
                 lines.truncate(kept)
         kept_records = read_records(self._aside / layout.FRAMES)
         self._records = {record.index: record for record in kept_records}
+        self._decided: dict[int, bytes] = {}  # masks as PNG
 
     @property
     def lines(self) -> int:
@@ -100,15 +87,26 @@ class RefinementWriter:
         """The answer for frame ``index`` as it is now: the second one, or the causal one where there is none."""
         return self._records.get(index) or self.causal[index]
 
-    def put_right(self, index: int, put_right: PutRight) -> None:
-        """Give a second answer what it says in the end; causal ones stand.
+    def put_right(
+        self,
+        index: int,
+        T_cam_obj: NDArray[np.float64],
+        judgement: Assessment | None = None,
+        evidence: Mapping[str, float] | None = None,
+    ) -> None:
+        """Give a second answer the pose that it has in the end; causal ones stand.
 
         It is not kept for a run that is stopped here and goes on later: that finds it anew.
+
+        Args:
+            index: Of the frame.
+            T_cam_obj: ``(4, 4)``, of the camera of the end.
+            judgement: How far it is believed in the end; as before, if left out.
+            evidence: What that comes from, kept among the losses.
         """
         if (record := self._records.get(index)) is None:
             return
-        T_cam_obj, judgement = put_right.T_cam_obj, put_right.judgement
-        losses = record.losses | put_right.evidence
+        losses = record.losses | dict(evidence or {})
         record = replace(record, T_cam_obj=T_cam_obj, camera=None, losses=losses)
         if judgement is not None:
             record = replace(
@@ -116,14 +114,37 @@ class RefinementWriter:
             )
         self._records[index] = record
 
-    def draw(self, frame: Frame, put_right: PutRight | None = None) -> None:
-        """Draw the answer for a frame, put right before where it is said how.
+    def put_mask(self, index: int, mask: NDArray[np.bool_], probability: NDArray[np.float32]) -> None:
+        """Give a second answer another mask ``(H, W)``, weighed against the image; causal ones stand.
+
+        Like a pose that is put right it is not kept for a run that is stopped here.
+
+        Args:
+            index: Of the frame.
+            mask: ``(H, W)``.
+            probability: ``(H, W)`` of the object.
+
+        Raises:
+            OutputError: If the probability cannot be written.
+        """
+        if (record := self._records.get(index)) is None:
+            return
+        self._records[index] = replace(
+            record,
+            area=int(np.count_nonzero(mask)),
+            iou_initial=mask_iou(mask, self.initial_mask(index)),
+            mask_source=MaskSource.WEIGHED,
+        )
+        self._decided[index] = cv2.imencode(".png", np.where(mask, 255, 0).astype(np.uint8))[1].tobytes()
+        if (self._folder / layout.PROBABILITIES).is_dir():
+            write_probability(self._aside, index, probability)
+
+    def draw(self, frame: Frame) -> None:
+        """Draw the answer for a frame.
 
         Raises:
             OutputError: If the video cannot be written.
         """
-        if put_right is not None:
-            self.put_right(frame.index, put_right)
         record = self.answer(frame.index)
         with measured("write") as watch:
             self.pictures.add_kept(frame, record, self.mask(record), self.initial_mask(frame.index))
@@ -158,6 +179,8 @@ class RefinementWriter:
 
     def mask(self, record: FrameRecord) -> NDArray[np.bool_]:
         """The mask ``(H, W)`` of an answer, empty where it cannot be read."""
+        if record.refined and (decided := self._decided.get(record.index)) is not None:
+            return _decoded(decided)
         mask = read_mask(layout.mask_path(self._aside if record.refined else self._folder, record.index))
         return (
             np.zeros((self.pictures.camera.height, self.pictures.camera.width), bool)
@@ -186,6 +209,8 @@ class RefinementWriter:
             (causal / layout.MASKS).mkdir(parents=True, exist_ok=True)
             for record in self._records.values():
                 place = layout.mask_path(self._folder, record.index)
+                if (decided := self._decided.get(record.index)) is not None:
+                    write_mask(layout.mask_path(self._aside, record.index), _decoded(decided))
                 place.replace(layout.mask_path(causal, record.index))
                 layout.mask_path(self._aside, record.index).replace(place)
             for name in layout.MESH_FILES:
@@ -217,6 +242,12 @@ class RefinementWriter:
         refined = list(self._records.values()) if self._taken_over else []
         causal = list(self.causal.values())
         return description.refinement(state, reason, causal, refined, self.seconds, self.together)
+
+
+def _decoded(mask: bytes) -> NDArray[np.bool_]:
+    grey = cv2.imdecode(np.frombuffer(mask, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert grey is not None
+    return np.asarray(grey > 0)
 
 
 def clear_refinement(folder: Path) -> None:

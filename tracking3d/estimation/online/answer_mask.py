@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import MaskSource
-from tracking3d.estimation.evidence import (
+from tracking3d.estimation.observation import Observation
+from tracking3d.evidence import (
     Colours,
     along_edges,
     as_lab,
     features,
     in_question,
     log_odds,
+    pasted,
     tidied,
 )
-from tracking3d.estimation.observation import Observation
 from tracking3d.geometry.camera import Window
 from tracking3d.trackers.crops import cut, inside_frame
 
@@ -53,7 +53,7 @@ def answer_mask(
     support = tidied(along_edges(image, log_odds(sources), in_question(sources)))
     support[~inside_frame(initial.shape, window)] = -1
     # The window is the initial mask's: beyond it the silhouette alone says where the object is.
-    full = _pasted(support, window, np.where(rendered, 1.0, -1.0).astype(np.float32))
+    full = pasted(support, window, np.where(rendered, 1.0, -1.0).astype(np.float32))
     mask = full > 0
     if not mask.any():  # a mask of nothing says that the evidence is for neither
         return initial, MaskSource.INITIAL, None
@@ -78,14 +78,3 @@ def seen_through(mask: NDArray[np.bool_], window: Window) -> NDArray[np.bool_]:
     # What is beyond the frame is not the object, although `cut` repeats the border.
     seen = cut(mask.astype(np.float32), window) > 0.5
     return np.asarray(seen & inside_frame(mask.shape, window))
-
-
-def _pasted(support: NDArray[np.float32], window: Window, beyond: NDArray[np.float32]) -> NDArray[np.float32]:
-    """``(H, W)`` support in the frame: the window's ``(S, S)``, and that ``beyond`` it ``(H, W)``."""
-    shape, full = beyond.shape, beyond.copy()
-    region = cv2.resize(support, (window.side, window.side), interpolation=cv2.INTER_LINEAR)
-    x0, y0 = max(window.left, 0), max(window.top, 0)
-    x1, y1 = min(window.left + window.side, shape[1]), min(window.top + window.side, shape[0])
-    if x1 > x0 and y1 > y0:
-        full[y0:y1, x0:x1] = region[y0 - window.top : y1 - window.top, x0 - window.left : x1 - window.left]
-    return full

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tracking3d.estimation.estimate import FrameEstimate
-from tracking3d.estimation.evidence import Colours
 from tracking3d.estimation.feature_space import FeatureSpace
 from tracking3d.estimation.observation import Observation
 from tracking3d.estimation.online.judgement import Usual
 from tracking3d.estimation.online.keypoints import Keypoints
 from tracking3d.estimation.online.points import FollowedPoints
 from tracking3d.estimation.shape import Shape
+from tracking3d.evidence import Colours
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose
 from tracking3d.rendering import BackProjection, Surface, TexelMap, back_project, project, rasterize

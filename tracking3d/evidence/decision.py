@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tracking3d.geometry.camera import Window
 from tracking3d.trackers.opencv_build import why_no_contrib
 from tracking3d.trackers.segmentation import SMOOTHER
 
@@ -27,7 +28,7 @@ def along_edges(
     Args:
         image: ``(S, S, 3)`` RGB.
         log_odds: ``(S, S)``.
-        share: How far the image has to be asked, see `tracking3d.estimation.evidence.in_question`.
+        share: How far the image has to be asked, see `tracking3d.evidence.in_question`.
     """
     support = np.tanh(log_odds / 2).astype(np.float32)
     if why_no_contrib(SMOOTHER):
@@ -47,3 +48,14 @@ def tidied(support: NDArray[np.float32]) -> NDArray[np.float32]:
     area = statistics[1:, cv2.CC_STAT_AREA]
     large = 1 + np.flatnonzero(area >= _LEAST_PART * area.max(initial=0))
     return np.where(np.isin(part, large), support, -np.abs(support)).astype(np.float32)
+
+
+def pasted(support: NDArray[np.float32], window: Window, beyond: NDArray[np.float32]) -> NDArray[np.float32]:
+    """``(H, W)`` support in the frame: the window's ``(S, S)``, and that ``beyond`` it ``(H, W)``."""
+    shape, full = beyond.shape, beyond.copy()
+    region = cv2.resize(support, (window.side, window.side), interpolation=cv2.INTER_LINEAR)
+    x0, y0 = max(window.left, 0), max(window.top, 0)
+    x1, y1 = min(window.left + window.side, shape[1]), min(window.top + window.side, shape[0])
+    if x1 > x0 and y1 > y0:
+        full[y0:y1, x0:x1] = region[y0 - window.top : y1 - window.top, x0 - window.left : x1 - window.left]
+    return full

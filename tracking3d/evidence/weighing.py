@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.estimation.evidence.colours import Colours, beside_outline, relative_distance
+from tracking3d.evidence.colours import Colours, beside_outline, relative_distance
 
 SOURCES = {
     "initial, near": 0.001,

@@ -1,0 +1,145 @@
+"""Masks answered once more when the whole video is known: what most frames call object is object in all.
+
+The frames are gone through twice. The first time, masks and poses that are believed are put together: a hull of their
+masks, and the colours of object and surroundings. The second time each pixel is weighed, with the frames around it in
+time telling which motion it has.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.evidence.colours import Colours, as_lab
+from tracking3d.evidence.consensus import Consensus
+from tracking3d.evidence.decision import along_edges, pasted, tidied
+from tracking3d.evidence.hindsight_weights import WEIGHTS
+from tracking3d.evidence.motion import motion_cue
+from tracking3d.evidence.order import REACH, InOrder
+from tracking3d.evidence.scene import Answered, Mask, Plane, Scene
+from tracking3d.evidence.sources import Said
+from tracking3d.geometry.camera import Camera
+
+MOST_VIEWS = 60
+"""Frames that are put together, spread over those that are believed."""
+_BELIEVED = 0.5
+_ASKED = 0.4
+"""How far the image smooths what is said, see `along_edges`: in an even one outlines would creep."""
+_MOST_CHANGE = 0.35  # of the union of both masks; a mask that changes more is another object's
+
+
+@dataclass(frozen=True, eq=False)
+class Decided:
+    """What came of a frame.
+
+    Attributes:
+        index: Of the frame.
+        mask: ``(H, W)``.
+        probability: ``(H, W)`` of the object; the mask is where it is above a half.
+    """
+
+    index: int
+    mask: Mask
+    probability: Plane
+
+
+class Hindsight:
+    """All frames of a video, with their masks and poses.
+
+    Args:
+        camera: Of the frames, without a lens.
+        vertices: ``(V, 3)`` of the object.
+        faces: ``(F, 3)``.
+        confidences: Of the frames that have a pose, by index.
+
+    Attributes:
+        order: The latest frames of the second time.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        vertices: NDArray[np.float64],
+        faces: NDArray[np.int64],
+        confidences: dict[int, float],
+    ) -> None:
+        self._camera, self._vertices, self._faces = camera, vertices, faces
+        chosen = sorted(index for index, confidence in confidences.items() if confidence >= _BELIEVED)
+        chosen = chosen or sorted(confidences)
+        places = np.linspace(0, len(chosen) - 1, min(MOST_VIEWS, len(chosen))).round().astype(int)
+        self._wanted = {chosen[place] for place in places}
+        self._consensus = Consensus(vertices)
+        self._colours: Colours | None = None
+        self.order, self._waiting = InOrder(), deque[Answered]()
+
+    def see(self, frame: Answered) -> None:
+        """A frame for the first time."""
+        if frame.index not in self._wanted or not np.isfinite(frame.T_cam_obj).all():
+            return
+        scene = self._scene(frame)
+        if scene is not None and scene.answer.any():
+            self._consensus.see(scene)
+            self._colours = Colours.of(as_lab(scene.image), scene.answer, self._colours)
+
+    def settle(self) -> None:
+        """All frames were seen a first time."""
+        self._consensus.settle()
+
+    def decide(self, frame: Answered) -> Iterator[tuple[int, Decided | None]]:
+        """A frame for the second time.
+
+        Args:
+            frame: The next one, in the order of time.
+
+        Yields:
+            Indices of earlier frames whose turn has come, with what is decided; None where the answer stands.
+        """
+        self.order.add(frame)
+        self._waiting.append(frame)
+        if len(self._waiting) > REACH:
+            yield self._decided(self._waiting.popleft())
+
+    def rest(self) -> Iterator[tuple[int, Decided | None]]:
+        """Those that are left when there are no more frames; see `decide`."""
+        while self._waiting:
+            yield self._decided(self._waiting.popleft())
+
+    def said(self, frame: Answered) -> tuple[Scene, Said] | None:
+        """What the sources say of one of the latest frames; None where it has no masks or no pose."""
+        if not frame.initial.any() or not frame.answer.any() or not np.isfinite(frame.T_cam_obj).all():
+            return None
+        scene = self._scene(frame)
+        if scene is None or not scene.initial.any() or not scene.answer.any():
+            return None
+        motion = motion_cue(scene, self._camera, self.order.around(frame.index, scene, self._camera))
+        return scene, Said.of(scene, self._consensus.drawn(scene), self._colours, motion)
+
+    def _scene(self, frame: Answered) -> Scene | None:
+        return Scene.of(frame, self._camera, self._vertices, self._faces)
+
+    def _decided(self, frame: Answered) -> tuple[int, Decided | None]:
+        asked = self.said(frame)
+        if asked is None:
+            return frame.index, None
+        scene, said = asked
+        support = tidied(along_edges(scene.image, said.log_odds(WEIGHTS), _ASKED))
+        support = np.where(scene.valid, support, -1).astype(np.float32)
+        full = pasted(support, scene.window, np.full(frame.answer.shape, -1, np.float32))
+        mask = full > 0
+        common, either = (
+            np.count_nonzero(way(mask, frame.answer)) for way in (np.logical_and, np.logical_or)
+        )
+        if common < (1 - _MOST_CHANGE) * either:
+            return frame.index, None
+        return frame.index, Decided(frame.index, mask, 0.5 + 0.5 * full)
+
+
+def all_decided(hindsight: Hindsight, frames: Iterable[Answered]) -> Iterator[tuple[int, Decided | None]]:
+    """Every frame of a video whose frames were all seen once, in their order."""
+    for frame in frames:
+        yield from hindsight.decide(frame)
+    yield from hindsight.rest()

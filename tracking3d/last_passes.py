@@ -1,0 +1,114 @@
+"""What becomes of an object's answers once all frames were looked at again: poses, then masks, then pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+from functools import partial
+
+import numpy as np
+
+from tracking3d.estimation.estimate import ObjectModel
+from tracking3d.frames import Frame, Image
+from tracking3d.geometry.camera import Camera
+from tracking3d.reconstruction.second_look import SecondLook
+from tracking3d.reconstruction.second_masks import Decision, Masked, SecondMasks
+from tracking3d.reconstruction.support import supported_answer
+from tracking3d.reconstruction.views import TextureView
+from tracking3d.results.records import FrameRecord
+from tracking3d.results.refinement_writer import RefinementWriter
+from tracking3d.stages import measured
+
+
+class LastPasses:
+    """Puts right what a final refinement has answered, from all frames together.
+
+    Args:
+        refinement: Its answers.
+        model: The object as it has made it.
+        camera: Of the full frame.
+        most: How many frames are bundled.
+        weighs_masks: Whether masks are weighed once more; the frames then come once more for it, see `put_right`.
+        fixed: Indices of frames whose masks the user has given.
+    """
+
+    def __init__(
+        self,
+        refinement: RefinementWriter,
+        model: ObjectModel,
+        camera: Camera,
+        most: int,
+        weighs_masks: bool,
+        fixed: Collection[int],
+    ) -> None:
+        self._refinement, self._fixed, self.weighs_masks = refinement, fixed, weighs_masks
+        self._faces = np.asarray(model.faces, np.int64)
+        self._look = SecondLook(model, camera, sorted(refinement.causal), most)
+        self._masks: SecondMasks | None = None
+
+    def see(self, answer: FrameRecord, image: Image) -> None:
+        """A frame that was looked at again."""
+        if answer.refined:
+            self._look.see(answer, image, self._refinement.mask(answer))
+
+    def settle(self) -> Camera:
+        """All were: put together what they say; the camera of the end."""
+        with measured("map") as watch:
+            self._look.settle()
+        self._refinement.together += watch.times
+        if self.weighs_masks:
+            answers = [self._refinement.answer(index) for index in self._refinement.causal]
+            self._masks = SecondMasks(self._look.camera, self._look.vertices, self._faces, answers)
+        return self._look.camera
+
+    def put_right(self, frame: Frame) -> None:
+        """Give a frame the pose that all frames together say, before masks are weighed."""
+        if self._masks is not None and frame.index in self._refinement.causal:
+            self._place(frame)
+            self._masks.see(self._masked(frame))
+
+    def draw(self, frame: Frame, do: Callable[[Callable[[], None]], object]) -> None:
+        """Draw a frame as it is answered in the end; where masks are weighed some frames late, with those around it.
+
+        Args:
+            frame: The frame.
+            do: Does what writes.
+        """
+        if frame.index not in self._refinement.causal:
+            return
+        if self._masks is not None:
+            self._draw(self._masks.decide(self._masked(frame)), do)
+        else:
+            self._place(frame)
+            do(partial(self._refinement.draw, frame))
+
+    def rest(self, do: Callable[[Callable[[], None]], object]) -> None:
+        """Draw the frames that are left when there are no more to come; ``do`` as in `draw`."""
+        if self._masks is not None:
+            self._draw(self._masks.rest(), do)
+
+    def moved(
+        self, model: ObjectModel, views: Collection[TextureView]
+    ) -> tuple[ObjectModel, tuple[TextureView, ...]]:
+        """The model with the surface that was found, and what its texture is taken from with the poses of the end."""
+        answered = ((view, self._refinement.answer(view.index)) for view in views)
+        return self._look.moved(model), tuple(self._look.seen_by(view, answer) for view, answer in answered)
+
+    def _place(self, frame: Frame) -> None:
+        answer = self._refinement.answer(frame.index)
+        if not answer.refined:
+            return
+        T_cam_obj, support = self._look.pose(answer, frame.image, self._refinement.mask(answer))
+        judged = () if support is None else supported_answer(answer, support)
+        self._refinement.put_right(frame.index, T_cam_obj, *judged)
+
+    def _masked(self, frame: Frame) -> Masked:
+        answer, initial = self._refinement.answer(frame.index), self._refinement.initial_mask(frame.index)
+        return Masked(frame, answer, initial, self._refinement.mask(answer), frame.index in self._fixed)
+
+    def _draw(self, decisions: Iterator[Decision], do: Callable[[Callable[[], None]], object]) -> None:
+        with measured("map") as watch:
+            for frame, decided in decisions:
+                if decided is not None:
+                    self._refinement.put_mask(frame.index, decided.mask, decided.probability)
+                do(partial(self._refinement.draw, frame))
+        self._refinement.together += watch.times

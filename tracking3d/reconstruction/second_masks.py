@@ -1,0 +1,109 @@
+"""Masks weighed against the image once more, when all frames of a video have been looked at again.
+
+`tracking3d.evidence.hindsight` knows pinhole cameras, masks and poses; here are the run's answers and its lens.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.estimation.estimate import Status
+from tracking3d.evidence.hindsight import Decided, Hindsight
+from tracking3d.evidence.scene import Answered
+from tracking3d.frames import Frame
+from tracking3d.geometry.camera import Camera
+from tracking3d.results.records import FrameRecord
+
+Decision = tuple[Frame, Decided | None]
+"""A frame whose turn has come, and its mask; None where the answer stands."""
+
+
+@dataclass(frozen=True, eq=False)
+class Masked:
+    """A frame as it was answered.
+
+    Attributes:
+        frame: The frame.
+        answer: Its answer, the pose put right.
+        initial: ``(H, W)`` the mask tracker's mask, or None.
+        mask: ``(H, W)`` the answer's.
+        fixed: Whether the user has said where the object is: that stands.
+    """
+
+    frame: Frame
+    answer: FrameRecord
+    initial: NDArray[np.bool_] | None
+    mask: NDArray[np.bool_]
+    fixed: bool = False
+
+
+class SecondMasks:
+    """The frames as they come by twice more: to be put together, and to be decided.
+
+    Args:
+        camera: Of the full frame, as it is in the end.
+        vertices: ``(V, 3)`` of the final object.
+        faces: ``(F, 3)``.
+        answers: Of all frames.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        vertices: NDArray[np.float64],
+        faces: NDArray[np.int64],
+        answers: Sequence[FrameRecord],
+    ) -> None:
+        self._camera = camera
+        known = {one.index: one.confidence for one in answers if _has_pose(one)}
+        self._hindsight = Hindsight(replace(camera, lens=None), vertices, faces, known)
+        self._settled = False
+        self._waiting: dict[int, Masked] = {}
+
+    def see(self, masked: Masked) -> None:
+        """A frame for the first time."""
+        self._hindsight.see(self._answered(masked))
+
+    def decide(self, masked: Masked) -> Iterator[Decision]:
+        """A frame for the second time, in the order of time; yields those whose turn has come."""
+        if not self._settled:
+            self._hindsight.settle()
+            self._settled = True
+        self._waiting[masked.frame.index] = masked
+        yield from map(self._decision, self._hindsight.decide(self._answered(masked)))
+
+    def rest(self) -> Iterator[Decision]:
+        """Those that are left when there are no more frames."""
+        yield from map(self._decision, self._hindsight.rest())
+
+    def _answered(self, masked: Masked) -> Answered:
+        camera, answer = self._camera, masked.answer
+        initial = np.zeros_like(masked.mask) if masked.initial is None else masked.initial
+        return Answered(
+            answer.index,
+            camera.undistorted(masked.frame.image),
+            camera.mask_to_pinhole(initial),
+            camera.mask_to_pinhole(masked.mask),
+            answer.T_cam_obj if _has_pose(answer) else np.full((4, 4), np.nan),
+            answer.confidence,
+        )
+
+    def _decision(self, found: tuple[int, Decided | None]) -> Decision:
+        index, decided = found
+        masked = self._waiting.pop(index)
+        if decided is None or masked.fixed or not masked.answer.refined:
+            return masked.frame, None
+        lens = self._camera.lens
+        if lens is not None:
+            probability = lens.mask_to_picture(decided.probability)
+            decided = Decided(index, probability > 0.5, probability)
+        return masked.frame, decided
+
+
+def _has_pose(answer: FrameRecord) -> bool:
+    """Whether an answer's pose, of the camera of the end, is one to go by."""
+    return answer.refined and answer.status is not Status.LOST
