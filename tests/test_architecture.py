@@ -36,6 +36,7 @@ FLOORS = [
         "corrected_run",
         "given_frames",
         "images",
+        "last_passes",
         "mask_tracking",
         "modules",
         "object_recording",

@@ -116,7 +116,8 @@ def test_every_frame_of_a_run_has_its_stages_and_their_sum(preset, source, clip,
     whole, stages = time_per_frame(run)
     assert whole == pytest.approx(stages.whole)
     # What is not of a frame is what is made once: the mesh, the contact sheet, the solver's start.
-    assert FRAMES * whole < took
+    # Reading and writing go on beside the rest.
+    assert FRAMES * (whole - stages.decode - stages.write) < took
 
 
 def test_the_second_look_has_its_own_stages(source, clip, tmp_path):
