@@ -15,11 +15,10 @@ from tracking3d.results.records import FrameRecord
 
 BELIEVED = 0.5
 """Confidence from which on a frame is tracked."""
-_INTERCEPT = 0.0
+_INTERCEPT = -0.1854
 _TERMS = {  # weight, and the range that was seen
-    "rendering": (0.0, -4.0, 4.0),
-    "landmarks": (0.0, 0.0, 6.5),
-    "agreement": (0.0, 0.0, 1.0),
+    "rendering": (0.6776, -2.244, 2.518),
+    "landmarks": (0.308, 0.0, 6.721),
 }
 
 
@@ -37,8 +36,8 @@ def supported(rendering: Assessment, support: Support) -> Assessment:
     """The judgement of a frame by what is rendered and by landmarks; what is lost stays lost.
 
     A logistic regression of whether the answer is right, that is, within 10 degrees and above an IoU of 0.7. Fitted by
-    ``training/confidence.py --refined`` on the suites ``fresh`` of the seeds 9303 and 9304; docs/method.md has what it
-    is worth on others.
+    ``training/confidence.py --refined`` on the suites ``fresh`` of the seeds 501 and 9303; docs/benchmark.md has what it
+    is worth on another.
 
     Args:
         rendering: The judgement by what is rendered, and by points that were followed from frame to frame.
@@ -70,5 +69,4 @@ def weighed(rendering: float, support: Support) -> dict[str, float]:
     return {
         "rendering": math.log(bounded / (1 - bounded)),
         "landmarks": math.log1p(support.agreeing),
-        "agreement": support.agreeing / max(support.followed, 1),
     }
