@@ -36,7 +36,7 @@ def supported(rendering: Assessment, support: Support) -> Assessment:
     """The judgement of a frame by what is rendered and by landmarks; what is lost stays lost.
 
     A logistic regression of whether the answer is right, that is, within 10 degrees and above an IoU of 0.7. Fitted by
-    ``training/confidence.py --refined`` on the suites ``fresh`` of the seeds 501 and 9303; docs/benchmark.md has what it
+    ``training/confidence.py --refined`` on the suites ``fresh`` of seeds 501 and 9303; docs/benchmark.md has what it
     is worth on another.
 
     Args:
