@@ -136,7 +136,7 @@ class ObjectRecording:
         self, estimate: FrameEstimate, frame: Frame, taken: TakenFrame | None, state: dict[str, Any] | None
     ) -> FrameRecord:
         answer = self._writer.write(estimate, frame)
-        if self._checkpoint and taken and state:
+        if self._checkpoint and taken is not None and state is not None:
             if taken.corrected:
                 self._checkpoint.keep_correction(frame.index, estimate.mask)
             self._progress = replace(self._progress, last=frame.index, lines=self._writer.lines)
