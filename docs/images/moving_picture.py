@@ -24,9 +24,9 @@ from tracking3d.results.run_reader import RunReader
 from tracking3d.video import open_source
 
 SIDE = 280
-MOST = 60
+MOST = 30
 """Pictures; of a longer run every second, third, ..."""
-PAUSE = 80
+PAUSE = 160
 """Milliseconds a picture."""
 MARGIN = 1.25
 """Side of what is cut out, in sides of the object."""

@@ -125,7 +125,7 @@ def test_what_a_result_depends_on_is_in_its_key(jobs, scripted, clips, tmp_path,
 
 
 def test_the_camera_of_the_dataset_is_used_unless_the_settings_say_one(jobs, scripted):
-    [one] = jobs(scripted(), ["narrow"])
+    [one] = jobs(scripted().changed("unsaid", camera__fov=None), ["narrow"])
     camera = one.truth.camera
     assert one.config.camera.intrinsics == (camera.fx, camera.fy, camera.cx, camera.cy)
     [other] = jobs(scripted().changed("fov", camera__fov=30.0), ["narrow"])

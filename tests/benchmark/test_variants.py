@@ -63,7 +63,8 @@ def test_rough_masks_are_made_for_a_clip_and_the_first_one_is_true(clips, tmp_pa
 
 def test_a_camera_that_is_not_told_is_not_in_the_configuration(clips, scripted, tmp_path):
     def config(clip):
-        return Job("clip", clips, clip, scripted(), tmp_path / "out").config.camera.intrinsics
+        variant = scripted().changed("unsaid", camera__fov=None)
+        return Job("clip", clips, clip, variant, tmp_path / "out").config.camera.intrinsics
 
     assert config("narrow") is not None
     file = clips / "narrow" / "camera.json"
