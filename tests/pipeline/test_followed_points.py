@@ -15,7 +15,7 @@ SETTINGS = ["window.size=64", "object.frequency=4", "object.texture_size=16", "o
 
 @pytest.fixture(scope="module")
 def clip() -> SyntheticClip:
-    return synthesize(SyntheticSpec(frames=7, size=(80, 64)))
+    return synthesize(SyntheticSpec(frames=7, size=(80, 64), degrees_per_frame=5.0))
 
 
 @pytest.fixture(scope="module")

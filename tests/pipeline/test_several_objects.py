@@ -193,13 +193,13 @@ def test_every_object_has_a_run_folder_as_if_it_were_alone(source, tmp_path):
         assert files == {path.relative_to(alone.folder) for path in alone.folder.rglob("*")}
 
 
-def test_all_objects_are_refined_in_one_more_pass_and_drawn_in_another(source, tmp_path, monkeypatch):
+def test_all_objects_are_refined_put_right_and_drawn_in_one_more_pass_each(source, tmp_path, monkeypatch):
     opened: list[int] = []
     iterate = ImageSequence.__iter__
     monkeypatch.setattr(ImageSequence, "__iter__", lambda self: opened.append(1) or iterate(self))
     config = settings("solver.final_refine=true")
     record_objects(source, config, tmp_path / "run", boxes=[LEFT, RIGHT])
-    assert len(opened) == 3
+    assert len(opened) == 4
     for number in (0, 1):
         run = RunReader(tmp_path / "run" / f"object_{number}")
         assert [frame.refined for frame in run.frames] == [True] * 5

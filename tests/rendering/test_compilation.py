@@ -133,12 +133,12 @@ def test_a_kernel_is_compiled_once_and_kept_and_that_is_told_once(tmp_path, cach
     file.write_text(SMALL)
     with caplog.at_level(logging.WARNING):
         assert small_kernel(file)(1.5) == 3
-        (folder,) = {path.parent for path in files_in(cache)}
-        assert caplog.messages == [f"{ANNOUNCED.partition(': ')[2]}the result is kept in {folder}."]
+        assert len({path.parent for path in files_in(cache)}) == 1
+        assert caplog.messages == [f"{ANNOUNCED.partition(': ')[2]}the result is kept."]
         assert small_kernel(file)(2.5) == 5
         assert len(caplog.messages) == 1
-        file.write_text(SMALL.replace("2 *", "4 *"))
-        assert small_kernel(file)(1.5) == 6
+        file.write_text(SMALL.replace("2 *", "10 *"))
+        assert small_kernel(file)(1.5) == 15
         assert len(caplog.messages) == 2
 
 

@@ -63,7 +63,7 @@ def solver(monkeypatch):
 
 
 def run(clip, folder: Path, *overrides: str) -> Path:
-    quick = ["tracker.name=flow", "tracker.segmentation_size=64", "window.size=32"]
+    quick = ["tracker.name=flow", "tracker.segmentation_size=64", "window.size=32", "object.evidence=false"]
     record(
         open_source(str(folder.parent / "clip")),
         load_config(overrides=[*quick, *overrides]),

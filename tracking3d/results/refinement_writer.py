@@ -209,10 +209,11 @@ class RefinementWriter:
             (causal / layout.MASKS).mkdir(parents=True, exist_ok=True)
             for record in self._records.values():
                 place = layout.mask_path(self._folder, record.index)
-                if (decided := self._decided.get(record.index)) is not None:
-                    write_mask(layout.mask_path(self._aside, record.index), _decoded(decided))
                 place.replace(layout.mask_path(causal, record.index))
-                layout.mask_path(self._aside, record.index).replace(place)
+                if (decided := self._decided.get(record.index)) is not None:
+                    write_mask(place, _decoded(decided))  # what it was decided from stays aside till the end
+                else:
+                    layout.mask_path(self._aside, record.index).replace(place)
             for name in layout.MESH_FILES:
                 if (self._folder / name).is_file():
                     (self._folder / name).replace(causal / name)

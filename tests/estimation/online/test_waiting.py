@@ -292,3 +292,12 @@ def test_where_points_get_worse_the_start_of_before_is_taken_up_again(monkeypatc
     _, start = solved_start(replace(state, waiting=given.waiting, due=0.0), CONFIG)
     assert start is not None and start.origin == "5"
     assert asked == [5, 6, 5]
+
+
+def test_when_no_more_frames_come_the_better_start_is_taken(monkeypatch):
+    known = map_with_points(STEADY)
+    monkeypatch.setattr(waiting, "solve_start", lambda *given: [Start(known, 1.0, 0.1, "points", CAMERA)] * 2)
+    monkeypatch.setattr(waiting, "_same_axis", lambda one, other: False)
+    state, start = solved_start(belief_of(STEADY), CONFIG)
+    assert start is None
+    assert solved_start(state, CONFIG, ended=True)[1].origin == "points"

@@ -142,9 +142,12 @@ class OnlineSolver:
     trusting = staticmethod(trusting)
 
     def refine(self, state: Belief) -> Belief:
-        """All keyframes together once more."""
+        """All keyframes together once more; where the start still waits, it is what the frames say so far."""
         if state.waiting is not None:
-            return state
+            state, start = solved_start(state, self.online, ended=True)
+            if start is None:
+                return state
+            state, _ = self._begun(state, start)
         known, camera = refined_once_more(state.known, state.camera, self.online)
         return replace(
             state,

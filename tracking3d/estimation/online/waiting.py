@@ -96,23 +96,29 @@ def waiting_view(
     return known, replace(view, points=points, keypoints=keypoints, keypoint_landmark=label)
 
 
-def solved_start(state: Belief, config: OnlineConfig) -> tuple[Belief, Start | None]:
-    """The start, where the waiting frames can tell; else None, and when it is tried next."""
+def solved_start(state: Belief, config: OnlineConfig, ended: bool = False) -> tuple[Belief, Start | None]:
+    """The start, where the waiting frames can tell; else None, and when it is tried next.
+
+    Args:
+        state: With the waiting frames.
+        config: Of the solver.
+        ended: Whether no more frames come, so that these have to do.
+    """
     waiting = state.waiting or ()
     views = [view for view, _ in waiting if view.mask is not None]
     if len(views) < _FEWEST:
         return state, None
-    gone = _gone([view for view, _ in waiting])  # what was seen until then has to do
+    ended = ended or _gone([view for view, _ in waiting])  # what was seen until then has to do
     if np.median([view.strength for view in views]) < PLAIN:
         enough = len(views) >= _FEWEST_BY_TURNING and (len(views) - _FEWEST_BY_TURNING) % _AGAIN == 0
-        if not enough and not gone:
+        if not enough and not ended:
             return state, None
         return _start_without_points(state, views, config)
     names = np.unique(np.concatenate([view.points.landmark for view in views]))
     motion = motion_enough(tracks_of(views, names[~state.known.candidate[names]]))
     still_there = np.isin(views[0].points.landmark, views[-1].points.landmark)
     shared = float(still_there.mean()) if len(still_there) else 0.0
-    waited = gone or len(views) >= _MOST
+    waited = ended or len(views) >= _MOST
     # Points that run wild show no more motion when there is more of it: then pixels and outlines are asked.
     wild = motion > _WILD and len(views) >= _FEWEST_BY_TURNING
     due = max(state.due, MOTION)
