@@ -10,12 +10,18 @@ from tracking3d.errors import InputError
 from tracking3d.point_following import checked_queries
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 
-SETTINGS = ["window.size=64", "object.frequency=4", "object.texture_size=16", "object.texture_views=0"]
+SETTINGS = [
+    "window.size=64",
+    "object.frequency=4",
+    "object.texture_size=16",
+    "object.texture_views=0",
+    "camera.fov=45",
+]
 
 
 @pytest.fixture(scope="module")
 def clip() -> SyntheticClip:
-    return synthesize(SyntheticSpec(frames=7, size=(80, 64), degrees_per_frame=5.0))
+    return synthesize(SyntheticSpec(frames=10, size=(120, 96), degrees_per_frame=5.0))
 
 
 @pytest.fixture(scope="module")
@@ -48,8 +54,8 @@ def test_pixels_alone_are_of_the_frame_in_which_the_object_is_given():
 
 
 def test_a_pixel_outside_the_frame_is_told_by_the_first(clip, config):
-    with pytest.raises(InputError, match=r"^follow= asks for the pixel 80,3, but frames have 80 x 64"):
-        next(track(clip.images, mask=clip.masks[0], config=config, follow=[(80, 3)]))
+    with pytest.raises(InputError, match=r"^follow= asks for the pixel 120,3, but frames have 120 x 96"):
+        next(track(clip.images, mask=clip.masks[0], config=config, follow=[(120, 3)]))
 
 
 def middle(clip, index: int) -> tuple[float, float]:
@@ -65,7 +71,7 @@ def test_every_answer_says_where_the_points_are_by_the_frames_until_then(clip, c
         answers.append(answer)
         revised.update({one.index: one.points for one in answer.revised})
     positions = np.stack([answer.points.positions for answer in answers])
-    assert positions.shape == (7, 3, 2)
+    assert positions.shape == (10, 3, 2)
     np.testing.assert_array_equal(positions[0, 0], queries[0][1:])
     assert np.isfinite(positions[:, 0]).all()
     assert np.isnan(positions[:, 1]).all()  # beside the object
