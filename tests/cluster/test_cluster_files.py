@@ -51,7 +51,7 @@ def test_scripts_are_of_the_shell_s_grammar_and_ask_slurm_for_known_things(path)
 def commands() -> list[str]:
     """What the files have `tracking3d` do, names of variables in place of their values."""
     found = []
-    for path in sorted(FOLDER.iterdir()):
+    for path in sorted(path for path in FOLDER.iterdir() if path.is_file()):
         for line in path.read_text(encoding="utf-8").splitlines():
             if match := re.search(r"tracking3d ((?:batch|run) .*?)(?:'?$| &$)", line.strip()):
                 found.append(re.sub(r'"?\$\{?(\w+)[^"\s]*"?', r"\1", match[1]).replace("0,0", "1,1"))
