@@ -59,9 +59,8 @@ def go_through(
             raise errors[0]
 
     with ExitStack() as threads:
-        for recording in (
-            recordings if source.repeatable else ()
-        ):  # of a live source, answers are told at once
+        # Of a live source, answers are told at once.
+        for recording in recordings if source.repeatable else ():
             threads.enter_context(recording.writing_beside())
         try:
             for frame, coming in _in_turn(source, frames) if any(one.takes for one in going_on) else ():
