@@ -95,5 +95,6 @@ def test_stopped_run_keeps_every_finished_frame(real_clip, box, tmp_path, stop, 
     assert run.description["state"] == ("running" if killed else "interrupted")
     for made in ("mesh.glb", "contact_sheet.png"):
         assert (tmp_path / "run" / made).is_file() is not killed
-    assert [frame.index for frame in run.frames] == [0, 1]
-    assert all(run.mask(index).any() for index in (0, 1))
+    # A kill while frame 2 is asked for may meet frame 1 on its way to disk: it is there whole, or not at all.
+    assert [frame.index for frame in run.frames] in ([[0], [0, 1]] if killed else [[0, 1]])
+    assert all(run.mask(frame.index).any() for frame in run.frames)
