@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -19,6 +20,7 @@ from tracking3d.points.bundle import bundle
 from tracking3d.points.carrying import Warps
 from tracking3d.points.chain import follow_chain
 from tracking3d.points.meeting import surface_under
+from tracking3d.points.reversal import Reversal, reversed_where_better
 from tracking3d.points.surface import move_surface
 from tracking3d.points.view import Array, View, draw
 
@@ -60,6 +62,7 @@ class Scene:
         faces: ``(F, 3)``.
         focal_factor: By which the views' focal lengths are those that they were opened with.
         support: What landmarks say of each view's pose; empty before they were looked for.
+        reversal: What was done to surface and poses, where landmarks said that depth was the other way round.
     """
 
     views: list[View | None]
@@ -67,6 +70,7 @@ class Scene:
     faces: NDArray[np.int64]
     focal_factor: float = 1.0
     support: Mapping[int, Support] = field(default_factory=dict)
+    reversal: Reversal | None = None
 
     @property
     def radius(self) -> float:
@@ -86,7 +90,9 @@ class Scene:
             else draw(replace(view, intrinsics=view.intrinsics * lens), vertices, self.faces, poses[index])
             for index, view in enumerate(self.views)
         ]
-        return Scene(views, vertices, self.faces, self.focal_factor * focal_factor)
+        return Scene(
+            views, vertices, self.faces, self.focal_factor * focal_factor, reversal=self.reversal
+        )
 
 
 def refine_scene(
@@ -94,6 +100,7 @@ def refine_scene(
     rounds: int = ROUNDS,
     after_round: Callable[[int], None] = lambda done: None,
     free_focal: bool = False,
+    may_reverse: bool = False,
 ) -> Scene:
     """Put surface and poses right, as far as the images say how, until the poses hardly turn any more.
 
@@ -105,9 +112,10 @@ def refine_scene(
         rounds: How many times at most.
         after_round: Is told how many are done.
         free_focal: Whether the lens is to be put right too, since nobody knows it.
+        may_reverse: Whether depth may be the other way round than the run has it.
     """
     for done in range(1, rounds + 1):
-        before, scene = scene, _refine_once(scene, free_focal)
+        before, scene = scene, _refine_once(scene, free_focal, may_reverse and done == 1)
         after_round(done)
         if _turned(before, scene) < _SETTLED:
             break
@@ -128,7 +136,7 @@ def _turned(before: Scene, after: Scene) -> float:
     return float(np.median((turned.mean().inv() * turned).magnitude()))
 
 
-def _refine_once(scene: Scene, free_focal: bool) -> Scene:
+def _refine_once(scene: Scene, free_focal: bool, may_reverse: bool) -> Scene:
     there = [index for index, view in enumerate(scene.views) if view is not None]
     if not there:
         return scene
@@ -148,11 +156,21 @@ def _refine_once(scene: Scene, free_focal: bool) -> Scene:
         return replace(
             scene, support={at: Support(count, 0) for at, count in zip(there, followed, strict=True)}
         )
-    deviation = np.sqrt(chain.variance[there] + DEVIATION**2)
-    radius = scene.radius
-    found = bundle(points, intrinsics, T, measured, deviation, _HELD * radius, free_focal)
+    solved = partial(
+        bundle,
+        intrinsics=intrinsics,
+        measured=measured,
+        deviation=np.sqrt(chain.variance[there] + DEVIATION**2),
+        held=_HELD * scene.radius,
+    )
+    found, vertices = solved(points, T_cam_obj=T, free_focal=free_focal), scene.vertices
+    other = reversed_where_better(points, T, solved) if may_reverse else None
+    if other is not None:
+        reversal, found = other
+        scene = replace(scene, reversal=reversal)
+        vertices = reversal.surface(vertices, points, found.points)
     kept = (found.weight > 0).sum(0) >= min(_LEAST_VIEWS, len(there))
-    vertices = move_surface(scene.vertices, scene.faces, face[kept], barycentric[kept], found.points[kept])
+    vertices = move_surface(vertices, scene.faces, face[kept], barycentric[kept], found.points[kept])
     counts = zip(there, followed, found.agreeing.sum(1).tolist(), strict=True)
     support = {at: Support(count, agreeing) for at, count, agreeing in counts}
     redrawn = scene.redrawn(vertices, dict(zip(there, found.T_cam_obj, strict=True)), found.focal_factor)

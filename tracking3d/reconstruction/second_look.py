@@ -71,7 +71,12 @@ class SecondLook:
         views: list[View | None] = [self._views[index] for index in self._bundled]
         self._before = {index: self._views[index].T_cam_obj for index in self._bundled}
         self._views = {}
-        scene = refine_scene(Scene(views, self.vertices, self._faces), ROUNDS, free_focal=self.camera.assumed)
+        scene = refine_scene(
+            Scene(views, self.vertices, self._faces),
+            ROUNDS,
+            free_focal=self.camera.assumed,
+            may_reverse=True,
+        )
         self._scene, self.vertices = scene, scene.vertices
         factor = scene.focal_factor
         self.camera = replace(self.camera, fx=factor * self.camera.fx, fy=factor * self.camera.fy)
@@ -100,9 +105,9 @@ class SecondLook:
             return kept.T_cam_obj, scene.support.get(nearest)
         # What the nearest frame's pose was moved by in object coordinates: mostly, the object frame itself moved.
         T_before_now = (
-            np.linalg.inv(self._through_lens(self._before[self._bundled[nearest]])) @ kept.T_cam_obj
+            np.linalg.inv(self._as_settled(self._before[self._bundled[nearest]])) @ kept.T_cam_obj
         )
-        predicted = self._through_lens(record.T_cam_obj) @ T_before_now
+        predicted = self._as_settled(record.T_cam_obj) @ T_before_now
         view = None if record.status is Status.LOST else self._view(predicted, image, mask)
         if view is None:
             return predicted, None
@@ -135,9 +140,12 @@ class SecondLook:
         image, mask = self.camera.undistorted(image), self.camera.mask_to_pinhole(mask)
         return open_view(image, mask, self.camera, T_cam_obj, self.vertices, self._faces, LONGEST_SIDE)
 
-    def _through_lens(self, T_cam_obj: _Pose) -> _Pose:
-        """A pose of before at which the object has the same size through the lens of now."""
+    def _as_settled(self, T_cam_obj: _Pose) -> _Pose:
+        """A pose of before as it is after what was done to all: the way round of depth, and the lens.
+
+        Through another lens the object has the same size.
+        """
         assert self._scene is not None
-        T = T_cam_obj.copy()
+        T = T_cam_obj.copy() if self._scene.reversal is None else self._scene.reversal.poses(T_cam_obj)
         T[2, 3] *= self._scene.focal_factor
         return T
