@@ -1,10 +1,13 @@
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tracking3d.points.bundle import LEAST_MEASURED, bundle, intersect
+from tracking3d.bundle_adjustment.reversal import reversal_of
+from tracking3d.points.bundle import LEAST_MEASURED, bundle, intersect, reversed_where_better
 
 RNG = np.random.default_rng(3)
 POINTS = RNG.uniform(-1, 1, (40, 3))
@@ -108,3 +111,28 @@ def test_noise_is_no_proof_of_another_lens():
     measured, lens, T = seen_through(1.0, noise=1.0)
     found = bundle(POINTS, lens, T, measured, np.full((9, 40), 1.0), 0.1, free_focal=True)
     assert found.focal_factor == pytest.approx(1, abs=0.05)
+
+
+@pytest.mark.parametrize("wrong", [False, True])
+def test_the_way_round_that_explains_the_measurements_is_found(wrong):
+    T, measured = poses(), projected(POINTS, poses()) + RNG.normal(0, 0.1, (9, 40, 2))
+    reversal = reversal_of(POINTS, T[4])
+    points, begun = (reversal.points(POINTS), reversal.poses(T)) if wrong else (POINTS, T)
+    solved = partial(
+        bundle, intrinsics=INTRINSICS, measured=measured, deviation=np.full((9, 40), 0.1), held=0.3
+    )
+    better = reversed_where_better(points, begun, solved)
+    if not wrong:
+        assert better is None
+        return
+    assert better is not None
+    found = better[1]
+    relative = found.T_cam_obj[:, :3, :3] @ found.T_cam_obj[0, :3, :3].T
+    true = T[:, :3, :3] @ T[0, :3, :3].T
+    off = Rotation.from_matrix(relative @ true.transpose(0, 2, 1)).magnitude()
+    assert np.degrees(off).max() < 1
+
+
+def test_without_points_there_is_no_other_way_round():
+    none = np.zeros((0, 3))
+    assert reversed_where_better(none, poses(), partial(bundle, intrinsics=INTRINSICS)) is None

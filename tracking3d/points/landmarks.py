@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from tracking3d.points.bundle import bundle
+from tracking3d.bundle_adjustment.reversal import Reversal
+from tracking3d.points.bundle import bundle, reversed_where_better
 from tracking3d.points.carrying import Warps
 from tracking3d.points.chain import follow_chain
 from tracking3d.points.meeting import surface_under
-from tracking3d.points.reversal import Reversal, reversed_where_better
 from tracking3d.points.surface import move_surface
 from tracking3d.points.view import Array, View, draw
 
@@ -90,9 +90,7 @@ class Scene:
             else draw(replace(view, intrinsics=view.intrinsics * lens), vertices, self.faces, poses[index])
             for index, view in enumerate(self.views)
         ]
-        return Scene(
-            views, vertices, self.faces, self.focal_factor * focal_factor, reversal=self.reversal
-        )
+        return Scene(views, vertices, self.faces, self.focal_factor * focal_factor, reversal=self.reversal)
 
 
 def refine_scene(
@@ -114,10 +112,14 @@ def refine_scene(
         free_focal: Whether the lens is to be put right too, since nobody knows it.
         may_reverse: Whether depth may be the other way round than the run has it.
     """
-    for done in range(1, rounds + 1):
-        before, scene = scene, _refine_once(scene, free_focal, may_reverse and done == 1)
+    done, last = 0, rounds
+    while done < last:
+        done += 1
+        before, scene = scene, _refine_once(scene, free_focal, may_reverse and scene.reversal is None)
         after_round(done)
-        if _turned(before, scene) < _SETTLED:
+        if scene.reversal is not before.reversal:
+            last = done + rounds  # all of it is new
+        elif _turned(before, scene) < _SETTLED:
             break
     return scene
 

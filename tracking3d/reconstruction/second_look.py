@@ -104,9 +104,7 @@ class SecondLook:
         if self._bundled[nearest] == record.index:
             return kept.T_cam_obj, scene.support.get(nearest)
         # What the nearest frame's pose was moved by in object coordinates: mostly, the object frame itself moved.
-        T_before_now = (
-            np.linalg.inv(self._as_settled(self._before[self._bundled[nearest]])) @ kept.T_cam_obj
-        )
+        T_before_now = np.linalg.inv(self._as_settled(self._before[self._bundled[nearest]])) @ kept.T_cam_obj
         predicted = self._as_settled(record.T_cam_obj) @ T_before_now
         view = None if record.status is Status.LOST else self._view(predicted, image, mask)
         if view is None:

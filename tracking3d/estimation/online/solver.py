@@ -33,6 +33,7 @@ from tracking3d.estimation.online.motion import carried, led_to, moved_on, predi
 from tracking3d.estimation.online.object_model import object_model
 from tracking3d.estimation.online.points import FollowedPoints, follow, grey
 from tracking3d.estimation.online.pose_refinement import PoseFit, PoseWeights
+from tracking3d.estimation.online.reversal import turned_round
 from tracking3d.estimation.online.sighting import meets, sighted
 from tracking3d.estimation.online.start import Start
 from tracking3d.estimation.online.steering import trusting, turned_back
@@ -259,14 +260,14 @@ class OnlineSolver:
             with in_stage("map"):
                 known, followed = with_keyframe(state.known, state.camera, view, image, self.online)
                 surface = known.surface()
-            pose = known.keyframes[-1].pose
-            belief = replace(
-                belief, known=known, surface=surface, last=(pose, frame.index), followed=followed
-            )
+                last = known.keyframes[-1].pose, frame.index
+                belief = replace(belief, known=known, surface=surface, last=last, followed=followed)
+                belief = turned_round(belief, self.online)
+            pose = belief.last[0]
         if found.lost:
             belief = replace(belief, before=None)
         elif usual:
-            belief = replace(belief, trail=(*state.trail, (pose, frame.index))[-_TRAIL:])
+            belief = replace(belief, trail=(*belief.trail, (pose, frame.index))[-_TRAIL:])
         found = replace(found, fit=replace(found.fit, pose=pose))
         answer = solved(belief, unsolved(frame, mask, pose, state.camera), found)
         return with_colours(belief, answer, found), replace(answer, keyframe=key)

@@ -8,18 +8,13 @@ than one axis and the surface itself tell which it is.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from tracking3d.points.bundle import Bundled
-from tracking3d.points.view import Array
+from tracking3d.bundle_adjustment.reprojection import FloatArray
 
 _ROBUST_TURNS = 5
-_BETTER = 0.97
-"""Share of the cost that the reversed explanation may have. On the suites ``fresh`` of seeds 501, 602 and 9303 it was
-lower in five of 72 runs, by .62 to .98, all of which were turned wrongly; from 1.02 on it was the wrong one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,15 +26,15 @@ class Reversal:
         direction: ``(3,)`` unit vector in object coordinates, along which points are negated.
     """
 
-    centre: Array
-    direction: Array
+    centre: FloatArray
+    direction: FloatArray
 
-    def points(self, points: Array) -> Array:
+    def points(self, points: FloatArray) -> FloatArray:
         """``(N, 3)`` points reversed."""
         depth = (points - self.centre) @ self.direction
         return points - 2 * depth[:, None] * self.direction
 
-    def poses(self, T_cam_obj: Array) -> Array:
+    def poses(self, T_cam_obj: FloatArray) -> FloatArray:
         """``(..., 4, 4)`` poses at which reversed points are seen in the same directions, but for perspective."""
         placed = T_cam_obj[..., :3, :3] @ self.centre + T_cam_obj[..., :3, 3]
         sight = placed / np.linalg.norm(placed, axis=-1, keepdims=True)
@@ -49,7 +44,7 @@ class Reversal:
         reversed_T[..., :3, 3] = placed - R @ self.centre
         return reversed_T
 
-    def surface(self, vertices: Array, before: Array, after: Array) -> Array:
+    def surface(self, vertices: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
         """A surface that follows its points through their reversal.
 
         What was seen from the front is seen from the front still, so that the surface is not turned inside out: it is
@@ -65,53 +60,34 @@ class Reversal:
         """
         shift = (after - before) @ self.direction
         across = np.column_stack([np.ones(len(before)), self._across(before)])
-        weight = np.ones(len(before))
-        slant = np.zeros(4)
+        weight: FloatArray = np.ones(len(before))
+        slant: FloatArray = np.zeros(4)
         for _ in range(_ROBUST_TURNS):
             slant = np.linalg.lstsq(weight[:, None] * across, weight * shift, rcond=None)[0]
             left = np.abs(shift - across @ slant)
-            weight = 1 / np.sqrt(1 + (left / (2 * np.median(left) + 1e-12)) ** 2)
+            far = left / (2 * float(np.median(left)) + 1e-12)
+            weight = np.asarray(1 / np.sqrt(1 + far**2), np.float64)
         depth = np.column_stack([np.ones(len(vertices)), self._across(vertices)]) @ slant
         return vertices + depth[:, None] * self.direction
 
-    def _across(self, points: Array) -> Array:
+    def _across(self, points: FloatArray) -> FloatArray:
         """What is left of points without their depth."""
         offset = points - self.centre
         return offset - (offset @ self.direction)[:, None] * self.direction
 
 
-def reversal_of(points: Array, T_cam_obj: Array) -> Reversal:
-    """The reversal that leaves the middle view's pose as it is.
+def reversal_of(points: FloatArray, T: FloatArray) -> Reversal:
+    """The reversal that leaves one view's pose as it is.
 
     Args:
         points: ``(N, 3)`` in object coordinates.
-        T_cam_obj: ``(T, 4, 4)``.
+        T: ``(4, 4)`` pose of that view.
     """
     centre = points.mean(0)
-    T = T_cam_obj[len(T_cam_obj) // 2]
     placed = T[:3, :3] @ centre + T[:3, 3]
     return Reversal(centre, T[:3, :3].T @ (placed / np.linalg.norm(placed)))
 
 
-def reversed_where_better(
-    points: Array, T_cam_obj: Array, solved: Callable[..., Bundled]
-) -> tuple[Reversal, Bundled] | None:
-    """The reversal of points and poses, and what they become by it, if that explains the measurements better.
-
-    Args:
-        points: ``(N, 3)`` in object coordinates.
-        T_cam_obj: ``(T, 4, 4)``.
-        solved: Bundles ``points`` and ``T_cam_obj``, see `tracking3d.points.bundle.bundle`.
-    """
-    if not len(points):
-        return None
-    as_it_is = solved(points, T_cam_obj=T_cam_obj)
-    reversal = reversal_of(points, T_cam_obj)
-    other = solved(reversal.points(points), T_cam_obj=reversal.poses(T_cam_obj))
-    other = solved(other.points, T_cam_obj=other.T_cam_obj)
-    return (reversal, other) if other.cost < _BETTER * as_it_is.cost else None
-
-
-def _reflection(normal: Array) -> Array:
+def _reflection(normal: FloatArray) -> FloatArray:
     """``(..., 3, 3)`` reflection of ``(..., 3)`` unit normals."""
     return np.asarray(np.eye(3) - 2 * normal[..., :, None] * normal[..., None, :])
