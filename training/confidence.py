@@ -81,7 +81,8 @@ def _of_landmarks(record: FrameRecord) -> dict[str, float]:
     """What landmarks say of a refined answer, beside what was believed before they were asked."""
     if "followed" not in record.losses:
         return {}
-    support = Support(int(record.losses["followed"]), int(record.losses["landmarks"]))
+    followed, agreeing = int(record.losses["followed"]), int(record.losses["landmarks"])
+    support = Support(followed, agreeing, bool(record.losses.get("telling", 1.0)))
     return supported_by(record.losses.get("rendering", record.confidence), support)
 
 

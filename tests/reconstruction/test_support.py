@@ -15,7 +15,7 @@ DOUBTED = Assessment(Status.UNCERTAIN, "points agree, pixels do not", 0.3)
 
 def test_the_more_landmarks_agree_the_more_an_answer_is_believed():
     for before in (TRACKED, DOUBTED):
-        said = [supported(before, Support(300, count)).confidence for count in (0, 5, 30, 100, 300)]
+        said = [supported(before, Support(300, count)).confidence for count in (0, 60, 80, 100, 150)]
         assert said == sorted(set(said))
     assert said[0] < BELIEVED < said[-1]
 
@@ -37,6 +37,14 @@ def test_doubt_says_why():
     barely = Assessment(Status.TRACKED, "", 0.52)
     assert "(0 agree of 40" in supported(barely, Support(40, 0)).reason
     assert supported(DOUBTED, Support(40, 0)).reason == DOUBTED.reason
+
+
+def test_landmarks_of_a_plain_object_say_nothing():
+    said = [supported(DOUBTED, Support(300, count, telling=False)).confidence for count in (0, 60, 300)]
+    assert len(set(said)) == 1
+    assert said[0] < supported(DOUBTED, Support(300, 300)).confidence
+    hardly = Assessment(Status.TRACKED, "", 0.03)
+    assert "plain" in supported(hardly, Support(300, 300, telling=False)).reason
 
 
 def test_what_is_lost_stays_lost():

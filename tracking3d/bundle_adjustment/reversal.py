@@ -63,7 +63,9 @@ class Reversal:
         weight: FloatArray = np.ones(len(before))
         slant: FloatArray = np.zeros(4)
         for _ in range(_ROBUST_TURNS):
-            slant = np.linalg.lstsq(weight[:, None] * across, weight * shift, rcond=None)[0]
+            slant = np.asarray(
+                np.linalg.lstsq(weight[:, None] * across, weight * shift, rcond=None)[0], np.float64
+            )
             left = np.abs(shift - across @ slant)
             far = left / (2 * float(np.median(left)) + 1e-12)
             weight = np.asarray(1 / np.sqrt(1 + far**2), np.float64)

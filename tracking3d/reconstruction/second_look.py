@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from tracking3d.estimation.estimate import ObjectModel, Status
+from tracking3d.estimation.online.points import grey
+from tracking3d.estimation.online.texture_strength import PLAIN, texture_strength
 from tracking3d.frames import Image
 from tracking3d.geometry.camera import Camera
 from tracking3d.points.landmarks import Scene, Support, refine_scene
@@ -52,6 +54,7 @@ class SecondLook:
         at = np.linspace(0, len(answered) - 1, count).round().astype(int) if count else ()
         self._wanted = {answered[index] for index in at}
         self._views: dict[int, View] = {}
+        self._strengths: list[float] = []
         self._scene: Scene | None = None
         self._bundled: list[int] = []
         self._before: dict[int, _Pose] = {}
@@ -62,6 +65,7 @@ class SecondLook:
             view = self._view(record.T_cam_obj, image, mask)
             if view is not None:
                 self._views[record.index] = view
+                self._strengths.append(texture_strength(grey(image), mask))
 
     def settle(self) -> None:
         """Put poses, lens and surface right, as far as the frames say how."""
@@ -102,7 +106,7 @@ class SecondLook:
         kept = scene.views[nearest]
         assert kept is not None
         if self._bundled[nearest] == record.index:
-            return kept.T_cam_obj, scene.support.get(nearest)
+            return kept.T_cam_obj, self._told(scene.support.get(nearest))
         # What the nearest frame's pose was moved by in object coordinates: mostly, the object frame itself moved.
         T_before_now = np.linalg.inv(self._as_settled(self._before[self._bundled[nearest]])) @ kept.T_cam_obj
         predicted = self._as_settled(record.T_cam_obj) @ T_before_now
@@ -112,7 +116,7 @@ class SecondLook:
         resected, share = resect(scene, view, around)
         there = [scene.support[at] for at in around if at in scene.support]
         followed = max((one.followed for one in there), default=0)
-        return resected.T_cam_obj, Support(followed, round(share * followed))
+        return resected.T_cam_obj, self._told(Support(followed, round(share * followed)))
 
     def moved(self, model: ObjectModel) -> ObjectModel:
         """The model with the surface that was found."""
@@ -122,6 +126,10 @@ class SecondLook:
         """What the texture is taken from, with the pose that its frame has in the end."""
         factor = self.camera.fx / self._lens
         return replace(view, K=view.K @ np.diag([factor, factor, 1.0]), T_cam_obj=record.T_cam_obj)
+
+    def _told(self, support: Support | None) -> Support | None:
+        """What landmarks say, with whether they can tell anything on this object."""
+        return support and replace(support, telling=float(np.median(self._strengths)) >= PLAIN)
 
     def _between(self, index: int, before: int, after: int) -> _Pose:
         """The pose of a frame in which the object was not found: it goes on steadily from one view to the next."""
