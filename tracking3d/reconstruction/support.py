@@ -16,8 +16,8 @@ from tracking3d.results.records import FrameRecord
 BELIEVED = 0.5
 """Confidence from which on a frame is tracked."""
 _FEW, _MANY = 60, 150
-"""Agreeing landmarks between which belief grows: of textured objects a quarter of the answers with fewer were right, and
-19 of 20 with more (suites ``fresh`` of seeds 501, 602 and 9303)."""
+"""Agreeing landmarks between which belief grows: of textured objects a quarter of the answers with fewer were right, 19
+of 20 with more (suites ``fresh`` of seeds 501, 602 and 9303)."""
 _INTERCEPT = -0.4355
 _TERMS = {  # weight, and the range that was seen
     "rendering": (0.8099, -2.671, 2.548),
