@@ -15,6 +15,7 @@ from tracking3d.estimation.online.points import FollowedPoints
 from tracking3d.estimation.online.recruits import (
     MOST_CANDIDATES,
     recruit,
+    still,
     surroundings,
     with_candidates,
 )
@@ -145,3 +146,42 @@ def test_candidates_are_corners_beside_the_mask_at_no_known_place(masked):
     # The room for candidates is filled once.
     again, _ = with_candidates(more, shows, speckle())
     assert len(again.landmarks) <= MOST_CANDIDATES
+
+
+def ring(directions) -> list:
+    """Tracks of points before the solid in these directions from its middle, four in each, that move as it does."""
+    angles = np.repeat(np.deg2rad(directions), 4) + np.tile(np.deg2rad([-6, -2, 2, 6]), len(directions))
+    points = np.column_stack([0.85 * np.cos(angles), 0.85 * np.sin(angles), np.full(len(angles), -0.75)])
+    return [[pixels_of(point[None], view)[0] for view in turned_map(ANGLES).keyframes] for point in points]
+
+
+def test_where_everything_around_moves_with_the_object_the_scene_is_a_still_one_and_nobody_is_recruited():
+    known = recruited(with_tracks(*ring([22.5 + 45 * n for n in range(8)])))
+    assert still(known.beside)
+    assert known.candidate.all()
+    assert not shown(known)
+    # From then on nobody is asked.
+    view = known.keyframes[-1]
+    assert len(with_candidates(known, view, speckle())[1].points) == len(view.points)
+
+
+def test_what_moves_with_the_object_on_some_sides_is_part_of_it():
+    known = recruited(with_tracks(*ring([22.5, 67.5, 112.5])))
+    assert not still(known.beside)
+    assert not known.candidate.any()
+
+
+@pytest.mark.parametrize(
+    ("told", "fit", "expected"),
+    [
+        ([9] * 8, [9] * 8, True),
+        ([9] * 8, [9, 9, 9, 9, 9, 9, 0, 0], True),
+        ([9] * 8, [9, 9, 9, 9, 0, 0, 0, 0], False),
+        ([9] * 8, [5] * 8, False),
+        ([9, 9, 9, 9, 0, 0, 0, 0], [9, 9, 9, 9, 0, 0, 0, 0], False),
+        ([2] * 8, [2] * 8, False),
+        ([0] * 8, [0] * 8, False),
+    ],
+)
+def test_a_still_scene_needs_most_directions(told, fit, expected):
+    assert still(np.array([told, fit]).T) is expected

@@ -68,6 +68,7 @@ class ObjectMap:
         candidate: ``(N,)`` found beside the mask, and not yet known to be on the object.
         pointless: Whether the object has no points that can be followed: it is known by pixels and outlines alone.
         renderer: Which renderer, see `tracking3d.rendering.backend`.
+        beside: ``(8, 2)`` candidates in each direction from the object that could be told, and that move as it does.
     """
 
     shape: Shape
@@ -78,6 +79,7 @@ class ObjectMap:
     candidate: NDArray[np.bool_]
     pointless: bool = False
     renderer: str = "auto"
+    beside: NDArray[np.int64] = field(default_factory=lambda: np.zeros((8, 2), np.int64))
 
     @cached_property
     def sightings(self) -> NDArray[np.int64]:

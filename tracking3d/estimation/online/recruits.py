@@ -2,7 +2,7 @@
 
 Corners around the mask are followed like the object's own. Once a few keyframes show one, it is triangulated with
 their poses: a point of the object fits them and has moved in the image; one of the background fits only while
-nothing moves.
+nothing moves. Where the object stands still and the camera moves, everything fits: then nobody is recruited.
 """
 
 from __future__ import annotations
@@ -26,6 +26,11 @@ _VIEWS = 3
 _FITS, _FAILS = 1.0, 2.5  # mean residual in pixels of an object 200 pixels large
 _MOVED = 6.0  # such pixels
 _STAYS = 0.3  # of the way that the object would have carried it
+_SECTORS = 8  # that the surroundings are divided into
+_STILL = (
+    0.6  # share of the candidates of a sector, and of the sectors, that fit where the scene is a still one
+)
+_FEWEST_SECTORS, _FEWEST = 5, 3  # sectors that tell, and candidates that make one tell
 
 
 def surroundings(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -37,7 +42,7 @@ def surroundings(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def with_candidates(known: ObjectMap, view: View, image: NDArray[np.uint8]) -> tuple[ObjectMap, View]:
     """With corners beside a view's mask."""
-    if view.mask is None:
+    if view.mask is None or still(known.beside):
         return known, view
     there = int(known.candidate[view.points.landmark].sum())
     corners = new_corners(image, surroundings(view.mask), view.points.pixel, MOST_CANDIDATES - there)
@@ -86,6 +91,10 @@ def recruit(known: ObjectMap, camera: Camera, positions: list[int]) -> ObjectMap
     accepted = enough & (residual < _FITS) & (motion > _MOVED) & near & ~stays
     rejected = stays | (enough & ((residual > _FAILS) | ~near) & (motion > _MOVED))
     rejected |= (tracks.visible.sum(0) >= 2 * _VIEWS) & ~accepted
+    told = enough & (motion > _MOVED)
+    beside = known.beside + _by_sector(views, first, pixel, told, residual < _FITS)
+    if still(beside):
+        accepted, rejected = np.zeros_like(accepted), np.ones_like(rejected)
     landmarks, candidate = known.landmarks.copy(), known.candidate.copy()
     landmarks[names[accepted]] = found.points[accepted]
     candidate[names[accepted]] = False
@@ -94,4 +103,40 @@ def recruit(known: ObjectMap, camera: Camera, positions: list[int]) -> ObjectMap
         replace(view, points=view.points.only(~np.isin(view.points.landmark, dropped)))
         for view in known.keyframes
     )
-    return replace(known, landmarks=landmarks, candidate=candidate, keyframes=keyframes)
+    return replace(known, landmarks=landmarks, candidate=candidate, keyframes=keyframes, beside=beside)
+
+
+def still(beside: NDArray[np.int64]) -> bool:
+    """Whether what is all around the object moves as it does: it stands still, and the camera moves.
+
+    A mask that is too small has points of the object beside it on some sides, and so has one beside a hand.
+
+    Args:
+        beside: ``(S, 2)`` candidates in each sector around the object that could be told, and that fit its motion.
+    """
+    told, fit = beside.T
+    tells = told >= _FEWEST
+    if tells.sum() < _FEWEST_SECTORS:
+        return False
+    return bool((fit[tells] > _STILL * told[tells]).mean() > _STILL)
+
+
+def _by_sector(
+    views: list[View],
+    first: NDArray[np.intp],
+    pixel: NDArray[np.float64],
+    told: NDArray[np.bool_],
+    fits: NDArray[np.bool_],
+) -> NDArray[np.int64]:
+    """``(S, 2)`` candidates in each direction from the middle of the mask, that can be told and that fit."""
+    counts = np.zeros((_SECTORS, 2), np.int64)
+    for number in np.unique(first[told]):
+        mask = views[number].mask
+        if mask is None or not mask.any():
+            continue
+        chosen = told & (first == number)
+        x, y = (pixel[chosen] - np.argwhere(mask)[:, ::-1].mean(0)).T
+        sector = ((np.arctan2(y, x) / (2 * np.pi) + 0.5) * _SECTORS).astype(int) % _SECTORS
+        np.add.at(counts, (sector, 0), 1)
+        np.add.at(counts, (sector[fits[chosen]], 1), 1)
+    return counts
