@@ -56,6 +56,8 @@ def check_session(config: Any, prompt: Any, intrinsics: Any) -> None:
             f"The tracker '{AUTO}' is chosen by the first frame, in track and record; for a session name one, or take "
             "what tracking3d.tracker_choice.choose_tracker gives."
         )
+    if prompt is None and needs_prompt(config):
+        raise InputError("Say what the object is by either a box or a mask of the first frame.")
     if prompt is not None:
         if not isinstance(prompt, Prompt):
             raise InputError(
@@ -74,6 +76,11 @@ def check_session(config: Any, prompt: Any, intrinsics: Any) -> None:
             raise InputError(
                 f"intrinsics={shown(intrinsics)} is not fx, fy, cx, cy in pixels with positive fx and fy."
             )
+
+
+def needs_prompt(config: PipelineConfig) -> bool:
+    """Whether somebody has to say what the object is: neither the mask tracker nor an earlier run knows it."""
+    return config.tracker.name != "precomputed" and config.object.known is None
 
 
 def check_source(source: Any) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.arguments import checked_config
+from tracking3d.arguments import checked_config, needs_prompt
 from tracking3d.config.camera import choose_camera
 from tracking3d.config.models import PipelineConfig
 from tracking3d.corrections import Correction, check_corrections_fit, checked_corrections, prompts_in
@@ -85,7 +85,7 @@ def track(
     """
     source, config = open_frames(frames), checked_config(config)
     config = config_of_result(config, source, refine, model)
-    check_prompt(box, mask, needed=config.tracker.name != "precomputed", points=points)
+    check_prompt(box, mask, needed=needs_prompt(config), points=points)
     [told] = checked_corrections(corrections)
     check_order(source, config, start_frame)
     untold = box is None and mask is None and points is None

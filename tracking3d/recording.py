@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.arguments import check_source, checked_config, checked_folder
+from tracking3d.arguments import check_source, checked_config, checked_folder, needs_prompt
 from tracking3d.checkpoint.folder import Checkpoint, finish_state
 from tracking3d.checkpoint.resuming import earlier_run, given_of
 from tracking3d.checkpoint.staging import corrected_aside, take_over
-from tracking3d.config.camera import choose_camera
 from tracking3d.config.models import PipelineConfig, PluginChoice
 from tracking3d.corrections import Correction, check_corrections_fit, checked_corrections
 from tracking3d.errors import InputError
 from tracking3d.frames import Box, Frame, Prompt, SkippedFrame
+from tracking3d.object_files import camera_of
 from tracking3d.object_recording import ObjectRecording
 from tracking3d.parts import build_encoder, check_turns
 from tracking3d.passes import Listener, go_through, timed
@@ -95,7 +95,7 @@ def record(
     """
     check_source(source)
     config, folder = checked_config(config), checked_folder(folder)
-    check_prompt(box, mask, needed=config.tracker.name != "precomputed", points=points)
+    check_prompt(box, mask, needed=needs_prompt(config), points=points)
     [told] = checked_corrections(corrections)
     begin = partial(
         begun, source, command=command, selection=selection, overwrite=overwrite, resume=resume,
@@ -271,11 +271,11 @@ def begun(
     if earlier == "stopped":
         checkpoint = Checkpoint(folder, session.state_classes, *keeps)
         kept = checkpoint.read()
-    (height, width), camera = first.size, session.config.camera
+    height, width = first.size
     writer = RunWriter(
         folder,
         config=config,
-        camera=choose_camera(camera, width, height, source.intrinsics, source.intrinsics_origin),
+        camera=camera_of(session.config, width, height, source.intrinsics, source.intrinsics_origin),
         source=source.name,
         seed=session.config.runtime.seed,
         renderer=session.renderer,
@@ -312,7 +312,7 @@ def with_tracker(
 
     A run that goes on does so with the tracker that it was begun with.
     """
-    if config.tracker.name != AUTO or prompt is None:
+    if config.tracker.name != AUTO:
         return config, None
     if resume and (folder / RUN).is_file():
         before = RunReader(folder)

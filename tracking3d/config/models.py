@@ -89,6 +89,13 @@ class CameraConfig(Section):
 class ObjectConfig(Section):
     """How the object is represented (paper section 3.1)."""
 
+    known: str | None = Field(
+        None,
+        description=(
+            "The folder of an earlier run or a mesh file: the object is that one, and is found in the video without a "
+            "start by motion. Shape and colours are held, so that nothing of landmark_views and texture_views is done."
+        ),
+    )
     prototype: str = Field(
         "ellipsoid", description="sphere, ellipsoid (fitted to the first mask) or a mesh file."
     )
@@ -134,6 +141,19 @@ class ObjectConfig(Section):
     flat: bool = Field(
         False, description="Flat prior: project all vertices onto one plane after each iteration."
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _is_held_where_known(cls, value: Any) -> Any:
+        if isinstance(value, dict) and value.get("known") is not None:
+            return {**value, "landmark_views": 0, "texture_views": 0}
+        return value
+
+    @model_validator(mode="after")
+    def _is_told_once(self) -> ObjectConfig:
+        if self.known is not None and (self.flat or self.prototype != "ellipsoid"):
+            raise ValueError("known, or flat and prototype, since what is known has its shape")
+        return self
 
 
 class WindowConfig(Section):
