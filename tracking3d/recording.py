@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.arguments import check_source, checked_config, checked_folder, needs_prompt
+from tracking3d.arguments import check_known, check_source, checked_config, checked_folder, needs_prompt
 from tracking3d.checkpoint.folder import Checkpoint, finish_state
 from tracking3d.checkpoint.resuming import earlier_run, given_of
 from tracking3d.checkpoint.staging import corrected_aside, take_over
@@ -70,7 +70,8 @@ def record(
         box: The object in the first frame, ``(x, y, width, height)``.
         mask: The object in the first frame, as a mask or the image file of one. Without a box, a mask and points
             the tracker's own first mask is the prompt.
-        points: The object in the first frame by ``(N, 3)`` points: x, y in pixels, and 1 on it or 0 beside it.
+        points: The object in the first frame by ``(N, 3)`` points: x, y in pixels, and 1 on it or 0 beside it. None of
+            the three is needed where ``object.known`` says which object it is.
         start_frame: Index of the frame in which the object is given, instead of the first: it is tracked from there to
             the end, and then backwards to the beginning, with what was learnt. Only of a source that can be read
             again.
@@ -162,6 +163,7 @@ def record_objects(
     check_source(source)
     config, folder = checked_config(config), checked_folder(folder)
     check_prompts(boxes, masks, points)
+    check_known(config, len(boxes) + len(masks) + len(points))
     told = checked_corrections(corrections, len(boxes) + len(masks) + len(points))
     begin = partial(
         begun, source, command=command, selection=selection, overwrite=overwrite, resume=resume,
