@@ -6,6 +6,7 @@ import math
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -13,12 +14,12 @@ from tracking3d.estimation.framing import mask_box
 from tracking3d.estimation.online.belief import ObjectMap, View
 from tracking3d.estimation.online.keypoints import Keypoints, detect, match
 from tracking3d.estimation.online.known_views import sides
-from tracking3d.estimation.online.mapping import nearest_views, pose_of, project_points
+from tracking3d.estimation.online.mapping import nearest_views, project_points
 from tracking3d.estimation.online.points import FollowedPoints
-from tracking3d.estimation.online.pose_refinement import PoseWeights, refine_poses
+from tracking3d.estimation.online.pose_refinement import PoseFit, PoseWeights, refine_poses
 from tracking3d.estimation.online.tracking import matched_poses, pose_of_points
 from tracking3d.geometry.camera import Camera
-from tracking3d.geometry.pose import Pose
+from tracking3d.geometry.pose import Pose, from_matrix
 from tracking3d.rendering import Surface
 
 _MOST = 2000  # keypoints of a whole frame, at each size
@@ -26,10 +27,10 @@ _LENGTHS = (0.25, 0.75)  # of the frame's height, that the object may have: pict
 _POSES = 3  # that most keypoints agree with
 _NEIGHBOURS = 6  # drawn sides whose matches are joined, once it is known which side is seen
 _JOINED = 5.0  # pixels of an object 200 pixels large within which they count
-_DIRECTIONS, _ROLLS = 96, 12  # that an outline is tried from
+_DIRECTIONS, _ROLLS = 160, 18  # that an outline is tried from
 _UNLIKE = 0.4  # logarithm of two boxes' ratios of width and height that are not one outline's
-_SURVIVORS, _FINALISTS = 16, 4
-_STEPS = (8,)
+_STAGES = ((120, 2), (24, 8))  # how many go on, and the steps that each then gets
+_FINALISTS = 5
 _VERTICES = 600  # that tell the box of an outline
 
 
@@ -93,15 +94,17 @@ def by_outline(surface: Surface, camera: Camera, view: View, weights: PoseWeight
     assert view.mask is not None
     poses = _placed(surface, camera, view.mask)
     small = view.observation.half
-    costs = [_cost(fit.cost, fit.overlap) for fit in refine_poses(surface, small, poses, None, weights, (0,))]
-    best = [poses[place] for place in np.argsort(costs)[:_SURVIVORS]]
-    fits = refine_poses(surface, small, best, None, weights, _STEPS)
-    fits.sort(key=lambda fit: _cost(fit.cost, fit.overlap))
+    fits = refine_poses(surface, small, poses, None, weights, (0,))
+    for survivors, steps in _STAGES:
+        fits.sort(key=_cost)
+        best = [fit.pose for fit in fits[:survivors]]
+        fits = refine_poses(surface, small, best, None, weights, (steps,))
+    fits.sort(key=_cost)
     return [fit.pose for fit in fits[:_FINALISTS]]
 
 
-def _cost(cost: float, overlap: float) -> float:
-    total = cost + 1 - overlap
+def _cost(fit: PoseFit) -> float:
+    total = fit.cost + 1 - fit.overlap
     return total if math.isfinite(total) else math.inf
 
 
@@ -111,16 +114,16 @@ def _placed(surface: Surface, camera: Camera, mask: NDArray[np.bool_]) -> list[P
     middle = np.array([left + (width - 1) / 2 - camera.cx, top + (height - 1) / 2 - camera.cy])
     vertices = surface.vertices.double().cpu().numpy()
     vertices = vertices[:: max(len(vertices) // _VERTICES, 1)]
-    poses = []
-    for side in sides(_DIRECTIONS):
-        for roll in range(_ROLLS):
-            R = Rotation.from_euler("z", 360 * roll / _ROLLS, degrees=True).as_matrix() @ side
-            placed = (vertices @ R.T)[:, :2]
-            low, high = placed.min(0), placed.max(0)
-            form = np.maximum(high - low, 1e-6)
-            if abs(math.log(form[0] / form[1] * height / width)) > _UNLIKE:
-                continue
-            depth = math.sqrt(camera.fx * form[0] / width * camera.fy * form[1] / height)
-            shift = depth * middle / [camera.fx, camera.fy] - 0.5 * (low + high)
-            poses.append(pose_of(R, np.array([*shift, depth]), surface.vertices))
-    return poses
+    turns = Rotation.from_euler("z", np.arange(_ROLLS)[:, None] * 360 / _ROLLS, degrees=True).as_matrix()
+    R = (turns[None] @ np.stack(sides(_DIRECTIONS))[:, None]).reshape(-1, 3, 3)
+    placed = np.einsum("nij,vj->nvi", R[:, :2], vertices)
+    low, high = placed.min(1), placed.max(1)
+    form = np.maximum(high - low, 1e-6)
+    alike = np.abs(np.log(form[:, 0] / form[:, 1] * height / width)) < _UNLIKE
+    depth = np.sqrt(camera.fx * form[:, 0] / width * camera.fy * form[:, 1] / height)[:, None]
+    shift = depth * middle / [camera.fx, camera.fy] - 0.5 * (low + high)
+    t = np.concatenate([shift, depth], 1)
+    both = from_matrix(
+        torch.from_numpy(R[alike]).to(surface.vertices), torch.from_numpy(t[alike]).to(surface.vertices)
+    )
+    return [both[n] for n in range(int(alike.sum()))]
