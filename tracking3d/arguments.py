@@ -6,8 +6,6 @@ import math
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from tracking3d.config.explain import a_kind, shown
 from tracking3d.config.loading import load_config
 from tracking3d.config.models import ObjectConfig, PipelineConfig
@@ -102,16 +100,13 @@ def with_known(config: PipelineConfig, known: Any) -> PipelineConfig:
     """The configuration for an object that is known; as it is where ``known`` is None.
 
     Raises:
-        InputError: If that is no path, or contradicts what the configuration says of the shape.
+        InputError: If that is no path.
     """
     if known is None:
         return config
     if not isinstance(known, str | Path):
         raise InputError(f"object= is {a_kind(known)}; give the folder of an earlier run, or a mesh file.")
-    try:
-        told = ObjectConfig.model_validate({**config.object.model_dump(), "known": str(known)})
-    except ValidationError as error:
-        raise InputError(f"object={known}: {error.errors()[0]['msg']}.") from error
+    told = ObjectConfig.model_validate({**config.object.model_dump(), "known": str(known)})
     return config.model_copy(update={"object": told})
 
 

@@ -49,6 +49,10 @@ def known_object(config: PipelineConfig) -> KnownObject | None:
             f"{_OBJECT}{path}: the solver {config.solver.name} begins without a known object; leave it to the "
             "default one, online."
         )
+    if config.object.flat:
+        raise InputError(
+            f"{_OBJECT}{path} has its shape, flat or not; leave out {argument('object.flat', '--flat')}."
+        )
     return read_object(Path(path))
 
 

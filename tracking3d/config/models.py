@@ -93,7 +93,7 @@ class ObjectConfig(Section):
         None,
         description=(
             "The folder of an earlier run or a mesh file: the object is that one, and is found in the video without a "
-            "start by motion. Shape and colours are held, so that nothing of landmark_views and texture_views is done."
+            "start by motion. Shape and colours are held, so that nothing of landmark_views and texture_views is done, and prototype is not asked."
         ),
     )
     prototype: str = Field(
@@ -148,12 +148,6 @@ class ObjectConfig(Section):
         if isinstance(value, dict) and value.get("known") is not None:
             return {**value, "landmark_views": 0, "texture_views": 0}
         return value
-
-    @model_validator(mode="after")
-    def _is_told_once(self) -> ObjectConfig:
-        if self.known is not None and (self.flat or self.prototype != "ellipsoid"):
-            raise ValueError("known, or flat and prototype, since what is known has its shape")
-        return self
 
 
 class WindowConfig(Section):

@@ -61,7 +61,7 @@ class Drawing:
     image: NDArray[np.uint8]
     mask: NDArray[np.bool_]
     known: NDArray[np.bool_]
-    points: NDArray[np.float64]
+    points: NDArray[np.float32]
 
 
 def known_map(
@@ -153,20 +153,20 @@ def draw(shape: Shape, colours: Tensor, pose: Pose, camera: Camera, renderer: st
     picture[covered] = torch.where(known, layers[:, :3] / layers[:, 3:].clamp_min(1e-6), mean).cpu().numpy()
     seen = np.zeros((size, size), np.float32)
     seen[covered] = known[:, 0].float().cpu().numpy()
-    points = np.full((size, size, 3), np.nan)
-    points[covered] = at[:, 2:].double().cpu().numpy()
+    points = np.full((size, size, 3), np.nan, np.float32)
+    points[covered] = at[:, 2:].cpu().numpy()
 
     def reduced(values: NDArray[np.float32]) -> NDArray[np.float32]:
         side = camera.width, camera.height
         return np.asarray(cv2.resize(values, side, interpolation=cv2.INTER_AREA), dtype=np.float32)
 
     # The centre of a pixel is where four finer ones meet; none of them may lie beside the object.
-    parts = points.reshape(camera.height, _FINER, camera.width, _FINER, 3)
+    corners_of = [points[row::_FINER, column::_FINER] for row in range(_FINER) for column in range(_FINER)]
     return Drawing(
         (255 * reduced(picture)).round().clip(0, 255).astype(np.uint8),
         reduced(covered.astype(np.float32)) > 0.5,
         reduced(seen) > 0.99,
-        parts.mean((1, 3)),
+        sum(corners_of[1:], corners_of[0]) / len(corners_of),
     )
 
 
@@ -185,7 +185,7 @@ def _with_points(learnt: ObjectMap, camera: Camera, view: View, drawing: Drawing
     return replace(learnt, landmarks=landmarks), view
 
 
-def _sampled(points: NDArray[np.float64], pixel: NDArray[np.float32]) -> NDArray[np.float64]:
+def _sampled(points: NDArray[np.float32], pixel: NDArray[np.float32]) -> NDArray[np.float64]:
     """``(N, 3)`` of ``points`` ``(S, S, 3)`` between four pixels; nan where one of those is."""
     low = np.floor(pixel).astype(int).clip(0, len(points) - 2)
     (x, y), (right, down) = low.T, (pixel - low).T[..., None]
