@@ -258,8 +258,8 @@ class Session:
 
     def _hand_back(self, frame: Frame, estimate: FrameEstimate) -> None:
         """Set the mask tracker on an answer that is sure and unlike its own; on the first one, where it waits."""
-        wanted = self._tracker.waits or (self.config.solver.correct_tracker and self._tracker.can_correct)
-        if wanted and corrects(estimate):
+        corrected = self.config.solver.correct_tracker and self._tracker.can_correct and corrects(estimate)
+        if corrected or (self._tracker.waits and estimate.status is not Status.LOST):
             self.corrected = True
             self._tracker.correct(frame, estimate.mask)
 

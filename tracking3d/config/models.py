@@ -93,7 +93,8 @@ class ObjectConfig(Section):
         None,
         description=(
             "The folder of an earlier run or a mesh file: the object is that one, and is found in the video without a "
-            "start by motion. Shape and colours are held, so that nothing of landmark_views and texture_views is done, and prototype is not asked."
+            "start by motion. Shape and colours are held: landmark_views and texture_views are 0, and prototype is not "
+            "asked."
         ),
     )
     prototype: str = Field(

@@ -31,6 +31,8 @@ from tracking3d.stages import in_stage
 
 NOT_SEEN = "the known object has not been seen yet"
 _OUTLINED = "outline"
+_ENOUGH_ALONE, _MOSTLY_SEEN = 30, 0.5
+"""Points that tell a first pose without a mask, and the share of unseen texture below which they do."""
 _log = logging.getLogger(__name__)
 
 
@@ -107,7 +109,7 @@ class KnownObjectSolver(OnlineSolver):
         image = grey(frame.image)
         state = self._with_space(state, frame, mask)
         found = self._met(state, frame, image, mask)
-        if found is None or found.lost:
+        if found is None or found.lost or _too_little(found):
             answer = _unseen(unsolved(frame, mask, state.last[0], state.camera), found)
             pose = state.last[0]
             missing = replace(state, last=(pose, frame.index), grey=image, lost_for=state.lost_for + 1)
@@ -196,7 +198,13 @@ def _sure(attempts: list[Attempt]) -> bool:
     return any(not one.doubtful for one in attempts)
 
 
+def _too_little(found: Attempt) -> bool:
+    """Whether a few points alone say where it is: no mask bears them out, and they may lie in one spot."""
+    enough = found.support.witnesses >= _ENOUGH_ALONE and found.fit.unseen < _MOSTLY_SEEN
+    return found.view.mask is None and found.doubtful and not enough
+
+
 def _unseen(answer: FrameEstimate, found: Attempt | None = None) -> FrameEstimate:
-    """The answer while the object has not been seen, and what spoke most for it."""
-    why = "" if found is None else f": {found.judgement.reason}"
+    """The answer while the object has not been seen, and what spoke most against what was found."""
+    why = "" if found is None or not found.view.observation.has_mask else f": {found.judgement.reason}"
     return replace(answer, status=Status.LOST, reason=NOT_SEEN + why, confidence=0.05)
