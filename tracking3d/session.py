@@ -132,7 +132,8 @@ class Session:
         self._state, estimate = solver.init(frame, mask)
         self._solver, self.initial_mask = solver, mask
         self._last_pose = self._first_pose = estimate.T_cam_obj
-        self._hand_back(frame, estimate)
+        if self._tracker.waits:
+            self._hand_back(frame, estimate)
         return estimate
 
     def _begun(self, first: Frame) -> Solver[Any]:

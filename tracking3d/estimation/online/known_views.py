@@ -166,7 +166,7 @@ def draw(shape: Shape, colours: Tensor, pose: Pose, camera: Camera, renderer: st
         (255 * reduced(picture)).round().clip(0, 255).astype(np.uint8),
         reduced(covered.astype(np.float32)) > 0.5,
         reduced(seen) > 0.99,
-        sum(corners_of[1:], corners_of[0]) / len(corners_of),
+        np.mean(corners_of, axis=0, dtype=np.float32),
     )
 
 
