@@ -7,7 +7,7 @@ import pytest
 from known_things import box_of, config, degrees_between, filmed, mesh_of, written
 from typer.testing import CliRunner
 
-from tracking3d import Frame, Prompt, Status, track, track_objects
+from tracking3d import Frame, Prompt, Session, Status, track, track_objects
 from tracking3d.config.models import PluginChoice
 from tracking3d.errors import InputError
 from tracking3d.estimation.correction import SIGHTED
@@ -64,6 +64,7 @@ def half_turns_of_a_box():
     return [np.diag([*signs, 1.0]) for signs in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))]
 
 
+@pytest.mark.slow
 def test_where_it_is_not_seen_frames_are_lost_and_say_so(clip, tmp_path, few_sides):
     path = written(clip.scene.solid, tmp_path)
     wall = np.random.default_rng(0).integers(0, 255, (2, 150, 200, 3), dtype=np.uint8)
@@ -72,6 +73,50 @@ def test_where_it_is_not_seen_frames_are_lost_and_say_so(clip, tmp_path, few_sid
     assert [one.status for one in answers] == [Status.LOST, Status.LOST, Status.TRACKED]
     assert all(one.reason.startswith(NOT_SEEN) and not one.mask.any() for one in answers[:2])
     assert degrees_between(answers[2].T_cam_obj, clip.scene.T_cam_obj[0]) < 2
+
+
+@pytest.mark.slow
+def test_a_session_goes_on_where_another_was_stopped(clip, tmp_path, few_sides):
+    settings = config(object={"known": str(written(clip.scene.solid, tmp_path))})
+    frames = [Frame(n, image) for n, image in enumerate(clip.images)]
+    whole, stopped = Session(settings, None), Session(settings, None)
+    corrections = []
+    for frame in frames[:2]:
+        whole.step(frame)
+        answer = stopped.step(frame)
+        corrections.append(answer.mask if stopped.corrected else None)
+    assert corrections[0] is not None  # where the tracker was told at last where the object is
+    resumed = Session(settings, None)
+    resumed.resume(frames[0], stopped.kept(), {})
+    assert resumed.replays
+    for frame, correction in zip(frames[:2], corrections, strict=True):
+        resumed.replay(frame, frame.index == 0, correction)
+    then, wanted = resumed.step(frames[2]), whole.step(frames[2])
+    np.testing.assert_array_equal(then.T_cam_obj, wanted.T_cam_obj)
+    np.testing.assert_array_equal(then.mask, wanted.mask)
+
+
+@pytest.mark.slow
+def test_an_object_of_an_earlier_run_is_found_under_another_light(tmp_path):
+    from tracking3d.recording import record
+    from tracking3d.results.run_reader import RunReader
+    from tracking3d.video import open_source
+
+    learnt = filmed(frames=24, size=(320, 240), seed=12, degrees_per_frame=5)
+    shown = filmed(frames=4, size=(320, 240), seed=12, motion="turntable", lamp=(0.7, -0.3, -0.6))
+    source = open_source(list(learnt.images))
+    record(source, config(), tmp_path / "run", box=box_of(learnt.masks[0]))
+    run = RunReader(tmp_path / "run")
+    first = run.frames[0]
+    # The run's axes in the true object's: they are those of every other video, too.
+    turn = learnt.scene.T_cam_obj[first.index][:3, :3].T @ first.T_cam_obj[:3, :3]
+    for one, truth in zip(
+        track(list(shown.images), object=tmp_path / "run", config=config()),
+        shown.scene.T_cam_obj,
+        strict=True,
+    ):
+        assert one.status is Status.TRACKED
+        assert degrees_between(one.T_cam_obj[:3, :3], truth[:3, :3] @ turn) < 3
 
 
 def test_points_of_a_drawn_side_lie_where_its_pixels_show_them(clip, tmp_path, few_sides):
