@@ -39,6 +39,7 @@ FLOORS = [
         "last_passes",
         "mask_tracking",
         "modules",
+        "object_files",
         "object_recording",
         "passes",
         "parts",

@@ -8,8 +8,8 @@ from typing import Any
 
 from tracking3d.config.explain import a_kind, shown
 from tracking3d.config.loading import load_config
-from tracking3d.config.models import PipelineConfig
-from tracking3d.errors import InputError
+from tracking3d.config.models import ObjectConfig, PipelineConfig
+from tracking3d.errors import InputError, argument
 from tracking3d.frames import Frame, Prompt
 from tracking3d.images import check_image
 from tracking3d.prompts import checked_box, checked_mask
@@ -56,6 +56,8 @@ def check_session(config: Any, prompt: Any, intrinsics: Any) -> None:
             f"The tracker '{AUTO}' is chosen by the first frame, in track and record; for a session name one, or take "
             "what tracking3d.tracker_choice.choose_tracker gives."
         )
+    if prompt is None and needs_prompt(config):
+        raise InputError("Say what the object is by either a box or a mask of the first frame.")
     if prompt is not None:
         if not isinstance(prompt, Prompt):
             raise InputError(
@@ -74,6 +76,38 @@ def check_session(config: Any, prompt: Any, intrinsics: Any) -> None:
             raise InputError(
                 f"intrinsics={shown(intrinsics)} is not fx, fy, cx, cy in pixels with positive fx and fy."
             )
+
+
+def needs_prompt(config: PipelineConfig) -> bool:
+    """Whether somebody has to say what the object is: neither the mask tracker nor an earlier run knows it."""
+    return config.tracker.name != "precomputed" and config.object.known is None
+
+
+def check_known(config: PipelineConfig, objects: int) -> None:
+    """Make sure that several objects are not all said to be one that is known.
+
+    Raises:
+        InputError: If they are.
+    """
+    if config.object.known is not None and objects > 1:
+        raise InputError(
+            f"{argument('object=', '--object ')}{config.object.known} is one object, but {objects} are given; track "
+            "each in a run of its own."
+        )
+
+
+def with_known(config: PipelineConfig, known: Any) -> PipelineConfig:
+    """The configuration for an object that is known; as it is where ``known`` is None.
+
+    Raises:
+        InputError: If that is no path.
+    """
+    if known is None:
+        return config
+    if not isinstance(known, str | Path):
+        raise InputError(f"object= is {a_kind(known)}; give the folder of an earlier run, or a mesh file.")
+    told = ObjectConfig.model_validate({**config.object.model_dump(), "known": str(known)})
+    return config.model_copy(update={"object": told})
 
 
 def check_source(source: Any) -> None:

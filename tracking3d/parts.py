@@ -8,9 +8,11 @@ from typing import Any, cast
 
 import torch
 
-from tracking3d.config.models import PipelineConfig
+from tracking3d.config.models import PipelineConfig, RuntimeConfig
 from tracking3d.errors import InputError, argument
 from tracking3d.estimation.estimate import FrameEstimate
+from tracking3d.estimation.known_object import KnownObject
+from tracking3d.estimation.online.known_solver import KnownObjectSolver
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.estimation.paper.solver import PaperSolver
 from tracking3d.estimation.solver import Solver
@@ -20,7 +22,7 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.plugins import FEATURES, build_plugin, plugin_label
 from tracking3d.plugins.guard import GuardedEncoder
 from tracking3d.process_settings import process_kept
-from tracking3d.rendering.backend import threads_kept
+from tracking3d.rendering.backend import choose_backend, threads_kept
 from tracking3d.stages import StageTimes, Stopwatch
 
 SOLVERS: dict[str, Callable[[PipelineConfig, Camera, FeatureEncoder], Solver[Any]]] = {
@@ -28,6 +30,23 @@ SOLVERS: dict[str, Callable[[PipelineConfig, Camera, FeatureEncoder], Solver[Any
     "online": OnlineSolver,
 }
 """Solvers by the name that `solver.name` selects."""
+
+
+def build_solver(
+    config: PipelineConfig, camera: Camera, encoder: FeatureEncoder, known: KnownObject | None
+) -> Solver[Any]:
+    """The solver that a configuration names, for the object that is known, if there is one.
+
+    Args:
+        config: The pipeline.
+        camera: Of the full frame.
+        encoder: The feature encoder.
+        known: See `tracking3d.object_files.known_object`.
+    """
+    if known is not None:
+        return KnownObjectSolver(config, camera, encoder, known)
+    return SOLVERS[config.solver.name](config, camera, encoder)
+
 
 _CPU = argument("runtime.device 'cpu'", "--device cpu")
 
@@ -54,6 +73,19 @@ def check_device(name: str) -> None:
         torch.zeros(1, device=device).item()
     except (RuntimeError, AssertionError) as error:
         raise InputError(f"The device '{name}' is not available on this machine; use {_CPU}.") from error
+
+
+def chosen_renderer(runtime: RuntimeConfig) -> dict[str, str | int]:
+    """What renders, and why, see `tracking3d.rendering.backend.choose_backend`.
+
+    Raises:
+        InputError: If that cannot be used here.
+    """
+    check_device(runtime.device)
+    try:
+        return choose_backend(runtime.renderer, runtime.device, runtime.threads)
+    except ValueError as error:
+        raise InputError(f"runtime.renderer: {error}.") from error
 
 
 def check_turns(config: PipelineConfig) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.arguments import checked_config
+from tracking3d.arguments import check_known, checked_config, needs_prompt, with_known
 from tracking3d.config.camera import choose_camera
 from tracking3d.config.models import PipelineConfig
 from tracking3d.corrections import Correction, check_corrections_fit, checked_corrections, prompts_in
@@ -50,6 +50,7 @@ def track(
     follow: Any = None,
     refine: bool | None = None,
     model: ModelChoice | None = None,
+    object: str | Path | None = None,
 ) -> Tracking:
     """Track an object through frames; answers come as the frames do, memory is bounded by the keyframes.
 
@@ -75,6 +76,8 @@ def track(
         model: What is made of the object for the result: ``none`` leaves what was learnt on the way, ``fast`` takes the
             texture from the video at its resolution, ``fine`` then makes the shape anew too from all frames, and keeps
             it if it explains them better; None leaves that to the configuration.
+        object: The folder of an earlier run, or a mesh file: the object is that one. It is then found without a box,
+            or with one, answers are in its coordinates and unit, and its shape and colours are held.
 
     Returns:
         An iterator of one estimate a frame, whose `Tracking.result` is all of it.
@@ -83,9 +86,9 @@ def track(
         Tracking3dError: If an argument cannot be used; on the way, if a frame cannot, or the first one does not fit
             the box or mask.
     """
-    source, config = open_frames(frames), checked_config(config)
+    source, config = open_frames(frames), with_known(checked_config(config), object)
     config = config_of_result(config, source, refine, model)
-    check_prompt(box, mask, needed=config.tracker.name != "precomputed", points=points)
+    check_prompt(box, mask, needed=needs_prompt(config), points=points)
     [told] = checked_corrections(corrections)
     check_order(source, config, start_frame)
     untold = box is None and mask is None and points is None
@@ -138,6 +141,7 @@ def track_objects(
     source, config = open_frames(frames), checked_config(config)
     check_order(source, config, start_frame)
     check_prompts(boxes, masks, points)
+    check_known(config, len(boxes) + len(masks) + len(points))
     told = checked_corrections(corrections, len(boxes) + len(masks) + len(points))
     prompts = partial(make_prompts, boxes=boxes, masks=masks, tracker=config.tracker.name, points=points)
     return _track_objects(source, prompts, told, config, start_frame, skip_damaged)

@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.arguments import check_source, checked_config, checked_folder
+from tracking3d.arguments import check_known, check_source, checked_config, checked_folder, needs_prompt
 from tracking3d.checkpoint.folder import Checkpoint, finish_state
 from tracking3d.checkpoint.resuming import earlier_run, given_of
 from tracking3d.checkpoint.staging import corrected_aside, take_over
-from tracking3d.config.camera import choose_camera
 from tracking3d.config.models import PipelineConfig, PluginChoice
 from tracking3d.corrections import Correction, check_corrections_fit, checked_corrections
 from tracking3d.errors import InputError
 from tracking3d.frames import Box, Frame, Prompt, SkippedFrame
+from tracking3d.object_files import camera_of
 from tracking3d.object_recording import ObjectRecording
 from tracking3d.parts import build_encoder, check_turns
 from tracking3d.passes import Listener, go_through, timed
@@ -70,7 +70,8 @@ def record(
         box: The object in the first frame, ``(x, y, width, height)``.
         mask: The object in the first frame, as a mask or the image file of one. Without a box, a mask and points
             the tracker's own first mask is the prompt.
-        points: The object in the first frame by ``(N, 3)`` points: x, y in pixels, and 1 on it or 0 beside it.
+        points: The object in the first frame by ``(N, 3)`` points: x, y in pixels, and 1 on it or 0 beside it. None of
+            the three is needed where ``object.known`` says which object it is.
         start_frame: Index of the frame in which the object is given, instead of the first: it is tracked from there to
             the end, and then backwards to the beginning, with what was learnt. Only of a source that can be read
             again.
@@ -95,7 +96,7 @@ def record(
     """
     check_source(source)
     config, folder = checked_config(config), checked_folder(folder)
-    check_prompt(box, mask, needed=config.tracker.name != "precomputed", points=points)
+    check_prompt(box, mask, needed=needs_prompt(config), points=points)
     [told] = checked_corrections(corrections)
     begin = partial(
         begun, source, command=command, selection=selection, overwrite=overwrite, resume=resume,
@@ -162,6 +163,7 @@ def record_objects(
     check_source(source)
     config, folder = checked_config(config), checked_folder(folder)
     check_prompts(boxes, masks, points)
+    check_known(config, len(boxes) + len(masks) + len(points))
     told = checked_corrections(corrections, len(boxes) + len(masks) + len(points))
     begin = partial(
         begun, source, command=command, selection=selection, overwrite=overwrite, resume=resume,
@@ -271,11 +273,11 @@ def begun(
     if earlier == "stopped":
         checkpoint = Checkpoint(folder, session.state_classes, *keeps)
         kept = checkpoint.read()
-    (height, width), camera = first.size, session.config.camera
+    height, width = first.size
     writer = RunWriter(
         folder,
         config=config,
-        camera=choose_camera(camera, width, height, source.intrinsics, source.intrinsics_origin),
+        camera=camera_of(session.config, width, height, source.intrinsics, source.intrinsics_origin),
         source=source.name,
         seed=session.config.runtime.seed,
         renderer=session.renderer,
@@ -312,7 +314,7 @@ def with_tracker(
 
     A run that goes on does so with the tracker that it was begun with.
     """
-    if config.tracker.name != AUTO or prompt is None:
+    if config.tracker.name != AUTO:
         return config, None
     if resume and (folder / RUN).is_file():
         before = RunReader(folder)

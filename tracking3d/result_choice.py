@@ -44,6 +44,11 @@ def config_of_result(
         raise InputError(
             f"refine=True: {source.name} comes once only, and all frames are needed a second time; give a list or path."
         )
+    if model in ("fast", "fine") and shape.known is not None:
+        raise InputError(
+            f"model='{model}' makes the object's {'shape' if model == 'fine' else 'texture'} anew, and what is known "
+            "of one is held; leave it out."
+        )
     if model == "fine":
         if not source.repeatable:
             raise InputError(

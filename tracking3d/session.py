@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.arguments import check_frame, check_session
-from tracking3d.config.camera import choose_camera, warn_of_unlikely
+from tracking3d.config.camera import warn_of_unlikely
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError
 from tracking3d.estimation.correction import corrects
@@ -22,12 +22,12 @@ from tracking3d.frames import Frame, MaskEstimate, Prompt, pixels
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.lens import Lens
 from tracking3d.mask_tracking import PromptedTracker
-from tracking3d.parts import SOLVERS, build_encoder, check_device, check_turns, with_times
+from tracking3d.object_files import camera_of, known_object
+from tracking3d.parts import SOLVERS, build_encoder, build_solver, check_turns, chosen_renderer, with_times
 from tracking3d.plugins.guard import PluginFailure
 from tracking3d.presented import Presented
 from tracking3d.process_settings import OwnSettings, RandomState
 from tracking3d.prompts import check_prompt_fits
-from tracking3d.rendering.backend import choose_backend
 from tracking3d.stages import StageTimes, measured
 
 
@@ -38,7 +38,7 @@ class Session:
 
     Args:
         config: The pipeline.
-        prompt: The object in the first frame; None takes the mask tracker's own first mask.
+        prompt: The object in the first frame; None takes the mask tracker's own first mask, or finds what is known.
         intrinsics: fx, fy, cx, cy that the source knows of, in pixels; the configuration wins over them.
         intrinsics_origin: Where they come from, in words.
         encoder: A feature encoder that several sessions share, see `build_encoder`; one of its own if None.
@@ -65,14 +65,9 @@ class Session:
         encoder: FeatureEncoder | None = None,
     ) -> None:
         check_session(config, prompt, intrinsics)
-        check_device(config.runtime.device)
-        if prompt is None and config.tracker.name != "precomputed":
-            raise InputError("Say what the object is by either a box or a mask of the first frame.")
+        self._known = known_object(config)
         runtime = config.runtime
-        try:
-            self.renderer = choose_backend(runtime.renderer, runtime.device, runtime.threads)
-        except ValueError as error:
-            raise InputError(f"runtime.renderer: {error}.") from error
+        self.renderer = chosen_renderer(runtime)
         self.config = config
         self._prompt = prompt
         self._intrinsics = intrinsics, intrinsics_origin
@@ -137,15 +132,17 @@ class Session:
         self._state, estimate = solver.init(frame, mask)
         self._solver, self.initial_mask = solver, mask
         self._last_pose = self._first_pose = estimate.T_cam_obj
+        if self._tracker.waits:
+            self._hand_back(frame, estimate)
         return estimate
 
     def _begun(self, first: Frame) -> Solver[Any]:
         """The solver for a video that begins with ``first``; the camera is set for it, too."""
         height, width = first.size
-        self._camera = choose_camera(self.config.camera, width, height, *self._intrinsics)
+        self._camera = camera_of(self.config, width, height, *self._intrinsics)
         warn_of_unlikely(self._camera)
         self._first, self._presented, self._latest = first, Presented(first.index), first.index
-        solver = SOLVERS[self.config.solver.name](self.config, self._camera, self._encoder)
+        solver = build_solver(self.config, self._camera, self._encoder, self._known)
         return behind(self._camera.lens, solver)
 
     @property
@@ -250,21 +247,22 @@ class Session:
         self._last_pose, self._camera = estimate.T_cam_obj, estimate.camera or self._camera
         for answer in (*estimate.revised, estimate):
             self._first_pose = answer.T_cam_obj if answer.index == self._presented.first else self._first_pose
-        if (
-            prompt is None
-            and self.config.solver.correct_tracker
-            and self._tracker.can_correct
-            and corrects(estimate)
-        ):
-            self.corrected = True
+        if prompt is None:
             try:
-                self._tracker.correct(frame, estimate.mask)
+                self._hand_back(frame, estimate)
             except PluginFailure as error:
                 failures.append(self._excused(error))
         if failures:
             self._failures[frame.index] = "; ".join(failures)
         revised = tuple(self._with_failure(earlier) for earlier in estimate.revised)
         return self._with_failure(replace(estimate, revised=revised))
+
+    def _hand_back(self, frame: Frame, estimate: FrameEstimate) -> None:
+        """Set the mask tracker on an answer that is sure and unlike its own; on the first one, where it waits."""
+        corrected = self.config.solver.correct_tracker and self._tracker.can_correct and corrects(estimate)
+        if corrected or (self._tracker.waits and estimate.status is not Status.LOST):
+            self.corrected = True
+            self._tracker.correct(frame, estimate.mask)
 
     def _facing(self, frame: Frame) -> Solver[Any]:
         """The solver, turned back to the first frame where this one is the first from before it."""

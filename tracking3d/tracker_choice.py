@@ -86,7 +86,7 @@ def check_tracker_options(config: PipelineConfig) -> None:
 
 
 def choose_tracker(
-    config: PipelineConfig, frames: int | None, live: bool, first: Frame, prompt: Prompt
+    config: PipelineConfig, frames: int | None, live: bool, first: Frame, prompt: Prompt | None
 ) -> tuple[PipelineConfig, str]:
     """The configuration with a tracker in place of ``auto``, and why it is that one; nothing is fetched.
 
@@ -95,10 +95,12 @@ def choose_tracker(
         frames: How many there are, where that is known.
         live: Whether they do not wait.
         first: The first frame, on which trackers with networks are timed.
-        prompt: The object in it.
+        prompt: The object in it; None where nobody has said where it is.
     """
     if config.tracker.name != AUTO:
         return config, ""
+    height, width = first.size
+    prompt = prompt or Prompt((0.0, 0.0, float(width), float(height)))
     budget = LIVE if live else UNHURRIED if not frames else AFFORDABLE / frames
     passed: list[str] = []
     for candidate in _usable():

@@ -202,9 +202,7 @@ def _started(
     task: Task, first: Frame, folder: Path | None, writers: ExitStack
 ) -> tuple[Session, ObjectRecording | None]:
     source, prompt = task.source, task.prompt and task.prompt(first)
-    config, choice = task.config, ""
-    if prompt is not None:
-        config, choice = choose_tracker(config, source.count, not source.repeatable, first, prompt)
+    config, choice = choose_tracker(task.config, source.count, not source.repeatable, first, prompt)
     session = Session(config, prompt, source.intrinsics, source.intrinsics_origin)
     check_corrections_fit(task.corrections.values(), first, config.tracker.name)
     if folder is None:

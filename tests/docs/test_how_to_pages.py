@@ -59,7 +59,9 @@ def film(clip, path: Path) -> None:
 
 
 def test_every_page_has_commands_and_says_what_comes_out():
-    assert [page.stem for page in HOW_TO] == ["composite", "many-videos", "robot-arm", "scan", "splat"]
+    assert [page.stem for page in HOW_TO] == [
+        "composite", "known-object", "many-videos", "robot-arm", "scan", "splat",
+    ]  # fmt: skip
     for page in HOW_TO:
         lines = commands(page, "tracking3d")
         assert [line for line in lines if line.startswith("run ")], page

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from tracking3d.arguments import needs_prompt
 from tracking3d.batch.beside import videos_of
 from tracking3d.batch.one_video import LOGS
 from tracking3d.batch.places import absolute, is_folder, local, parent
@@ -71,7 +72,7 @@ def _of_sequence(dataset: Dataset, name: str, config: PipelineConfig) -> VideoJo
         truth = read_sequence(load_layout(layout), dataset.root, name)
     except Tracking3dError as error:
         return replace(job, fault=str(error))
-    if truth.box is None and config.tracker.name != "precomputed":
+    if truth.box is None and needs_prompt(config):
         return replace(job, fault=f"{name} has no box in its first frame; a mask tracker cannot start.")
     camera, given = truth.told_camera or truth.camera, config.camera
     if camera is not None and truth.camera_told and given.intrinsics is None and given.fov is None:
@@ -186,5 +187,5 @@ def _job(row: Row, name: str, size: int, configure: Configure) -> VideoJob:
         row.start_frame,
         row.frames,
         size=size,
-        fault="" if config.tracker.name == "precomputed" and fault == NO_PROMPT else fault,
+        fault="" if fault == NO_PROMPT and not needs_prompt(config) else fault,
     )

@@ -1,4 +1,4 @@
-"""What ``--box`` and ``--mask`` say of the objects, where they name files of other tools."""
+"""What ``--box``, ``--mask`` and ``--object`` say of the objects, where they name files."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from tracking3d.errors import InputError
 
 if TYPE_CHECKING:
+    from tracking3d.config.models import PipelineConfig
     from tracking3d.frames import Box
 
 _ALL = "@all"
@@ -45,3 +46,22 @@ def given_masks(file: Path) -> list[Path]:
     if not numbers:
         raise InputError(f"--mask {name} is empty; mark the objects in it by numbers from 1.")
     return [Path(f"{image}@{number}") for number in numbers]
+
+
+def check_known(settings: PipelineConfig, objects: int, fine: bool, split: bool) -> None:
+    """Make sure of what is asked for beside ``--object``.
+
+    Raises:
+        InputError: If it does not go together.
+    """
+    if settings.object.known is None:
+        return
+    from tracking3d.arguments import check_known as check_one
+
+    check_one(settings, objects)
+    if fine:
+        raise InputError(
+            "The shape of an object that is known is held; leave out --model fine, or --object for a new one."
+        )
+    if split:
+        raise InputError("--split joins parts that each get to know the object; leave it out with --object.")

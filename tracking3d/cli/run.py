@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from tracking3d.cli.model import check_fine
-from tracking3d.cli.objects import given_box, given_masks
+from tracking3d.cli.objects import check_known, given_box, given_masks
 from tracking3d.cli.options import (
     ConfigFile,
     Debug,
@@ -67,6 +67,15 @@ def run(
         typer.Option(
             metavar="'X,Y+ X,Y-'",
             help="Points of the first frame on the object (+) and beside it (-); may be repeated.",
+            rich_help_panel=_TRACKING,
+        ),
+    ] = None,
+    known: Annotated[
+        str | None,
+        typer.Option(
+            "--object",
+            metavar="RUN|MESH",
+            help="The object is that of an earlier run, or this mesh; found without a box, or with one.",
             rich_help_panel=_TRACKING,
         ),
     ] = None,
@@ -233,8 +242,8 @@ def run(
 ) -> None:
     """Track the object through SOURCE: masks, poses and a textured mesh in a run folder.
 
-    Say what the object is by --box, --mask, --points or --masks. Several boxes, masks or --points are several objects,
-    each with a run folder of its own in the one of the run.
+    Say what the object is by --box, --mask, --points, --masks or --object. Several boxes, masks or --points are several
+    objects, each with a run folder of its own in the one of the run.
     """
     from tracking3d.config.loading import load_prompt
 
@@ -275,6 +284,7 @@ def run(
         features=features,
         camera=camera,
         object={
+            "known": known,
             "flat": flat or None,
             "prototype": prototype,
             "texture_views": 0 if model is ModelChoice.NONE else None,
@@ -283,6 +293,7 @@ def run(
         solver={"final_refine": final_refine},
         runtime={"device": device, "seed": seed, "on_plugin_failure": on_plugin_failure},
     )
+    from tracking3d.arguments import needs_prompt
     from tracking3d.corrections import checked_corrections, parse_correction
     from tracking3d.point_prompts import parse_points
     from tracking3d.video.selection import parse_selection
@@ -297,7 +308,8 @@ def run(
     corrections = [parse_correction(text) for text in correct or told.correct]
     checked_corrections(corrections, max(len(given), 1))  # before anything is written
     folder = out or default_folder(source)
-    if not given and settings.tracker.name != "precomputed":
+    check_known(settings, len(given), fine, split is not None)
+    if not given and needs_prompt(settings):
         if not a_person_is_there() or quiet or resume or source.isdigit():
             raise InputError(
                 "Say what the object is in the first frame: --box X,Y,W,H, --mask FILE, --points 'X,Y+ X,Y-', or "

@@ -89,6 +89,14 @@ class CameraConfig(Section):
 class ObjectConfig(Section):
     """How the object is represented (paper section 3.1)."""
 
+    known: str | None = Field(
+        None,
+        description=(
+            "The folder of an earlier run or a mesh file: the object is that one, and is found in the video without a "
+            "start by motion. Shape and colours are held: landmark_views and texture_views are 0, and prototype is not "
+            "asked."
+        ),
+    )
     prototype: str = Field(
         "ellipsoid", description="sphere, ellipsoid (fitted to the first mask) or a mesh file."
     )
@@ -134,6 +142,13 @@ class ObjectConfig(Section):
     flat: bool = Field(
         False, description="Flat prior: project all vertices onto one plane after each iteration."
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _is_held_where_known(cls, value: Any) -> Any:
+        if isinstance(value, dict) and value.get("known") is not None:
+            return {**value, "landmark_views": 0, "texture_views": 0}
+        return value
 
 
 class WindowConfig(Section):

@@ -69,6 +69,8 @@ class ObjectMap:
         pointless: Whether the object has no points that can be followed: it is known by pixels and outlines alone.
         renderer: Which renderer, see `tracking3d.rendering.backend`.
         beside: ``(8, 2)`` candidates in each direction from the object that could be told, and that move as it does.
+        held: How many of the first keyframes are drawn ones of an object that was known before, whose shape is held and
+            of whose surface every point counts as often seen; 0 where the object is got to know in the video.
     """
 
     shape: Shape
@@ -80,11 +82,12 @@ class ObjectMap:
     pointless: bool = False
     renderer: str = "auto"
     beside: NDArray[np.int64] = field(default_factory=lambda: np.zeros((8, 2), np.int64))
+    held: int = 0
 
     @cached_property
     def sightings(self) -> NDArray[np.int64]:
         """``(N,)`` how many keyframes show each landmark."""
-        count = np.zeros(len(self.landmarks), np.int64)
+        count = np.full(len(self.landmarks), int(self.held > 0), np.int64)
         for view in self.keyframes:
             count[view.points.landmark] += 1
         return count

@@ -21,13 +21,15 @@ def refined_once_more(known: ObjectMap, camera: Camera, config: OnlineConfig) ->
     """The map and the camera that re-render the keyframes best: as they are, refined, or refined with a solved lens.
 
     Points fit better with every freedom that they are given; what is drawn does so only where it is true. Without
-    that brake a refinement can end worse than it began.
+    that brake a refinement can end worse than it began. A map whose shape is held stays as it is.
 
     Args:
         known: The map.
         camera: Of the full frame; another lens is tried where it is assumed.
         config: Of the solver.
     """
+    if known.held:
+        return known, camera
     tried = [(keyframe_cost(known), known, camera), _refined(known, camera, config)]
     if camera.assumed:
         with_lens, solved = solve_lens(known, camera)

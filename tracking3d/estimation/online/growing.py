@@ -39,7 +39,7 @@ def with_points(
     taken = np.concatenate([view.points.pixel, keypoints.pixel])
     corners = new_corners(image, inside, taken, MOST_POINTS)
     known, view = with_landmarks(known, camera, view, keypoints, corners)
-    return with_candidates(known, view, image)
+    return (known, view) if known.held else with_candidates(known, view, image)
 
 
 def with_keyframe(
@@ -47,7 +47,8 @@ def with_keyframe(
 ) -> tuple[ObjectMap, FollowedPoints]:
     """The map with a view as a new keyframe, refined over a window; and the points to follow from it."""
     known, view = with_points(known, camera, view, image)
-    known = replace(known, keyframes=thinned((*known.keyframes, view), config.most_keyframes))
+    drawn, filmed = known.keyframes[: known.held], (*known.keyframes[known.held :], view)
+    known = replace(known, keyframes=(*drawn, *thinned(filmed, config.most_keyframes)))
     window = window_of(len(known.keyframes), config.window)
     known = refined(known, camera, window, config, bundle_iterations=10, rounds=1)
     followed = known.keyframes[-1].points.spread(MOST_FOLLOWED, float(view.observation.window.side))
@@ -63,7 +64,14 @@ def refined(
     bundle_iterations: int,
     rounds: int,
 ) -> ObjectMap:
-    """Candidates taken over or dropped, then poses, landmarks and shape refined; see `refine_map`."""
+    """Candidates taken over or dropped, then poses, landmarks and shape refined; see `refine_map`.
+
+    Of an object whose shape is held nothing is, but what the newest view shows of its texture is taken.
+    """
+    if known.held:
+        newest = known.keyframes[-1]
+        newest = replace(newest, texture=known.back_project(newest.observation.features, newest))
+        return replace(known, keyframes=(*known.keyframes[:-1], newest))
     if known.pointless:
         recent = list(range(len(known.keyframes)))[-_MOST_WITHOUT_POINTS:]
         return refine_without_points(known, sorted({0, *recent}), FitWeights(smoothness=config.smoothness))

@@ -80,13 +80,12 @@ def match(a: Keypoints, b: Keypoints) -> NDArray[np.int64]:
     similarity = _rooted(a.descriptor) @ _rooted(b.descriptor).T
     distance = np.sqrt(np.maximum(2 - 2 * similarity, 0.0))
     best = distance.argmin(1)
-    rows = np.arange(len(a))
+    mutual = np.flatnonzero(distance.argmin(0)[best] == np.arange(len(a)))
+    distance, best = distance[mutual], best[mutual]
     gap = np.abs(b.pixel[best][:, None] - b.pixel).max(2)
     elsewhere = np.where(gap < _SAME_PLACE, np.inf, distance).min(1)
-    clear = np.isfinite(elsewhere) & (distance[rows, best] < _RATIO * elsewhere)
-    mutual = distance.argmin(0)[best] == rows
-    kept = np.flatnonzero(clear & mutual)
-    return np.stack([kept, best[kept]], 1)
+    clear = np.isfinite(elsewhere) & (distance[np.arange(len(best)), best] < _RATIO * elsewhere)
+    return np.stack([mutual[clear], best[clear]], 1)
 
 
 def _rooted(descriptor: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -26,6 +26,7 @@ _SAME_PLACE = 1.5  # pixels within which a keypoint is a point that is followed
 _FEWEST_WITNESSES = 12
 _FEWEST_BUNDLED = 8
 _MOST_BUNDLED = 1500
+_FINER = 4  # times, that a surface is drawn which stays as it is
 _SEARCH = 12.0  # pixels around its projection within which a landmark may be found again
 
 
@@ -34,15 +35,17 @@ def lift(
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Surface points ``(N, 3)`` at pixels ``(N, 2)`` of the full frame, and which pixels meet the surface.
 
-    The depth is that of the window's nearest drawn pixel.
+    The depth is that of the window's nearest drawn pixel; of a surface that is held it is drawn finer, since no
+    bundle adjustment puts its points right.
     """
-    observation = view.observation
-    size = observation.window.size
-    screen, depth = project_vertices(
-        known.vertices, view.pose.R[None], view.pose.translation[None], observation.K[None]
-    )
+    observation, finer = view.observation, _FINER if known.held else 1
+    size, K = finer * observation.window.size, observation.K
+    if finer > 1:
+        K = K * K.new_tensor([[finer], [finer], [1.0]])
+        K[:2, 2] += (finer - 1) / 2  # pixel centres stay at integers
+    screen, depth = project_vertices(known.vertices, view.pose.R[None], view.pose.translation[None], K[None])
     drawn = rasterize(screen, depth, known.shape.faces, (size, size), known.renderer).depth[0].cpu().numpy()
-    in_window = to_window(view, pixel)
+    in_window = (to_window(view, pixel) + 0.5) * finer - 0.5
     column, row = np.clip(np.rint(in_window), 0, size - 1).astype(int).T
     inside = (np.abs(in_window - (size - 1) / 2) <= size / 2).all(1)
     # The deepest of the neighbours is the background; the nearest would cut corners off the outline.

@@ -54,7 +54,7 @@ def turned_round(belief: Belief, config: OnlineConfig) -> Belief:
 def _better_reversed(known: ObjectMap, camera: Camera) -> tuple[Reversal, ObjectMap] | None:
     """The reversal and the map that it makes, where that explains the keyframes better."""
     views = list(known.keyframes)
-    if known.pointless or len(views) < _FEWEST_KEYFRAMES:
+    if known.held or known.pointless or len(views) < _FEWEST_KEYFRAMES:
         return None
     turned = max(viewing_angle(views[0].pose, view.pose) for view in views)
     names = shared_landmarks(known, views)

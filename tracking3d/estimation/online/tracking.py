@@ -250,11 +250,13 @@ def searched(
             tried.append(fitted("grid", pose, FollowedPoints.none(), view.points))
     return min(
         tried,
-        key=lambda one: (
-            evidence(one[1], weights, view.mask_weight)
-            - _WITNESS * min(witnesses(known, one[2]), _MOST_WITNESSES)
-        ),
+        key=lambda one: standing(one[1], weights, view.mask_weight, witnesses(known, one[2])),
     )
+
+
+def standing(fit: PoseFit, weights: PoseWeights, mask_weight: float, agreed: int) -> float:
+    """What tells the best of several poses, the lowest: what each costs, less what ``agreed`` landmarks take off."""
+    return evidence(fit, weights, mask_weight) - _WITNESS * min(agreed, _MOST_WITNESSES)
 
 
 def witnesses(known: ObjectMap, points: FollowedPoints) -> int:
