@@ -20,8 +20,8 @@ _ON_A_PHONE = """<style>
     div[style*="flex-grow: 1; height: 100%"] { height: 42% !important; }
 }
 </style>"""
-"""Viser's panel on a phone leaves a strip beside it, and has the middle of the model behind it. Where a version of viser
-is made otherwise, this says nothing."""
+"""Viser's panel on a phone leaves a strip beside it and hides the middle of the model. Where a version of viser is made
+otherwise, this says nothing."""
 _STEPS = ("◀◀", "◀", "▶", "▶▶")
 _STEP_HINT = "Doubtful frame before, frame before, next frame, next doubtful frame."
 
