@@ -18,7 +18,10 @@ _MARGIN = 1.15
 
 
 def look_from_aside(server: viser.ViserServer, scenes: Sequence[ObjectScene]) -> None:
-    """Where a browser looks from at first: from behind the camera's path and aside, at objects and paths together."""
+    """Where a browser looks from at first: from behind the camera's path and aside, at objects and paths together.
+
+    Browsers that are open stay where they are; their button that resets the view takes them there.
+    """
     aside = aside_of(scenes[0].path)
     places = np.concatenate([scene.place + np.vstack([scene.path, np.zeros(3)]) for scene in scenes])
     camera = server.initial_camera
@@ -60,10 +63,11 @@ def aside_of(path: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _mean_direction(path: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Where the cameras are, seen from the object: shorter than 1 the more they are all around it."""
+    """Where the cameras are, seen from the object; short where they are all around it."""
     directions = path / np.maximum(np.linalg.norm(path, axis=1, keepdims=True), 1e-9)
     mean = directions.mean(axis=0)
-    return mean if np.linalg.norm(mean) > 0.2 else 0.25 * directions[0]
+    length = float(np.linalg.norm(mean))
+    return mean / length if length > 0.2 else 0.25 * directions[0]
 
 
 def look_through(

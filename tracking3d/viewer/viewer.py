@@ -88,7 +88,6 @@ class Viewer:
             ObjectScene(self._server, run, number, self.go_to) for number, run in enumerate(self._runs)
         ]
         self._take_news(draw=True)
-        look_from_aside(self._server, self._scenes)
         self._listen()
         self._threads = [
             threading.Thread(target=work, name=f"viewer {work.__name__}", daemon=True)
@@ -310,6 +309,7 @@ class Viewer:
             points = None if run.refined else kept_landmarks(run.folder)
             scene.draw_landmarks(points)
             any_landmarks = any_landmarks or points is not None
+        look_from_aside(self._server, self._scenes)  # who is looking already is left where they are
         self._panel.landmarks.visible = any_landmarks
         for video in self._videos:
             video.axes = [axes_of(run) for run in video.runs]
