@@ -10,7 +10,9 @@ from contextlib import suppress
 import av
 import numpy as np
 
-DESCRIPTION = "v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=camera\r\nt=0 0\r\nm=video 0 RTP/AVP 32\r\na=control:track\r\n"
+DESCRIPTION = (
+    "v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=camera\r\nt=0 0\r\nm=video 0 RTP/AVP 32\r\na=control:track\r\n"
+)
 """Of MPEG video, whose packets need nothing further said about them."""
 
 

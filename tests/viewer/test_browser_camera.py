@@ -25,7 +25,9 @@ def test_the_first_look_is_onto_the_plane_of_the_path_and_not_along_it(axes):
 def test_a_path_of_next_to_no_length_is_looked_at_from_aside(path):
     aside = aside_of(path)
     assert np.isfinite(aside).all()
-    assert 0.5 < aside @ path[0] / np.linalg.norm(path[0]) < 0.9, "as the camera saw it, but not through the camera"
+    assert 0.5 < aside @ path[0] / np.linalg.norm(path[0]) < 0.9, (
+        "as the camera saw it, but not through the camera"
+    )
 
 
 def test_an_arc_is_seen_from_behind_its_cameras():
