@@ -16,11 +16,11 @@ from tracking3d.corrections import Correction, checked_corrections
 from tracking3d.errors import InputError
 from tracking3d.frames import SkippedFrame
 from tracking3d.recording import record
-from tracking3d.results.following import open_run_source
 from tracking3d.results.given_masks import given_mask
 from tracking3d.results.layout import runs_in
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
+from tracking3d.results.run_source import open_run_source
 
 
 def correct_run(

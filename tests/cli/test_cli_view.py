@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -196,3 +198,9 @@ def test_the_page_of_pick_is_served_until_the_run_is_started(clip, tmp_path, mon
         assert "--box 20,10,20,20" in json.loads(answer.read())["command"]
     work.join(30)
     assert found[0].boxes == [(20.0, 10.0, 20.0, 20.0)] and (tmp_path / "run" / "picked.json").is_file()
+
+
+def test_the_viewer_starts_without_torch():
+    code = "import sys, tracking3d.viewer.opening; print({'torch', 'kornia', 'numba'} & set(sys.modules))"
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert answer.stdout == "set()\n", "loading it takes longer than all else until the page is there"

@@ -327,7 +327,7 @@ def test_bad_override_is_quoted(item):
 
 
 def test_unknown_preset_is_answered_with_the_nearest():
-    with pytest.raises(InputError, match=r"no preset 'papr' .*did you mean 'paper'\?"):
+    with pytest.raises(InputError, match=r"no preset 'papr'; did you mean 'paper'\?"):
         load_config(preset="papr")
     with pytest.raises(InputError, match="no preset"):
         load_config(preset="../presets/paper")

@@ -11,10 +11,11 @@ from scipy.spatial.transform import Rotation
 from tracking3d.errors import InputError
 from tracking3d.results import layout
 from tracking3d.results.correspondences import grid_on_object, project, track_points
-from tracking3d.results.following import open_run_source, open_scene
+from tracking3d.results.following import open_scene
 from tracking3d.results.point_files import COLUMNS, points_to_csv
 from tracking3d.results.point_trails import draw_trails, write_trails
 from tracking3d.results.run_reader import RunReader
+from tracking3d.results.run_source import open_run_source
 from tracking3d.video import open_source
 
 SHAKEN = 1.5  # degrees

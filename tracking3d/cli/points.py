@@ -99,7 +99,7 @@ def points(
 
 def _images(reader: RunReader, source: str | None, needed: bool) -> FrameSource | None:
     """The video of the run; where it is gone and not needed, None, and a word about it."""
-    from tracking3d.results.following import open_run_source
+    from tracking3d.results.run_source import open_run_source
 
     try:
         return open_run_source(reader, source)

@@ -200,7 +200,7 @@ def _prompt_of(file: Path | None, from_file: dict[str, Any]) -> PromptSection:
 
 def _named_layer(kind: str, folder: str, names: Sequence[str], name: str) -> Layer:
     if name not in names:
-        raise InputError(f"There is no {kind} '{name}' (available: {', '.join(names)}); {hint(name, names)}")
+        raise InputError(f"There is no {kind} '{name}'; {hint(name, names)}")
     with resources.as_file(resources.files("tracking3d.config") / folder / f"{name}.yaml") as path:
         return f"{kind} {name}", read_mapping(path)
 

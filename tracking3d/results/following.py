@@ -27,7 +27,8 @@ from tracking3d.results.correspondences import PointTracks, as_points, in_frame,
 from tracking3d.results.files import write_atomic
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
-from tracking3d.video import FrameSource, open_source
+from tracking3d.results.run_source import open_run_source
+from tracking3d.video import FrameSource
 
 _VERSION = 1  # of what is kept; another one is found anew
 
@@ -83,42 +84,6 @@ class RunScene:
             found.uncertainty,
             found.measured,
         )
-
-
-def open_run_source(run: RunReader, source: str | Path | None = None) -> FrameSource:
-    """The video that a run was made on.
-
-    Args:
-        run: The run.
-        source: Where it lies now; as the run has it if left out, from the present folder or from those above the run's.
-
-    Raises:
-        InputError: If it is not there.
-    """
-    named = source if source is not None else run.description.get("source")
-    if not isinstance(named, str | Path) or not str(named) or str(named).isdigit():
-        raise InputError(
-            f"The run {run.folder} does not name a video that can be read again; give it by --source."
-        )
-    places = [Path(named)] if source is not None else places_of(str(named), run.folder)
-    there = next((place for place in places if place.exists()), named)
-    try:
-        return open_source(str(there), run.description.get("selection"))
-    except InputError as error:
-        raise InputError(
-            f"The video of the run {run.folder} cannot be read ({str(error).rstrip('.')}); say by --source where it is."
-        ) from error
-
-
-def places_of(source: str, folder: Path) -> list[Path]:
-    """Where the video of a run may lie, by what the run calls it: it was relative to where the run was begun.
-
-    Args:
-        source: What ``run.json`` calls it.
-        folder: The run folder.
-    """
-    name = Path(source).expanduser()
-    return [name] if name.is_absolute() else [name, *(above / name for above in folder.resolve().parents)]
 
 
 def open_scene(

@@ -31,6 +31,7 @@ from tracking3d.results.layout import FEATURES, GLB, MTL, OBJ, OUT, TEXTURE
 
 _FARTHEST = 1e12  # of a vertex; float32 can square it
 _REPEAT, _CLAMP, _LINEAR, _MIPMAP = 10497, 33071, 9729, 9987  # glTF's constants
+_VERTICES, _INDICES = 34962, 34963  # so are these, for what a buffer holds
 _ROUNDING = 2.0**-20  # of texture coordinates; far less than a texel
 
 
@@ -208,3 +209,7 @@ def _finish_gltf(tree: dict[str, Any]) -> None:
     tree["samplers"] = [{"wrapS": _REPEAT, "wrapT": _CLAMP, "magFilter": _LINEAR, "minFilter": _MIPMAP}]
     for texture in tree.get("textures", []):
         texture["sampler"] = 0
+    for primitive in mesh["primitives"]:
+        for accessor in primitive["attributes"].values():
+            tree["bufferViews"][tree["accessors"][accessor]["bufferView"]]["target"] = _VERTICES
+        tree["bufferViews"][tree["accessors"][primitive["indices"]]["bufferView"]]["target"] = _INDICES

@@ -39,7 +39,7 @@ def load_suite(name: str) -> list[SequenceSpec]:
         raise InputError(f"The suite {FRESH} is drawn from a seed; say --seed N, or name it {FRESH}-N.")
     if name not in SUITES:
         known = (*SUITES, FRESH)
-        raise InputError(f"There is no suite '{name}' (available: {', '.join(known)}); {hint(name, known)}")
+        raise InputError(f"There is no suite '{name}'; {hint(name, known)}")
     with resources.as_file(resources.files("tracking3d.synthesis") / "suites" / f"{name}.yaml") as file:
         document = read_mapping(file)
     common = document.get("common", {})

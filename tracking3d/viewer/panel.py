@@ -12,6 +12,16 @@ from tracking3d.viewer.picture import LAYERS, Shown
 VIDEO_WIDTH, VIDEOS_WIDTH = 560, 720
 """Pixels of the panel with the video, or with several."""
 SPEEDS = {"¼ x": 0.25, "½ x": 0.5, "1 x": 1.0, "2 x": 2.0, "4 x": 4.0}
+_ON_A_PHONE = """<style>
+@media (max-width: 36em) {
+  .mantine-Paper-root[style*="position: fixed"],
+  .mantine-Paper-root[style*="position: fixed"] [style*="width: 20em"] { width: 100% !important; }
+  body:has([style*="width: 20em"] > div > [style*="grid-template-rows: 1fr"])
+    div[style*="flex-grow: 1; height: 100%"] { height: 42% !important; }
+}
+</style>"""
+"""Viser's panel on a phone leaves a strip beside it and hides the middle of the model. Where a version of viser is made
+otherwise, this says nothing."""
 _STEPS = ("◀◀", "◀", "▶", "▶▶")
 _STEP_HINT = "Doubtful frame before, frame before, next frame, next doubtful frame."
 
@@ -33,6 +43,7 @@ class Panel:
         # The video is in viser's own panel, which a phone shows open; there the others are a tap away.
         blank: Image = np.full((9, 16, 3), 40, np.uint8)
         self.picture = gui.add_image(blank, format="jpeg", jpeg_quality=85)
+        gui.add_html(_ON_A_PHONE)
         self.timeline = gui.add_html("")
         self.slider = gui.add_slider(timeline.SLIDER, 0, 1, 1, 0)
         self.play = gui.add_button("Play", hint="Key P.")
@@ -79,6 +90,7 @@ class Panel:
             self.path = gui.add_checkbox(
                 "path of the camera", True, hint="Click a frustum to go to its frame."
             )
+            self.here = gui.add_checkbox("present frame", True, hint="Its picture, where the camera stood.")
             self.landmarks = gui.add_checkbox("landmarks", True, visible=False)
             self.still = gui.add_checkbox(
                 "camera stands still", False, hint="Move the object, not the camera."

@@ -24,8 +24,19 @@ MOST_FRUSTA = 48
 LARGEST_MESH = 2**28
 """Bytes of a mesh file that are sent to the browser."""
 _FRUSTUM = 0.06  # of the distance between camera and object
+_EVEN_LIGHT, _LIGHT_FROM_ABOVE = 2.4, 0.6
 _LANDMARK = (255, 230, 120)
 _HALF_TURN_ABOUT_X = (0.0, 1.0, 0.0, 0.0)  # from glTF's axes, in which mesh.glb is, to the object's
+
+
+def set_up_space(server: viser.ViserServer) -> None:
+    """Which way is up, and the light: nearly even, since the light of the video is in the texture already."""
+    scene = server.scene
+    scene.set_up_direction("-y")
+    scene.configure_default_lights(False)
+    scene.configure_environment_map(None)
+    scene.add_light_ambient("/light/even", intensity=_EVEN_LIGHT)
+    scene.add_light_directional("/light/above", intensity=_LIGHT_FROM_ABOVE, position=(-1.0, -2.0, -1.0))
 
 
 class ObjectScene:
@@ -105,8 +116,10 @@ class ObjectScene:
         else:
             self._root.wxyz, self._root.position = (1.0, 0.0, 0.0, 0.0), self.place
 
-    def show(self, mesh: bool, path: bool, landmarks: bool) -> None:
+    def show(self, mesh: bool, path: bool, here: bool, landmarks: bool) -> None:
         """Which parts are to be seen."""
+        if self._here is not None and not here:
+            self._here.visible = False
         self._way.visible, self._landmarks.visible = path, landmarks
         if self._mesh is not None:
             self._mesh.visible = mesh

@@ -29,7 +29,7 @@ from tracking3d.viewer.guarded_server import start_server
 from tracking3d.viewer.kept_landmarks import kept_landmarks
 from tracking3d.viewer.panel import SPEEDS, Panel
 from tracking3d.viewer.picture import axes_of, beside, draw_picture
-from tracking3d.viewer.scene import ObjectScene
+from tracking3d.viewer.scene import ObjectScene, set_up_space
 from tracking3d.viewer.told import about, describe, list_streaks
 from tracking3d.web.access import Access
 
@@ -82,13 +82,12 @@ class Viewer:
         live = any(run.going_on for run in self._runs)
         self._server = start_server(access, port)
         self.address = access.address(self._server.get_port())
-        self._server.scene.set_up_direction("-y")
+        set_up_space(self._server)
         self._panel = Panel(self._server, len(videos), live, any(run.refined for run in self._runs))
         self._scenes = [
             ObjectScene(self._server, run, number, self.go_to) for number, run in enumerate(self._runs)
         ]
         self._take_news(draw=True)
-        look_from_aside(self._server, self._scenes)
         self._listen()
         self._threads = [
             threading.Thread(target=work, name=f"viewer {work.__name__}", daemon=True)
@@ -126,7 +125,7 @@ class Viewer:
         panel.quantity.on_update(lambda _: self._redraw_timeline())
         panel.look.on_click(lambda _: self._look_through())
         boxes = [*panel.layers.values(), panel.axes, panel.probability]
-        boxes += [panel.mesh, panel.path, panel.landmarks, panel.still]
+        boxes += [panel.mesh, panel.path, panel.here, panel.landmarks, panel.still]
         for box in boxes:
             box.on_update(lambda _: self._want())
         keys: dict[str, tuple[str, Callable[[], None]]] = {
@@ -228,7 +227,7 @@ class Viewer:
             panel.picture.image = beside(drawn, [video.name for video in self._videos])
             for scene, picture in zip(self._scenes, pictures.values(), strict=True):
                 scene.go_to(index, picture[::2, ::2], panel.still.value)
-                scene.show(panel.mesh.value, panel.path.value, panel.landmarks.value)
+                scene.show(panel.mesh.value, panel.path.value, panel.here.value, panel.landmarks.value)
             first, last = self._ends()
             panel.timeline.content = timeline.with_cursor(self._timeline, index, first, last)
             told = "".join(
@@ -310,6 +309,7 @@ class Viewer:
             points = None if run.refined else kept_landmarks(run.folder)
             scene.draw_landmarks(points)
             any_landmarks = any_landmarks or points is not None
+        look_from_aside(self._server, self._scenes)  # who is looking already is left where they are
         self._panel.landmarks.visible = any_landmarks
         for video in self._videos:
             video.axes = [axes_of(run) for run in video.runs]
@@ -331,8 +331,10 @@ class Viewer:
     def _look_through(self) -> None:
         record = self._runs[0].frames.get(self._nearest(self._wanted))
         if record is not None and np.isfinite(record.T_cam_obj).all():
+            self._panel.here.value = False  # its picture would stand before the model
             T_world_cam = np.eye(4) if self._panel.still.value else np.linalg.inv(record.T_cam_obj)
-            look_through(self._server, T_world_cam, record.through(self._runs[0].camera).fov)
+            camera = record.through(self._runs[0].camera)
+            look_through(self._server, T_world_cam, camera.fov, camera.width / camera.height)
 
 
 def _ignoring_the_event(act: Callable[[], None], event: object) -> None:
