@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -117,9 +117,7 @@ def shape_run(
         model = textured(online, views, largest)
         export_mesh(run.mesh_folder, model)
         return ShapedRun(model, len(views), False, made.sentence)
-    poses = made.T_cam_obj
-    fitted = [replace(view, T_cam_obj=poses.get(view.index, view.T_cam_obj)) for view in views]
-    model = textured(with_shape(online, made.vertices, made.faces, shapes), fitted, largest)
+    model = textured(with_shape(online, made.vertices, made.faces, shapes), views, largest)
     kept = run.mesh_folder / layout.ONLINE
     if not (kept / layout.FEATURES).is_file():
         kept.mkdir(exist_ok=True)
