@@ -111,9 +111,10 @@ def test_a_depth_is_a_surface_and_free_space_before_it(around):
     total, weight = depth_evidence(points, [one], 0.2)
     assert total[0] < 0 and abs(total[1]) < 1e-6 and weight[1] == 1 and weight[2] == 0
     everywhere = np.full(3, 0.1, np.float32)
-    inside = fused(everywhere, everywhere, 5 * total, 5 * weight, 0.2)
+    inside = fused((1, 1, 3), everywhere, everywhere, 5 * total, 5 * weight, 0.2, variation=0)
     assert inside[0] < 0 < inside[2]
-    assert (fused(-everywhere, everywhere, total, weight, 0.2) < 0).all()  # nothing is beyond the hull
+    hull = fused((1, 1, 3), -everywhere, everywhere, total, weight, 0.2)
+    assert (hull < 0).all()  # nothing is beyond it
 
 
 def test_views_that_show_the_same_are_one(around):

@@ -21,6 +21,15 @@ _MISSED = 0.5
 """Difference of colours that a pixel of the mask counts which the surface does not cover."""
 
 
+MOST_LEFT_OUT = 32
+"""Frames that are asked."""
+
+
+def is_left_out(place: int) -> bool:
+    """Whether a believed frame, counted from 0, is kept out of the reconstruction."""
+    return place % EVERY == EVERY // 2
+
+
 @dataclass(frozen=True)
 class Explained:
     """How well a shape explains frames, in the mean.

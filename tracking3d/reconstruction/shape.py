@@ -20,7 +20,7 @@ from tracking3d.reconstruction.depth_maps import Guide, depth_maps
 from tracking3d.reconstruction.fusion import depth_evidence, fused
 from tracking3d.reconstruction.grid import FloatArray, Grid
 from tracking3d.reconstruction.hull import robust_hull
-from tracking3d.reconstruction.judged import EVERY, Explained, explained
+from tracking3d.reconstruction.judged import Explained, explained
 from tracking3d.reconstruction.mesh_distance import mesh_distance
 from tracking3d.reconstruction.shape_views import ShapeView, turned_apart
 from tracking3d.reconstruction.surface import extracted, is_sound, main_pieces, roughly, simplified
@@ -60,17 +60,20 @@ class Shape:
 
 
 def reconstructed(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], views: Sequence[ShapeView]
+    vertices: NDArray[np.float64],
+    faces: NDArray[np.int64],
+    views: Sequence[ShapeView],
+    left_out: Sequence[ShapeView],
 ) -> Shape:
     """Make a shape that explains frames better than the one at hand.
 
     Args:
         vertices: ``(V, 3)`` of the shape at hand, closed.
         faces: ``(F, 3)``.
-        views: All frames that are believed, in order.
+        views: The frames that it is made from, in order.
+        left_out: The frames that it is judged by, see `is_left_out`.
     """
-    left_out = [view for n, view in enumerate(views) if n % EVERY == EVERY // 2]
-    used = turned_apart([view for n, view in enumerate(views) if n % EVERY != EVERY // 2], _APART, MOST)
+    used = turned_apart(views, _APART, MOST)
     if len(used) < FEWEST or not left_out:
         return _kept(f"only {len(used)} frames differ enough to tell a shape, and {FEWEST} are needed")
     if (turn := _turn(used)) < LEAST_TURN:
