@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from test_volume import shape_views
 
 from tracking3d.reconstruction.judged import Explained, explained, is_left_out
+from tracking3d.reconstruction.outline_fit import fitted_to_outlines
 from tracking3d.reconstruction.pose_polish import coloured_surface, polished
 from tracking3d.reconstruction.seen_vertices import seen_vertices
 from tracking3d.reconstruction.shape import reconstructed
@@ -63,3 +64,13 @@ def test_the_back_is_not_seen():
 
 def test_every_eighth_frame_is_left_out():
     assert [place for place in range(24) if is_left_out(place)] == [4, 12, 20]
+
+
+def test_vertices_go_to_where_the_outlines_are():
+    model, views = ball(), shape_views(range(0, 180, 20))
+    small = 0.95 * model.vertices
+    fitted = fitted_to_outlines(small, model.faces, views)
+    # All views look along the horizon: the ring that they see goes out, and the poles with it.
+    radius = np.linalg.norm(fitted, axis=1)
+    assert np.abs(radius - 1).mean() < 0.5 * 0.05
+    assert explained(fitted, model.faces, views[::2], views[1::2]).iou > 0.97

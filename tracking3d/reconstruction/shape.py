@@ -22,6 +22,7 @@ from tracking3d.reconstruction.grid import FloatArray, Grid
 from tracking3d.reconstruction.hull import robust_hull
 from tracking3d.reconstruction.judged import Explained, explained
 from tracking3d.reconstruction.mesh_distance import mesh_distance
+from tracking3d.reconstruction.outline_fit import fitted_to_outlines
 from tracking3d.reconstruction.shape_views import ShapeView, turned_apart
 from tracking3d.reconstruction.surface import extracted, is_sound, main_pieces, roughly, simplified
 
@@ -83,7 +84,10 @@ def reconstructed(
     mesh = _sound(grid, inside)
     if mesh is None:
         return _kept("what is seen contradicts itself: the new surface is full of holes")
-    new_vertices, new_faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+    new_faces = np.asarray(mesh.faces, np.int64)
+    new_vertices = fitted_to_outlines(
+        np.asarray(mesh.vertices), new_faces, turned_apart(used, _REFERENCES_APART, _REFERENCES)
+    )
     old = explained(vertices, faces, used, left_out)
     new = explained(new_vertices, new_faces, used, left_out)
     told = (
