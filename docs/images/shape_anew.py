@@ -57,9 +57,7 @@ def picture(run: Path, clip: Path) -> Image:
         face_uvs=np.full((len(mesh.faces), 3, 2), 0.5),
     )
     rows = [grey(true), grey(online), grey(made), made]
-    return np.vstack(
-        [np.hstack([render_view(one, rotation(n), SIDE) for n in range(SIDES)]) for one in rows]
-    )
+    return np.vstack([np.hstack([render_view(one, rotation(n), SIDE) for n in range(SIDES)]) for one in rows])
 
 
 if __name__ == "__main__":

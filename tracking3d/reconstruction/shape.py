@@ -1,9 +1,9 @@
 """The shape of an object of any topology, from all frames that are believed.
 
 Silhouettes bound it, matched patches say how deep it is, and the mesh of the online map holds it where neither knows;
-everything is fused in a volume. Poses are taken as they are: landmarks told them to a tenth of a degree, which no fit to
-a surface that is still rough can better. Every eighth frame is kept out; only if the new shape explains those better
-than the old one does it take its place.
+everything is fused in a volume. Poses are taken as they are: landmarks told them to a tenth of a degree, which no
+fit to a surface that is still rough can better. Every eighth frame is kept out; only if the new shape explains those
+better than the old one does it take its place.
 """
 
 from __future__ import annotations
@@ -35,7 +35,10 @@ MOST = 150
 _APART, _REFERENCES_APART, _REFERENCES = 1.0, 6.0, 32  # degrees between views, and between those with a depth
 _MARGIN = 0.15
 _TRUNCATION = 0.04  # of the object's diagonal
-_COARSE, _CELLS = 48, 96  # along the longest side, of the surface that says where to look, and of the one that is made
+_COARSE, _CELLS = (
+    48,
+    96,
+)  # along the longest side, of the surface that says where to look, and of the one that is made
 _REACH, _STEPS = 0.10, 10
 """How far around that surface depths are searched (of the diagonal), and in how many steps to either side."""
 _SMOOTH = (0.5, 0.8, 1.2)  # voxels; the first that gives a surface that is sound
