@@ -18,7 +18,7 @@ from tracking3d.reconstruction.grid import FloatArray
 from tracking3d.reconstruction.shape_views import ShapeView
 from tracking3d.rendering.backend import use_numba
 
-SHARE = 0.1
+SHARE = 0.05
 """Of the views that see a point, those that may be wrong."""
 LEAST = 1
 """And so many at least."""
