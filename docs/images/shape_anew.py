@@ -1,9 +1,8 @@
-"""Makes the picture of shapes from eight sides: the true one, that of the online map, the one made anew, its texture.
+"""Makes the picture of shapes from eight sides: that of the online map, the one made anew, and that with its texture.
 
-The run that is shown is of a sequence of a fresh suite, its masks the true ones.
-
-$ tracking3d model RUN --quality fine --source CLIP/frames
-$ python docs/images/shape_anew.py RUN CLIP picture.jpg
+$ tracking3d model RUN --quality fine
+$ python docs/images/shape_anew.py RUN docs/images/shape_anew.jpg
+$ python docs/images/shape_anew.py RUN picture.jpg --truth CLIP    # the true shape above them
 """
 
 from __future__ import annotations
@@ -43,28 +42,33 @@ def grey(model: ObjectModel) -> ObjectModel:
     )
 
 
-def picture(run: Path, clip: Path) -> Image:
-    """``(4 SIDE, SIDES SIDE, 3)``."""
+def true_shape(run: Path, clip: Path, like: ObjectModel) -> ObjectModel:
+    """The true mesh in the coordinates of the run."""
     truth = read_truth(clip)
-    alignment = fit_alignment(pair_poses(answers_of_run(run, truth), truth), None)
+    T_est_true = np.linalg.inv(fit_alignment(pair_poses(answers_of_run(run, truth), truth), None).T_true_est)
     mesh = truth.mesh.read()
-    made, online = load_model(run), load_model(run / layout.ONLINE)
-    T_est_true = np.linalg.inv(alignment.T_true_est)
-    true = replace(
-        online,
+    return replace(
+        like,
         vertices=mesh.vertices @ T_est_true[:3, :3].T + T_est_true[:3, 3],
         faces=np.asarray(mesh.faces, np.int64),
         face_uvs=np.full((len(mesh.faces), 3, 2), 0.5),
     )
-    rows = [grey(true), grey(online), grey(made), made]
+
+
+def picture(run: Path, clip: Path | None) -> Image:
+    """``(N SIDE, SIDES SIDE, 3)``."""
+    made, online = load_model(run), load_model(run / layout.ONLINE)
+    rows = [grey(online), grey(made), made]
+    if clip is not None:
+        rows.insert(0, grey(true_shape(run, clip, online)))
     return np.vstack([np.hstack([render_view(one, rotation(n), SIDE) for n in range(SIDES)]) for one in rows])
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("run", type=Path)
-    parser.add_argument("clip", type=Path)
     parser.add_argument("out", type=Path)
+    parser.add_argument("--truth", type=Path, default=None)
     given = parser.parse_args()
-    made = cv2.cvtColor(picture(given.run, given.clip), cv2.COLOR_RGB2BGR)
+    made = cv2.cvtColor(picture(given.run, given.truth), cv2.COLOR_RGB2BGR)
     cv2.imwrite(str(given.out), made, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
