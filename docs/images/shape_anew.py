@@ -1,7 +1,7 @@
 """Makes the picture of shapes from eight sides: that of the online map, the one made anew, and that with its texture.
 
 $ tracking3d model RUN --quality fine
-$ python docs/images/shape_anew.py RUN docs/images/shape_anew.jpg
+$ python docs/images/shape_anew.py RUN picture.jpg
 $ python docs/images/shape_anew.py RUN picture.jpg --truth CLIP    # the true shape above them
 """
 
