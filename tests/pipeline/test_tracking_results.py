@@ -129,9 +129,9 @@ def test_the_model_is_what_was_asked_for(clip, config):
 def test_a_fine_model_has_a_new_shape_where_that_explains_the_frames_better(clip, config, monkeypatch):
     given: list[int] = []
 
-    def smaller(vertices, faces, views):
-        given.extend(view.index for view in views)
-        return Shape(vertices * 0.9, faces, {}, "It is better.", None, None)
+    def smaller(vertices, faces, views, left_out):
+        given.extend(view.index for view in (*views, *left_out))
+        return Shape(vertices * 0.9, faces, "It is better.", None, None)
 
     def reshaped(model, vertices, faces, views):  # the stand-in's texture is too small to be taken apart
         return replace(model, vertices=vertices)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,12 +26,12 @@ from tracking3d.results.run_writer import RunWriter
 YAWS = (0, 15, 30)
 
 
-def written(folder: Path, **changes) -> Path:
-    """A finished run of three frames, and its frames beside it."""
+def written(folder: Path, yaws=YAWS, **changes) -> Path:
+    """A finished run of a few frames, and its frames beside it."""
     images = folder / "frames"
     images.mkdir(parents=True)
     estimates, frames = [], []
-    for index, yaw in enumerate(YAWS):
+    for index, yaw in enumerate(yaws):
         image, mask = seen(pose(yaw), pattern())
         write_image(images / f"{index:03d}.png", image)
         frames.append(Frame(index, image, index / 30, f"{index:03d}.png"))
@@ -108,8 +109,8 @@ def test_a_shape_that_cannot_be_told_leaves_the_mesh_and_its_texture(tmp_path):
 def test_a_new_shape_takes_the_place_of_the_old_one_which_is_kept(tmp_path, monkeypatch):
     run = written(tmp_path)
     before, smaller = load_model(run), ball().vertices * 0.97
-    made = Shape(smaller, ball().faces, {}, "it is better", None, None)
-    monkeypatch.setattr(of_run, "reconstructed", lambda vertices, faces, views: made)
+    made = Shape(smaller, ball().faces, "it is better", None, None)
+    monkeypatch.setattr(of_run, "reconstructed", lambda vertices, faces, views, left_out: made)
     shaped = shape_run(run)
     after = load_model(run)
     assert shaped.new and shaped.views == len(YAWS)
@@ -128,3 +129,25 @@ def test_a_missing_package_is_named(tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"tracking3d\[model\]"):
         shape_run(run)
     assert len(load_model(run).texture) == 16
+
+
+def test_the_model_is_judged_by_a_frame_that_its_texture_has_not_seen(tmp_path):
+    run = written(tmp_path, yaws=(0, 8, 16, 24, 32, 40))
+    before = (run / "texture.png").read_bytes()
+    result = CliRunner().invoke(app, ["evaluate", "model", str(run), "--json"])
+    assert result.exit_code == 0, result.output
+    (scores,) = json.loads(result.stdout).values()
+    assert scores["frames"] == 1 and scores["psnr"] > 20 and 0.7 < scores["ssim"] <= 1
+    assert (run / "texture.png").read_bytes() == before
+    table = CliRunner().invoke(app, ["evaluate", "model", str(run)])
+    assert f"{scores['psnr']:.2f} dB" in table.stdout and "genus" not in table.stdout
+
+
+def test_what_models_are_judged_by_has_to_be_there(tmp_path):
+    run = written(tmp_path)
+    for options, words in [
+        ([], "none can be left out"),
+        (["--truth", str(tmp_path), "--truth", str(tmp_path)], "--truth is given 2 times for 1 runs"),
+    ]:
+        result = CliRunner().invoke(app, ["evaluate", "model", str(run), *options])
+        assert result.exit_code == 2 and words in " ".join(result.output.replace("│", " ").split())

@@ -111,12 +111,35 @@ def test_a_depth_is_a_surface_and_free_space_before_it(around):
     total, weight = depth_evidence(points, [one], 0.2)
     assert total[0] < 0 and abs(total[1]) < 1e-6 and weight[1] == 1 and weight[2] == 0
     everywhere = np.full(3, 0.1, np.float32)
-    inside = fused(everywhere, everywhere, 5 * total, 5 * weight, 0.2)
+    inside = fused((1, 1, 3), everywhere, everywhere, 5 * total, 5 * weight, 0.2, variation=0)
     assert inside[0] < 0 < inside[2]
-    assert (fused(-everywhere, everywhere, total, weight, 0.2) < 0).all()  # nothing is beyond the hull
+    hull = fused((1, 1, 3), -everywhere, everywhere, total, weight, 0.2)
+    assert (hull < 0).all()  # nothing is beyond it
 
 
 def test_views_that_show_the_same_are_one(around):
     assert len(turned_apart([around[0]] * 5, 1.0, 10)) == 1
     assert len(turned_apart(around, 1.0, 100)) == len(around)
     assert len(turned_apart(around, 1.0, 5)) <= 5
+
+
+def test_noise_and_holes_go_and_the_surface_stays():
+    grid = Grid.around(np.array([[-1.0] * 3, [1.0] * 3]), 24, 0.1)
+    radius = np.linalg.norm(grid.points, axis=1)
+    ball, truncation = (1 - radius).astype(np.float32), 0.3
+    rng = np.random.default_rng(0)
+    weight = np.where(rng.random(len(ball)) < 0.7, 4.0, 0.0).astype(np.float32)  # the rest is known to nobody
+    noisy = np.clip(ball + rng.normal(0, 0.2, len(ball)), -truncation, truncation).astype(np.float32)
+    far = np.full_like(ball, 1.0)
+    made = fused(grid.shape, far, -far, noisy * weight, weight, truncation)
+    rough = fused(grid.shape, far, -far, noisy * weight, weight, truncation, variation=0)
+    wrong, before = ((one > 0) != (ball > 0) for one in (made, rough))
+    assert wrong.mean() < 0.5 * before.mean()
+
+
+def test_a_map_of_every_other_pixel_is_known_everywhere(around):
+    depth = np.full((SIDE, SIDE), np.nan, np.float32)
+    depth[::3, ::3] = 4.5
+    points = np.random.default_rng(2).uniform(-0.3, 0.3, (50, 3)).astype(np.float32)
+    sparse = DepthMap(around[0], depth, np.ones((SIDE, SIDE), np.float32), 3)
+    assert (depth_evidence(points, [sparse], 1.5)[1] > 0).all()

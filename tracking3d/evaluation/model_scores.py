@@ -14,6 +14,7 @@ from tracking3d.evaluation.bop import AverageRecall, average_recall, mspd, mssd
 from tracking3d.evaluation.pose_scores import PosePairs
 from tracking3d.evaluation.seen_surface import seen_surface
 from tracking3d.evaluation.shape import ShapeScores, shape_scores
+from tracking3d.evaluation.surface_alignment import align_surfaces
 from tracking3d.evaluation.vsd import TOLERANCES, VISIBILITY_TOLERANCE, model_depth, vsd
 
 SAMPLES = 30_000
@@ -34,6 +35,9 @@ class ModelScores:
         shape_f_score_fine: At 1 percent.
         shape_f_score_seen: At 2 percent, of the surface that the frames show; needs the camera.
         shape_f_score_fine_seen: The same at 1 percent.
+        shape_f_score_fitted: At 2 percent, of the surface that the frames show (all of it, where the camera is not
+            known), size and place fitted to the surfaces instead of the poses.
+        shape_f_score_fine_fitted: The same at 1 percent.
         shape_accuracy_percent: Mean distance of the estimated from the true surface in percent of the diameter.
         shape_completeness_percent: Of the true from the estimated surface.
         shape_normals: Mean cosine between normals of the two surfaces.
@@ -49,6 +53,8 @@ class ModelScores:
     shape_f_score_fine: float | None = None
     shape_f_score_seen: float | None = None
     shape_f_score_fine_seen: float | None = None
+    shape_f_score_fitted: float | None = None
+    shape_f_score_fine_fitted: float | None = None
     shape_accuracy_percent: float | None = None
     shape_completeness_percent: float | None = None
     shape_normals: float | None = None
@@ -81,15 +87,18 @@ def score_model(
     if pairs is None or not pairs.frames or mesh is None or diameter is None:
         return ModelScores()
     recall = _recall(truth, pairs, alignment, mesh, diameter)
-    shape = None
+    shape = fitted = None
     if alignment is not None and answers.mesh is not None:
         try:
             seen = None
             if truth.camera is not None:
                 seen = seen_surface(mesh, diameter, list(truth.T_cam_obj.values()), truth.camera)
-            shape = shape_scores(answers.mesh(), mesh, diameter, alignment.T_true_est, SAMPLES, seen=seen)
+            estimated = answers.mesh()
+            shape = shape_scores(estimated, mesh, diameter, alignment.T_true_est, SAMPLES, seen=seen)
+            T_true_est = align_surfaces(estimated, mesh, diameter, alignment.T_true_est, seen)
+            fitted = shape_scores(estimated, mesh, diameter, T_true_est, SAMPLES, seen=seen)
         except ValueError:  # the method has no surface: there is nothing to measure
-            shape = None
+            shape = fitted = None
     return ModelScores(
         bop_ar=recall.mean,
         bop_ar_vsd=recall.vsd,
@@ -97,6 +106,8 @@ def score_model(
         bop_ar_mspd=recall.mspd,
         chamfer_percent=100 * shape.chamfer if shape else None,
         **(_of_shape(shape) if shape else {}),
+        shape_f_score_fitted=fitted and (fitted.f_score_seen or fitted.f_score),
+        shape_f_score_fine_fitted=fitted and (fitted.f_score_fine_seen or fitted.f_score_fine),
     )
 
 

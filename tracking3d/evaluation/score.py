@@ -96,6 +96,18 @@ def score(answers: Answers, truth: Truth) -> Scores:
     )
 
 
+def score_mesh(answers: Answers, truth: Truth) -> ModelScores:
+    """The scores of the shape alone, and of poses by the true mesh; empty where there is none.
+
+    Raises:
+        InputError: If a file that one side names cannot be read.
+    """
+    mesh = truth.mesh.read() if truth.mesh is not None else None
+    diameter = None if mesh is None else model_diameter(mesh.vertices)
+    pairs = pair_poses(answers, truth)
+    return score_model(answers, truth, pairs, fit_alignment(pairs, diameter), mesh, diameter)
+
+
 def _stages(answers: Answers) -> dict[str, Any]:
     stages = list(answers.stages.values())
     if not stages or len(stages) < len(answers.seconds):

@@ -40,6 +40,8 @@ ROWS: tuple[tuple[str, str, str], ...] = (
     ("shape_f_score_seen", "the same of what was seen", ""),
     ("shape_f_score_fine", "F-score of the shape at 1 %", ""),
     ("shape_f_score_fine_seen", "the same of what was seen", ""),
+    ("shape_f_score_fitted", "at 2 %, seen, size and place fitted", ""),
+    ("shape_f_score_fine_fitted", "at 1 %, seen, size and place fitted", ""),
     ("shape_accuracy_percent", "from the shape to the true one", " % of the diameter"),
     ("shape_completeness_percent", "from the true shape to it", " % of the diameter"),
     ("shape_normals", "cosine between normals", ""),

@@ -47,11 +47,13 @@ class DepthMap:
         view: The view.
         depth: ``(S, S)`` float32 z in camera coordinates, NaN where nothing is known.
         score: ``(S, S)`` float32 correlation there.
+        stride: Depths are known at every so manyeth pixel of a row, and row, at most.
     """
 
     view: ShapeView
     depth: FloatArray
     score: FloatArray
+    stride: int = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +176,7 @@ def _depth_map(
     at = tuple(pixels[kept].T)
     depth[at] = (first + np.interp(place, np.arange(len(offsets)), offsets))[kept]
     score[at] = value[kept]
-    return DepthMap(view, depth, score)
+    return DepthMap(view, depth, score, stride)
 
 
 def patch_scores(
@@ -312,4 +314,4 @@ def _agreed(one: DepthMap, maps: Sequence[DepthMap], tolerance: float, stride: i
     kept = np.full_like(one.depth, np.nan)
     sure = confirmed >= 1
     kept[rows[sure], columns[sure]] = one.depth[rows[sure], columns[sure]]
-    return DepthMap(view, kept, one.score)
+    return DepthMap(view, kept, one.score, stride)

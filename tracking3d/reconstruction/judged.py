@@ -15,10 +15,17 @@ from tracking3d.rendering import render
 
 EVERY = 8
 """Every so manyeth believed frame is kept out of the reconstruction."""
-_WORSE_OUTLINE = 0.005
+_WORSE_OUTLINE = 0.01
 """IoU that may be lost where colours gain."""
-_MISSED = 0.5
-"""Difference of colours that a pixel of the mask counts which the surface does not cover."""
+
+
+MOST_LEFT_OUT = 32
+"""Frames that are asked."""
+
+
+def is_left_out(place: int) -> bool:
+    """Whether a believed frame, counted from 0, is kept out of the reconstruction."""
+    return place % EVERY == EVERY // 2
 
 
 @dataclass(frozen=True)
@@ -27,7 +34,8 @@ class Explained:
 
     Attributes:
         iou: Of silhouette and mask.
-        colour: Mean difference of colours in [0, 1] within the mask.
+        colour: Mean difference of colours in [0, 1] where both the mask and the surface are; what the surface does not
+            cover counts in the IoU.
     """
 
     iou: float
@@ -66,5 +74,6 @@ def explained(
         overlaps.append((covered & mask).sum() / max(either.sum(), 1))
         colours = drawn.image()[0].permute(1, 2, 0).numpy()
         apart = np.abs(colours - view.image / 255.0).mean(2)
-        differences.append(np.where(covered, apart, _MISSED)[mask].mean())
+        both = covered & mask
+        differences.append(float(apart[both].mean()) if both.any() else 1.0)
     return Explained(float(np.mean(overlaps)), float(np.mean(differences)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -10,17 +10,22 @@ import numpy as np
 
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import ObjectModel
+from tracking3d.frames import Frame
 from tracking3d.reconstruction.believed_frames import believed_frames, none_believed
+from tracking3d.reconstruction.judged import MOST_LEFT_OUT, is_left_out
 from tracking3d.reconstruction.new_atlas import with_shape
+from tracking3d.reconstruction.predicted import PictureScores, picture_scores
 from tracking3d.reconstruction.shape import MOST, reconstructed
 from tracking3d.reconstruction.shape_views import ShapeView, shape_view, turned_apart
 from tracking3d.reconstruction.texturing import textured
 from tracking3d.reconstruction.views import TextureView, kept_views, texture_view
 from tracking3d.results import layout
 from tracking3d.results.mesh_export import export_mesh, load_model
+from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
 from tracking3d.video.source import FrameSource
 
+_TEXTURE_VIEWS = 24
 _NEEDED = ("skimage", "xatlas", "fast_simplification")
 
 
@@ -95,37 +100,85 @@ def shape_run(
     run = RunReader(folder)
     online = _online_model(run)
     shapes: list[ShapeView] = []
+    left_out: list[ShapeView] = []
+    believed = 0
     views: tuple[TextureView, ...] = ()
     for frame, record in believed_frames(run, source):
-        mask, camera, pose = (
-            run.pinhole_mask(frame.index),
-            run.camera_of(record),
-            np.asarray(record.T_cam_obj),
-        )
-        shape = shape_view(frame.index, frame.image, mask, camera, pose)
-        view = texture_view(frame.index, frame.image, mask, camera, pose)
-        if shape is None or view is None:
+        seen = _seen(run, frame, record)
+        if seen is None:
             continue
-        shapes.append(shape)
-        views = kept_views(views, view, most)
+        views = kept_views(views, seen[1], most)
+        (left_out if is_left_out(believed) else shapes).append(seen[0])
+        believed += 1
         if len(shapes) > 4 * MOST:  # memory does not grow with the video
             shapes = turned_apart(shapes, 0.5, 2 * MOST)
+        if len(left_out) > 2 * MOST_LEFT_OUT:
+            left_out = turned_apart(left_out, 0.5, MOST_LEFT_OUT)
     if not views:
         raise none_believed(run)
-    made = reconstructed(online.vertices, online.faces, shapes)
+    judges = turned_apart(left_out, 0.5, MOST_LEFT_OUT)
+    made = reconstructed(online.vertices, online.faces, shapes, judges)
     if made.vertices is None or made.faces is None:
         model = textured(online, views, largest)
         export_mesh(run.mesh_folder, model)
         return ShapedRun(model, len(views), False, made.sentence)
-    poses = made.T_cam_obj
-    fitted = [replace(view, T_cam_obj=poses.get(view.index, view.T_cam_obj)) for view in views]
-    model = textured(with_shape(online, made.vertices, made.faces, shapes), fitted, largest)
+    model = textured(with_shape(online, made.vertices, made.faces, shapes), views, largest)
     kept = run.mesh_folder / layout.ONLINE
     if not (kept / layout.FEATURES).is_file():
         kept.mkdir(exist_ok=True)
         export_mesh(kept, online)
     export_mesh(run.mesh_folder, model)
     return ShapedRun(model, len(views), True, made.sentence)
+
+
+def explained_run(folder: Path, source: str | None = None, largest: int = 2048) -> PictureScores:
+    """How well the mesh of a run predicts frames that it was not made from.
+
+    The frames that `shape_run` keeps out are; the others give the mesh its texture anew, and the poses alone of those
+    kept out are fitted to it. Nothing is written. Of a mesh of the online map all frames have shaped the surface.
+
+    Args:
+        folder: The run folder.
+        source: The video; None for the one that the run names.
+        largest: Most texels along a side.
+
+    Raises:
+        InputError: If a package is missing, the run goes on, has no mesh, too few frames that are believed, or the
+            video is another one.
+    """
+    check_packages()
+    run = RunReader(folder)
+    model = load_model(run.mesh_folder)
+    used: list[ShapeView] = []
+    left_out: list[tuple[ShapeView, TextureView]] = []
+    views: tuple[TextureView, ...] = ()
+    believed = 0
+    for frame, record in believed_frames(run, source):
+        if (seen := _seen(run, frame, record)) is None:
+            continue
+        if is_left_out(believed):
+            left_out.append(seen)
+        else:
+            used.append(seen[0])
+            views = kept_views(views, seen[1], _TEXTURE_VIEWS)
+        believed += 1
+        if len(used) > 2 * MOST:
+            used = turned_apart(used, 0.5, MOST)
+        if len(left_out) > MOST_LEFT_OUT:
+            left_out = left_out[::2]
+    if not left_out:
+        raise InputError(
+            f"Only {believed} frames of the run {folder} are believed; none can be left out to judge its model by."
+        )
+    return picture_scores(textured(model, views, largest), used, left_out)
+
+
+def _seen(run: RunReader, frame: Frame, record: FrameRecord) -> tuple[ShapeView, TextureView] | None:
+    """A frame as shapes and textures are made from it; None where its mask is empty or too small."""
+    given = run.pinhole_mask(frame.index), run.camera_of(record), np.asarray(record.T_cam_obj)
+    shape = shape_view(frame.index, frame.image, *given)
+    view = texture_view(frame.index, frame.image, *given)
+    return None if shape is None or view is None else (shape, view)
 
 
 def check_packages() -> None:

@@ -1,7 +1,7 @@
 """Poses fitted once more, to the surface at hand at the views' resolution.
 
 Each view is compared with what all of them together show of the surface: a few Levenberg-Marquardt steps on colours
-within the mask and on the outline. The surface holds the gauge; `mean_motion` says how far all poses went together.
+within the mask and on the outline.
 """
 
 from __future__ import annotations
@@ -72,28 +72,6 @@ def polished(surface: Surface, views: Sequence[ShapeView]) -> list[ShapeView]:
         views: The frames.
     """
     return [replace(view, T_cam_obj=_fitted(surface, view)) for view in views]
-
-
-def mean_motion(before: Sequence[ShapeView], after: Sequence[ShapeView]) -> NDArray[np.float64]:
-    """``(4, 4)`` T_after_before: how the object moved in its own coordinates when its poses were fitted, in the mean.
-
-    Args:
-        before: The frames as they were.
-        after: The same with other poses.
-    """
-    pairs = [(a.T_cam_obj, b.T_cam_obj) for a, b in zip(before, after, strict=True)]
-    turn = Rotation.from_matrix(np.stack([b[:3, :3].T @ a[:3, :3] for a, b in pairs])).mean()
-    T_after_before = np.eye(4)
-    T_after_before[:3, :3] = turn.as_matrix()
-    # A long lens hardly tells how far away the object is: only shifts across the line of sight have a say.
-    matrix, target = 1e-6 * np.eye(3), np.zeros(3)
-    for a, b in pairs:
-        ray = a[:3, 3] / np.linalg.norm(a[:3, 3])
-        across = np.eye(3) - np.outer(ray, ray)
-        matrix += b[:3, :3].T @ across @ b[:3, :3]
-        target += b[:3, :3].T @ across @ (a[:3, 3] - b[:3, 3])
-    T_after_before[:3, 3] = np.linalg.solve(matrix, target)
-    return T_after_before
 
 
 def _fitted(surface: Surface, view: ShapeView) -> NDArray[np.float64]:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from tracking3d.reconstruction.grid import FloatArray, Grid
 
-SMALLEST_PIECE = 0.02
+SMALLEST_PIECE = 0.1
 """Share of the largest piece's volume below which a piece is a crumb."""
 
 

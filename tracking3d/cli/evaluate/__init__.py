@@ -8,7 +8,7 @@ from __future__ import annotations
 import typer
 
 from tracking3d.cli.default_command import WithDefault
-from tracking3d.cli.evaluate import answers, compare, peer, spread, suite, table
+from tracking3d.cli.evaluate import answers, compare, model, peer, spread, suite, table
 
 DEFAULT = "answers"
 
@@ -23,6 +23,7 @@ app = typer.Typer(
     no_args_is_help=True,
 )
 app.command(name=DEFAULT)(answers.score_answers)
+app.command(name="model")(model.score_models)
 app.command(name="suite")(suite.suite)
 app.command(name="table")(table.table)
 app.command(name="compare")(compare.compare)

@@ -1,0 +1,96 @@
+"""``tracking3d evaluate model RUN...``: what the mesh of a run is worth, by pictures left out and by the true shape."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from tracking3d.cli.options import Debug
+from tracking3d.errors import InputError
+
+_COLUMNS = {
+    "frames": ("frames", "{:d}"),
+    "psnr": ("PSNR", "{:.2f} dB"),
+    "ssim": ("SSIM", "{:.3f}"),
+    "covered": ("covered", "{:.3f}"),
+    "shape_f_score_seen": ("F 2 % seen", "{:.3f}"),
+    "shape_f_score_fitted": ("F 2 % fitted", "{:.3f}"),
+    "shape_f_score_fine_fitted": ("F 1 % fitted", "{:.3f}"),
+    "shape_normals": ("normals", "{:.3f}"),
+    "shape_genus_error": ("genus off", "{:d}"),
+}
+
+
+def score_models(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Run folders.")],
+    truth: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="CLIP", help="Clip with the true mesh; as many as runs, in their order."),
+    ] = None,
+    source: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="The video, where it is no longer where the run names it; as many as runs, in their order."
+        ),
+    ] = None,
+    largest: Annotated[int, typer.Option(min=64, max=8192, help="Most texels along a side.")] = 2048,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON only.")] = False,
+    debug: Debug = False,
+) -> None:
+    """Score the meshes of runs: as pictures of frames that they were not made from, and beside the true shape.
+
+    Every eighth believed frame is left out of the texture, as `tracking3d model --quality fine` leaves it out of the
+    shape; its pose alone is fitted. Nothing is written.
+    """
+    import json
+
+    from rich.markup import escape
+    from rich.table import Table
+
+    from tracking3d.cli.tables import print_table
+
+    for name, given in (("--truth", truth), ("--source", source)):
+        if given and len(given) != len(runs):
+            raise InputError(
+                f"{name} is given {len(given)} times for {len(runs)} runs; give it once for each, in their order."
+            )
+    scores = {
+        str(run): _scores(run, truth[n] if truth else None, source[n] if source else None, largest)
+        for n, run in enumerate(runs)
+    }
+    if as_json:
+        typer.echo(json.dumps(scores, indent=2))
+        return
+    known = [key for key in _COLUMNS if any(one.get(key) is not None for one in scores.values())]
+    table = Table("run", *(_COLUMNS[key][0] for key in known))
+    for name, one in scores.items():
+        table.add_row(escape(name), *(_cell(key, one.get(key)) for key in known))
+    print_table(table)
+
+
+def _scores(run: Path, clip: Path | None, source: str | None, largest: int) -> dict[str, Any]:
+    from dataclasses import asdict
+
+    from tracking3d.reconstruction.of_run import explained_run
+
+    found = asdict(explained_run(run, source, largest))
+    if clip is not None:
+        found |= asdict(_beside_truth(run, clip))
+    return found
+
+
+def _beside_truth(run: Path, clip: Path) -> Any:
+    from tracking3d.datasets.clip import read_truth
+    from tracking3d.datasets.run_answers import answers_of_run
+    from tracking3d.evaluation.score import score_mesh
+
+    truth = read_truth(clip)
+    if truth.mesh is None:
+        raise InputError(f"{clip} has no mesh.obj, so there is no true shape to compare with.")
+    return score_mesh(answers_of_run(run, truth), truth)
+
+
+def _cell(key: str, value: float | None) -> str:
+    return "-" if value is None else _COLUMNS[key][1].format(value)
