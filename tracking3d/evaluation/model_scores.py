@@ -106,8 +106,8 @@ def score_model(
         bop_ar_mspd=recall.mspd,
         chamfer_percent=100 * shape.chamfer if shape else None,
         **(_of_shape(shape) if shape else {}),
-        shape_f_score_fitted=fitted and (fitted.f_score_seen or fitted.f_score),
-        shape_f_score_fine_fitted=fitted and (fitted.f_score_fine_seen or fitted.f_score_fine),
+        shape_f_score_fitted=(fitted.f_score_seen or fitted.f_score) if fitted else None,
+        shape_f_score_fine_fitted=(fitted.f_score_fine_seen or fitted.f_score_fine) if fitted else None,
     )
 
 
