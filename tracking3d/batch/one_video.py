@@ -7,7 +7,8 @@ import os
 import shutil
 import tempfile
 import time
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,8 @@ from tracking3d.video.source import FrameSource
 WORK = ".work"
 """In the folder of a batch: what is not whole yet, and what a video that is tried again goes on from."""
 LOGS = "logs"
+RUN = "run"
+"""In the folder that a video is worked on in: what becomes its run folder."""
 
 _TELL = 1.0  # seconds between two words about how far it is
 
@@ -85,24 +88,61 @@ def track_video(
     Raises:
         Tracking3dError: If it cannot be tracked; what is finished is kept for another time.
     """
+    with worked_on(job, out, networks) as work:
+        attempts = counted(work)
+        run = work / RUN
+        _track(tell, fetched(job, work / "source"), run, command)
+        return put_away(job, out, work, layout.runs_in(run), report, attempts)
+
+
+@contextmanager
+def worked_on(job: VideoJob, out: str, networks: tuple[SharedNetwork, ...] = ()) -> Iterator[Path]:
+    """The folder that a video is worked on in; what went wrong within leaves there what can be gone on from.
+
+    Args:
+        job: The video.
+        out: The folder of the batch.
+        networks: What the machine may lack.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
     work = work_folder(out, job)
     with writing(work):
         work.mkdir(parents=True, exist_ok=True)
-        attempts = _counted(work / "attempts")
     keep_networks(networks)
-    run = work / "run"
     try:
-        _track(tell, _fetched(job, work / "source"), run, command)
-        if report:
-            write_reports(layout.runs_in(run))
-        told = write_marker(run, job, attempts)
-        _put_into_place(run, joined(out, job.name))
+        yield work
     except InputError:
-        if not run.exists():  # nothing was begun that could go on
+        if not (work / RUN).exists():  # nothing was begun that could go on
             _forget(work)
         raise
     finally:
         _send_log(out, job)
+
+
+def put_away(
+    job: VideoJob, out: str, work: Path, runs: Sequence[Path], report: bool, attempts: int, note: str = ""
+) -> dict[str, Any]:
+    """Put what is whole into its place; see `tracking3d.batch.summary.write_marker` for what is returned.
+
+    Args:
+        job: The video.
+        out: The folder of the batch.
+        work: The folder that it was worked on in, which is removed.
+        runs: The run folders in there.
+        report: Whether to write a report of each.
+        attempts: How often the video was begun.
+        note: What else is to be said of it.
+
+    Raises:
+        OutputError: If something cannot be written.
+    """
+    if report:
+        write_reports(runs)
+    told = write_marker(work / RUN, job, attempts, runs, note)
+    _put_into_place(work / RUN, joined(out, job.name))
+    _send_log(out, job)
     _forget(work)
     return told
 
@@ -111,16 +151,7 @@ def _track(tell: Tell, job: VideoJob, run: Path, command: str) -> None:
     source = _source(job)
     passes = 2 if job.config.solver.final_refine else 1
     whole = source.count and source.count * job.objects * passes
-    answers, last, process = 0, 0.0, os.getpid()
-
-    def listener(frame: FrameRecord | SkippedFrame) -> None:
-        nonlocal answers, last
-        answers += 1
-        if time.monotonic() - last > _TELL:
-            last = time.monotonic()
-            tell({"frames": answers, "of": whole, "process": process})
-
-    tell({"frames": 0, "of": whole, "process": process})
+    listener = counting(tell, whole)
     boxes: list[Any] = [parse_box(text) for text in job.box]
     masks: list[Any] = [Path(file) for file in job.mask]
     points: list[Any] = [parse_points(text) for text in job.points]
@@ -139,6 +170,21 @@ def _track(tell: Tell, job: VideoJob, run: Path, command: str) -> None:
         record(source, job.config, run, box=box, mask=mask, points=point, **about)
 
 
+def counting(tell: Tell, of: int | None, **about: Any) -> Callable[[FrameRecord | SkippedFrame], None]:
+    """A listener that tells how many answers there are, now and then, and at once that there are none."""
+    answers, last, process = 0, 0.0, os.getpid()
+
+    def listener(frame: FrameRecord | SkippedFrame) -> None:
+        nonlocal answers, last
+        answers += 1
+        if time.monotonic() - last > _TELL:
+            last = time.monotonic()
+            tell({"frames": answers, "of": of, "process": process, **about})
+
+    tell({"frames": 0, "of": of, "process": process, **about})
+    return listener
+
+
 def _source(job: VideoJob) -> FrameSource:
     if job.sequence is None:
         return open_source(job.video, job.frames)
@@ -147,7 +193,7 @@ def _source(job: VideoJob) -> FrameSource:
     return ImageSequence(name, frames, range(len(frames)))
 
 
-def _fetched(job: VideoJob, folder: Path) -> VideoJob:
+def fetched(job: VideoJob, folder: Path) -> VideoJob:
     """The same job with files that are elsewhere copied to this machine."""
 
     def here(place: str, number: int) -> str:
@@ -196,10 +242,12 @@ def _send_log(out: str, job: VideoJob) -> None:
             write(joined(out, LOGS, f"{job.name}.log"), log.read_bytes())
 
 
-def _counted(file: Path) -> int:
-    """How often this has been called for the file."""
+def counted(work: Path) -> int:
+    """How often a video has been begun, with this time."""
+    file = work / "attempts"
     times = int(file.read_text()) + 1 if file.is_file() else 1
-    file.write_text(str(times))
+    with writing(file):
+        file.write_text(str(times))
     return times
 
 
