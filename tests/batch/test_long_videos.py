@@ -107,7 +107,7 @@ def test_parts_that_cannot_be_joined_are_a_row_each_with_the_reason(cut, long_ba
 
 def test_a_part_that_fails_once_is_tried_again_by_itself(cut, long_batch, tmp_path):
     cut[1][2] = [OutputError("The disk is full.")]
-    progress, told = long_batch()
+    progress, _ = long_batch()
     assert progress.failed == 0 and cut[0].count(1) == 1 and cut[0].count(2) == 2
     [row] = [row for row in read_results(str(tmp_path / "out")) if row["run"] == "one"]
     assert row["attempts"] == "2"

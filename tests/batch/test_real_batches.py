@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from heavy_task import hold
 
-from tracking3d.batch.demonstration import ABORTING, DAMAGED, FILLING, demonstrate, make_clips
+from tracking3d.batch.demonstration import ABORTING, DAMAGED, FILLING, Asked, demonstrate, make_clips
 from tracking3d.batch.load import load_now
 from tracking3d.batch.running import run_batch
 from tracking3d.benchmark.job import Job
@@ -54,12 +54,15 @@ def poses(folder: Path) -> np.ndarray:
 
 def test_whatever_goes_wrong_all_other_answers_are_those_of_a_single_run(config, tmp_path, monkeypatch):
     monkeypatch.setenv("TRACKING3D_PLUGINS", "")  # is put back at the end
-    plain, faults, single = demonstrate(config, tmp_path, videos=3, frames=5, workers=(2,), report=False)
+    asked = Asked(videos=3, frames=5, size=(200, 160), workers=(2,), faults=3, report=False)
+    said = []
+    plain, faults, single = demonstrate(config, tmp_path, asked, said.append)
     assert plain.failed == {} and plain.finished == 3
     assert set(faults.failed) == {DAMAGED, ABORTING} and faults.finished == 4
-    assert {"clip_0000", FILLING, DAMAGED, ABORTING} <= set(faults.again)
+    assert {"clip_0001", FILLING, DAMAGED, ABORTING} <= set(faults.again)
     assert "signal 6" in faults.failed[ABORTING]
     assert faults.different < 1e-9 and single.different < 1e-9
+    assert single.finished == 3 and any("3 of 3 videos" in line for line in said)
 
 
 @pytest.mark.parametrize("address", [None, "local"])
