@@ -113,12 +113,11 @@ def worked_on(job: VideoJob, out: str, networks: tuple[SharedNetwork, ...] = ())
     keep_networks(networks)
     try:
         yield work
-    except InputError:
-        if not (work / RUN).exists():  # nothing was begun that could go on
+    except BaseException as error:
+        send_log(out, job)
+        if isinstance(error, InputError) and not (work / RUN).exists():  # nothing was begun that could go on
             _forget(work)
         raise
-    finally:
-        _send_log(out, job)
 
 
 def put_away(
@@ -142,7 +141,7 @@ def put_away(
         write_reports(runs)
     told = write_marker(work / RUN, job, attempts, runs, note)
     _put_into_place(work / RUN, joined(out, job.name))
-    _send_log(out, job)
+    send_log(out, job)
     _forget(work)
     return told
 
@@ -234,12 +233,13 @@ def _put_into_place(run: Path, place: str) -> None:
         run.rename(target)
 
 
-def _send_log(out: str, job: VideoJob) -> None:
-    """Keep what was printed beside the results where these are elsewhere."""
+def send_log(out: str, job: VideoJob) -> bool:
+    """Keep what was printed beside the results where these are elsewhere; whether this machine has it."""
     log = log_file(out, job)
     if local(out) is None and log.is_file():
         with suppress(OutputError):  # the results are what counts
             write(joined(out, LOGS, f"{job.name}.log"), log.read_bytes())
+    return log.is_file()
 
 
 def counted(work: Path) -> int:

@@ -10,9 +10,9 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
-from tracking3d.batch.folder import Failure, Progress, relative, write_progress, write_tables
+from tracking3d.batch.folder import Failure, Progress, write_progress, write_tables
 from tracking3d.batch.networks import share_networks
-from tracking3d.batch.one_video import LOGS, WORK, log_file
+from tracking3d.batch.one_video import LOGS, WORK, send_log
 from tracking3d.batch.overview import write_overview
 from tracking3d.batch.places import joined, local, read_many
 from tracking3d.batch.summary import MARKER, read_marker
@@ -198,8 +198,10 @@ class Batch:
             return
         about = {"reason": fault.reason, "attempts": ended.attempts, "crashed": fault.crashed}
         if not ended.again:
-            log = log_file(self._out, job)
-            told = relative(self._out, str(log)) if log.is_file() else ""
+            # A worker that could say why it failed has sent its log; what one that crashed has printed may be here.
+            elsewhere = local(self._out) is None and not fault.crashed
+            has_log = send_log(self._out, job) or elsewhere
+            told = f"{LOGS}/{job.name}.log" if has_log else ""
             self.failures[job.name] = Failure(
                 job.name, job.video, fault.reason, ended.attempts, fault.crashed, told
             )
