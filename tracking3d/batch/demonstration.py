@@ -64,11 +64,11 @@ class Asked:
     """
 
     videos: int = 200
-    frames: int = 12
+    frames: int = 10
     size: tuple[int, int] = (320, 240)
     workers: Sequence[int] = (1, 2)
     address: str | None = None
-    faults: int = 200
+    faults: int = 60
     report: bool = True
     minutes: float = math.inf
 

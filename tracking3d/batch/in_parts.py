@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from tracking3d.batch.networks import SharedNetwork
-from tracking3d.batch.one_video import RUN, counted, counting, fetched, put_away, worked_on
+from tracking3d.batch.one_video import RUN, begun_before, counted, counting, fetched, put_away, worked_on
 from tracking3d.batch.video_job import VideoJob
 from tracking3d.engines.protocol import Tell
 from tracking3d.point_prompts import parse_points
@@ -89,7 +89,7 @@ def settle_in_parts(
         OutputError: If something cannot be written.
     """
     with worked_on(job, out) as work:
-        attempts = int((work / "attempts").read_text()) + again
+        attempts = max(begun_before(work), 1) + again
         return put_away(job, out, work, ended.folders, report, attempts, _note(ended))
 
 

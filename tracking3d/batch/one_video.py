@@ -29,7 +29,7 @@ from tracking3d.prompts import parse_box
 from tracking3d.recording import record, record_objects
 from tracking3d.report.several import write_reports
 from tracking3d.results import layout
-from tracking3d.results.files import writing
+from tracking3d.results.files import write_atomic, writing
 from tracking3d.results.records import FrameRecord
 from tracking3d.video import open_source
 from tracking3d.video.image_sequence import ImageSequence
@@ -41,6 +41,7 @@ LOGS = "logs"
 RUN = "run"
 """In the folder that a video is worked on in: what becomes its run folder."""
 
+_ATTEMPTS = "attempts"
 _TELL = 1.0  # seconds between two words about how far it is
 
 
@@ -244,11 +245,16 @@ def send_log(out: str, job: VideoJob) -> bool:
 
 def counted(work: Path) -> int:
     """How often a video has been begun, with this time."""
-    file = work / "attempts"
-    times = int(file.read_text()) + 1 if file.is_file() else 1
-    with writing(file):
-        file.write_text(str(times))
+    times = begun_before(work) + 1
+    write_atomic(work / _ATTEMPTS, str(times).encode())
     return times
+
+
+def begun_before(work: Path) -> int:
+    """How often a video has been begun; what a full disk has left of the note counts as nothing."""
+    with suppress(OSError, ValueError):
+        return int((work / _ATTEMPTS).read_text())
+    return 0
 
 
 def _forget(work: Path) -> None:

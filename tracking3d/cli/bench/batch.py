@@ -14,7 +14,7 @@ def batch(
     videos: Annotated[
         int, typer.Option("--clips", "--videos", min=1, max=100_000, help="How many synthetic clips.")
     ] = 200,
-    frames: Annotated[int, typer.Option(min=2, help="How many frames each has.")] = 12,
+    frames: Annotated[int, typer.Option(min=2, help="How many frames each has.")] = 10,
     width: Annotated[
         int, typer.Option(min=48, max=4096, help="Width of the frames; the height is 3/4.")
     ] = 320,
@@ -40,11 +40,9 @@ def batch(
         ),
     ] = True,
     with_faults: Annotated[
-        int | None,
-        typer.Option(
-            "--fault-clips", min=1, help="So many of them only, for that.", show_default="all of them"
-        ),
-    ] = None,
+        int,
+        typer.Option("--fault-clips", min=1, help="How many of them go through that."),
+    ] = 60,
     minutes: Annotated[
         float | None,
         typer.Option(
@@ -88,7 +86,7 @@ def batch(
         (width, width * 3 // 4),
         workers or (1, 2),
         address,
-        (with_faults or videos) if faults else 0,
+        with_faults if faults else 0,
         report,
         math.inf if minutes is None else minutes,
     )
