@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from heavy_task import hold
 
-from tracking3d.batch.demonstration import ABORTING, DAMAGED, FILLING, demonstrate, make_clips
+from tracking3d.batch.demonstration import ABORTING, DAMAGED, FILLING, Asked, demonstrate, make_clips
 from tracking3d.batch.load import load_now
 from tracking3d.batch.running import run_batch
+from tracking3d.batch.video_job import VideoJob
 from tracking3d.benchmark.job import Job
 from tracking3d.benchmark.pool import run_jobs
 from tracking3d.benchmark.variant import Variant
@@ -23,6 +24,8 @@ from tracking3d.engines.choosing import open_engine
 from tracking3d.engines.mapping import map_tasks
 from tracking3d.engines.processes import ProcessEngine
 from tracking3d.engines.protocol import Ended, Task
+from tracking3d.evaluation.metrics import aligned_rotation_errors
+from tracking3d.results.files import write_image, write_mask
 from tracking3d.results.run_reader import RunReader
 from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
 
@@ -54,12 +57,15 @@ def poses(folder: Path) -> np.ndarray:
 
 def test_whatever_goes_wrong_all_other_answers_are_those_of_a_single_run(config, tmp_path, monkeypatch):
     monkeypatch.setenv("TRACKING3D_PLUGINS", "")  # is put back at the end
-    plain, faults, single = demonstrate(config, tmp_path, videos=3, frames=5, workers=(2,), report=False)
+    asked = Asked(videos=3, frames=5, size=(200, 160), workers=(2,), faults=3, report=False)
+    said = []
+    plain, faults, single = demonstrate(config, tmp_path, asked, said.append)
     assert plain.failed == {} and plain.finished == 3
     assert set(faults.failed) == {DAMAGED, ABORTING} and faults.finished == 4
-    assert {"clip_0000", FILLING, DAMAGED, ABORTING} <= set(faults.again)
+    assert {"clip_0001", FILLING, DAMAGED, ABORTING} <= set(faults.again)
     assert "signal 6" in faults.failed[ABORTING]
     assert faults.different < 1e-9 and single.different < 1e-9
+    assert single.finished == 3 and any("3 of 3 videos" in line for line in said)
 
 
 @pytest.mark.parametrize("address", [None, "local"])
@@ -106,6 +112,36 @@ def test_evaluate_gives_the_same_figures_on_both_engines(tmp_path, workers_find_
         ]
 
     assert scores("here", None) == scores("ray", "local")
+
+
+def test_parts_of_a_long_video_are_tracked_by_all_workers_and_joined(tmp_path):
+    clip = synthesize(SyntheticSpec(frames=50, degrees_per_frame=4, size=(200, 160)))
+    for index, (image, mask) in enumerate(zip(clip.images, clip.masks, strict=True)):
+        for kind, write, content in (("frames", write_image, image), ("masks", write_mask, mask)):
+            (tmp_path / kind).mkdir(exist_ok=True)
+            write(tmp_path / kind / f"{index:03d}.png", content)
+    small = ["window.size=64", "object.frequency=3", "object.texture_size=64", "camera.fov=45"]
+    tracker = {"name": "precomputed", "path": str(tmp_path / "masks")}
+    job = VideoJob(
+        "long", str(tmp_path / "frames"), load_config(overrides=small, tracker=tracker), split="25f"
+    )
+    told = []
+    progress = run_batch(
+        [job], str(tmp_path / "out"), ProcessEngine(2), report=False, listener=told.append, retries=0
+    )
+    assert progress.finished == 1
+    began = {
+        one.about["step"]: one.about["worker"]
+        for one in told
+        if one.about.get("attempt") and one.about.get("step")
+    }
+    assert began["part 1 of 2"] != began["part 2 of 2"]
+    assert began["second look 1 of 2"] != began["second look 2 of 2"]
+    run = RunReader(tmp_path / "out/long")
+    assert run.state == "finished" and len(run.frames) == 50 and run.description["split"]["joints"]
+    R = np.stack([one.T_cam_obj[:3, :3] for one in run.frames])
+    assert aligned_rotation_errors(R, clip.T_cam_obj[:, :3, :3]).mean() < 3
+    assert not (tmp_path / "out/long/parts").exists() and not (tmp_path / "out/.work").exists()
 
 
 def test_a_hundred_tasks_leave_nothing_behind():

@@ -98,6 +98,14 @@ def test_a_video_that_fails_once_goes_on_where_it_was(batch, videos, recorded, t
     assert row["attempts"] == "2"
 
 
+def test_what_a_full_disk_has_left_of_a_note_costs_no_video(batch, videos, recorded, tmp_path):
+    recorded.faults["one"] = [OutputError("The disk is full.")]
+    assert batch(videos, retries=0)[0].failed == 1
+    [note] = (tmp_path / "out/.work").glob("*/attempts")
+    note.write_text("")
+    assert batch(videos)[0].finished == 2
+
+
 def test_a_video_that_never_succeeds_is_listed_with_its_reason_and_costs_nothing_else(
     batch, videos, tmp_path
 ):

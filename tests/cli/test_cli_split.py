@@ -9,7 +9,7 @@ import pytest
 
 from tracking3d.benchmark.split_benefit import Measured, looped
 from tracking3d.errors import OutputError
-from tracking3d.splitting.split_run import Ended
+from tracking3d.splitting.long_video import Ended
 
 BOX = ("--box", "20,10,20,20")
 

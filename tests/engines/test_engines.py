@@ -70,6 +70,22 @@ def test_a_task_may_lead_to_more(engine):
     assert ended[2].value == 81
 
 
+def test_what_goes_on_is_begun_before_what_has_not_begun():
+    begun = []
+
+    def listener(event):
+        if isinstance(event, Began):
+            begun.append(event.number)
+
+    def further(ended):
+        return [Task(number, tasks.square, (1,)) for number in (10, 11) if ended.number == 1]
+
+    map_tasks(
+        InThisProcess(), [Task(n, tasks.square, (n,)) for n in (1, 2)], listener=listener, further=further
+    )
+    assert begun == [1, 10, 11, 2]
+
+
 def test_what_stops_the_loop_lets_tasks_keep_what_is_done(tmp_path):
     note = tmp_path / "note"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,7 +17,9 @@ from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.online.belief import Belief
 from tracking3d.estimation.online.final_refinement import keyframe_cost
 from tracking3d.frames import Prompt
+from tracking3d.geometry.camera import Camera
 from tracking3d.parts import build_encoder
+from tracking3d.splitting import joining
 from tracking3d.splitting.agreement import (
     DisagreementError,
     by_lens,
@@ -265,3 +268,20 @@ def test_poses_that_are_no_numbers_are_left_out():
     broken = poses.copy()
     broken[3] = np.nan
     assert len(common_poses(records_of(range(20), poses), records_of(range(20), broken))[0]) == 19
+
+
+def test_lenses_that_differ_are_named_where_parts_cannot_be_joined(monkeypatch):
+    cameras = [Camera.from_fov(64, 48, fov) for fov in (45.0, 16.0)]
+    told = [SimpleNamespace(camera=camera) for camera in cameras]
+
+    def refuse(*given):
+        raise DisagreementError("parts 1 and 2: they tell of two objects")
+
+    monkeypatch.setattr(joining, "_joined_by", refuse)
+    monkeypatch.setattr(joining, "build_encoder", lambda config: None)
+    monkeypatch.setattr(joining, "_read", lambda *given: ([], told))
+    with pytest.raises(DisagreementError, match=r"two objects; .* 16 to 45 degrees.*--fov"):
+        joining.joined_parts(None, load_config(), None, Path())
+    monkeypatch.setattr(joining, "_read", lambda *given: ([], [told[0], told[0]]))
+    with pytest.raises(DisagreementError, match=r"two objects$"):
+        joining.joined_parts(None, load_config(), None, Path())

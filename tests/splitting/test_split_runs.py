@@ -17,11 +17,12 @@ from tracking3d.results import layout
 from tracking3d.results.files import write_image, write_mask
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.run_reader import RunReader
-from tracking3d.splitting import split_run
+from tracking3d.splitting import beginning, ending, steps
 from tracking3d.splitting.agreement import DisagreementError
+from tracking3d.splitting.long_video import Ended
 from tracking3d.splitting.part_runs import Given
 from tracking3d.splitting.plan import PARTS
-from tracking3d.splitting.split_run import Ended, record_in_parts
+from tracking3d.splitting.split_run import record_in_parts
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, degrade_masks, synthesize
 from tracking3d.video import open_source
 
@@ -73,7 +74,7 @@ def test_what_cannot_be_joined_is_not_split(override, short, tmp_path):
 
 def test_a_video_shorter_than_a_part_is_one_run(short, tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr(split_run, "record", lambda *given, **named: asked.append(named))
+    monkeypatch.setattr(beginning, "record", lambda *given, **named: asked.append(named))
     ended = record_in_parts(
         short, settings(short), tmp_path / "run", Given(), length="1000f", selection="0:40"
     )
@@ -89,14 +90,14 @@ def test_parts_that_cannot_be_joined_are_finished_each_by_itself(short, tmp_path
     def track(tell, job):
         done.append((job.folder.name, job.first_pass_only, job.selection))
         if not job.first_pass_only:
-            monkeypatch.setattr(split_run, "is_finished", lambda folder: True)
+            monkeypatch.setattr(beginning, "is_finished", lambda folder: True)
 
     def refuse(*given):
         raise DisagreementError("parts 1 and 2: they tell of two objects")
 
-    monkeypatch.setattr(split_run, "track_part", track)
-    monkeypatch.setattr(split_run, "joined_parts", refuse)
-    monkeypatch.setattr(split_run, "_begun_elsewhere", lambda *given: [])
+    monkeypatch.setattr(steps, "track_part", track)
+    monkeypatch.setattr(ending, "joined_parts", refuse)
+    monkeypatch.setattr(ending, "_begun_elsewhere", lambda tracked: None)
     run = tmp_path / "run"
     ended = record_in_parts(short, settings(short), run, Given(), length="25f", workers=1, selection="2:50")
     assert ended == Ended((run / PARTS / "part_0", run / PARTS / "part_1"), 2, ended.reason)
@@ -118,7 +119,7 @@ def test_parts_of_other_settings_are_not_gone_on_with(short, tmp_path, monkeypat
     def fail(tell, job):
         raise OutputError("The disk is full.")
 
-    monkeypatch.setattr(split_run, "track_part", fail)
+    monkeypatch.setattr(steps, "track_part", fail)
     run = tmp_path / "run"
     with pytest.raises(OutputError):
         record_in_parts(short, settings(short), run, Given(), length="25f", workers=1)
@@ -137,8 +138,7 @@ def test_a_folder_of_somebody_s_parts_is_left_alone(short, tmp_path, monkeypatch
     own = tmp_path / "run" / PARTS / "mine.txt"
     own.parent.mkdir(parents=True)
     own.write_text("mine")
-    monkeypatch.setattr(split_run, "record", lambda *given, **named: None)
-    monkeypatch.setattr(split_run, "look_ahead", None, raising=False)
+    monkeypatch.setattr(beginning, "record", lambda *given, **named: None)
     record_in_parts(short, settings(short), tmp_path / "run", Given(), length="1000f", overwrite=True)
     assert own.read_text() == "mine"
 

@@ -7,6 +7,7 @@ answer with that of a single run.
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 import signal
@@ -15,7 +16,6 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -23,6 +23,7 @@ import numpy as np
 from tracking3d.batch import fault_plugins
 from tracking3d.batch.folder import read_failures
 from tracking3d.batch.load import Load, measured_load
+from tracking3d.batch.one_video import WORK
 from tracking3d.batch.running import Happening, run_batch
 from tracking3d.batch.video_job import VideoJob
 from tracking3d.config.models import PipelineConfig
@@ -37,10 +38,39 @@ from tracking3d.video import VideoWriter, open_source
 
 DISTINCT = 20
 """Clips that differ; of more videos every such clip is there several times."""
+QUICK = ("object.frequency=4", f"camera.fov={SyntheticSpec().fov:g}")
+"""Settings with which most of the time is not the solver's, who otherwise looks for shape and lens first of all."""
+SINGLE = 3
+"""Clips that are tracked without a batch, too."""
 DAMAGED, ABORTING, FILLING = "damaged", "aborting", "filling"
 _SETTLED = 0.25  # share of a batch after which nothing may grow any more
 
 Said = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a demonstration is of.
+
+    Attributes:
+        videos: How many clips.
+        frames: How many frames each has.
+        size: Width and height of the frames.
+        workers: Numbers of workers, a pass each.
+        address: Of a Ray cluster; processes of this machine if None.
+        faults: How many of the clips to go through once more, with the most workers and with faults; none if 0.
+        report: Whether runs get reports, as they do by default.
+        minutes: After so long no further video is begun.
+    """
+
+    videos: int = 200
+    frames: int = 10
+    size: tuple[int, int] = (320, 240)
+    workers: Sequence[int] = (1, 2)
+    address: str | None = None
+    faults: int = 60
+    report: bool = True
+    minutes: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -58,6 +88,7 @@ class Pass:
         again: Videos that were tried again.
         load: The most that it took of the machine.
         growth: How much more that was in the last quarter than after the first, by kind.
+        stopped: Whether it was ended early.
     """
 
     label: str
@@ -70,51 +101,56 @@ class Pass:
     again: tuple[str, ...]
     load: dict[str, float] = field(default_factory=dict)
     growth: dict[str, float] = field(default_factory=dict)
+    stopped: bool = False
 
 
 def demonstrate(
-    config: PipelineConfig,
-    folder: Path,
-    videos: int = 200,
-    frames: int = 20,
-    workers: Sequence[int] = (1, 2),
-    address: str | None = None,
-    faults: bool = True,
-    report: bool = True,
-    said: Said = lambda text: None,
+    config: PipelineConfig, folder: Path, asked: Asked, said: Said = lambda text: None
 ) -> list[Pass]:
-    """Track clips with each number of workers, then with faults, then one by itself.
+    """Track clips with each number of workers, then with faults, then some by themselves.
+
+    After Ctrl-C, or when the time is over, what there is until then is the answer.
 
     Args:
         config: The pipeline.
         folder: Gets clips and results; passes that are there are replaced.
-        videos: How many clips.
-        frames: How many frames each has.
-        workers: Numbers of workers.
-        address: Of a Ray cluster; processes of this machine if None.
-        faults: Whether to go through them once more, with the most workers and with faults.
-        report: Whether runs get reports, as they do by default.
-        said: Is told what goes on.
+        asked: Of how many clips, and how.
+        said: Is told what goes on, and what each pass came to.
 
     Returns:
-        A pass for each number of workers, with ``faults`` one more, and the single run of one clip at the end.
+        A pass for each number of workers, with faults one more, and the single runs of some clips at the end.
     """
-    jobs = make_clips(folder / "clips", videos, frames, config)
+    until = time.monotonic() + 60 * asked.minutes
+    said(f"{asked.videos} clips of {asked.frames} frames")
+    jobs = make_clips(folder / "clips", asked.videos, asked.frames, config, asked.size)
+    reference = folder / f"workers_{asked.workers[0]}"
     passes: list[Pass] = []
-    for count in workers:
-        said(f"{videos} videos, {count} at a time")
-        passes.append(_pass(jobs, folder, f"workers_{count}", count, address, report))
-    reference = folder / f"workers_{workers[0]}"
-    if faults:
-        said("once more, with faults")
-        damaged = _with_faults(jobs, folder, address is None)
-        passes.append(_pass(damaged, folder, "faults", max(workers), address, report, kill=jobs[0].name))
-    said("one clip by itself")
-    passes.append(_single(jobs[0], folder))
-    return [replace(one, different=_difference(reference, folder / one.label, jobs)) for one in passes]
+
+    def take(one: Pass) -> bool:
+        passes.append(replace(one, different=_difference(reference, folder / one.label, jobs)))
+        said(in_a_line(passes[-1]))
+        return not one.stopped
+
+    try:
+        for count in asked.workers:
+            pass_ = _Pass(folder, f"workers_{count}", count, asked, until, said)
+            if not take(pass_.through(jobs)):
+                return passes
+        if asked.faults:
+            some = jobs[: asked.faults]
+            faulty = _with_faults(some, folder, asked.address is None)
+            pass_ = _Pass(folder, "faults", max(asked.workers), asked, until, said)
+            if not take(pass_.through(faulty, kill=some[len(some) // 2].name)):
+                return passes
+        take(_single(jobs[:SINGLE], folder))
+    except KeyboardInterrupt:
+        said("stopped")
+    return passes
 
 
-def make_clips(folder: Path, videos: int, frames: int, config: PipelineConfig) -> list[VideoJob]:
+def make_clips(
+    folder: Path, videos: int, frames: int, config: PipelineConfig, size: tuple[int, int] = (200, 160)
+) -> list[VideoJob]:
     """Make clips of solids that turn, unless they are there, and say where the object is in each."""
     folder.mkdir(parents=True, exist_ok=True)
     jobs = []
@@ -124,7 +160,8 @@ def make_clips(folder: Path, videos: int, frames: int, config: PipelineConfig) -
         like = folder / f"clip_{number % DISTINCT:04d}"
         if not box.is_file():
             if number < DISTINCT:
-                box.write_text(_write_clip(file, frames, seed=number))
+                spec = SyntheticSpec(frames=frames, size=size, supersample=1, seed=number)
+                box.write_text(_write_clip(file, spec))
             else:
                 shutil.copyfile(like.with_suffix(".mp4"), file)
                 shutil.copyfile(like.with_suffix(".box"), box)
@@ -132,8 +169,8 @@ def make_clips(folder: Path, videos: int, frames: int, config: PipelineConfig) -
     return jobs
 
 
-def _write_clip(file: Path, frames: int, seed: int) -> str:
-    clip = synthesize(SyntheticSpec(frames=frames, supersample=1, seed=seed))
+def _write_clip(file: Path, spec: SyntheticSpec) -> str:
+    clip = synthesize(spec)
     with VideoWriter(file, 10, clip.images[0].shape[:2]) as writer:
         for image in clip.images:
             writer.write(image)
@@ -166,60 +203,103 @@ def _with_faults(jobs: Sequence[VideoJob], folder: Path, disk: bool) -> list[Vid
     return [*jobs, *more]
 
 
-def _pass(
-    jobs: Sequence[VideoJob],
-    folder: Path,
-    label: str,
-    workers: int,
-    address: str | None,
-    report: bool,
-    kill: str = "",
-) -> Pass:
-    out = folder / label
-    shutil.rmtree(out, ignore_errors=True)
-    again: list[str] = []
-    killed = False
+@dataclass(frozen=True)
+class _Pass:
+    """A pass that is to be made."""
 
-    def listener(happening: Happening) -> None:
-        nonlocal killed
-        if happening.event == "again":
-            again.append(happening.video)
-        process = happening.about.get("process")
-        if happening.video == kill and process and happening.about.get("frames") and not killed:
-            killed = True
-            with suppress(OSError):
-                os.kill(process, signal.SIGKILL)
+    folder: Path
+    label: str
+    workers: int
+    asked: Asked
+    until: float
+    said: Said
 
-    with open_engine(address, workers, Needs()) as engine, measured_load() as samples:
-        started = time.monotonic()
-        progress = run_batch(
-            jobs, str(out.absolute()), engine, report=report, listener=listener, retries=2, command=label
+    def through(self, jobs: Sequence[VideoJob], kill: str = "") -> Pass:
+        """Go through the clips; the worker that is at ``kill`` is ended by a signal, once."""
+        out = self.folder / self.label
+        shutil.rmtree(out, ignore_errors=True)
+        again: list[str] = []
+        killed, stopped = False, False
+        started, said = time.monotonic(), 0.0
+
+        def listener(happening: Happening) -> None:
+            nonlocal killed, said
+            about, progress = happening.about, happening.progress
+            if happening.event == "again":
+                again.append(happening.video)
+            if happening.video == kill and about.get("process") and about.get("frames") and not killed:
+                killed = True
+                with suppress(OSError):
+                    os.kill(about["process"], signal.SIGKILL)
+            if happening.event == "finished" and progress.finished >= said + len(jobs) / 10:
+                said = progress.finished
+                seconds = time.monotonic() - started
+                self.said(
+                    f"{self.label}: {progress.finished} of {len(jobs)} videos in {seconds:.0f} s, "
+                    f"{60 * progress.finished / seconds:.1f} a minute"
+                )
+            if time.monotonic() > self.until:
+                raise KeyboardInterrupt
+
+        unfinished = out / WORK
+        with (
+            open_engine(self.asked.address, self.workers, Needs()) as engine,
+            measured_load(unfinished=unfinished) as samples,
+        ):
+            started = time.monotonic()
+            try:
+                run_batch(
+                    jobs,
+                    str(out.absolute()),
+                    engine,
+                    report=self.asked.report,
+                    listener=listener,
+                    retries=2,
+                    command=self.label,
+                )
+            except KeyboardInterrupt:
+                stopped = True
+            seconds = time.monotonic() - started
+        whole = [out / job.name for job in jobs if (out / job.name).is_dir()]
+        frames = sum(len(RunReader(one).frames) for one in whole)
+        failed = {one.run: one.reason for one in read_failures(str(out.absolute()))}
+        return Pass(
+            self.label,
+            self.workers,
+            seconds,
+            len(whole),
+            failed,
+            frames / seconds,
+            0.0,
+            tuple(again),
+            _most(samples),
+            _growth(samples),
+            stopped,
         )
-        seconds = time.monotonic() - started
-    failed = {one.run: one.reason for one in read_failures(str(out.absolute()))}
-    frames = sum(len(RunReader(out / job.name).frames) for job in jobs if (out / job.name).is_dir())
-    return Pass(
-        label,
-        workers,
-        seconds,
-        progress.finished,
-        failed,
-        frames / seconds,
-        0.0,
-        tuple(again),
-        _most(samples),
-        _growth(samples),
-    )
 
 
-def _single(job: VideoJob, folder: Path) -> Pass:
-    """One clip without any batch, in this process."""
-    out = folder / "single" / job.name
-    shutil.rmtree(out, ignore_errors=True)
-    started = time.monotonic()
-    record(open_source(job.video), job.config, out, box=parse_box(job.box[0]))
+def _single(jobs: Sequence[VideoJob], folder: Path) -> Pass:
+    """Some clips without any batch, in this process."""
+    shutil.rmtree(folder / "single", ignore_errors=True)
+    started, frames = time.monotonic(), 0
+    for job in jobs:
+        out = folder / "single" / job.name
+        record(open_source(job.video), job.config, out, box=parse_box(job.box[0]))
+        frames += len(RunReader(out).frames)
     seconds = time.monotonic() - started
-    return Pass("single", 1, seconds, 1, {}, len(RunReader(out).frames) / seconds, 0.0, ())
+    return Pass("single", 1, seconds, len(jobs), {}, frames / seconds, 0.0, ())
+
+
+def in_a_line(one: Pass) -> str:
+    """What a pass came to."""
+    told = [
+        f"{one.label}: {one.finished} videos in {one.seconds:.0f} s{' (stopped early)' if one.stopped else ''}",
+        f"{60 * one.finished / one.seconds:.1f} a minute",
+        f"poses differ by {one.different:.1e} at most",
+        f"{len(one.failed)} failed",
+        f"{len(one.again)} tried again",
+    ]
+    return ", ".join(told)
 
 
 def _difference(reference: Path, other: Path, jobs: Sequence[VideoJob]) -> float:
@@ -260,6 +340,8 @@ def to_json(passes: Sequence[Pass]) -> str:
 
 
 def speed_up(passes: Sequence[Pass]) -> float | None:
-    """How many times as fast the most workers were as the first number of them; None of one pass."""
-    plain: list[Any] = [one for one in passes if one.label.startswith("workers_")]
-    return plain[0].seconds / plain[-1].seconds if len(plain) > 1 else None
+    """How many times as many videos a second the last number of workers finished as the first; None of one pass."""
+    plain = [one for one in passes if one.label.startswith("workers_") and one.finished]
+    if len(plain) < 2:
+        return None
+    return (plain[-1].finished / plain[-1].seconds) / (plain[0].finished / plain[0].seconds)

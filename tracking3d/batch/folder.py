@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from tracking3d.batch.places import joined, local, read, write
+from tracking3d.batch.places import joined, read, write
 from tracking3d.batch.summary import COLUMNS
 from tracking3d.errors import InputError
 
@@ -150,13 +150,6 @@ def read_results(out: str) -> list[dict[str, str]]:
     """The rows of the table of results, as texts."""
     content = read(joined(out, RESULTS)) or b""
     return list(csv.DictReader(io.StringIO(content.decode("utf-8", "replace"))))
-
-
-def relative(out: str, place: str) -> str:
-    """A place within the folder of the batch as the tables have it."""
-    base = local(out)
-    start = f"{base}/" if base is not None else f"{out.rstrip('/')}/"
-    return place.removeprefix(start)
 
 
 def _csv(columns: Iterable[str], rows: Iterable[Mapping[str, Any]]) -> bytes:

@@ -32,7 +32,7 @@ NO_PROMPT = (
 )
 
 
-def list_jobs(place: str, configure: Configure) -> list[VideoJob]:
+def list_jobs(place: str, configure: Configure, split: str = "") -> list[VideoJob]:
     """The videos of a folder, a pattern or a table.
 
     Rows of one video with the same settings are one job with several objects. What is wrong with one video is its
@@ -41,6 +41,7 @@ def list_jobs(place: str, configure: Configure) -> list[VideoJob]:
     Args:
         place: What the user named.
         configure: Makes the pipeline of a row.
+        split: Length of the parts that long videos are cut into, where a row does not say; empty for none.
 
     Raises:
         InputError: If there is nothing, a table cannot be read, or two videos would have one name.
@@ -55,8 +56,7 @@ def list_jobs(place: str, configure: Configure) -> list[VideoJob]:
         rows = [(_absolute(row, "."), size) for row, size in videos_of(place)]
     rows = _together(rows)
     names = _names([row for row, _ in rows], root)
-    jobs = [_job(row, name, size, configure) for (row, size), name in zip(rows, names, strict=True)]
-    return jobs
+    return [_job(row, name, size, configure, split) for (row, size), name in zip(rows, names, strict=True)]
 
 
 def dataset_jobs(dataset: Dataset, config: PipelineConfig) -> list[VideoJob]:
@@ -168,7 +168,7 @@ def _within(video: str, root: str) -> str:
     return "/".join(part.lstrip(".") or "_" for part in path.parts) or "video"
 
 
-def _job(row: Row, name: str, size: int, configure: Configure) -> VideoJob:
+def _job(row: Row, name: str, size: int, configure: Configure, split: str) -> VideoJob:
     fault = "" if row.has_prompt else NO_PROMPT
     try:
         config = configure(row)
@@ -188,4 +188,5 @@ def _job(row: Row, name: str, size: int, configure: Configure) -> VideoJob:
         row.frames,
         size=size,
         fault="" if fault == NO_PROMPT and not needs_prompt(config) else fault,
+        split=row.split or split,
     )

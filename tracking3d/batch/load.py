@@ -26,6 +26,7 @@ class Load:
         own_descriptors: Of this process.
         processes: How many there are.
         shared_memory: Megabytes of files in the system's folder for shared memory, of all programs.
+        unfinished: Megabytes on disk of what is not whole yet.
     """
 
     memory: float
@@ -34,17 +35,23 @@ class Load:
     own_descriptors: int
     processes: int
     shared_memory: float
+    unfinished: float = 0.0
 
 
 @contextmanager
-def measured_load(every: float = 1.0) -> Iterator[list[Load]]:
-    """Measure again and again while something goes on; the list grows, and stays empty where there is no ``/proc``."""
+def measured_load(every: float = 1.0, unfinished: Path | None = None) -> Iterator[list[Load]]:
+    """Measure again and again while something goes on; the list grows, and stays empty where there is no ``/proc``.
+
+    Args:
+        every: Seconds between two samples.
+        unfinished: Folder of what is not whole yet, if its size is wanted.
+    """
     samples: list[Load] = []
     over = threading.Event()
 
     def sample() -> None:
         while not over.wait(every):
-            if (load := load_now()) is not None:
+            if (load := load_now(unfinished)) is not None:
                 samples.append(load)
 
     thread = threading.Thread(target=sample, daemon=True)
@@ -56,7 +63,7 @@ def measured_load(every: float = 1.0) -> Iterator[list[Load]]:
         thread.join()
 
 
-def load_now() -> Load | None:
+def load_now(unfinished: Path | None = None) -> Load | None:
     """What this process and those that it began take; None where the system does not tell."""
     if not (_PROCESSES / "self/stat").is_file():
         return None
@@ -69,7 +76,8 @@ def load_now() -> Load | None:
         sum(descriptors.values()),
         descriptors[own],
         len(family),
-        _shared_memory(),
+        _megabytes_in(_SHARED_MEMORY),
+        _megabytes_in(unfinished) if unfinished is not None else 0.0,
     )
 
 
@@ -100,10 +108,10 @@ def _descriptors(number: int) -> int:
     return 0
 
 
-def _shared_memory() -> float:
+def _megabytes_in(folder: Path) -> float:
     total = 0.0
     with suppress(OSError):
-        for file in _SHARED_MEMORY.rglob("*"):
+        for file in folder.rglob("*"):
             with suppress(OSError):
                 total += 1e-6 * 512 * file.stat().st_blocks
     return total

@@ -7,7 +7,8 @@ import os
 import shutil
 import tempfile
 import time
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ from tracking3d.prompts import parse_box
 from tracking3d.recording import record, record_objects
 from tracking3d.report.several import write_reports
 from tracking3d.results import layout
-from tracking3d.results.files import writing
+from tracking3d.results.files import write_atomic, writing
 from tracking3d.results.records import FrameRecord
 from tracking3d.video import open_source
 from tracking3d.video.image_sequence import ImageSequence
@@ -37,7 +38,10 @@ from tracking3d.video.source import FrameSource
 WORK = ".work"
 """In the folder of a batch: what is not whole yet, and what a video that is tried again goes on from."""
 LOGS = "logs"
+RUN = "run"
+"""In the folder that a video is worked on in: what becomes its run folder."""
 
+_ATTEMPTS = "attempts"
 _TELL = 1.0  # seconds between two words about how far it is
 
 
@@ -85,24 +89,60 @@ def track_video(
     Raises:
         Tracking3dError: If it cannot be tracked; what is finished is kept for another time.
     """
+    with worked_on(job, out, networks) as work:
+        attempts = counted(work)
+        run = work / RUN
+        _track(tell, fetched(job, work / "source"), run, command)
+        return put_away(job, out, work, layout.runs_in(run), report, attempts)
+
+
+@contextmanager
+def worked_on(job: VideoJob, out: str, networks: tuple[SharedNetwork, ...] = ()) -> Iterator[Path]:
+    """The folder that a video is worked on in; what went wrong within leaves there what can be gone on from.
+
+    Args:
+        job: The video.
+        out: The folder of the batch.
+        networks: What the machine may lack.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
     work = work_folder(out, job)
     with writing(work):
         work.mkdir(parents=True, exist_ok=True)
-        attempts = _counted(work / "attempts")
     keep_networks(networks)
-    run = work / "run"
     try:
-        _track(tell, _fetched(job, work / "source"), run, command)
-        if report:
-            write_reports(layout.runs_in(run))
-        told = write_marker(run, job, attempts)
-        _put_into_place(run, joined(out, job.name))
-    except InputError:
-        if not run.exists():  # nothing was begun that could go on
+        yield work
+    except BaseException as error:
+        send_log(out, job)
+        if isinstance(error, InputError) and not (work / RUN).exists():  # nothing was begun that could go on
             _forget(work)
         raise
-    finally:
-        _send_log(out, job)
+
+
+def put_away(
+    job: VideoJob, out: str, work: Path, runs: Sequence[Path], report: bool, attempts: int, note: str = ""
+) -> dict[str, Any]:
+    """Put what is whole into its place; see `tracking3d.batch.summary.write_marker` for what is returned.
+
+    Args:
+        job: The video.
+        out: The folder of the batch.
+        work: The folder that it was worked on in, which is removed.
+        runs: The run folders in there.
+        report: Whether to write a report of each.
+        attempts: How often the video was begun.
+        note: What else is to be said of it.
+
+    Raises:
+        OutputError: If something cannot be written.
+    """
+    if report:
+        write_reports(runs)
+    told = write_marker(work / RUN, job, attempts, runs, note)
+    _put_into_place(work / RUN, joined(out, job.name))
+    send_log(out, job)
     _forget(work)
     return told
 
@@ -111,16 +151,7 @@ def _track(tell: Tell, job: VideoJob, run: Path, command: str) -> None:
     source = _source(job)
     passes = 2 if job.config.solver.final_refine else 1
     whole = source.count and source.count * job.objects * passes
-    answers, last, process = 0, 0.0, os.getpid()
-
-    def listener(frame: FrameRecord | SkippedFrame) -> None:
-        nonlocal answers, last
-        answers += 1
-        if time.monotonic() - last > _TELL:
-            last = time.monotonic()
-            tell({"frames": answers, "of": whole, "process": process})
-
-    tell({"frames": 0, "of": whole, "process": process})
+    listener = counting(tell, whole)
     boxes: list[Any] = [parse_box(text) for text in job.box]
     masks: list[Any] = [Path(file) for file in job.mask]
     points: list[Any] = [parse_points(text) for text in job.points]
@@ -139,6 +170,21 @@ def _track(tell: Tell, job: VideoJob, run: Path, command: str) -> None:
         record(source, job.config, run, box=box, mask=mask, points=point, **about)
 
 
+def counting(tell: Tell, of: int | None, **about: Any) -> Callable[[FrameRecord | SkippedFrame], None]:
+    """A listener that tells how many answers there are, now and then, and at once that there are none."""
+    answers, last, process = 0, 0.0, os.getpid()
+
+    def listener(frame: FrameRecord | SkippedFrame) -> None:
+        nonlocal answers, last
+        answers += 1
+        if time.monotonic() - last > _TELL:
+            last = time.monotonic()
+            tell({"frames": answers, "of": of, "process": process, **about})
+
+    tell({"frames": 0, "of": of, "process": process, **about})
+    return listener
+
+
 def _source(job: VideoJob) -> FrameSource:
     if job.sequence is None:
         return open_source(job.video, job.frames)
@@ -147,7 +193,7 @@ def _source(job: VideoJob) -> FrameSource:
     return ImageSequence(name, frames, range(len(frames)))
 
 
-def _fetched(job: VideoJob, folder: Path) -> VideoJob:
+def fetched(job: VideoJob, folder: Path) -> VideoJob:
     """The same job with files that are elsewhere copied to this machine."""
 
     def here(place: str, number: int) -> str:
@@ -188,19 +234,27 @@ def _put_into_place(run: Path, place: str) -> None:
         run.rename(target)
 
 
-def _send_log(out: str, job: VideoJob) -> None:
-    """Keep what was printed beside the results where these are elsewhere."""
+def send_log(out: str, job: VideoJob) -> bool:
+    """Keep what was printed beside the results where these are elsewhere; whether this machine has it."""
     log = log_file(out, job)
     if local(out) is None and log.is_file():
         with suppress(OutputError):  # the results are what counts
             write(joined(out, LOGS, f"{job.name}.log"), log.read_bytes())
+    return log.is_file()
 
 
-def _counted(file: Path) -> int:
-    """How often this has been called for the file."""
-    times = int(file.read_text()) + 1 if file.is_file() else 1
-    file.write_text(str(times))
+def counted(work: Path) -> int:
+    """How often a video has been begun, with this time."""
+    times = begun_before(work) + 1
+    write_atomic(work / _ATTEMPTS, str(times).encode())
     return times
+
+
+def begun_before(work: Path) -> int:
+    """How often a video has been begun; what a full disk has left of the note counts as nothing."""
+    with suppress(OSError, ValueError):
+        return int((work / _ATTEMPTS).read_text())
+    return 0
 
 
 def _forget(work: Path) -> None:

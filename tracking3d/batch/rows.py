@@ -39,6 +39,10 @@ def _text(value: Any) -> Any:
     return _numbers(value) if isinstance(value, list | tuple) else value
 
 
+def _word(value: Any) -> Any:
+    return f"{value:g}" if isinstance(value, int | float) else value
+
+
 def _numbers(values: Any) -> Any:
     return ",".join(f"{one:.17g}" if isinstance(one, float) else str(one) for one in values)
 
@@ -64,6 +68,7 @@ class Row(Section):
     features: str | None = None
     preset: str | None = None
     quality: str | None = None
+    split: Annotated[str | None, BeforeValidator(_word)] = None
     settings: Annotated[tuple[str, ...], BeforeValidator(_settings)] = ()
 
     @property

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
-from tracking3d.batch.folder import Failure, Progress, relative, write_progress, write_tables
+from tracking3d.batch.folder import Failure, Progress, write_progress, write_tables
 from tracking3d.batch.networks import share_networks
-from tracking3d.batch.one_video import LOGS, WORK, log_file, track_video
+from tracking3d.batch.one_video import LOGS, WORK, send_log
 from tracking3d.batch.overview import write_overview
 from tracking3d.batch.places import joined, local, read_many
 from tracking3d.batch.summary import MARKER, read_marker
+from tracking3d.batch.tasks import Tasks, is_whole
 from tracking3d.batch.video_job import VideoJob
 from tracking3d.engines.mapping import PAUSE, map_tasks
 from tracking3d.engines.protocol import Began, Ended, Engine, Event, Task, Told
@@ -68,6 +70,8 @@ class Batch:
         self, out: str, jobs: Sequence[VideoJob], engine: Engine, report: bool, listener: Listener
     ) -> None:
         self._out, self._jobs, self._report, self._listener = out, jobs, report, listener
+        self._tasks: Tasks | None = None
+        self._shares: defaultdict[str, float] = defaultdict(float)  # of long videos, what is done
         self._rows: dict[str, list[Mapping[str, Any]]] = {}
         self._pictures: dict[str, str] = {}
         self._workers: dict[int, str] = {}
@@ -102,12 +106,20 @@ class Batch:
                 self._say("failed", job, {"reason": failure.reason, "attempts": 0, "crashed": False})
         return left
 
+    def tasks(self, left: Sequence[int], tasks: Tasks) -> list[Task]:
+        """The first tasks of all videos that are still to be done, large ones first."""
+        self._tasks = tasks
+        return [tasks.first(number) for number in sorted(left, key=lambda number: -self._jobs[number].size)]
+
     def told(self, event: Event) -> None:
         """Take in what an engine tells."""
-        job = self._jobs[event.number]
+        assert self._tasks is not None
+        job = self._jobs[self._tasks.video(event.number)]
         if isinstance(event, Began):
             self._workers[event.number] = event.worker
             about: dict[str, Any] = {"frames": 0, "of": None, "attempt": event.attempt}
+            if label := self._tasks.label(event.number):
+                about["step"] = label
             self._running[event.worker] = {"video": job.name, "since": time.time(), **about}
             self._say("began", job, {"worker": event.worker, **about})
         elif isinstance(event, Told):
@@ -171,8 +183,14 @@ class Batch:
         return f"{place} holds {what}; give another --out, or --overwrite." if what else ""
 
     def _end(self, job: VideoJob, ended: Ended) -> None:
-        self._running.pop(self._workers.pop(ended.number, ""), None)
+        last = self._running.pop(self._workers.pop(ended.number, ""), {})
         fault = ended.fault
+        if fault is None and not is_whole(ended):  # a step of a long video
+            self._shares[job.name] += last.get("share", 0.0)
+            return
+        self._shares.pop(job.name, None)
+        if job.name in self.failures:  # another part of it came to nothing before
+            return
         if fault is None:
             self._take(job, ended.value)
             self._count()
@@ -180,8 +198,10 @@ class Batch:
             return
         about = {"reason": fault.reason, "attempts": ended.attempts, "crashed": fault.crashed}
         if not ended.again:
-            log = log_file(self._out, job)
-            told = relative(self._out, str(log)) if log.is_file() else ""
+            # A worker that could say why it failed has sent its log; what one that crashed has printed may be here.
+            elsewhere = local(self._out) is None and not fault.crashed
+            has_log = send_log(self._out, job) or elsewhere
+            told = f"{LOGS}/{job.name}.log" if has_log else ""
             self.failures[job.name] = Failure(
                 job.name, job.video, fault.reason, ended.attempts, fault.crashed, told
             )
@@ -196,8 +216,9 @@ class Batch:
     def _count(self, state: str = "running") -> None:
         finished, failed = len(self._rows), len(self.failures)
         done = finished + failed - self.progress.before - self._refused
-        parts = (min(1.0, one["frames"] / one["of"]) for one in self._running.values() if one.get("of"))
-        share, left = done + sum(parts), self.progress.total - self.progress.before - self._refused
+        parts = (min(1.0, _share(one)) for one in self._running.values())
+        share = done + sum(parts) + sum(min(1.0, one) for one in self._shares.values())
+        left = self.progress.total - self.progress.before - self._refused
         spent = time.monotonic() - self._clock
         to_go = spent * (left - share) / share if share > 0 else None
         self.progress = replace(
@@ -213,6 +234,13 @@ class Batch:
 
     def _say(self, event: str, job: VideoJob, about: Mapping[str, Any]) -> None:
         self._listener(Happening(event, job.name, about, self.progress))
+
+
+def _share(running: Mapping[str, Any]) -> float:
+    """The share of its video that a worker has done since it began."""
+    if "step" in running or not running.get("of"):
+        return float(running.get("share", 0.0))
+    return float(running["frames"] / running["of"])
 
 
 def run_batch(
@@ -252,15 +280,19 @@ def run_batch(
         left = batch.find_finished(overwrite)
         batch.write(now=True)
         shared = share_networks(engine, jobs)
-        tasks = [
-            Task(
-                number, track_video, (jobs[number], out, command, report, shared), log_file(out, jobs[number])
-            )
-            for number in sorted(left, key=lambda number: -jobs[number].size)
-        ]
+        tasks = Tasks(jobs, out, command, report, engine.workers, shared)
+        first = batch.tasks(left, tasks)
         batch.say_all()
         try:
-            map_tasks(engine, tasks, retries=retries, pause=pause, listener=batch.told, meanwhile=batch.write)
+            map_tasks(
+                engine,
+                first,
+                retries=retries,
+                pause=pause,
+                listener=batch.told,
+                further=tasks.further,
+                meanwhile=batch.write,
+            )
         except BaseException:
             with suppress(OutputError):
                 batch.write("interrupted", now=True)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import base64
 import json
 import platform
+import posixpath
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,11 +46,12 @@ COLUMNS = {
     "machine": str,
     "finished": str,
     "key": str,
+    "note": str,
 }
 """Columns of the table of results, one row a run folder, and their types."""
 
 
-def row_of(run: RunReader, name: str, job: VideoJob, attempts: int = 1) -> dict[str, Any]:
+def row_of(run: RunReader, name: str, job: VideoJob, attempts: int = 1, note: str = "") -> dict[str, Any]:
     """One row of the table of results.
 
     Args:
@@ -56,6 +59,7 @@ def row_of(run: RunReader, name: str, job: VideoJob, attempts: int = 1) -> dict[
         name: What it is called in the batch.
         job: What it is of.
         attempts: How often the video was begun.
+        note: What else is to be said of it.
     """
     about = run.description
     counts, (per_frame, _) = about["counts"], time_per_frame(about)
@@ -75,6 +79,7 @@ def row_of(run: RunReader, name: str, job: VideoJob, attempts: int = 1) -> dict[
         "machine": platform.node(),
         "finished": now(),
         "key": job.key,
+        "note": note,
     }
 
 
@@ -89,19 +94,28 @@ def thumbnail(run: RunReader) -> str:
     return ""
 
 
-def write_marker(folder: Path, job: VideoJob, attempts: int = 1) -> dict[str, Any]:
+def write_marker(
+    folder: Path, job: VideoJob, attempts: int = 1, runs: Sequence[Path] = (), note: str = ""
+) -> dict[str, Any]:
     """Write what the batch needs to know of a finished video into its folder; returns that.
+
+    Args:
+        folder: The video's.
+        job: The video.
+        attempts: How often it was begun.
+        runs: The run folders within it; those of its objects if left out.
+        note: What else is to be said of each.
 
     Raises:
         OutputError: If it cannot be written.
     """
-    runs = layout.runs_in(folder)
+    runs = runs or layout.runs_in(folder)
     readers = [RunReader(one) for one in runs]
-    names = [job.name if one == folder else f"{job.name}/{one.name}" for one in runs]
+    names = [posixpath.join(job.name, one.relative_to(folder).as_posix()).removesuffix("/.") for one in runs]
     marker = {
         "format": FORMAT,
         "key": job.key,
-        "rows": [row_of(run, name, job, attempts) for run, name in zip(readers, names, strict=True)],
+        "rows": [row_of(run, name, job, attempts, note) for run, name in zip(readers, names, strict=True)],
         "thumbnails": [thumbnail(run) for run in readers],
     }
     write_atomic(folder / MARKER, json.dumps(marker, indent=1).encode() + b"\n")

@@ -28,6 +28,7 @@ class VideoJob:
         sequence: Layout, folder and name of a sequence of a dataset, whose images are then the video.
         size: Bytes of the video, where known: large ones are begun first.
         fault: Why it cannot be done, where that is known beforehand.
+        split: Length of the parts that it is cut into, see `tracking3d.splitting.cutting.parse_length`; empty for none.
     """
 
     name: str
@@ -42,6 +43,13 @@ class VideoJob:
     sequence: tuple[str, str, str] | None = None
     size: int = 0
     fault: str = ""
+    split: str = ""
+
+    @property
+    def in_parts(self) -> bool:
+        """Whether it is cut where it is long: parts are joined of one object that is given in the first frame."""
+        whole = self.sequence is not None or self.start_frame is not None or self.correct or self.objects > 1
+        return bool(self.split) and not whole
 
     @property
     def objects(self) -> int:
@@ -60,4 +68,6 @@ class VideoJob:
             "frames": self.frames,
             "sequence": self.sequence,
         }
+        if self.split:
+            told["split"] = self.split
         return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]

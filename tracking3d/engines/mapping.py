@@ -39,7 +39,8 @@ def map_tasks(
         retries: How often a task that came to nothing is tried again.
         pause: See `PAUSE`.
         listener: Is told of everything that happens; what it raises ends the loop.
-        further: What is to be done after a task that has ended for good, such as the next step of the same video.
+        further: What is to be done after a task that has ended for good, such as the next steps of the same video;
+            it is begun before what has not begun yet.
         meanwhile: Is called again and again, at least twice a second, whether something happens or not.
 
     Raises:
@@ -70,7 +71,7 @@ def map_tasks(
                         heapq.heappush(later, (time.monotonic() + delay, task.number, task))
                     else:
                         ended[task.number] = event
-                        waiting.extend(further(event))
+                        waiting.extendleft(reversed(further(event)))
                     listener(event)
                 else:
                     listener(event)

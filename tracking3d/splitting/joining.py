@@ -71,13 +71,14 @@ def joined_parts(session: Session, config: PipelineConfig, plan: Plan, folder: P
     encoder = build_encoder(config)
     tried: list[_Try] = []
     refused: list[DisagreementError] = []
-    for camera in _lenses(known):
+    lenses = _lenses(known)
+    for camera in lenses:
         try:
             tried.append(_joined_by(camera, tracked, known, config.solver, encoder))
         except DisagreementError as error:
             refused.append(error)
     if not tried:
-        raise refused[0]
+        raise DisagreementError(f"{refused[0]}{_of_lenses(lenses)}") from refused[0]
     best = min(tried, key=lambda one: one.dearer)
     runs, belief = best.runs, best.belief
     settled = [
@@ -114,6 +115,17 @@ def _lenses(beliefs: Sequence[Belief]) -> list[Camera]:
         if all(abs(math.log(belief.camera.fy / other.fy)) > _SAME_LENS for other in lenses):
             lenses.append(belief.camera)
     return lenses
+
+
+def _of_lenses(lenses: Sequence[Camera]) -> str:
+    """What is to be said of lenses that differ: parts that are told one have the better chance to agree."""
+    if len(lenses) < 2:
+        return ""
+    degrees = sorted(one.fov for one in lenses)
+    return (
+        f"; each part solved the lens anew (vertical fields of view of {degrees[0]:.0f} to {degrees[-1]:.0f} degrees), "
+        "so that saying what it is (--fov or --intrinsics) may mend that"
+    )
 
 
 def _joined_by(

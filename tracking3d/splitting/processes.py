@@ -1,26 +1,20 @@
-"""Jobs side by side in processes of this machine, each telling how far it is."""
+"""Jobs side by side in processes of this machine, each telling how far it is: by the engine that batches have."""
 
 from __future__ import annotations
 
-import os
-import signal
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import suppress
-from multiprocessing import get_context
-from queue import Empty
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from tracking3d.engines.mapping import map_tasks
+from tracking3d.engines.processes import ProcessEngine
+from tracking3d.engines.protocol import Ended, Event, Task, Told
 from tracking3d.errors import Tracking3dError
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 Tell = Callable[[Any], None]
 """Takes whatever can be pickled to who waits for the job."""
-
-_LOOK = 0.2  # seconds
-_queue: Any = None
 
 
 def side_by_side(
@@ -44,64 +38,40 @@ def side_by_side(
     """
     if workers <= 1 or len(jobs) <= 1:
         return [function(told, job) for job in jobs]
-    context = get_context("spawn")
-    queue = context.Queue()
-    before = os.environ.get("OMP_NUM_THREADS")
-    os.environ["OMP_NUM_THREADS"] = (
-        before or "1"
-    )  # processes that share a machine must not each take all of it
-    pool = ProcessPoolExecutor(
-        min(workers, len(jobs)), mp_context=context, initializer=_begin, initargs=(queue,)
-    )
+
+    def listener(event: Event) -> None:
+        if isinstance(event, Told):
+            told(event.content)
+        elif isinstance(event, Ended):
+            _raise(event)
+
+    tasks = [Task(number, _called, (function, job)) for number, job in enumerate(jobs)]
+    ended = map_tasks(ProcessEngine(min(workers, len(jobs))), tasks, listener=listener)
+    return [ended[number].value for number in range(len(jobs))]
+
+
+@dataclass(frozen=True)
+class _Raised:
+    """An error in a sentence, as the answer of a process: engines tell of errors by their words only."""
+
+    error: Tracking3dError
+
+
+def _called(tell: Tell, function: Callable[[Tell, Any], Any], job: Any) -> Any:
     try:
-        futures = [pool.submit(_run, function, job) for job in jobs]
-        _follow(futures, queue, told)
-        return [future.result() for future in futures]
-    except BrokenProcessPool as error:
+        return function(tell, job)
+    except Tracking3dError as error:
+        return _Raised(error)
+
+
+def _raise(event: Ended) -> None:
+    if isinstance(event.value, _Raised):
+        raise event.value.error
+    if event.fault is None:
+        return
+    if event.fault.crashed:
         raise Tracking3dError(
-            "A process that tracked a part of the video ended without a word, as where memory runs out; the same "
-            "command with --resume goes on."
-        ) from error
-    except BaseException:
-        for process in list(
-            (pool._processes or {}).values()
-        ):  # a pool has no word for this before Python 3.14
-            process.terminate()
-        raise
-    finally:
-        pool.shutdown(cancel_futures=True)
-        if before is None:
-            os.environ.pop("OMP_NUM_THREADS", None)
-
-
-class _Ended:
-    """The last that a job tells. A process hands its words on in a thread of its own, after the job has returned."""
-
-
-def _follow(futures: Sequence[Future[Any]], queue: Any, told: Callable[[Any], None]) -> None:
-    """Pass on what is told until all is done and told, or something fails."""
-    waiting, telling = set(futures), len(futures)
-    while waiting or telling:
-        done, waiting = wait(waiting, timeout=_LOOK, return_when=FIRST_COMPLETED)
-        with suppress(Empty):
-            while telling:
-                content = queue.get(timeout=0 if waiting else _LOOK)
-                if isinstance(content, _Ended):
-                    telling -= 1
-                else:
-                    told(content)
-        for future in done:
-            future.result()
-
-
-def _begin(queue: Any) -> None:
-    global _queue
-    _queue = queue
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-
-
-def _run(function: Callable[[Tell, Job], Result], job: Job) -> Result:
-    try:
-        return function(_queue.put, job)
-    finally:
-        _queue.put(_Ended())
+            "A process that tracked a part of the video ended without a word, as where memory runs out "
+            f"({event.fault.reason.rstrip('.')}); the same command with --resume goes on."
+        )
+    raise Tracking3dError(f"A part of the video came to nothing: {event.fault.reason}")

@@ -55,7 +55,7 @@ def shown(quiet: bool, as_json: bool) -> Iterator[Listener]:
                 lines[worker],
                 total=about.get("of"),
                 completed=about.get("frames", 0),
-                said=escape(str(about["video"])),
+                said=escape(", ".join(str(about[key]) for key in ("video", "step") if key in about)),
                 visible=True,
             )
         for worker, line in lines.items():
@@ -88,7 +88,8 @@ def _line(happening: Happening) -> str:
         frames, seconds = sum(row["frames"] for row in rows), sum(row["seconds"] for row in rows)
         known = [row["confidence"] for row in rows if row["confidence"] is not None]
         sure = f", confidence {sum(known) / len(known):.2f}" if known else ""
-        return f"{video}: {frames} frames in {seconds:.0f} s{sure}"
+        note = f"; {rows[0]['note']}" if rows[0].get("note") else ""
+        return f"{video}: {frames} frames in {seconds:.0f} s{sure}{note}"
     if happening.event == "again":
         return f"{video} is tried again: {about['reason']}"
     if happening.event == "failed":

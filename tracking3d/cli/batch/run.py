@@ -45,6 +45,14 @@ def run(
     retries: Annotated[
         int, typer.Option(min=0, max=100, help="How often a video that came to nothing is tried again.")
     ] = 1,
+    split: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SECONDS",
+            help="Cut long videos into parts of about that length (or frames, as 900f), each a task of its own, and "
+            "join them.",
+        ),
+    ] = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Track all again, and replace run folders that are there.")
     ] = False,
@@ -109,10 +117,12 @@ def run(
     videos: list[VideoJob]
     # What is wrong on the command line is no fault of any video.
     settings = configure(config, preset, overrides, quality, runtime=_runtime(threads))
+    if split is not None:
+        _check_split(split, settings, out, data, address)
     if data is not None:
         videos = dataset_jobs(open_dataset(jobs, data, data, 1).only(sequences or []), settings)
     else:
-        videos = list_jobs(jobs, of_row)
+        videos = list_jobs(jobs, of_row, split or "")
     gpus = any(video.config.runtime.device.startswith("cuda") for video in videos)
     needs = Needs(threads, memory or 0.0, 1.0 if gpus else 0.0)
     command = shlex.join(sys.argv)
@@ -133,6 +143,25 @@ def run(
             raise
     if progress.failed:
         raise typer.Exit(1)
+
+
+def _check_split(
+    split: str, settings: PipelineConfig, out: str, data: Path | None, address: str | None
+) -> None:
+    from tracking3d.batch.places import local
+    from tracking3d.errors import InputError
+    from tracking3d.splitting.cutting import parse_length
+    from tracking3d.splitting.long_video import refuse_what_cannot_be_joined
+
+    refuse_what_cannot_be_joined(settings)
+    parse_length(split, 1e9)  # what is no length at all; the rate of each video tells the rest
+    if data is not None:
+        raise InputError("--split cuts videos, not sequences of a dataset; leave out --split.")
+    if address is not None and local(out) is None:
+        raise InputError(
+            f"--split on a cluster needs a folder that all machines see, for parts of one video meet there; {out} is "
+            "none: give --out a shared folder."
+        )
 
 
 def _configured(

@@ -39,7 +39,8 @@ def status(
     table.add_row("engine", f"{progress.engine}, {progress.workers} at a time")
     for worker, about in progress.running.items():
         of = f" of {about['of']}" if about.get("of") else ""
-        table.add_row(escape(worker), escape(f"{about['video']}: {about.get('frames', 0)}{of} answers"))
+        step = f", {about['step']}" if about.get("step") else ""
+        table.add_row(escape(worker), escape(f"{about['video']}{step}: {about.get('frames', 0)}{of} answers"))
     for one in failures:
         table.add_row("failed", escape(f"{one.run}: {one.reason}"))
     print_table(table)

@@ -1,0 +1,226 @@
+"""The last steps of a long video: its parts become one object and one run, which ends as any run does."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tracking3d.checkpoint.folder import Checkpoint
+from tracking3d.checkpoint.resuming import given_of
+from tracking3d.frames import Frame
+from tracking3d.prompts import make_prompt
+from tracking3d.recording import record
+from tracking3d.results import layout
+from tracking3d.results.run_reader import RunReader
+from tracking3d.results.run_writer import RunWriter
+from tracking3d.session import Session
+from tracking3d.splitting.agreement import DisagreementError
+from tracking3d.splitting.beginning import Begun
+from tracking3d.splitting.joined_run import (
+    note_in_run,
+    take_second_answers,
+    write_causal_mesh,
+    write_joined,
+)
+from tracking3d.splitting.joining import Whole, joined_parts
+from tracking3d.splitting.long_video import Tell
+from tracking3d.splitting.part_runs import Given, PartJob, SecondLook, begin_session
+from tracking3d.splitting.plan import PARTS, part_folder, put_cut_mask, remove_parts
+from tracking3d.video import open_source
+
+_log = logging.getLogger(__name__)
+_SAME_OBJECT = 0.5
+"""Share of the smaller one of two masks that lies within the other, below which a part began on something else than the
+part before ends with. One of them may well have lost a side of the object."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """A video whose parts have their causal answers.
+
+    Attributes:
+        begun: The video.
+        jobs: Its parts, as they were tracked last.
+        again: Numbers of those that were tracked a second time.
+        seconds: What tracking the parts took.
+    """
+
+    begun: Begun
+    jobs: tuple[PartJob, ...]
+    again: tuple[int, ...] = ()
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Again:
+    """A part that began on something else and is to be tracked once more."""
+
+    number: int
+    job: PartJob
+
+
+@dataclass(frozen=True)
+class Refused:
+    """Why parts cannot be joined."""
+
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Joined:
+    """A video whose parts are one run, but for its second answers.
+
+    Attributes:
+        begun: The video.
+        looks: Frames to be looked at again, by parts.
+        about: What ``run.json`` says of the parts.
+        seconds: What each step took, by name.
+    """
+
+    begun: Begun
+    looks: tuple[SecondLook, ...]
+    about: Mapping[str, Any]
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+
+def join(tell: Tell, tracked: Tracked) -> Again | Refused | Joined:
+    """Make one run of the parts, up to where all frames are looked at again.
+
+    Raises:
+        Tracking3dError: If something cannot be read or written; what was finished until then is kept.
+    """
+    begun, clock = tracked.begun, time.monotonic()
+    video = begun.video
+    if (again := _begun_elsewhere(tracked)) is not None:
+        return again
+    first, session = begin_session(open_source(video.source, video.selection), begun.config, video.given)
+    try:
+        whole = joined_parts(session, begun.config, begun.plan, video.folder)
+    except DisagreementError as error:
+        _log.warning("The parts could not be joined: %s.", error)
+        return Refused(str(error))
+    seconds = {"look_ahead": begun.plan.seconds, "parts": tracked.seconds}
+    seconds["join"], clock = time.monotonic() - clock, time.monotonic()
+    about = {
+        "workers": video.workers,
+        "parts": [[run.part.start, run.part.stop] for run in whole.runs],
+        "looked_at": begun.plan.looked_at,
+        "tracked_again": list(tracked.again),
+        "joints": whole.joints,
+        "dearer": whole.dearer,
+    }
+    writer = _begin_writing(begun, first, session, whole)
+    owned = _owned(begun)
+    session.resume(first, whole.session, {})
+    write_causal_mesh(video.folder, session)
+    session.refine()
+    write_joined(writer, session, whole.runs, owned, sum(seconds.values()) + time.monotonic() - clock)
+    seconds["refine"] = time.monotonic() - clock
+    note_in_run(video.folder, {"split": {**about, "seconds": seconds}})
+    return Joined(begun, _second_looks(begun, owned), about, seconds)
+
+
+def end(tell: Tell, joined: Joined) -> None:
+    """Take in the second answers, draw what is answered, and write what is made at the end.
+
+    Args:
+        tell: Is given the answers that are drawn.
+        joined: The run; its ``seconds`` tell what the second look took, too.
+
+    Raises:
+        Tracking3dError: If something cannot be read or written; what was finished until then is kept.
+    """
+    video, seconds = joined.begun.video, joined.seconds
+    source = open_source(video.source, video.selection)
+    _, session = begin_session(source, joined.begun.config, video.given)
+    if not _taken(video.folder, session):
+        note_in_run(video.folder, {"split": {**joined.about, "seconds": dict(seconds)}})
+        took = seconds["refine"] + seconds["second_look"]
+        take_second_answers(video.folder, session, [look.out for look in joined.looks], took)
+    record(
+        source, video.config, video.folder, box=video.given.box, mask=video.given.mask, points=video.given.points,
+        command=video.command, selection=video.selection, resume=True, skip_damaged=True, listener=tell,
+    )  # fmt: skip
+    remove_parts(video.folder)
+
+
+def _taken(folder: Path, session: Session) -> bool:
+    """Whether the second answers are in their place, as where this step was stopped after that."""
+    if not layout.has_state(folder):
+        return True
+    kept = Checkpoint(folder, session.state_classes, session.config.runtime.device).read()
+    return kept.progress.last_refined >= kept.progress.last
+
+
+def _begun_elsewhere(tracked: Tracked) -> Again | None:
+    """The first part that began on something else than the part before ends with, and was not tracked again yet."""
+    begun = tracked.begun
+    folder, whole = begun.video.folder, begun.video.frames(begun.count)
+    checked = max(tracked.again, default=0)
+    for before, part in zip(begun.plan.parts, begun.plan.parts[1:], strict=False):
+        if part.number <= checked:
+            continue
+        cut = whole[part.start]
+        earlier = RunReader(part_folder(folder, before), refined=False)
+        answers = {one.index: one for one in earlier.frames}
+        began = tracked.jobs[part.number].given.mask
+        if cut not in answers or answers[cut].status != "tracked" or began is None or isinstance(began, Path):
+            continue
+        answer = earlier.mask(cut)
+        smaller = min(answer.sum(), began.sum())
+        if smaller and np.count_nonzero(answer & began) < _SAME_OBJECT * smaller:
+            _log.warning("Part %d began on something else and is tracked again.", part.number + 1)
+            put_cut_mask(folder, part, answer)
+            job = replace(tracked.jobs[part.number], given=Given(mask=answer), resume=False)
+            return Again(part.number, job)
+    return None
+
+
+def _owned(begun: Begun) -> list[range]:
+    """Indices of the frames that each part answers for."""
+    whole = begun.video.frames(begun.count)
+    starts = [part.owns_from for part in begun.plan.parts]
+    return [whole[start:stop] for start, stop in zip(starts, [*starts[1:], len(whole)], strict=True)]
+
+
+def _begin_writing(begun: Begun, first: Frame, session: Session, whole: Whole) -> RunWriter:
+    """The writer of the joined run, with all that a run knows of itself before its first frame."""
+    video, given = begun.video, begun.video.given
+    opened = open_source(video.source, video.selection)
+    prompt = None if given.untold else make_prompt(first, given.box, given.mask, points=given.points)
+    return RunWriter(
+        video.folder,
+        config=begun.config.model_dump(mode="json"),
+        camera=whole.camera,
+        source=opened.name,
+        seed=begun.config.runtime.seed,
+        renderer=session.renderer,
+        fps=opened.fps,
+        command=video.command,
+        selection=video.selection,
+        given=given_of(first, prompt, opened.count),
+        tracker_choice=begun.choice,
+        overwrite=True,
+    )
+
+
+def _second_looks(begun: Begun, owned: Sequence[range]) -> tuple[SecondLook, ...]:
+    video = begun.video
+    return tuple(
+        SecondLook(
+            video.source,
+            video.selection,
+            f"{mine.start}:{mine[-1] + 1}:{mine.step}",
+            begun.config,
+            video.folder,
+            video.given,
+            video.folder / PARTS / f"second_{part.number}",
+        )
+        for part, mine in zip(begun.plan.parts, owned, strict=True)
+    )
