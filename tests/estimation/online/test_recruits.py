@@ -11,6 +11,7 @@ from solid_points import pixels_of
 from turned_solid import CAMERA, turned_map
 
 from tracking3d.estimation.online import recruits
+from tracking3d.estimation.online.mapping import shared_landmarks
 from tracking3d.estimation.online.points import FollowedPoints
 from tracking3d.estimation.online.recruits import (
     MOST_CANDIDATES,
@@ -156,13 +157,20 @@ def ring(directions) -> list:
 
 
 def test_where_everything_around_moves_with_the_object_the_scene_is_a_still_one_and_nobody_is_recruited():
-    known = recruited(with_tracks(*ring([22.5 + 45 * n for n in range(8)])))
+    tracks = ring([22.5 + 45 * n for n in range(8)])
+    known = recruited(with_tracks(*tracks))
     assert still(known.beside)
     assert known.candidate.all()
-    assert not shown(known)
-    # From then on nobody is asked.
-    view = known.keyframes[-1]
-    assert len(with_candidates(known, view, speckle())[1].points) == len(view.points)
+    # They tell how the camera moves, and nothing of the object.
+    assert np.isfinite(known.landmarks).all()
+    assert not len(shared_landmarks(known, list(known.keyframes)))
+
+
+def test_what_moves_otherwise_in_a_still_scene_is_dropped():
+    across = [[20.0, 20.0], [26.0, 38.0], [21.0, 28.0], [40.0, 25.0]]
+    known = recruited(with_tracks(*ring([22.5 + 45 * n for n in range(8)]), across))
+    assert still(known.beside)
+    assert shown(known) == set(range(32))
 
 
 def test_what_moves_with_the_object_on_some_sides_is_part_of_it():

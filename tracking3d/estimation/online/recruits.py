@@ -2,7 +2,8 @@
 
 Corners around the mask are followed like the object's own. Once a few keyframes show one, it is triangulated with
 their poses: a point of the object fits them and has moved in the image; one of the background fits only while
-nothing moves. Where the object stands still and the camera moves, everything fits: then nobody is recruited.
+nothing moves. Where the object stands still and the camera moves, everything fits: then nobody is recruited, but
+candidates tell the pose.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ def surroundings(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def with_candidates(known: ObjectMap, view: View, image: NDArray[np.uint8]) -> tuple[ObjectMap, View]:
     """With corners beside a view's mask."""
-    if view.mask is None or still(known.beside):
+    if view.mask is None:
         return known, view
     there = int(known.candidate[view.points.landmark].sum())
     corners = new_corners(image, surroundings(view.mask), view.points.pixel, MOST_CANDIDATES - there)
@@ -93,10 +94,14 @@ def recruit(known: ObjectMap, camera: Camera, positions: list[int]) -> ObjectMap
     rejected |= (tracks.visible.sum(0) >= 2 * _VIEWS) & ~accepted
     told = enough & (motion > _MOVED)
     beside = known.beside + _by_sector(views, first, pixel, told, residual < _FITS)
+    around = np.zeros_like(accepted)
     if still(beside):
-        accepted, rejected = np.zeros_like(accepted), np.ones_like(rejected)
+        # They tell the pose as well as the object's own points do, but nothing of its shape or mask.
+        around, accepted = told & (residual < _FITS), np.zeros_like(accepted)
+        rejected = (told | (tracks.visible.sum(0) >= 2 * _VIEWS)) & ~around
     landmarks, candidate = known.landmarks.copy(), known.candidate.copy()
-    landmarks[names[accepted]] = found.points[accepted]
+    placed = accepted | around
+    landmarks[names[placed]] = found.points[placed]
     candidate[names[accepted]] = False
     dropped = names[rejected & ~accepted]
     keyframes = tuple(
