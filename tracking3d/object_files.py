@@ -90,9 +90,10 @@ def camera_of(
     if not camera.assumed or path is None or not Path(path).is_dir():
         return camera
     earlier = RunReader(Path(path)).camera
-    if earlier.assumed or (earlier.width, earlier.height) != (width, height):
+    if not earlier.known or (earlier.width, earlier.height) != (width, height):
         return camera
-    return replace(earlier, origin=f"that of the run {path}, which knows the object ({earlier.origin})")
+    origin = f"that of the run {path}, which knows the object ({earlier.origin})"
+    return replace(earlier, origin=origin, assumed=False)
 
 
 def _of_run(folder: Path) -> KnownObject:

@@ -196,6 +196,11 @@ def test_the_lens_of_the_run_is_taken_over_where_it_was_told_and_fits(tmp_path):
     description["camera"]["assumed"] = True
     (tmp_path / "run/run.json").write_text(json.dumps(description))
     assert camera_of(config, WIDTH, HEIGHT, None, "").assumed
+    # What nobody gave, but the run has solved, is known too.
+    description["camera"]["origin"] = given.solved(1.0).origin
+    (tmp_path / "run/run.json").write_text(json.dumps(description))
+    solved = camera_of(config, WIDTH, HEIGHT, None, "")
+    assert solved.fov == pytest.approx(30) and not solved.assumed and "solved" in solved.origin
 
 
 def test_a_known_shape_is_held_and_said_once():

@@ -63,6 +63,8 @@ def test_a_lens_that_was_assumed_is_put_right_with_them_and_one_that_was_given_s
     look, found = settled(off, camera=replace(longer, assumed=True))
     assert look.camera.fx == pytest.approx(CAMERA.fx, rel=0.08)
     assert look.camera.fy == pytest.approx(look.camera.fx)
+    assert look.camera.assumed and look.camera.known
+    assert look.camera.origin == f"solved field of view of {look.camera.fov:.1f} degrees"
     assert rotation_errors(found).mean() < 0.5
 
 

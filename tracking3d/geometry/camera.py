@@ -18,6 +18,8 @@ from tracking3d.geometry.lens import Lens
 DEFAULT_FIELD_OF_VIEW = 45.0
 """Vertical field of view in degrees when nothing better is known (paper section 3.2)."""
 
+_SOLVED = "solved field of view"
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -58,6 +60,16 @@ class Camera:
     def fov(self) -> float:
         """Vertical field of view in degrees."""
         return 2 * math.degrees(math.atan2(self.height / 2, self.fy))
+
+    @property
+    def known(self) -> bool:
+        """Whether the lens was given, or else solved from what the video shows."""
+        return not self.assumed or self.origin.startswith(_SOLVED)
+
+    def solved(self, factor: float) -> Camera:
+        """With ``factor`` times the focal lengths, as the video says."""
+        other = self.zoomed(factor, "")
+        return replace(other, origin=f"{_SOLVED} of {other.fov:.1f} degrees")
 
     def zoomed(self, factor: float, origin: str) -> Camera:
         """With ``factor`` times the focal lengths; ``origin`` says in words where that came from."""

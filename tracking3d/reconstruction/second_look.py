@@ -82,8 +82,8 @@ class SecondLook:
             may_reverse=True,
         )
         self._scene, self.vertices = scene, scene.vertices
-        factor = scene.focal_factor
-        self.camera = replace(self.camera, fx=factor * self.camera.fx, fy=factor * self.camera.fy)
+        if scene.focal_factor != 1:
+            self.camera = self.camera.solved(scene.focal_factor)
 
     def pose(
         self, record: FrameRecord, image: Image, mask: NDArray[np.bool_]

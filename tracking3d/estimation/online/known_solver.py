@@ -185,7 +185,7 @@ class KnownObjectSolver(OnlineSolver):
     def _warn_of_lens(self) -> None:
         """Tell the log where the lens is assumed though the object was learnt with another."""
         earlier = self.known_object.camera
-        if self.camera.assumed and earlier is not None and not earlier.assumed:
+        if self.camera.assumed and earlier is not None and earlier.known:
             _log.warning(
                 "%s was learnt with a lens of %.1f degrees in pictures of %d x %d pixels, not %d x %d; its lens is "
                 "not taken over, and 45 degrees are assumed. Give the lens of this video.",

@@ -96,8 +96,7 @@ def _with_lens(
     landmarks = known.landmarks.copy()
     sound = np.isfinite(found.points).all(1)
     landmarks[names[sound]] = found.points[sound]
-    solved = camera.zoomed(factor, "")
-    solved = replace(solved, origin=f"solved field of view of {solved.fov:.1f} degrees")
+    solved = camera.solved(factor)
     keyframes = [
         replace(through(view, camera, solved), pose=pose_of(found.R[n], found.t[n], known.vertices))
         for n, view in enumerate(known.keyframes)
