@@ -121,7 +121,7 @@ def test_the_way_round_that_explains_the_measurements_is_found(wrong):
     solved = partial(
         bundle, intrinsics=INTRINSICS, measured=measured, deviation=np.full((9, 40), 0.1), held=0.3
     )
-    better = reversed_where_better(points, begun, solved)
+    better = reversed_where_better(points, begun, solved, solved(points, T_cam_obj=begun))
     if not wrong:
         assert better is None
         return
@@ -135,4 +135,11 @@ def test_the_way_round_that_explains_the_measurements_is_found(wrong):
 
 def test_without_points_there_is_no_other_way_round():
     none = np.zeros((0, 3))
-    assert reversed_where_better(none, poses(), partial(bundle, intrinsics=INTRINSICS)) is None
+    solved = partial(
+        bundle,
+        intrinsics=INTRINSICS,
+        measured=np.zeros((9, 0, 2)),
+        deviation=np.zeros((9, 0)),
+        held=0.3,
+    )
+    assert reversed_where_better(none, poses(), solved, solved(none, T_cam_obj=poses())) is None

@@ -9,8 +9,11 @@ import pytest
 from rendered_views import CAMERA, ball, pattern, pose, seen
 from scipy.spatial.transform import Rotation
 
+from tracking3d.bundle_adjustment.reversal import reversal_of
 from tracking3d.estimation.estimate import Status
 from tracking3d.evaluation.alignment import align_object_frame
+from tracking3d.points import landmarks
+from tracking3d.points.chain import Chain
 from tracking3d.reconstruction.second_look import SecondLook
 from tracking3d.results.records import FrameRecord
 
@@ -115,3 +118,32 @@ def test_landmarks_speak_for_poses_that_were_put_right_and_few_for_an_object_in_
     other, _ = settled(TRUE[::-1].copy(), most)
     wrong = [other.pose(answer(index, T), *FRAMES[index])[1] for index, T in enumerate(TRUE[::-1])]
     assert np.median([one.agreeing for one in wrong]) < 0.5 * np.median([one.agreeing for one in right])
+
+
+def test_a_run_that_is_the_other_way_round_is_turned_also_where_frames_were_not_kept(monkeypatch):
+    # Patches cannot be carried between views of a ball that turns the wrong way; where they really went stands in.
+    def really_followed(warps, start, xy):
+        views = warps.views
+        points = np.stack([on_ball(views[at], at, pixel) for at, pixel in zip(start, xy, strict=True)])
+        measured = np.stack([seen_at(view, TRUE[kept[n]], points) for n, view in enumerate(views)])
+        return Chain(measured, np.full(measured.shape[:2], 0.01), np.ones(measured.shape[:2]))
+
+    def on_ball(view, at, pixel):
+        T, (fx, fy, cx, cy) = TRUE[kept[at]], view.intrinsics
+        ray = np.array([(pixel[0] - cx) / fx, (pixel[1] - cy) / fy, 1.0])
+        ray /= np.linalg.norm(ray)
+        along = ray @ T[:3, 3]
+        depth = along - np.sqrt(max(along**2 - T[:3, 3] @ T[:3, 3] + 1, 0.0))
+        return (depth * ray - T[:3, 3]) @ T[:3, :3]
+
+    def seen_at(view, T, points):
+        x, (fx, fy, cx, cy) = points @ T[:3, :3].T + T[:3, 3], view.intrinsics
+        return np.column_stack([fx * x[:, 0] / x[:, 2] + cx, fy * x[:, 1] / x[:, 2] + cy])
+
+    monkeypatch.setattr(landmarks, "follow_chain", really_followed)
+    kept = np.linspace(0, len(TRUE) - 1, 5).round().astype(int)
+    vertices = ball().vertices
+    wrong = reversal_of(vertices[vertices @ TRUE[4][2, :3] < -0.3], TRUE[4]).poses(TRUE)
+    assert rotation_errors(wrong).mean() > 10
+    _, found = settled(wrong, 5)
+    assert rotation_errors(found).max() < 2

@@ -129,18 +129,18 @@ def bundle(
 
 
 def reversed_where_better(
-    points: Array, T_cam_obj: Array, solved: Callable[..., Bundled]
+    points: Array, T_cam_obj: Array, solved: Callable[..., Bundled], as_it_is: Bundled
 ) -> tuple[Reversal, Bundled] | None:
     """The reversal of points and poses, and what they become by it, if that explains the measurements better.
 
     Args:
         points: ``(N, 3)`` in object coordinates.
         T_cam_obj: ``(T, 4, 4)``.
-        solved: Bundles ``points`` and ``T_cam_obj``, see `tracking3d.points.bundle.bundle`.
+        solved: Bundles ``points`` and ``T_cam_obj`` through the lens at hand, see `bundle`.
+        as_it_is: What it makes of these.
     """
     if not len(points):
         return None
-    as_it_is = solved(points, T_cam_obj=T_cam_obj)
     reversal = reversal_of(points, T_cam_obj[len(T_cam_obj) // 2])
     other = solved(reversal.points(points), T_cam_obj=reversal.poses(T_cam_obj))
     other = solved(other.points, T_cam_obj=other.T_cam_obj)

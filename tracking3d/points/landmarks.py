@@ -168,12 +168,14 @@ def _refine_once(scene: Scene, free_focal: bool, may_reverse: bool) -> Scene:
         deviation=np.sqrt(chain.variance[there] + DEVIATION**2),
         held=_HELD * scene.radius,
     )
-    found, vertices = solved(points, T_cam_obj=T, free_focal=free_focal), scene.vertices
-    other = reversed_where_better(points, T, solved) if may_reverse else None
+    found, vertices = solved(points, T_cam_obj=T), scene.vertices
+    other = reversed_where_better(points, T, solved, found) if may_reverse else None
     if other is not None:
         reversal, found = other
         scene = replace(scene, reversal=reversal)
         vertices = reversal.surface(vertices, points, found.points)
+    elif free_focal:
+        found = solved(points, T_cam_obj=T, free_focal=True)
     kept = (found.weight > 0).sum(0) >= min(_LEAST_VIEWS, len(there))
     vertices = move_surface(vertices, scene.faces, face[kept], barycentric[kept], found.points[kept])
     counts = zip(there, followed, found.agreeing.sum(1).tolist(), strict=True)
