@@ -17,8 +17,7 @@ from tracking3d.errors import InputError, argument
 from tracking3d.estimation.estimate import ObjectModel, Status
 from tracking3d.estimation.known_object import KnownObject
 from tracking3d.geometry.camera import Camera
-from tracking3d.geometry.gltf_axes import read_mesh_file
-from tracking3d.geometry.mesh_checks import what_is_wrong
+from tracking3d.geometry.mesh_checks import sound_mesh_file, what_is_wrong
 from tracking3d.rendering.backprojection import TexelMap
 from tracking3d.rendering.face_atlas import face_atlas, on_faces, painted, shares_no_texel
 from tracking3d.rendering.texture import sample_texture
@@ -113,13 +112,7 @@ def _of_run(folder: Path) -> KnownObject:
 
 
 def _of_mesh(path: Path) -> KnownObject:
-    try:
-        mesh = read_mesh_file(path)
-    except Exception as error:  # trimesh raises whatever its loaders raise
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{_OBJECT}{path} cannot be read as a mesh ({reason}); {_ADVICE}.") from error
-    if wrong := what_is_wrong(mesh):
-        raise InputError(f"{_OBJECT}{path} {wrong}; {_ADVICE}.")
+    mesh = sound_mesh_file(path, f"{_OBJECT}{path}", _ADVICE)
     if len(mesh.faces) > _MOST_FACES:
         raise InputError(
             f"{_OBJECT}{path} has {len(mesh.faces):,} faces; simplify it to {_MOST_FACES:,} or fewer, a tenth of "

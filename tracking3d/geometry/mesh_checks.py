@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import trimesh
+
+from tracking3d.errors import InputError
+from tracking3d.geometry.gltf_axes import read_mesh_file
 
 FARTHEST = 1e9
 """No vertex lies farther out, in whatever unit; beyond, squares and products of coordinates lose all digits."""
@@ -11,6 +16,29 @@ SMALLEST = 1e-9
 """No mesh is smaller."""
 MOST_FACES = 5_000_000
 """And none has more faces."""
+
+
+def sound_mesh_file(path: Path, named: str, advice: str) -> trimesh.Trimesh:
+    """Read a mesh file that can be computed with.
+
+    Args:
+        path: The file.
+        named: What the sentence of an error calls it.
+        advice: How that sentence ends.
+
+    Raises:
+        InputError: If it cannot be read, or for `what_is_wrong`.
+    """
+    try:
+        mesh = read_mesh_file(path)
+    except Exception as error:  # trimesh raises whatever its loaders raise
+        reason = " ".join(str(error).split()) or type(error).__name__
+        if isinstance(error, ImportError):  # for text in another encoding it would like a further library
+            reason = "its text is damaged"
+        raise InputError(f"{named} cannot be read as a mesh ({reason}); {advice}.") from error
+    if wrong := what_is_wrong(mesh):
+        raise InputError(f"{named} {wrong}; {advice}.")
+    return mesh
 
 
 def what_is_wrong(mesh: object) -> str:

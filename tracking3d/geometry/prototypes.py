@@ -14,9 +14,8 @@ import trimesh
 from numpy.typing import NDArray
 
 from tracking3d.errors import InputError
-from tracking3d.geometry.gltf_axes import read_mesh_file
 from tracking3d.geometry.mesh import Mesh
-from tracking3d.geometry.mesh_checks import what_is_wrong
+from tracking3d.geometry.mesh_checks import sound_mesh_file
 
 LONGEST_EDGE = 0.25
 """A user's mesh is refined until its edges are shorter than this, in units of its radius."""
@@ -91,15 +90,7 @@ def from_file(path: Path) -> Mesh:
     advice = "give an OBJ, PLY, STL or GLB file"
     if not _is_file(path):
         raise InputError(f"The prototype '{path}' does not exist; give sphere, ellipsoid or a mesh file.")
-    try:
-        loaded = read_mesh_file(path)
-    except Exception as error:  # trimesh raises whatever its loaders raise
-        reason = " ".join(str(error).split()) or type(error).__name__
-        if isinstance(error, ImportError):  # for text in another encoding it would like a further library
-            reason = "its text is damaged"
-        raise InputError(f"The prototype '{path}' cannot be read as a mesh ({reason}); {advice}.") from error
-    if wrong := what_is_wrong(loaded):
-        raise InputError(f"The prototype '{path}' {wrong}; {advice}.")
+    loaded = sound_mesh_file(path, f"The prototype '{path}'", advice)
     # Duplicated vertices at texture seams would tear when the shape deforms.
     solid = trimesh.Trimesh(loaded.vertices, loaded.faces, process=False)
     solid.merge_vertices(merge_tex=True, merge_norm=True)

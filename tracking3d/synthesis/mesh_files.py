@@ -9,8 +9,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from tracking3d.errors import InputError
-from tracking3d.geometry.gltf_axes import read_mesh_file
-from tracking3d.geometry.mesh_checks import what_is_wrong
+from tracking3d.geometry.mesh_checks import sound_mesh_file
 from tracking3d.synthesis.procedural_texture import plain_colour
 from tracking3d.synthesis.solid import Solid
 from tracking3d.synthesis.spec import SequenceSpec
@@ -28,13 +27,7 @@ def load_solid(path: Path, spec: SequenceSpec) -> Solid:
     """
     if not path.is_file():
         raise InputError(f"The mesh '{path}' does not exist; {_ADVICE}.")
-    try:
-        mesh = read_mesh_file(path)
-    except Exception as error:  # trimesh raises whatever its loaders raise
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"The mesh '{path}' cannot be read ({reason}); {_ADVICE}.") from error
-    if wrong := what_is_wrong(mesh):
-        raise InputError(f"The mesh '{path}' {wrong}; {_ADVICE}.")
+    mesh = sound_mesh_file(path, f"The mesh '{path}'", _ADVICE)
     vertices = np.asarray(mesh.vertices, np.float64)
     centre = 0.5 * (vertices.min(0) + vertices.max(0))
     texture, uvs = _texture(mesh) if spec.textured else (None, None)
