@@ -31,7 +31,6 @@ from tracking3d.rendering.backend import compiled
 _FIRST_DAMPING = 1e-3
 _LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e9
 _TRIES = 6
-_CONVERGED = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,11 +97,9 @@ class System:
         """Damped step of poses ``(C,)`` and points ``(N, 3)``; None where there is none."""
         poses, points = _damped(self.poses, damping), _damped(self.points, damping)
         if compiled():
-            from tracking3d.bundle_adjustment.kernels import normal_equations
+            from tracking3d.bundle_adjustment.kernels import elimination
 
-            return normal_equations.step(
-                poses, points, self.coupling, self.poses_gradient, self.points_gradient
-            )
+            return elimination.step(poses, points, self.coupling, self.poses_gradient, self.points_gradient)
         flat = self.coupling.reshape(3 * len(points), len(poses))
         by_points = (np.linalg.inv(points) @ self.coupling).reshape(flat.shape)
         gradient = self.poses_gradient - by_points.T @ self.points_gradient.ravel()
@@ -230,6 +227,7 @@ def adjust(
     scale: float = 1.0,
     free_focal: bool = False,
     iterations: int = 20,
+    converged: float = 1e-7,
     point_prior: FloatArray | None = None,
     point_prior_weight: float = 0.0,
 ) -> Structure:
@@ -249,6 +247,7 @@ def adjust(
             it and the answer means nothing. A start from a lens more than twice as wide or narrow may not get
             there: start from several and compare their costs.
         iterations: The most steps that are tried.
+        converged: Share of the cost that a step has to gain for another one to follow.
         point_prior: ``(N, 3)`` where the points should be, for instance on a mesh; nan for those that are free.
         point_prior_weight: What a point at distance 1 from its place costs; an observation at a residual of one
             scale costs ``log 2``.
@@ -284,7 +283,7 @@ def adjust(
             step = system.step(damping)
             better = None if step is None else problem.evaluated(problem.stepped(best, *step))
             if better is not None and better.cost < best.cost:
-                settled = best.cost - better.cost < _CONVERGED * best.cost
+                settled = best.cost - better.cost < converged * best.cost
                 best, damping = better, max(damping / 10, _LEAST_DAMPING)
                 break
             damping = min(damping * 10, _MOST_DAMPING)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tracking3d.bundle_adjustment.reversal import Reversal
-from tracking3d.points.bundle import bundle, reversed_where_better
+from tracking3d.points.bundle import bundle, other_way_round
 from tracking3d.points.carrying import Warps
 from tracking3d.points.chain import follow_chain
 from tracking3d.points.meeting import surface_under
@@ -65,7 +65,8 @@ class Scene:
         faces: ``(F, 3)``.
         focal_factor: By which the views' focal lengths are those that they were opened with.
         support: What landmarks say of each view's pose; empty before they were looked for.
-        reversal: What was done to surface and poses, where landmarks said that depth was the other way round.
+        may_reverse: Whether depth may be the other way round than the run has it; no longer once that is clear.
+        reversal: What was done to surface and poses, where landmarks said that it was.
     """
 
     views: list[View | None]
@@ -73,6 +74,7 @@ class Scene:
     faces: NDArray[np.int64]
     focal_factor: float = 1.0
     support: Mapping[int, Support] = field(default_factory=dict)
+    may_reverse: bool = False
     reversal: Reversal | None = None
 
     @property
@@ -93,7 +95,9 @@ class Scene:
             else draw(replace(view, intrinsics=view.intrinsics * lens), vertices, self.faces, poses[index])
             for index, view in enumerate(self.views)
         ]
-        return Scene(views, vertices, self.faces, self.focal_factor * focal_factor, reversal=self.reversal)
+        return replace(
+            self, views=views, vertices=vertices, focal_factor=self.focal_factor * focal_factor, support={}
+        )
 
 
 def refine_scene(
@@ -101,7 +105,6 @@ def refine_scene(
     rounds: int = ROUNDS,
     after_round: Callable[[int], None] = lambda done: None,
     free_focal: bool = False,
-    may_reverse: bool = False,
 ) -> Scene:
     """Put surface and poses right, as far as the images say how, until the poses hardly turn any more.
 
@@ -113,12 +116,11 @@ def refine_scene(
         rounds: How many times at most.
         after_round: Is told how many are done.
         free_focal: Whether the lens is to be put right too, since nobody knows it.
-        may_reverse: Whether depth may be the other way round than the run has it.
     """
     done, last = 0, rounds
     while done < last:
         done += 1
-        before, scene = scene, _refine_once(scene, free_focal, may_reverse and scene.reversal is None)
+        before, scene = scene, _refine_once(scene, free_focal)
         after_round(done)
         if scene.reversal is not before.reversal:
             last = done + rounds  # all of it is new
@@ -141,7 +143,7 @@ def _turned(before: Scene, after: Scene) -> float:
     return float(np.median((turned.mean().inv() * turned).magnitude()))
 
 
-def _refine_once(scene: Scene, free_focal: bool, may_reverse: bool) -> Scene:
+def _refine_once(scene: Scene, free_focal: bool) -> Scene:
     there = [index for index, view in enumerate(scene.views) if view is not None]
     if not there:
         return scene
@@ -169,13 +171,15 @@ def _refine_once(scene: Scene, free_focal: bool, may_reverse: bool) -> Scene:
         held=_HELD * scene.radius,
     )
     found, vertices = solved(points, T_cam_obj=T), scene.vertices
-    other = reversed_where_better(points, T, solved, found) if may_reverse else None
-    if other is not None:
-        reversal, found = other
-        scene = replace(scene, reversal=reversal)
-        vertices = reversal.surface(vertices, points, found.points)
+    other = other_way_round(points, T, solved, found) if scene.may_reverse else None
+    if other is not None and other.is_better:
+        found = other.found
+        vertices = other.reversal.surface(vertices, points, found.points)
+        scene = replace(scene, reversal=other.reversal, may_reverse=False)
     elif free_focal:
-        found = solved(points, T_cam_obj=T, free_focal=True)
+        found = solved(points, T_cam_obj=T, begun=found)
+    if other is not None and other.is_hopeless:
+        scene = replace(scene, may_reverse=False)
     kept = (found.weight > 0).sum(0) >= min(_LEAST_VIEWS, len(there))
     vertices = move_surface(vertices, scene.faces, face[kept], barycentric[kept], found.points[kept])
     counts = zip(there, followed, found.agreeing.sum(1).tolist(), strict=True)

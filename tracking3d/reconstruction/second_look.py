@@ -76,10 +76,9 @@ class SecondLook:
         self._before = {index: self._views[index].T_cam_obj for index in self._bundled}
         self._views = {}
         scene = refine_scene(
-            Scene(views, self.vertices, self._faces),
+            Scene(views, self.vertices, self._faces, may_reverse=True),
             ROUNDS,
             free_focal=self.camera.assumed,
-            may_reverse=True,
         )
         self._scene, self.vertices = scene, scene.vertices
         if scene.focal_factor != 1:

@@ -12,10 +12,12 @@ from tracking3d.bundle_adjustment import adjustment
 from tracking3d.bundle_adjustment.adjustment import Problem, adjust
 from tracking3d.estimation.online import pose_from_points
 from tracking3d.estimation.online.pose_from_points import pose_of_tracks
+from tracking3d.rendering.kernels.threads import get_num_threads, set_num_threads
 
 SCENES = {
     "a few points": {"frames": 4, "count": 9, "noise": 0.5},
     "many": {"frames": 12, "count": 150, "noise": 0.3, "outliers": 0.2},
+    "long": {"frames": 41, "count": 70, "noise": 0.3},
     "flat": {"frames": 5, "count": 40, "shape": "plane", "noise": 0.1},
 }
 every_scene = pytest.mark.parametrize("settings", SCENES.values(), ids=SCENES)
@@ -75,6 +77,21 @@ def test_an_adjustment_ends_in_the_same_place(both, settings):
     mine, expected = both(lambda: adjust(given.tracks, given.K, disturbed(given.truth), iterations=40))
     assert mine.cost == pytest.approx(expected.cost, rel=1e-5)
     np.testing.assert_allclose(mine.R, expected.R, atol=2e-3)
+
+
+def test_threads_change_no_digit_of_a_step():
+    problem, at = posed(scene(frames=41, count=70), 1, True)
+    system = problem.linearised(at)
+    before, steps = get_num_threads(), []
+    for threads in (1, 2, 5):
+        set_num_threads(threads)
+        try:
+            steps.append(system.step(1e-3))
+        finally:
+            set_num_threads(before)
+    for other in steps[1:]:
+        np.testing.assert_array_equal(steps[0][0], other[0])
+        np.testing.assert_array_equal(steps[0][1], other[1])
 
 
 def test_equations_that_are_not_finite_give_no_step(both):

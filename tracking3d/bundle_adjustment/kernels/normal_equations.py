@@ -1,4 +1,4 @@
-"""Kernels of `tracking3d.bundle_adjustment.adjustment`: residuals, normal equations and a step without the points."""
+"""Kernels of `tracking3d.bundle_adjustment.adjustment`: residuals and normal equations."""
 # mypy: disable-error-code="no-untyped-def"
 
 from __future__ import annotations
@@ -7,13 +7,7 @@ import math
 
 import numpy as np
 
-from tracking3d.bundle_adjustment.kernels.reprojection import (
-    factorised,
-    pixel_motion,
-    shared,
-    solve_factorised,
-    to_camera,
-)
+from tracking3d.bundle_adjustment.kernels.reprojection import pixel_motion, shared, to_camera
 from tracking3d.bundle_adjustment.reprojection import BEHIND, NEAREST, FloatArray
 from tracking3d.rendering.kernels.compilation import kernel
 
@@ -52,19 +46,6 @@ def linearised(
         poses, blocks, coupling, poses_gradient, points_gradient,
     )  # fmt: skip
     return poses, blocks, coupling, poses_gradient, points_gradient
-
-
-def step(
-    poses: FloatArray,
-    points: FloatArray,
-    coupling: FloatArray,
-    poses_gradient: FloatArray,
-    points_gradient: FloatArray,
-) -> tuple[FloatArray, FloatArray] | None:
-    """Step of poses ``(C,)`` and points ``(N, 3)`` by damped blocks; None where there is none."""
-    d_poses, d_points = np.empty(len(poses)), np.empty(points_gradient.shape)
-    there = _step(poses.copy(), points.copy(), coupling, poses_gradient, points_gradient, d_poses, d_points)
-    return (d_poses, d_points) if there else None
 
 
 def _packed(*arrays: FloatArray) -> list[FloatArray]:
@@ -155,66 +136,3 @@ def _linearise(
                         for i in range(6):
                             poses[last, first + i] += by_pose[row, i] * by_focal
                             poses[first + i, last] += by_pose[row, i] * by_focal
-
-
-@kernel(
-    "boolean(float64[:,::1], float64[:,:,::1], float64[:,:,::1], float64[::1], float64[:,::1], float64[::1],"
-    " float64[:,::1])"
-)
-def _step(poses, points, coupling, poses_gradient, points_gradient, d_poses, d_points):
-    size, by_points, along = len(poses), np.empty((3, len(poses))), np.empty(3)
-    for i in range(size):
-        d_poses[i] = poses_gradient[i]
-    for n in range(len(points)):
-        if not factorised(points[n]):
-            return False
-        first, last = _coupled(coupling[n])
-        for row in range(3):
-            along[row] = points_gradient[n, row]
-        _solve_columns(points[n], coupling[n], by_points, first, last)
-        solve_factorised(points[n], along)
-        for i in range(first, last):
-            a, b, c = coupling[n, 0, i], coupling[n, 1, i], coupling[n, 2, i]
-            d_poses[i] -= a * along[0] + b * along[1] + c * along[2]
-            for j in range(first, i + 1):
-                poses[i, j] -= a * by_points[0, j] + b * by_points[1, j] + c * by_points[2, j]
-    if not factorised(poses):
-        return False
-    solve_factorised(poses, d_poses)
-    sound = True
-    for i in range(size):
-        d_poses[i] = -d_poses[i]
-        sound = sound and math.isfinite(d_poses[i])
-    for n in range(len(points)):
-        for row in range(3):
-            total = points_gradient[n, row]
-            for i in range(size):
-                total += coupling[n, row, i] * d_poses[i]
-            d_points[n, row] = -total
-        solve_factorised(points[n], d_points[n])
-        for row in range(3):
-            sound = sound and math.isfinite(d_points[n, row])
-    return sound
-
-
-@shared
-def _coupled(coupling):
-    """The range of pose unknowns that a point is coupled with."""
-    first, last = coupling.shape[1], 0
-    for i in range(coupling.shape[1]):
-        if coupling[0, i] != 0 or coupling[1, i] != 0 or coupling[2, i] != 0:
-            first, last = min(first, i), i + 1
-    return first, last
-
-
-@shared
-def _solve_columns(factor, right, solved, first, last):
-    """Write the solutions ``(3, C)`` of a system whose matrix was `factorised`."""
-    for i in range(first, last):
-        x = right[0, i] / factor[0, 0]
-        y = (right[1, i] - factor[1, 0] * x) / factor[1, 1]
-        z = (right[2, i] - factor[2, 0] * x - factor[2, 1] * y) / factor[2, 2]
-        z /= factor[2, 2]
-        y = (y - factor[2, 1] * z) / factor[1, 1]
-        solved[0, i] = (x - factor[1, 0] * y - factor[2, 0] * z) / factor[0, 0]
-        solved[1, i], solved[2, i] = y, z
