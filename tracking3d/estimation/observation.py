@@ -105,11 +105,14 @@ def observe(
     device: torch.device,
 ) -> Observation:
     """Cut the window out of a frame and encode it."""
-    pixels = torch.tensor(np.ascontiguousarray(frame.image), device=device)
-    pixels = pixels.permute(2, 0, 1).float() / 255
-    image = crop(pixels, window)
-    detail = crop(pixels, replace(window, size=2 * window.size))
-    valid = crop(torch.ones(1, *frame.size, device=device), window)[0].ge(0.5).float()
+    rows, columns, border = _within(window, *frame.size)
+    pixels = torch.tensor(np.ascontiguousarray(frame.image[rows, columns]), device=device)
+    pixels = functional.pad(pixels.permute(2, 0, 1).float() / 255, border)
+    image, detail = _resampled(pixels, window.size), _resampled(pixels, 2 * window.size)
+    valid = torch.ones(window.size, window.size, device=device)
+    if any(border):
+        inside = torch.ones(1, rows.stop - rows.start, columns.stop - columns.start, device=device)
+        valid = _resampled(functional.pad(inside, border), window.size)[0].ge(0.5).float()
     # Features of a stride above 1 are cut out of the finer image, so as not to be coarser than the rest.
     features = encoder.encode((image if encoder.stride == 1 else detail)[None])
     if features.shape[-1] != window.size:
@@ -119,7 +122,8 @@ def observe(
     if mask is None or not mask.any():
         soft = distance = torch.zeros_like(valid)
     else:
-        soft = crop(torch.from_numpy(mask).to(device).float()[None], window)[0]
+        there = torch.from_numpy(mask[rows, columns]).to(device).float()
+        soft = _resampled(functional.pad(there[None], border), window.size)[0]
         distance = mask_distance(soft)
     K = torch.tensor(window.K(camera), dtype=torch.float32, device=device)
     known = mask is not None and bool(soft.any())
@@ -151,16 +155,29 @@ def halved(observation: Observation) -> Observation:
 
 def crop(image: Tensor, window: Window) -> Tensor:
     """Resample ``(C, H, W)`` into the window: ``(C, S, S)``, antialiased, zero beyond the border."""
-    height, width = image.shape[-2:]
-    right, bottom = window.left + window.side, window.top + window.side
-    inner = image[:, max(window.top, 0) : max(bottom, 0), max(window.left, 0) : max(right, 0)]
-    if inner.numel() == 0:
-        return image.new_zeros(image.shape[0], window.size, window.size)
-    left, top = max(-window.left, 0), max(-window.top, 0)
-    border = (left, max(right - width, 0), top, max(bottom - height, 0))
-    inner = functional.pad(inner, border)
-    size = (window.size, window.size)
-    return functional.interpolate(inner[None], size=size, mode="bilinear", antialias=True)[0]
+    rows, columns, border = _within(window, *image.shape[-2:])
+    return _resampled(functional.pad(image[:, rows, columns], border), window.size)
+
+
+def _within(window: Window, height: int, width: int) -> tuple[slice, slice, tuple[int, int, int, int]]:
+    """Rows and columns of an image that a window sees, and how far it reaches beyond: left, right, above, below."""
+    (columns, *across), (rows, *along) = (
+        _span(first, window.side, size) for first, size in ((window.left, width), (window.top, height))
+    )
+    return rows, columns, (across[0], across[1], along[0], along[1])
+
+
+def _span(first: int, count: int, size: int) -> tuple[slice, int, int]:
+    """What of ``count`` places from ``first`` on lies in ``range(size)``, and how many come before and after it."""
+    begin = min(max(first, 0), size)
+    end = max(min(first + count, size), begin)
+    before = min(max(-first, 0), count)
+    return slice(begin, end), before, count - before - (end - begin)
+
+
+def _resampled(image: Tensor, size: int) -> Tensor:
+    """``(C, side, side)`` at ``size`` x ``size`` pixels, antialiased."""
+    return functional.interpolate(image[None], size=(size, size), mode="bilinear", antialias=True)[0]
 
 
 def mask_distance(mask: Tensor) -> Tensor:

@@ -15,11 +15,21 @@ def cut(image: NDArray, window: Window) -> NDArray:
 
     The part of the window beyond the frame repeats the frame's border.
     """
-    rows = np.clip(np.arange(window.top, window.top + window.side), 0, image.shape[0] - 1)
-    columns = np.clip(np.arange(window.left, window.left + window.side), 0, image.shape[1] - 1)
-    region = image.take(rows, axis=0).take(columns, axis=1)
+    rows, above, below = _span(window.top, window.side, image.shape[0])
+    columns, before, after = _span(window.left, window.side, image.shape[1])
+    region = image[rows, columns]
+    if above or below or before or after:
+        region = cv2.copyMakeBorder(region, above, below, before, after, cv2.BORDER_REPLICATE)
     method = cv2.INTER_AREA if window.size < window.side else cv2.INTER_LINEAR
     return cv2.resize(region, (window.size, window.size), interpolation=method)
+
+
+def _span(first: int, count: int, size: int) -> tuple[slice, int, int]:
+    """What of ``count`` places from ``first`` on lies in ``range(size)``, one at least, and how many before and after."""
+    begin, end = min(max(first, 0), size - 1), max(min(first + count, size), 1)
+    end = max(end, begin + 1)
+    before = min(max(-first, 0), count - 1)
+    return slice(begin, end), before, count - (end - begin) - before
 
 
 def inside_frame(shape: tuple[int, ...], window: Window) -> NDArray[np.bool_]:
