@@ -10,16 +10,20 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from tracking3d.points.alignment import NOISE, align
 from tracking3d.points.view import REACH, Array, Plane, View
+from tracking3d.rendering.backend import use_numba
+from tracking3d.rendering.visibility import NEAR
 
 LEAST_AGREEMENT = 0.7
 """Correlation of a patch with its template from which a correction is believed."""
 _TELLS = 2 * NOISE  # contrast of a template that can be told from something else
 _FLOOR = 0.05  # deviation in pixels of the best alignments: interpolation, shading
 _BEYOND = REACH / 2  # pixels around the surface onto which an image is warped
+_LEAST_ROWS = 64  # below, another thread does not pay
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +64,7 @@ class Warps:
             nothing = np.full(xy.shape, np.nan)
             return Carried(nothing, nothing, np.full(len(xy), np.inf), np.full(len(xy), -1.0))
         predicted, seen = end.sees(start.surface(xy), self.tolerance)
-        warped, known = self._warp(source, target)
+        warped, known = self._warp(source, target, backend)
         found = align(warped, known, end.image, np.where(seen[:, None], predicted, np.nan), backend=backend)
         good = found.agreement > LEAST_AGREEMENT
         return Carried(
@@ -70,10 +74,12 @@ class Warps:
             np.where(found.contrast > _TELLS, found.agreement, np.sign(found.contrast) * 2 - 1),
         )
 
-    def _warp(self, source: int, target: int) -> tuple[Plane, Plane]:
+    def _warp(self, source: int, target: int, backend: str) -> tuple[Plane, Plane]:
         """The image of ``source`` as ``target`` would see it, and where it is known."""
-        start = self.views[source]
-        assert start is not None
+        start, end = self.views[source], self.views[target]
+        assert start is not None and end is not None
+        if use_numba(backend, torch.empty(0, dtype=torch.float32)):
+            return _warped(start, end, self.tolerance)
         near, points = self._surface_pixels(target)
         xy, depth = start.project(points)
         maps = np.full((2, *near.shape), -1e4, np.float32)
@@ -98,3 +104,20 @@ class Warps:
             points = view.back_project(np.stack([columns, rows], 1).astype(float), view.inverse_depth[near])
             self._pixels = index, near, points
         return self._pixels[1:]
+
+
+def _warped(source: View, target: View, tolerance: float) -> tuple[Plane, Plane]:
+    """The same by the kernel, rows shared among threads."""
+    from tracking3d.points.kernels.warping import warp
+    from tracking3d.rendering.kernels.threads import share
+
+    height, width = target.image.shape
+    warped, known = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
+    share(
+        warp, height, _LEAST_ROWS,
+        target.inverse_depth, target.beyond, _BEYOND, target.intrinsics,
+        np.ascontiguousarray(source.T_cam_obj @ np.linalg.inv(target.T_cam_obj)),
+        source.intrinsics, source.image, source.mask, source.inverse_depth, NEAR, tolerance,
+        warped, known,
+    )  # fmt: skip
+    return warped, known

@@ -25,7 +25,7 @@ def cut(image: NDArray, window: Window) -> NDArray:
 
 
 def _span(first: int, count: int, size: int) -> tuple[slice, int, int]:
-    """What of ``count`` places from ``first`` on lies in ``range(size)``, one at least, and how many before and after."""
+    """What of ``count`` places from ``first`` on lies in ``range(size)``, one at least; how many before and after."""
     begin, end = min(max(first, 0), size - 1), max(min(first + count, size), 1)
     end = max(end, begin + 1)
     before = min(max(-first, 0), count - 1)
