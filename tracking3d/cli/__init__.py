@@ -5,6 +5,8 @@ Each command has a file and imports what it needs when it is called, so that ``-
 
 from __future__ import annotations
 
+import os
+
 import typer
 
 from tracking3d.cli import (
@@ -77,4 +79,6 @@ def _root(
 
 def main() -> None:
     """Entry point of the console script."""
+    # Matrices are small here: OpenBLAS's threads, one a core by default, wait for one another longer than they work.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     app()

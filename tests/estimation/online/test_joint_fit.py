@@ -16,7 +16,13 @@ from tracking3d.estimation.online.joint_fit import (
     fit_jointly,
     refine_without_points,
 )
-from tracking3d.estimation.online.shaded_appearance import FaceEquations, _lit, face_equations, layers_of
+from tracking3d.estimation.online.shaded_appearance import (
+    SharedFaces,
+    _lit,
+    face_equations,
+    layers_of,
+    shared_faces,
+)
 from tracking3d.estimation.online.shape_modes import Modes
 from tracking3d.estimation.online.surface_fit import FitWeights
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
@@ -42,7 +48,7 @@ def errors(known: ObjectMap, angles: list[float] = ANGLES) -> list[float]:
     ]
 
 
-def equations(known: ObjectMap) -> tuple[FaceEquations, Pose]:
+def shared(known: ObjectMap) -> tuple[SharedFaces, Pose]:
     poses = Pose.stack([view.pose for view in known.keyframes])
     observations = [view.observation for view in known.keyframes]
     K = torch.stack([o.K for o in observations])
@@ -60,7 +66,7 @@ def equations(known: ObjectMap) -> tuple[FaceEquations, Pose]:
         K,
         (SIZE, SIZE),
     )
-    return face_equations(drawn, layers, poses.R, poses.translation, 0.25), poses
+    return shared_faces(drawn, layers, 0.25), poses
 
 
 def surface_distance(vertices: Tensor, truth: ObjectMap) -> float:
@@ -116,7 +122,8 @@ def test_the_light_of_flat_colours_is_found_exactly() -> None:
 
 def test_moving_the_object_is_moving_all_views() -> None:
     # An exact property of the derivatives: both sides are the same motion on every screen.
-    found, poses = equations(disturbed(turned_map(ANGLES), 5.0))
+    shown, poses = shared(disturbed(turned_map(ANGLES), 5.0))
+    found = face_equations(shown, poses.R, poses.translation)
     by_view = found.by_rest[: 6 * len(ANGLES)].reshape(-1, 2, 3)
     by_shift = found.by_corners.reshape(-1, 3, 3).sum((0, 1))
     by_views = torch.einsum("bij,bi->j", poses.R, by_view[:, 0])
@@ -126,20 +133,20 @@ def test_moving_the_object_is_moving_all_views() -> None:
 
 def test_the_cost_falls_along_the_gradient_by_about_as_much_as_it_says() -> None:
     known = disturbed(turned_map(ANGLES, lit=False), 4.0)
-    found, _ = equations(known)
-    gradient = found.by_rest[6:12]
+    found, poses = shared(known)
+    gradient = face_equations(found, poses.R, poses.translation).by_rest[6:12]
     step = -0.01 * gradient / gradient.norm()
     view = known.keyframes[1]
     R = rotation_about(step[3:], float(torch.rad2deg(step[3:].norm()))) @ view.pose.R
     moved = replace(view, pose=from_matrix(R, view.pose.translation + step[:3]))
-    after, _ = equations(replace(known, keyframes=(known.keyframes[0], moved, *known.keyframes[2:])))
+    after, _ = shared(replace(known, keyframes=(known.keyframes[0], moved, *known.keyframes[2:])))
     # Not exactly: which faces are seen, and how large, changes too.
     assert 0.5 < (found.cost - after.cost) / (0.01 * float(gradient.norm())) < 2.0
 
 
 def test_a_lit_and_turning_solid_costs_next_to_nothing_at_the_truth() -> None:
-    plain, _ = equations(turned_map(ANGLES, textured=False))
-    dark, _ = equations(turned_map(ANGLES, textured=False, lit=False))
+    plain, _ = shared(turned_map(ANGLES, textured=False))
+    dark, _ = shared(turned_map(ANGLES, textured=False, lit=False))
     assert plain.cost < 0.05
     assert dark.cost < 0.05
 

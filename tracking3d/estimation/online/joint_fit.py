@@ -13,12 +13,17 @@ import torch
 from torch import Tensor
 
 from tracking3d.estimation.online.belief import ObjectMap
-from tracking3d.estimation.online.shaded_appearance import face_equations, layers_of
+from tracking3d.estimation.online.shaded_appearance import (
+    SharedFaces,
+    face_equations,
+    layers_of,
+    shared_faces,
+)
 from tracking3d.estimation.online.shape_modes import Modes, in_modes
 from tracking3d.estimation.online.surface_fit import FitWeights
 from tracking3d.estimation.shape import flatten
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_exponential
-from tracking3d.rendering import Rendering, find_contour, render
+from tracking3d.rendering import Contour, Rendering, find_contour, render
 from tracking3d.rendering.contour import contour_slopes
 from tracking3d.rendering.normal_equations import screen_motion
 
@@ -69,12 +74,31 @@ class _Problem:
 
 
 @dataclass(frozen=True, eq=False)
+class _Outlines:
+    """The outlines as they are drawn: distances from the masks' in pixels, their slopes, weights, and the cost."""
+
+    contour: Contour
+    residual: Tensor
+    slope: Tensor
+    weight: Tensor
+    cost: float
+
+
+@dataclass(frozen=True, eq=False)
 class _State:
-    """Vertices and poses, their cost, and its normal equations in modes, poses and light."""
+    """Vertices and poses, what they show, and its cost."""
 
     vertices: Tensor
     poses: Pose
+    faces: SharedFaces
+    outlines: _Outlines
     cost: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Equations:
+    """Normal equations of a state's cost in modes, poses and light."""
+
     matrix: Tensor
     gradient: Tensor
 
@@ -141,12 +165,14 @@ def _minimized(problem: _Problem, free: Tensor, iterations: int) -> _State:
     """The best state that Levenberg-Marquardt reaches in the free unknowns."""
     poses = Pose.stack([view.pose for view in problem.known.keyframes])
     state = _evaluated(problem, problem.known.vertices, poses)
+    equations: _Equations | None = None
     damping, small = _DAMPING, 0
     for _ in range(iterations):
-        trial = _stepped(problem, state, free, damping)
+        equations = equations or _linearised(problem, state)
+        trial = _stepped(problem, state, equations, free, damping)
         if trial is not None and trial.cost < state.cost:
             gain = state.cost - trial.cost
-            state, damping = trial, max(damping / _LESS, _LEAST_DAMPING)
+            state, equations, damping = trial, None, max(damping / _LESS, _LEAST_DAMPING)
             small = small + 1 if gain < _ENOUGH * state.cost else 0
             if small == _SMALL_GAINS:
                 break
@@ -157,18 +183,20 @@ def _minimized(problem: _Problem, free: Tensor, iterations: int) -> _State:
     return state
 
 
-def _stepped(problem: _Problem, state: _State, free: Tensor, damping: float) -> _State | None:
+def _stepped(
+    problem: _Problem, state: _State, equations: _Equations, free: Tensor, damping: float
+) -> _State | None:
     """The state after one step; None where there is none."""
     # The light is fitted anew at every state: its part of the step is only what the others must allow for.
     free = free.clone()
     free[problem.shape_unknowns + 6 * len(problem.K) :] = True
-    matrix = state.matrix[free][:, free]
+    matrix = equations.matrix[free][:, free]
     diagonal = matrix.diagonal()
     damped = matrix + torch.diag(damping * diagonal + 1e-7 * diagonal.max())
-    solution, failed = torch.linalg.solve_ex(damped, -state.gradient[free])
+    solution, failed = torch.linalg.solve_ex(damped, -equations.gradient[free])
     if failed or not solution.isfinite().all():
         return None
-    step = torch.zeros_like(state.gradient)
+    step = torch.zeros_like(equations.gradient)
     step[free] = solution
     shape, poses, _ = step.split(
         [problem.shape_unknowns, 6 * len(problem.K), len(step) - problem.shape_unknowns - 6 * len(problem.K)]
@@ -179,32 +207,44 @@ def _stepped(problem: _Problem, state: _State, free: Tensor, damping: float) -> 
 
 
 def _evaluated(problem: _Problem, vertices: Tensor, poses: Pose) -> _State:
-    """Cost, and normal equations in the modes, the poses and the light."""
-    known, modes = problem.known, problem.modes
-    R, t = poses.R, poses.translation
+    """What vertices and poses show, and its cost."""
+    known = problem.known
     drawn = render(
-        vertices, known.shape.faces, known.shape.face_uvs, vertices.new_zeros(1, 8, 8), R, t, problem.K,
-        (problem.size, problem.size), backend=known.renderer,
+        vertices, known.shape.faces, known.shape.face_uvs, vertices.new_zeros(1, 8, 8), poses.R, poses.translation,
+        problem.K, (problem.size, problem.size), backend=known.renderer,
     )  # fmt: skip
-    shown = face_equations(drawn, problem.layers, R, t, _APPEARANCE_SCALE)
-    matrix, gradient = in_modes(shown, modes, known.shape.faces)
+    faces, outlines = shared_faces(drawn, problem.layers, _APPEARANCE_SCALE), _outlines(problem, drawn)
+    stiffness, offsets = _bending(problem, vertices)
+    cost = _APPEARANCE * faces.cost + outlines.cost + float((stiffness * offsets.square()).sum())
+    return _State(vertices, poses, faces, outlines, cost)
+
+
+def _linearised(problem: _Problem, state: _State) -> _Equations:
+    """Normal equations in the modes, the poses and the light."""
+    modes, R, t = problem.modes, state.poses.R, state.poses.translation
+    by_faces = face_equations(state.faces, R, t)
+    matrix, gradient = in_modes(by_faces, modes, problem.known.shape.faces)
     matrix, gradient = _APPEARANCE * matrix, _APPEARANCE * gradient
-    outline = _add_outline(problem, drawn, R, t, matrix, gradient)
-    stiffness = problem.weights.smoothness / len(vertices) * modes.bending[:, None]
-    offsets = modes.vectors.T @ (vertices - known.shape.rest).double()
+    jacobian, weighted = _outline_rows(problem, state.outlines, R, t)
+    count = jacobian.shape[1]
+    matrix[:count, :count] += (jacobian.T @ weighted).double()
+    gradient[:count] += (weighted.T @ state.outlines.residual).double()
+    stiffness, offsets = _bending(problem, state.vertices)
     count = 3 * len(modes.bending)
     gradient[:count] += 2 * (stiffness * offsets).reshape(-1)
     matrix.diagonal()[:count] += 2 * stiffness.expand(-1, 3).reshape(-1)
-    cost = _APPEARANCE * shown.cost + outline + float((stiffness * offsets.square()).sum())
-    return _State(vertices, poses, cost, matrix, gradient)
+    return _Equations(matrix, gradient)
 
 
-def _add_outline(
-    problem: _Problem, drawn: Rendering, R: Tensor, t: Tensor, matrix: Tensor, gradient: Tensor
-) -> float:
-    """Add the outlines' normal equations to those in modes and poses; their cost."""
-    weights, vectors = problem.weights, problem.modes.vectors
-    contour = find_contour(drawn)
+def _bending(problem: _Problem, vertices: Tensor) -> tuple[Tensor, Tensor]:
+    """What bending costs in each mode ``(M, 1)``, and how far the shape is bent in it ``(M, 3)``."""
+    modes = problem.modes
+    stiffness = problem.weights.smoothness / len(vertices) * modes.bending[:, None]
+    return stiffness, modes.vectors.T @ (vertices - problem.known.shape.rest).double()
+
+
+def _outlines(problem: _Problem, drawn: Rendering) -> _Outlines:
+    weights, contour = problem.weights, find_contour(drawn)
     view = contour.view
     scale = _FULL_SIZE / problem.size
     residual, slope = (part * scale for part in contour_slopes(contour, problem.distance))
@@ -212,6 +252,13 @@ def _add_outline(
     weight = weights.outline * contour.length / total[view] / contour.frames * problem.mask_weight[view]
     square = weights.outline_scale**2
     cost = float((weight * square * torch.log1p(residual.square() / square)).sum())
+    return _Outlines(contour, residual, slope, weight, cost)
+
+
+def _outline_rows(problem: _Problem, outlines: _Outlines, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+    """The outlines' Jacobian in modes and poses ``(N, 3 M + 6 B)``, and the same by its robust weights."""
+    contour, residual, slope = outlines.contour, outlines.residual, outlines.slope
+    view, vectors = contour.view, problem.modes.vectors
     motion = screen_motion(contour.points, problem.K[view], t[view])
     by_pose = torch.einsum("ni,nia->na", slope, motion)
     by_object = torch.einsum("na,nab->nb", by_pose[:, :3], R[view])
@@ -220,11 +267,8 @@ def _add_outline(
     by_poses = by_pose.new_zeros(len(view), contour.frames, 6)
     by_poses[torch.arange(len(view)), view] = by_pose
     jacobian = torch.cat([by_mode, by_poses.flatten(1)], 1)
-    weighted = jacobian * (2 * weight / (1 + residual.square() / square))[:, None]
-    count = jacobian.shape[1]
-    matrix[:count, :count] += (jacobian.T @ weighted).double()
-    gradient[:count] += (weighted.T @ residual).double()
-    return cost
+    square = problem.weights.outline_scale**2
+    return jacobian, jacobian * (2 * outlines.weight / (1 + residual.square() / square))[:, None]
 
 
 def _moved(pose: Pose, step: Tensor) -> Pose:

@@ -28,6 +28,34 @@ _ROUNDS = 3  # of the robust means
 
 
 @dataclass(frozen=True, eq=False)
+class SharedFaces:
+    """What B views show of the faces that two views or more show, C channels.
+
+    Attributes:
+        cost: The mean Cauchy loss, of what one view alone shows too.
+        faces: ``(N,)`` int64, which they are.
+        corner: ``(N, B, 3, 3)`` in the cameras' axes; normal: ``(N, B, 3)``; length: ``(N, B, 1)``, twice their areas.
+        slopes: Two of ``(N, B, C)``, of the values by x and by y.
+        light: ``(C, 3)``.
+        residual: ``(N, B, C)``; used: ``(N, B, C)`` their weights as in the matrix of the Cauchy loss.
+        K: ``(B, 3, 3)``.
+        scale: Difference of features at which the loss is ``log 2``.
+    """
+
+    cost: float
+    faces: Tensor
+    corner: Tensor
+    normal: Tensor
+    length: Tensor
+    slopes: tuple[Tensor, Tensor]
+    light: Tensor
+    residual: Tensor
+    used: Tensor
+    K: Tensor
+    scale: float
+
+
+@dataclass(frozen=True, eq=False)
 class FaceEquations:
     """A quadratic model of the mean Cauchy loss over what B views show, C channels.
 
@@ -35,14 +63,12 @@ class FaceEquations:
     for each channel.
 
     Attributes:
-        cost: The loss.
         faces: ``(N,)`` int64, the faces that two views or more show.
         corners: ``(N, 9, 9)`` matrix in each face's corners, in object coordinates.
         mixed: ``(N, 9, G)`` between corners and the rest; rest: ``(G, G)``.
         by_corners: ``(N, 9)`` gradient; by_rest: ``(G,)``.
     """
 
-    cost: float
     faces: Tensor
     corners: Tensor
     mixed: Tensor
@@ -62,13 +88,12 @@ def layers_of(features: Tensor, valid: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def face_equations(drawn: Rendering, layers: Tensor, R: Tensor, t: Tensor, scale: float) -> FaceEquations:
-    """The model at the present shape and poses.
+def shared_faces(drawn: Rendering, layers: Tensor, scale: float) -> SharedFaces:
+    """What the views show of the same faces at the present shape and poses.
 
     Args:
         drawn: The rendering.
         layers: From `layers_of`.
-        R: ``(B, 3, 3)``; t: ``(B, 3)``: the poses.
         scale: Difference of features at which the loss is ``log 2``.
     """
     corner = drawn.x_cam[:, drawn.faces].transpose(0, 1)  # (F, B, 3, 3)
@@ -88,11 +113,20 @@ def face_equations(drawn: Rendering, layers: Tensor, R: Tensor, t: Tensor, scale
     light, residual, used = _lit(value, normal, full, scale)
     cost = float((full * torch.log1p(residual.square() / scale**2)).sum()) + _SINGLE * single
     cost += _RIDGE * float(light.square().sum()) / (count * scale**2)
+    return SharedFaces(
+        cost, faces, corner, normal, length, (by_x, by_y), light, residual, used, drawn.K, scale
+    )
 
+
+@torch.no_grad()
+def face_equations(shown: SharedFaces, R: Tensor, t: Tensor) -> FaceEquations:
+    """The model at the present shape and poses, ``R`` ``(B, 3, 3)`` and ``t`` ``(B, 3)``."""
+    faces, corner, normal, length = shown.faces, shown.corner, shown.normal, shown.length
+    (by_x, by_y), light, used = shown.slopes, shown.light, shown.used
+    frames, count = len(R), len(light)
     # Derivatives of a view's value, less the light's part, by the corners in the camera's axes.
-    frames = len(R)
     middle = corner.mean(2).reshape(-1, 3)
-    K = drawn.K.repeat(len(faces), 1, 1)
+    K = shown.K.repeat(len(faces), 1, 1)
     motion = screen_motion(middle, K, middle)[:, :, :3].reshape(len(faces), frames, 2, 3)
     moving = by_x[..., None] * motion[:, :, None, 0] + by_y[..., None] * motion[:, :, None, 1]  # (N, B, C, 3)
     across = light - (normal @ light.T)[..., None] * normal[:, :, None]
@@ -120,12 +154,11 @@ def face_equations(drawn: Rendering, layers: Tensor, R: Tensor, t: Tensor, scale
     poses = torch.block_diag(*own) - spread.T @ spread
     poses_light = -torch.einsum("nbcp,nbci->bpci", pull, tilt).reshape(6 * frames, 3 * count)
     per_channel = torch.einsum("nbc,nbi,nbcj->cij", used, normal, tilt)
-    ridge = torch.eye(3).to(tilt) * (2 * _RIDGE / (count * scale**2))
+    ridge = torch.eye(3).to(tilt) * (2 * _RIDGE / (count * shown.scale**2))
     lights = torch.block_diag(*(per_channel + ridge))
     rest = torch.cat([torch.cat([poses, poses_light], 1), torch.cat([poses_light.T, lights], 1)])
-    error = (used * residual)[..., None]
+    error = (used * shown.residual)[..., None]
     return FaceEquations(
-        cost,
         faces,
         corners,
         torch.cat([with_poses, with_light], 2),
