@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,6 +21,7 @@ from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
 from tracking3d.stages import STAGES
 
+_EVERY = 10.0  # seconds between lines of a log
 _COLOURS = {"tracked": "green", "uncertain": "yellow", "lost": "red", "skipped": "red"}
 
 
@@ -27,24 +29,28 @@ _COLOURS = {"tracked": "green", "uncertain": "yellow", "lost": "red", "skipped":
 def progress(count: int | None, quiet: bool, objects: int = 1) -> Iterator[Listener]:
     """A progress bar on the standard error: frame, status, IoU against the initial mask, speed, time left.
 
-    It begins again where the frames come a second time, in the final refinement.
+    It begins again where the frames come a second time, in the final refinement. Where the standard error is no
+    terminal, but a log, it is a line every now and then.
 
     Args:
         count: Number of frames, where known.
-        quiet: Show nothing, as where the standard error is no terminal.
+        quiet: Show nothing.
         objects: How many are tracked; the bar counts the frames of each.
 
     Yields:
         The listener to tell of every frame.
     """
     console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _silent if quiet else _logged(console, count and count * objects)
+        return
     bar = Progress(
         BarColumn(bar_width=24),
         MofNCompleteColumn(),
         TextColumn("{task.fields[frame]}"),
         TimeRemainingColumn(compact=True),
         console=console,
-        disable=quiet or not console.is_terminal,
+        disable=quiet,
         transient=True,
     )
     tasks = [bar.add_task("", total=count and count * objects, frame="first frame")]
@@ -58,6 +64,30 @@ def progress(count: int | None, quiet: bool, objects: int = 1) -> Iterator[Liste
 
     with bar:
         yield listener
+
+
+def _silent(frame: FrameRecord | SkippedFrame) -> None:
+    pass
+
+
+def _logged(console: Console, count: int | None) -> Listener:
+    """Prints how far it is, at most once in `_EVERY` seconds and not before these are over."""
+    last, done = time.monotonic(), {False: 0, True: 0}
+
+    def listener(frame: FrameRecord | SkippedFrame) -> None:
+        nonlocal last
+        again = isinstance(frame, FrameRecord) and frame.refined
+        done[again] += 1
+        if time.monotonic() - last >= _EVERY:
+            last = time.monotonic()
+            total = done[False] if again else count
+            console.print(
+                f"{done[again]}{f' of {total}' if total else ''}: {_line(frame)}",
+                highlight=False,
+                soft_wrap=True,
+            )
+
+    return listener
 
 
 def print_summary(folder: Path) -> None:
