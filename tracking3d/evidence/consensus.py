@@ -87,8 +87,14 @@ class Consensus:
         depths = np.linspace(max(middle - radius, 1e-2), middle + radius, _STEPS)
         # The deepest within come first, so that most of the others need no look.
         depths = depths[np.argsort(np.abs(depths - middle), kind="stable")]
-        within = (np.asarray(one, np.float32) for one in (origin, rays, depths))
-        nearest = marched(self._hulls, *within, focal=float(scene.K[0, 0]), beyond=-float(size))
+        nearest = marched(
+            self._hulls,
+            origin.astype(np.float32),
+            rays.astype(np.float32),
+            depths.astype(np.float32),
+            float(scene.K[0, 0]),
+            -float(size),
+        )
         return np.stack([cv2.resize(one, (size, size), interpolation=cv2.INTER_LINEAR) for one in nearest])
 
 
