@@ -76,9 +76,13 @@ class Hindsight:
         self._colours: Colours | None = None
         self.order, self._waiting = InOrder(), deque[Answered]()
 
+    def wants(self, index: int) -> bool:
+        """Whether a frame is one of those that are put together; `see` passes the others over."""
+        return index in self._wanted
+
     def see(self, frame: Answered) -> None:
         """A frame for the first time."""
-        if frame.index not in self._wanted or not np.isfinite(frame.T_cam_obj).all():
+        if not self.wants(frame.index) or not np.isfinite(frame.T_cam_obj).all():
             return
         scene = self._scene(frame)
         if scene is not None and scene.answer.any():
