@@ -96,7 +96,7 @@ def motion_cue(scene: Scene, camera: Camera, targets: Sequence[Target]) -> NDArr
         By colours and by fine texture, within 2; 0 where the motions cannot be told.
     """
     size = scene.window.size
-    costs = np.full((2, size, size, 2), np.inf, np.float32)  # of object and background; by colours and fine
+    costs = np.full((2, 2, size, size), np.inf, np.float32)  # of object and background; by colours and fine
     told = np.zeros((size, size), np.float32)
     here = _both(scene.image)
     for target in targets:
@@ -106,11 +106,11 @@ def motion_cue(scene: Scene, camera: Camera, targets: Sequence[Target]) -> NDArr
             continue
         for cost, at in zip(costs, ways, strict=True):
             found = _residuals(here, _both(cv2.remap(target[0], at, None, cv2.INTER_LINEAR)))
-            np.minimum(cost, found, out=cost, where=known[..., None])
+            np.minimum(cost, np.where(known, found, np.inf), out=cost)
         np.maximum(told, share, out=told)
     known = told > 0
-    ours, theirs = (np.where(known[..., None], cost, 0) + np.float32(_NOISE) for cost in costs)
-    cue = np.clip(np.log(theirs / ours), -_MOST, _MOST).transpose(2, 0, 1)
+    ours, theirs = np.where(known, costs, 0) + np.float32(_NOISE)
+    cue = np.clip(np.log(theirs / ours), -_MOST, _MOST)
     return np.asarray(told * _texture(scene.image) * cue, np.float32)
 
 
@@ -180,7 +180,7 @@ def _projected(points: Matrix) -> NDArray[np.float32]:
 
 
 def _residuals(here: _Both, there: _Both) -> NDArray[np.float32]:
-    """``(S, S, 2)`` grey levels by which patches differ from those of another frame, by colours and by fine texture.
+    """``(2, S, S)`` grey levels by which patches differ from those of another frame, by colours and by fine texture.
 
     A value between those of a pixel's neighbours does not differ: poses are off by a pixel.
     """
@@ -190,8 +190,8 @@ def _residuals(here: _Both, there: _Both) -> NDArray[np.float32]:
         cv2.subtract(cv2.erode(there[0], _SQUARE), here[0]),
     )
     fine = cv2.max(here[1] - cv2.dilate(there[1], _SQUARE), cv2.erode(there[1], _SQUARE) - here[1])
-    means = [_mean(beyond.astype(np.float32)), _mean(cv2.max(fine, 0.0))]
-    return cv2.blur(cv2.merge(means), (_PATCH, _PATCH))
+    means = _mean(beyond.astype(np.float32)), _mean(cv2.max(fine, 0.0))
+    return np.stack([cv2.blur(one, (_PATCH, _PATCH)) for one in means])
 
 
 def _both(image: NDArray[np.uint8]) -> _Both:
