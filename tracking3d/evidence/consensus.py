@@ -77,10 +77,11 @@ class Consensus:
         coarse = max(size // 2, 8)
         step = size / coarse
         centres = np.arange(coarse) * step + (step - 1) / 2
-        v, u = np.meshgrid(centres, centres, indexing="ij")
+        v, u = centres[:, None, None], centres[:, None]
         R, t = scene.T_cam_obj[:3, :3], scene.T_cam_obj[:3, 3]
         to_cells = CELLS / self._side * R.T
-        rays = np.stack([u, v, np.ones_like(u)], -1) @ (to_cells @ np.linalg.inv(scene.K)).T
+        by_u, by_v, first = (to_cells @ np.linalg.inv(scene.K)).T
+        rays = u * by_u + v * by_v + first
         origin = -to_cells @ t - self._low * CELLS / self._side - 0.5
         middle = float((R @ (self._low + self._side / 2) + t)[2])
         radius = 0.75 * self._side

@@ -158,19 +158,20 @@ def _object_flow(scene: Scene, camera: Camera, T_cam_obj: Matrix, step: int = 1)
     """``(S, S, 2)`` where in the other frame a pixel's surface point is; NaN where there is none."""
     inverse_depth = scene.inverse_depth[::step, ::step, None]
     through, shift = _through(scene, camera, T_cam_obj)
-    moved = _pixels(scene, step) @ through.T + inverse_depth * shift
+    moved = _carried(scene, through, step) + inverse_depth * shift
     return _projected(np.where(inverse_depth > 0, moved, np.nan))
 
 
 def _background_flow(scene: Scene, H: Matrix, step: int = 1) -> NDArray[np.float32]:
     """``(S, S, 2)`` where in the other frame a pixel of the background is."""
-    return _projected(_pixels(scene, step) @ (H @ _to_frame(scene)).T)
+    return _projected(_carried(scene, H @ _to_frame(scene), step))
 
 
-def _pixels(scene: Scene, step: int) -> Matrix:
-    """``(S, S, 3)`` homogeneous, every so many of the window."""
-    v, u = np.mgrid[: scene.window.size : step, : scene.window.size : step].astype(np.float64)
-    return np.stack([u, v, np.ones_like(u)], -1)
+def _carried(scene: Scene, through: Matrix, step: int) -> Matrix:
+    """``(S, S, 3)`` where a matrix ``(3, 3)`` takes every so many of the window's pixels, homogeneous."""
+    at = np.arange(0.0, scene.window.size, step)
+    by_u, by_v, first = through.T
+    return np.asarray(at[:, None] * by_u + at[:, None, None] * by_v + first)
 
 
 def _projected(points: Matrix) -> NDArray[np.float32]:
