@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.reconstruction.views import TextureView
 from tracking3d.rendering import TexelMap, seen_texels
-from tracking3d.rendering.backend import compiled
+from tracking3d.rendering.backend import compiled, give_threads, threads_kept
 
 _SMALLEST = 64
 _STEEPNESS = 3
@@ -48,7 +48,13 @@ def textured(model: ObjectModel, views: Sequence[TextureView], largest: int = 20
     """
     if not views:
         return model
-    size = texture_size(views, largest)
+    with threads_kept():
+        if compiled():
+            give_threads({"backend": "numba", "threads": 1})
+        return _textured(model, views, texture_size(views, largest))
+
+
+def _textured(model: ObjectModel, views: Sequence[TextureView], size: int) -> ObjectModel:
     gains, coarse = _levelled(model, views, max(size // _COARSE, 64))
     expected = cv2.resize(coarse, (size, size), interpolation=cv2.INTER_LINEAR).reshape(-1, 3)
     texels = TexelMap.of(torch.from_numpy(model.face_uvs).float(), size)
