@@ -128,7 +128,7 @@ def test_geometry_and_rendering_know_nothing_of_video_or_tracking(room):
 def test_pixels_are_weighed_without_solvers_and_runs():
     for path in (PACKAGE / "evidence").rglob("*.py"):
         rooms = {name.split(".")[1] for name in imported_modules(path)}
-        assert rooms <= {"evidence", "frames", "geometry", "rendering", "trackers"}, path
+        assert rooms <= {"evidence", "frames", "geometry", "rendering", "side_by_side", "trackers"}, path
 
 
 def test_points_are_followed_by_surface_and_images_alone():

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import threading
 from contextlib import closing
+from functools import partial
 
 import pytest
 
-from tracking3d.side_by_side import WorkBehind, read_ahead, with_next
+from tracking3d.side_by_side import InTurn, WorkBehind, read_ahead, with_next
 
 
 def test_items_come_in_order_from_another_thread():
@@ -92,3 +93,35 @@ def test_a_job_that_fails_is_told_of_once_and_the_next_is_not_begun():
     work.do(lambda: 1 / 0)
     work.end()  # what ends for another reason does not hear of it
     assert work.do(lambda: 3) == 3  # where it is given, from now on
+
+
+@pytest.mark.parametrize("most", [1, 2, 3])
+def test_jobs_done_several_at_a_time_give_their_results_in_order(most):
+    jobs, begun, found = InTurn(most), [], []
+    let_go = [threading.Event() for _ in range(9)]
+
+    def job(number):
+        begun.append(number)
+        if number % most:  # the first of each round waits for the last
+            let_go[number - number % most].set()
+        elif most > 1:
+            assert let_go[number].wait(10)
+        return number
+
+    for number in range(9 - 9 % most):
+        found += jobs.do(partial(job, number))
+        assert len(begun) <= len(found) + most
+    found += jobs.rest()
+    assert found == sorted(begun) == list(range(9 - 9 % most))
+    assert not [one for one in threading.enumerate() if one.name.startswith("tracking3d-in-turn")]
+
+
+def test_an_error_of_one_of_several_jobs_comes_in_its_turn():
+    def fail():
+        raise ValueError("job 1")
+
+    jobs = InTurn(2)
+    assert [*jobs.do(lambda: 0), *jobs.do(fail)] == []
+    assert list(jobs.do(lambda: 2)) == [0]
+    with pytest.raises(ValueError, match="job 1"):
+        list(jobs.rest())

@@ -6,6 +6,7 @@ from collections.abc import Callable, Collection, Iterator
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.frames import Frame, Image
@@ -45,10 +46,10 @@ class LastPasses:
         self._look = SecondLook(model, camera, sorted(refinement.causal), most)
         self._masks: SecondMasks | None = None
 
-    def see(self, answer: FrameRecord, image: Image) -> None:
-        """A frame that was looked at again."""
+    def see(self, answer: FrameRecord, image: Image, mask: NDArray[np.bool_]) -> None:
+        """A frame that was looked at again, with the mask ``(H, W)`` of its answer."""
         if answer.refined:
-            self._look.see(answer, image, self._refinement.mask(answer))
+            self._look.see(answer, image, mask)
 
     def settle(self) -> Camera:
         """All were: put together what they say; the camera of the end."""
@@ -63,8 +64,9 @@ class LastPasses:
     def put_right(self, frame: Frame) -> None:
         """Give a frame the pose that all frames together say, before masks are weighed."""
         if self._masks is not None and frame.index in self._refinement.causal:
-            self._place(frame)
-            self._masks.see(self._masked(frame))
+            mask = self._place(frame)
+            if self._masks.wants(frame.index):
+                self._masks.see(self._masked(frame, mask))
 
     def draw(self, frame: Frame, do: Callable[[Callable[[], None]], object]) -> None:
         """Draw a frame as it is answered in the end; where masks are weighed some frames late, with those around it.
@@ -76,10 +78,11 @@ class LastPasses:
         if frame.index not in self._refinement.causal:
             return
         if self._masks is not None:
-            self._draw(self._masks.decide(self._masked(frame)), do)
+            mask = self._refinement.mask(self._refinement.answer(frame.index))
+            self._draw(self._masks.decide(self._masked(frame, mask)), do)
         else:
-            self._place(frame)
-            do(partial(self._refinement.draw, frame))
+            mask, initial = self._place(frame), self._refinement.initial_mask(frame.index)
+            do(partial(self._refinement.draw, frame, mask, initial))
 
     def rest(self, do: Callable[[Callable[[], None]], object]) -> None:
         """Draw the frames that are left when there are no more to come; ``do`` as in `draw`."""
@@ -93,22 +96,26 @@ class LastPasses:
         answered = ((view, self._refinement.answer(view.index)) for view in views)
         return self._look.moved(model), tuple(self._look.seen_by(view, answer) for view, answer in answered)
 
-    def _place(self, frame: Frame) -> None:
+    def _place(self, frame: Frame) -> NDArray[np.bool_]:
+        """Put a frame's pose right; its mask ``(H, W)``."""
         answer = self._refinement.answer(frame.index)
-        if not answer.refined:
-            return
-        T_cam_obj, support = self._look.pose(answer, frame.image, self._refinement.mask(answer))
-        judged = () if support is None else supported_answer(answer, support)
-        self._refinement.put_right(frame.index, T_cam_obj, *judged)
+        mask = self._refinement.mask(answer)
+        if answer.refined:
+            T_cam_obj, support = self._look.pose(answer, frame.image, mask)
+            judged = () if support is None else supported_answer(answer, support)
+            self._refinement.put_right(frame.index, T_cam_obj, *judged)
+        return mask
 
-    def _masked(self, frame: Frame) -> Masked:
+    def _masked(self, frame: Frame, mask: NDArray[np.bool_]) -> Masked:
         answer, initial = self._refinement.answer(frame.index), self._refinement.initial_mask(frame.index)
-        return Masked(frame, answer, initial, self._refinement.mask(answer), frame.index in self._fixed)
+        return Masked(frame, answer, initial, mask, frame.index in self._fixed)
 
     def _draw(self, decisions: Iterator[Decision], do: Callable[[Callable[[], None]], object]) -> None:
         with measured("map") as watch:
-            for frame, decided in decisions:
+            for masked, decided in decisions:
+                frame, mask = masked.frame, masked.mask
                 if decided is not None:
-                    self._refinement.put_mask(frame.index, decided.mask, decided.probability)
-                do(partial(self._refinement.draw, frame))
+                    mask = decided.mask
+                    self._refinement.put_mask(frame.index, mask, decided.probability, masked.initial)
+                do(partial(self._refinement.draw, frame, mask, masked.initial))
         self._refinement.together += watch.times

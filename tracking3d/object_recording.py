@@ -17,6 +17,7 @@ from tracking3d.checkpoint.trees import UnkeptError
 from tracking3d.corrections import Correction, prompts_in
 from tracking3d.errors import OutputError, PluginError
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
+from tracking3d.evidence.scene import Mask
 from tracking3d.frames import Frame, MaskEstimate, SkippedFrame
 from tracking3d.last_passes import LastPasses
 from tracking3d.reconstruction import BELIEVED, TextureView, kept_views, texture_view, textured
@@ -208,7 +209,7 @@ class ObjectRecording:
             check_picture(self._kept, frame)
             if frame.index <= self._until.last_refined:
                 answer = refinement.answer(frame.index)
-                return self._work.do(partial(self._seen_again, refinement, answer, frame))
+                return self._work.do(partial(self._seen_again, answer, frame, refinement.mask(answer)))
         mask = refinement.initial_mask(frame.index)
         score, reason = self._initial.get(frame.index, (1.0, ""))
         initial = MaskEstimate(None if mask is None else mask.astype(np.float32), score, reason)
@@ -219,25 +220,23 @@ class ObjectRecording:
             if self._session.config.runtime.on_plugin_failure == "stop":
                 raise
         state = self._session.kept() if self._checkpoint else {}
-        return self._work.do(partial(self._keep_second, refinement, estimate, frame, state))
+        return self._work.do(partial(self._keep_second, estimate, frame, mask, state))
 
     def _keep_second(
-        self,
-        refinement: RefinementWriter,
-        estimate: FrameEstimate | None,
-        frame: Frame,
-        state: dict[str, Any],
+        self, estimate: FrameEstimate | None, frame: Frame, initial: Mask | None, state: dict[str, Any]
     ) -> FrameRecord:
-        answer = refinement.write(estimate, frame)
+        refinement = self._refinement
+        assert refinement is not None
+        answer = refinement.write(estimate, frame, initial)
         self._progress = replace(self._progress, last_refined=frame.index, refined_lines=refinement.lines)
         self._keep(state)
-        return self._seen_again(refinement, answer, frame)
+        return self._seen_again(answer, frame, estimate.mask if estimate else refinement.mask(answer))
 
-    def _seen_again(self, refinement: RefinementWriter, answer: FrameRecord, frame: Frame) -> FrameRecord:
+    def _seen_again(self, answer: FrameRecord, frame: Frame, mask: Mask) -> FrameRecord:
         """Keep what poses, surface and texture of the end can be taken from; the answer as it is."""
-        most, mask = self._session.config.object.texture_views, refinement.mask(answer)
+        most = self._session.config.object.texture_views
         if self._last:
-            self._last.see(answer, frame.image)
+            self._last.see(answer, frame.image, mask)
         if most and answer.status is Status.TRACKED and answer.confidence >= BELIEVED:
             camera = answer.through(self._session.camera)
             image, seen = camera.undistorted(frame.image), camera.mask_to_pinhole(mask)

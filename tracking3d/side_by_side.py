@@ -1,17 +1,18 @@
 """What is done beside the frames, in threads of its own: reading those that come, and keeping what is answered.
 
 One thread reads a few frames ahead; every recording has one that writes, one answer behind at most. Reading and
-writing change no answer, so that these are the same on every run, however busy the machine is. What goes wrong
-in such a thread is raised where its result is asked for.
+writing change no answer, so that these are the same on every run, however busy the machine is. Frames that do not
+depend on each other are done several at a time, their results in order. What goes wrong in such a thread is raised
+where its result is asked for.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 T = TypeVar("T")
 
@@ -49,6 +50,42 @@ def with_next(items: Iterable[T]) -> Generator[tuple[T, T | None]]:
         after = next(following, _END)
         yield cast(T, item), None if after is _END else cast(T, after)
         item = after
+
+
+class InTurn:
+    """Jobs that do not depend on each other, done several at a time; what they give comes in their order.
+
+    Args:
+        most: How many at a time; one is done where it is given.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._threads: ThreadPoolExecutor | None = None
+        self._waiting = deque[Future[Any]]()
+
+    def do(self, job: Callable[[], T]) -> Iterator[T]:
+        """Begin a job; gives what earlier ones gave, when as many wait as are done at a time.
+
+        Raises:
+            Exception: What an earlier one ended with.
+        """
+        if self._most <= 1:
+            yield job()
+            return
+        if self._threads is None:
+            self._threads = ThreadPoolExecutor(self._most, "tracking3d-in-turn")
+        self._waiting.append(self._threads.submit(job))
+        while len(self._waiting) > self._most:
+            yield self._waiting.popleft().result()
+
+    def rest(self) -> Iterator[Any]:
+        """What the last jobs give, and an end of the threads."""
+        while self._waiting:
+            yield self._waiting.popleft().result()
+        if self._threads is not None:
+            self._threads.shutdown()
+            self._threads = None
 
 
 class WorkBehind:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from tracking3d.evidence import hindsight
 from tracking3d.evidence.alignment import alignment, edge_strength
 from tracking3d.evidence.consensus import Consensus
 from tracking3d.evidence.hindsight import Hindsight, all_decided
@@ -18,6 +19,7 @@ from tracking3d.evidence.order import InOrder
 from tracking3d.evidence.scene import Answered, Scene
 from tracking3d.evidence.sources import Said
 from tracking3d.geometry.camera import Camera
+from tracking3d.trackers.outline import signed_distance
 
 CAMERA = Camera(200.0, 200.0, 79.5, 59.5, 160, 120)
 BALL = trimesh.creation.icosphere(3)
@@ -54,11 +56,11 @@ def with_strip(mask: np.ndarray) -> np.ndarray:
 
 
 def looked_at(frames: list[Answered]) -> dict[int, np.ndarray | None]:
-    hindsight = Hindsight(CAMERA, VERTICES, FACES, {one.index: one.confidence for one in frames})
+    known = Hindsight(CAMERA, VERTICES, FACES, {one.index: one.confidence for one in frames})
     for one in frames:
-        hindsight.see(one)
-    hindsight.settle()
-    found = list(all_decided(hindsight, frames))
+        known.see(one)
+    known.settle()
+    found = list(all_decided(known, frames))
     assert [index for index, _ in found] == [one.index for one in frames]
     for _, decided in found:
         if decided is not None:
@@ -75,6 +77,16 @@ def test_a_strip_of_background_in_all_masks_is_taken_out():
     before = [overlap(with_strip(frame(number)[1]), frame(number)[1]) for number in found]
     after = [overlap(mask, frame(number)[1]) for number, mask in found.items()]
     assert np.mean(after) > np.mean(before) + 0.05 and np.min(after) > np.min(before)
+
+
+def test_frames_decided_side_by_side_are_the_same_to_the_last_digit(monkeypatch):
+    frames = [answered(number, with_strip) for number in range(12)]
+    masks = []
+    for at_a_time in (1, 2):
+        monkeypatch.setattr(hindsight, "_AT_A_TIME", at_a_time)
+        masks.append(looked_at(frames))
+    for index in masks[0]:
+        np.testing.assert_array_equal(masks[0][index], masks[1][index])
 
 
 def test_exact_masks_stay_what_they_are():
@@ -167,9 +179,10 @@ def test_an_outline_on_edges_is_told_from_one_beside_them():
     disc = np.hypot(*(np.mgrid[:96, :96] - 48)) < 30
     lab = np.where(disc[..., None], 200, 60).astype(np.uint8).repeat(3, 2)
     edges = edge_strength(lab)
-    on, off = (alignment(edges, np.hypot(*(np.mgrid[:96, :96] - 48)) < radius)[1] for radius in (30, 24))
+    around = np.hypot(*(np.mgrid[:96, :96] - 48))
+    on, off = (alignment(edges, signed_distance(around < radius))[1] for radius in (30, 24))
     assert on > 1 > 0 > off
-    assert alignment(edges, disc & False) == (pytest.approx(np.zeros((96, 96))), 0.0)
+    assert alignment(edges, signed_distance(disc & False)) == (pytest.approx(np.zeros((96, 96))), 0.0)
 
 
 def test_every_source_is_odd_and_has_a_weight():

@@ -10,7 +10,7 @@ import torch
 from rendered_views import FINE, ball, pattern, view
 
 from tracking3d.estimation.estimate import ObjectModel
-from tracking3d.reconstruction import textured
+from tracking3d.reconstruction import textured, texturing
 from tracking3d.reconstruction.texturing import filled, texture_size
 from tracking3d.rendering import sample_texture
 
@@ -77,6 +77,15 @@ def test_exposures_are_brought_to_one_level():
     well = textured(ball(), views).texture_weight > 0.3
     ratio = level[well].mean(-1) / even[well].mean(-1)
     assert ratio.std() < 0.03  # 0.075 where each texel has its own view's exposure
+
+
+def test_the_kernel_adds_up_what_numpy_adds_up(monkeypatch):
+    views = [view(n, yaw) for n, yaw in enumerate(YAWS)]
+    fast = textured(ball(), views)
+    monkeypatch.setattr(texturing, "compiled", lambda: False)
+    plain = textured(ball(), views)
+    assert np.abs(fast.texture.astype(int) - plain.texture).max() <= 1
+    assert fast.texture_weight == pytest.approx(plain.texture_weight, rel=1e-4)
 
 
 def test_the_largest_texture_is_bounded():

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from scenes import bumpy_sphere, waves
 
-from tracking3d.rendering import BackProjection, TexelMap, back_project, render, sample_texture
+from tracking3d.rendering import BackProjection, TexelMap, back_project, render, sample_texture, seen_texels
 
 
 def looked_at(texture: torch.Tensor, valid: torch.Tensor | None = None) -> tuple[BackProjection, TexelMap]:
@@ -69,3 +70,42 @@ def test_the_far_side_is_not_painted_through():
     assert (seen.weight > 0).double().mean() > 0.25
     picked = sample_texture(seen.weight[None], torch.tensor([[0.5, 0.5]], dtype=torch.float64))
     assert picked.isfinite().all()
+
+
+def test_back_projection_is_the_same_to_the_last_digit_with_every_backend():
+    scene = bumpy_sphere((96, 96), views=1, frequency=8)
+    vertices, uvs, R, t, K = (
+        one.float() for one in (scene.vertices, scene.face_uvs, scene.R, scene.t, scene.K)
+    )
+    texels, image = TexelMap.of(uvs, 32), torch.rand(3, 96, 96)
+    fast, plain = (
+        back_project(image, image[0], vertices, scene.faces, texels, R[0], t[0], K[0], backend)
+        for backend in ("numba", "torch")
+    )
+    assert torch.equal(fast.total, plain.total) and torch.equal(fast.weight, plain.weight)
+
+
+def test_the_kernel_sees_what_torch_sees():
+    scene = bumpy_sphere((96, 96), views=3, frequency=8)
+    vertices, uvs, R, t, K = (
+        one.float() for one in (scene.vertices, scene.face_uvs, scene.R, scene.t, scene.K)
+    )
+    K[:, 0, 2] += 30  # a part lies beyond the frame
+    texels = TexelMap.of(uvs, 64)
+    image = torch.rand(5, 96, 96)
+    valid = (torch.rand(96, 96) - 0.3).clamp(0, 1)
+    K = (
+        K + torch.tensor([0.0, 0.0, 30.0])[:, None].T * torch.eye(3)[0][:, None]
+    )  # a part lies beyond the frame
+    for n in range(3):
+        fast, plain = (
+            seen_texels(image, valid, vertices, scene.faces, texels, R[n], t[n], K[n], backend)
+            for backend in ("numba", "torch")
+        )
+        both, ours, theirs = (
+            torch.from_numpy(one)
+            for one in np.intersect1d(fast.texel, plain.texel, assume_unique=True, return_indices=True)
+        )
+        assert len(both) > 300 and len(both) >= 0.999 * max(len(fast.texel), len(plain.texel))
+        torch.testing.assert_close(fast.values[:, ours], plain.values[:, theirs], atol=1e-3, rtol=0)
+        torch.testing.assert_close(fast.weight[ours], plain.weight[theirs], atol=1e-3, rtol=0)

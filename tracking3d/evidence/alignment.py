@@ -8,8 +8,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.trackers.outline import signed_distance
-
 _ON, _OFF = 1.0, (3.0, 9.0)
 """Pixels from the outline within which an edge is on it, and between which it is beside it."""
 _NEIGHBOURHOOD = 0.15  # half its side, relative to the root of the area
@@ -27,20 +25,20 @@ def edge_strength(lab: NDArray[np.uint8]) -> NDArray[np.float32]:
     return np.asarray(np.sqrt(strength / max(float(strength.mean()), 1e-6)), np.float32)
 
 
-def alignment(edges: NDArray[np.float32], mask: NDArray[np.bool_]) -> tuple[NDArray[np.float32], float]:
+def alignment(edges: NDArray[np.float32], distance: NDArray[np.float32]) -> tuple[NDArray[np.float32], float]:
     """Log of how strong edges are on an outline over how strong they are beside it.
 
     Args:
         edges: ``(S, S)`` from `edge_strength`.
-        mask: ``(S, S)``.
+        distance: ``(S, S)`` pixels to the outline, positive inside.
 
     Returns:
         ``(S, S)`` around each pixel, within 1.5, and of the whole outline; 0 where there is no outline.
     """
-    area = int(np.count_nonzero(mask))
-    if area in (0, mask.size):
-        return np.zeros(mask.shape, np.float32), 0.0
-    distance = np.abs(signed_distance(mask))
+    area = int(np.count_nonzero(distance > 0))
+    if area in (0, distance.size):
+        return np.zeros_like(distance), 0.0
+    distance = np.abs(distance)
     on, off = (
         (distance <= _ON).astype(np.float32),
         ((distance >= _OFF[0]) & (distance <= _OFF[1])).astype(np.float32),

@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.trackers.colour_models import Palette, histograms, log_ratio
+from tracking3d.rendering.backend import compiled
+from tracking3d.trackers.colour_models import Palette, histograms, local_shares, log_ratio
 from tracking3d.trackers.outline import signed_distance
 
 _RATE = 0.1
@@ -18,6 +19,8 @@ _INSIDE, _BESIDE = 0.03, (0.06, 0.4)
 """Distances from an outline, relative to the root of the area, from and within which a pixel surely is on its side."""
 _NEIGHBOURHOOD = 0.4
 """Half the side of the neighbourhood in which colours are compared, relative to the root of the area."""
+_RARE, _MOST = 0.002, 3.0
+"""Share that is added to either side's, and limit of the log of their ratio."""
 
 _SAMPLES = 44
 """Along either side of a crop, from which its few colours are taken."""
@@ -70,15 +73,45 @@ def beside_outline(lab: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[n
     palette = Palette(lab, stride=max(round(len(lab) / _SAMPLES), 1))
     labels = palette.label(lab)
     radius = max(round(_NEIGHBOURHOOD * math.sqrt(np.count_nonzero(mask))), 2)
-    return palette.local_log_ratio(labels, labels, mask.astype(np.float32), radius)
+    inside, beside = alike_around(labels, mask, radius, palette.size)
+    return np.clip(np.log((inside + _RARE) / (beside + _RARE)), -_MOST, _MOST)
 
 
-def relative_distance(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """``(S, S)`` distance to the outline over the root of the area: positive inside, negative outside."""
+def alike_around(
+    labels: NDArray[np.uint8], mask: NDArray[np.bool_], radius: int, size: int
+) -> NDArray[np.float32]:
+    """``(2, S, S)`` shares of what lies in a mask around a pixel that have its label, and of what lies beside it.
+
+    Of less than a fiftieth of the neighbourhood the shares are those in so much.
+
+    Args:
+        labels: ``(S, S)``.
+        mask: ``(S, S)``.
+        radius: Half the side of the neighbourhood in pixels.
+        size: More than any label.
+    """
+    if compiled():
+        from tracking3d.evidence.kernels import colours
+
+        return colours.alike_around(labels, mask, radius, size)
+    sides = np.stack([mask, ~mask]).astype(np.float32)
+    total = np.maximum(np.stack([cv2.blur(one, (2 * radius + 1,) * 2) for one in sides]), 0.02)
+    return local_shares(labels, labels, sides[0], radius, size) / total
+
+
+def relative_distance(
+    mask: NDArray[np.bool_], distance: NDArray[np.float32] | None = None
+) -> NDArray[np.float32]:
+    """``(S, S)`` distance to the outline over the root of the area: positive inside, negative outside.
+
+    Args:
+        mask: ``(S, S)``.
+        distance: ``(S, S)`` the same in pixels, where it is known already.
+    """
     area = int(np.count_nonzero(mask))
     if area in (0, mask.size):  # without an outline everything is far on one side of it
         return np.full(mask.shape, 1.0 if area else -1.0, np.float32)
-    return signed_distance(mask) / math.sqrt(area)
+    return (signed_distance(mask) if distance is None else distance) / math.sqrt(area)
 
 
 def as_lab(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

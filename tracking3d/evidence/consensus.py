@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from tracking3d.evidence.scene import Scene
+from tracking3d.rendering.backend import compiled
 from tracking3d.trackers.outline import signed_distance
 
 CELLS = 64
@@ -21,6 +22,7 @@ RANKS = (0.04, 0.15)
 _MARGIN = 0.15  # of the grid beside the surface, relative to its extent
 _STEPS = 48
 _LEAST_VIEWS = 4
+_NEAR = 1e-3  # depth of a cell
 _UNKNOWN = 127  # larger than any stored distance
 _MOST_UNKNOWN = 0.7  # of the views
 
@@ -36,38 +38,22 @@ class Consensus:
         low, high = vertices.min(0), vertices.max(0)
         middle, half = (low + high) / 2, (0.5 + _MARGIN) * float((high - low).max())
         self._low, self._side = middle - half, 2 * half
-        steps = (np.arange(CELLS, dtype=np.float32) + 0.5) / CELLS * self._side
-        z, y, x = np.meshgrid(steps, steps, steps, indexing="ij")
-        self._points = (np.stack([x, y, z], -1).reshape(-1, 3) + self._low).astype(np.float32)
         self._unit = self._side / 400  # a step of the stored distances
         self._views: list[NDArray[np.int8]] = []
-        self._hull: torch.Tensor | None = None
+        self._hulls: NDArray[np.float32] | None = None
 
     def see(self, scene: Scene) -> None:
         """Add a frame whose pose and mask are believed."""
-        P = (scene.K @ scene.T_cam_obj[:3]).astype(np.float32)
-        seen = self._points @ P[:, :3].T + P[:, 3]
-        depth = seen[:, 2]
-        if (depth <= 1e-3).any():
-            return
-        x, y = ((seen[:, i] / depth).reshape(CELLS, -1) for i in (0, 1))
+        # Beyond the window nothing is the object, beyond the frame nothing is known.
         size = scene.window.size
         distance = np.clip(signed_distance(scene.answer), -size, size)
-        # Beyond the window nothing is the object, beyond the frame nothing is known.
-        far = np.float32(-size)
-        value = cv2.remap(
-            distance, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=float(far)
-        ).ravel()
-        unknown = (
-            cv2.remap(
-                (~scene.valid).astype(np.float32), x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT
-            ).ravel()
-            > 0
-        )
-        value = value * depth / np.float32(scene.K[0, 0]) / np.float32(self._unit)
-        value = np.clip(np.rint(value), -_UNKNOWN + 1, _UNKNOWN - 1)
-        value[unknown] = _UNKNOWN
-        self._views.append(value.astype(np.int8))
+        P = scene.K @ scene.T_cam_obj[:3]
+        step = self._side / CELLS
+        to_pixels = np.column_stack([step * P[:, :3], P[:, :3] @ (self._low + step / 2) + P[:, 3]])
+        by_depth = 1 / (float(scene.K[0, 0]) * self._unit)
+        values = carried(distance, ~scene.valid, to_pixels, by_depth, -size)
+        if values is not None:
+            self._views.append(values)
 
     def settle(self) -> None:
         """All views are there."""
@@ -80,33 +66,115 @@ class Consensus:
         hull = values[:, places].T.astype(np.float32) * self._unit
         # Where few views can see nothing is known, and the hull ends.
         hull[:, np.count_nonzero(values == _UNKNOWN, axis=1) > _MOST_UNKNOWN * count] = -self._side
-        self._hull = torch.from_numpy(hull).reshape(1, len(RANKS), CELLS, CELLS, CELLS)
+        self._hulls = with_peaks(hull.reshape(len(RANKS), CELLS, CELLS, CELLS))
         self._views = []
 
     def drawn(self, scene: Scene) -> NDArray[np.float32] | None:
         """``(R, S, S)`` pixels within (positive) or from the hulls in a frame; None where they are not known."""
-        if self._hull is None or not np.isfinite(scene.T_cam_obj).all():
+        if self._hulls is None or not np.isfinite(scene.T_cam_obj).all():
             return None
         size = scene.window.size
         coarse = max(size // 2, 8)
         step = size / coarse
-        centres = torch.arange(coarse, dtype=torch.float32) * step + (step - 1) / 2
-        v, u = torch.meshgrid(centres, centres, indexing="ij")
-        K_inv = torch.tensor(np.linalg.inv(scene.K), dtype=torch.float32)
-        T = scene.T_cam_obj
-        R, t = T[:3, :3], T[:3, 3]
-        rays = torch.stack([u, v, torch.ones_like(u)], -1) @ K_inv.T @ torch.tensor(R, dtype=torch.float32)
-        origin = torch.tensor(-R.T @ t, dtype=torch.float32)
-        middle = R @ (self._low + self._side / 2) + t
+        centres = np.arange(coarse) * step + (step - 1) / 2
+        v, u = centres[:, None, None], centres[:, None]
+        R, t = scene.T_cam_obj[:3, :3], scene.T_cam_obj[:3, 3]
+        to_cells = CELLS / self._side * R.T
+        by_u, by_v, first = (to_cells @ np.linalg.inv(scene.K)).T
+        rays = u * by_u + v * by_v + first
+        origin = -to_cells @ t - self._low * CELLS / self._side - 0.5
+        middle = float((R @ (self._low + self._side / 2) + t)[2])
         radius = 0.75 * self._side
-        depths = torch.linspace(max(middle[2] - radius, 1e-2), middle[2] + radius, _STEPS)
-        points = origin + depths[:, None, None, None] * rays
-        low = torch.tensor(self._low, dtype=torch.float32)
-        grid = (points - low) / self._side * 2 - 1
-        beyond = (grid.abs().amax(-1) > 1)[None]
-        value = torch.nn.functional.grid_sample(
-            self._hull, grid[None], align_corners=False, padding_mode="border"
-        )[0]
-        pixels = value / depths[:, None, None] * float(scene.K[0, 0])
-        nearest = pixels.masked_fill(beyond, -float(size)).amax(1).numpy()
+        depths = np.linspace(max(middle - radius, 1e-2), middle + radius, _STEPS)
+        # The deepest within come first, so that most of the others need no look.
+        depths = depths[np.argsort(np.abs(depths - middle), kind="stable")]
+        nearest = marched(
+            self._hulls,
+            origin.astype(np.float32),
+            rays.astype(np.float32),
+            depths.astype(np.float32),
+            float(scene.K[0, 0]),
+            -float(size),
+        )
         return np.stack([cv2.resize(one, (size, size), interpolation=cv2.INTER_LINEAR) for one in nearest])
+
+
+def carried(
+    distance: NDArray[np.float32],
+    unknown: NDArray[np.bool_],
+    to_pixels: NDArray[np.float64],
+    by_depth: float,
+    beyond: float,
+) -> NDArray[np.int8] | None:
+    """``(C * C * C,)`` distances that the cells of the grid have in a view, in whole units, `_UNKNOWN` where unknown.
+
+    Args:
+        distance: ``(S, S)`` pixels to the outline.
+        unknown: ``(S, S)`` what lies beyond the frame.
+        to_pixels: ``(3, 4)`` from ``x, y, z, 1`` in cells to homogeneous pixels, the third of them the depth.
+        by_depth: Units that a pixel has at a depth of 1.
+        beyond: The distance beyond the window.
+
+    Returns:
+        None where a cell is not in front of the camera.
+    """
+    if compiled():
+        from tracking3d.evidence.kernels import consensus
+
+        return consensus.carried(distance, unknown, to_pixels, by_depth, beyond, _NEAR, CELLS, _UNKNOWN)
+    z, y, x = np.mgrid[:CELLS, :CELLS, :CELLS].reshape(3, -1)
+    u, v, depth = to_pixels @ np.stack([x, y, z, np.ones_like(x)])
+    if (depth <= _NEAR).any():
+        return None
+    u, v = ((one / depth).astype(np.float32).reshape(CELLS, -1) for one in (u, v))
+    value, hidden = (
+        cv2.remap(plane, u, v, method, borderMode=cv2.BORDER_CONSTANT, borderValue=border).ravel()
+        for plane, method, border in (
+            (distance, cv2.INTER_LINEAR, beyond),
+            (unknown.astype(np.uint8), cv2.INTER_NEAREST, 0),
+        )
+    )
+    value = np.clip(np.rint(value * depth * by_depth), -_UNKNOWN + 1, _UNKNOWN - 1)
+    return np.where(hidden > 0, _UNKNOWN, value).astype(np.int8)
+
+
+def with_peaks(hulls: NDArray[np.float32]) -> NDArray[np.float32]:
+    """``(C, C, C, 2 R)``: signed distances ``(R, C, C, C)`` by z, y and x, then the largest of a cell's 8 corners."""
+    peaks = hulls
+    for axis in (1, 2, 3):
+        after = np.minimum(np.arange(CELLS) + 1, CELLS - 1)
+        peaks = np.maximum(peaks, peaks.take(after, axis))
+    return np.ascontiguousarray(np.concatenate([hulls, peaks]).transpose(1, 2, 3, 0))
+
+
+def marched(
+    hulls: NDArray[np.float32],
+    origin: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    depths: NDArray[np.float32],
+    focal: float,
+    beyond: float,
+) -> NDArray[np.float32]:
+    """``(R, S, S)`` pixels within or from hulls, where each ray comes nearest to being within.
+
+    Args:
+        hulls: ``(C, C, C, 2 R)`` from `with_peaks`.
+        origin: ``(3,)`` of the camera in cells; the middle of the first cell is at 0.
+        rays: ``(S, S, 3)`` in cells, for a depth of 1.
+        depths: ``(D,)`` at which each ray is asked.
+        focal: Pixels that a distance of 1 has at a depth of 1.
+        beyond: What rays get that miss the grid.
+    """
+    if compiled():
+        from tracking3d.evidence.kernels import consensus
+
+        return consensus.marched(hulls, origin, rays, depths, focal, beyond)
+    cells = origin + depths[:, None, None, None] * rays
+    grid = torch.from_numpy((2 * cells + 1) / np.float32(len(hulls)) - 1)
+    signed = torch.from_numpy(hulls[..., : hulls.shape[-1] // 2])
+    value = torch.nn.functional.grid_sample(
+        signed.permute(3, 0, 1, 2)[None], grid[None], align_corners=False, padding_mode="border"
+    )[0].numpy()
+    pixels = value / depths[:, None, None] * np.float32(focal)
+    missed = (grid.abs().amax(-1) > 1).numpy()
+    return np.asarray(np.where(missed, np.float32(beyond), pixels).max(1))

@@ -10,7 +10,9 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,12 +25,15 @@ from tracking3d.evidence.order import REACH, InOrder
 from tracking3d.evidence.scene import Answered, Mask, Plane, Scene
 from tracking3d.evidence.sources import Said
 from tracking3d.geometry.camera import Camera
+from tracking3d.side_by_side import InTurn
 
 MOST_VIEWS = 60
 """Frames that are put together, spread over those that are believed."""
 _BELIEVED = 0.5
 _ASKED = 0.4
 """How far the image smooths what is said, see `along_edges`: in an even one outlines would creep."""
+_AT_A_TIME = 2
+"""Frames that are decided at a time, in as many threads as OpenCV may take at most."""
 _MOST_CHANGE = 0.35  # of the union of both masks; a mask that changes more is another object's
 
 
@@ -75,10 +80,15 @@ class Hindsight:
         self._consensus = Consensus(vertices)
         self._colours: Colours | None = None
         self.order, self._waiting = InOrder(), deque[Answered]()
+        self._jobs = InTurn(min(cv2.getNumThreads(), _AT_A_TIME))
+
+    def wants(self, index: int) -> bool:
+        """Whether a frame is one of those that are put together; `see` passes the others over."""
+        return index in self._wanted
 
     def see(self, frame: Answered) -> None:
         """A frame for the first time."""
-        if frame.index not in self._wanted or not np.isfinite(frame.T_cam_obj).all():
+        if not self.wants(frame.index) or not np.isfinite(frame.T_cam_obj).all():
             return
         scene = self._scene(frame)
         if scene is not None and scene.answer.any():
@@ -101,28 +111,38 @@ class Hindsight:
         self.order.add(frame)
         self._waiting.append(frame)
         if len(self._waiting) > REACH:
-            yield self._decided(self._waiting.popleft())
+            yield from self._begin(self._waiting.popleft())
 
     def rest(self) -> Iterator[tuple[int, Decided | None]]:
         """Those that are left when there are no more frames; see `decide`."""
         while self._waiting:
-            yield self._decided(self._waiting.popleft())
+            yield from self._begin(self._waiting.popleft())
+        yield from self._jobs.rest()
 
-    def said(self, frame: Answered) -> tuple[Scene, Said] | None:
-        """What the sources say of one of the latest frames; None where it has no masks or no pose."""
+    def said(self, frame: Answered, order: InOrder | None = None) -> tuple[Scene, Said] | None:
+        """What the sources say of one of the latest frames; None where it has no masks or no pose.
+
+        Args:
+            frame: The frame.
+            order: Those around it; `order` as it is, if left out.
+        """
         if not frame.initial.any() or not frame.answer.any() or not np.isfinite(frame.T_cam_obj).all():
             return None
         scene = self._scene(frame)
         if scene is None or not scene.initial.any() or not scene.answer.any():
             return None
-        motion = motion_cue(scene, self._camera, self.order.around(frame.index, scene, self._camera))
+        around = (order or self.order).around(frame.index, scene, self._camera)
+        motion = motion_cue(scene, self._camera, around)
         return scene, Said.of(scene, self._consensus.drawn(scene), self._colours, motion)
 
     def _scene(self, frame: Answered) -> Scene | None:
         return Scene.of(frame, self._camera, self._vertices, self._faces)
 
-    def _decided(self, frame: Answered) -> tuple[int, Decided | None]:
-        asked = self.said(frame)
+    def _begin(self, frame: Answered) -> Iterator[tuple[int, Decided | None]]:
+        yield from self._jobs.do(partial(self._decided, frame, self.order.as_it_is()))
+
+    def _decided(self, frame: Answered, order: InOrder) -> tuple[int, Decided | None]:
+        asked = self.said(frame, order)
         if asked is None:
             return frame.index, None
         scene, said = asked

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from tracking3d.evidence.scene import Mask, Plane, Scene
 from tracking3d.frames import Image
 from tracking3d.geometry.camera import Camera
+from tracking3d.rendering.backend import compiled
 
 _CORNERS, _LEAST_CORNERS = 300, 12
 _AGREEING = 0.3  # of the corners
@@ -29,6 +30,10 @@ _MOST = 2.0
 _TEXTURE = (4.0, 20.0)
 """Mean contrast of neighbouring pixels in a patch, grey levels, from which on, and in full, its motion can be told."""
 
+_SQUARE = np.ones((3, 3), np.uint8)
+_THIRDS = np.full((1, 3), 1 / 3)
+
+_Both = tuple[NDArray[np.uint8], NDArray[np.float32]]
 Matrix = NDArray[np.float64]
 Target = tuple[Image, Matrix, Matrix]
 """Another frame ``(H, W, 3)``, the object's pose ``(4, 4)`` there, and the background's homography ``(3, 3)`` to it."""
@@ -91,75 +96,118 @@ def motion_cue(scene: Scene, camera: Camera, targets: Sequence[Target]) -> NDArr
         By colours and by fine texture, within 2; 0 where the motions cannot be told.
     """
     size = scene.window.size
-    costs = np.full((2, 2, size, size), np.inf, np.float32)  # by colours and fine; object and background
+    costs = np.full((2, 2, size, size), np.inf, np.float32)  # of object and background; by colours and fine
     told = np.zeros((size, size), np.float32)
     here = _both(scene.image)
-    for image, T_cam_obj, H in targets:
-        ways = _object_flow(scene, camera, T_cam_obj), _background_flow(scene, H)
-        parted = np.nan_to_num(np.linalg.norm(ways[0] - ways[1], axis=-1))
-        share = np.clip((parted - _APART[0]) / (_APART[1] - _APART[0]), 0, 1)
-        if not share.any():
+    for target in targets:
+        ways, share = _parted_ways(scene, camera, target)
+        known = share > 0
+        if not known.any():
             continue
-        found = np.stack([_residuals(here, image, at) for at in ways], 1)
-        known = np.isfinite(found).all((0, 1)) & (share > 0)
-        costs = np.where(known, np.fmin(costs, found), costs)
-        told = np.where(known, np.maximum(told, share), told)
-    known = np.isfinite(costs).all((0, 1))
-    costs = np.where(known, costs, 0)
-    cue = np.log((costs[:, 1] + _NOISE) / (costs[:, 0] + _NOISE))
-    return np.asarray(told * _texture(scene.image) * np.clip(cue, -_MOST, _MOST), np.float32)
+        for cost, at in zip(costs, ways, strict=True):
+            found = _residuals(here, _both(cv2.remap(target[0], at, None, cv2.INTER_LINEAR)))
+            np.minimum(cost, np.where(known, found, np.inf), out=cost)
+        np.maximum(told, share, out=told)
+    known = told > 0
+    ours, theirs = np.where(known, costs, 0) + np.float32(_NOISE)
+    cue = np.clip(np.log(theirs / ours), -_MOST, _MOST)
+    return np.asarray(told * _texture(scene.image) * cue, np.float32)
+
+
+def _parted_ways(
+    scene: Scene, camera: Camera, target: Target
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Where pixels are in another frame.
+
+    Returns:
+        ``(2, S, S, 2)`` by the object's motion and by the background's, and ``(S, S)`` in [0, 1] how far that can be
+        told apart; both 0 where either leads out of the frame.
+    """
+    image, T_cam_obj, H = target
+    if compiled():
+        from tracking3d.evidence.kernels import motion
+
+        of_surface = np.column_stack(_through(scene, camera, T_cam_obj))
+        of_background = np.ascontiguousarray(H @ _to_frame(scene))
+        return motion.parted_ways(scene.inverse_depth, of_surface, of_background, image.shape[:2], _APART)
+    ways = np.stack([_object_flow(scene, camera, T_cam_obj), _background_flow(scene, H)])
+    limit = np.array([image.shape[1] - 1, image.shape[0] - 1])
+    with np.errstate(invalid="ignore"):
+        inside = np.asarray(((ways > 0) & (ways < limit)).all((0, -1)))
+    ways = np.where(inside[..., None], ways, 0).astype(np.float32)
+    parted = np.linalg.norm(ways[0] - ways[1], axis=-1)
+    return ways, np.clip((parted - _APART[0]) / (_APART[1] - _APART[0]), 0, 1) * inside
+
+
+def _through(scene: Scene, camera: Camera, T_cam_obj: Matrix) -> tuple[Matrix, Matrix]:
+    """``(3, 3)`` and ``(3,)`` that take the window's ``u, v, 1`` and one over a depth to the other frame's pixels."""
+    T = T_cam_obj @ np.linalg.inv(scene.T_cam_obj)
+    return camera.K @ T[:3, :3] @ np.linalg.inv(scene.K), camera.K @ T[:3, 3]
+
+
+def _to_frame(scene: Scene) -> Matrix:
+    """``(3, 3)`` from the window's pixels to the frame's."""
+    window = scene.window
+    corner = (0.5 / window.scale + edge - 0.5 for edge in (window.left, window.top))
+    to_frame = np.diag([1 / window.scale, 1 / window.scale, 1.0])
+    to_frame[:2, 2] = tuple(corner)
+    return to_frame
 
 
 def _object_flow(scene: Scene, camera: Camera, T_cam_obj: Matrix, step: int = 1) -> NDArray[np.float32]:
     """``(S, S, 2)`` where in the other frame a pixel's surface point is; NaN where there is none."""
-    size = scene.window.size
-    v, u = np.mgrid[:size:step, :size:step].astype(np.float32)
     inverse_depth = scene.inverse_depth[::step, ::step, None]
-    T = T_cam_obj @ np.linalg.inv(scene.T_cam_obj)
-    through = (camera.K @ T[:3, :3] @ np.linalg.inv(scene.K)).astype(np.float32)
-    moved = np.stack([u, v, np.ones_like(u)], -1) @ through.T
-    moved += inverse_depth * (camera.K @ T[:3, 3]).astype(np.float32)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ahead = np.where((inverse_depth > 0) & (moved[..., 2:] > 0), moved[..., 2:], np.nan)
-        return np.asarray(moved[..., :2] / ahead, np.float32)
+    through, shift = _through(scene, camera, T_cam_obj)
+    moved = _carried(scene, through, step) + inverse_depth * shift
+    return _projected(np.where(inverse_depth > 0, moved, np.nan))
 
 
 def _background_flow(scene: Scene, H: Matrix, step: int = 1) -> NDArray[np.float32]:
     """``(S, S, 2)`` where in the other frame a pixel of the background is."""
-    window = scene.window
-    v, u = np.mgrid[: window.size : step, : window.size : step].astype(np.float32)
-    x, y = ((at + 0.5) / window.scale + edge - 0.5 for at, edge in ((u, window.left), (v, window.top)))
-    moved = np.stack([x, y, np.ones_like(x)], -1) @ H.T
+    return _projected(_carried(scene, H @ _to_frame(scene), step))
+
+
+def _carried(scene: Scene, through: Matrix, step: int) -> Matrix:
+    """``(S, S, 3)`` where a matrix ``(3, 3)`` takes every so many of the window's pixels, homogeneous."""
+    at = np.arange(0.0, scene.window.size, step)
+    by_u, by_v, first = through.T
+    return np.asarray(at[:, None] * by_u + at[:, None, None] * by_v + first)
+
+
+def _projected(points: Matrix) -> NDArray[np.float32]:
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(moved[..., :2] / np.where(moved[..., 2:] > 0, moved[..., 2:], np.nan), np.float32)
+        ahead = np.where(points[..., 2:] > 0, points[..., 2:], np.nan)
+        return np.asarray(points[..., :2] / ahead, np.float32)
 
 
-def _residuals(here: list[NDArray[np.float32]], image: Image, at: NDArray[np.float32]) -> Plane:
+def _residuals(here: _Both, there: _Both) -> NDArray[np.float32]:
     """``(2, S, S)`` grey levels by which patches differ from those of another frame, by colours and by fine texture.
 
     A value between those of a pixel's neighbours does not differ: poses are off by a pixel.
     """
-    limit = np.array([image.shape[1] - 1, image.shape[0] - 1])
-    with np.errstate(invalid="ignore"):
-        inside = np.asarray(((at > 0) & (at < limit)).all(-1))
-    at = np.where(inside[..., None], at, 0).astype(np.float32)
-    there = _both(cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR))
-    square, found = np.ones((3, 3), np.uint8), []
-    for mine, other in zip(here, there, strict=True):
-        beyond = np.maximum(mine - cv2.dilate(other, square), cv2.erode(other, square) - mine)
-        found.append(cv2.blur(np.maximum(beyond, 0).mean(-1), (_PATCH, _PATCH)))
-    return np.where(inside, np.stack(found), np.nan).astype(np.float32)
+    # Bytes end at 0 by themselves.
+    beyond = cv2.add(
+        cv2.subtract(here[0], cv2.dilate(there[0], _SQUARE)),
+        cv2.subtract(cv2.erode(there[0], _SQUARE), here[0]),
+    )
+    fine = cv2.max(here[1] - cv2.dilate(there[1], _SQUARE), cv2.erode(there[1], _SQUARE) - here[1])
+    means = _mean(beyond.astype(np.float32)), _mean(cv2.max(fine, 0.0))
+    return np.stack([cv2.blur(one, (_PATCH, _PATCH)) for one in means])
 
 
-def _both(image: NDArray[np.uint8]) -> list[NDArray[np.float32]]:
+def _both(image: NDArray[np.uint8]) -> _Both:
     """An image as it is, and what is finer than a shadow."""
     plain = image.astype(np.float32)
-    return [plain, plain - cv2.GaussianBlur(plain, (0, 0), _FINE)]
+    return image, plain - cv2.GaussianBlur(plain, (0, 0), _FINE)
 
 
 def _texture(image: NDArray[np.uint8]) -> Plane:
     """``(S, S)`` in [0, 1]: what is even moves with anything."""
-    square = np.ones((3, 3), np.uint8)
-    contrast = cv2.dilate(image, square).astype(np.float32) - cv2.erode(image, square)
-    around = cv2.blur(contrast.mean(-1), (_PATCH, _PATCH))
+    contrast = cv2.subtract(cv2.dilate(image, _SQUARE), cv2.erode(image, _SQUARE))
+    around = cv2.blur(_mean(contrast.astype(np.float32)), (_PATCH, _PATCH))
     return np.asarray(np.clip((around - _TEXTURE[0]) / (_TEXTURE[1] - _TEXTURE[0]), 0, 1), np.float32)
+
+
+def _mean(image: NDArray[np.float32]) -> Plane:
+    """``(S, S)`` of the three channels."""
+    return cv2.transform(image, _THIRDS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,8 +32,12 @@ class InOrder:
     The background is followed from frame to frame; further steps are put together.
     """
 
-    def __init__(self) -> None:
-        self._links: deque[_Link] = deque(maxlen=2 * REACH + 1)
+    def __init__(self, links: Iterable[_Link] = ()) -> None:
+        self._links = deque(links, maxlen=2 * REACH + 1)
+
+    def as_it_is(self) -> InOrder:
+        """The frames that are known now; what is added later is not."""
+        return InOrder(self._links)
 
     def add(self, frame: Answered) -> None:
         """The next frame; frames further back than twice `REACH` are forgotten."""

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from tracking3d.evidence.alignment import alignment, edge_strength
 from tracking3d.evidence.colours import Colours, as_lab, beside_outline, relative_distance
 from tracking3d.evidence.scene import Scene
+from tracking3d.trackers.outline import signed_distance
 
 Plane = NDArray[np.float32]
 
@@ -58,12 +59,15 @@ class Said:
         lab = as_lab(scene.image)
         masks = {"initial": scene.initial, "answer": scene.answer}
         masks |= {"drawn": scene.drawn} if scene.drawn.any() else {}
-        distances = {name: relative_distance(mask) for name, mask in masks.items()}
+        outlines = {name: signed_distance(mask) for name, mask in masks.items()}
+        distances = {name: relative_distance(mask, outlines[name]) for name, mask in masks.items()}
         if hulls is not None:
             root = math.sqrt(max(int(np.count_nonzero(scene.answer)), 1))
-            distances |= {name: hull / root for name, hull in zip(("hull", "wide hull"), hulls, strict=True)}
+            named = dict(zip(("hull", "wide hull"), hulls, strict=True))
+            distances |= {name: hull / root for name, hull in named.items()}
+            outlines |= {name: signed_distance(hull > 0) for name, hull in named.items()}
         edges = edge_strength(lab)
-        alignments = {name: alignment(edges, distance > 0) for name, distance in distances.items()}
+        alignments = {name: alignment(edges, outline) for name, outline in outlines.items()}
         nearby = beside_outline(lab, scene.answer) if scene.answer.any() else np.zeros_like(edges)
         remembered = np.zeros_like(edges) if colours is None else colours.log_ratio(lab)
         return cls(distances, alignments, np.stack([nearby, remembered]), motion, scene.confidence)
@@ -76,41 +80,40 @@ class Said:
 
     def sources(self) -> Iterator[tuple[str, Plane]]:
         """Each by name, ``(S, S)``."""
-        for name, distance in self.distances.items():
-            near, at = np.clip(distance / _NEAR, -_MOST, _MOST), np.tanh(distance / _AT_OUTLINE)
-            around, whole = self.alignments[name]
-            beliefs = {
-                "": 1.0,
-                " on edges": np.clip(around, -1, 1),
-                " on edges as a whole": np.clip(whole, -0.5, 1.5),
-            }
-            beliefs |= {} if name == "initial" else {" by confidence": self.confidence}
-            for how, belief in beliefs.items():
-                yield f"{name}, near{how}", near * belief
-                yield f"{name}, at the outline{how}", at * belief
-            if name != "wide hull":
-                yield f"{name}, deep", np.clip(distance / _DEEP, -_MOST, _MOST)
-        initial = self.distances["initial"]
-        doubt = self._doubt()
-        yield "initial, near by doubt", doubt * np.clip(initial / _NEAR, -_MOST, _MOST)
-        yield "initial, at the outline by doubt", doubt * np.tanh(initial / _AT_OUTLINE)
-        whole = float(np.clip(self.alignments["initial"][1], -0.5, 1.5))
-        for name, plane in zip(
-            ("beside the outline", "remembered"), self.colours / _SCALE_OF_LOGS, strict=True
-        ):
-            yield f"colours {name}", plane
-            yield f"colours {name} by doubt", doubt * plane
-            yield f"colours {name} by the initial mask's edges", whole * plane
-        for name, plane in zip(("colours", "fine texture"), self.motion / _SCALE_OF_MOTION, strict=True):
-            yield f"motion of {name}", plane
-            yield f"motion of {name} by doubt", doubt * plane
+        for plane, beliefs in self._terms():
+            yield from ((name, plane * belief) for name, belief in beliefs.items())
 
     def log_odds(self, weights: Mapping[str, float]) -> Plane:
         """``(S, S)`` log-odds of the object."""
         total = np.zeros_like(self.colours[0])
-        for name, plane in self.sources():
-            total += np.float32(weights[name]) * plane
+        for plane, beliefs in self._terms():
+            factors = [np.float32(weights[name]) * belief for name, belief in beliefs.items()]
+            total += sum(factors[1:], factors[0]) * plane
         return np.where(self.in_reach, total, -6.0).astype(np.float32)
+
+    def _terms(self) -> Iterator[tuple[Plane, dict[str, np.float32 | Plane]]]:
+        """What is said, ``(S, S)``, and by source how far it is believed: throughout, or ``(S, S)`` of each pixel."""
+        one, confidence, doubt = np.float32(1), np.float32(self.confidence), np.float32(self._doubt())
+        for name, distance in self.distances.items():
+            around, whole = self.alignments[name]
+            beliefs: dict[str, np.float32 | Plane] = {
+                "": one,
+                " on edges": np.clip(around, -1, 1),
+                " on edges as a whole": np.float32(np.clip(whole, -0.5, 1.5)),
+            }
+            beliefs |= {" by doubt": doubt} if name == "initial" else {" by confidence": confidence}
+            near, at = np.clip(distance / _NEAR, -_MOST, _MOST), np.tanh(distance / _AT_OUTLINE)
+            yield near, {f"{name}, near{how}": belief for how, belief in beliefs.items()}
+            yield at, {f"{name}, at the outline{how}": belief for how, belief in beliefs.items()}
+            if name != "wide hull":
+                yield np.clip(distance / _DEEP, -_MOST, _MOST), {f"{name}, deep": one}
+        edges = np.float32(np.clip(self.alignments["initial"][1], -0.5, 1.5))
+        names = "colours beside the outline", "colours remembered"
+        for name, plane in zip(names, self.colours / _SCALE_OF_LOGS, strict=True):
+            yield plane, {name: one, f"{name} by doubt": doubt, f"{name} by the initial mask's edges": edges}
+        names = "motion of colours", "motion of fine texture"
+        for name, plane in zip(names, self.motion / _SCALE_OF_MOTION, strict=True):
+            yield plane, {name: one, f"{name} by doubt": doubt}
 
     def _doubt(self) -> float:
         """How far the initial mask's outline is from the drawn surface's, in [0, 2]."""

@@ -18,9 +18,6 @@ from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.results.records import FrameRecord
 
-Decision = tuple[Frame, Decided | None]
-"""A frame whose turn has come, and its mask; None where the answer stands."""
-
 
 @dataclass(frozen=True, eq=False)
 class Masked:
@@ -39,6 +36,10 @@ class Masked:
     initial: NDArray[np.bool_] | None
     mask: NDArray[np.bool_]
     fixed: bool = False
+
+
+Decision = tuple[Masked, Decided | None]
+"""A frame whose turn has come, and its mask; None where the answer stands."""
 
 
 class SecondMasks:
@@ -63,6 +64,10 @@ class SecondMasks:
         self._hindsight = Hindsight(replace(camera, lens=None), vertices, faces, known)
         self._settled = False
         self._waiting: dict[int, Masked] = {}
+
+    def wants(self, index: int) -> bool:
+        """Whether a frame is to be seen for the first time; the others need not."""
+        return self._hindsight.wants(index)
 
     def see(self, masked: Masked) -> None:
         """A frame for the first time."""
@@ -96,12 +101,12 @@ class SecondMasks:
         index, decided = found
         masked = self._waiting.pop(index)
         if decided is None or masked.fixed or not masked.answer.refined:
-            return masked.frame, None
+            return masked, None
         lens = self._camera.lens
         if lens is not None:
             probability = lens.mask_to_picture(decided.probability)
             decided = Decided(index, probability > 0.5, probability)
-        return masked.frame, decided
+        return masked, decided
 
 
 def _has_pose(answer: FrameRecord) -> bool:

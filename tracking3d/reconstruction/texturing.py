@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.reconstruction.views import TextureView
 from tracking3d.rendering import TexelMap, seen_texels
+from tracking3d.rendering.backend import compiled, give_threads, threads_kept
 
 _SMALLEST = 64
 _STEEPNESS = 3
@@ -29,6 +30,8 @@ _EXPOSURE = 1.25  # factor up to which a view may be brighter or darker than the
 _VOTED_DOWN = 0.12  # difference of colours, in [0, 1], at which a view loses most of its say
 
 FloatArray = NDArray[np.float32]
+Seen = tuple[NDArray[np.int64], FloatArray, FloatArray]
+"""The texels ``(N,)`` that a view shows, their colours ``(3, N)`` in [0, 1], and how well each is seen ``(N,)``."""
 
 
 def textured(model: ObjectModel, views: Sequence[TextureView], largest: int = 2048) -> ObjectModel:
@@ -45,19 +48,20 @@ def textured(model: ObjectModel, views: Sequence[TextureView], largest: int = 20
     """
     if not views:
         return model
-    size = texture_size(views, largest)
+    with threads_kept():
+        if compiled():
+            give_threads({"backend": "numba", "threads": 1})
+        return _textured(model, views, texture_size(views, largest))
+
+
+def _textured(model: ObjectModel, views: Sequence[TextureView], size: int) -> ObjectModel:
     gains, coarse = _levelled(model, views, max(size // _COARSE, 64))
     expected = cv2.resize(coarse, (size, size), interpolation=cv2.INTER_LINEAR).reshape(-1, 3)
     texels = TexelMap.of(torch.from_numpy(model.face_uvs).float(), size)
     total, weight = np.zeros((size * size, 3), np.float32), np.zeros(size * size, np.float32)
     sharpest = max(view.sharpness for view in views) or 1.0
     for view, gain in zip(views, gains, strict=True):
-        texel, colours, seen = _seen(model, texels, view)
-        colours *= gain
-        apart = np.square(colours - expected[texel]).sum(1) / _VOTED_DOWN**2
-        say = (seen * view.sharpness / sharpest) ** _STEEPNESS / (1 + apart)
-        total[texel] += say[:, None] * colours
-        weight[texel] += say
+        add_view(total, weight, _seen(model, texels, view), gain, expected, view.sharpness / sharpest)
     if not weight.any():
         return model
     texture = filled(_per(total, weight).reshape(size, size, 3), (weight > 0).reshape(size, size))
@@ -66,6 +70,37 @@ def textured(model: ObjectModel, views: Sequence[TextureView], largest: int = 20
         texture=np.clip(np.round(255 * texture), 0, 255).astype(np.uint8),
         texture_weight=weight.reshape(size, size),
     )
+
+
+def add_view(
+    total: FloatArray,
+    weight: FloatArray,
+    seen: Seen,
+    gain: FloatArray,
+    expected: FloatArray,
+    sharpness: float,
+) -> None:
+    """Add what a view says to sums over all views.
+
+    Args:
+        total: ``(T * T, 3)`` weighted sum of colours, and ``weight`` ``(T * T,)`` of the weights; changed.
+        weight: See ``total``.
+        seen: What the view shows.
+        gain: ``(3,)`` factors for its colours.
+        expected: ``(T * T, 3)`` colours that all views together give.
+        sharpness: Of the view, relative to the sharpest.
+    """
+    if compiled():
+        from tracking3d.reconstruction.kernels import texturing
+
+        texturing.add_view(total, weight, seen, gain, expected, sharpness, _VOTED_DOWN, _STEEPNESS)
+        return
+    texel, colours, how_well = seen
+    colours = gain * colours.T
+    apart = np.square(colours - expected[texel]).sum(1) / _VOTED_DOWN**2
+    say = (how_well * np.float32(sharpness)) ** _STEEPNESS / (1 + apart)
+    total[texel] += say[:, None] * colours
+    weight[texel] += say
 
 
 def texture_size(views: Sequence[TextureView], largest: int) -> int:
@@ -100,7 +135,10 @@ def _levelled(
 ) -> tuple[list[FloatArray], FloatArray]:
     """Factors ``(3,)`` that bring each view's colours to one level, and the texture ``(T, T, 3)`` that they give."""
     texels = TexelMap.of(torch.from_numpy(model.face_uvs).float(), size)
-    seen = [_seen(model, texels, view) for view in views]
+    seen = [
+        (texel, colours.T.copy(), say)
+        for texel, colours, say in (_seen(model, texels, view) for view in views)
+    ]
 
     def mean(gains: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
         total, weight = np.zeros((size * size, 3), np.float32), np.zeros(size * size, np.float32)
@@ -124,10 +162,7 @@ def _per(total: FloatArray, weight: FloatArray) -> FloatArray:
     return np.asarray(total / np.maximum(weight, 1e-20)[:, None], np.float32)
 
 
-def _seen(
-    model: ObjectModel, texels: TexelMap, view: TextureView
-) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
-    """The texels ``(N,)`` that a view shows, their colours ``(N, 3)`` in [0, 1], and how well each is seen ``(N,)``."""
+def _seen(model: ObjectModel, texels: TexelMap, view: TextureView) -> Seen:
     seen = seen_texels(
         torch.from_numpy(view.image).permute(2, 0, 1).float() / 255,
         torch.from_numpy(view.valid),
@@ -138,4 +173,4 @@ def _seen(
         torch.from_numpy(view.T_cam_obj[:3, 3]).float(),
         torch.from_numpy(view.K).float(),
     )
-    return seen.texel.numpy(), seen.values.T.contiguous().numpy(), seen.weight.numpy()
+    return seen.texel.numpy(), seen.values.numpy(), seen.weight.numpy()

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from tracking3d.rendering.backend import use_numba
 from tracking3d.rendering.interpolation import barycentrics
 from tracking3d.rendering.renderer import project
 from tracking3d.rendering.visibility import rasterize
@@ -107,8 +108,11 @@ def back_project(
     K: Tensor,
     backend: str = "auto",
 ) -> BackProjection:
-    """What one frame shows of the texture; see `seen_texels` for the arguments."""
-    seen = seen_texels(values, valid, vertices, faces, texels, R, t, K, backend)
+    """What one frame shows of the texture; see `seen_texels` for the arguments.
+
+    Solvers go on from it: it is torch's to the last digit with every backend.
+    """
+    seen = seen_texels(values, valid, vertices, faces, texels, R, t, K, backend, by_kernel=False)
     size = texels.size
     total = values.new_zeros(values.shape[0], size * size)
     total[:, seen.texel] = seen.values * seen.weight
@@ -128,6 +132,7 @@ def seen_texels(
     t: Tensor,
     K: Tensor,
     backend: str = "auto",
+    by_kernel: bool = True,
 ) -> SeenTexels:
     """The texels that one frame shows.
 
@@ -140,6 +145,7 @@ def seen_texels(
         R: ``(3, 3)``; t: ``(3,)``: ``T_cam_obj``.
         K: ``(3, 3)`` of the window.
         backend: See `tracking3d.rendering.backend`.
+        by_kernel: Whether texels may be looked up by the kernel, where that is the backend: it rounds otherwise.
     """
     height, width = values.shape[1:]
     screen, depth = project(vertices, R[None], t[None], K[None])
@@ -151,6 +157,16 @@ def seen_texels(
     )
     # A face that turns away from all of its corners shows no texel: most of a large atlas is left out so.
     facing = ((corner * normal[:, None]).sum(2) < 0).any(1)
+    radius = (vertices - vertices.mean(0)).norm(dim=1).max()
+    if by_kernel and use_numba(backend, values, valid, vertices, texels.barycentric):
+        from tracking3d.rendering.kernels import backprojection
+
+        atlas = texels.texel, texels.face, texels.barycentric
+        tolerance = _DEPTH_TOLERANCE * float(radius)
+        seen = backprojection.seen_texels(
+            values, valid, drawn[0], corner, normal, facing, atlas, K, _GRAZING, tolerance
+        )
+        return SeenTexels(*seen)
     front = torch.nonzero(facing[texels.face])[:, 0]
     face, texel = texels.face[front], texels.texel[front]
     point = (corner[face] * texels.barycentric[front, :, None]).sum(1)
@@ -163,7 +179,6 @@ def seen_texels(
     nearest = functional.grid_sample(
         torch.where(drawn.isinf(), 0.0, drawn)[None], grid, mode="nearest", align_corners=False
     )[0, 0, 0]
-    radius = (vertices - vertices.mean(0)).norm(dim=1).max()
     visible = (nearest > 0) & (point[:, 2] < nearest + _DEPTH_TOLERANCE * radius / cosine)
     layers = torch.cat([values, valid[None]])
     sampled = functional.grid_sample(layers[None], grid, mode="bilinear", align_corners=False)[0, :, 0]

@@ -79,20 +79,35 @@ def write_reserved(path: Path, data: bytes, reserve: int) -> None:
 
 def write_image(path: Path, image: NDArray[np.uint8]) -> None:
     """Write ``(H, W)`` grey or ``(H, W, 3)`` RGB uint8 as PNG, atomically."""
+    write_atomic(path, image_file(image))
+
+
+def image_file(image: NDArray[np.uint8]) -> bytes:
+    """``(H, W)`` grey or ``(H, W, 3)`` RGB uint8 as PNG."""
     ordered = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
-    write_atomic(path, cv2.imencode(".png", ordered)[1].tobytes())
+    return cv2.imencode(".png", ordered)[1].tobytes()
 
 
 def write_mask(path: Path, mask: NDArray[np.bool_]) -> None:
     """Write ``(H, W)`` bool as a 0/255 PNG, atomically."""
-    write_image(path, mask.astype(np.uint8) * np.uint8(255))
+    write_atomic(path, mask_file(mask))
+
+
+def mask_file(mask: NDArray[np.bool_]) -> bytes:
+    """``(H, W)`` bool as a 0/255 PNG."""
+    return image_file(mask.astype(np.uint8) * np.uint8(255))
 
 
 def read_mask(path: Path) -> NDArray[np.bool_] | None:
     """Read a mask written by `write_mask`: ``(H, W)`` bool, or None if there is no such image."""
     if not path.is_file():
         return None
-    image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE) if path.stat().st_size else None
+    return decoded_mask(path.read_bytes())
+
+
+def decoded_mask(data: bytes) -> NDArray[np.bool_] | None:
+    """A mask from the bytes of such a file; None where they are no image."""
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
     return None if image is None else image >= 128
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import trimesh
@@ -26,7 +26,7 @@ from trimesh.exchange.obj import export_obj
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.geometry.gltf_axes import OBJECT_NODE, UPRIGHT_NODE, UPRIGHT_ROTATION
-from tracking3d.results.files import write_atomic
+from tracking3d.results.files import image_file, write_atomic
 from tracking3d.results.layout import FEATURES, GLB, MTL, OBJ, OUT, TEXTURE
 
 _FARTHEST = 1e12  # of a vertex; float32 can square it
@@ -41,9 +41,10 @@ def export_mesh(folder: Path, model: ObjectModel) -> None:
     Raises:
         OutputError: If one cannot be written.
     """
-    for name, data in obj_files(model, "object coordinates, OpenCV axes, arbitrary unit").items():
+    texture = _Texture(model)
+    for name, data in obj_files(model, "object coordinates, OpenCV axes, arbitrary unit", texture).items():
         write_atomic(folder / name, data)
-    write_atomic(folder / GLB, glb_file(model))
+    write_atomic(folder / GLB, glb_file(model, texture=texture))
     exact = io.BytesIO()
     seen: dict[str, Any] = {} if model.seen is None else {"seen": model.seen}
     np.savez_compressed(
@@ -58,15 +59,33 @@ def export_mesh(folder: Path, model: ObjectModel) -> None:
     write_atomic(folder / FEATURES, exact.getvalue())
 
 
-def obj_files(model: ObjectModel, header: str) -> dict[str, bytes]:
+class _Texture:
+    """A model's texture as a file; trimesh would encode it once for each format.
+
+    Attributes:
+        format: As Pillow has it.
+    """
+
+    format = "PNG"
+
+    def __init__(self, model: ObjectModel) -> None:
+        self._file = image_file(model.texture)
+
+    def save(self, fp: BinaryIO, format: str | None = None) -> None:
+        """What trimesh asks of an image."""
+        fp.write(self._file)
+
+
+def obj_files(model: ObjectModel, header: str, texture: _Texture | None = None) -> dict[str, bytes]:
     """The model as OBJ with MTL and texture: contents by file name.
 
     Args:
         model: The object.
         header: Which coordinates these are, for who opens the file.
+        texture: Its texture, where it is encoded already.
     """
     simple = trimesh.visual.material.SimpleMaterial(
-        PillowImage.fromarray(model.texture),
+        texture or _Texture(model),
         diffuse=(255, 255, 255),
         ambient=(255, 255, 255),
         specular=(0, 0, 0),
@@ -84,18 +103,22 @@ def obj_files(model: ObjectModel, header: str) -> dict[str, bytes]:
 
 
 def glb_file(
-    model: ObjectModel, finish: Callable[[dict[str, Any]], None] | None = None, **more: Any
+    model: ObjectModel,
+    finish: Callable[[dict[str, Any]], None] | None = None,
+    texture: _Texture | None = None,
+    **more: Any,
 ) -> bytes:
     """The model as GLB, turned upright.
 
     Args:
         model: The object.
         finish: Changes the glTF tree once this module is done with it; see trimesh's ``tree_postprocessor``.
+        texture: Its texture, where it is encoded already.
         more: Further arguments of trimesh's ``export_glb``.
     """
     pbr = trimesh.visual.material.PBRMaterial(
         name=Path(TEXTURE).stem,
-        baseColorTexture=PillowImage.fromarray(model.texture),
+        baseColorTexture=texture or _Texture(model),
         metallicFactor=0.0,
         roughnessFactor=1.0,
     )

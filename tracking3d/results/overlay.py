@@ -102,10 +102,11 @@ def draw_overlay(
     """
     size = OverlaySize.of(camera)
     shape = (size.width, size.picture)
-    canvas = np.full((size.height, size.width, 3), drawing.PAPER, dtype=np.uint8)
+    canvas = np.empty((size.height, size.width, 3), dtype=np.uint8)
+    canvas[size.picture :] = drawing.PAPER
     way = cv2.INTER_AREA if size.scale < 1 else cv2.INTER_LINEAR
     picture = canvas[: size.picture]
-    picture[:] = cv2.resize(frame.image, shape, interpolation=way)
+    cv2.resize(frame.image, shape, picture, interpolation=way)
     thin = max(round(size.width / 400), 1)
     drawing.draw_outline(picture, _scaled(estimate.mask, shape), drawing.REFINED, thin + 1)
     if estimate.initial_mask is not None:
@@ -117,6 +118,8 @@ def draw_overlay(
 
 
 def _scaled(mask: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np.bool_]:
+    if mask.shape == shape[::-1]:
+        return mask
     return cv2.resize(mask.astype(np.uint8), shape, interpolation=cv2.INTER_NEAREST).astype(bool)
 
 

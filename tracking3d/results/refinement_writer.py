@@ -12,7 +12,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,7 +20,7 @@ from tracking3d.estimation.estimate import FrameEstimate, MaskSource
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.results import description, layout
-from tracking3d.results.files import read_mask, write_mask, writing
+from tracking3d.results.files import decoded_mask, mask_file, read_mask, write_atomic, write_mask, writing
 from tracking3d.results.pictures import Pictures
 from tracking3d.results.probabilities import take_over_probability, write_probability
 from tracking3d.results.records import FrameRecord, mask_iou
@@ -114,7 +113,13 @@ class RefinementWriter:
             )
         self._records[index] = record
 
-    def put_mask(self, index: int, mask: NDArray[np.bool_], probability: NDArray[np.float32]) -> None:
+    def put_mask(
+        self,
+        index: int,
+        mask: NDArray[np.bool_],
+        probability: NDArray[np.float32],
+        initial: NDArray[np.bool_] | None,
+    ) -> None:
         """Give a second answer another mask ``(H, W)``, weighed against the image; causal ones stand.
 
         Like a pose that is put right it is not kept for a run that is stopped here.
@@ -123,6 +128,7 @@ class RefinementWriter:
             index: Of the frame.
             mask: ``(H, W)``.
             probability: ``(H, W)`` of the object.
+            initial: ``(H, W)`` what the mask tracker gave.
 
         Raises:
             OutputError: If the probability cannot be written.
@@ -132,27 +138,39 @@ class RefinementWriter:
         self._records[index] = replace(
             record,
             area=int(np.count_nonzero(mask)),
-            iou_initial=mask_iou(mask, self.initial_mask(index)),
+            iou_initial=mask_iou(mask, initial),
             mask_source=MaskSource.WEIGHED,
         )
-        self._decided[index] = cv2.imencode(".png", np.where(mask, 255, 0).astype(np.uint8))[1].tobytes()
+        self._decided[index] = mask_file(mask)
         if (self._folder / layout.PROBABILITIES).is_dir():
             write_probability(self._aside, index, probability)
 
-    def draw(self, frame: Frame) -> None:
+    def draw(self, frame: Frame, mask: NDArray[np.bool_], initial: NDArray[np.bool_] | None) -> None:
         """Draw the answer for a frame.
+
+        Args:
+            frame: The frame.
+            mask: ``(H, W)`` the answer's.
+            initial: ``(H, W)`` what the mask tracker gave.
 
         Raises:
             OutputError: If the video cannot be written.
         """
         record = self.answer(frame.index)
         with measured("write") as watch:
-            self.pictures.add_kept(frame, record, self.mask(record), self.initial_mask(frame.index))
+            self.pictures.add_kept(frame, record, mask, initial)
         if frame.index in self._records:
             self._records[frame.index] = record.and_wrote(watch.times.write)
 
-    def write(self, estimate: FrameEstimate | None, frame: Frame) -> FrameRecord:
+    def write(
+        self, estimate: FrameEstimate | None, frame: Frame, initial: NDArray[np.bool_] | None
+    ) -> FrameRecord:
         """Keep the second answer for one frame; None lets the causal one stand.
+
+        Args:
+            estimate: The answer.
+            frame: The frame.
+            initial: ``(H, W)`` what the mask tracker gave.
 
         Returns:
             What the frame's answer will be.
@@ -162,7 +180,7 @@ class RefinementWriter:
         """
         if estimate is None:
             return self.causal[frame.index]
-        causal, initial = self.causal[frame.index], self.initial_mask(frame.index)
+        causal = self.causal[frame.index]
         estimate = replace(
             estimate, refined=True, initial_mask=initial, keyframe=estimate.keyframe or causal.keyframe
         )
@@ -180,8 +198,9 @@ class RefinementWriter:
     def mask(self, record: FrameRecord) -> NDArray[np.bool_]:
         """The mask ``(H, W)`` of an answer, empty where it cannot be read."""
         if record.refined and (decided := self._decided.get(record.index)) is not None:
-            return _decoded(decided)
-        mask = read_mask(layout.mask_path(self._aside if record.refined else self._folder, record.index))
+            mask = decoded_mask(decided)
+        else:
+            mask = read_mask(layout.mask_path(self._aside if record.refined else self._folder, record.index))
         return (
             np.zeros((self.pictures.camera.height, self.pictures.camera.width), bool)
             if mask is None
@@ -211,7 +230,7 @@ class RefinementWriter:
                 place = layout.mask_path(self._folder, record.index)
                 place.replace(layout.mask_path(causal, record.index))
                 if (decided := self._decided.get(record.index)) is not None:
-                    write_mask(place, _decoded(decided))  # what it was decided from stays aside till the end
+                    write_atomic(place, decided)  # what it was decided from stays aside till the end
                 else:
                     layout.mask_path(self._aside, record.index).replace(place)
             for name in layout.MESH_FILES:
@@ -243,12 +262,6 @@ class RefinementWriter:
         refined = list(self._records.values()) if self._taken_over else []
         causal = list(self.causal.values())
         return description.refinement(state, reason, causal, refined, self.seconds, self.together)
-
-
-def _decoded(mask: bytes) -> NDArray[np.bool_]:
-    grey = cv2.imdecode(np.frombuffer(mask, np.uint8), cv2.IMREAD_GRAYSCALE)
-    assert grey is not None
-    return np.asarray(grey > 0)
 
 
 def clear_refinement(folder: Path) -> None:
