@@ -9,8 +9,11 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+import cv2
+
 from tracking3d.frames import Frame, SkippedFrame
 from tracking3d.object_recording import ObjectRecording
+from tracking3d.rendering.backend import shared_among
 from tracking3d.results.records import FrameRecord
 from tracking3d.side_by_side import read_ahead, with_next
 from tracking3d.video.source import FrameSource
@@ -91,17 +94,19 @@ def look_again(
         each: Does something with every one of them.
     """
     share = 1 / len(recordings)
-    each(partial(ObjectRecording.begin_refinement, source=source))
-    for frame in _once_more(source) if any(recording.looks_again for recording in recordings) else ():
-        each(partial(ObjectRecording.take_again, frame=_shared(frame, share)))
-    each(ObjectRecording.written)
-    each(ObjectRecording.settle)
-    for frame in _once_more(source) if any(recording.weighs_masks for recording in recordings) else ():
-        each(partial(ObjectRecording.put_right, frame=frame))
-    for frame in _once_more(source) if any(recording.draws for recording in recordings) else ():
-        each(partial(ObjectRecording.draw, frame=frame))
-    each(ObjectRecording.written)
-    each(ObjectRecording.finish)
+    with shared_among(1):
+        each(partial(ObjectRecording.begin_refinement, source=source))
+        for frame in _once_more(source) if any(recording.looks_again for recording in recordings) else ():
+            each(partial(ObjectRecording.take_again, frame=_shared(frame, share)))
+        each(ObjectRecording.written)
+        with shared_among(cv2.getNumThreads()):
+            each(ObjectRecording.settle)
+        for frame in _once_more(source) if any(recording.weighs_masks for recording in recordings) else ():
+            each(partial(ObjectRecording.put_right, frame=frame))
+        for frame in _once_more(source) if any(recording.draws for recording in recordings) else ():
+            each(partial(ObjectRecording.draw, frame=frame))
+        each(ObjectRecording.written)
+        each(ObjectRecording.finish)
 
 
 def _in_turn(

@@ -173,7 +173,8 @@ class RuntimeConfig(Section):
         ge=1,
         description=(
             "CPU threads of torch and of the renderer. One is never much slower here, and far faster on a busy "
-            "machine or when several runs share one."
+            "machine or when several runs share one. What is bundled at the end of a final refinement takes as many as "
+            "OpenCV has."
         ),
     )
     renderer: Literal["auto", "torch", "numba"] = Field(

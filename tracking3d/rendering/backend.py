@@ -115,6 +115,17 @@ def threads_kept() -> Iterator[None]:
             set_num_threads(of_kernels)
 
 
+@contextmanager
+def shared_among(threads: int) -> Iterator[None]:
+    """Within, kernels share their work among so many threads and torch has one; where there are no kernels, so many.
+
+    For work that is done once, when no frame waits.
+    """
+    with threads_kept():
+        give_threads({"backend": "numba" if compiled() else "torch", "threads": max(threads, 1)})
+        yield
+
+
 def _kernels_threads() -> int:
     """Threads of the kernels; the default where nobody has imported them, which takes its time."""
     module = sys.modules.get("tracking3d.rendering.kernels.threads")
