@@ -16,6 +16,7 @@ from typing import Any, ClassVar
 
 import torch
 
+from tracking3d.benchmark import feature_encoders
 from tracking3d.estimation.online import solver, waiting
 from tracking3d.synthesis import convex_clips, scene
 from tracking3d.trackers import first_mask
@@ -83,7 +84,8 @@ class _BitsOfTensors(pickle.Pickler):
 
 
 def make_once() -> None:
-    """Let it be so for GrabCut, synthetic clips, procedural objects, and starts and maps that a run solves."""
+    """Let it be so for GrabCut, painted images, synthetic clips and objects, and starts and maps that a run solves."""
+    feature_encoders.painted_images = MadeOnce(feature_encoders.painted_images)
     first_mask._grab_cut = MadeOnce(first_mask._grab_cut)
     convex_clips.synthesize = MadeOnce(convex_clips.synthesize)
     scene.make_procedural_solid = MadeOnce(
