@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
-import subprocess
 import sys
 from pathlib import Path
 
@@ -44,17 +42,10 @@ def box(real_clip: Path) -> str:
     return ",".join(str(value) for value in json.loads((real_clip / "init.json").read_text())["bbox_xywh"])
 
 
-def program(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", "from tracking3d.cli import main; main()", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "OMP_NUM_THREADS": "1", **environment},
-    )
-
-
 def test_real_run_from_a_box(real_clip, box, tmp_path):
-    result = program("run", real_clip / "frames", "--box", box, *QUICK, "--out", tmp_path / "run")
+    result = forked_program(
+        tmp_path, "run", real_clip / "frames", "--box", box, *QUICK, "--out", tmp_path / "run"
+    )
     assert result.returncode == 0, result.stderr
     run = RunReader(tmp_path / "run")
     assert run.state == "finished"
