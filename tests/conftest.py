@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import logging
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -69,6 +70,15 @@ def drawn_quickly() -> None:
     from quick_pictures import draw_quickly
 
     draw_quickly()
+
+
+@pytest.fixture
+def as_users_see_it(drawn_quickly: None) -> Iterator[None]:
+    """For tests that look at pictures of runs."""
+    from quick_pictures import draw_as_users_see_it
+
+    with draw_as_users_see_it():
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -1,55 +1,47 @@
-"""What every run draws for people to look at, in tests that do not look: as little and as seldom as shows the same.
+"""What every run draws for people to look at, in tests that do not look: small, in haste, and without text.
 
-A run of a few frames takes longer to draw its video and its contact sheet than to be tracked.
+A run of a few frames takes longer to draw its video and its contact sheet than to be tracked. OpenCV alone takes 20 ms
+to load its font in every thread that writes text, and every recording writes in a thread of its own.
 """
 
 from __future__ import annotations
 
-import functools
-import os
-import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 from tracking3d.results import contact_sheet, drawing
 from tracking3d.video import writer
 
-_WHOLE = contact_sheet.TILE
-_SMALL = 80
-_NAME = "the one that draws text"
+
+def _width(text: str, height: int) -> int:
+    """As wide as text is, roughly."""
+    return len(text) * height * 4 // 5
+
+
+def _no_text(image: Any, text: str, left: int, base: int, height: int, colour: Any) -> int:
+    return left + _width(text, height)
+
+
+_QUICK: list[tuple[Any, str, Any]] = [
+    (contact_sheet, "TILE", 80),
+    (drawing, "draw_text", _no_text),
+    (drawing, "text_width", _width),
+    (writer, "_OPTIONS", {"libx264": {"crf": "20", "preset": "ultrafast", "tune": "zerolatency"}}),
+]
+_TRUE = [getattr(module, name) for module, name, _ in _QUICK]
 
 
 def draw_quickly() -> None:
-    """Small contact sheets, an encoder in haste, and a font that is loaded once."""
-    contact_sheet.TILE = _SMALL
-    writer._OPTIONS["libx264"]["preset"] = "ultrafast"
-    drawing.draw_text = _in_one_thread(drawing.draw_text)
-    drawing.text_width = _in_one_thread(drawing.text_width)
+    """From here on."""
+    for module, name, quick in _QUICK:
+        setattr(module, name, quick)
 
 
 @contextmanager
-def whole_contact_sheets() -> Iterator[None]:
-    """Contact sheets as users see them."""
-    contact_sheet.TILE = _WHOLE
+def draw_as_users_see_it() -> Iterator[None]:
+    """Meanwhile pictures are what they are."""
+    for (module, name, _), true in zip(_QUICK, _TRUE, strict=True):
+        setattr(module, name, true)
     yield
-    contact_sheet.TILE = _SMALL
-
-
-@functools.cache
-def _thread(process: int) -> ThreadPoolExecutor:
-    """A fork has a thread of its own."""
-    return ThreadPoolExecutor(1, _NAME)
-
-
-def _in_one_thread(function: Callable[..., Any]) -> Callable[..., Any]:
-    """OpenCV loads its font in every thread that writes text, in 20 ms, and every recording writes in a new one."""
-
-    @functools.wraps(function)
-    def wrapper(*arguments: Any) -> Any:
-        if threading.current_thread().name.startswith(_NAME):
-            return function(*arguments)
-        return _thread(os.getpid()).submit(function, *arguments).result()
-
-    return wrapper
+    draw_quickly()

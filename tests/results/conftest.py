@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
-from quick_pictures import whole_contact_sheets
 from turning_sphere import TurningSphere, started_run, turning_sphere_of, written_run
 
 from tracking3d.results.run_writer import RunWriter
@@ -33,10 +32,3 @@ def start_run() -> Callable[..., RunWriter]:
 def write_run() -> Callable[..., None]:
     """Writes a whole run: ``write_run(folder, clip, **changes)``."""
     return written_run
-
-
-@pytest.fixture
-def as_users_see_it() -> Iterator[None]:
-    """For tests that look at the contact sheet."""
-    with whole_contact_sheets():
-        yield
