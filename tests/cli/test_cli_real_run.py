@@ -15,7 +15,8 @@ from tracking3d.cli import app
 from tracking3d.results.run_reader import RunReader
 from tracking3d.synthesis.convex_clips import make_demo_clip
 
-QUICK = ["--size", "32", "--set", "object.frequency=2", "--set", "camera.fov=45"]
+SETTINGS = ["object.frequency=2", "camera.fov=45", "tracker.segmentation_size=64"]
+QUICK = ["--size", "32", *(word for setting in SETTINGS for word in ("--set", setting))]
 
 STOPPING_TRACKER = """
 import os
