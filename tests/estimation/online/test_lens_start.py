@@ -28,10 +28,10 @@ SOON = 6
 
 
 @cache
-def clip(frames: int) -> SyntheticClip:
+def clip() -> SyntheticClip:
     """A box with cut corners through a long lens, turning 5 degrees a frame."""
     return synthesize(
-        SyntheticSpec(frames=frames, size=(160, 120), degrees_per_frame=5.0, drift=(0.1, 0.0, 0.1), fov=FOV)
+        SyntheticSpec(frames=FRAMES, size=(160, 120), degrees_per_frame=5.0, drift=(0.1, 0.0, 0.1), fov=FOV)
     )
 
 
@@ -45,7 +45,7 @@ def answers(assumed: bool, frames: int = FRAMES) -> list[FrameEstimate]:
     found: dict[int, FrameEstimate] = {}
     state = None
     for index in range(frames):
-        frame, mask = Frame(index, clip(frames).images[index]), estimate_of(clip(frames).masks[index])
+        frame, mask = Frame(index, clip().images[index]), estimate_of(clip().masks[index])
         state, answer = solver.init(frame, mask) if state is None else solver.step(state, frame, mask)
         found |= {one.index: one for one in (*answer.revised, answer)}
     return [found[index] for index in range(frames)]
@@ -53,7 +53,7 @@ def answers(assumed: bool, frames: int = FRAMES) -> list[FrameEstimate]:
 
 def error(assumed: bool) -> float:
     found = np.array([answer.T_cam_obj[:3, :3] for answer in answers(assumed)])
-    truth = np.array([pose[:3, :3] for pose in clip(FRAMES).T_cam_obj])
+    truth = np.array([pose[:3, :3] for pose in clip().T_cam_obj])
     return float(np.mean(aligned_rotation_errors(found, truth)))
 
 
