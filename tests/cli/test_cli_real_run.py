@@ -15,8 +15,8 @@ from tracking3d.cli import app
 from tracking3d.results.run_reader import RunReader
 from tracking3d.synthesis.convex_clips import make_demo_clip
 
-SETTINGS = ["object.frequency=2", "camera.fov=45", "tracker.segmentation_size=64"]
-QUICK = ["--size", "32", *(word for setting in SETTINGS for word in ("--set", setting))]
+QUICK = ["--size", "32", "--set", "object.frequency=2", "--set", "camera.fov=45"]
+QUICK_TRACKER = ["--set", "tracker.segmentation_size=64"]
 
 STOPPING_TRACKER = """
 import os
@@ -45,7 +45,7 @@ def box(real_clip: Path) -> str:
 
 def test_real_run_from_a_box(real_clip, box, tmp_path):
     result = forked_program(
-        tmp_path, "run", real_clip / "frames", "--box", box, *QUICK, "--out", tmp_path / "run"
+        tmp_path, "run", real_clip / "frames", "--box", box, *QUICK, *QUICK_TRACKER, "--out", tmp_path / "run"
     )
     assert result.returncode == 0, result.stderr
     run = RunReader(tmp_path / "run")
@@ -73,7 +73,7 @@ def test_stopped_run_keeps_every_finished_frame(real_clip, box, tmp_path, stop, 
     (tmp_path / "stopping.py").write_text(STOPPING_TRACKER)
     result = forked_program(
         tmp_path,
-        *("run", real_clip / "frames", "--box", box, *QUICK),
+        *("run", real_clip / "frames", "--box", box, *QUICK, *QUICK_TRACKER),
         *("--tracker", "stopping", "--out", tmp_path / "run"),
         TRACKING3D_PLUGINS=f"tracking3d.trackers:stopping={tmp_path / 'stopping.py'}:Stopping",
         STOP_BY=stop,
