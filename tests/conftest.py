@@ -1,20 +1,19 @@
-"""Fixtures shared by all tests."""
+"""Fixtures shared by all tests.
+
+What takes long to import is imported where it is used: with workers, the process that hands out tests needs none of it.
+"""
 
 from __future__ import annotations
 
 import functools
 import logging
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
 import pytest
-import torch
 import typer.testing
 from filelock import FileLock
-from made_once import MadeOnce, make_once
-
-from tracking3d.rendering.kernels.compilation import Kernel
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
@@ -38,8 +37,14 @@ def shared_models() -> Path:
     return _shared("models")
 
 
-def pytest_sessionstart() -> None:
+def pytest_sessionstart(session: pytest.Session) -> None:
     """Tests that run side by side on few cores wait for each other's threads far longer than they compute."""
+    if session.config.getoption("dist", "no") != "no":
+        return  # the workers compute, and each of them comes here
+    import cv2
+    import torch
+    from made_once import make_once
+
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     # Building the command line from its annotations takes longer than most commands; a command keeps no state.
@@ -54,7 +59,26 @@ def pytest_sessionstart() -> None:
 @pytest.fixture
 def made_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     """For tests of whether something is the same when it is made again."""
+    from made_once import MadeOnce
+
     monkeypatch.setattr(MadeOnce, "anew", True)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def drawn_quickly() -> None:
+    """See `quick_pictures`; it begins after the collection, where tests take sizes from modules."""
+    from quick_pictures import draw_quickly
+
+    draw_quickly()
+
+
+@pytest.fixture
+def as_users_see_it(drawn_quickly: None) -> Iterator[None]:
+    """For tests that look at pictures of runs."""
+    from quick_pictures import draw_as_users_see_it
+
+    with draw_as_users_see_it():
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -62,6 +86,10 @@ def made_together(tmp_path_factory: pytest.TempPathFactory) -> None:
     """What one worker has made is there for the others; in a fresh clone that holds for compiled kernels, too."""
     if "PYTEST_XDIST_WORKER" not in os.environ:
         return
+    from made_once import MadeOnce
+
+    from tracking3d.rendering.kernels.compilation import Kernel
+
     folder, compile_one = tmp_path_factory.getbasetemp().parent, Kernel._compile
     MadeOnce.folder = folder / "made"
     MadeOnce.folder.mkdir(exist_ok=True)

@@ -16,8 +16,9 @@ from typing import Any, ClassVar
 
 import torch
 
+from tracking3d.benchmark import feature_encoders
 from tracking3d.estimation.online import solver, waiting
-from tracking3d.synthesis import convex_clips, scene
+from tracking3d.synthesis import convex_clips, ray_casting, scene
 from tracking3d.trackers import first_mask
 
 
@@ -83,12 +84,14 @@ class _BitsOfTensors(pickle.Pickler):
 
 
 def make_once() -> None:
-    """Let it be so for GrabCut, synthetic clips, procedural objects, and starts and maps that a run solves."""
+    """Let it be so for GrabCut, painted images, synthetic clips and solids, and starts and maps that a run solves."""
+    feature_encoders.painted_images = MadeOnce(feature_encoders.painted_images)
     first_mask._grab_cut = MadeOnce(first_mask._grab_cut)
     convex_clips.synthesize = MadeOnce(convex_clips.synthesize)
     scene.make_procedural_solid = MadeOnce(
         scene.make_procedural_solid,
         lambda spec: (spec.object, spec.textured, spec.print_strength == 0, spec.seed),
     )
+    ray_casting._corner_normals = MadeOnce(ray_casting._corner_normals, lambda *mesh: mesh[:2])
     waiting.solve_start = MadeOnce(waiting.solve_start)
     solver.refined_once_more = MadeOnce(solver.refined_once_more)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
-import subprocess
 import sys
 from pathlib import Path
 
@@ -18,6 +16,7 @@ from tracking3d.results.run_reader import RunReader
 from tracking3d.synthesis.convex_clips import make_demo_clip
 
 QUICK = ["--size", "32", "--set", "object.frequency=2", "--set", "camera.fov=45"]
+QUICK_TRACKER = ["--set", "tracker.segmentation_size=64"]
 
 STOPPING_TRACKER = """
 import os
@@ -44,17 +43,10 @@ def box(real_clip: Path) -> str:
     return ",".join(str(value) for value in json.loads((real_clip / "init.json").read_text())["bbox_xywh"])
 
 
-def program(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", "from tracking3d.cli import main; main()", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "OMP_NUM_THREADS": "1", **environment},
-    )
-
-
 def test_real_run_from_a_box(real_clip, box, tmp_path):
-    result = program("run", real_clip / "frames", "--box", box, *QUICK, "--out", tmp_path / "run")
+    result = forked_program(
+        tmp_path, "run", real_clip / "frames", "--box", box, *QUICK, *QUICK_TRACKER, "--out", tmp_path / "run"
+    )
     assert result.returncode == 0, result.stderr
     run = RunReader(tmp_path / "run")
     assert run.state == "finished"
@@ -81,7 +73,7 @@ def test_stopped_run_keeps_every_finished_frame(real_clip, box, tmp_path, stop, 
     (tmp_path / "stopping.py").write_text(STOPPING_TRACKER)
     result = forked_program(
         tmp_path,
-        *("run", real_clip / "frames", "--box", box, *QUICK),
+        *("run", real_clip / "frames", "--box", box, *QUICK, *QUICK_TRACKER),
         *("--tracker", "stopping", "--out", tmp_path / "run"),
         TRACKING3D_PLUGINS=f"tracking3d.trackers:stopping={tmp_path / 'stopping.py'}:Stopping",
         STOP_BY=stop,

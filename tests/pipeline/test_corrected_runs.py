@@ -83,8 +83,9 @@ def settings(*overrides: str):
 
 
 def run(clip, images, folder: Path, *overrides: str, **given) -> Path:
+    """Without evidence, which is weighed anew whatever is corrected."""
     given.setdefault("mask", clip.masks[given.get("start_frame") or 0])
-    record(open_source(str(images)), settings(*overrides), folder, **given)
+    record(open_source(str(images)), settings("object.evidence=false", *overrides), folder, **given)
     return folder
 
 
@@ -113,10 +114,7 @@ def contents(folder: Path) -> dict[Path, bytes]:
     [
         (StandInSolver, {}),
         pytest.param(OnlineSolver, {}, marks=pytest.mark.slow),  # the solver itself, three times
-        (
-            StandInSolver,
-            {"tracker": "csrt"},
-        ),  # which knows no other way to go on than to see the frames again
+        (StandInSolver, {"name": "csrt"}),  # which knows no other way to go on than to see the frames again
     ],
     ids=["memory kept", "online", "frames seen again"],
 )
@@ -124,7 +122,7 @@ def test_a_finished_run_is_computed_again_from_the_corrected_frame_on(
     clip, images, tmp_path, monkeypatch, stepped, solver, given
 ):
     monkeypatch.setitem(SOLVERS, "online", solver)
-    config = load_config(overrides=["tracker.name=csrt", "window.size=32"]) if given else settings()
+    config = settings(*(f"tracker.{name}={value}" for name, value in given.items()))
     prompt = {"box": box_of(clip, 0)} if given else {"mask": clip.masks[0]}
     record(open_source(str(images)), config, tmp_path / "run", **prompt)
     record(open_source(str(images)), config, tmp_path / "whole", **prompt, corrections=told(clip))

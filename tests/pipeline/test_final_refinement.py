@@ -206,6 +206,7 @@ def test_run_json_tells_counts_and_seconds_of_the_refinement(clip, source, tmp_p
     )
 
 
+@pytest.mark.usefixtures("as_users_see_it")
 def test_the_overlay_is_drawn_again(clip, source, tmp_path):
     """The bar below the picture names the status in its colour: yellow before, green after."""
     greens = {}

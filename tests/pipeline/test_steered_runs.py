@@ -89,8 +89,9 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def run(clip, images, folder: Path, *overrides: str, **given) -> RunReader:
+    """Without evidence, which is weighed alike whichever way the frames come."""
     given.setdefault("mask", clip.masks[given.get("start_frame") or 0])
-    record(open_source(str(images)), settings(*overrides), folder, **given)
+    record(open_source(str(images)), settings("object.evidence=false", *overrides), folder, **given)
     return RunReader(folder)
 
 

@@ -19,14 +19,20 @@ def house():
     return module
 
 
-def test_the_picture_is_up_to_date(house):
+@pytest.fixture(scope="module")
+def picture(house) -> str:
+    """It reads every module's imports."""
+    return house.picture()
+
+
+def test_the_picture_is_up_to_date(house, picture):
     drawn = house.PICTURE.read_text(encoding="utf-8")
-    assert drawn == house.picture(), "draw it anew: python docs/images/house.py"
+    assert drawn == picture, "draw it anew: python docs/images/house.py"
 
 
-def test_every_room_is_in_it(house):
+def test_every_room_is_in_it(house, picture):
     rooms = set().union(*house.architecture().FLOORS)
-    assert rooms <= set(re.findall(r">([a-z_]+)</text>", house.picture()))
+    assert rooms <= set(re.findall(r">([a-z_]+)</text>", picture))
 
 
 def test_only_the_longest_ways_are_drawn(house):

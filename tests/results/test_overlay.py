@@ -16,6 +16,8 @@ from tracking3d.results.description import summary
 from tracking3d.results.overlay import ObjectAxes, OverlaySize, draw_overlay
 from tracking3d.results.records import FrameRecord
 
+pytestmark = pytest.mark.usefixtures("as_users_see_it")
+
 
 def overlay_of(clip, number, axes=None, **changes):
     estimate = dataclasses.replace(clip.estimates[number], **changes)

@@ -17,6 +17,8 @@ from tracking3d.results.records import FrameRecord
 from tracking3d.stages import STAGES, StageTimes
 from tracking3d.video.image_file import read_image
 
+pytestmark = pytest.mark.usefixtures("as_users_see_it")
+
 TIMES = StageTimes(0.1, 0.2, 0.05, 0.3, 0.15, 0.0)
 
 

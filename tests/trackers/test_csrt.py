@@ -19,7 +19,8 @@ from tracking3d.trackers.segmentation import ColourSegmentation
 
 
 def tracker(**options: object) -> CsrtTracker:
-    return CsrtTracker.from_options(CsrtTracker.Options(**options))
+    """With a crop of 96 pixels a side where users have 224, unless that is said."""
+    return CsrtTracker.from_options(CsrtTracker.Options(**{"segmentation_size": 96} | options))
 
 
 def track(frames: list[Frame], prompt: Prompt) -> list[MaskEstimate]:
@@ -268,7 +269,7 @@ def test_options_reach_the_filter() -> None:
     for options in (
         {"resolution": 0.5},
         {"template_size": 64.0, "use_hog": False},
-        {"segmentation_size": 96},
+        {"segmentation_size": 224},
     ):
         csrt = tracker(**options)
         csrt.init(frames[0], prompt)

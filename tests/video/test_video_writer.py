@@ -12,6 +12,8 @@ from tracking3d.errors import OutputError
 from tracking3d.frames import Image
 from tracking3d.video import VideoWriter, open_source, writer
 
+pytestmark = pytest.mark.usefixtures("as_users_see_it")
+
 
 def colour_chart(height: int = 90, width: int = 120) -> Image:
     """Smooth ramps with four patches of pure colour."""

@@ -16,6 +16,8 @@ from tracking3d.viewer.followed_run import FollowedRun
 from tracking3d.viewer.picture import CAUSAL, LAYERS, Shown, axes_of, beside, draw_picture
 from tracking3d.viewer.run_images import LatestImages, OverlayPictures, images_of_run
 
+pytestmark = pytest.mark.usefixtures("as_users_see_it")
+
 
 @pytest.fixture
 def follower(run):

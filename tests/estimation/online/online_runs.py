@@ -32,8 +32,9 @@ def turning_clip() -> SyntheticClip:
 
 @cache
 def solver() -> OnlineSolver:
-    """With the default settings."""
-    return OnlineSolver(load_config(preset="default"), turning_clip().camera, RgbEncoder())
+    """With the default settings, but for a shape of fewer vertices."""
+    config = load_config(preset="default", overrides=["object.frequency=7"])
+    return OnlineSolver(config, turning_clip().camera, RgbEncoder())
 
 
 def frame(index: int, shown: int | None = None) -> Frame:
