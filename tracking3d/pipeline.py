@@ -100,7 +100,6 @@ def track(
         start_frame=start_frame,
         skip_damaged=skip_damaged or untold,
         queries=checked_queries(follow),
-        fine=model == "fine",
     )
     return Tracking(task, keeps=refine is not None or model is not None)
 

@@ -26,6 +26,7 @@ from tracking3d.object_recording import ObjectRecording
 from tracking3d.parts import build_encoder, check_turns
 from tracking3d.passes import Listener, go_through, timed
 from tracking3d.prompts import check_prompt, check_prompts, damaged_start, make_prompt, make_prompts
+from tracking3d.reconstruction.asked_shape import shape_as_asked
 from tracking3d.results.given_masks import keep_given_masks
 from tracking3d.results.layout import RUN, object_folders
 from tracking3d.results.run_reader import RunReader
@@ -113,6 +114,8 @@ def record(
         )
         if recording is not None:
             go_through(source, chain(skipped, [first], frames), [recording], listener, first_pass_only)
+    if recording is not None and not first_pass_only:
+        shape_as_asked(folder, config, source)
     return RunReader(folder)
 
 
@@ -187,6 +190,9 @@ def record_objects(
         ]
         if unfinished := [recording for recording in recordings if recording is not None]:
             go_through(source, chain(skipped, [first], frames), unfinished, listener)
+    for one, begun_now in zip(folders, recordings, strict=True):
+        if begun_now is not None:
+            shape_as_asked(one, config, source)
     return [RunReader(one) for one in folders]
 
 

@@ -67,4 +67,6 @@ def config_of_result(
         shape = shape.model_copy(update={"texture_views": shape.texture_views or least})
     elif model == "none":
         shape = shape.model_copy(update={"texture_views": 0})
+    if model is not None:
+        shape = shape.model_copy(update={"shape": "fine" if model == "fine" else "online"})
     return config.model_copy(update={"solver": solver, "object": shape})

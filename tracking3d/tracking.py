@@ -23,7 +23,7 @@ from tracking3d.object_recording import ObjectRecording
 from tracking3d.passes import look_again
 from tracking3d.point_following import PointFollowing
 from tracking3d.prompts import damaged_start
-from tracking3d.reconstruction.of_run import shape_run
+from tracking3d.reconstruction.asked_shape import shape_as_asked
 from tracking3d.recording import begun, opened
 from tracking3d.session import Session
 from tracking3d.tracker_choice import choose_tracker
@@ -45,7 +45,6 @@ class Task:
         start_frame: The frame in which the object is given; None for the first.
         skip_damaged: Whether frames before the first that can be read are passed over.
         queries: Points to follow, see `tracking3d.point_following.checked_queries`.
-        fine: Whether the shape is made anew from all frames when they are answered.
     """
 
     source: FrameSource
@@ -55,7 +54,6 @@ class Task:
     start_frame: int | None
     skip_damaged: bool
     queries: NDArray[np.float64] | None
-    fine: bool = False
 
 
 class Tracking(Iterator[FrameEstimate]):
@@ -194,8 +192,8 @@ def _answers(task: Task, kept: TemporaryRun | None) -> Generator[FrameEstimate]:
             _finish(recording, task.source)
         elif folder is not None:
             raise InputError(f"{task.source.name} has no frame that can be decoded.")
-    if kept is not None and task.fine:
-        kept.about_shape = _shape_anew(kept.folder, task.source)
+    if kept is not None:
+        kept.about_shape = shape_as_asked(kept.folder, task.config, task.source)
 
 
 def _started(
@@ -222,14 +220,6 @@ def _finish(recording: ObjectRecording, source: FrameSource) -> None:
         action(recording)
 
     look_again(source, [recording], does)
-
-
-def _shape_anew(folder: Path, source: FrameSource) -> str:
-    """Make the shape anew; where that cannot be, the model stays. What came of it, in a sentence."""
-    try:
-        return shape_run(folder, source).sentence
-    except InputError as error:
-        return str(error)
 
 
 def _nothing() -> Generator[FrameEstimate]:

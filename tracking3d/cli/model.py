@@ -48,14 +48,10 @@ def model(
     typer.echo(f"{run}: texture of {size} x {size} texels from {taken} frames")
 
 
-def check_fine(source: str, split: str | None) -> None:
+def check_fine(source: str) -> None:
     """Make sure, before anything is tracked, that a shape can be made anew at the end."""
     from tracking3d.reconstruction.of_run import check_packages
 
-    if split is not None:
-        raise InputError(
-            "--model fine and --split do not go together; run `tracking3d model RUN --quality fine` after it."
-        )
     if source.isdigit() and not Path(source).exists():
         raise InputError(
             "--model fine goes through the video once more, which a camera cannot; leave it out."

@@ -128,6 +128,8 @@ def print_summary(folder: Path) -> None:
     table.add_row("seconds per frame", shown(whole))
     for stage in STAGES if stages else ():
         table.add_row(f"  {stage}", shown(getattr(stages, stage)))
+    if shape := run.get("shape"):
+        table.add_row("shape", escape(str(shape)))
     for note in run["notes"]:
         table.add_row("note", f"[yellow]{escape(note)}[/]")
     for what, names in _OUTPUTS.items():

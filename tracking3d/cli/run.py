@@ -265,7 +265,7 @@ def run(
         raise InputError("--workers is how many parts of --split are tracked at a time; give both.")
     fine = model is ModelChoice.FINE
     if fine:
-        check_fine(source, split)
+        check_fine(source)
     chosen: dict[str, Any] = {"name": tracker}
     if masks is not None:
         if tracker not in (None, "precomputed", "auto"):
@@ -288,6 +288,7 @@ def run(
             "flat": flat or None,
             "prototype": prototype,
             "texture_views": 0 if model is ModelChoice.NONE else None,
+            "shape": None if model is None else "fine" if fine else "online",
         },
         window={"size": size},
         solver={"final_refine": final_refine},
@@ -355,5 +356,4 @@ def run(
             report=report,
             view=view,
             host=host,
-            fine=fine,
         )

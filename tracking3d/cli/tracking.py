@@ -41,7 +41,6 @@ def track(
     report: bool = True,
     view: bool = False,
     host: str | None = None,
-    fine: bool = False,
 ) -> None:
     """Track, show how it goes, and print what came of it.
 
@@ -56,7 +55,6 @@ def track(
         report: Write a report at the end.
         view: Show the run in the browser.
         host: Where that is served.
-        fine: Make the shape anew from all frames when the run has ended.
     """
     from tracking3d.cli.progress import print_summary, progress
     from tracking3d.cli.report import reported
@@ -85,27 +83,11 @@ def track(
         else:
             box, mask, points = (next(iter(one), None) for one in (given.boxes, given.masks, given.points))
             record(opened, settings, folder, box=box, mask=mask, points=points, **about)
-        if fine:
-            shape_anew([one for one in folders if one not in finished], source, quiet)
     for one in () if quiet else folders:
         if one in finished and finished[one] == _written(one):
             typer.echo(f"The run {one} is finished already; there is nothing to resume.")
         else:
             print_summary(one)
-
-
-def shape_anew(folders: list[Path], source: str, quiet: bool) -> None:
-    """Make the shapes of runs that have ended anew; where that cannot be, a sentence says why, and the run stays."""
-    from tracking3d.errors import InputError
-    from tracking3d.reconstruction.of_run import shape_run
-
-    for folder in folders:
-        try:
-            sentence = shape_run(folder, source).sentence
-        except InputError as error:
-            sentence = str(error)
-        if not quiet:
-            typer.echo(f"{folder}: {sentence}", err=True)
 
 
 def a_person_is_there() -> bool:

@@ -93,8 +93,8 @@ class ObjectConfig(Section):
         None,
         description=(
             "The folder of an earlier run or a mesh file: the object is that one, and is found in the video without a "
-            "start by motion. Shape and colours are held: landmark_views and texture_views are 0, and prototype is not "
-            "asked."
+            "start by motion. Shape and colours are held: landmark_views and texture_views are 0, shape is online, and "
+            "prototype is not asked."
         ),
     )
     prototype: str = Field(
@@ -139,6 +139,13 @@ class ObjectConfig(Section):
     largest_texture: int = Field(
         2048, ge=64, le=8192, description="Most texels along a side of the mesh's texture."
     )
+    shape: Literal["online", "fine"] = Field(
+        "online",
+        description=(
+            "The shape of the mesh at the end: the online map's, or fine, made anew from all frames after the final "
+            "refinement and kept where it explains frames that were left out better (extra model)."
+        ),
+    )
     flat: bool = Field(
         False, description="Flat prior: project all vertices onto one plane after each iteration."
     )
@@ -147,7 +154,7 @@ class ObjectConfig(Section):
     @classmethod
     def _is_held_where_known(cls, value: Any) -> Any:
         if isinstance(value, dict) and value.get("known") is not None:
-            return {**value, "landmark_views": 0, "texture_views": 0}
+            return {**value, "landmark_views": 0, "texture_views": 0, "shape": "online"}
         return value
 
 

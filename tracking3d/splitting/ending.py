@@ -17,13 +17,13 @@ from tracking3d.frames import Frame
 from tracking3d.prompts import make_prompt
 from tracking3d.recording import record
 from tracking3d.results import layout
+from tracking3d.results.run_notes import note_in_run
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_writer import RunWriter
 from tracking3d.session import Session
 from tracking3d.splitting.agreement import DisagreementError
 from tracking3d.splitting.beginning import Begun
 from tracking3d.splitting.joined_run import (
-    note_in_run,
     take_second_answers,
     write_causal_mesh,
     write_joined,

@@ -5,13 +5,11 @@ Whatever happens from there on, ``resume`` finishes it as it does any stopped ru
 
 from __future__ import annotations
 
-import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -19,11 +17,11 @@ from tracking3d.checkpoint.folder import Checkpoint
 from tracking3d.checkpoint.progress import Kept, Progress
 from tracking3d.frames import SkippedFrame
 from tracking3d.results import layout
-from tracking3d.results.files import write_reserved, writing
+from tracking3d.results.files import writing
 from tracking3d.results.frame_lines import FrameLines
 from tracking3d.results.mesh_export import export_mesh
-from tracking3d.results.records import FrameRecord, jsonable
-from tracking3d.results.run_writer import RESERVE, RunWriter
+from tracking3d.results.records import FrameRecord
+from tracking3d.results.run_writer import RunWriter
 from tracking3d.session import Session
 from tracking3d.splitting.cutting import Part
 from tracking3d.splitting.similarity import Similarity
@@ -86,17 +84,6 @@ def write_joined(
         checkpoint.note(one)
     last = records[-1].index if records else -1
     checkpoint.save(Progress(last, size, refining=True, seconds=seconds), session.kept())
-
-
-def note_in_run(folder: Path, about: Mapping[str, Any]) -> None:
-    """Add to what ``run.json`` of a stopped run says.
-
-    Raises:
-        OutputError: If it cannot be written.
-    """
-    path = folder / layout.RUN
-    description = {**json.loads(path.read_bytes()), **jsonable(about)}
-    write_reserved(path, json.dumps(description, indent=2, allow_nan=False).encode() + b"\n", RESERVE)
 
 
 def write_causal_mesh(folder: Path, session: Session) -> None:

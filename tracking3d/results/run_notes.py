@@ -1,0 +1,24 @@
+"""What is added to the description of a run that has stopped."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from tracking3d.results import layout
+from tracking3d.results.files import write_reserved
+from tracking3d.results.records import jsonable
+from tracking3d.results.run_writer import RESERVE
+
+
+def note_in_run(folder: Path, about: Mapping[str, Any]) -> None:
+    """Add to what ``run.json`` of a run that has stopped says.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
+    path = folder / layout.RUN
+    description = {**json.loads(path.read_bytes()), **jsonable(about)}
+    write_reserved(path, json.dumps(description, indent=2, allow_nan=False).encode() + b"\n", RESERVE)
