@@ -8,7 +8,8 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from tracking3d.benchmark.track_speed import TrackSpeed, as_figures, checked_out
+from tracking3d.benchmark import track_speed
+from tracking3d.benchmark.track_speed import Contender, TrackSpeed, as_figures, checked_out
 from tracking3d.benchmark.track_speed_table import plot_stages, speed_table, stage_table
 from tracking3d.cli import app
 from tracking3d.errors import InputError, OutputError
@@ -66,6 +67,16 @@ def test_stages_are_drawn_over_time(tmp_path):
 def test_a_version_that_git_does_not_know_is_refused(tmp_path):
     with pytest.raises(InputError, match="--against v0-never"):
         checked_out("v0-never", tmp_path)
+
+
+def test_an_earlier_version_is_the_one_that_runs_wherever_the_command_is_given(tmp_path, monkeypatch):
+    for place in ("earlier", "here"):
+        (tmp_path / place / "tracking3d").mkdir(parents=True)
+        (tmp_path / place / "tracking3d" / "__init__.py").write_text("")
+        (tmp_path / place / "tracking3d" / "__main__.py").write_text(f"print({place!r})")
+    monkeypatch.chdir(tmp_path / "here")
+    told = track_speed._python(Contender("v0", package=tmp_path / "earlier"), "tracking3d")
+    assert told.stdout == "earlier\n"
 
 
 def test_what_is_wrong_is_said_before_anything_runs(clips, tmp_path):

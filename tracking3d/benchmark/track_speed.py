@@ -102,6 +102,7 @@ def measure(
     taken: dict[str, list[TrackSpeed]] = {one.name: [] for one in contenders}
     for one in contenders:
         listener(f"warming up: {one.name}")
+        _compile_ahead(one)
         _run(truth, one, folder / "warm", _WARM_UP)
     for number in range(repeats):
         for one in contenders:
@@ -113,20 +114,32 @@ def measure(
 def _run(truth: Truth, contender: Contender, folder: Path, frames: int | None) -> TrackSpeed:
     box = ",".join(f"{side:g}" for side in truth.box or ())
     command = [
-        sys.executable, "-m", "tracking3d", "run", str(truth.frames[0].parent), "--box", box, "--out", str(folder),
-        "--overwrite", "--no-report", "--quiet", *(("--frames", f":{frames}") if frames else ()), *contender.settings,
+        "run", str(truth.frames[0].parent), "--box", box, "--out", str(folder), "--overwrite", "--no-report", "--quiet", *(("--frames", f":{frames}") if frames else ()), *contender.settings,
     ]  # fmt: skip
-    package = contender.package or Path(__file__).parents[2]
     before, started = _processor(), time.perf_counter()
-    done = subprocess.run(
-        command, env={**os.environ, "PYTHONPATH": str(package)}, capture_output=True, text=True, check=False
-    )
+    done = _python(contender, "tracking3d", *command)
     wall, after = time.perf_counter() - started, _processor()
     if done.returncode:
         said = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
         raise InputError(f"{contender.name} cannot track {truth.name}: {said}")
     spent = None if before is None or after is None else after - before
     return _told(contender.name, folder, wall, spent)
+
+
+def _compile_ahead(contender: Contender) -> None:
+    """Compile its kernels, where its version can: a few frames do not come to all of them."""
+    _python(contender, "tracking3d.speed.kernels_ahead")
+
+
+def _python(contender: Contender, module: str, *words: str) -> subprocess.CompletedProcess[str]:
+    """Run a module of a contender's version."""
+    package = contender.package or Path(__file__).parents[2]
+    # How many threads linear algebra has is for each version to say, not for this one's command line.
+    environment = {**os.environ, "PYTHONPATH": str(package)}
+    environment.pop("OPENBLAS_NUM_THREADS", None)
+    # Without `-P` a package in the working directory would be taken, whatever version is asked for.
+    command = [sys.executable, "-P", "-m", module, *words]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
 
 
 def _told(name: str, folder: Path, wall: float, processor: float | None) -> TrackSpeed:
