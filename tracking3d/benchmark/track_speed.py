@@ -113,8 +113,10 @@ def measure(
 
 def _run(truth: Truth, contender: Contender, folder: Path, frames: int | None) -> TrackSpeed:
     box = ",".join(f"{side:g}" for side in truth.box or ())
+    some = ["--frames", f":{frames}"] if frames else []
     command = [
-        "run", str(truth.frames[0].parent), "--box", box, "--out", str(folder), "--overwrite", "--no-report", "--quiet", *(("--frames", f":{frames}") if frames else ()), *contender.settings,
+        "run", str(truth.frames[0].parent), "--box", box, "--out", str(folder), "--overwrite", "--no-report", "--quiet",
+        *some, *contender.settings,
     ]  # fmt: skip
     before, started = _processor(), time.perf_counter()
     done = _python(contender, "tracking3d", *command)
