@@ -94,5 +94,5 @@ def test_the_result_follows_them_by_the_whole_video(clip, config):
     queries = [(0, *middle(clip, 0)), (5, *middle(clip, 5)), (0, middle(clip, 0)[0] + 3, middle(clip, 0)[1])]
     first, second = track(clip.images, mask=clip.masks[0], config=config, follow=queries).result().tracks
     assert (first.query_frame, second.query_frame) == (0, 5)
-    assert first.positions.shape == (7, 2, 2)
+    assert first.positions.shape == (10, 2, 2)
     assert second.on_object.all() and np.isfinite(second.uncertainty).all()
