@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -390,3 +391,24 @@ def test_default_folder_is_named_after_the_source(tmp_path, monkeypatch):
     assert default_folder("shots/*.png") == Path("runs/shots")
     assert default_folder(".") == Path("runs") / tmp_path.name
     assert default_folder("0") == Path("runs/camera_0")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [["--model", "fine"], ["--quality", "best", "--tracker", "csrt"], ["--set", "object.shape=fine"]],
+)
+def test_the_shape_is_made_anew_once_and_the_run_says_what_came_of_it(
+    call, clip, script, monkeypatch, options
+):
+    made = []
+    monkeypatch.setattr(
+        "tracking3d.reconstruction.asked_shape.shape_run",
+        lambda folder, source: made.append(folder) or SimpleNamespace(sentence="It is better."),
+    )
+    assert "It is better." in call("run", clip, *BOX, *options, "--out", "run").stdout
+    assert json.loads(Path("run/run.json").read_text())["shape"] == "It is better."
+    call("run", clip, *BOX, *options, "--out", "run", "--resume")  # is finished
+    assert made == [Path("run")]
+    several = ["--box", "5,5,10,10", *options, "--out", "several"]
+    assert call("run", clip, *BOX, *several).exit_code == 0
+    assert made[1:] == [Path("several/object_0"), Path("several/object_1")]
