@@ -24,9 +24,18 @@ ELSEWHERE = 0.2
 """IoU of the object's silhouette, or mask, with the initial mask up to which that is of something else."""
 
 
+TAKEN_IN = "taken_in"
+"""What `FrameEstimate.losses` calls the share of the answer's mask that was taken in since it moves as the object does.
+The mask tracker is told of it at once: a side that comes into view is small for a few frames only."""
+
+ENOUGH_TAKEN = 0.01
+"""Share from which on it is told."""
+
+
 def corrects(estimate: FrameEstimate) -> bool:
     """Whether an answer is sure enough, and unlike the initial mask enough, to be handed back to the mask tracker."""
-    if estimate.status is not Status.TRACKED:
+    taken_in = estimate.losses.get(TAKEN_IN, 0.0) >= ENOUGH_TAKEN
+    if estimate.status is not Status.TRACKED and not taken_in:
         return False
     if estimate.initial_mask is None:
         return estimate.hypothesis == SIGHTED
@@ -35,4 +44,6 @@ def corrects(estimate: FrameEstimate) -> bool:
     if estimate.hypothesis == SIGHTED and both <= ELSEWHERE * either:
         return True
     least, most = WORTH_CORRECTING
+    if taken_in:
+        return both >= least * either
     return estimate.confidence >= SURE and both > 0 and least * either <= both <= most * either

@@ -41,8 +41,12 @@ Target = tuple[Image, Matrix, Matrix]
 
 def small_grey(image: Image) -> NDArray[np.uint8]:
     """The frame as the background is followed in it."""
-    factor = min(1.0, _LARGEST / max(image.shape[:2]))
-    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    return smaller(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+
+
+def smaller(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The same of a frame that is grey already."""
+    factor = min(1.0, _LARGEST / max(grey.shape))
     return grey if factor == 1 else cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
 
 

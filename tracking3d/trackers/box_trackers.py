@@ -5,6 +5,8 @@ from __future__ import annotations
 import functools
 import os
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Self
 
 import cv2
 import numpy as np
@@ -12,6 +14,33 @@ from numpy.typing import NDArray
 
 from tracking3d.frames import Box, Image
 from tracking3d.trackers.crops import clip_box
+
+
+@dataclass(frozen=True)
+class BoxOffset:
+    """How the object's box lies to the one that a tracker follows, which keeps to what it was started on.
+
+    Attributes:
+        shift: Of the corner, in widths and heights of the box.
+        factor: Of width and height.
+    """
+
+    shift: tuple[float, float] = (0.0, 0.0)
+    factor: tuple[float, float] = (1.0, 1.0)
+
+    @classmethod
+    def between(cls, followed: Box, told: Box) -> Self:
+        """From the box that is followed to the one that is told."""
+        x, y, width, height = followed
+        return cls(
+            ((told[0] - x) / width, (told[1] - y) / height), (told[2] / width, told[3] / height)
+        )
+
+    def applied(self, box: Box) -> Box:
+        """The object's box where the one that is followed is ``box``."""
+        x, y, width, height = box
+        across, down = self.factor
+        return x + self.shift[0] * width, y + self.shift[1] * height, across * width, down * height
 
 
 class OpenCvBoxes:

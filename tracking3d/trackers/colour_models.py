@@ -101,9 +101,10 @@ def _smooth(cube: NDArray[np.float64]) -> NDArray[np.float64]:
     return cube
 
 
-def log_ratio(histograms: NDArray[np.float64], colours: NDArray[np.uint8]) -> NDArray[np.float32]:
+def log_ratio(
+    histograms: NDArray[np.float64], colours: NDArray[np.uint8], floor: float = 1e-4
+) -> NDArray[np.float32]:
     """``(S, S)`` log of the first over the second likelihood of each pixel of a Lab crop, clipped at 3."""
-    floor = 1e-4  # about five pixels of a crop: rarer colours are evidence for neither side
     table = np.log((histograms[0] + floor) / (histograms[1] + floor))
     return np.clip(table, -_LOG_LIMIT, _LOG_LIMIT).astype(np.float32)[_bin(colours)]
 

@@ -13,7 +13,7 @@ from pydantic import BaseModel, Field
 
 from tracking3d.errors import InputError, PluginError
 from tracking3d.frames import Box, Frame, Image, MaskEstimate, Prompt
-from tracking3d.trackers.box_trackers import OpenCvBoxes
+from tracking3d.trackers.box_trackers import BoxOffset, OpenCvBoxes
 from tracking3d.trackers.crops import box_iou, box_of, clip_box
 from tracking3d.trackers.cues import Cues
 from tracking3d.trackers.opencv_build import why_no_contrib
@@ -62,7 +62,8 @@ class CsrtTracker:
     def __init__(self, options: CsrtTracker.Options) -> None:
         self._options = options
         self._boxes: BoxTracker | None = None
-        self._box: Box | None = None
+        self._followed: Box | None = None
+        self._offset = BoxOffset()
         self._segmentation: ColourSegmentation | None = None
 
     @classmethod
@@ -86,14 +87,15 @@ class CsrtTracker:
         self._segmentation = ColourSegmentation(
             frame.image, prompt.box, prompt.mask, size=self._options.segmentation_size, cues=_CUES
         )
-        self._boxes, self._box = BoxTracker(self._options, frame.image, prompt.box), prompt.box
+        self._begin(frame.image, prompt.box)
         return self._segmentation.estimate
 
     def step(self, frame: Frame) -> MaskEstimate:
         """Answer for the next frame."""
         if self._segmentation is None or self._boxes is None:
             raise PluginError("The tracker csrt was asked for a frame before it was started with init.")
-        box = self._box = self._boxes.update(frame.image)
+        self._followed = self._boxes.update(frame.image)
+        box = self._witness
         estimate = self._segmentation.step(frame.image, box)
         if box is None and estimate.mask is not None:
             return MaskEstimate(estimate.mask, estimate.score / 2, "CSR-DCF has lost the object")
@@ -110,8 +112,20 @@ class CsrtTracker:
         if box is None or self._segmentation is None:
             return
         self._segmentation.correct(frame.image, mask)
-        if self._box is None or box_iou(self._box, box) < STRAYED:
-            self._boxes, self._box = BoxTracker(self._options, frame.image, box), box
+        witness = self._witness
+        if self._followed is None or witness is None or box_iou(witness, box) < STRAYED:
+            self._begin(frame.image, box)
+        else:
+            self._offset = BoxOffset.between(self._followed, box)
+
+    @property
+    def _witness(self) -> Box | None:
+        """The box as the last correction had it; None where the box tracker has lost the object."""
+        return None if self._followed is None else self._offset.applied(self._followed)
+
+    def _begin(self, image: Image, box: Box) -> None:
+        self._boxes, self._followed = BoxTracker(self._options, image, box), box
+        self._offset = BoxOffset()
 
 
 class BoxTracker(OpenCvBoxes):

@@ -19,6 +19,7 @@ from tracking3d.evidence import (
     pasted,
     tidied,
 )
+from tracking3d.evidence.taking_in import taken_in, unlike_surroundings
 from tracking3d.geometry.camera import Window
 from tracking3d.trackers.crops import cut, inside_frame
 
@@ -32,10 +33,12 @@ def answer_mask(
     observation: Observation,
     confidence: float,
     colours: Colours | None,
-) -> tuple[NDArray[np.bool_], MaskSource, NDArray[np.float32] | None]:
+    moving: NDArray[np.float32] | None = None,
+) -> tuple[NDArray[np.bool_], MaskSource, NDArray[np.float32] | None, float]:
     """The mask ``(H, W)`` that the evidence is for, where it comes from, and the object's probability ``(H, W)``.
 
-    The mask is where the probability is above a half; where the mask is not weighed there is none.
+    The mask is where the probability is above a half; where the mask is not weighed there is none. The last is the
+    share of the mask that was taken in since it moves along.
 
     Args:
         rendered: ``(H, W)`` the silhouette at the frame's pose.
@@ -43,21 +46,28 @@ def answer_mask(
         observation: The frame.
         confidence: Of the pose.
         colours: What earlier frames showed, or None.
+        moving: ``(S, S)`` what moves as the object does in the window of `finer`, or None where that is not known.
     """
     if initial is None:
-        return rendered, MaskSource.RENDERED, None
+        return rendered, MaskSource.RENDERED, None, 0.0
     window, image = finer(observation)
     sources = features(
         as_lab(image), seen_through(initial, window), seen_through(rendered, window), confidence, colours
     )
-    support = tidied(along_edges(image, log_odds(sources), in_question(sources)))
+    odds = log_odds(sources)
+    share = 0.0
+    if moving is not None:
+        known = seen_through(initial | rendered, window)
+        strange = unlike_surroundings(as_lab(image), known)
+        odds, share = taken_in(odds, known, moving, strange)
+    support = tidied(along_edges(image, odds, in_question(sources)))
     support[~inside_frame(initial.shape, window)] = -1
     # The window is the initial mask's: beyond it the silhouette alone says where the object is.
     full = pasted(support, window, np.where(rendered, 1.0, -1.0).astype(np.float32))
     mask = full > 0
     if not mask.any():  # a mask of nothing says that the evidence is for neither
-        return initial, MaskSource.INITIAL, None
-    return mask, MaskSource.WEIGHED, 0.5 + 0.5 * full
+        return initial, MaskSource.INITIAL, None, 0.0
+    return mask, MaskSource.WEIGHED, 0.5 + 0.5 * full, share
 
 
 def learnt(colours: Colours | None, observation: Observation, mask: NDArray[np.bool_]) -> Colours | None:

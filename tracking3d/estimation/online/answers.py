@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource, Status
+from tracking3d.estimation.correction import TAKEN_IN
 from tracking3d.estimation.online.answer_mask import answer_mask, learnt
 from tracking3d.estimation.online.attempt import Attempt
 from tracking3d.estimation.online.belief import Belief
@@ -39,28 +40,33 @@ def with_colours(state: Belief, answer: FrameEstimate, found: Attempt) -> Belief
     """The belief with what a frame that is believed shows of the colours."""
     if found.doubtful or found.view.mask is None:
         return state
-    return replace(state, colours=learnt(state.colours, found.view.observation, answer.mask))
+    colours = learnt(state.colours, found.view.observation, answer.mask)
+    return replace(state, colours=colours)
 
 
-def solved(state: Belief, answer: FrameEstimate, found: Attempt) -> FrameEstimate:
+def solved(
+    state: Belief, answer: FrameEstimate, found: Attempt, moving: NDArray[np.float32] | None = None
+) -> FrameEstimate:
     """The answer with a pose, its judgement and the mask that the image shows; of a lost frame, the initial mask.
 
     Args:
         state: Map, camera and colours.
         answer: What does not depend on the pose.
         found: What was found in the frame.
+        moving: See `answer_mask`.
     """
     view, fit, judgement = found.view, found.fit, found.judgement
     if found.lost:
         mask = view.mask if view.mask is not None else np.zeros_like(answer.mask)
-        source, probability = MaskSource.handed_back(view.mask), None
+        source, probability, share = MaskSource.handed_back(view.mask), None, 0.0
     else:
-        mask, source, probability = answer_mask(
+        mask, source, probability, share = answer_mask(
             state.known.silhouette(fit.pose, state.camera),
             view.mask,
             view.observation,
             judgement.confidence,
             state.colours,
+            moving,
         )
     return replace(
         answer,
@@ -84,5 +90,6 @@ def solved(state: Belief, answer: FrameEstimate, found: Attempt) -> FrameEstimat
             "strays": found.support.strays,
             "stiffness": least_held(fit)[0],
             "mask_weight": view.mask_weight,
+            TAKEN_IN: share,
         },
     )

@@ -31,6 +31,7 @@ from tracking3d.estimation.online.lens import through
 from tracking3d.estimation.online.mapping import mask_weight, pose_of
 from tracking3d.estimation.online.motion import carried, led_to, moved_on, predicted
 from tracking3d.estimation.online.object_model import object_model
+from tracking3d.estimation.online.moving import moving_beside, with_past
 from tracking3d.estimation.online.points import FollowedPoints, follow, grey
 from tracking3d.estimation.online.pose_refinement import PoseFit, PoseWeights
 from tracking3d.estimation.online.reversal import turned_round
@@ -269,8 +270,10 @@ class OnlineSolver:
         elif usual:
             belief = replace(belief, trail=(*belief.trail, (pose, frame.index))[-_TRAIL:])
         found = replace(found, fit=replace(found.fit, pose=pose))
-        answer = solved(belief, unsolved(frame, mask, pose, state.camera), found)
-        return with_colours(belief, answer, found), replace(answer, keyframe=key)
+        moving = moving_beside(belief, found, image)
+        answer = solved(belief, unsolved(frame, mask, pose, state.camera), found, moving)
+        belief = with_past(with_colours(belief, answer, found), answer, found, image)
+        return belief, replace(answer, keyframe=key)
 
     def _found(
         self, state: Belief, view: View, frame: Frame, image: NDArray[np.uint8], starts: dict[str, Pose]
