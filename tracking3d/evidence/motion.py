@@ -128,19 +128,47 @@ def _parted_ways(
         told apart; both 0 where either leads out of the frame.
     """
     image, T_cam_obj, H = target
+    of_surface = np.column_stack(_through(scene, camera, T_cam_obj))
+    return parted_ways(
+        scene.inverse_depth, of_surface, H @ scene.window.to_frame, image.shape[:2], _APART
+    )
+
+
+def parted_ways(
+    inverse_depth: Plane,
+    of_surface: Matrix,
+    of_background: Matrix,
+    image_size: tuple[int, int],
+    apart: tuple[float, float],
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Where pixels are in another frame.
+
+    Args:
+        inverse_depth: ``(S, S)``, 0 where there is none.
+        of_surface: ``(3, 4)`` from ``u, v, 1, 1 / depth`` to homogeneous pixels of the other frame.
+        of_background: ``(3, 3)`` from ``u, v, 1`` to those.
+        image_size: ``(H, W)`` of the other frame.
+        apart: Pixels of distance from which on, and in full, the motions can be told.
+
+    Returns:
+        See `_parted_ways`.
+    """
     if compiled():
         from tracking3d.evidence.kernels import motion
 
-        of_surface = np.column_stack(_through(scene, camera, T_cam_obj))
-        of_background = np.ascontiguousarray(H @ _to_frame(scene))
-        return motion.parted_ways(scene.inverse_depth, of_surface, of_background, image.shape[:2], _APART)
-    ways = np.stack([_object_flow(scene, camera, T_cam_obj), _background_flow(scene, H)])
-    limit = np.array([image.shape[1] - 1, image.shape[0] - 1])
+        return motion.parted_ways(
+            inverse_depth, of_surface, np.ascontiguousarray(of_background), image_size, apart
+        )
+    near = inverse_depth[..., None]
+    moved = _carried(len(inverse_depth), of_surface[:, :3]) + near * of_surface[:, 3]
+    beyond = _carried(len(inverse_depth), of_background)
+    ways = np.stack([_projected(np.where(near > 0, moved, np.nan)), _projected(beyond)])
+    limit = np.array([image_size[1] - 1, image_size[0] - 1])
     with np.errstate(invalid="ignore"):
         inside = np.asarray(((ways > 0) & (ways < limit)).all((0, -1)))
     ways = np.where(inside[..., None], ways, 0).astype(np.float32)
     parted = np.linalg.norm(ways[0] - ways[1], axis=-1)
-    return ways, np.clip((parted - _APART[0]) / (_APART[1] - _APART[0]), 0, 1) * inside
+    return ways, np.clip((parted - apart[0]) / (apart[1] - apart[0]), 0, 1) * inside
 
 
 def _through(scene: Scene, camera: Camera, T_cam_obj: Matrix) -> tuple[Matrix, Matrix]:
@@ -149,31 +177,22 @@ def _through(scene: Scene, camera: Camera, T_cam_obj: Matrix) -> tuple[Matrix, M
     return camera.K @ T[:3, :3] @ np.linalg.inv(scene.K), camera.K @ T[:3, 3]
 
 
-def _to_frame(scene: Scene) -> Matrix:
-    """``(3, 3)`` from the window's pixels to the frame's."""
-    window = scene.window
-    corner = (0.5 / window.scale + edge - 0.5 for edge in (window.left, window.top))
-    to_frame = np.diag([1 / window.scale, 1 / window.scale, 1.0])
-    to_frame[:2, 2] = tuple(corner)
-    return to_frame
-
-
 def _object_flow(scene: Scene, camera: Camera, T_cam_obj: Matrix, step: int = 1) -> NDArray[np.float32]:
     """``(S, S, 2)`` where in the other frame a pixel's surface point is; NaN where there is none."""
     inverse_depth = scene.inverse_depth[::step, ::step, None]
     through, shift = _through(scene, camera, T_cam_obj)
-    moved = _carried(scene, through, step) + inverse_depth * shift
+    moved = _carried(scene.window.size, through, step) + inverse_depth * shift
     return _projected(np.where(inverse_depth > 0, moved, np.nan))
 
 
 def _background_flow(scene: Scene, H: Matrix, step: int = 1) -> NDArray[np.float32]:
     """``(S, S, 2)`` where in the other frame a pixel of the background is."""
-    return _projected(_carried(scene, H @ _to_frame(scene), step))
+    return _projected(_carried(scene.window.size, H @ scene.window.to_frame, step))
 
 
-def _carried(scene: Scene, through: Matrix, step: int) -> Matrix:
-    """``(S, S, 3)`` where a matrix ``(3, 3)`` takes every so many of the window's pixels, homogeneous."""
-    at = np.arange(0.0, scene.window.size, step)
+def _carried(size: int, through: Matrix, step: int = 1) -> Matrix:
+    """``(S, S, 3)`` where a matrix ``(3, 3)`` takes every so many of a window's pixels, homogeneous."""
+    at = np.arange(0.0, size, step)
     by_u, by_v, first = through.T
     return np.asarray(at[:, None] * by_u + at[:, None, None] * by_v + first)
 

@@ -1,22 +1,22 @@
 """What moves as the object does, of what lies beside its mask: one frame against an earlier one, while frames come.
 
-A side that turns into view is in no mask yet, and no surface says how deep it lies. But where a pixel of the object was
-in an earlier frame is known but for its depth, since the object's poses are: it lies on a line. So every pixel is asked
-whether the earlier frame shows the same patch at one of a few depths around the surface's, carried on beyond the
-silhouette, and whether the background's motion explains it better. What was hidden behind the object, has no
-texture, or moves alike in both, says nothing.
+A side that turns into view is in no mask yet, and no surface says how deep it lies. But where one of its points was in
+an earlier frame is known but for that depth, since the object's poses are. So every pixel is asked whether the earlier
+frame shows the same patch at one of a few depths about that of the surface beside it, and whether the background's
+motion explains it better. Where nothing has texture, or both motions lead to the same place, there is no answer.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.evidence.motion import background_motion, smaller
+from tracking3d.evidence.motion import background_motion, parted_ways, smaller
 from tracking3d.evidence.scene import Mask, Plane, surface_in
 from tracking3d.geometry.camera import Camera, Window
 
@@ -24,14 +24,16 @@ _DEPTHS = np.linspace(-0.4, 1.2, 9)
 """Where a pixel beside the silhouette may lie, behind the surface beside it, in radii of the object: what turns into
 view lies behind the edge that it turns about."""
 _LARGEST = 144  # pixels of the window's side
-_MOVED = 4.0  # pixels of the small frame by which the motions part in the median, at least
-_APART = (1.0, 3.0)  # such pixels of a pixel's own motions, from which on, and in full, it can be told
-_PATCH = 7
+_MOVED = 4.0
+"""Pixels of a frame as `smaller` gives it by which the motions part in the median, at least."""
+_APART = (1.0, 3.0)
+"""Such pixels by which a pixel's own two ways part from which on, and in full, it can be told."""
+_ATTEMPTS = 2  # to find an earlier frame in which they part by so much
+_PATCH, _SHIFT = 7, 3  # pixels
 _NOISE = 3.0  # grey levels
 _MOST = 1.5
-_TEXTURE = (8.0, 24.0)  # grey levels of contrast in a patch
-_ATTEMPTS = 3
-_SHIFT = 3  # pixels
+_TEXTURE = (8.0, 24.0)
+"""Mean contrast of neighbouring pixels in a patch, grey levels, from which on, and in full, its motion can be told."""
 _SQUARE = np.ones((3, 3), np.uint8)
 
 Matrix = NDArray[np.float64]
@@ -39,13 +41,13 @@ Matrix = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Past:
-    """A frame that was believed.
+    """A frame whose pose is believed.
 
     Attributes:
         index: Of the frame.
-        grey: ``(h, w)`` the frame as `tracking3d.evidence.motion.small_grey` gives it.
+        grey: ``(h, w)`` the frame as `tracking3d.evidence.motion.smaller` gives it.
         T_cam_obj: ``(4, 4)``.
-        mask: ``(H, W)`` its answer.
+        mask: ``(H, W)`` where the object is in it.
     """
 
     index: int
@@ -54,9 +56,16 @@ class Past:
     mask: Mask
 
     @classmethod
-    def of(cls, index: int, grey: NDArray[np.uint8], T_cam_obj: Matrix, mask: Mask) -> Past:
-        """Of a frame ``(H, W)``, grey."""
+    def of(cls, index: int, grey: NDArray[np.uint8], T_cam_obj: Matrix, mask: Mask) -> Self:
+        """Of a grey frame ``(H, W)``."""
         return cls(index, smaller(grey), T_cam_obj, mask)
+
+    @property
+    def to_small(self) -> Matrix:
+        """``(3, 3)`` from the frame's pixels to those of ``grey``; centres are at integers in both."""
+        (height, width), (rows, columns) = self.mask.shape, self.grey.shape
+        across, down = columns / width, rows / height
+        return np.array([[across, 0.0, (across - 1) / 2], [0.0, down, (down - 1) / 2], [0.0, 0.0, 1.0]])
 
 
 def moves_along(
@@ -84,158 +93,140 @@ def moves_along(
     drawn, inverse_depth = surface_in(seen.K(camera), here.T_cam_obj, vertices, faces, seen.size)
     if not earlier or not drawn.any():
         return None
-    ways = _ways_apart(here, earlier, seen, camera, inverse_depth, drawn)
+    ways = _ways_apart(here, earlier, seen, camera, drawn, inverse_depth)
     if ways is None:
         return None
-    middle = vertices.mean(0)
-    radius = float(np.linalg.norm(vertices - middle, axis=1).max())
-    told = _told(_grey(here, seen), ways, inverse_depth, radius)
+    radius = float(np.linalg.norm(vertices - vertices.mean(0), axis=1).max())
+    told = _told(_seen_through(here, seen), ways, inverse_depth, radius)
     return cv2.resize(told, (window.size, window.size), interpolation=cv2.INTER_LINEAR)
 
 
 @dataclass(frozen=True, eq=False)
 class _Ways:
-    """How a window's pixels get into an earlier frame, in the pixels of its `small_grey`.
+    """How a window's pixels get into the ``grey`` of an earlier frame.
 
     Attributes:
         past: The earlier frame.
-        turned: ``(S, S, 3)`` homogeneous, by the object's motion, of what is infinitely far.
-        shift: ``(3,)`` that is added to it for each inverse depth.
-        background: ``(S, S, 2)``.
+        of_surface: ``(3, 4)`` from ``u, v, 1, 1 / depth`` by the object's motion.
+        of_background: ``(3, 3)`` from ``u, v, 1`` by the background's.
     """
 
     past: Past
-    turned: Matrix
-    shift: Matrix
-    background: NDArray[np.float32]
+    of_surface: Matrix
+    of_background: Matrix
 
     @classmethod
-    def of(cls, here: Past, past: Past, window: Window, camera: Camera) -> _Ways | None:
-        """None where the background's motion is not known."""
-        H = background_motion(here.grey, past.grey, here.mask)
-        if H is None:
-            return None
+    def of(cls, here: Past, past: Past, window: Window, camera: Camera, background: Matrix) -> Self:
+        """With the background's homography ``(3, 3)`` from the frame to the earlier one, in full pixels."""
         T = past.T_cam_obj @ np.linalg.inv(here.T_cam_obj)
-        to_small = _to_small(past)
-        homogeneous = _homogeneous(window.size)
-        turned = homogeneous @ (to_small @ camera.K @ T[:3, :3] @ np.linalg.inv(window.K(camera))).T
-        beyond = homogeneous @ (to_small @ H @ _to_frame(window)).T
-        return cls(past, turned, to_small @ camera.K @ T[:3, 3], _projected(beyond))
+        K = past.to_small @ camera.K
+        of_surface = np.column_stack([K @ T[:3, :3] @ np.linalg.inv(window.K(camera)), K @ T[:3, 3]])
+        return cls(past, of_surface, past.to_small @ background @ window.to_frame)
 
-    def of_object(self, inverse_depth: Matrix) -> NDArray[np.float32]:
-        """``(S, S, 2)`` by the object's motion, of points at one over a depth ``(S, S)``."""
-        return _projected(self.turned + inverse_depth[..., None] * self.shift)
+    def at(self, inverse_depth: Plane) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """See `tracking3d.evidence.motion.parted_ways`."""
+        return parted_ways(inverse_depth, self.of_surface, self.of_background, self.past.grey.shape, _APART)
+
+    def apart(self, drawn: Mask, inverse_depth: Plane) -> float:
+        """Median of the pixels by which both part on the surface; 0 where they lead out of the frame."""
+        ways, _ = self.at(inverse_depth)
+        within = drawn & ways.any((0, -1))
+        return float(np.median(np.linalg.norm(ways[0] - ways[1], axis=-1)[within])) if within.any() else 0.0
 
 
 def _ways_apart(
-    here: Past, earlier: Sequence[Past], window: Window, camera: Camera, inverse_depth: Plane, drawn: Mask
+    here: Past, earlier: Sequence[Past], window: Window, camera: Camera, drawn: Mask, inverse_depth: Plane
 ) -> _Ways | None:
-    """Into the latest earlier frame that the two motions part in by enough; None where there is none.
+    """Into the latest earlier frame in which the two motions part by enough; None where they do in none.
 
-    How far they part in the frame before says how many frames it takes.
+    As if the background stood still it is guessed which that is, and once more when its motion is known.
     """
-    lag, most = 1, len(earlier)
+    most = len(earlier)
+    lag = most
+    for guess in range(1, most + 1):
+        if _Ways.of(here, earlier[-guess], window, camera, np.eye(3)).apart(drawn, inverse_depth) >= _MOVED:
+            lag = guess
+            break
     for _ in range(_ATTEMPTS):
-        ways = _Ways.of(here, earlier[-lag], window, camera)
-        if ways is None:
+        past = earlier[-lag]
+        background = background_motion(here.grey, past.grey, here.mask)
+        if background is None:
             return None
-        parted = np.linalg.norm(ways.of_object(inverse_depth)[drawn] - ways.background[drawn], axis=-1)
-        middle = float(np.median(parted))
-        if middle >= _MOVED:
+        ways = _Ways.of(here, past, window, camera, background)
+        parted = ways.apart(drawn, inverse_depth)
+        if parted >= _MOVED:
             return ways
-        wanted = int(np.ceil(lag * _MOVED / max(middle, 1e-3)))
+        wanted = int(np.ceil(lag * _MOVED / max(parted, 1e-3)))
         if lag == most or wanted > 2 * most:
             return None
         lag = min(max(wanted, lag + 1), most)
     return None
 
 
-def _told(
-    grey: NDArray[np.uint8], ways: _Ways, inverse_depth: Plane, radius: float
-) -> Plane:
-    """``(S, S)`` see `moves_along`."""
-    depth = 1 / np.maximum(inverse_depth.astype(np.float64), 1e-9)
+def _told(grey: NDArray[np.uint8], ways: _Ways, inverse_depth: Plane, radius: float) -> Plane:
+    """``(S, S)`` see `moves_along`; ``grey`` ``(S, S)`` is what the window shows."""
     ours = np.full(grey.shape, np.inf, np.float32)
     told = np.zeros(grey.shape, np.float32)
-    for offset in _DEPTHS * radius:
-        way = ways.of_object(1 / np.maximum(depth + offset, 1e-9))
-        parted = np.linalg.norm(way - ways.background, axis=-1)
-        share = np.clip((parted - _APART[0]) / (_APART[1] - _APART[0]), 0, 1)
-        cost = np.where(share > 0, _residual(grey, ways.past.grey, way), np.inf)
-        told = np.where(cost < ours, share, told)
-        ours = np.minimum(ours, cost)
-    theirs = _residual(grey, ways.past.grey, ways.background)
-    covered = cv2.remap(
-        _small_mask(ways.past), ways.background, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT
-    )
+    depth = 1 / inverse_depth
+    way, share = ways.at(inverse_depth)
+    theirs = _residual(grey, ways.past.grey, way[1])
+    covered = cv2.remap(_small_mask(ways.past), way[1], None, cv2.INTER_NEAREST) > 0
+    for offset in np.float32(radius) * _DEPTHS.astype(np.float32):
+        deeper = depth + offset
+        way, share = ways.at(np.where(deeper > 0, 1 / deeper, 0).astype(np.float32))
+        cost = _residual(grey, ways.past.grey, way[0])
+        better = (cost < ours) & (share > 0)
+        ours, told = np.where(better, cost, ours), np.where(better, share, told)
     # Behind the object nobody saw the background: there the patch has to be one that fits nowhere else.
-    theirs = np.where(covered > 0, np.minimum(theirs, _distinct(grey)), theirs)
+    theirs = np.where(covered, np.minimum(theirs, _distinct(grey)), theirs)
     known = np.isfinite(ours)
-    cue = np.clip(np.log((theirs + _NOISE) / (np.where(known, ours, 0) + _NOISE)) / _MOST, -1, 1)
-    cue = np.where(covered > 0, np.maximum(cue, 0), cue)
-    return (cue * told * known * _texture(grey)).astype(np.float32)
-
-
-def _distinct(grey: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """``(S, S)`` by how much a patch differs at least from what lies a few pixels beside it (Moravec)."""
-    least = np.full(grey.shape, np.inf, np.float32)
-    for right, down in ((_SHIFT, 0), (0, _SHIFT), (_SHIFT, _SHIFT), (_SHIFT, -_SHIFT)):
-        moved = np.roll(grey, (down, right), (0, 1))
-        beyond = cv2.absdiff(grey, moved).astype(np.float32)
-        least = np.minimum(least, cv2.blur(beyond, (_PATCH, _PATCH)))
-    return least
+    cue = np.log((theirs + _NOISE) / (np.where(known, ours, 0) + _NOISE))
+    cue = np.clip(cue / _MOST, -1, 1)
+    cue = np.where(covered, np.maximum(cue, 0), cue)
+    return np.asarray(cue * told * known * _texture(grey), np.float32)
 
 
 def _residual(
     grey: NDArray[np.uint8], there: NDArray[np.uint8], way: NDArray[np.float32]
 ) -> NDArray[np.float32]:
     """``(S, S)`` grey levels by which patches differ; a value between those of a pixel's neighbours does not."""
-    seen = cv2.remap(there, way, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    beyond = cv2.add(
-        cv2.subtract(grey, cv2.dilate(seen, _SQUARE)), cv2.subtract(cv2.erode(seen, _SQUARE), grey)
-    )
-    return cv2.blur(beyond.astype(np.float32), (_PATCH, _PATCH))
+    seen = cv2.remap(there, way, None, cv2.INTER_LINEAR)
+    above, below = cv2.subtract(grey, cv2.dilate(seen, _SQUARE)), cv2.subtract(cv2.erode(seen, _SQUARE), grey)
+    return cv2.blur(cv2.add(above, below).astype(np.float32), (_PATCH, _PATCH))
+
+
+def _distinct(grey: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """``(S, S)`` grey levels by which a patch differs, at least, from those a few pixels beside it (Moravec)."""
+    wide = cv2.copyMakeBorder(grey, *(_SHIFT,) * 4, cv2.BORDER_REPLICATE)
+    size = len(grey)
+    least = np.full(grey.shape, np.inf, np.float32)
+    for right, down in ((1, 0), (0, 1), (1, 1), (1, -1)):
+        row, column = _SHIFT * (1 + down), _SHIFT * (1 + right)
+        moved = wide[row : row + size, column : column + size]
+        least = np.minimum(least, cv2.blur(cv2.absdiff(grey, moved).astype(np.float32), (_PATCH, _PATCH)))
+    return least
 
 
 def _texture(grey: NDArray[np.uint8]) -> Plane:
     """``(S, S)`` in [0, 1]: what is even moves with anything."""
     contrast = cv2.subtract(cv2.dilate(grey, _SQUARE), cv2.erode(grey, _SQUARE)).astype(np.float32)
     around = cv2.blur(contrast, (_PATCH, _PATCH))
-    return np.clip((around - _TEXTURE[0]) / (_TEXTURE[1] - _TEXTURE[0]), 0, 1)
+    return np.asarray(np.clip((around - _TEXTURE[0]) / (_TEXTURE[1] - _TEXTURE[0]), 0, 1), np.float32)
 
 
-def _grey(here: Past, window: Window) -> NDArray[np.uint8]:
-    """``(S, S)`` what the window shows of a frame."""
-    way = _projected(_homogeneous(window.size) @ (_to_small(here) @ _to_frame(window)).T)
-    return cv2.remap(here.grey, way, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+def _seen_through(here: Past, window: Window) -> NDArray[np.uint8]:
+    """``(S, S)`` what a window shows of a frame's ``grey``."""
+    to_small = here.to_small @ window.to_frame
+    return cv2.warpAffine(
+        here.grey,
+        to_small[:2],
+        (window.size, window.size),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
 
 
 def _small_mask(past: Past) -> NDArray[np.uint8]:
+    """``(h, w)`` where the object is in ``grey``."""
     height, width = past.grey.shape
     return cv2.resize(past.mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
-
-
-def _to_small(past: Past) -> Matrix:
-    """``(3, 3)`` from the frame's pixels to those of its `small_grey`; centres are at integers in both."""
-    to_small = np.diag([past.grey.shape[1] / past.mask.shape[1], past.grey.shape[0] / past.mask.shape[0], 1.0])
-    to_small[:2, 2] = (to_small[[0, 1], [0, 1]] - 1) / 2
-    return to_small
-
-
-def _to_frame(window: Window) -> Matrix:
-    """``(3, 3)`` from the window's pixels to the frame's."""
-    to_frame = np.diag([1 / window.scale, 1 / window.scale, 1.0])
-    to_frame[:2, 2] = tuple(0.5 / window.scale + edge - 0.5 for edge in (window.left, window.top))
-    return to_frame
-
-
-def _homogeneous(size: int) -> Matrix:
-    """``(S, S, 3)`` the window's pixels."""
-    at = np.arange(float(size))
-    u, v = np.meshgrid(at, at)
-    return np.stack([u, v, np.ones_like(u)], -1)
-
-
-def _projected(points: Matrix) -> NDArray[np.float32]:
-    ahead = np.where(points[..., 2:] > 0, points[..., 2:], np.nan)
-    return np.nan_to_num(points[..., :2] / ahead, nan=-1e4).astype(np.float32)

@@ -141,3 +141,10 @@ class Window:
                 [0.0, 0.0, 1.0],
             ]
         )
+
+    @property
+    def to_frame(self) -> NDArray[np.float64]:
+        """``(3, 3)`` from this window's pixels, homogeneous, to the frame's."""
+        step = 1 / self.scale
+        first = 0.5 * step - 0.5
+        return np.array([[step, 0.0, self.left + first], [0.0, step, self.top + first], [0.0, 0.0, 1.0]])
