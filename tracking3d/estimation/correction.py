@@ -28,7 +28,7 @@ TAKEN_IN = "taken_in"
 """What `FrameEstimate.losses` calls the share of the answer's mask that was taken in since it moves as the object does.
 The mask tracker is told of it at once: a side that comes into view is small for a few frames only."""
 
-ENOUGH_TAKEN = 0.01
+ENOUGH_TAKEN = 0.02
 """Share from which on it is told."""
 
 

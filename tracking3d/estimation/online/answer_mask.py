@@ -23,6 +23,7 @@ from tracking3d.evidence.taking_in import taken_in, unlike_surroundings
 from tracking3d.geometry.camera import Window
 from tracking3d.trackers.crops import cut, inside_frame
 
+_IN_QUESTION = 0.5
 _FINER = 2
 """Pixels of the evidence for each of the window, as of its image."""
 
@@ -56,7 +57,7 @@ def answer_mask(
     )
     odds = log_odds(sources)
     share = 0.0
-    if moving is not None:
+    if moving is not None and in_question(sources) >= _IN_QUESTION:
         known = seen_through(initial | rendered, window)
         strange = unlike_surroundings(as_lab(image), known)
         odds, share = taken_in(odds, known, moving, strange)
