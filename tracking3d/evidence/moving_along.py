@@ -99,7 +99,7 @@ def moves_along(
     if ways is None:
         return None
     radius = float(np.linalg.norm(vertices - vertices.mean(0), axis=1).max())
-    told = _told(_seen_through(here, seen), ways, inverse_depth, radius)
+    told = _told(here, seen, ways, inverse_depth, radius)
     return cv2.resize(told, (window.size, window.size), interpolation=cv2.INTER_LINEAR)
 
 
@@ -165,27 +165,52 @@ def _ways_apart(
     return None
 
 
-def _told(grey: NDArray[np.uint8], ways: _Ways, inverse_depth: Plane, radius: float) -> Plane:
-    """``(S, S)`` see `moves_along`; ``grey`` ``(S, S)`` is what the window shows."""
+def _told(here: Past, window: Window, ways: _Ways, inverse_depth: Plane, radius: float) -> Plane:
+    """``(S, S)`` see `moves_along`."""
+    grey, past = _seen_through(here.grey, here.to_small @ window.to_frame, window), ways.past
     ours = np.full(grey.shape, np.inf, np.float32)
     told = np.zeros(grey.shape, np.float32)
     depth = 1 / inverse_depth
-    way, share = ways.at(inverse_depth)
-    theirs = _residual(grey, ways.past.grey, way[1])
-    covered = cv2.remap(_small_mask(ways.past), way[1], None, cv2.INTER_NEAREST) > 0
+    (near, background), _ = ways.at(inverse_depth)
     for offset in np.float32(radius) * _DEPTHS.astype(np.float32):
         deeper = depth + offset
-        way, share = ways.at(np.where(deeper > 0, 1 / deeper, 0).astype(np.float32))
-        cost = _residual(grey, ways.past.grey, way[0])
+        (way, _), share = ways.at(np.where(deeper > 0, 1 / deeper, 0).astype(np.float32))
+        cost = _residual(grey, past.grey, way)
         better = (cost < ours) & (share > 0)
         ours, told = np.where(better, cost, ours), np.where(better, share, told)
-    # Behind the object nobody saw the background: there the patch has to be one that fits nowhere else.
-    theirs = np.where(covered, np.minimum(theirs, _distinct(grey)), theirs)
-    known = np.isfinite(ours)
+    theirs = _residual(grey, past.grey, background)
+    # What was behind the object looks like nothing that was seen before, unless it is a side that turns into view:
+    # that is no wider than the object has turned, and its patches fit nowhere else.
+    covered = cv2.remap(_small_mask(past), background, None, cv2.INTER_NEAREST) > 0
+    new = covered & _turned_into_view(here, window, near, way)
+    theirs = np.where(new, np.minimum(theirs, _distinct(grey)), theirs)
+    known = np.isfinite(ours) & (~covered | new)
     cue = np.log((theirs + _NOISE) / (np.where(known, ours, 0) + _NOISE))
     cue = np.clip(cue / _MOST, -1, 1)
     cue = np.where(covered, np.maximum(cue, 0), cue)
     return np.asarray(cue * told * known * _texture(grey), np.float32)
+
+
+def _turned_into_view(
+    here: Past, window: Window, near: NDArray[np.float32], far: NDArray[np.float32]
+) -> Mask:
+    """``(S, S)`` what may be a side that was behind an edge of the object in the earlier frame.
+
+    Args:
+        here: The frame.
+        window: Of it.
+        near: ``(S, S, 2)`` where pixels were in the earlier frame as parts of the surface beside them.
+        far: The same as parts of what lies deepest behind it.
+    """
+    known = _seen_through(here.mask.astype(np.uint8), window.to_frame, window)
+    if known.all() or not known.any():
+        return np.zeros(known.shape, bool)
+    distance = cv2.distanceTransform(1 - known, cv2.DIST_L2, cv2.DIST_MASK_5)
+    smooth = cv2.GaussianBlur(distance, (0, 0), 2.0)
+    outward = np.stack([cv2.Sobel(smooth, cv2.CV_32F, *order, scale=0.125) for order in ((1, 0), (0, 1))], -1)
+    # What lies behind an edge has come out from behind it by as much as it moved past the edge.
+    come = ((near - far) * outward).sum(-1) * (near.any(-1) & far.any(-1))
+    return np.asarray(distance * (here.to_small[0, 0] / window.scale) < come)
 
 
 def _residual(
@@ -216,12 +241,11 @@ def _texture(grey: NDArray[np.uint8]) -> Plane:
     return np.asarray(np.clip((around - _TEXTURE[0]) / (_TEXTURE[1] - _TEXTURE[0]), 0, 1), np.float32)
 
 
-def _seen_through(here: Past, window: Window) -> NDArray[np.uint8]:
-    """``(S, S)`` what a window shows of a frame's ``grey``."""
-    to_small = here.to_small @ window.to_frame
+def _seen_through(image: NDArray[np.uint8], of_window: Matrix, window: Window) -> NDArray[np.uint8]:
+    """``(S, S)`` an image at the pixels to which ``of_window`` ``(3, 3)`` takes a window's."""
     return cv2.warpAffine(
-        here.grey,
-        to_small[:2],
+        image,
+        of_window[:2],
         (window.size, window.size),
         flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
         borderMode=cv2.BORDER_REPLICATE,

@@ -39,14 +39,15 @@ def taken_in(
     root = math.sqrt(max(int(np.count_nonzero(known)), 1))
     strange = first > _BACKGROUND
     distance = relative_distance(known)
-    # A patch that reaches over the outline moves along with what it has of the object.
-    beside = distance < -(HALF_PATCH * len(known) + 1) / root
-    seen = (moving > _MOVES) & strange & beside
+    seen = (moving > _MOVES) & strange & ~known
     radius = max(round(_CLOSED * root), 1)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     if _still(moving, distance):
         return log_odds, 0.0
-    closed = cv2.morphologyEx((seen | known).astype(np.uint8), cv2.MORPH_CLOSE, disc) > 0
+    closed = cv2.morphologyEx((seen | known).astype(np.uint8), cv2.MORPH_CLOSE, disc)
+    # A patch that reaches over the outline moves along with what it has of the object.
+    over = 2 * max(round(HALF_PATCH * len(known)), 1) + 1
+    closed = cv2.erode(closed, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (over, over))) > 0
     near = distance > -_REACH
     added = closed & near & ~known & (moving > _STAYS) & strange
     count, part = cv2.connectedComponents(added.astype(np.uint8))
