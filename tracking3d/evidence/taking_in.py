@@ -12,10 +12,11 @@ from tracking3d.evidence.colours import relative_distance
 from tracking3d.evidence.moving_along import HALF_PATCH
 from tracking3d.trackers.colour_models import histograms, log_ratio
 
-_MOVES, _STAYS = 0.35, -0.3
+MOVES = 0.35
+_DISPUTED = 2.0  # log-odds
 _CLOSED = 0.1  # of the root of the area: gaps between what moves along, which is seen where there are edges
 _DENSE = 0.2  # share of a part in which motion is seen
-_BACKGROUND = -1.0  # log of the colours' ratio in the first frame, below which it is of the surroundings
+_SURROUNDINGS = -1.0  # of `unlike_surroundings`, below which a colour is of them
 _REACH = 0.15  # of the root of the area, in one frame
 _STILL, _FEWEST = 0.5, 0.01  # shares of what can be told beside it, and of the window that tell at least
 _FAR, _RARE = 0.25, 0.002
@@ -24,46 +25,56 @@ _TAKEN = 3.0  # log-odds
 
 def taken_in(
     log_odds: NDArray[np.float32],
-    known: NDArray[np.bool_],
+    initial: NDArray[np.bool_],
+    rendered: NDArray[np.bool_],
     moving: NDArray[np.float32],
-    first: NDArray[np.float32],
-) -> tuple[NDArray[np.float32], float]:
-    """``(S, S)`` log-odds with the parts beside the object that move with it, and their share of the whole.
+    strange: NDArray[np.float32],
+) -> NDArray[np.float32]:
+    """``(S, S)`` log-odds with what motion says: where both masks differ, and of parts beside both that move along.
 
     Args:
         log_odds: ``(S, S)`` so far.
-        known: ``(S, S)`` where the object is known to be.
+        initial: ``(S, S)`` the mask tracker's mask.
+        rendered: ``(S, S)`` the silhouette.
         moving: ``(S, S)`` from `tracking3d.evidence.moving_along`.
-        first: ``(S, S)`` log of how likely the colours are the object's by what the first frame showed.
+        strange: ``(S, S)`` from `unlike_surroundings`.
     """
-    root = math.sqrt(max(int(np.count_nonzero(known)), 1))
-    strange = first > _BACKGROUND
+    known = initial | rendered
     distance = relative_distance(known)
-    seen = (moving > _MOVES) & strange & ~known
-    radius = max(round(_CLOSED * root), 1)
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     if _still(moving, distance):
-        return log_odds, 0.0
-    closed = cv2.morphologyEx((seen | known).astype(np.uint8), cv2.MORPH_CLOSE, disc)
+        return log_odds
+    log_odds = log_odds + np.where(initial ^ rendered, _DISPUTED * moving, 0)
+    root = math.sqrt(max(int(np.count_nonzero(known)), 1))
+    seen = (moving > MOVES) & (strange > _SURROUNDINGS) & ~known
+    closed = cv2.morphologyEx((seen | known).astype(np.uint8), cv2.MORPH_CLOSE, _disc(_CLOSED * root))
     # A patch that reaches over the outline moves along with what it has of the object.
-    over = 2 * max(round(HALF_PATCH * len(known)), 1) + 1
-    closed = cv2.erode(closed, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (over, over))) > 0
-    near = distance > -_REACH
-    added = closed & near & ~known & (moving > _STAYS) & strange
+    closed = cv2.erode(closed, _disc(HALF_PATCH * len(known))) > 0
+    added = closed & (distance > -_REACH) & ~known & (moving > -MOVES) & (strange > _SURROUNDINGS)
     count, part = cv2.connectedComponents(added.astype(np.uint8))
     touching = np.unique(part[cv2.dilate(known.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0])
     dense = np.bincount(part[seen], minlength=count) >= _DENSE * np.bincount(part.ravel(), minlength=count)
     dense &= np.isin(np.arange(count), touching)
     dense[0] = False
-    into = dense[part]
-    share = float(np.count_nonzero(into)) / max(int(np.count_nonzero(into | known)), 1)
-    return np.where(into, np.maximum(log_odds, _TAKEN), log_odds).astype(np.float32), share
+    return np.where(dense[part], np.maximum(log_odds, _TAKEN), log_odds).astype(np.float32)
+
+
+def vouched(
+    mask: NDArray[np.bool_], initial: NDArray[np.bool_], moving: NDArray[np.float32]
+) -> float:
+    """Share of a mask ``(S, S)`` by which it differs from the initial one where motion says so."""
+    more, less = mask & ~initial & (moving > MOVES), initial & ~mask & (moving < -MOVES)
+    return int(np.count_nonzero(more | less)) / max(int(np.count_nonzero(mask)), 1)
+
+
+def _disc(radius: float) -> NDArray[np.uint8]:
+    side = 2 * max(round(radius), 1) + 1
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)).astype(np.uint8)
 
 
 def _still(moving: NDArray[np.float32], distance: NDArray[np.float32]) -> bool:
     """Whether most of what lies well beside the object moves as it does: it stands there, and the camera moves."""
     well_beside = distance < -_REACH
-    along, stays = (np.count_nonzero(one & well_beside) for one in (moving > _MOVES, moving < -_MOVES))
+    along, stays = (np.count_nonzero(one & well_beside) for one in (moving > MOVES, moving < -MOVES))
     return along > _STILL * max(along + stays, _FEWEST * moving.size)
 
 

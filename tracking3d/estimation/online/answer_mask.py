@@ -19,7 +19,7 @@ from tracking3d.evidence import (
     pasted,
     tidied,
 )
-from tracking3d.evidence.taking_in import taken_in, unlike_surroundings
+from tracking3d.evidence.taking_in import taken_in, unlike_surroundings, vouched
 from tracking3d.geometry.camera import Window
 from tracking3d.trackers.crops import cut, inside_frame
 
@@ -52,17 +52,16 @@ def answer_mask(
     if initial is None:
         return rendered, MaskSource.RENDERED, None, 0.0
     window, image = finer(observation)
-    sources = features(
-        as_lab(image), seen_through(initial, window), seen_through(rendered, window), confidence, colours
-    )
-    odds = log_odds(sources)
-    share = 0.0
-    if moving is not None and in_question(sources) >= _IN_QUESTION:
-        known = seen_through(initial | rendered, window)
-        strange = unlike_surroundings(as_lab(image), known)
-        odds, share = taken_in(odds, known, moving, strange)
-    support = tidied(along_edges(image, odds, in_question(sources)))
+    lab, own, drawn = as_lab(image), seen_through(initial, window), seen_through(rendered, window)
+    sources = features(lab, own, drawn, confidence, colours)
+    odds, asked = log_odds(sources), in_question(sources)
+    if moving is not None and asked < _IN_QUESTION:
+        moving = None
+    if moving is not None:
+        odds = taken_in(odds, own, drawn, moving, unlike_surroundings(lab, own | drawn))
+    support = tidied(along_edges(image, odds, asked))
     support[~inside_frame(initial.shape, window)] = -1
+    share = 0.0 if moving is None else vouched(support > 0, own, moving)
     # The window is the initial mask's: beyond it the silhouette alone says where the object is.
     full = pasted(support, window, np.where(rendered, 1.0, -1.0).astype(np.float32))
     mask = full > 0

@@ -11,6 +11,7 @@ from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.estimation.online.answer_mask import finer
 from tracking3d.estimation.online.attempt import Attempt
 from tracking3d.estimation.online.belief import Belief
+from tracking3d.estimation.online.recruits import still
 from tracking3d.evidence.moving_along import Past, moves_along
 
 _MOST = 10  # earlier frames
@@ -31,6 +32,8 @@ def moving_beside(
     if mask is None or found.lost or found.support.witnesses < _WITNESSES or not state.past:
         return None
     known, pose = state.known, found.fit.pose
+    if still(known.beside):
+        return None
     taken = mask | known.silhouette(pose, state.camera)
     here = Past.of(found.view.index, image, pose.matrix().numpy(), taken)
     vertices = known.vertices.double().cpu().numpy()
