@@ -23,6 +23,8 @@ from tracking3d.geometry.camera import Camera, Window
 _DEPTHS = np.linspace(-0.4, 1.2, 9)
 """Where a pixel beside the silhouette may lie, behind the surface beside it, in radii of the object: what turns into
 view lies behind the edge that it turns about."""
+_IN_FRONT = (-0.8, -1.2, -1.6)
+"""The same of where none of it can be."""
 _LARGEST = 144  # pixels of the window's side
 _MOVED = 4.0
 """Pixels of a frame as `smaller` gives it by which the motions part in the median, at least."""
@@ -172,23 +174,31 @@ def _told(here: Past, window: Window, ways: _Ways, inverse_depth: Plane, radius:
     told = np.zeros(grey.shape, np.float32)
     depth = 1 / inverse_depth
     (near, background), _ = ways.at(inverse_depth)
-    for offset in np.float32(radius) * _DEPTHS.astype(np.float32):
-        deeper = depth + offset
-        (way, _), share = ways.at(np.where(deeper > 0, 1 / deeper, 0).astype(np.float32))
+    for offset in radius * _DEPTHS:
+        way, share = _at(ways, depth, offset)
         cost = _residual(grey, past.grey, way)
         better = (cost < ours) & (share > 0)
         ours, told = np.where(better, cost, ours), np.where(better, share, told)
     theirs = _residual(grey, past.grey, background)
     # What was behind the object looks like nothing that was seen before, unless it is a side that turns into view:
-    # that is no wider than the object has turned, and its patches fit nowhere else.
+    # that is no wider than the object has turned, and its patches do not fit where it cannot have been.
     covered = cv2.remap(_small_mask(past), background, None, cv2.INTER_NEAREST) > 0
     new = covered & _turned_into_view(here, window, near, way)
-    theirs = np.where(new, np.minimum(theirs, _distinct(grey)), theirs)
+    if new.any():
+        wrong = [_residual(grey, past.grey, _at(ways, depth, radius * offset)[0]) for offset in _IN_FRONT]
+        theirs = np.where(new, np.minimum(theirs, np.min([_distinct(grey), *wrong], 0)), theirs)
     known = np.isfinite(ours) & (~covered | new)
     cue = np.log((theirs + _NOISE) / (np.where(known, ours, 0) + _NOISE))
     cue = np.clip(cue / _MOST, -1, 1)
     cue = np.where(covered, np.maximum(cue, 0), cue)
     return np.asarray(cue * told * known * _texture(grey), np.float32)
+
+
+def _at(ways: _Ways, depth: Plane, offset: float) -> tuple[NDArray[np.float32], Plane]:
+    """Where pixels were by the object's motion, and how far that can be told, if they lie ``offset`` deeper."""
+    deeper = depth + np.float32(offset)
+    way, share = ways.at(np.where(deeper > 0, 1 / deeper, 0).astype(np.float32))
+    return way[0], share
 
 
 def _turned_into_view(

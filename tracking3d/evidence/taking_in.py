@@ -48,22 +48,34 @@ def taken_in(
     seen = (moving > MOVES) & (strange > _SURROUNDINGS) & ~known
     closed = cv2.morphologyEx((seen | known).astype(np.uint8), cv2.MORPH_CLOSE, _disc(_CLOSED * root))
     # A patch that reaches over the outline moves along with what it has of the object.
-    closed = cv2.erode(closed, _disc(HALF_PATCH * len(known))) > 0
+    closed = cv2.erode(closed, _disc(HALF_PATCH * len(known) / 2)) > 0
     added = closed & (distance > -_REACH) & ~known & (moving > -MOVES) & (strange > _SURROUNDINGS)
-    count, part = cv2.connectedComponents(added.astype(np.uint8))
-    touching = np.unique(part[cv2.dilate(known.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0])
-    dense = np.bincount(part[seen], minlength=count) >= _DENSE * np.bincount(part.ravel(), minlength=count)
-    dense &= np.isin(np.arange(count), touching)
-    dense[0] = False
-    return np.where(dense[part], np.maximum(log_odds, _TAKEN), log_odds).astype(np.float32)
+    added = _touching(_seen_parts(added, seen), known)
+    return np.where(added, np.maximum(log_odds, _TAKEN), log_odds).astype(np.float32)
 
 
 def vouched(
     mask: NDArray[np.bool_], initial: NDArray[np.bool_], moving: NDArray[np.float32]
 ) -> float:
     """Share of a mask ``(S, S)`` by which it differs from the initial one where motion says so."""
-    more, less = mask & ~initial & (moving > MOVES), initial & ~mask & (moving < -MOVES)
+    more = _seen_parts(mask & ~initial, moving > MOVES)
+    less = _seen_parts(initial & ~mask, moving < -MOVES)
     return int(np.count_nonzero(more | less)) / max(int(np.count_nonzero(mask)), 1)
+
+
+def _seen_parts(where: NDArray[np.bool_], seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """``(S, S)`` the connected parts in which enough is seen of a motion."""
+    count, part = cv2.connectedComponents(where.astype(np.uint8))
+    dense = np.bincount(part[seen], minlength=count) >= _DENSE * np.bincount(part.ravel(), minlength=count)
+    dense[0] = False
+    return np.asarray(dense[part])
+
+
+def _touching(where: NDArray[np.bool_], known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """``(S, S)`` the connected parts that lie against what is known."""
+    _, part = cv2.connectedComponents(where.astype(np.uint8))
+    beside = np.unique(part[cv2.dilate(known.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0])
+    return np.isin(part, beside) & where
 
 
 def _disc(radius: float) -> NDArray[np.uint8]:
