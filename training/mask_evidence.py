@@ -88,7 +88,7 @@ def told(truth: Any, sequence: int, into: list[Samples]) -> Iterator[None]:
     """While a sequence is tracked, note what the sources say in each frame."""
     original = answers.answer_mask
 
-    def noting(rendered, initial, observation, confidence, colours):
+    def noting(rendered, initial, observation, confidence, colours, moving=None):
         exact = truth.masks[observation.index].read() if observation.index in truth.masks else None
         asked = exact is not None and initial is not None and exact.any()
         if asked and max(_overlap(initial, exact), _overlap(rendered, exact)) >= _LEAST_OVERLAP:
@@ -100,7 +100,7 @@ def told(truth: Any, sequence: int, into: list[Samples]) -> Iterator[None]:
             count = len(chosen)
             weight, number = np.full(count, 1 / max(count, 1)), np.full(count, sequence)
             into.append(Samples(rows, masks[2].ravel()[chosen], weight, number))
-        return original(rendered, initial, observation, confidence, colours)
+        return original(rendered, initial, observation, confidence, colours, moving)
 
     answers.answer_mask = noting
     try:

@@ -12,7 +12,7 @@ from refining_solver import CausalSolver
 
 from tracking3d import Frame, FrameEstimate, Status, load_config, track
 from tracking3d.errors import PluginError
-from tracking3d.estimation.correction import SIGHTED, SURE, WORTH_CORRECTING, corrects
+from tracking3d.estimation.correction import MOVES, MOVING, SIGHTED, SURE, WORTH_CORRECTING, corrects
 from tracking3d.frames import MaskEstimate, Prompt
 from tracking3d.plugins import VARIABLE
 from tracking3d.session import SOLVERS
@@ -118,6 +118,15 @@ def test_the_bounds_themselves_are_worth_correcting():
     assert corrects(estimate(mask=square(10, 10)))  # half of it
     assert corrects(estimate(mask=square(10, 18)))  # 18 of 20
     assert not corrects(estimate(mask=square(10, 9)))
+
+
+def test_what_moves_along_corrects_however_unsure_the_pose_is():
+    unsure = {"confidence": 0.3, "status": Status.UNCERTAIN}
+    assert corrects(estimate(losses={MOVING: MOVES}, **unsure))
+    assert corrects(estimate(losses={MOVING: 0.05}, mask=square(10, 19), **unsure))  # 19 of 20
+    assert not corrects(estimate(losses={MOVING: MOVES / 2}, **unsure))
+    assert not corrects(estimate(losses={MOVING: 0.5}, mask=square(10, 9), **unsure))
+    assert not corrects(estimate(losses={MOVING: 0.5}, mask=np.zeros(SIZE, bool), **unsure))
 
 
 def test_what_was_found_elsewhere_by_its_points_corrects_a_mask_of_something_else():

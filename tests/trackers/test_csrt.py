@@ -13,6 +13,7 @@ from pydantic import ValidationError
 
 from tracking3d.errors import InputError, PluginError
 from tracking3d.frames import Frame, MaskEstimate, Prompt
+from tracking3d.trackers.box_trackers import BoxOffset
 from tracking3d.trackers.csrt import CsrtTracker
 from tracking3d.trackers.protocol import CorrectableTracker, ForewarnedTracker, MaskTracker, Options
 from tracking3d.trackers.segmentation import ColourSegmentation
@@ -302,3 +303,23 @@ def test_real_clips_from_a_box(shared_data: Path, clip: str, expected: float) ->
             true_mask = cv2.imread(str(truth), cv2.IMREAD_GRAYSCALE) > 127
             ious.append(0.0 if estimate.mask is None else iou(estimate.binary, true_mask))
     assert np.mean(ious) > expected
+
+
+def test_a_box_that_was_corrected_keeps_its_offset() -> None:
+    followed, told = (40.0, 30.0, 20.0, 10.0), (38.0, 30.0, 30.0, 12.0)
+    offset = BoxOffset.between(followed, told)
+    assert offset.applied(followed) == pytest.approx(told)
+    assert offset.applied((80.0, 60.0, 40.0, 20.0)) == pytest.approx((76.0, 60.0, 60.0, 24.0))
+    assert BoxOffset().applied(followed) == followed
+
+
+def test_what_a_correction_adds_is_not_held_back_by_the_box_of_before() -> None:
+    frames, truth = moving_shape(6)
+    half = truth[0] & (
+        np.arange(truth[0].shape[1]) < box_around(truth[0])[0] + box_around(truth[0])[2] * 0.75
+    )
+    csrt = tracker()
+    csrt.init(frames[0], Prompt(box_around(half), half))
+    csrt.step(frames[1])
+    csrt.correct(frames[1], truth[1])
+    assert iou(csrt.step(frames[2]).binary, truth[2]) > 0.9

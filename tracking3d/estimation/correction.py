@@ -24,18 +24,19 @@ ELSEWHERE = 0.2
 """IoU of the object's silhouette, or mask, with the initial mask up to which that is of something else."""
 
 
-TAKEN_IN = "taken_in"
-"""What `FrameEstimate.losses` calls the share of the answer's mask that was taken in since it moves as the object does.
-The mask tracker is told of it at once: a side that comes into view is small for a few frames only."""
+MOVING = "moving"
+"""What `FrameEstimate.losses` calls the share of the answer's mask by which it differs from the initial mask because of
+what moves as the object does."""
 
-ENOUGH_TAKEN = 0.02
-"""Share from which on it is told."""
+MOVES = 0.02
+"""Such a share from which on the answer is handed back, however sure it is: a side that turns into view lies beside the
+mask for a few frames only, and a pose that is judged by a mask without it cannot be sure."""
 
 
 def corrects(estimate: FrameEstimate) -> bool:
     """Whether an answer is sure enough, and unlike the initial mask enough, to be handed back to the mask tracker."""
-    taken_in = estimate.losses.get(TAKEN_IN, 0.0) >= ENOUGH_TAKEN
-    if estimate.status is not Status.TRACKED and not taken_in:
+    moving = estimate.losses.get(MOVING, 0.0) >= MOVES
+    if estimate.status is not Status.TRACKED and not moving:
         return False
     if estimate.initial_mask is None:
         return estimate.hypothesis == SIGHTED
@@ -44,6 +45,6 @@ def corrects(estimate: FrameEstimate) -> bool:
     if estimate.hypothesis == SIGHTED and both <= ELSEWHERE * either:
         return True
     least, most = WORTH_CORRECTING
-    if taken_in:
-        return both >= least * either
-    return estimate.confidence >= SURE and both > 0 and least * either <= both <= most * either
+    if not both or both < least * either:
+        return False
+    return moving or (estimate.confidence >= SURE and both <= most * either)

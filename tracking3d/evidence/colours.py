@@ -59,9 +59,6 @@ class Colours:
         """``(S, S)`` log of the object's over the surroundings' likelihood of each pixel's colour, within 3."""
         return log_ratio(self.histograms, lab)
 
-    def strange_share(self, lab):
-        return log_ratio(self.histograms, lab, 0.01)
-
 
 def beside_outline(lab: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.float32]:
     """``(S, S)`` log of how often a pixel's colour lies around it in the mask over how often beside it, within 3.

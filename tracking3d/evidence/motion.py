@@ -129,9 +129,7 @@ def _parted_ways(
     """
     image, T_cam_obj, H = target
     of_surface = np.column_stack(_through(scene, camera, T_cam_obj))
-    return parted_ways(
-        scene.inverse_depth, of_surface, H @ scene.window.to_frame, image.shape[:2], _APART
-    )
+    return parted_ways(scene.inverse_depth, of_surface, H @ scene.window.to_frame, image.shape[:2], _APART)
 
 
 def parted_ways(

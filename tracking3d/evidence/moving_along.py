@@ -44,37 +44,39 @@ Matrix = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Past:
-    """A frame whose pose is believed.
+class Glimpse:
+    """A frame whose pose is believed, as small as motion is looked for in it.
 
     Attributes:
-        index: Of the frame.
-        grey: ``(h, w)`` the frame as `tracking3d.evidence.motion.smaller` gives it.
+        grey: ``(h, w)`` from `tracking3d.evidence.motion.smaller`.
+        mask: ``(h, w)`` where the object is.
         T_cam_obj: ``(4, 4)``.
-        mask: ``(H, W)`` where the object is in it.
+        size: ``(H, W)`` of the frame itself.
     """
 
-    index: int
     grey: NDArray[np.uint8]
-    T_cam_obj: Matrix
     mask: Mask
+    T_cam_obj: Matrix
+    size: tuple[int, int]
 
     @classmethod
-    def of(cls, index: int, grey: NDArray[np.uint8], T_cam_obj: Matrix, mask: Mask) -> Self:
-        """Of a grey frame ``(H, W)``."""
-        return cls(index, smaller(grey), T_cam_obj, mask)
+    def of(cls, grey: NDArray[np.uint8], mask: Mask, T_cam_obj: Matrix) -> Self:
+        """Of a frame and its mask, both ``(H, W)``."""
+        small = smaller(grey)
+        seen = cv2.resize(mask.astype(np.uint8), small.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        return cls(small, seen > 0, T_cam_obj, grey.shape)
 
     @property
     def to_small(self) -> Matrix:
         """``(3, 3)`` from the frame's pixels to those of ``grey``; centres are at integers in both."""
-        (height, width), (rows, columns) = self.mask.shape, self.grey.shape
+        (height, width), (rows, columns) = self.size, self.grey.shape
         across, down = columns / width, rows / height
         return np.array([[across, 0.0, (across - 1) / 2], [0.0, down, (down - 1) / 2], [0.0, 0.0, 1.0]])
 
 
 def moves_along(
-    here: Past,
-    earlier: Sequence[Past],
+    here: Glimpse,
+    earlier: Sequence[Glimpse],
     window: Window,
     camera: Camera,
     vertices: NDArray[np.float64],
@@ -115,17 +117,17 @@ class _Ways:
         of_background: ``(3, 3)`` from ``u, v, 1`` by the background's.
     """
 
-    past: Past
+    past: Glimpse
     of_surface: Matrix
     of_background: Matrix
 
     @classmethod
-    def of(cls, here: Past, past: Past, window: Window, camera: Camera, background: Matrix) -> Self:
-        """With the background's homography ``(3, 3)`` from the frame to the earlier one, in full pixels."""
+    def of(cls, here: Glimpse, past: Glimpse, window: Window, camera: Camera, background: Matrix) -> Self:
+        """With the background's homography ``(3, 3)`` from the frame's ``grey`` to the earlier one's."""
         T = past.T_cam_obj @ np.linalg.inv(here.T_cam_obj)
         K = past.to_small @ camera.K
         of_surface = np.column_stack([K @ T[:3, :3] @ np.linalg.inv(window.K(camera)), K @ T[:3, 3]])
-        return cls(past, of_surface, past.to_small @ background @ window.to_frame)
+        return cls(past, of_surface, background @ here.to_small @ window.to_frame)
 
     def at(self, inverse_depth: Plane) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """See `tracking3d.evidence.motion.parted_ways`."""
@@ -139,7 +141,12 @@ class _Ways:
 
 
 def _ways_apart(
-    here: Past, earlier: Sequence[Past], window: Window, camera: Camera, drawn: Mask, inverse_depth: Plane
+    here: Glimpse,
+    earlier: Sequence[Glimpse],
+    window: Window,
+    camera: Camera,
+    drawn: Mask,
+    inverse_depth: Plane,
 ) -> _Ways | None:
     """Into the latest earlier frame in which the two motions part by enough; None where they do in none.
 
@@ -167,12 +174,12 @@ def _ways_apart(
     return None
 
 
-def _told(here: Past, window: Window, ways: _Ways, inverse_depth: Plane, radius: float) -> Plane:
+def _told(here: Glimpse, window: Window, ways: _Ways, inverse_depth: Plane, radius: float) -> Plane:
     """``(S, S)`` see `moves_along`."""
     grey, past = _seen_through(here.grey, here.to_small @ window.to_frame, window), ways.past
     ours = np.full(grey.shape, np.inf, np.float32)
     told = np.zeros(grey.shape, np.float32)
-    depth = 1 / inverse_depth
+    depth = np.asarray(1 / inverse_depth, np.float32)
     (near, background), _ = ways.at(inverse_depth)
     for offset in radius * _DEPTHS:
         way, share = _at(ways, depth, offset)
@@ -182,7 +189,7 @@ def _told(here: Past, window: Window, ways: _Ways, inverse_depth: Plane, radius:
     theirs = _residual(grey, past.grey, background)
     # What was behind the object looks like nothing that was seen before, unless it is a side that turns into view:
     # that is no wider than the object has turned, and its patches do not fit where it cannot have been.
-    covered = cv2.remap(_small_mask(past), background, None, cv2.INTER_NEAREST) > 0
+    covered = cv2.remap(past.mask.astype(np.uint8), background, None, cv2.INTER_NEAREST) > 0
     new = covered & _turned_into_view(here, window, near, way)
     if new.any():
         wrong = [_residual(grey, past.grey, _at(ways, depth, radius * offset)[0]) for offset in _IN_FRONT]
@@ -202,9 +209,9 @@ def _at(ways: _Ways, depth: Plane, offset: float) -> tuple[NDArray[np.float32], 
 
 
 def _turned_into_view(
-    here: Past, window: Window, near: NDArray[np.float32], far: NDArray[np.float32]
+    here: Glimpse, window: Window, near: NDArray[np.float32], far: NDArray[np.float32]
 ) -> Mask:
-    """``(S, S)`` what may be a side that was behind an edge of the object in the earlier frame.
+    """``(S, S)`` what is known of the object, and what may be a side that was behind its edge in the earlier frame.
 
     Args:
         here: The frame.
@@ -212,15 +219,15 @@ def _turned_into_view(
         near: ``(S, S, 2)`` where pixels were in the earlier frame as parts of the surface beside them.
         far: The same as parts of what lies deepest behind it.
     """
-    known = _seen_through(here.mask.astype(np.uint8), window.to_frame, window)
+    known = _seen_through(here.mask.astype(np.uint8), here.to_small @ window.to_frame, window)
     if known.all() or not known.any():
-        return np.zeros(known.shape, bool)
+        return known > 0
     distance = cv2.distanceTransform(1 - known, cv2.DIST_L2, cv2.DIST_MASK_5)
     smooth = cv2.GaussianBlur(distance, (0, 0), 2.0)
     outward = np.stack([cv2.Sobel(smooth, cv2.CV_32F, *order, scale=0.125) for order in ((1, 0), (0, 1))], -1)
     # What lies behind an edge has come out from behind it by as much as it moved past the edge.
     come = ((near - far) * outward).sum(-1) * (near.any(-1) & far.any(-1))
-    return np.asarray(distance * (here.to_small[0, 0] / window.scale) < come)
+    return np.asarray((known > 0) | (distance * (here.to_small[0, 0] / window.scale) < come))
 
 
 def _residual(
@@ -260,9 +267,3 @@ def _seen_through(image: NDArray[np.uint8], of_window: Matrix, window: Window) -
         flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
         borderMode=cv2.BORDER_REPLICATE,
     )
-
-
-def _small_mask(past: Past) -> NDArray[np.uint8]:
-    """``(h, w)`` where the object is in ``grey``."""
-    height, width = past.grey.shape
-    return cv2.resize(past.mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)

@@ -1,4 +1,9 @@
-"""Sides that turn into view: what moves with the object, lies against it, and was not beside it in the beginning."""
+"""Sides that turn into view: what moves with the object and lies against it becomes part of it.
+
+Motion shows where there are edges, and goes over the object's own outline by half a patch; so gaps are closed and the
+outermost is taken off again. An arm that holds the object moves along as well, but goes on beyond it: what has a colour
+that is seen well beside the object, too, is left out.
+"""
 
 from __future__ import annotations
 
@@ -13,14 +18,14 @@ from tracking3d.evidence.moving_along import HALF_PATCH
 from tracking3d.trackers.colour_models import histograms, log_ratio
 
 MOVES = 0.35
-_DISPUTED = 2.0  # log-odds
+"""Of what `tracking3d.evidence.moving_along` says, from which on something does."""
+_DISPUTED, _TAKEN = 2.0, 3.0  # log-odds: of motion where the masks differ, and of what is taken in
 _CLOSED = 0.1  # of the root of the area: gaps between what moves along, which is seen where there are edges
 _DENSE = 0.2  # share of a part in which motion is seen
 _SURROUNDINGS = -1.0  # of `unlike_surroundings`, below which a colour is of them
 _REACH = 0.15  # of the root of the area, in one frame
-_STILL, _FEWEST = 0.5, 0.01  # shares of what can be told beside it, and of the window that tell at least
-_FAR, _RARE = 0.25, 0.002
-_TAKEN = 3.0  # log-odds
+_FAR = 0.25  # of the root of the area, from which on something lies well beside the object
+_RARE = 0.002  # share of the surroundings that a colour needs to be theirs
 
 
 def taken_in(
@@ -40,23 +45,18 @@ def taken_in(
         strange: ``(S, S)`` from `unlike_surroundings`.
     """
     known = initial | rendered
-    distance = relative_distance(known)
-    if _still(moving, distance):
-        return log_odds
     log_odds = log_odds + np.where(initial ^ rendered, _DISPUTED * moving, 0)
     root = math.sqrt(max(int(np.count_nonzero(known)), 1))
     seen = (moving > MOVES) & (strange > _SURROUNDINGS) & ~known
     closed = cv2.morphologyEx((seen | known).astype(np.uint8), cv2.MORPH_CLOSE, _disc(_CLOSED * root))
     # A patch that reaches over the outline moves along with what it has of the object.
     closed = cv2.erode(closed, _disc(HALF_PATCH * len(known) / 2)) > 0
-    added = closed & (distance > -_REACH) & ~known & (moving > -MOVES) & (strange > _SURROUNDINGS)
-    added = _touching(_seen_parts(added, seen), known)
+    added = closed & ~known & (moving > -MOVES) & (strange > _SURROUNDINGS)
+    added = _touching(_seen_parts(added, seen), known) & (relative_distance(known) > -_REACH)
     return np.where(added, np.maximum(log_odds, _TAKEN), log_odds).astype(np.float32)
 
 
-def vouched(
-    mask: NDArray[np.bool_], initial: NDArray[np.bool_], moving: NDArray[np.float32]
-) -> float:
+def vouched(mask: NDArray[np.bool_], initial: NDArray[np.bool_], moving: NDArray[np.float32]) -> float:
     """Share of a mask ``(S, S)`` by which it differs from the initial one where motion says so."""
     more = _seen_parts(mask & ~initial, moving > MOVES)
     less = _seen_parts(initial & ~mask, moving < -MOVES)
@@ -81,13 +81,6 @@ def _touching(where: NDArray[np.bool_], known: NDArray[np.bool_]) -> NDArray[np.
 def _disc(radius: float) -> NDArray[np.uint8]:
     side = 2 * max(round(radius), 1) + 1
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)).astype(np.uint8)
-
-
-def _still(moving: NDArray[np.float32], distance: NDArray[np.float32]) -> bool:
-    """Whether most of what lies well beside the object moves as it does: it stands there, and the camera moves."""
-    well_beside = distance < -_REACH
-    along, stays = (np.count_nonzero(one & well_beside) for one in (moving > MOVES, moving < -MOVES))
-    return along > _STILL * max(along + stays, _FEWEST * moving.size)
 
 
 def unlike_surroundings(lab: NDArray[np.uint8], known: NDArray[np.bool_]) -> NDArray[np.float32]:

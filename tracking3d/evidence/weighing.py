@@ -80,4 +80,3 @@ def log_odds(features: NDArray[np.float32]) -> NDArray[np.float32]:
     total = features @ np.array(list(SOURCES.values()), np.float32)
     beyond = np.maximum(features[..., _INITIAL], features[..., _RENDERED]) <= -_MOST
     return np.where(beyond, -6.0, total).astype(np.float32)
-

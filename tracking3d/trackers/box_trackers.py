@@ -32,9 +32,7 @@ class BoxOffset:
     def between(cls, followed: Box, told: Box) -> Self:
         """From the box that is followed to the one that is told."""
         x, y, width, height = followed
-        return cls(
-            ((told[0] - x) / width, (told[1] - y) / height), (told[2] / width, told[3] / height)
-        )
+        return cls(((told[0] - x) / width, (told[1] - y) / height), (told[2] / width, told[3] / height))
 
     def applied(self, box: Box) -> Box:
         """The object's box where the one that is followed is ``box``."""

@@ -33,7 +33,8 @@ def iou(a, b):
 
 
 def answer(truth, rendered, initial, window=None, confidence=0.8):
-    return answer_mask(rendered, initial, observed(truth, initial, window), confidence, None)[:2]
+    found = answer_mask(rendered, initial, observed(truth, initial, window), confidence, None)
+    return found.mask, found.source
 
 
 def test_without_an_initial_mask_it_is_the_silhouette():
@@ -44,7 +45,8 @@ def test_without_an_initial_mask_it_is_the_silhouette():
 
 def test_the_mask_is_where_the_probability_is_above_a_half():
     aside = disc(SIZE, (114, 80), 50)
-    mask, _, probability = answer_mask(TRUTH, aside, observed(TRUTH, aside, None), 0.8, None)
+    found = answer_mask(TRUTH, aside, observed(TRUTH, aside, None), 0.8, None)
+    mask, probability = found.mask, found.probability
     np.testing.assert_array_equal(mask, probability > 0.5)
     assert 0 <= probability.min() < 0.1 and 0.9 < probability.max() <= 1
     undecided = (probability > 0.3) & (probability < 0.7)

@@ -24,6 +24,7 @@ from online_runs import (
 
 from tracking3d.config.loading import load_config
 from tracking3d.errors import InputError
+from tracking3d.estimation.correction import MOVES, MOVING
 from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.solver import RefiningSolver
 from tracking3d.evaluation.metrics import mask_iou
@@ -177,6 +178,19 @@ def test_what_has_vanished_is_lost_and_found_again():
     before = whole_run()[1][shown].T_cam_obj[:3, :3]
     turned = np.degrees(np.arccos(np.clip((np.trace(back.T_cam_obj[:3, :3] @ before.T) - 1) / 2, -1, 1)))
     assert turned < 6
+
+
+def test_a_side_that_the_masks_leave_out_is_taken_in_since_it_moves_along():
+    last = FRAMES - 1
+    leftmost = [np.flatnonzero(true_mask(index).any(0))[0] for index in range(FRAMES)]
+    cut = {index: true_mask(index) & (np.arange(160) >= leftmost[index] + 8) for index in range(9, FRAMES)}
+    _, answers = run([(frame(index), cut[index]) for index in cut], after=known_run(9))
+    answer = answers[-1]
+    assert mask_iou(answer.mask, true_mask(last)) > mask_iou(cut[last], true_mask(last)) + 0.03
+    assert max(one.losses[MOVING] for one in answers[9:]) > MOVES
+    assert all(
+        one.losses[MOVING] < MOVES for one in whole_run()[1][started() + 1 :]
+    )  # true masks lack nothing
 
 
 def test_an_object_that_is_still_stays_uncertain_and_says_why():

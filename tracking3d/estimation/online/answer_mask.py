@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +24,27 @@ from tracking3d.geometry.camera import Window
 from tracking3d.trackers.crops import cut, inside_frame
 
 _IN_QUESTION = 0.5
+"""See `tracking3d.evidence.in_question`: where both outlines nearly agree, as those of exact masks do, nothing is
+missing that motion would have to tell."""
 _FINER = 2
 """Pixels of the evidence for each of the window, as of its image."""
+
+
+@dataclass(frozen=True, eq=False)
+class WeighedMask:
+    """The mask that a frame is answered with.
+
+    Attributes:
+        mask: ``(H, W)``.
+        source: Where it comes from.
+        probability: ``(H, W)`` of the object: the mask is where it is above a half. None where nothing was weighed.
+        moving: Share of the mask by which it differs from the initial one where motion says so.
+    """
+
+    mask: NDArray[np.bool_]
+    source: MaskSource
+    probability: NDArray[np.float32] | None = None
+    moving: float = 0.0
 
 
 def answer_mask(
@@ -35,11 +54,8 @@ def answer_mask(
     confidence: float,
     colours: Colours | None,
     moving: NDArray[np.float32] | None = None,
-) -> tuple[NDArray[np.bool_], MaskSource, NDArray[np.float32] | None, float]:
-    """The mask ``(H, W)`` that the evidence is for, where it comes from, and the object's probability ``(H, W)``.
-
-    The mask is where the probability is above a half; where the mask is not weighed there is none. The last is the
-    share of the mask that was taken in since it moves along.
+) -> WeighedMask:
+    """The mask that the evidence is for.
 
     Args:
         rendered: ``(H, W)`` the silhouette at the frame's pose.
@@ -50,7 +66,7 @@ def answer_mask(
         moving: ``(S, S)`` what moves as the object does in the window of `finer`, or None where that is not known.
     """
     if initial is None:
-        return rendered, MaskSource.RENDERED, None, 0.0
+        return WeighedMask(rendered, MaskSource.RENDERED)
     window, image = finer(observation)
     lab, own, drawn = as_lab(image), seen_through(initial, window), seen_through(rendered, window)
     sources = features(lab, own, drawn, confidence, colours)
@@ -66,8 +82,8 @@ def answer_mask(
     full = pasted(support, window, np.where(rendered, 1.0, -1.0).astype(np.float32))
     mask = full > 0
     if not mask.any():  # a mask of nothing says that the evidence is for neither
-        return initial, MaskSource.INITIAL, None, 0.0
-    return mask, MaskSource.WEIGHED, 0.5 + 0.5 * full, share
+        return WeighedMask(initial, MaskSource.INITIAL)
+    return WeighedMask(mask, MaskSource.WEIGHED, 0.5 + 0.5 * full, share)
 
 
 def learnt(colours: Colours | None, observation: Observation, mask: NDArray[np.bool_]) -> Colours | None:

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tracking3d.estimation.correction import MOVING
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource, Status
-from tracking3d.estimation.correction import TAKEN_IN
-from tracking3d.estimation.online.answer_mask import answer_mask, learnt
+from tracking3d.estimation.online.answer_mask import WeighedMask, answer_mask, learnt
 from tracking3d.estimation.online.attempt import Attempt
 from tracking3d.estimation.online.belief import Belief
 from tracking3d.estimation.online.stiffness import least_held
@@ -58,9 +58,9 @@ def solved(
     view, fit, judgement = found.view, found.fit, found.judgement
     if found.lost:
         mask = view.mask if view.mask is not None else np.zeros_like(answer.mask)
-        source, probability, share = MaskSource.handed_back(view.mask), None, 0.0
+        weighed = WeighedMask(mask, MaskSource.handed_back(view.mask))
     else:
-        mask, source, probability, share = answer_mask(
+        weighed = answer_mask(
             state.known.silhouette(fit.pose, state.camera),
             view.mask,
             view.observation,
@@ -72,9 +72,9 @@ def solved(
         answer,
         T_cam_obj=fit.pose.matrix().numpy(),
         camera=state.camera,
-        mask=mask,
-        mask_source=source,
-        probability=probability,
+        mask=weighed.mask,
+        mask_source=weighed.source,
+        probability=weighed.probability,
         status=judgement.status,
         reason=judgement.reason,
         confidence=judgement.confidence,
@@ -90,6 +90,6 @@ def solved(
             "strays": found.support.strays,
             "stiffness": least_held(fit)[0],
             "mask_weight": view.mask_weight,
-            TAKEN_IN: share,
+            MOVING: weighed.moving,
         },
     )

@@ -19,7 +19,7 @@ from tracking3d.estimation.online.keypoints import Keypoints
 from tracking3d.estimation.online.points import FollowedPoints
 from tracking3d.estimation.shape import Shape
 from tracking3d.evidence import Colours
-from tracking3d.evidence.moving_along import Past
+from tracking3d.evidence.moving_along import Glimpse
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose
 from tracking3d.rendering import BackProjection, Surface, TexelMap, back_project, project, rasterize
@@ -181,12 +181,12 @@ class Belief:
     doubted_for: int = 0
     trail: tuple[tuple[Pose, int], ...] = ()
     colours: Colours | None = None
-    past: tuple[Past, ...] = ()
+    past: tuple[Glimpse, ...] = ()
 
     def moved(self, pose: Pose, index: int, grey: NDArray[np.uint8], followed: FollowedPoints) -> Belief:
         """One frame later."""
         return replace(self, last=(pose, index), before=self.last, grey=grey, followed=followed)
 
 
-ONLINE_CLASSES = (Belief, Colours, ObjectMap, Past, View, Surface, FollowedPoints, Keypoints, Usual)
+ONLINE_CLASSES = (Belief, Colours, Glimpse, ObjectMap, View, Surface, FollowedPoints, Keypoints, Usual)
 """What a `Belief` is made of beside `tracking3d.estimation.solver.STATE_CLASSES`."""

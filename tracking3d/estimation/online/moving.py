@@ -12,15 +12,13 @@ from tracking3d.estimation.online.answer_mask import finer
 from tracking3d.estimation.online.attempt import Attempt
 from tracking3d.estimation.online.belief import Belief
 from tracking3d.estimation.online.recruits import still
-from tracking3d.evidence.moving_along import Past, moves_along
+from tracking3d.evidence.moving_along import Glimpse, moves_along
 
 _MOST = 10  # earlier frames
 _WITNESSES = 20  # points that agree, with which a pose can tell a motion
 
 
-def moving_beside(
-    state: Belief, found: Attempt, image: NDArray[np.uint8]
-) -> NDArray[np.float32] | None:
+def moving_beside(state: Belief, found: Attempt, image: NDArray[np.uint8]) -> NDArray[np.float32] | None:
     """``(S, S)`` what moves along in the window of `finer`; None where that cannot be told.
 
     Args:
@@ -35,7 +33,9 @@ def moving_beside(
     if still(known.beside):
         return None
     taken = mask | known.silhouette(pose, state.camera)
-    here = Past.of(found.view.index, image, pose.matrix().numpy(), taken)
+    if taken[[0, -1]].any() or taken[:, [0, -1]].any():  # what is cut off by the frame's border is leaving
+        return None
+    here = Glimpse.of(image, taken, pose.matrix().numpy())
     vertices = known.vertices.double().cpu().numpy()
     window, _ = finer(found.view.observation)
     return moves_along(here, state.past, window, state.camera, vertices, known.shape.faces.cpu().numpy())
@@ -47,5 +47,5 @@ def with_past(state: Belief, answer: FrameEstimate, found: Attempt, image: NDArr
         return replace(state, past=())
     if found.support.witnesses < _WITNESSES:
         return state
-    seen = Past.of(answer.index, image, answer.T_cam_obj, answer.mask)
+    seen = Glimpse.of(image, answer.mask, answer.T_cam_obj)
     return replace(state, past=(*state.past, seen)[-_MOST:])

@@ -30,8 +30,8 @@ from tracking3d.estimation.online.judgement import ENOUGH_POINTS, judge, looks_w
 from tracking3d.estimation.online.lens import through
 from tracking3d.estimation.online.mapping import mask_weight, pose_of
 from tracking3d.estimation.online.motion import carried, led_to, moved_on, predicted
-from tracking3d.estimation.online.object_model import object_model
 from tracking3d.estimation.online.moving import moving_beside, with_past
+from tracking3d.estimation.online.object_model import object_model
 from tracking3d.estimation.online.points import FollowedPoints, follow, grey
 from tracking3d.estimation.online.pose_refinement import PoseFit, PoseWeights
 from tracking3d.estimation.online.reversal import turned_round
