@@ -136,8 +136,8 @@ class _Ways:
     def apart(self, drawn: Mask, inverse_depth: Plane) -> float:
         """Median of the pixels by which both part on the surface; 0 where they lead out of the frame."""
         ways, _ = self.at(inverse_depth)
-        within = drawn & ways.any((0, -1))
-        return float(np.median(np.linalg.norm(ways[0] - ways[1], axis=-1)[within])) if within.any() else 0.0
+        across, down = np.moveaxis(ways[0] - ways[1], -1, 0)[:, drawn & (ways[0, ..., 0] > 0)]
+        return float(np.median(np.hypot(across, down))) if across.size else 0.0
 
 
 def _ways_apart(
@@ -224,9 +224,10 @@ def _turned_into_view(
         return known > 0
     distance = cv2.distanceTransform(1 - known, cv2.DIST_L2, cv2.DIST_MASK_5)
     smooth = cv2.GaussianBlur(distance, (0, 0), 2.0)
-    outward = np.stack([cv2.Sobel(smooth, cv2.CV_32F, *order, scale=0.125) for order in ((1, 0), (0, 1))], -1)
+    outward = [cv2.Sobel(smooth, cv2.CV_32F, *order, scale=0.125) for order in ((1, 0), (0, 1))]
     # What lies behind an edge has come out from behind it by as much as it moved past the edge.
-    come = ((near - far) * outward).sum(-1) * (near.any(-1) & far.any(-1))
+    within = (near[..., 0] > 0) & (far[..., 0] > 0)
+    come = ((near - far)[..., 0] * outward[0] + (near - far)[..., 1] * outward[1]) * within
     return np.asarray((known > 0) | (distance * (here.to_small[0, 0] / window.scale) < come))
 
 

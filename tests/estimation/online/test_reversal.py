@@ -19,6 +19,7 @@ from tracking3d.estimation.online.belief import Belief, ObjectMap
 from tracking3d.estimation.online.mapping import pose_of
 from tracking3d.estimation.online.points import FollowedPoints
 from tracking3d.estimation.online.reversal import turned_round
+from tracking3d.evidence.moving_along import Glimpse
 
 ANGLES = [0.0, 10.0, 20.0, 30.0, 40.0]
 
@@ -79,7 +80,9 @@ def test_a_plate_changes_its_slant_and_is_not_turned_inside_out():
 
 def test_a_map_that_is_the_wrong_way_round_is_turned():
     true = map_with_points(ANGLES)
-    belief = turned_round(believed(wrong_way_round(true)), OnlineConfig())
+    earlier = Glimpse(np.zeros((4, 4), np.uint8), np.zeros((4, 4), bool), np.eye(4), (4, 4))
+    believing = replace(believed(wrong_way_round(true)), past=(earlier,))
+    belief = turned_round(believing, OnlineConfig())
     off = [
         degrees_apart(found.pose, view.pose)
         for found, view in zip(belief.known.keyframes, true.keyframes, strict=True)
@@ -87,6 +90,7 @@ def test_a_map_that_is_the_wrong_way_round_is_turned():
     assert max(off) < 4
     assert belief.last[0] is belief.known.keyframes[-1].pose
     assert degrees_apart(belief.trail[0][0], true.keyframes[-1].pose) < 8  # motion goes on the right way
+    assert not belief.past  # frames with poses of the wrong way tell no motion
 
 
 def test_a_map_that_is_right_stays():

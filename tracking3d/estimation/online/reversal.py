@@ -48,7 +48,9 @@ def turned_round(belief: Belief, config: OnlineConfig) -> Belief:
     before = belief.before and (_reversed(belief.before[0], reversal), belief.before[1])
     trail = tuple((_reversed(pose, reversal), index) for pose, index in belief.trail)
     last = known.keyframes[-1].pose, belief.last[1]
-    return replace(belief, known=known, surface=known.surface(), last=last, before=before, trail=trail)
+    return replace(
+        belief, known=known, surface=known.surface(), last=last, before=before, trail=trail, past=()
+    )
 
 
 def _better_reversed(known: ObjectMap, camera: Camera) -> tuple[Reversal, ObjectMap] | None:

@@ -37,6 +37,7 @@ def turned_back(state: Belief, frame: Frame, number: int, T_cam_obj: NDArray[np.
         lost_for=0,
         doubted_for=0,
         trail=((pose, number),) if state.waiting is None else (),
+        past=(),
     )
 
 
