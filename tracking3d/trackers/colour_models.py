@@ -104,7 +104,13 @@ def _smooth(cube: NDArray[np.float64]) -> NDArray[np.float64]:
 def log_ratio(
     histograms: NDArray[np.float64], colours: NDArray[np.uint8], floor: float = 1e-4
 ) -> NDArray[np.float32]:
-    """``(S, S)`` log of the first over the second likelihood of each pixel of a Lab crop, clipped at 3."""
+    """``(S, S)`` log of the first over the second likelihood of each pixel of a Lab crop, clipped at 3.
+
+    Args:
+        histograms: ``(2, B)`` from `histograms`.
+        colours: ``(S, S, 3)``.
+        floor: Added to both; rarer colours are evidence for neither side. About five pixels of a crop if left out.
+    """
     table = np.log((histograms[0] + floor) / (histograms[1] + floor))
     return np.clip(table, -_LOG_LIMIT, _LOG_LIMIT).astype(np.float32)[_bin(colours)]
 

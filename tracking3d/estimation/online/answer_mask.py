@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -53,7 +54,7 @@ def answer_mask(
     observation: Observation,
     confidence: float,
     colours: Colours | None,
-    moving: NDArray[np.float32] | None = None,
+    moving: Callable[[], NDArray[np.float32] | None] | None = None,
 ) -> WeighedMask:
     """The mask that the evidence is for.
 
@@ -63,7 +64,8 @@ def answer_mask(
         observation: The frame.
         confidence: Of the pose.
         colours: What earlier frames showed, or None.
-        moving: ``(S, S)`` what moves as the object does in the window of `finer`, or None where that is not known.
+        moving: Gives what moves as the object does in the window of `finer`, ``(S, S)``, or None where that is not
+            known; asked where the image has to be.
     """
     if initial is None:
         return WeighedMask(rendered, MaskSource.RENDERED)
@@ -71,13 +73,12 @@ def answer_mask(
     lab, own, drawn = as_lab(image), seen_through(initial, window), seen_through(rendered, window)
     sources = features(lab, own, drawn, confidence, colours)
     odds, asked = log_odds(sources), in_question(sources)
-    if moving is not None and asked < _IN_QUESTION:
-        moving = None
-    if moving is not None:
-        odds = taken_in(odds, own, drawn, moving, unlike_surroundings(lab, own | drawn))
+    told = moving() if moving is not None and asked >= _IN_QUESTION else None
+    if told is not None:
+        odds = taken_in(odds, own, drawn, told, unlike_surroundings(lab, own | drawn))
     support = tidied(along_edges(image, odds, asked))
     support[~inside_frame(initial.shape, window)] = -1
-    share = 0.0 if moving is None else vouched(support > 0, own, moving)
+    share = 0.0 if told is None else vouched(support > 0, own, told)
     # The window is the initial mask's: beyond it the silhouette alone says where the object is.
     full = pasted(support, window, np.where(rendered, 1.0, -1.0).astype(np.float32))
     mask = full > 0

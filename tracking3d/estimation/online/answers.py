@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -40,12 +41,14 @@ def with_colours(state: Belief, answer: FrameEstimate, found: Attempt) -> Belief
     """The belief with what a frame that is believed shows of the colours."""
     if found.doubtful or found.view.mask is None:
         return state
-    colours = learnt(state.colours, found.view.observation, answer.mask)
-    return replace(state, colours=colours)
+    return replace(state, colours=learnt(state.colours, found.view.observation, answer.mask))
 
 
 def solved(
-    state: Belief, answer: FrameEstimate, found: Attempt, moving: NDArray[np.float32] | None = None
+    state: Belief,
+    answer: FrameEstimate,
+    found: Attempt,
+    moving: Callable[[], NDArray[np.float32] | None] | None = None,
 ) -> FrameEstimate:
     """The answer with a pose, its judgement and the mask that the image shows; of a lost frame, the initial mask.
 

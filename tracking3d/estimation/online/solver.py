@@ -270,8 +270,8 @@ class OnlineSolver:
         elif usual:
             belief = replace(belief, trail=(*belief.trail, (pose, frame.index))[-_TRAIL:])
         found = replace(found, fit=replace(found.fit, pose=pose))
-        moving = moving_beside(belief, found, image)
-        answer = solved(belief, unsolved(frame, mask, pose, state.camera), found, moving)
+        plain, now = unsolved(frame, mask, pose, state.camera), belief
+        answer = solved(now, plain, found, lambda: moving_beside(now, found, image))
         belief = with_past(with_colours(belief, answer, found), answer, found, image)
         return belief, replace(answer, keyframe=key)
 
