@@ -32,8 +32,8 @@ _APART = (1.0, 3.0)
 """Such pixels by which a pixel's own two ways part from which on, and in full, it can be told."""
 _ATTEMPTS = 2  # to find an earlier frame in which they part by so much
 _PATCH, _SHIFT = 7, 3  # pixels
-HALF_PATCH = _PATCH / 2 / _LARGEST
-"""Half the side of the patches that are compared, as a share of the window's side."""
+PATCH = _PATCH / _LARGEST
+"""Side of the patches that are compared, as a share of the window's side."""
 _NOISE = 3.0  # grey levels
 _MOST = 1.5
 _TEXTURE = (8.0, 24.0)

@@ -1,8 +1,8 @@
 """Sides that turn into view: what moves with the object and lies against it becomes part of it.
 
-Motion shows where there are edges, and goes over the object's own outline by half a patch; so gaps are closed and the
-outermost is taken off again. An arm that holds the object moves along as well, but goes on beyond it: what has a colour
-that is seen well beside the object, too, is left out.
+Motion shows where there are edges, and goes over the object's own outline by up to half a patch; so gaps are closed and
+the outermost is taken off again. An arm that holds the object moves along as well, but goes on beyond it: what has a
+colour that is seen well beside the object, too, is left out.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.evidence.colours import relative_distance
-from tracking3d.evidence.moving_along import HALF_PATCH
+from tracking3d.evidence.moving_along import PATCH
 from tracking3d.trackers.colour_models import histograms, log_ratio
 
 MOVES = 0.35
@@ -50,7 +50,7 @@ def taken_in(
     seen = (moving > MOVES) & (strange > _SURROUNDINGS) & ~known
     closed = cv2.morphologyEx((seen | known).astype(np.uint8), cv2.MORPH_CLOSE, _disc(_CLOSED * root))
     # A patch that reaches over the outline moves along with what it has of the object.
-    closed = cv2.erode(closed, _disc(HALF_PATCH * len(known) / 2)) > 0
+    closed = cv2.erode(closed, _disc(PATCH * len(known) / 4)) > 0
     added = closed & ~known & (moving > -MOVES) & (strange > _SURROUNDINGS)
     added = _touching(_seen_parts(added, seen), known) & (relative_distance(known) > -_REACH)
     return np.where(added, np.maximum(log_odds, _TAKEN), log_odds).astype(np.float32)
