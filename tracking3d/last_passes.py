@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -15,9 +16,25 @@ from tracking3d.reconstruction.second_look import SecondLook
 from tracking3d.reconstruction.second_masks import Decision, Masked, SecondMasks
 from tracking3d.reconstruction.support import supported_answer
 from tracking3d.reconstruction.views import TextureView
+from tracking3d.results.files import decoded_mask
 from tracking3d.results.records import FrameRecord
-from tracking3d.results.refinement_writer import RefinementWriter
+from tracking3d.results.refinement_writer import RefinementWriter, put_right
 from tracking3d.stages import measured
+
+
+@dataclass(frozen=True, eq=False)
+class Foreseen:
+    """What the last passes come to, found elsewhere: see `tracking3d.splitting.last_looks`.
+
+    Attributes:
+        look: What all frames say together, settled.
+        answers: Their answers, poses put right.
+        masks: The masks that were decided anew, as PNG, by index; their probabilities are written.
+    """
+
+    look: SecondLook
+    answers: Mapping[int, FrameRecord]
+    masks: Mapping[int, bytes]
 
 
 class LastPasses:
@@ -30,6 +47,7 @@ class LastPasses:
         most: How many frames are bundled.
         weighs_masks: Whether masks are weighed once more; the frames then come once more for it, see `put_right`.
         fixed: Indices of frames whose masks the user has given.
+        foreseen: What comes of it, where that is known; then frames are only drawn.
     """
 
     def __init__(
@@ -40,19 +58,23 @@ class LastPasses:
         most: int,
         weighs_masks: bool,
         fixed: Collection[int],
+        foreseen: Foreseen | None = None,
     ) -> None:
-        self._refinement, self._fixed, self.weighs_masks = refinement, fixed, weighs_masks
+        self._refinement, self._fixed, self._foreseen = refinement, fixed, foreseen
+        self.weighs_masks = weighs_masks and foreseen is None
         self._faces = np.asarray(model.faces, np.int64)
-        self._look = SecondLook(model, camera, sorted(refinement.causal), most)
+        self._look = foreseen.look if foreseen else SecondLook(model, camera, sorted(refinement.causal), most)
         self._masks: SecondMasks | None = None
 
     def see(self, answer: FrameRecord, image: Image, mask: NDArray[np.bool_]) -> None:
         """A frame that was looked at again, with the mask ``(H, W)`` of its answer."""
-        if answer.refined:
+        if answer.refined and self._foreseen is None:
             self._look.see(answer, image, mask)
 
     def settle(self) -> Camera:
         """All were: put together what they say; the camera of the end."""
+        if self._foreseen is not None:
+            return self._look.camera
         with measured("map") as watch:
             self._look.settle()
         self._refinement.together += watch.times
@@ -77,7 +99,9 @@ class LastPasses:
         """
         if frame.index not in self._refinement.causal:
             return
-        if self._masks is not None:
+        if self._foreseen is not None:
+            self._draw_foreseen(self._foreseen, frame, do)
+        elif self._masks is not None:
             mask = self._refinement.mask(self._refinement.answer(frame.index))
             self._draw(self._masks.decide(self._masked(frame, mask)), do)
         else:
@@ -103,8 +127,21 @@ class LastPasses:
         if answer.refined:
             T_cam_obj, support = self._look.pose(answer, frame.image, mask)
             judged = () if support is None else supported_answer(answer, support)
-            self._refinement.put_right(frame.index, T_cam_obj, *judged)
+            self._refinement.put(put_right(answer, T_cam_obj, *judged))
         return mask
+
+    def _draw_foreseen(
+        self, foreseen: Foreseen, frame: Frame, do: Callable[[Callable[[], None]], object]
+    ) -> None:
+        index, initial = frame.index, self._refinement.initial_mask(frame.index)
+        if (answer := foreseen.answers.get(index)) is not None:
+            self._refinement.put(answer)
+        mask = None if (decided := foreseen.masks.get(index)) is None else decoded_mask(decided)
+        if mask is None:
+            mask = self._refinement.mask(self._refinement.answer(index))
+        else:
+            self._refinement.put_mask(index, mask, None, initial)
+        do(partial(self._refinement.draw, frame, mask, initial))
 
     def _masked(self, frame: Frame, mask: NDArray[np.bool_]) -> Masked:
         answer, initial = self._refinement.answer(frame.index), self._refinement.initial_mask(frame.index)

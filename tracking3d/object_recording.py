@@ -19,7 +19,7 @@ from tracking3d.errors import OutputError, PluginError
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.evidence.scene import Mask
 from tracking3d.frames import Frame, MaskEstimate, SkippedFrame
-from tracking3d.last_passes import LastPasses
+from tracking3d.last_passes import Foreseen, LastPasses
 from tracking3d.reconstruction import BELIEVED, TextureView, kept_views, texture_view, textured
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord
@@ -45,6 +45,7 @@ class ObjectRecording:
 
     Attributes:
         latest: The answer for the frame that was taken last.
+        foreseen: What the last passes come to, where somebody else found it.
     """
 
     def __init__(
@@ -62,6 +63,7 @@ class ObjectRecording:
         self._kept = kept
         self._work = WorkBehind()  # all that touches writer and checkpoint while frames come
         self.latest: FrameEstimate | None = None
+        self.foreseen: Foreseen | None = None
         self._progress = kept.progress if kept else Progress()
         self._until = self._progress  # what was done before
         self._past = {*kept.taken, *(one.index for one in kept.skipped)} if kept else set()
@@ -165,7 +167,7 @@ class ObjectRecording:
             wanted, camera = self._session.config.object, self._session.camera
             self._last = LastPasses(
                 self._refinement, self._session.result(), camera, wanted.landmark_views, wanted.evidence,
-                self._corrections,
+                self._corrections, self.foreseen,
             )  # fmt: skip
         elif self._redraw:
             self._writer.begin_drawing_anew()

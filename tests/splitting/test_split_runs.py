@@ -158,14 +158,15 @@ def files_of(folder: Path) -> set[Path]:
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_video_in_two_parts_is_one_run_as_good_as_a_whole_one(workers, clip, tmp_path):
     frames = written(clip, tmp_path / "clip")
+    config = settings(frames, "runtime.probabilities=true")
     told: list[tuple[int, bool]] = []
     ended = record_in_parts(
-        frames, settings(frames), tmp_path / "split", Given(), length="30f", workers=workers,
+        frames, config, tmp_path / "split", Given(), length="30f", workers=workers,
         listener=lambda one: told.append((one.index, one.refined)),
     )  # fmt: skip
     assert ended == Ended((tmp_path / "split",), 2)
     assert sorted(told) == sorted([(index, refined) for index in range(LONG) for refined in (False, True)])
-    record(open_source(str(frames)), settings(frames), tmp_path / "whole")
+    record(open_source(str(frames)), config, tmp_path / "whole")
 
     errors = {}
     for name in ("split", "whole"):
@@ -188,9 +189,7 @@ def test_a_video_in_two_parts_is_one_run_as_good_as_a_whole_one(workers, clip, t
     assert split["split"]["joints"][0]["frames"] >= 5
     assert files_of(tmp_path / "split") == files_of(tmp_path / "whole")
     assert len(load_model(tmp_path / "split").vertices) == len(load_model(tmp_path / "whole").vertices)
-    record_in_parts(
-        frames, settings(frames), tmp_path / "split", Given(), length="30f", resume=True
-    )  # done already
+    record_in_parts(frames, config, tmp_path / "split", Given(), length="30f", resume=True)  # done already
 
 
 @pytest.mark.slow

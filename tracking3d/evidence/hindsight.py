@@ -80,7 +80,7 @@ class Hindsight:
         self._consensus = Consensus(vertices)
         self._colours: Colours | None = None
         self.order, self._waiting = InOrder(), deque[Answered]()
-        self._jobs = InTurn(min(cv2.getNumThreads(), _AT_A_TIME))
+        self._jobs: InTurn | None = None
 
     def wants(self, index: int) -> bool:
         """Whether a frame is one of those that are put together; `see` passes the others over."""
@@ -117,7 +117,8 @@ class Hindsight:
         """Those that are left when there are no more frames; see `decide`."""
         while self._waiting:
             yield from self._begin(self._waiting.popleft())
-        yield from self._jobs.rest()
+        if self._jobs is not None:
+            yield from self._jobs.rest()
 
     def said(self, frame: Answered, order: InOrder | None = None) -> tuple[Scene, Said] | None:
         """What the sources say of one of the latest frames; None where it has no masks or no pose.
@@ -139,6 +140,8 @@ class Hindsight:
         return Scene.of(frame, self._camera, self._vertices, self._faces)
 
     def _begin(self, frame: Answered) -> Iterator[tuple[int, Decided | None]]:
+        if self._jobs is None:  # as many threads as there are where frames are decided
+            self._jobs = InTurn(min(cv2.getNumThreads(), _AT_A_TIME))
         yield from self._jobs.do(partial(self._decided, frame, self.order.as_it_is()))
 
     def _decided(self, frame: Answered, order: InOrder) -> tuple[int, Decided | None]:

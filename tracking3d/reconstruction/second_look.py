@@ -45,11 +45,12 @@ class SecondLook:
     Attributes:
         camera: The same, through another lens where nobody gave it and `settle` found it.
         vertices: ``(V, 3)`` of the object; others after `settle`.
+        faces: ``(F, 3)``.
     """
 
     def __init__(self, model: ObjectModel, camera: Camera, answered: Sequence[int], most: int) -> None:
         self.camera, self.vertices = camera, np.asarray(model.vertices, np.float64)
-        self._lens, self._faces = camera.fx, np.asarray(model.faces, np.int64)
+        self._lens, self.faces = camera.fx, np.asarray(model.faces, np.int64)
         count = min(most, len(answered))
         at = np.linspace(0, len(answered) - 1, count).round().astype(int) if count else ()
         self._wanted = {answered[index] for index in at}
@@ -59,9 +60,13 @@ class SecondLook:
         self._bundled: list[int] = []
         self._before: dict[int, _Pose] = {}
 
+    def wants(self, index: int) -> bool:
+        """Whether a frame is one of those that `see` may keep."""
+        return index in self._wanted
+
     def see(self, record: FrameRecord, image: Image, mask: NDArray[np.bool_]) -> None:
         """Keep a frame, if it is one of those to be bundled and its object was found."""
-        if record.index in self._wanted and record.status is not Status.LOST:
+        if self.wants(record.index) and record.status is not Status.LOST:
             view = self._view(record.T_cam_obj, image, mask)
             if view is not None:
                 self._views[record.index] = view
@@ -76,7 +81,7 @@ class SecondLook:
         self._before = {index: self._views[index].T_cam_obj for index in self._bundled}
         self._views = {}
         scene = refine_scene(
-            Scene(views, self.vertices, self._faces, may_reverse=True),
+            Scene(views, self.vertices, self.faces, may_reverse=True),
             ROUNDS,
             free_focal=self.camera.assumed,
         )
@@ -143,7 +148,7 @@ class SecondLook:
 
     def _view(self, T_cam_obj: _Pose, image: Image, mask: NDArray[np.bool_]) -> View | None:
         image, mask = self.camera.undistorted(image), self.camera.mask_to_pinhole(mask)
-        return open_view(image, mask, self.camera, T_cam_obj, self.vertices, self._faces, LONGEST_SIDE)
+        return open_view(image, mask, self.camera, T_cam_obj, self.vertices, self.faces, LONGEST_SIDE)
 
     def _as_settled(self, T_cam_obj: _Pose) -> _Pose:
         """A pose of before as it is after what was done to all: the way round of depth, and the lens.

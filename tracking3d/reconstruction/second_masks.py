@@ -73,11 +73,15 @@ class SecondMasks:
         """A frame for the first time."""
         self._hindsight.see(self._answered(masked))
 
-    def decide(self, masked: Masked) -> Iterator[Decision]:
-        """A frame for the second time, in the order of time; yields those whose turn has come."""
+    def settle(self) -> None:
+        """All frames that are wanted were seen: put together what they say, unless that is done."""
         if not self._settled:
             self._hindsight.settle()
             self._settled = True
+
+    def decide(self, masked: Masked) -> Iterator[Decision]:
+        """A frame for the second time, in the order of time; yields those whose turn has come."""
+        self.settle()
         self._waiting[masked.frame.index] = masked
         yield from map(self._decision, self._hindsight.decide(self._answered(masked)))
 

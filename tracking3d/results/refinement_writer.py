@@ -86,38 +86,19 @@ class RefinementWriter:
         """The answer for frame ``index`` as it is now: the second one, or the causal one where there is none."""
         return self._records.get(index) or self.causal[index]
 
-    def put_right(
-        self,
-        index: int,
-        T_cam_obj: NDArray[np.float64],
-        judgement: Assessment | None = None,
-        evidence: Mapping[str, float] | None = None,
-    ) -> None:
-        """Give a second answer the pose that it has in the end; causal ones stand.
+    def put(self, answer: FrameRecord) -> None:
+        """Let a second answer be what it is in the end, see `put_right`; causal ones stand.
 
         It is not kept for a run that is stopped here and goes on later: that finds it anew.
-
-        Args:
-            index: Of the frame.
-            T_cam_obj: ``(4, 4)``, of the camera of the end.
-            judgement: How far it is believed in the end; as before, if left out.
-            evidence: What that comes from, kept among the losses.
         """
-        if (record := self._records.get(index)) is None:
-            return
-        losses = record.losses | dict(evidence or {})
-        record = replace(record, T_cam_obj=T_cam_obj, camera=None, losses=losses)
-        if judgement is not None:
-            record = replace(
-                record, status=judgement.status, reason=judgement.reason, confidence=judgement.confidence
-            )
-        self._records[index] = record
+        if answer.index in self._records:
+            self._records[answer.index] = answer
 
     def put_mask(
         self,
         index: int,
         mask: NDArray[np.bool_],
-        probability: NDArray[np.float32],
+        probability: NDArray[np.float32] | None,
         initial: NDArray[np.bool_] | None,
     ) -> None:
         """Give a second answer another mask ``(H, W)``, weighed against the image; causal ones stand.
@@ -127,7 +108,7 @@ class RefinementWriter:
         Args:
             index: Of the frame.
             mask: ``(H, W)``.
-            probability: ``(H, W)`` of the object.
+            probability: ``(H, W)`` of the object; None where it was written before.
             initial: ``(H, W)`` what the mask tracker gave.
 
         Raises:
@@ -142,7 +123,7 @@ class RefinementWriter:
             mask_source=MaskSource.WEIGHED,
         )
         self._decided[index] = mask_file(mask)
-        if (self._folder / layout.PROBABILITIES).is_dir():
+        if probability is not None and (self._folder / layout.PROBABILITIES).is_dir():
             write_probability(self._aside, index, probability)
 
     def draw(self, frame: Frame, mask: NDArray[np.bool_], initial: NDArray[np.bool_] | None) -> None:
@@ -262,6 +243,27 @@ class RefinementWriter:
         refined = list(self._records.values()) if self._taken_over else []
         causal = list(self.causal.values())
         return description.refinement(state, reason, causal, refined, self.seconds, self.together)
+
+
+def put_right(
+    answer: FrameRecord,
+    T_cam_obj: NDArray[np.float64],
+    judgement: Assessment | None = None,
+    evidence: Mapping[str, float] | None = None,
+) -> FrameRecord:
+    """A second answer with the pose that it has in the end.
+
+    Args:
+        answer: As it was.
+        T_cam_obj: ``(4, 4)``, of the camera of the end.
+        judgement: How far it is believed in the end; as before, if left out.
+        evidence: What that comes from, kept among the losses.
+    """
+    losses = answer.losses | dict(evidence or {})
+    answer = replace(answer, T_cam_obj=T_cam_obj, camera=None, losses=losses)
+    if judgement is None:
+        return answer
+    return replace(answer, status=judgement.status, reason=judgement.reason, confidence=judgement.confidence)
 
 
 def clear_refinement(folder: Path) -> None:

@@ -5,32 +5,32 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tracking3d.checkpoint.folder import Checkpoint
 from tracking3d.checkpoint.resuming import given_of
-from tracking3d.frames import Frame
+from tracking3d.frames import Frame, Prompt
+from tracking3d.last_passes import Foreseen
+from tracking3d.passes import go_through
 from tracking3d.prompts import make_prompt
-from tracking3d.recording import record
-from tracking3d.results import layout
+from tracking3d.reconstruction.asked_shape import shape_as_asked
+from tracking3d.recording import begun as begin_recording
+from tracking3d.recording import first_frame, opened
 from tracking3d.results.run_notes import note_in_run
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_writer import RunWriter
 from tracking3d.session import Session
 from tracking3d.splitting.agreement import DisagreementError
 from tracking3d.splitting.beginning import Begun
-from tracking3d.splitting.joined_run import (
-    take_second_answers,
-    write_causal_mesh,
-    write_joined,
-)
+from tracking3d.splitting.joined_run import write_causal_mesh, write_joined
 from tracking3d.splitting.joining import Whole, joined_parts
 from tracking3d.splitting.long_video import Tell
-from tracking3d.splitting.part_runs import Given, PartJob, SecondLook, begin_session
+from tracking3d.splitting.part_runs import Given, PartJob, Revisit, begin_session
 from tracking3d.splitting.plan import PARTS, part_folder, put_cut_mask, remove_parts
 from tracking3d.video import open_source
 
@@ -84,7 +84,7 @@ class Joined:
     """
 
     begun: Begun
-    looks: tuple[SecondLook, ...]
+    looks: tuple[Revisit, ...]
     about: Mapping[str, Any]
     seconds: Mapping[str, float] = field(default_factory=dict)
 
@@ -123,39 +123,55 @@ def join(tell: Tell, tracked: Tracked) -> Again | Refused | Joined:
     write_joined(writer, session, whole.runs, owned, sum(seconds.values()) + time.monotonic() - clock)
     seconds["refine"] = time.monotonic() - clock
     note_in_run(video.folder, {"split": {**about, "seconds": seconds}})
-    return Joined(begun, _second_looks(begun, owned), about, seconds)
+    return Joined(begun, _revisits(begun, owned), about, seconds)
 
 
-def end(tell: Tell, joined: Joined) -> None:
-    """Take in the second answers, draw what is answered, and write what is made at the end.
+@dataclass(frozen=True, eq=False)
+class Ending:
+    """A video whose frames are all answered, to be drawn.
+
+    Attributes:
+        joined: The run; its ``seconds`` tell what all steps took.
+        foreseen: What its frames are answered with in the end.
+    """
+
+    joined: Joined
+    foreseen: Foreseen
+
+
+def end(tell: Tell, ending: Ending) -> None:
+    """Draw what is answered, and write what is made at the end; the parts are removed.
 
     Args:
         tell: Is given the answers that are drawn.
-        joined: The run; its ``seconds`` tell what the second look took, too.
+        ending: All that is known.
 
     Raises:
         Tracking3dError: If something cannot be read or written; what was finished until then is kept.
     """
-    video, seconds = joined.begun.video, joined.seconds
+    begun = ending.joined.begun
+    video, config = begun.video, begun.config
     source = open_source(video.source, video.selection)
-    _, session = begin_session(source, joined.begun.config, video.given)
-    if not _taken(video.folder, session):
-        note_in_run(video.folder, {"split": {**joined.about, "seconds": dict(seconds)}})
-        took = seconds["refine"] + seconds["second_look"]
-        take_second_answers(video.folder, session, [look.out for look in joined.looks], took)
-    record(
-        source, video.config, video.folder, box=video.given.box, mask=video.given.mask, points=video.given.points,
-        command=video.command, selection=video.selection, resume=True, skip_damaged=True, listener=tell,
-    )  # fmt: skip
+    about = {**ending.joined.about, "seconds": dict(ending.joined.seconds)}
+    note_in_run(video.folder, {"split": about})
+    with opened(source, config) as frames, ExitStack() as writers:
+        skipped, first = first_frame(frames, source.name, skip_damaged=True)
+        prompt = _prompt(first, video.given)
+        session = Session(config, prompt, source.intrinsics, source.intrinsics_origin)
+        recording = begin_recording(
+            source, session, prompt, choice=begun.choice, first=first, folder=video.folder, command=video.command,
+            selection=video.selection, overwrite=False, resume=True, writers=writers,
+        )  # fmt: skip
+        if recording is not None:
+            recording.foreseen = ending.foreseen
+            go_through(source, chain(skipped, [first], frames), [recording], tell)
+    if recording is not None:
+        shape_as_asked(video.folder, config, source)
     remove_parts(video.folder)
 
 
-def _taken(folder: Path, session: Session) -> bool:
-    """Whether the second answers are in their place, as where this step was stopped after that."""
-    if not layout.has_state(folder):
-        return True
-    kept = Checkpoint(folder, session.state_classes, session.config.runtime.device).read()
-    return kept.progress.last_refined >= kept.progress.last
+def _prompt(first: Frame, given: Given) -> Prompt | None:
+    return None if given.untold else make_prompt(first, given.box, given.mask, points=given.points)
 
 
 def _begun_elsewhere(tracked: Tracked) -> Again | None:
@@ -193,7 +209,7 @@ def _begin_writing(begun: Begun, first: Frame, session: Session, whole: Whole) -
     """The writer of the joined run, with all that a run knows of itself before its first frame."""
     video, given = begun.video, begun.video.given
     opened = open_source(video.source, video.selection)
-    prompt = None if given.untold else make_prompt(first, given.box, given.mask, points=given.points)
+    prompt = _prompt(first, given)
     return RunWriter(
         video.folder,
         config=begun.config.model_dump(mode="json"),
@@ -210,10 +226,10 @@ def _begin_writing(begun: Begun, first: Frame, session: Session, whole: Whole) -
     )
 
 
-def _second_looks(begun: Begun, owned: Sequence[range]) -> tuple[SecondLook, ...]:
+def _revisits(begun: Begun, owned: Sequence[range]) -> tuple[Revisit, ...]:
     video = begun.video
     return tuple(
-        SecondLook(
+        Revisit(
             video.source,
             video.selection,
             f"{mine.start}:{mine[-1] + 1}:{mine.step}",

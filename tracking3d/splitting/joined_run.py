@@ -9,6 +9,7 @@ import shutil
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -110,10 +111,11 @@ def take_second_answers(folder: Path, session: Session, made: Sequence[Path], se
     aside = folder / layout.REFINING
     lines = b"".join((one / layout.FRAMES).read_bytes() for one in made)
     with writing(aside):
-        (aside / layout.MASKS).mkdir(parents=True, exist_ok=True)
-        for one in made:
-            for mask in sorted((one / layout.MASKS).iterdir()):
-                mask.replace(aside / layout.MASKS / mask.name)
+        for one, kind in product(made, (layout.MASKS, layout.PROBABILITIES)):
+            if (one / kind).is_dir():
+                (aside / kind).mkdir(parents=True, exist_ok=True)
+                for file in sorted((one / kind).iterdir()):
+                    file.replace(aside / kind / file.name)
         (aside / layout.FRAMES).write_bytes(lines)
     checkpoint = Checkpoint(folder, session.state_classes, session.config.runtime.device)
     before = checkpoint.read()
@@ -138,7 +140,11 @@ def _moved(records: Sequence[FrameRecord], similarity: Similarity) -> list[Frame
 
 def _copy_masks(source: Path, target: Path, indices: Sequence[int]) -> None:
     with writing(target):
-        for path_of in (layout.mask_path, layout.initial_mask_path):
+        if (source / layout.PROBABILITIES).is_dir():
+            (target / layout.PROBABILITIES).mkdir(exist_ok=True)
+        for path_of in (layout.mask_path, layout.initial_mask_path, layout.probability_path):
             for index in indices:
-                with suppress(FileNotFoundError):  # where the mask tracker gave none
+                with suppress(
+                    FileNotFoundError
+                ):  # where the mask tracker gave none, or no probabilities are kept
                     shutil.copyfile(path_of(source, index), path_of(target, index))

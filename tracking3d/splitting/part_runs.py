@@ -24,6 +24,7 @@ from tracking3d.prompts import make_prompt
 from tracking3d.recording import first_frame, record
 from tracking3d.results import layout
 from tracking3d.results.files import read_mask, write_mask, writing
+from tracking3d.results.probabilities import write_probability
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
 from tracking3d.session import Session
@@ -120,7 +121,7 @@ def begin_session(source: FrameSource, config: PipelineConfig, given: Given) -> 
 
 
 @dataclass(frozen=True, eq=False)
-class SecondLook:
+class Revisit:
     """Frames of the joined run, to be answered against the whole object.
 
     Attributes:
@@ -142,7 +143,7 @@ class SecondLook:
     out: Path
 
 
-def look_again(tell: Tell, job: SecondLook) -> int:
+def look_again(tell: Tell, job: Revisit) -> int:
     """Answer for some frames once more, in order of time; ``tell`` is given each answer's record.
 
     Returns:
@@ -151,7 +152,7 @@ def look_again(tell: Tell, job: SecondLook) -> int:
     Raises:
         Tracking3dError: If a plug-in fails that may not, or something cannot be read or written.
     """
-    kept, session = _resumed(job)
+    kept, session = resumed(job)
     causal = {one.index: one for one in RunReader(job.folder, refined=False).frames}
     with writing(job.out):
         (job.out / layout.MASKS).mkdir(parents=True, exist_ok=True)
@@ -169,7 +170,12 @@ def look_again(tell: Tell, job: SecondLook) -> int:
     return answered
 
 
-def _resumed(job: SecondLook) -> tuple[Kept, Session]:
+def resumed(job: Revisit) -> tuple[Kept, Session]:
+    """The state of the joined run, and a session that has its object.
+
+    Raises:
+        Tracking3dError: If it cannot be read.
+    """
     first, session = begin_session(open_source(job.source, job.whole), job.config, job.given)
     kept = Checkpoint(job.folder, session.state_classes, job.config.runtime.device).read()
     failures = {index: frame.failure for index, frame in kept.taken.items() if frame.failure}
@@ -178,7 +184,7 @@ def _resumed(job: SecondLook) -> tuple[Kept, Session]:
 
 
 def _second_answer(
-    session: Session, job: SecondLook, kept: Kept, frame: Frame, causal: FrameRecord
+    session: Session, job: Revisit, kept: Kept, frame: Frame, causal: FrameRecord
 ) -> FrameRecord | None:
     """The record of a frame's second answer, its mask written; None lets the first stand."""
     mask = read_mask(layout.initial_mask_path(job.folder, frame.index))
@@ -194,4 +200,6 @@ def _second_answer(
         estimate = replace(estimate, refined=True, keyframe=estimate.keyframe or causal.keyframe)
         record_ = FrameRecord.of(estimate, frame.name, mask, revision=True)
         write_mask(layout.mask_path(job.out, frame.index), estimate.mask)
+        if (job.folder / layout.PROBABILITIES).is_dir():
+            write_probability(job.out, frame.index, estimate.probability)
     return record_.and_wrote(watch.times.write)

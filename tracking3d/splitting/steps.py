@@ -7,10 +7,12 @@ from collections.abc import Callable, Generator
 from dataclasses import dataclass, replace
 from typing import Any
 
+from tracking3d.last_passes import Foreseen
 from tracking3d.splitting.beginning import Begun
-from tracking3d.splitting.ending import Again, Joined, Refused, Tracked, end, join
+from tracking3d.splitting.ending import Again, Ending, Joined, Refused, Tracked, end, join
+from tracking3d.splitting.last_looks import Placing, Settling, Weighing, place, put_together, settle, weigh
 from tracking3d.splitting.long_video import Ended
-from tracking3d.splitting.part_runs import PartJob, SecondLook, look_again, track_part
+from tracking3d.splitting.part_runs import PartJob, Revisit, look_again, track_part
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,10 +63,41 @@ def steps_of(begun: Begun) -> Steps:
         for number, look in enumerate(looks, 1)
     ]
     seconds = {**found.seconds, "second_look": time.monotonic() - clock}
-    yield [Step(end, replace(found, seconds=seconds), "its end")]
+    yield from steps_to_the_end(replace(found, seconds=seconds))
     return Ended((begun.video.folder,), of)
 
 
-def _frames(job: PartJob | SecondLook) -> int:
+def steps_to_the_end(joined: Joined) -> Generator[list[Step], list[Any], None]:
+    """What is left to be done when all frames of a joined run were looked at again."""
+    foreseen, seconds = yield from _last_looks(joined)
+    joined = replace(joined, seconds={**joined.seconds, **seconds})
+    yield [Step(end, Ending(joined, foreseen), "its end")]
+
+
+def _last_looks(joined: Joined) -> Generator[list[Step], list[Any], tuple[Foreseen, dict[str, float]]]:
+    """What becomes of the frames, and the seconds of each step."""
+    looks, of, clock = joined.looks, len(joined.looks), time.monotonic()
+    refined = joined.seconds["refine"] + joined.seconds["second_look"]
+    [look] = yield [Step(settle, Settling(looks, refined), "what its frames say together")]
+    settled = time.monotonic()
+    placed = yield [
+        Step(place, Placing(job, look), f"poses {number} of {of}") for number, job in enumerate(looks, 1)
+    ]
+    answers = {answer.index: answer for part in placed for answer in part}
+    seconds = {"settle": settled - clock, "poses": time.monotonic() - settled}
+    if not joined.begun.config.object.evidence:
+        return Foreseen(look, answers, {}), seconds
+    clock = time.monotonic()
+    weighing = Weighing(looks[0], answers, look)
+    [masks] = yield [Step(put_together, weighing, "what its masks say together")]
+    decided = yield [
+        Step(weigh, replace(weighing, job=job, masks=masks), f"masks {number} of {of}")
+        for number, job in enumerate(looks, 1)
+    ]
+    pictures = {index: mask for part in decided for index, mask in part.items()}
+    return Foreseen(look, answers, pictures), {**seconds, "masks": time.monotonic() - clock}
+
+
+def _frames(job: PartJob | Revisit) -> int:
     start, stop, step = (int(number) for number in job.selection.split(":"))
     return len(range(start, stop, step))
