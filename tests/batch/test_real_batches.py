@@ -74,11 +74,11 @@ def test_sigterm_keeps_what_is_done_and_the_same_batch_goes_on(
 ):
     if address:
         pytest.importorskip("ray", reason="the extra ray is not installed")
-    jobs = make_clips(tmp_path / "clips", 2, 6, config)
+    jobs = make_clips(tmp_path / "clips", 2, 30, config)
     out = tmp_path / "out"
 
     def stop(happening):
-        if happening.event == "progress" and happening.about.get("frames", 0) >= 2:
+        if happening.event == "progress" and happening.about.get("frames", 0) >= 1:
             os.kill(os.getpid(), signal.SIGINT)
 
     with open_engine(address, 1) as engine:
@@ -155,5 +155,6 @@ def test_a_hundred_tasks_leave_nothing_behind():
     assert all(one.value == 16_000_000 for one in ended.values())
     first, last = loads[20:40], loads[80:]
     for name, more in (("own_descriptors", 0), ("descriptors", 10), ("own_memory", 2), ("processes", 0)):
-        before, after = (max(getattr(one, name) for one in some) for some in (first, last))
+        # Not the most of them: a process that just begins has the open files of the one that it is forked from.
+        before, after = (np.median([getattr(one, name) for one in some]) for some in (first, last))
         assert after <= before + more, name
