@@ -73,9 +73,7 @@ def test_a_node_that_goes_costs_nothing_but_time(ray, here, tmp_path):
 
     def remove(event):
         nonlocal removed
-        if (
-            isinstance(event, Told) and event.content == second.node_id
-        ):  # its task takes three seconds from now on
+        if isinstance(event, Told) and event.content == second.node_id:  # for three seconds from now on
             cluster.remove_node(second, allow_graceful=False)
             removed = True
 
