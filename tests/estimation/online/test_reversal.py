@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from turned_solid import CAMERA, SIZE, degrees_apart
 from tracking3d.bundle_adjustment.reprojection import project, to_camera
 from tracking3d.bundle_adjustment.reversal import reversal_of
 from tracking3d.config.solvers import OnlineConfig
+from tracking3d.estimation.online import reversal as online_reversal
 from tracking3d.estimation.online.belief import Belief, ObjectMap
 from tracking3d.estimation.online.mapping import pose_of
 from tracking3d.estimation.online.points import FollowedPoints
@@ -95,7 +97,31 @@ def test_a_map_that_is_the_wrong_way_round_is_turned():
 
 def test_a_map_that_is_right_stays():
     belief = believed(map_with_points(ANGLES))
-    assert turned_round(belief, OnlineConfig()) is belief
+    tried = turned_round(belief, OnlineConfig())
+    assert tried.known is belief.known
+    assert tried.reversal_tried == (len(ANGLES), pytest.approx(40))
+
+
+def test_many_keyframes_that_show_nothing_new_are_not_tried_again(monkeypatch):
+    """Each try costs as much as bundling all of them; without this a long video spent a third of its time on it."""
+    tried: list[int] = []
+    monkeypatch.setattr(
+        online_reversal, "_better_reversed", lambda known, camera: tried.append(len(known.keyframes))
+    )
+    view = map_with_points([0.0, 40.0])
+    first, last = view.keyframes
+    belief = believed(view)
+    for count in range(4, 65):
+        known = replace(view, keyframes=(first,) * (count - 1) + (last,))
+        belief = turned_round(replace(belief, known=known), OnlineConfig())
+    assert tried[:9] == list(range(4, 13))  # all of them while there are few
+    assert all(later >= 1.25 * earlier for earlier, later in pairwise(tried[8:]))
+    assert tried[-1] > 45
+    sides = map_with_points([0.0, 50.0]).keyframes
+    belief = turned_round(
+        replace(belief, known=replace(known, keyframes=(*known.keyframes, sides[1]))), OnlineConfig()
+    )
+    assert tried[-1] == 65  # a new side is something new
 
 
 @pytest.mark.parametrize("angles", [[0.0, 10.0, 20.0], [0.0, 40.0, 80.0, 120.0]])

@@ -161,6 +161,8 @@ class Belief:
         trail: Poses and indices of the last frames that were believed.
         colours: Of object and surroundings in frames that were believed.
         past: The last frames that were believed, for what moves along.
+        reversal_tried: How many keyframes there were, and how many degrees they had turned, when depth was last tried
+            the other way round.
     """
 
     camera: Camera
@@ -182,6 +184,7 @@ class Belief:
     trail: tuple[tuple[Pose, int], ...] = ()
     colours: Colours | None = None
     past: tuple[Glimpse, ...] = ()
+    reversal_tried: tuple[int, float] = (0, 0.0)
 
     def moved(self, pose: Pose, index: int, grey: NDArray[np.uint8], followed: FollowedPoints) -> Belief:
         """One frame later."""

@@ -32,6 +32,10 @@ _BETTER = 0.97
 """Share of the cost up to which the other way round is the better one. In runs that were right it was 1.02 and more at
 each of some 200 keyframes (suites ``fresh`` of seeds 501, 602 and 9303), in wrong ones .81 to 1.04."""
 _MOST_TURNED = 100.0  # degrees; what has shown more of its sides cannot be the other way round
+_ALWAYS_TRIED = 12
+"""Keyframes up to which it is tried at each. Later, when there are this many more, or have turned by so much more:
+trying costs as much as bundling all keyframes, and keyframes that show the same again tell nothing new."""
+_MORE_KEYFRAMES, _MORE_TURNED = 1.25, 4.0
 _ITERATIONS = 20
 _HELD = 0.05  # what a landmark at distance 1 from its place costs: the wrong way round has bent the surface
 _SCALE = 1.0  # pixels
@@ -39,9 +43,15 @@ _SCALE = 1.0  # pixels
 
 def turned_round(belief: Belief, config: OnlineConfig) -> Belief:
     """The belief with depth the other way round where that explains the keyframes better, else as it is."""
-    better = _better_reversed(belief.known, belief.camera)
-    if better is None:
+    known, views = belief.known, belief.known.keyframes
+    if known.held or known.pointless or len(views) < _FEWEST_KEYFRAMES:
         return belief
+    turned = max(viewing_angle(views[0].pose, view.pose) for view in views)
+    if turned > _MOST_TURNED or not _due(belief.reversal_tried, len(views), turned):
+        return belief
+    better = _better_reversed(known, belief.camera)
+    if better is None:
+        return replace(belief, reversal_tried=(len(views), turned))
     reversal, known = better
     everything = list(range(len(known.keyframes)))
     known = refined(known, belief.camera, everything, config, bundle_iterations=20, rounds=2)
@@ -49,19 +59,26 @@ def turned_round(belief: Belief, config: OnlineConfig) -> Belief:
     trail = tuple((_reversed(pose, reversal), index) for pose, index in belief.trail)
     last = known.keyframes[-1].pose, belief.last[1]
     return replace(
-        belief, known=known, surface=known.surface(), last=last, before=before, trail=trail, past=()
+        belief, known=known, surface=known.surface(), last=last, before=before, trail=trail, past=(),
+        reversal_tried=(0, 0.0),
+    )  # fmt: skip
+
+
+def _due(tried: tuple[int, float], keyframes: int, turned: float) -> bool:
+    """Whether enough is new since it was tried last."""
+    return (
+        keyframes <= _ALWAYS_TRIED
+        or keyframes >= _MORE_KEYFRAMES * tried[0]
+        or turned >= tried[1] + _MORE_TURNED
     )
 
 
 def _better_reversed(known: ObjectMap, camera: Camera) -> tuple[Reversal, ObjectMap] | None:
     """The reversal and the map that it makes, where that explains the keyframes better."""
     views = list(known.keyframes)
-    if known.held or known.pointless or len(views) < _FEWEST_KEYFRAMES:
-        return None
-    turned = max(viewing_angle(views[0].pose, view.pose) for view in views)
     names = shared_landmarks(known, views)
     names = names[np.isfinite(known.landmarks[names]).all(1)]
-    if len(names) < _FEWEST_LANDMARKS or turned > _MOST_TURNED:
+    if len(names) < _FEWEST_LANDMARKS:
         return None
     tracks, start = tracks_of(views, names), structure_of(known, views, names)
     T = np.stack([view.pose.matrix().numpy() for view in views])
