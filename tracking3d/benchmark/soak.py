@@ -207,13 +207,18 @@ def trends(samples: list[Sample], round_length: int) -> dict[str, Trend]:
     if len(settled) < 2 * round_length:
         return {}
     found = {}
-    for name, allowed in (("memory", MEMORY), ("descriptors", 0.0), ("seconds", SPEED)):
+    # A file that is read or written is open for a moment, in some rounds whenever it is looked at.
+    for name, allowed, level_of in (
+        ("memory", MEMORY, np.median),
+        ("descriptors", 0.0, np.min),
+        ("seconds", SPEED, np.median),
+    ):
         values = [getattr(sample, name) for sample in settled]
         if any(value is None for value in values):
             continue
         # Whole rounds are alike; single frames are not: some enter the map, in some the object is searched for.
         rounds = len(values) // round_length
-        levels = [float(np.median(values[n * round_length : (n + 1) * round_length])) for n in range(rounds)]
+        levels = [float(level_of(values[n * round_length : (n + 1) * round_length])) for n in range(rounds)]
         slope, level = np.polyfit(np.arange(rounds), levels, 1)
         start, end = float(level), float(level + slope * (rounds - 1))
         flat = end <= start * (1 + allowed) + 1e-6
