@@ -40,6 +40,7 @@ from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_source import open_run_source
 from tracking3d.video import FrameSource
 
+_DAMAGED = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
 _VERSION = 1  # of what is kept; another one is found anew
 
 
@@ -130,10 +131,7 @@ def open_scene(
         InputError: If the run has no mesh, or its frames cannot be read or are of another size.
     """
     run = run if isinstance(run, RunReader) else RunReader(run)
-    mesh = run.mesh()
-    # An OBJ may hold a vertex once for each texture coordinate; to move, a surface must hang together.
-    vertices, merged = np.unique(np.asarray(mesh.vertices).round(9), axis=0, return_inverse=True)
-    faces = merged.reshape(-1)[np.asarray(mesh.faces)]
+    vertices, faces = _surface(run)
     images: dict[int, View | None] = {}
     records = {one.index: one for one in run.frames}
     source = source if source is not None else open_run_source(run)
@@ -176,6 +174,29 @@ def _view(
     return open_view(image, run.pinhole_mask(record.index), camera, record.T_cam_obj, vertices, faces)
 
 
+def has_landmarks(run: RunReader) -> bool:
+    """Whether landmarks were found before that are of the poses and the mesh that the run has now.
+
+    Raises:
+        InputError: If the run has no mesh.
+    """
+    file = run.mesh_folder / layout.LANDMARKS
+    try:
+        with np.load(file, allow_pickle=False) as kept:
+            key = str(kept["key"])
+    except _DAMAGED:
+        return False
+    return key == _key(run, _surface(run)[0], ROUNDS)
+
+
+def _surface(run: RunReader) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Vertices ``(V, 3)`` and faces ``(F, 3)`` of the mesh of a run."""
+    mesh = run.mesh()
+    # An OBJ may hold a vertex once for each texture coordinate; to move, a surface must hang together.
+    vertices, merged = np.unique(np.asarray(mesh.vertices).round(9), axis=0, return_inverse=True)
+    return vertices, merged.reshape(-1)[np.asarray(mesh.faces)]
+
+
 def _key(run: RunReader, vertices: NDArray[np.float64], rounds: int) -> str:
     """What the refined scene depends on."""
     parts = [vertices.tobytes(), *(one.T_cam_obj.tobytes() for one in run.frames)]
@@ -189,7 +210,7 @@ def _read(file: Path, key: str, scene: Scene) -> Scene | None:
             if str(kept["key"]) != key:
                 return None
             vertices, T = kept["vertices"], kept["T_cam_obj"]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+    except _DAMAGED:
         return None
     if vertices.shape != scene.vertices.shape or T.shape != (len(scene.views), 4, 4):
         return None
