@@ -8,7 +8,7 @@ appearance changes. A point that is not found goes along with what is around it,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -42,6 +42,7 @@ _FLOOR = 0.04  # pixels: of interpolation
 _RIM = 3.0  # pixels by which masks may be off
 _AROUND = 9  # helpers that a hidden point goes along with
 _HELPERS = 400
+_MOST_KEPT = 32  # pictures that templates are kept of
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +81,116 @@ class _Template:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class ImageAnswers:
+    """N points in one picture; see `ImageTracks`."""
+
+    positions: Array
+    visible: NDArray[np.bool_]
+    uncertainty: Array
+    likeness: Array
+    variance: Array
+
+
+class ImageFollower:
+    """Follows pixels of one picture through those that come after it, or before it.
+
+    Args:
+        index: Of the picture.
+        picture: The one that the pixels are in.
+        xy: ``(N, 2)`` pixels.
+    """
+
+    def __init__(self, index: int, picture: Picture, xy: Array) -> None:
+        self.xy = xy
+        self._on_object = picture.depth_in_mask(xy) > 0
+        self._asked = _Template(np.full(len(xy), index), xy, np.zeros(len(xy)))
+        self._first, self._pictures = index, {index: picture}
+        self._begin()
+
+    def _begin(self) -> None:
+        count = len(self.xy)
+        self._kept, self._last = self._asked, self._first
+        self._position, self._variance, self._hidden = self.xy.copy(), np.zeros(count), np.zeros(count)
+
+    def first(self) -> ImageAnswers:
+        """The answer for the picture that the pixels are in."""
+        count = len(self.xy)
+        nothing = np.zeros(count)
+        error = expected_error(nothing, 0, 0)
+        return ImageAnswers(self.xy, np.ones(count, bool), error, np.ones(count), nothing)
+
+    def step(self, index: int, now: Picture) -> ImageAnswers:
+        """Answer for the next picture; on the other side of the first one it begins there again.
+
+        Args:
+            index: Of the picture.
+            now: The picture.
+        """
+        if (index - self._first) * (self._last - self._first) < 0:
+            self._begin()
+        last, position, variance = self._last, self._position, self._variance
+        before, seen = self._pictures[last], self._hidden == 0
+        self._pictures[index] = now
+        ahead = _predicted(before, now, position, seen, self._on_object)
+        step = _placed(
+            self._pictures,
+            index,
+            _Template(np.full(len(ahead), last), position, variance),
+            ahead,
+            seen,
+            _LIKE,
+        )
+        guess = np.where(np.isfinite(step.variance)[:, None], step.xy, ahead)
+        lost = ~np.isfinite(step.variance)
+        total, weight, alike = _mean_begun(step)
+        same = self._kept.row == self._asked.row
+        for template, asked in ((self._kept, ~same), (self._asked, np.ones(len(same), bool))):
+            found = _placed(
+                self._pictures,
+                index,
+                template,
+                guess,
+                asked & (template.row != last),
+                np.where(lost, _FOUND, _KEPT),
+            )
+            contradicts = ~lost & (np.linalg.norm(found.xy - step.xy, axis=1) > _TOGETHER)
+            _add(found, ~contradicts, total, weight, alike)
+        # Where its layer is not, a point needs more than a way from the frame before.
+        at = np.where(weight[:, None] > 0, total / np.maximum(weight, 1e-12)[:, None], ahead)
+        depth = now.depth_in_mask(at)
+        elsewhere = np.where(self._on_object, depth < -_RIM, depth > _RIM)
+        is_found = (weight > 0) & now.holds(at) & ~(elsewhere & (alike < _FOUND))
+        # The template that was kept no longer says anything: the frame before is the next one.
+        stale = is_found & ~lost & (1 / np.maximum(weight, 1e-12) >= step.variance * 0.999)
+        self._kept = self._kept.replaced(stale, last, position, variance)
+        moved = np.linalg.norm(ahead - position, axis=1)
+        self._position = np.where(is_found[:, None], at, ahead)
+        self._variance = np.where(
+            is_found, 1 / np.maximum(weight, 1e-12), variance + (0.3 + 0.2 * moved) ** 2
+        )
+        self._hidden = np.where(is_found, 0, self._hidden + 1)
+        self._last = index
+        self._forget()
+        return ImageAnswers(
+            self._position,
+            is_found,
+            expected_error(self._variance, abs(index - self._first), self._hidden),
+            np.where(is_found, alike, -1.0),
+            self._variance,
+        )
+
+    def _forget(self) -> None:
+        """Keep the pictures that a template is of; of too many of them the oldest is left for that of the question."""
+        rows = sorted(
+            set(self._kept.row.tolist()) - {self._first, self._last}, key=lambda row: abs(row - self._last)
+        )
+        dropped = np.isin(self._kept.row, rows[_MOST_KEPT:])
+        self._kept = self._kept.replaced(dropped, self._first, self.xy, np.zeros(len(self.xy)))
+        held = {self._first, self._last, *rows[:_MOST_KEPT]}
+        self._pictures = {row: picture for row, picture in self._pictures.items() if row in held}
+
+
 def follow_in_images(pictures: Sequence[Picture | None], start: int, xy: Array) -> ImageTracks:
     """Follow pixels of one picture through all of them, forwards and backwards.
 
@@ -99,70 +210,17 @@ def follow_in_images(pictures: Sequence[Picture | None], start: int, xy: Array) 
     first = pictures[start]
     if first is None or not count:
         return tracks
-    tracks.positions[start], tracks.visible[start], tracks.likeness[start] = xy, True, 1.0
-    tracks.variance[start] = 0.0
-    tracks.uncertainty[start] = expected_error(np.zeros(count), 0, 0)
-    on_object = first.depth_in_mask(xy) > 0
-    for direction in (1, -1):
-        _follow(pictures, start, direction, xy, on_object, tracks)
+    follower = ImageFollower(start, first, xy)
+    _write(tracks, start, follower.first())
+    for row in (*range(start + 1, whole), *range(start - 1, -1, -1)):
+        if (picture := pictures[row]) is not None:
+            _write(tracks, row, follower.step(row, picture))
     return tracks
 
 
-def _follow(
-    pictures: Sequence[Picture | None],
-    start: int,
-    direction: int,
-    xy: Array,
-    on_object: NDArray[np.bool_],
-    tracks: ImageTracks,
-) -> None:
-    """Write one direction into ``tracks``."""
-    count = len(xy)
-    asked = _Template(np.full(count, start), xy, np.zeros(count))
-    kept = asked
-    position, variance, hidden = xy.copy(), np.zeros(count), np.zeros(count)
-    last = start
-    for row in range(start + direction, len(pictures) if direction > 0 else -1, direction):
-        now, before = pictures[row], pictures[last]
-        if now is None or before is None:
-            continue
-        seen = hidden == 0
-        ahead = _predicted(before, now, position, seen, on_object)
-        step = _placed(
-            pictures,
-            row,
-            _Template(np.full(count, last), position, variance),
-            ahead,
-            seen,
-            _LIKE,
-        )
-        guess = np.where(np.isfinite(step.variance)[:, None], step.xy, ahead)
-        lost = ~np.isfinite(step.variance)
-        total, weight, alike = _mean_begun(step)
-        for template in (kept, asked) if kept is not asked else (asked,):
-            other = template.row != last
-            if template is asked:
-                other &= (template.row != kept.row) | (kept is asked)
-            found = _placed(pictures, row, template, guess, other, np.where(lost, _FOUND, _KEPT))
-            contradicts = ~lost & (np.linalg.norm(found.xy - step.xy, axis=1) > _TOGETHER)
-            _add(found, ~contradicts, total, weight, alike)
-        # Where its layer is not, a point needs more than a way from the frame before.
-        at = np.where(weight[:, None] > 0, total / np.maximum(weight, 1e-12)[:, None], ahead)
-        depth = now.depth_in_mask(at)
-        elsewhere = np.where(on_object, depth < -_RIM, depth > _RIM)
-        is_found = (weight > 0) & now.holds(at) & ~(elsewhere & (alike < _FOUND))
-        position = np.where(is_found[:, None], at, ahead)
-        # The template that was kept no longer says anything: the frame before is the next one.
-        stale = is_found & ~lost & (1 / np.maximum(weight, 1e-12) >= step.variance * 0.999)
-        kept = kept.replaced(stale, last, tracks.positions[last], tracks.variance[last])
-        moved = np.linalg.norm(ahead - tracks.positions[last], axis=1)
-        variance = np.where(is_found, 1 / np.maximum(weight, 1e-12), variance + (0.3 + 0.2 * moved) ** 2)
-        hidden = np.where(is_found, 0, hidden + 1)
-        tracks.positions[row], tracks.visible[row] = position, is_found
-        tracks.likeness[row] = np.where(is_found, alike, -1.0)
-        tracks.variance[row] = variance
-        tracks.uncertainty[row] = expected_error(variance, abs(row - start), hidden)
-        last = row
+def _write(tracks: ImageTracks, row: int, answers: ImageAnswers) -> None:
+    for name in ("positions", "visible", "uncertainty", "likeness", "variance"):
+        getattr(tracks, name)[row] = getattr(answers, name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +234,7 @@ class _Placed:
 
 
 def _placed(
-    pictures: Sequence[Picture | None],
+    pictures: Mapping[int, Picture],
     row: int,
     template: _Template,
     guess: Array,
@@ -188,12 +246,10 @@ def _placed(
     found = _Placed(guess.copy(), np.full(count, np.inf), np.full(count, -1.0))
     least = np.broadcast_to(np.asarray(least, float), (count,))
     now = pictures[row]
-    assert now is not None
     asked = asked & now.holds(guess)
     for source in np.unique(template.row[asked]).tolist():
         picture = pictures[source]
         chosen = np.flatnonzero(asked & (template.row == source))
-        assert picture is not None
         from_xy = template.xy[chosen]
         there, good = _flow(picture.grey, now.grey, from_xy, guess[chosen])
         back, returned = _flow(now.grey, picture.grey, there, from_xy)
