@@ -14,6 +14,8 @@ from tracking3d.estimation.estimate import FrameEstimate, Status
 from tracking3d.frames import Frame
 from tracking3d.points.answers import PointAnswers
 from tracking3d.points.causal import CausalPoints
+from tracking3d.points.pictures import open_picture
+from tracking3d.points.uncovered import UncoveredPoints
 from tracking3d.points.view import open_view
 from tracking3d.session import Session
 
@@ -62,6 +64,7 @@ class PointFollowing:
     def __init__(self, queries: Array) -> None:
         self._queries = queries
         self._asked: dict[int, CausalPoints] = {}
+        self._uncovered: dict[int, UncoveredPoints] = {}
         self._size: tuple[int, int] | None = None
         self._surface: tuple[Array, NDArray[np.int64]] | None = None
 
@@ -85,9 +88,8 @@ class PointFollowing:
         if poses:
             for number, group in self._asked.items():
                 for index, answer in group.again(radius).items():
-                    self._place(
-                        earlier.setdefault(index, PointAnswers.unknown(len(self._queries))), number, answer
-                    )
+                    into = earlier.setdefault(index, PointAnswers.unknown(len(self._queries)))
+                    self._place(into, number, self._completed(number, index, answer))
         view = None
         if estimate.status is not Status.LOST:
             camera = estimate.camera or session.camera
@@ -97,9 +99,26 @@ class PointFollowing:
             if number == frame.index and number not in self._asked:
                 self._asked[number] = CausalPoints(self._queries[self._queries[:, 0] == number, 1:])
             if number in self._asked:
-                self._place(points, number, self._asked[number].step(frame.index, view, radius))
+                group = self._asked[number]
+                answer = group.step(frame.index, view, radius)
+                self._follow_uncovered(number, group, frame, estimate)
+                self._place(points, number, self._completed(number, frame.index, answer))
         revised = tuple(replace(one, points=earlier.get(one.index)) for one in estimate.revised)
         return replace(estimate, points=points, revised=revised)
+
+    def _follow_uncovered(
+        self, number: int, group: CausalPoints, frame: Frame, estimate: FrameEstimate
+    ) -> None:
+        """Follow what no surface covers into a frame; the points were asked for in frame ``number``."""
+        if number not in self._uncovered:
+            picture = open_picture(frame.image, estimate.mask)
+            self._uncovered[number] = UncoveredPoints(frame.index, picture, group.xy, group.on_surface())
+        elif uncovered := self._uncovered[number]:
+            uncovered.step(frame.index, open_picture(frame.image, estimate.mask))
+
+    def _completed(self, number: int, index: int, answer: PointAnswers) -> PointAnswers:
+        uncovered = self._uncovered.get(number)
+        return uncovered.completed(index, answer, self._asked[number].on_surface()) if uncovered else answer
 
     def _begin(self, first: Frame) -> None:
         self._size = first.size

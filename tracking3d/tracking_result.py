@@ -185,22 +185,29 @@ class TrackingResult:
             self.track_points(int(frame), self._queries[frames == frame, 1:]) for frame in np.unique(frames)
         )
 
-    def track_points(self, frame: int, xy: ArrayLike) -> PointTracks:
-        """Where the surface points under some pixels of one frame are in all frames.
+    def track_points(self, frame: int, xy: ArrayLike, *, beside_object: bool = False) -> PointTracks:
+        """Where the points under some pixels of one frame are in all frames.
 
         By mesh, poses and images; where the frames come once only, by mesh and poses.
 
         Args:
             frame: Index of the frame that ``xy`` is in.
             xy: ``(N, 2)`` pixels.
+            beside_object: Follow pixels beside the object too, in the images alone; else they have no answer.
 
         Raises:
-            InputError: If there is no such frame or model, the object is lost in it, or ``xy`` are no points.
+            InputError: If there is no such frame or model, the object is lost in it, ``xy`` are no points, or points
+                beside the object are asked for where the frames come once only.
         """
         if not self._source.repeatable:
+            if beside_object:
+                raise InputError(
+                    "beside_object=True needs the frames a second time, and these come once only; give a file or a "
+                    "list of images to track()."
+                )
             return track_points(self.run, frame, xy)
         track_points(self.run, frame, xy)  # bad questions are told before the frames are read
-        return self._scene.track(frame, xy)
+        return self._scene.track(frame, xy, beside_object)
 
     @cached_property
     def _scene(self) -> RunScene:

@@ -224,6 +224,21 @@ def test_points_are_followed_as_csv_and_json(call, finished):
     assert list(csv.DictReader(io.StringIO(Path("points.csv").read_text()))) == rows
 
 
+def test_points_beside_the_object_are_followed_in_the_images_with_any(call, finished):
+    rows = list(
+        csv.DictReader(io.StringIO(call("points", finished, "--xy", "31.5,23.5", "--xy", "1,1").stdout))
+    )
+    assert [row["kind"] for row in rows[:2]] == ["surface", "none"]
+    result = call("points", finished, "--xy", "31.5,23.5", "--xy", "1,1", "--any")
+    rows = list(csv.DictReader(io.StringIO(result.stdout)))
+    assert [row["kind"] for row in rows[:2]] == ["surface", "image"]
+    assert float(rows[1]["x"]) == 1 and rows[1]["on_object"] == "0" and float(rows[1]["uncertainty"]) > 0
+    assert "Followed in the images: 1 of 2 points; 0 of them came to lie on the mesh" in result.stderr
+    quiet = call("points", finished, "--xy", "1,1", "--any", "--quiet", "--json")
+    assert quiet.stderr == ""
+    assert json.loads(quiet.stdout)["kind"] == ["image"]
+
+
 def test_points_of_a_grid_are_drawn_and_need_no_video_by_mesh(call, finished):
     result = call("points", finished, "--grid", 8, "--frame", 2, "--video", "trails.mp4", "--quiet")
     assert (result.exit_code, result.stdout) == (0, "")
@@ -259,6 +274,12 @@ def test_points_without_their_video_are_carried_by_the_mesh_and_that_is_said(cal
         ("points run --xy 31,23 --xy 64,23", "There is no pixel 64,23 in frame 0, which has 64 x 48 pixels"),
         ("points run --xy 31,-1", "There is no pixel 31,-1"),
         ("points run --xy 1,1 --xy 2,1", "Beside the object's mesh in frame 0: 1,1 and 2,1;"),
+        ("points run --xy 1,1", "or --any to follow them in the images alone"),
+        (
+            "points run --xy 1,1 --any --by-mesh",
+            "--any follows points in the images, and --by-mesh looks at none",
+        ),
+        ("points run --xy 99,1 --any", "There is no pixel 99,1 in frame 0"),
     ],
 )
 def test_bad_question_for_points_is_refused(refused, finished, arguments, words):

@@ -6,7 +6,7 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.prototypes import sphere
 from tracking3d.points.meeting import surface_under
 from tracking3d.points.surface import move_surface
-from tracking3d.points.view import open_view
+from tracking3d.points.view import open_view, sample
 
 MESH = sphere(8)
 CAMERA = Camera(900.0, 900.0, 319.5, 239.5, 640, 480)
@@ -44,6 +44,14 @@ def test_the_surface_under_a_pixel_projects_to_it():
     assert np.abs(points - exact).max() < 0.01
     assert one.sees(points, 0.02)[1].all()
     assert not one.sees(-points, 0.02)[1].any()
+
+
+def test_as_many_pixels_are_looked_up_as_are_asked_for():
+    one = view()
+    few = one.to_window(np.array([[355.0, 221.0], [330.3, 250.8], [np.nan, 0.0]]))
+    many = np.tile(few, (20_000, 1))
+    np.testing.assert_array_equal(sample(one.inverse_depth, many)[-3:], sample(one.inverse_depth, few))
+    assert sample(one.inverse_depth, many).shape == (60_000,)
 
 
 def test_slant_is_one_in_front_and_falls_to_the_rim():

@@ -262,6 +262,7 @@ def test_tracks_are_written_as_json_and_csv(tmp_path):
         "X": f"{tracks.points[0, 0]:.5f}",
         "Y": f"{tracks.points[0, 1]:.5f}",
         "Z": f"{tracks.points[0, 2]:.5f}",
+        "kind": "surface",
     }
     unknown = ("x", "y", "uncertainty", "X", "Y", "Z")
     assert rows[1] == {
@@ -270,4 +271,5 @@ def test_tracks_are_written_as_json_and_csv(tmp_path):
         "visible": "0",
         "on_object": "0",
         "measured": "0",
+        "kind": "none",
     } | dict.fromkeys(unknown, "")

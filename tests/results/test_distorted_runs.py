@@ -67,6 +67,19 @@ def test_points_that_the_images_correct_are_in_the_pictures_as_taken(runs, turni
     assert np.median(np.linalg.norm(curved.positions - expected, axis=2)[both]) < 1.0
 
 
+def test_pixels_beside_the_object_are_followed_in_the_pictures_as_taken(runs, turning_sphere):
+    _, bent = runs
+    frames = [
+        replace(frame, image=_taken(bent.camera.lens, frame.image))
+        for frame in turning_sphere.frames
+        if frame.index != 2
+    ]
+    tracks = open_scene(bent, frames, rounds=0).track(0, [[3.0, 4.0]], beside_object=True)
+    assert tracks.kind.tolist() == ["image"]
+    np.testing.assert_array_equal(tracks.positions[0], [[3.0, 4.0]])
+    assert np.isnan(tracks.positions[2]).all() and np.isfinite(np.delete(tracks.positions, 2, 0)).all()
+
+
 def _taken(lens: Lens, image: np.ndarray) -> np.ndarray:
     import cv2
 

@@ -11,6 +11,7 @@ from tracking3d.cli.options import Debug, Quiet, numbers
 from tracking3d.errors import InputError, OutputError
 
 if TYPE_CHECKING:
+    from tracking3d.results.correspondences import PointTracks
     from tracking3d.results.run_reader import RunReader
     from tracking3d.video import FrameSource
 
@@ -33,6 +34,10 @@ def points(
             metavar="SOURCE", help="The video, where it is not where it was.", show_default="as the run"
         ),
     ] = None,
+    any_pixel: Annotated[
+        bool,
+        typer.Option("--any", help="Follow pixels beside the object too, in the images alone."),
+    ] = False,
     by_mesh: Annotated[
         bool, typer.Option("--by-mesh", help="Carry points by mesh and pose alone; looks at no image.")
     ] = False,
@@ -50,10 +55,10 @@ def points(
 ) -> None:
     """Follow surface points through all frames: position, visibility, uncertainty.
 
-    Mesh and poses predict where a point goes and whether it is seen; the images correct it. A pixel outside the frame
-    is an error, and so is none on the object.
+    Mesh and poses predict where a point goes and whether it is seen; the images correct it. What the mesh does not
+    cover is followed in the images. A pixel outside the frame is an error, and so is none on the object without --any.
     """
-    from tracking3d.results.correspondences import check_asked, grid_on_object, track_points
+    from tracking3d.results.correspondences import check_asked, grid_on_object, on_mask, track_points
     from tracking3d.results.following import open_scene
     from tracking3d.results.point_files import points_to_csv, points_to_json
     from tracking3d.results.point_trails import write_trails
@@ -64,6 +69,10 @@ def points(
         raise InputError(
             "No point is asked for; give pixels by --xy X,Y, or --grid STEP for all of the object."
         )
+    if any_pixel and by_mesh:
+        raise InputError(
+            "--any follows points in the images, and --by-mesh looks at none; leave one of them out."
+        )
     for file in (csv, video):
         if file is not None and not file.absolute().parent.is_dir():
             raise OutputError(f"{file} cannot be written: there is no folder {file.parent}; make it first.")
@@ -72,15 +81,21 @@ def points(
         pixels += grid_on_object(reader, frame, grid)
     # Bad questions are told before the video is read.
     tracks = track_points(reader, frame, pixels)
-    told = [reader.not_finished, check_asked(tracks, reader.camera)]
     images: FrameSource | None = None
     if not by_mesh or video is not None:
-        images = _images(reader, source, needed=source is not None or video is not None)
+        images = _images(reader, source, needed=any_pixel or source is not None or video is not None)
+    answered = tracks.on_object | any_pixel
+    if images is not None and not by_mesh:
+        answered |= on_mask(reader, frame, tracks.query)
+    otherwise = "" if by_mesh else ", or --any to follow them in the images alone"
+    told = [reader.not_finished, check_asked(tracks, reader.camera, answered, otherwise)]
     if images is not None and not by_mesh:
         tell = (
             (lambda done: None) if quiet else (lambda done: typer.echo(f"landmarks, round {done}", err=True))
         )
-        tracks = open_scene(reader, images, after_round=tell).track(frame, pixels)
+        tracks = open_scene(reader, images, after_round=tell).track(frame, pixels, any_pixel)
+        if not quiet:
+            told.append(_by_images(tracks))
     for sentence in told:
         if sentence:
             typer.echo(sentence, err=True)
@@ -95,6 +110,17 @@ def points(
         typer.echo(points_to_json(tracks))
     elif csv is None and video is None:
         typer.echo(points_to_csv(tracks), nl=False)
+
+
+def _by_images(tracks: PointTracks) -> str:
+    """What to say of points that the mesh does not cover where they were asked for; empty where there are none."""
+    alone, tied = (int((tracks.kind == kind).sum()) for kind in ("image", "tied"))
+    if not alone + tied:
+        return ""
+    count = f"{alone + tied} of {len(tracks.kind)} points"
+    return (
+        f"Followed in the images: {count}; {tied} of them came to lie on the mesh, which carries them since."
+    )
 
 
 def _images(reader: RunReader, source: str | None, needed: bool) -> FrameSource | None:

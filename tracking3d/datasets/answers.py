@@ -45,6 +45,7 @@ class Answers:
         memory_growth_mb: How much more was held at most in the second half of the frames than in the first.
         mesh: Reads the estimated shape in object coordinates.
         points: Follows points.
+        corrected_points: Follows points with the help of the images too.
     """
 
     origin: Path
@@ -64,6 +65,7 @@ class Answers:
     memory_growth_mb: float | None = None
     mesh: Callable[[], trimesh.Trimesh] | None = None
     points: PointTracker | None = None
+    corrected_points: PointTracker | None = None
 
     def matched(self, frames: int) -> str:
         """Which frames are scored, in words.

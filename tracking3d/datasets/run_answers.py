@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +18,11 @@ from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import Status
 from tracking3d.results import layout
 from tracking3d.results.correspondences import track_points
+from tracking3d.results.following import RunScene, has_landmarks, open_scene
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
 from tracking3d.stages import StageTimes
+from tracking3d.video.image_sequence import ImageSequence
 from tracking3d.video.selection import parse_selection, within
 
 LEAST_SHARED = 0.5
@@ -49,6 +52,8 @@ def answers_of_run(folder: Path, truth: Truth, *, refined: bool = True, offset: 
     _check_shared(run, records, truth, offset)
     memory = run.description.get("peak_memory_mb")
     seconds, stages = _times(run, records)
+    has_mesh = (run.mesh_folder / layout.OBJ).is_file()
+    points = _RunPoints(run, len(truth.frames), offset)
     return Answers(
         origin=folder,
         asked=asked,
@@ -64,9 +69,10 @@ def answers_of_run(folder: Path, truth: Truth, *, refined: bool = True, offset: 
         stages=stages,
         mask_sources={n: one.mask_source for n, one in records.items() if one.mask_source is not None},
         peak_memory_mb=memory if isinstance(memory, int | float) else None,
-        mesh=run.mesh if (run.mesh_folder / layout.OBJ).is_file() else None,
-        points=_RunPoints(run, len(truth.frames), offset)
-        if (run.mesh_folder / layout.OBJ).is_file()
+        mesh=run.mesh if has_mesh else None,
+        points=points if has_mesh else None,
+        corrected_points=replace(points, images=_frames(truth, offset))
+        if has_mesh and has_landmarks(run)
         else None,
     )
 
@@ -141,13 +147,32 @@ def _initial_masks(folder: Path, records: Mapping[int, FrameRecord]) -> dict[int
     return {index: MaskFile(file) for index, file in files.items() if file.is_file()}
 
 
+def _frames(truth: Truth, offset: int) -> ImageSequence:
+    """The frames of the clip by the indices that the run has for them."""
+    before = (truth.frames[0],) * max(-offset, 0)  # is not read
+    files = (*before, *truth.frames[max(offset, 0) :])
+    return ImageSequence(truth.name, files, range(len(before), len(files)))
+
+
 @dataclass(frozen=True, eq=False)
 class _RunPoints:
-    """Follows points by the mesh and the poses of a run; see `tracking3d.datasets.answers.PointTracker`."""
+    """Follows points by the mesh and the poses of a run; see `tracking3d.datasets.answers.PointTracker`.
+
+    Attributes:
+        run: The run.
+        frames: How many the clip has.
+        offset: See `answers_of_run`.
+        images: Corrects by landmarks and images, where they are given.
+    """
 
     run: RunReader
     frames: int
     offset: int = 0
+    images: ImageSequence | None = None
+
+    @cached_property
+    def _scene(self) -> RunScene | None:
+        return None if self.images is None else open_scene(self.run, self.images)
 
     def __call__(self, frame: int, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         count = len(np.asarray(points))
@@ -157,7 +182,8 @@ class _RunPoints:
         record = next((one for one in self.run.frames if one.index == own), None)
         if record is None or record.status is Status.LOST or not is_rigid(record.T_cam_obj):
             return positions, visible  # where the object was not found, its points were not either
-        tracks = track_points(self.run, own, points)
+        scene = self._scene
+        tracks = track_points(self.run, own, points) if scene is None else scene.track(own, points)
         frames = tracks.frames + self.offset
         inside = (frames >= 0) & (frames < self.frames)
         positions[frames[inside]] = tracks.positions[inside]

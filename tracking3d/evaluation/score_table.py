@@ -31,6 +31,9 @@ ROWS: tuple[tuple[str, str, str], ...] = (
     ("points_average_jaccard", "points: average Jaccard", ""),
     ("points_delta_average", "points: share within 1 to 16 px", ""),
     ("points_occlusion_accuracy", "points: visibility right", ""),
+    ("points_corrected_average_jaccard", "points corrected by images: average Jaccard", ""),
+    ("points_corrected_delta_average", "points corrected by images: share within 1 to 16 px", ""),
+    ("points_corrected_occlusion_accuracy", "points corrected by images: visibility right", ""),
     ("bop_ar", "BOP average recall", ""),
     ("bop_ar_vsd", "of it VSD", ""),
     ("bop_ar_mssd", "of it MSSD", ""),
@@ -70,8 +73,15 @@ def format_scores(scores: Scores) -> Table:
     for number, (measure, label, unit) in enumerate(ROWS):
         value = getattr(scores, measure)
         if value is not None or number < ALWAYS or measure == "seconds_per_frame":
-            table.add_row(label, _text(value, unit))
+            table.add_row(_label(measure, label, scores), _text(value, unit))
     return table
+
+
+def _label(measure: str, label: str, scores: Scores) -> str:
+    """The label; of points it says which they are where there are two kinds."""
+    if measure.startswith("points_") and scores.points_corrected_delta_average is not None:
+        return label.replace("points:", "points by the mesh alone:")
+    return label
 
 
 def _text(value: float | int | None, unit: str) -> str:

@@ -114,29 +114,32 @@ def _align_together(
         [0.5 * (_between(template, at + d) - _between(template, at - d)) for d in (right, down)], 2
     )
     slope = slope - (w[..., None] * slope).sum(1, keepdims=True)
-    moved, ended = np.zeros((len(at), 2)), np.zeros(len(at), bool)
-    for step in range(STEPS + 1):
-        here = _between(image, at + moved[:, None])
-        here = here - (w * here).sum(1, keepdims=True)
-        together = (w * here * T).sum(1, keepdims=True)
-        gain = np.clip(together / (variance + 1e-6), 0.4, 2.5)
-        left = here - gain * T
-        u = w * (9 * NOISE**2 / (9 * NOISE**2 + left**2)) ** 2
-        a = gain[..., None] * slope
-        H = np.einsum("ns,nsi,nsj->nij", u, a, a)
-        if step == STEPS:
-            break
-        hold = NOISE**2 / (cover * prior**2) * 6
-        b = -np.einsum("ns,nsi,ns->ni", u, a, left) - hold * moved
-        move = np.linalg.solve(H + hold[..., None] * np.eye(2), b[..., None])[..., 0]
+    moved, going = np.zeros((len(at), 2)), np.ones(len(at), bool)
+    H, left = np.zeros((len(at), 2, 2)), np.zeros(w.shape)
+    together, variance_here = np.zeros((len(at), 1)), np.zeros(len(at))
+    for _ in range(STEPS):
+        here = _between(image, at[going] + moved[going, None])
+        share = w[going]
+        here = here - (share * here).sum(1, keepdims=True)
+        variance_here[going] = (share * here * here).sum(1)
+        together[going] = (share * here * T[going]).sum(1, keepdims=True)
+        gain = np.clip(together[going] / (variance[going] + 1e-6), 0.4, 2.5)
+        left[going] = here - gain * T[going]
+        u = share * (9 * NOISE**2 / (9 * NOISE**2 + left[going] ** 2)) ** 2
+        a = gain[..., None] * slope[going]
+        H[going] = np.einsum("ns,nsi,nsj->nij", u, a, a)
+        hold = NOISE**2 / (cover[going] * prior**2) * 6
+        b = -np.einsum("ns,nsi,ns->ni", u, a, left[going]) - hold * moved[going]
+        move = np.linalg.solve(H[going] + hold[..., None] * np.eye(2), b[..., None])[..., 0]
         length = np.linalg.norm(move, axis=1)
-        moved = moved + np.where(ended, 0, 1 / np.maximum(length, 1))[:, None] * move
-        ended |= length < 0.02
+        moved[going] += (1 / np.maximum(length, 1))[:, None] * move
+        going[going] = length >= 0.02
+        if not going.any():
+            break
     error = np.maximum(NOISE**2, (w * left**2).sum(1, keepdims=True)) / cover * 6
     spread = error[..., None] * np.linalg.inv(H + (error / prior**2)[..., None] * np.eye(2))
     shift[chosen] = moved
     covariance[chosen] = np.stack([spread[:, 0, 0], spread[:, 0, 1], spread[:, 1, 1]], 1)
-    variance_here = (w * here * here).sum(1)
     contrast[chosen] = np.sqrt(variance[:, 0])
     agreement[chosen] = together[:, 0] / np.sqrt((variance[:, 0] + 4) * (variance_here + 4))
     return Alignment(shift, covariance, agreement, contrast)

@@ -14,7 +14,8 @@ class PointAnswers:
 
     Attributes:
         positions: ``(N, 2)`` pixels of the frame; NaN before a point was asked for, beside the object, where the object
-            is lost and behind the camera.
+            is lost and behind the camera. Points on the object's mask that no surface covers yet are where the images
+            carry them, and their ``points`` are NaN.
         visible: ``(N,)`` bool.
         uncertainty: ``(N,)`` pixels; twice as much is meant to hold 19 of 20 errors. NaN where there is no position.
         points: ``(N, 3)`` in object coordinates, as they are known now; NaN where a point is not known.

@@ -12,11 +12,13 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from tracking3d.bundle_adjustment import Structure, Tracks, adjust
 from tracking3d.bundle_adjustment.reversal import Reversal, reversal_of
 from tracking3d.points.view import Array
+from tracking3d.rendering.backend import use_numba
 
 TURNS = 12
 _CONVERGED = 3e-4
@@ -31,6 +33,8 @@ _HOPELESS = 1.5
 _GLIMPSE = 4
 """Steps after which that shows: on those two clips the cost is then within a tenth of where it ends."""
 _OUTLIER = 3.0  # deviations at which a measurement has a quarter of its weight
+_AHEAD = 1e-3  # depth from which on points have an image
+_LEAST_SHARED = 64  # points for which another thread pays
 _LENS = 0.3  # deviation of the logarithm of a focal length that nobody gave
 
 
@@ -63,6 +67,7 @@ def intersect(
     deviation: Array,
     held: float,
     turns: int = TURNS,
+    backend: str = "auto",
 ) -> tuple[Array, Array]:
     """Move points to where the views say they are.
 
@@ -73,14 +78,42 @@ def intersect(
         measured: ``(T, N, 2)`` pixels; NaN where there is none.
         deviation: ``(T, N)`` of them in pixels; infinite where there is none.
         held: Deviation of the points' movement, in object units.
+        turns: Steps.
+        backend: ``numba``, ``torch`` for NumPy, or ``auto``; see `tracking3d.rendering.backend`.
 
     Returns:
         The points, and the weights ``(T, N)`` that the measurements had in the end: 0 where there is none.
     """
+    if turns and use_numba(backend, torch.empty(0, dtype=torch.float32)):
+        return _intersect_compiled(points, intrinsics, T_cam_obj, measured, deviation, held, turns)
     start, weight = points, np.zeros(deviation.shape)
     for _ in range(turns):
         points, weight = _move_points(points, start, intrinsics, T_cam_obj, measured, deviation, held)
     return points, weight
+
+
+def _intersect_compiled(
+    points: Array,
+    intrinsics: Array,
+    T_cam_obj: Array,
+    measured: Array,
+    deviation: Array,
+    held: float,
+    turns: int,
+) -> tuple[Array, Array]:
+    from tracking3d.points.kernels.intersection import intersect as compiled
+    from tracking3d.rendering.kernels.threads import share
+
+    known = np.isfinite(deviation) & np.isfinite(measured).all(2)
+    certain = np.where(known, 1 / np.where(known, deviation, 1.0) ** 2, 0.0)
+    moved, weight = np.array(points, dtype=np.float64, order="C"), np.zeros((len(points), len(T_cam_obj)))
+    share(
+        compiled, len(points), _LEAST_SHARED,
+        moved, *(np.ascontiguousarray(one, np.float64) for one in (intrinsics, T_cam_obj)),
+        np.ascontiguousarray(measured.transpose(1, 0, 2)), np.ascontiguousarray(certain.T),
+        held, _OUTLIER, _AHEAD, turns, weight,
+    )  # fmt: skip
+    return moved, weight.T
 
 
 def bundle(
@@ -213,7 +246,7 @@ def _residuals(
     """
     seen = points @ T_cam_obj[:, :3, :3].transpose(0, 2, 1) + T_cam_obj[:, None, :3, 3]
     focal, centre = intrinsics[:, None, :2], intrinsics[:, None, 2:]
-    ahead = seen[..., 2] > 1e-3
+    ahead = seen[..., 2] > _AHEAD
     inverse = 1 / np.where(ahead, seen[..., 2], 1.0)
     xy = focal * seen[..., :2] * inverse[..., None] + centre
     known = ahead & np.isfinite(deviation) & np.isfinite(measured).all(2)

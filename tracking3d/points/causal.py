@@ -83,6 +83,14 @@ class CausalPoints:
         self._rows = [*self._rows, row][-KEPT:]
         return self._answer(row, radius)
 
+    def on_surface(self) -> NDArray[np.bool_]:
+        """``(N,)`` which points lie on the surface as it is known now; none where the object is lost."""
+        if self._first is None or self._first.view is None:
+            return np.zeros(len(self.xy), bool)
+        view = self._first.view
+        pixels = view.to_window(self.xy)
+        return np.asarray(np.isfinite(view.surface(pixels)).all(1) & (sample(view.beyond, pixels) < RIM))
+
     def redrawn(self, known: Known, vertices: Array, faces: NDArray[np.int64]) -> None:
         """Draw another surface into the kept views, in the poses that are known now; `again` answers by them.
 

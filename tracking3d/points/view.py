@@ -21,6 +21,7 @@ MARGIN = 12
 """Frame pixels around mask and mesh that belong to the window."""
 REACH = 12.0
 """Window pixels beyond the drawn outline up to which the surface is carried on."""
+_MOST_AT_ONCE = 2**14  # pixels that OpenCV looks up in one call
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,10 +122,13 @@ def sample(plane: Plane, xy: Array) -> Plane:
     at = np.where(finite[:, None], xy, 0).astype(np.float32)
     if not len(at):
         return np.zeros(0, np.float32)
-    values = cv2.remap(
-        plane, at[None, :, 0], at[None, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    values = np.concatenate(
+        [
+            cv2.remap(plane, x[None], y[None], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0]
+            for x, y in (at[first : first + _MOST_AT_ONCE].T for first in range(0, len(at), _MOST_AT_ONCE))
+        ]
     )
-    return np.where(finite, values[0], 0).astype(np.float32)
+    return np.where(finite, values, 0).astype(np.float32)
 
 
 def open_view(

@@ -7,7 +7,8 @@ object is in front of it. Other things in front of the object are unknown to the
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from enum import StrEnum
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,19 @@ from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
 
 
+class PointKind(StrEnum):
+    """By what a point is followed."""
+
+    NONE = "none"
+    """By nothing: it lies beside the object."""
+    SURFACE = "surface"
+    """By mesh and pose, and by the images where they are looked at."""
+    TIED = "tied"
+    """By the images where the mesh does not cover it, and by mesh and pose since it came to lie on the mesh."""
+    IMAGE = "image"
+    """By the images alone."""
+
+
 @dataclass(frozen=True, eq=False)
 class PointTracks:
     """N surface points in T frames.
@@ -33,14 +47,16 @@ class PointTracks:
         query_frame: Index of the frame the points were asked in.
         query: ``(N, 2)`` the pixels asked for, x and y.
         frames: ``(T,)`` int64 frame indices.
-        positions: ``(T, N, 2)`` pixels; NaN for a point that is not on the object or is behind the camera.
-        visible: ``(T, N)`` bool; never where the frame is lost or its mask empty.
-        on_object: ``(N,)`` bool: whether the pixel lies on the object.
+        positions: ``(T, N, 2)`` pixels; NaN for a point that is not followed or is behind the camera.
+        visible: ``(T, N)`` bool; of points on the surface never where the frame is lost or its mask empty.
+        on_object: ``(N,)`` bool: whether the pixel lies on the object: on its mesh, or on its mask where points
+            that the mesh does not cover are followed.
         face: ``(N,)`` int64 face of the mesh, -1 off the object.
         barycentric: ``(N, 3)`` weights of the face's corners, NaN off the object.
         points: ``(N, 3)`` in object coordinates, NaN off the object.
         uncertainty: ``(T, N)`` pixels; twice as much holds some 19 of 20 errors. NaN where nothing is known of it.
         measured: ``(T, N)`` bool: whether the image had a say.
+        kind: ``(N,)`` text, by what each is followed; see `PointKind`.
     """
 
     query_frame: int
@@ -54,6 +70,7 @@ class PointTracks:
     points: NDArray[np.float64]
     uncertainty: NDArray[np.float64]
     measured: NDArray[np.bool_]
+    kind: NDArray[np.str_] = field(default_factory=lambda: np.zeros(0, "<U7"))
 
 
 def track_points(run: RunReader | Path, frame: int, xy: ArrayLike) -> PointTracks:
@@ -112,11 +129,25 @@ def track_points(run: RunReader | Path, frame: int, xy: ArrayLike) -> PointTrack
         points,
         uncertainty=np.full(visible.shape, np.nan),
         measured=np.zeros_like(visible),
+        kind=kinds(on_object),
     )
 
 
-def check_asked(tracks: PointTracks, camera: Camera) -> str:
+def kinds(on_surface: NDArray[np.bool_]) -> NDArray[np.str_]:
+    """``(N,)`` of points that the mesh alone decides about."""
+    return np.where(on_surface, PointKind.SURFACE.value, PointKind.NONE.value).astype("<U7")
+
+
+def check_asked(
+    tracks: PointTracks, camera: Camera, answered: NDArray[np.bool_] | None = None, otherwise: str = ""
+) -> str:
     """Make sure that the pixels that were asked for can have an answer.
+
+    Args:
+        tracks: By the mesh.
+        camera: Of the frames.
+        answered: ``(N,)`` which pixels will have one; those on the mesh if left out.
+        otherwise: What else can be done about the others.
 
     Returns:
         What to say of pixels beside the object, of which nothing is known; empty where there are none.
@@ -135,12 +166,12 @@ def check_asked(tracks: PointTracks, camera: Camera) -> str:
             f"There is no pixel {listed(outside)} in frame {tracks.query_frame}, which has {camera.width} x "
             f"{camera.height} pixels counted from 0; give pixels on the object."
         )
-    beside = tracks.query[~tracks.on_object]
+    beside = tracks.query[~(tracks.on_object if answered is None else answered)]
     if not len(beside):
         return ""
     said = (
         f"Beside the object's mesh in frame {tracks.query_frame}: {listed(beside)}; give pixels inside its outline, "
-        f"which {OVERLAY} shows."
+        f"which {OVERLAY} shows{otherwise}."
     )
     if len(beside) == len(tracks.query):
         raise InputError(said)
@@ -197,6 +228,14 @@ def in_frame(camera: Camera, xy: NDArray[np.float64]) -> NDArray[np.bool_]:
     size = np.array([camera.width, camera.height])
     inside: NDArray[np.bool_] = np.all((xy > -0.5) & (xy < size - 0.5), axis=1)
     return inside
+
+
+def on_mask(run: RunReader, frame: int, xy: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """``(N,)`` which pixels ``(N, 2)`` of a frame lie on the object's mask."""
+    inside = in_frame(run.camera, xy)
+    column, row = np.where(inside[:, None], xy, 0.0).round().astype(int).T
+    lies: NDArray[np.bool_] = inside & run.mask(frame)[row, column]
+    return lies
 
 
 def as_points(xy: ArrayLike) -> NDArray[np.float64]:

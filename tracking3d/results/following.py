@@ -10,6 +10,7 @@ import io
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -21,15 +22,25 @@ from tracking3d.frames import Frame, Image
 from tracking3d.points.follow import follow_points
 from tracking3d.points.landmarks import ROUNDS, Scene, refine_scene
 from tracking3d.points.meeting import surface_under
+from tracking3d.points.pictures import Picture
 from tracking3d.points.view import View, open_view
 from tracking3d.results import layout
-from tracking3d.results.correspondences import PointTracks, as_points, in_frame, tracked_record
+from tracking3d.results.correspondences import (
+    PointTracks,
+    as_points,
+    in_frame,
+    kinds,
+    on_mask,
+    tracked_record,
+)
 from tracking3d.results.files import write_atomic
+from tracking3d.results.image_points import follow_beside_mesh, read_pictures, with_image_points
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_source import open_run_source
 from tracking3d.video import FrameSource
 
+_DAMAGED = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
 _VERSION = 1  # of what is kept; another one is found anew
 
 
@@ -40,18 +51,24 @@ class RunScene:
     Attributes:
         run: The run.
         scene: Its surface in the frames, in their order.
+        pictures: Reads the whole frames, in the same order, for points that the surface does not cover; None where
+            such points are not followed.
     """
 
     run: RunReader
     scene: Scene
+    pictures: Callable[[], list[Picture | None]] | None = None
 
-    def track(self, frame: int, xy: ArrayLike) -> PointTracks:
+    def track(self, frame: int, xy: ArrayLike, beside_object: bool = False) -> PointTracks:
         """Follow pixels of one frame through the whole run: predicted by surface and poses, corrected by the images.
+
+        Pixels on the object's mask that the surface does not cover are followed in the images, until they meet it.
 
         Args:
             frame: Index of the frame that ``xy`` is in.
             xy: ``(N, 2)`` pixels; (0, 0) is the centre of the top-left pixel. Those that lie a few pixels beside the
                 surface count as on its rim; their ``face`` is -1.
+            beside_object: Follow pixels beside the object too, in the images alone; else they have no answer.
 
         Raises:
             InputError: If the run has no such frame, the object was lost there, or ``xy`` are no points.
@@ -71,7 +88,7 @@ class RunScene:
                 *view.project(self.scene.vertices), self.scene.faces, view.to_window(seen[on_object])
             )
         lost = np.array([one.status == Status.LOST or one.area == 0 for one in records])
-        return PointTracks(
+        tracks = PointTracks(
             frame,
             query,
             np.array([one.index for one in records], dtype=np.int64),
@@ -83,7 +100,14 @@ class RunScene:
             found.points,
             found.uncertainty,
             found.measured,
+            kinds(on_object),
         )
+        on_it = on_mask(self.run, frame, query)
+        rest = np.flatnonzero(~on_object & inside & (on_it | beside_object))
+        if self.pictures is None or not len(rest):
+            return tracks
+        points = follow_beside_mesh(self.run, self.scene, self.pictures(), start, query[rest], on_it[rest])
+        return with_image_points(tracks, rest, points, on_it[rest])
 
 
 def open_scene(
@@ -107,13 +131,11 @@ def open_scene(
         InputError: If the run has no mesh, or its frames cannot be read or are of another size.
     """
     run = run if isinstance(run, RunReader) else RunReader(run)
-    mesh = run.mesh()
-    # An OBJ may hold a vertex once for each texture coordinate; to move, a surface must hang together.
-    vertices, merged = np.unique(np.asarray(mesh.vertices).round(9), axis=0, return_inverse=True)
-    faces = merged.reshape(-1)[np.asarray(mesh.faces)]
+    vertices, faces = _surface(run)
     images: dict[int, View | None] = {}
     records = {one.index: one for one in run.frames}
-    for frame in source if source is not None else open_run_source(run):
+    source = source if source is not None else open_run_source(run)
+    for frame in source:
         if isinstance(frame, Frame) and (record := records.get(frame.index)) is not None:
             images[frame.index] = _view(run, record, frame.image, vertices, faces)
     if not images:
@@ -121,15 +143,16 @@ def open_scene(
             f"The video has no frame of the run {run.folder}; say by --source which one it was made on."
         )
     scene = Scene([images.get(one.index) for one in run.frames], vertices, faces)
+    pictures = cache(partial(read_pictures, run, source)) if getattr(source, "repeatable", True) else None
     if not rounds:
-        return RunScene(run, scene)
+        return RunScene(run, scene, pictures)
     file = run.mesh_folder / layout.LANDMARKS
     key = _key(run, vertices, rounds)
     if (kept := _read(file, key, scene)) is not None:
-        return RunScene(run, kept)
+        return RunScene(run, kept, pictures)
     scene = refine_scene(scene, rounds, after_round)
     _write(file, key, scene)
-    return RunScene(run, scene)
+    return RunScene(run, scene, pictures)
 
 
 def _view(
@@ -151,6 +174,29 @@ def _view(
     return open_view(image, run.pinhole_mask(record.index), camera, record.T_cam_obj, vertices, faces)
 
 
+def has_landmarks(run: RunReader) -> bool:
+    """Whether landmarks were found before that are of the poses and the mesh that the run has now.
+
+    Raises:
+        InputError: If the run has no mesh.
+    """
+    file = run.mesh_folder / layout.LANDMARKS
+    try:
+        with np.load(file, allow_pickle=False) as kept:
+            key = str(kept["key"])
+    except _DAMAGED:
+        return False
+    return key == _key(run, _surface(run)[0], ROUNDS)
+
+
+def _surface(run: RunReader) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Vertices ``(V, 3)`` and faces ``(F, 3)`` of the mesh of a run."""
+    mesh = run.mesh()
+    # An OBJ may hold a vertex once for each texture coordinate; to move, a surface must hang together.
+    vertices, merged = np.unique(np.asarray(mesh.vertices).round(9), axis=0, return_inverse=True)
+    return vertices, merged.reshape(-1)[np.asarray(mesh.faces)]
+
+
 def _key(run: RunReader, vertices: NDArray[np.float64], rounds: int) -> str:
     """What the refined scene depends on."""
     parts = [vertices.tobytes(), *(one.T_cam_obj.tobytes() for one in run.frames)]
@@ -164,7 +210,7 @@ def _read(file: Path, key: str, scene: Scene) -> Scene | None:
             if str(kept["key"]) != key:
                 return None
             vertices, T = kept["vertices"], kept["T_cam_obj"]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+    except _DAMAGED:
         return None
     if vertices.shape != scene.vertices.shape or T.shape != (len(scene.views), 4, 4):
         return None

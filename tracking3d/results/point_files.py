@@ -15,13 +15,27 @@ def points_to_json(tracks: PointTracks) -> str:
     return json.dumps(jsonable(vars(tracks)), allow_nan=False)
 
 
-COLUMNS = ["frame", "point", "x", "y", "visible", "on_object", "uncertainty", "measured", "X", "Y", "Z"]
+COLUMNS = [
+    "frame",
+    "point",
+    "x",
+    "y",
+    "visible",
+    "on_object",
+    "uncertainty",
+    "measured",
+    "X",
+    "Y",
+    "Z",
+    "kind",
+]
 
 
 def points_to_csv(tracks: PointTracks) -> str:
     """One row a frame and point, with the columns `COLUMNS`.
 
-    x, y and uncertainty are pixels, X, Y and Z object coordinates; empty where they are unknown.
+    x, y and uncertainty are pixels, X, Y and Z object coordinates; empty where they are unknown. ``kind`` says by
+    what a point is followed, see `PointKind`.
     """
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
@@ -33,7 +47,9 @@ def points_to_csv(tracks: PointTracks) -> str:
             unsure = _number(tracks.uncertainty[row, point], 3)
             place = [_number(x, 3), _number(y, 3)]
             measured = int(tracks.measured[row, point])
-            table.writerow([int(frame), point, *place, *flags, unsure, measured, *places[point]])
+            table.writerow(
+                [int(frame), point, *place, *flags, unsure, measured, *places[point], tracks.kind[point]]
+            )
     return text.getvalue()
 
 

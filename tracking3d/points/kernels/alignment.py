@@ -11,6 +11,12 @@ from numpy.typing import NDArray
 
 from tracking3d.rendering.kernels.compilation import OPTIONS, REORDER, kernel
 
+_STRIDE = 16
+"""Pixels from one row of a patch to the next: whole vectors. It holds a window and a pixel on either side of it, so
+that a window has up to 14 pixels; what is beyond the window has no weight."""
+_NONE: Any = np.float32(0)
+_HALF, _ONE = np.float32(0.5), np.float32(1)
+
 
 @numba.njit(inline="always", fastmath=REORDER, **OPTIONS)
 def _between(plane: NDArray[Any], x: float, y: float) -> Any:
@@ -26,25 +32,27 @@ def _between(plane: NDArray[Any], x: float, y: float) -> Any:
 
 @numba.njit(inline="always", fastmath=REORDER, **OPTIONS)
 def _patch(plane: NDArray[Any], x: float, y: float, half: int, values: NDArray[Any]) -> bool:
-    """Fill ``values`` ((2 half + 1)^2) around ``x, y``, where all of it lies within the plane; all pixels lie alike
+    """Fill ``values``, rows of `_STRIDE`, around ``x, y``, where all of it lies within the plane; all pixels lie alike
     between those of the plane."""
     height, width = plane.shape
-    if not (x >= half and y >= half and x + half <= width - 1.001 and y + half <= height - 1.001):
+    if not (x >= half and y >= half and x - half + _STRIDE <= width - 1.001 and y + half <= height - 1.001):
         return False
     row, column = int(y), int(x)
-    right, down = x - column, y - row
-    left_up, right_up = (1 - right) * (1 - down), right * (1 - down)
-    left_down, right_down = (1 - right) * down, right * down
-    side = 2 * half + 1
-    for i in range(side):
-        upper, lower = plane[row - half + i], plane[row - half + i + 1]
-        for j in range(side):
-            at = column - half + j
-            values[i * side + j] = (
-                left_up * upper[at]
-                + right_up * upper[at + 1]
-                + left_down * lower[at]
-                + right_down * lower[at + 1]
+    right, down = np.float32(x - column), np.float32(y - row)
+    left, up = _ONE - right, _ONE - down
+    left_up, right_up = left * up, right * up
+    left_down, right_down = left * down, right * down
+    for i in range(2 * half + 1):
+        # Counted from the patch's own edge, no index can be negative, which the compiler would have to look for.
+        upper = plane[row - half + i, column - half : column - half + _STRIDE + 1]
+        lower = plane[row - half + i + 1, column - half : column - half + _STRIDE + 1]
+        into = values[i * _STRIDE : (i + 1) * _STRIDE]
+        for j in range(_STRIDE):
+            into[j] = (
+                left_up * upper[j]
+                + right_up * upper[j + 1]
+                + left_down * lower[j]
+                + right_down * lower[j + 1]
             )
     return True
 
@@ -73,11 +81,17 @@ def align(
     """Fill ``shift`` (N, 2), ``covariance`` (N, 3) as xx, xy, yy, and ``agreement`` (N, 2): correlation, and
     contrast of the template; of the points from ``first`` to before ``last``."""
     side = window.shape[0]
-    radius, count = side // 2, side * side
-    T, w = np.empty(count), np.empty(count)
-    gx, gy = np.empty(count), np.empty(count)
-    here, known, wider = np.empty(count), np.empty(count), np.empty((side + 2) ** 2)
+    radius, count = side // 2, side * _STRIDE
+    # Single precision: twice as many pixels fit into a vector, and grey values have eight bits.
+    T, w, share = np.zeros(count, np.float32), np.zeros(count, np.float32), np.zeros(count, np.float32)
+    gx, gy = np.zeros(count, np.float32), np.zeros(count, np.float32)
+    here, known = np.zeros(count, np.float32), np.zeros(count, np.float32)
+    wider = np.zeros((side + 3) * _STRIDE, np.float32)
+    for i in range(side):
+        for j in range(side):
+            share[i * _STRIDE + j] = window[i, j]
     total = window.sum()
+    spread = np.float32(9 * noise * noise)
     height, width = template.shape
     for p in range(first, last):
         px, py = xy[p, 0], xy[p, 1]
@@ -86,19 +100,21 @@ def align(
         agreement[p, 0], agreement[p, 1] = -1.0, 0.0
         if not (-radius < px < width + radius and -radius < py < height + radius):
             continue
-        cover, mean = 0.0, 0.0
+        cover, mean = _NONE, _NONE
         if _patch(template, px, py, radius + 1, wider) and _patch(weight, px, py, radius, known):
-            for i in range(side):
-                for j in range(side):
-                    k, at = i * side + j, (i + 1) * (side + 2) + j + 1
-                    w[k] = window[i, j] * known[k]
-                    T[k] = wider[at]
-                    gx[k] = 0.5 * (wider[at + 1] - wider[at - 1])
-                    gy[k] = 0.5 * (wider[at + side + 2] - wider[at - side - 2])
+            # One array a loop: of more the compiler does not find out that they lie apart.
+            for k in range(count):
+                w[k] = share[k] * known[k]
+            for k in range(count):
+                T[k] = wider[k + _STRIDE + 1]
+            for k in range(count):
+                gx[k] = _HALF * (wider[k + _STRIDE + 2] - wider[k + _STRIDE])
+            for k in range(count):
+                gy[k] = _HALF * (wider[k + 2 * _STRIDE + 1] - wider[k + 1])
         else:
             for i in range(side):
                 for j in range(side):
-                    k = i * side + j
+                    k = i * _STRIDE + j
                     x, y = px + j - radius, py + i - radius
                     within = 1.0 <= x <= width - 2.0 and 1.0 <= y <= height - 2.0
                     w[k] = window[i, j] * _between(weight, x, y) if within else 0.0
@@ -110,48 +126,51 @@ def align(
             mean += w[k] * T[k]
         if cover < least_cover * total:
             continue
-        mean /= cover
-        variance, mean_x, mean_y = 0.0, 0.0, 0.0
+        mean = mean / cover
+        variance, mean_x, mean_y = _NONE, _NONE, _NONE
+        part = _ONE / cover
         for k in range(count):
-            w[k] /= cover
+            w[k] *= part
+        for k in range(count):
             T[k] -= mean
+        for k in range(count):
             variance += w[k] * T[k] * T[k]
             mean_x += w[k] * gx[k]
             mean_y += w[k] * gy[k]
         agreement[p, 1] = sqrt(variance)
         for k in range(count):
             gx[k] -= mean_x
+        for k in range(count):
             gy[k] -= mean_y
         dx, dy = 0.0, 0.0
-        step = 0
-        while True:
+        for _ in range(steps):
             if not _patch(image, px + dx, py + dy, radius, here):
                 for i in range(side):
                     for j in range(side):
-                        here[i * side + j] = _between(image, px + j - radius + dx, py + i - radius + dy)
-            mean_here = 0.0
+                        here[i * _STRIDE + j] = _between(image, px + j - radius + dx, py + i - radius + dy)
+            mean_here, together = _NONE, _NONE
             for k in range(count):
                 mean_here += w[k] * here[k]
-            variance_here, together = 0.0, 0.0
+                together += w[k] * here[k] * T[k]  # whatever the mean: that of T is 0
+            gain = np.float32(min(max(together / (variance + 1e-6), 0.4), 2.5))
+            sxx, sxy, syy, gradient_x, gradient_y, residual = _NONE, _NONE, _NONE, _NONE, _NONE, _NONE
             for k in range(count):
-                here[k] -= mean_here
-                variance_here += w[k] * here[k] * here[k]
-                together += w[k] * here[k] * T[k]
-            gain = min(max(together / (variance + 1e-6), 0.4), 2.5)
-            hxx, hxy, hyy, bx, by, residual = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-            for k in range(count):
-                r = here[k] - gain * T[k]
-                ax, ay = gain * gx[k], gain * gy[k]
-                robust = 9 * noise * noise / (9 * noise * noise + r * r)
+                r = here[k] - mean_here - gain * T[k]
+                robust = spread / (spread + r * r)
                 u = w[k] * robust * robust
-                hxx += u * ax * ax
-                hxy += u * ax * ay
-                hyy += u * ay * ay
-                bx -= u * ax * r
-                by -= u * ay * r
+                ux, uy = u * gx[k], u * gy[k]
+                sxx += ux * gx[k]
+                sxy += ux * gy[k]
+                syy += uy * gy[k]
+                gradient_x += ux * r
+                gradient_y += uy * r
                 residual += w[k] * r * r
-            if step < 0:
-                break
+            hxx, hxy, hyy = (
+                gain * gain * np.float64(sxx),
+                gain * gain * np.float64(sxy),
+                gain * gain * np.float64(syy),
+            )
+            bx, by = -gain * np.float64(gradient_x), -gain * np.float64(gradient_y)
             hold = noise * noise / (cover * prior * prior) * 6
             bx -= hold * dx
             by -= hold * dy
@@ -163,9 +182,11 @@ def align(
                 sx, sy = sx / length, sy / length
             dx += sx
             dy += sy
-            step += 1
-            if length < 0.02 or step >= steps:
-                step = -1  # once more, for what is told of the end
+            if length < 0.02:
+                break  # what was found out so near to the end is told of it
+        variance_here = _NONE
+        for k in range(count):
+            variance_here += w[k] * (here[k] - mean_here) * (here[k] - mean_here)
         shift[p, 0], shift[p, 1] = dx, dy
         agreement[p, 0] = together / sqrt((variance + 4) * (variance_here + 4))
         error = max(noise * noise, residual) / cover * 6

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from math import floor
 from typing import Any
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.rendering.kernels.compilation import OPTIONS, kernel
+from tracking3d.rendering.kernels.compilation import OPTIONS, REORDER, kernel
 
 
 @numba.njit(inline="always", **OPTIONS)
-def _between(plane: NDArray[Any], x: float, y: float) -> Any:
+def _between(plane: NDArray[Any], row: int, column: int, down: float, right: float) -> Any:
     """Between pixels, 0 beyond the border."""
-    row, column = floor(y), floor(x)
-    right, down = x - column, y - row
     height, width = plane.shape
     value = 0.0
     for i in range(2):
@@ -29,7 +26,8 @@ def _between(plane: NDArray[Any], x: float, y: float) -> Any:
 
 @kernel(
     "void(float32[:,::1], float32[:,::1], float64, float64[::1], float64[:,::1], float64[::1], float32[:,::1],"
-    " float32[:,::1], float32[:,::1], float64, float64, float32[:,::1], float32[:,::1], int64, int64)"
+    " float32[:,::1], float32[:,::1], float64, float64, float32[:,::1], float32[:,::1], int64, int64)",
+    fastmath=REORDER,
 )
 def warp(
     inverse_depth: NDArray[Any],
@@ -61,25 +59,66 @@ def warp(
         first, last: Rows.
     """
     fx, fy, cx, cy = intrinsics
-    source_fx, source_fy, source_cx, source_cy = source_intrinsics
     height, width = source_image.shape
-    T, point = T_source_target, np.empty(3)
+    T = T_source_target
+    # Homogeneous pixels of the other view are P (x, y, 1) + q / depth: what is common to a row is added up once.
+    P, q = np.empty((3, 3)), np.empty(3)
+    for j in range(4):
+        across, along, ahead = T[0, j], T[1, j], T[2, j]
+        across = source_intrinsics[0] * across + source_intrinsics[2] * ahead
+        along = source_intrinsics[1] * along + source_intrinsics[3] * ahead
+        if j < 3:
+            P[0, j], P[1, j], P[2, j] = across, along, ahead
+        else:
+            q[0], q[1], q[2] = across, along, ahead
+    for i in range(3):
+        P[i, 2] -= P[i, 0] * cx / fx + P[i, 1] * cy / fy
+        P[i, 0] /= fx
+        P[i, 1] /= fy
     for y in range(first, last):
+        row_x = P[0, 1] * y + P[0, 2]
+        row_y = P[1, 1] * y + P[1, 2]
+        row_z = P[2, 1] * y + P[2, 2]
         for x in range(inverse_depth.shape[1]):
             warped[y, x] = known[y, x] = 0.0
-            if not (beyond[y, x] < reach and inverse_depth[y, x] > 0):
+            near = np.float64(inverse_depth[y, x])
+            if not (beyond[y, x] < reach and near > 0):
                 continue
-            depth = 1 / np.float64(inverse_depth[y, x])
-            across, along = (x - cx) / fx * depth, (y - cy) / fy * depth
-            for i in range(3):
-                point[i] = T[i, 0] * across + T[i, 1] * along + T[i, 2] * depth + T[i, 3]
-            if not point[2] > nearest:
+            z = P[2, 0] * x + row_z + near * q[2]  # over the depth in the view that is written
+            if not z > nearest * near:
                 continue
-            u = source_fx * point[0] / point[2] + source_cx
-            v = source_fy * point[1] / point[2] + source_cy
+            over = 1 / z
+            u = (P[0, 0] * x + row_x + near * q[0]) * over
+            v = (P[1, 0] * x + row_y + near * q[1]) * over
             if not (-1 < u < width and -1 < v < height):
                 continue
-            warped[y, x] = _between(source_image, u, v)
-            drawn = _between(source_inverse_depth, u, v)
-            if drawn > 0 and point[2] < 1 / drawn + tolerance:
-                known[y, x] = _between(source_mask, u, v)
+            # Counted from one pixel further, cutting off the fraction is rounding down.
+            column, row = int(u + 1) - 1, int(v + 1) - 1
+            right, down = u - column, v - row
+            if column >= 0 and row >= 0 and column + 1 < width and row + 1 < height:
+                a, b = (1 - right) * (1 - down), right * (1 - down)
+                c, d = (1 - right) * down, right * down
+                warped[y, x] = (
+                    a * source_image[row, column]
+                    + b * source_image[row, column + 1]
+                    + c * source_image[row + 1, column]
+                    + d * source_image[row + 1, column + 1]
+                )
+                drawn = (
+                    a * source_inverse_depth[row, column]
+                    + b * source_inverse_depth[row, column + 1]
+                    + c * source_inverse_depth[row + 1, column]
+                    + d * source_inverse_depth[row + 1, column + 1]
+                )
+                if drawn > 0 and z * drawn < near * (1 + tolerance * drawn):
+                    known[y, x] = (
+                        a * source_mask[row, column]
+                        + b * source_mask[row, column + 1]
+                        + c * source_mask[row + 1, column]
+                        + d * source_mask[row + 1, column + 1]
+                    )
+            else:
+                warped[y, x] = _between(source_image, row, column, down, right)
+                drawn = _between(source_inverse_depth, row, column, down, right)
+                if drawn > 0 and z * drawn < near * (1 + tolerance * drawn):
+                    known[y, x] = _between(source_mask, row, column, down, right)
