@@ -229,7 +229,7 @@ def adjust(
     iterations: int = 20,
     converged: float = 1e-7,
     point_prior: FloatArray | None = None,
-    point_prior_weight: float | FloatArray = 0.0,
+    point_prior_weight: float = 0.0,
 ) -> Structure:
     """The poses and points of least robust reprojection error near a start; never worse than the start.
 
@@ -249,8 +249,8 @@ def adjust(
         iterations: The most steps that are tried.
         converged: Share of the cost that a step has to gain for another one to follow.
         point_prior: ``(N, 3)`` where the points should be, for instance on a mesh; nan for those that are free.
-        point_prior_weight: What a point at distance 1 from its place costs, one number or ``(N,)``; an observation at
-            a residual of one scale costs ``log 2``.
+        point_prior_weight: What a point at distance 1 from its place costs; an observation at a residual of one
+            scale costs ``log 2``.
 
     Raises:
         ValueError: If shapes do not fit.

@@ -11,7 +11,6 @@ from patterns import disc
 from solid_points import map_with_points, pixels_of
 from turned_solid import CAMERA, SIZE, degrees_apart, turned, turned_map
 
-from tracking3d.estimation.online import mapping
 from tracking3d.estimation.online.keypoints import Keypoints
 from tracking3d.estimation.online.mapping import (
     lift,
@@ -267,30 +266,6 @@ def test_refining_puts_disturbed_poses_right_and_keeps_the_first():
     # Positions that take no part stay as they are.
     some = refine_map(known, CAMERA, [0, 1], weights=FitWeights(), prior=20.0)
     assert some.keyframes[3] is known.keyframes[3]
-
-
-@pytest.mark.parametrize(("turn", "believed_less"), [(10.0, True), (5.0, False)])
-def test_a_surface_that_is_wrong_on_one_side_bends_less_once_turning_tells_depth(
-    turn, believed_less, monkeypatch
-):
-    """As one that was drawn from masks which lack a side."""
-    true = map_with_points([n * turn for n in (-2, -1, 0, 1, 2)])
-    dented = true.vertices.clone()
-    dented[dented[:, 0] > 0.2, 2] += 0.3
-    known = replace(true, vertices=dented)
-
-    def off() -> float:
-        found = refine_map(
-            known, CAMERA, list(range(5)), weights=FitWeights(), prior=20.0, bundle_iterations=30, rounds=0
-        )
-        assert torch.equal(found.vertices, dented)
-        return float(np.median(np.linalg.norm(found.landmarks - true.landmarks, axis=1)))
-
-    now = off()
-    monkeypatch.setattr(mapping, "_belief_in", lambda places, points, radius: np.ones(len(points)))
-    before = off()
-    assert before > 0.01  # it does bend
-    assert now < 0.5 * before if believed_less else now == pytest.approx(before)
 
 
 def test_a_point_that_does_not_move_with_the_others_is_no_longer_shown():

@@ -26,10 +26,6 @@ _SAME_PLACE = 1.5  # pixels within which a keypoint is a point that is followed
 _FEWEST_WITNESSES = 12
 _FEWEST_BUNDLED = 8
 _MOST_BUNDLED = 1500
-_TELLS_DEPTH = 30.0
-"""Degrees between keyframes from which on landmarks know depth better than a surface that they have left; with less,
-the surface keeps them from bending in depth."""
-_APART = 0.05  # distance from the surface, in radii of the object, at which it is half believed
 _FINER = 4  # times, that a surface is drawn which stays as it is
 _SEARCH = 12.0  # pixels around its projection within which a landmark may be found again
 
@@ -228,11 +224,9 @@ def _bundled(
         return known
     tracks, start = tracks_of(views, names), structure_of(known, views, names)
     places = surface_places(known, camera, views, names)
-    turned = max(viewing_angle(views[0].pose, view.pose) for view in views)
-    held = prior if turned < _TELLS_DEPTH else prior * _belief_in(places, start.points, known.radius)
     found = adjust(
         tracks, camera.K, start, fixed=1, scale=scale, iterations=iterations,
-        point_prior=places, point_prior_weight=held,
+        point_prior=places, point_prior_weight=prior,
     )  # fmt: skip
     landmarks = known.landmarks.copy()
     sound = np.isfinite(found.points).all(1)
@@ -249,16 +243,6 @@ def _bundled(
             keyframes[position] = replace(view, points=view.points.only(~np.isin(view.points.landmark, bad)))
     # Landmarks seen once move with the surface.
     return replace(known, landmarks=landmarks, keyframes=tuple(keyframes))
-
-
-def _belief_in(places: FloatArray, points: FloatArray, radius: float) -> FloatArray:
-    """``(N,)`` in [0, 1], how far to believe the surface where landmarks ``(N, 3)`` have left it.
-
-    The surface comes from masks as well; one that misses a side would bend all landmarks of that side, and their poses
-    with them.
-    """
-    apart = np.nan_to_num(np.linalg.norm(points - places, axis=1))
-    return np.asarray(1 / (1 + (apart / (_APART * radius)) ** 2))
 
 
 def shared_landmarks(known: ObjectMap, views: list[View]) -> NDArray[np.int64]:
