@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import trimesh
-from scipy.spatial import HalfspaceIntersection
+from solid_of_clip import mesh_of
 
 from tracking3d.points.answers import PointAnswers
 from tracking3d.points.causal import KEPT, CausalPoints
@@ -26,9 +25,7 @@ def clip() -> SyntheticClip:
 
 @pytest.fixture(scope="module")
 def surface(clip):
-    planes = np.column_stack([clip.surface.normals, -clip.surface.offsets])
-    solid = trimesh.convex.convex_hull(HalfspaceIntersection(planes, np.zeros(3)).intersections)
-    return np.asarray(solid.vertices), np.asarray(solid.faces)
+    return mesh_of(clip)
 
 
 @pytest.fixture(scope="module")
