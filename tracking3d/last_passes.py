@@ -37,6 +37,22 @@ class Foreseen:
     masks: Mapping[int, bytes]
 
 
+def placed(answer: FrameRecord, look: SecondLook, image: Image, mask: NDArray[np.bool_]) -> FrameRecord:
+    """A frame's answer with the pose that all frames together say; a causal one as it is.
+
+    Args:
+        answer: Of the frame.
+        look: What all frames say together, settled.
+        image: ``(H, W, 3)`` the frame.
+        mask: ``(H, W)`` the answer's.
+    """
+    if not answer.refined:
+        return answer
+    T_cam_obj, support = look.pose(answer, image, mask)
+    judged = () if support is None else supported_answer(answer, support)
+    return put_right(answer, T_cam_obj, *judged)
+
+
 class LastPasses:
     """Puts right what a final refinement has answered, from all frames together.
 
@@ -124,10 +140,7 @@ class LastPasses:
         """Put a frame's pose right; its mask ``(H, W)``."""
         answer = self._refinement.answer(frame.index)
         mask = self._refinement.mask(answer)
-        if answer.refined:
-            T_cam_obj, support = self._look.pose(answer, frame.image, mask)
-            judged = () if support is None else supported_answer(answer, support)
-            self._refinement.put(put_right(answer, T_cam_obj, *judged))
+        self._refinement.put(placed(answer, self._look, frame.image, mask))
         return mask
 
     def _draw_foreseen(

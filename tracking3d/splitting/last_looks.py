@@ -17,15 +17,14 @@ from numpy.typing import NDArray
 
 from tracking3d.evidence.order import REACH
 from tracking3d.frames import Frame
+from tracking3d.last_passes import placed
 from tracking3d.reconstruction.second_look import SecondLook
 from tracking3d.reconstruction.second_masks import Decision, Masked, SecondMasks
-from tracking3d.reconstruction.support import supported_answer
 from tracking3d.rendering.backend import shared_among
 from tracking3d.results import layout
 from tracking3d.results.files import mask_file, read_mask
 from tracking3d.results.probabilities import write_probability
 from tracking3d.results.records import FrameRecord
-from tracking3d.results.refinement_writer import put_right
 from tracking3d.results.run_reader import RunReader, read_records
 from tracking3d.side_by_side import read_ahead
 from tracking3d.splitting.joined_run import take_second_answers
@@ -105,16 +104,12 @@ def place(tell: Tell, job: Placing) -> list[FrameRecord]:
     Raises:
         Tracking3dError: If something cannot be read.
     """
-    folder, placed = job.job.folder, list[FrameRecord]()
+    folder = job.job.folder
     answers = _answers(folder)
-    for frame in _frames(job.job.source, job.job.selection, answers):
-        answer = answers[frame.index]
-        if answer.refined:
-            T_cam_obj, support = job.look.pose(answer, frame.image, _mask(folder, answer, frame))
-            judged = () if support is None else supported_answer(answer, support)
-            answer = put_right(answer, T_cam_obj, *judged)
-        placed.append(answer)
-    return placed
+    return [
+        placed(answers[frame.index], job.look, frame.image, _mask(folder, answers[frame.index], frame))
+        for frame in _frames(job.job.source, job.job.selection, answers)
+    ]
 
 
 def put_together(tell: Tell, job: Weighing) -> SecondMasks:
