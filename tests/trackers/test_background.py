@@ -12,7 +12,6 @@ from tracking3d.trackers.background import BackgroundMemory
 
 SHAPE = (90, 120)
 WINDOW = Window(20, 5, 80, 80)
-STAY = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
 def picture(seed: int = 0) -> np.ndarray:
@@ -71,7 +70,7 @@ def test_the_memory_moves_with_the_camera(right: int, down: int) -> None:
     shift = np.array([[1, 0, right], [0, 1, down]], float)
     moved = cv2.warpAffine(picture(), shift, SHAPE[::-1], borderMode=cv2.BORDER_REPLICATE)
     unmoved = kept.change(moved, WINDOW)
-    kept.move(np.array([[1, 0, -right], [0, 1, -down]], float), WINDOW, WINDOW)
+    kept.move(np.array([[1, 0, -right], [0, 1, -down], [0, 0, 1]], float), WINDOW, WINDOW)
     inner = np.s_[12:-12, 12:-12]
     assert kept.change(moved, WINDOW)[inner].max() < -0.4
     assert (unmoved > 0).mean() > 0.1
@@ -80,7 +79,7 @@ def test_the_memory_moves_with_the_camera(right: int, down: int) -> None:
 def test_a_motion_of_crops_alone_is_none_of_the_camera() -> None:
     kept = memory(picture())
     elsewhere = Window(26, 9, 80, 80)
-    kept.move(np.array([[1, 0, 6], [0, 1, 4]], float), WINDOW, elsewhere)
+    kept.move(np.array([[1, 0, 6], [0, 1, 4], [0, 0, 1]], float), WINDOW, elsewhere)
     np.testing.assert_allclose(kept.change(picture(), WINDOW), -0.5)
 
 

@@ -38,19 +38,19 @@ class BackgroundMemory:
         """Follow the camera.
 
         Args:
-            present_to_last: ``(2, 3)`` similarity from the present crop's pixels to the last crop's.
+            present_to_last: ``(3, 3)`` homography from the present crop's pixels to the last crop's.
             last: The last crop.
             present: The present crop.
         """
-        matrix = _crop_to_frame(last) @ np.vstack([present_to_last, [0, 0, 1]])
-        matrix = (matrix @ np.linalg.inv(_crop_to_frame(present)))[:2]
+        matrix = _crop_to_frame(last) @ present_to_last
+        matrix = matrix @ np.linalg.inv(_crop_to_frame(present))
         sides = [present.left, present.top], [present.left + present.side, present.top + present.side]
         corners = np.array([sides], np.float64)
-        if np.abs(cv2.transform(corners, matrix) - corners).max() < _STILL:
+        if np.abs(cv2.perspectiveTransform(corners, matrix) - corners).max() < _STILL:
             return
         height, width = self._frames.shape
         self._mean, self._variance, self._frames = (
-            cv2.warpAffine(one, matrix, (width, height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+            cv2.warpPerspective(one, matrix, (width, height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
             for one in (self._mean, self._variance, self._frames)
         )
 

@@ -15,6 +15,12 @@ MAX_ROUND_TRIP = 1.5
 """Flow is trusted where forward and backward flow cancel to within this many pixels."""
 
 _STRIDE = 3  # models of motion are fitted on every third pixel: enough, and nine times cheaper
+_LEAST = 12  # pixels that a model is fitted on
+_AGREEING = 1.5  # pixels
+_LAST_ROW = (0.0, 0.0, 1.0)
+_MORE = 1.1
+"""Times as many pixels have to agree with a homography as with a similarity. A floor that a camera walks over moves as
+no similarity does; a still background does, and whatever else moves before it would bend a homography."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,8 +32,9 @@ class MaskMotion:
         by_flow: ``(S, S)`` float32 in [0, 1], the last mask warped by the flow.
         by_similarity: ``(S, S)`` float32 in [0, 1], the last mask moved by one similarity.
         cue: ``(S, S)`` float32 pixels: how much better a pixel's motion fits the object's affine motion than
-            the background's similarity; 0 where it cannot be told.
-        background: ``(2, 3)``, the background's similarity from present to last pixels; None where it cannot be told.
+            the background's; 0 where it cannot be told.
+        background: ``(3, 3)``, the background's homography from present to last pixels, a similarity where that
+            explains as much; None where it cannot be told.
     """
 
     source: NDArray[np.float32]
@@ -63,7 +70,7 @@ def follow_mask(
     inside = by_flow > 0.5
     fit = _fit(cv2.estimateAffinePartial2D, source, target, inside & reliable) if similarity else None
     by_similarity = by_flow if fit is None else cv2.warpAffine(mask, fit, mask.shape[::-1])
-    background = _fit(cv2.estimateAffinePartial2D, target, source, ~inside & reliable)
+    background = _background_motion(target, source, ~inside & reliable)
     object_ = _fit(cv2.estimateAffine2D, target, source, inside & reliable)
     cue = _motion_cue(present, source, target, background, object_, reliable)
     return MaskMotion(source, by_flow, by_similarity, cue, background)
@@ -79,21 +86,40 @@ def _motion_cue(
 ) -> NDArray[np.float32]:
     if background is None or object_ is None:
         return np.zeros(grey.shape, np.float32)
-    cue = _residual(background, target, source) - _residual(object_, target, source)
+    cue = _residual(background, target, source) - _residual(np.vstack([object_, _LAST_ROW]), target, source)
     gradient = cv2.magnitude(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
     texture = 1.0 - np.exp(-cv2.blur(gradient, (9, 9)) / 40.0)  # flow in flat regions is interpolation
     return np.clip(cue, -2.0, 2.0) * texture * reliable
 
 
+def _background_motion(
+    target: NDArray[np.float32], source: NDArray[np.float32], selected: NDArray[np.bool_]
+) -> NDArray[np.float64] | None:
+    """``(3, 3)`` from present to last pixels ``(S, S, 2)``, by those that are selected; None where they are too few."""
+    pick = selected[::_STRIDE, ::_STRIDE]
+    if np.count_nonzero(pick) < _LEAST:
+        return None
+    here, there = (points[::_STRIDE, ::_STRIDE][pick] for points in (target, source))
+    similarity, agreeing = cv2.estimateAffinePartial2D(
+        here, there, method=cv2.RANSAC, ransacReprojThreshold=_AGREEING, maxIters=500
+    )
+    wanted = 0.0 if similarity is None else _MORE * np.count_nonzero(agreeing)
+    if wanted <= len(here):
+        homography, agreeing = cv2.findHomography(here, there, cv2.RANSAC, _AGREEING, maxIters=500)
+        if homography is not None and np.count_nonzero(agreeing) >= wanted:
+            return homography
+    return None if similarity is None else np.vstack([similarity, _LAST_ROW])
+
+
 def _fit(estimate, source, target, selected) -> NDArray[np.float64] | None:  # type: ignore[no-untyped-def]
     pick = selected[::_STRIDE, ::_STRIDE]
-    if np.count_nonzero(pick) < 12:
+    if np.count_nonzero(pick) < _LEAST:
         return None
     matrix, _ = estimate(
         source[::_STRIDE, ::_STRIDE][pick],
         target[::_STRIDE, ::_STRIDE][pick],
         method=cv2.RANSAC,
-        ransacReprojThreshold=1.5,
+        ransacReprojThreshold=_AGREEING,
         maxIters=500,
     )
     return matrix
@@ -102,4 +128,5 @@ def _fit(estimate, source, target, selected) -> NDArray[np.float64] | None:  # t
 def _residual(
     matrix: NDArray[np.float64], points: NDArray[np.float32], images: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    return np.linalg.norm(cv2.transform(points, matrix) - images, axis=2).astype(np.float32)
+    moved = cv2.perspectiveTransform(points, matrix)
+    return np.linalg.norm(moved - images, axis=2).astype(np.float32)
