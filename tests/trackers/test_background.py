@@ -18,11 +18,21 @@ def picture(seed: int = 0) -> np.ndarray:
     return clutter(seed, SHAPE, (20, 40, 60), (200, 160, 220)).round().astype(np.uint8)
 
 
-def memory(image: np.ndarray, background: np.ndarray | None = None, frames: int = 4) -> BackgroundMemory:
+def everywhere(value: float = 1.0) -> np.ndarray:
+    return np.full((80, 80), value, np.float32)
+
+
+def nothing_known() -> BackgroundMemory:
+    return BackgroundMemory(picture(), np.zeros(SHAPE, bool))
+
+
+def memory(
+    image: np.ndarray, background: np.ndarray | None = None, frames: int = 4, proof: float = 1.0
+) -> BackgroundMemory:
     background = np.ones((80, 80), bool) if background is None else background
-    kept = BackgroundMemory(image.shape)
+    kept = nothing_known()
     for _ in range(frames):
-        kept.learn(image, WINDOW, background)
+        kept.learn(image, WINDOW, background, everywhere(proof))
     return kept
 
 
@@ -45,9 +55,9 @@ def test_noise_that_was_seen_is_no_change() -> None:
     def noisy() -> np.ndarray:
         return np.clip(picture() + rng.normal(0, 12, (*SHAPE, 3)), 0, 255).astype(np.uint8)
 
-    kept = BackgroundMemory(SHAPE)
+    kept = nothing_known()
     for _ in range(15):
-        kept.learn(noisy(), WINDOW, np.ones((80, 80), bool))
+        kept.learn(noisy(), WINDOW, np.ones((80, 80), bool), everywhere())
     assert (kept.change(noisy(), WINDOW) < 0).mean() > 0.99
 
 
@@ -62,6 +72,63 @@ def test_where_the_object_has_always_been_nothing_is_known() -> None:
 def test_what_is_known_for_one_frame_counts_less_than_what_is_known_for_many() -> None:
     once, often = (memory(picture(), frames=n).change(picture(), WINDOW) for n in (1, 6))
     np.testing.assert_allclose(once, often / 3)
+
+
+def test_what_lay_beside_the_object_in_the_first_frame_is_known_everywhere() -> None:
+    beside = np.ones(SHAPE, bool)
+    beside[30:60, 40:80] = False
+    kept = BackgroundMemory(picture(), beside)
+    image = picture()
+    image[:20, :20] = 255 - image[:20, :20] // 2
+    unchanged = kept.unchanged(image)
+    np.testing.assert_array_equal(unchanged[30:60, 40:80], 0)
+    assert unchanged[:18, :18].max() < 0.1
+    beside[:22, :22] = False
+    np.testing.assert_allclose(unchanged[beside], 1)
+
+
+def test_what_nothing_proves_is_not_held_for_background() -> None:
+    np.testing.assert_array_equal(memory(picture(), proof=0.0).change(picture(), WINDOW), 0)
+
+
+def test_proof_adds_up_frame_by_frame_and_can_be_taken_back() -> None:
+    kept = memory(picture(), frames=4, proof=0.125)
+    np.testing.assert_allclose(kept.change(picture(), WINDOW), -0.25)
+    for _ in range(2):
+        kept.learn(picture(), WINDOW, np.ones((80, 80), bool), everywhere(-0.125))
+    np.testing.assert_allclose(kept.change(picture(), WINDOW), -0.125)
+
+
+def with_visitor(left: int) -> np.ndarray:
+    """The picture with something before it, 20 pixels wide."""
+    image = picture()
+    image[40:60, left : left + 20] = clutter(7, (20, 20), (230, 20, 20), (255, 90, 60))
+    return image
+
+
+def test_what_passes_outside_the_mask_does_not_become_background() -> None:
+    kept = memory(picture(), frames=10)
+    for step in range(6):
+        kept.learn(with_visitor(40 + 2 * step), WINDOW, np.ones((80, 80), bool), everywhere())
+    change = kept.change(with_visitor(52), WINDOW)
+    assert change[37:53, 34:50].min() > 0.9  # the visitor, but for its edge
+    assert change[37:53, 20:30].max() < -0.4  # where it was
+
+
+def test_what_comes_to_stay_becomes_background() -> None:
+    kept = memory(picture(), frames=10)
+    for _ in range(30):
+        kept.learn(with_visitor(50), WINDOW, np.ones((80, 80), bool), everywhere())
+    assert kept.change(with_visitor(50), WINDOW).max() < -0.4
+
+
+def test_a_camera_that_is_not_followed_is_forgotten_unless_it_stood_still() -> None:
+    kept = memory(picture())
+    kept.lose()
+    np.testing.assert_allclose(kept.change(picture(), WINDOW), -0.5)
+    kept.move(np.array([[1, 0, 2], [0, 1, 0], [0, 0, 1]], float), WINDOW, WINDOW)
+    kept.lose()
+    np.testing.assert_array_equal(kept.change(picture(), WINDOW), 0)
 
 
 @pytest.mark.parametrize(("right", "down"), [(3, 0), (-2, 5)])
@@ -96,7 +163,7 @@ def test_what_is_forgotten_is_not_known() -> None:
     "window", [Window(-40, -40, 80, 64), Window(100, 70, 60, 64), Window(300, 300, 20, 64)]
 )
 def test_windows_beyond_the_frame_are_answered(window: Window) -> None:
-    kept = BackgroundMemory(SHAPE)
-    kept.learn(picture(), window, np.ones((64, 64), bool))
+    kept = nothing_known()
+    kept.learn(picture(), window, np.ones((64, 64), bool), np.ones((64, 64), np.float32))
     change = kept.change(picture(), window)
     assert change.shape == (64, 64) and change.max() <= 0

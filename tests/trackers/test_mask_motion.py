@@ -58,6 +58,13 @@ def test_what_lies_on_the_floor_is_told_from_what_moves_with_the_object() -> Non
     assert motion.cue[inside].mean() > 0.3
 
 
+@pytest.mark.parametrize(("right", "down"), [(0, 0), (5, -3)])
+def test_a_background_that_stands_still_does_so_to_the_last_digit(right: int, down: int) -> None:
+    still = np.array([[1.0, 0, right], [0, 1, down], [0, 0, 1]])
+    motion = follow_mask(*crops(still), shift=(right, down))
+    np.testing.assert_array_equal(motion.background, still)
+
+
 @pytest.mark.parametrize("background", [np.eye(3), np.array([[1.02, 0.01, 3], [-0.01, 1.02, -2], [0, 0, 1]])])
 def test_where_a_similarity_explains_as_much_it_is_one(background: np.ndarray) -> None:
     motion = follow_mask(*crops(background))
@@ -75,6 +82,15 @@ def test_what_else_moves_before_a_still_background_does_not_bend_it() -> None:
     motion = follow_mask(last, present, mask)
     assert motion.background is not None
     assert off(motion.background, np.eye(3)) < 0.5
+
+
+def test_what_lies_beyond_the_frame_says_nothing() -> None:
+    last, present, mask = crops(np.eye(3))
+    in_frame = np.ones((SIZE, SIZE), bool)
+    in_frame[:, :48] = False
+    last[:, :48], present[:, :48] = last[:, 48:49], grey(5)[:, :48]
+    motion = follow_mask(last, present, mask, in_frame=in_frame)
+    np.testing.assert_array_equal(motion.background, np.eye(3))
 
 
 def test_where_nothing_is_seen_of_the_background_its_motion_is_not_known() -> None:

@@ -37,6 +37,14 @@ def test_the_background_alone_is_not_much_like_the_object(known) -> None:
     assert found is None or found[2] < 0.3
 
 
+def test_what_was_there_without_the_object_is_not_it(known) -> None:
+    frames, truth = moving_shape(1)
+    there = truth[0].astype(np.float32)
+    assert find_by_colours(frames[0].image, *known, 0.45, 224, there) is None
+    mask, window, _ = find_by_colours(frames[0].image, *known, 0.45, 224, 1 - there)
+    assert iou(paste(mask, window, SIZE) > 0.5, truth[0]) > 0.85
+
+
 @pytest.mark.parametrize("factor", [20, 1 / 20])
 def test_something_of_another_size_is_not_the_object(known, factor) -> None:
     frames, _ = moving_shape(1)

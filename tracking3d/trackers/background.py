@@ -1,7 +1,9 @@
 """What lies around and behind the object: remembered pixel by pixel, and moved as the camera moves.
 
 A running Gaussian average of every pixel outside the mask (Wren et al., "Pfinder: real-time tracking of the human
-body", PAMI 1997). What differs from it has come in front of it: a new side of the object, or a hand.
+body", PAMI 1997). What differs from it has come in front of it: a new side of the object, or a hand. What a mask misses
+of the object must not be taken for background: a pixel counts when it lay outside all that may be the object, or has
+moved as the background does.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ from tracking3d.geometry.camera import Window
 
 _RATE = 0.1  # at which a pixel that is known well follows its values
 _FAMILIAR = 3.0  # frames until a pixel's memory has full weight
+_LASTING = 20.0  # frames that are remembered: as many that contradict them undo it
 _NOISE, _LEAST_NOISE = (8.0, 3.6)  # standard deviation in grey levels, at first and at least
 _CHANGED = 6.0  # squared difference, in variances, at which a pixel may or may not have changed
 _UNCHANGED_WEIGHT = 0.5  # what was mistaken for background once does not change either
@@ -25,14 +28,17 @@ class BackgroundMemory:
     """The background of one object, in the pixels of the latest frame.
 
     Args:
-        shape: ``(H, W, ...)`` of the frames.
+        image: ``(H, W, 3)`` RGB, the first frame.
+        beside: ``(H, W)`` what surely is not the object there.
     """
 
-    def __init__(self, shape: tuple[int, ...]) -> None:
-        height, width = shape[:2]
-        self._mean = np.zeros((height, width, 3), np.float32)
+    def __init__(self, image: Image, beside: NDArray[np.bool_]) -> None:
+        height, width = beside.shape
+        self._mean = image.astype(np.float32)
         self._variance = np.full((height, width), _NOISE**2, np.float32)
-        self._frames = np.zeros((height, width), np.float32)
+        self._frames = beside.astype(np.float32)
+        self._proven = beside.astype(np.float32)
+        self._stands_still = True
 
     def move(self, present_to_last: NDArray[np.float64], last: Window, present: Window) -> None:
         """Follow the camera.
@@ -48,11 +54,17 @@ class BackgroundMemory:
         corners = np.array([sides], np.float64)
         if np.abs(cv2.perspectiveTransform(corners, matrix) - corners).max() < _STILL:
             return
+        self._stands_still = False
         height, width = self._frames.shape
-        self._mean, self._variance, self._frames = (
+        self._mean, self._variance, self._frames, self._proven = (
             cv2.warpPerspective(one, matrix, (width, height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
-            for one in (self._mean, self._variance, self._frames)
+            for one in (self._mean, self._variance, self._frames, self._proven)
         )
+
+    def lose(self) -> None:
+        """The camera is not followed in this frame; all is forgotten but of one that has stood still so far."""
+        if not self._stands_still:
+            self._frames[:] = 0
 
     def change(self, image: Image, window: Window) -> NDArray[np.float32]:
         """``(S, S)`` in [-0.5, 1]: has a pixel changed against the background? 0 where that is not known.
@@ -61,36 +73,65 @@ class BackgroundMemory:
         """
         cue = np.zeros((window.side, window.side), np.float32)
         here, within = _overlap(window, self._frames.shape)
-        present, mean, frames = (image[here].astype(np.float32), self._mean[here], self._frames[here])
+        present, frames = image[here].astype(np.float32), self._frames[here]
         if not frames.size:
             return np.zeros((window.size, window.size), np.float32)
-        square = np.ones((3, 3), np.uint8)
-        beyond = np.maximum(present - cv2.dilate(mean, square), cv2.erode(mean, square) - present)
-        distance = _mean_square(np.maximum(beyond, 0)) / (self._variance[here] + _LEAST_NOISE**2)
-        changed = np.clip(cv2.blur(distance, (3, 3)) / _CHANGED - 1, -1, 1)
-        known = np.where(frames < 0.9, 0, np.minimum(frames / _FAMILIAR, 1))
+        changed = np.clip(self._difference(present, here) / _CHANGED - 1, -1, 1)
+        known = np.where(frames < 0.9, 0, np.minimum(frames / _FAMILIAR, 1)) * self._proven[here]
         cue[within] = known * np.where(changed < 0, _UNCHANGED_WEIGHT * changed, changed)
         return cv2.resize(cue, (window.size, window.size), interpolation=_interpolation(window))
 
-    def learn(self, image: Image, window: Window, background: NDArray[np.bool_]) -> None:
-        """Remember the pixels of ``image`` that are ``background`` ``(S, S)`` in ``window``."""
+    def unchanged(self, image: Image) -> NDArray[np.float32]:
+        """``(H, W)`` in [0, 1]: how surely a pixel of the frame is what was seen of the background there."""
+        everywhere = (slice(None), slice(None))
+        alike = np.clip(1 - self._difference(image.astype(np.float32), everywhere) / _CHANGED, 0, 1)
+        return np.asarray(alike * self._proven * (self._frames >= 0.9), np.float32)
+
+    def learn(
+        self, image: Image, window: Window, background: NDArray[np.bool_], proof: NDArray[np.float32]
+    ) -> None:
+        """Remember pixels of a frame.
+
+        Args:
+            image: ``(H, W, 3)`` RGB.
+            window: Of the frame.
+            background: ``(S, S)`` which are outside the mask.
+            proof: ``(S, S)`` how far this frame proves that they are background, 1 in full; negative where it speaks
+                for the object.
+        """
         here, within = _overlap(window, self._frames.shape)
-        frames, mean, variance = (self._frames[here], self._mean[here], self._variance[here])
+        frames, mean, variance, proven = (
+            plane[here] for plane in (self._frames, self._mean, self._variance, self._proven)
+        )
         if not frames.size:
             return
         side = (window.side, window.side)
-        seen = cv2.resize(background.astype(np.float32), side, interpolation=cv2.INTER_NEAREST)[within]
-        rate = seen * np.maximum(1 / (frames + 1), _RATE)
-        difference = image[here] - mean
-        spread = _mean_square(difference) - variance
-        variance += np.where(frames < 0.9, 0, rate) * spread  # the first value tells nothing of the noise
+        seen = cv2.resize(background.astype(np.uint8), side, interpolation=cv2.INTER_NEAREST)[within] > 0
+        new = seen & (frames < 0.9)
+        present = image[here].astype(np.float32)
+        familiar = seen & ~new & (self._difference(present, here) < _CHANGED)
+        rate = familiar * np.maximum(1 / (frames + 1), _RATE)
+        difference = present - mean
+        variance += rate * (_mean_square(difference) - variance)
         np.maximum(variance, 4.0, out=variance)
-        mean += rate[..., None] * difference
-        frames += seen
+        variance[new] = _NOISE**2  # the first value tells nothing of the noise
+        mean += np.where(new, 1, rate)[..., None] * difference
+        frames += np.where(familiar | new, 1, -1) * seen
+        np.clip(frames, 0, _LASTING, out=frames)
+        proven[new] = 0
+        proven += seen * cv2.resize(proof, side, interpolation=cv2.INTER_LINEAR)[within]
+        np.clip(proven, 0, 1, out=proven)
 
     def forget(self, mask: NDArray[np.bool_]) -> None:
         """Take back what was remembered in ``mask`` ``(H, W)``, which has turned out to be the object."""
         self._frames[mask] = 0
+
+    def _difference(self, present: NDArray[np.float32], here: tuple[slice, slice]) -> NDArray[np.float32]:
+        """Squared difference of pixels ``(h, w, 3)`` from those remembered ``here``, in variances."""
+        mean, square = self._mean[here], np.ones((3, 3), np.uint8)
+        beyond = np.maximum(present - cv2.dilate(mean, square), cv2.erode(mean, square) - present)
+        distance = _mean_square(np.maximum(beyond, 0)) / (self._variance[here] + _LEAST_NOISE**2)
+        return cv2.blur(distance, (3, 3))
 
 
 def _mean_square(values: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -65,6 +65,14 @@ def clip_box(box: Box, shape: tuple[int, ...]) -> Box | None:
     return (x0, y0, x1 - x0, y1 - y0) if x1 - x0 >= 1 and y1 - y0 >= 1 else None
 
 
+def outside(box: Box, shape: tuple[int, ...], slack: float = 0.0) -> NDArray[np.bool_]:
+    """``(H, W)``: the pixels of a frame of ``shape`` that are not in ``box``, grown by a share of its sides."""
+    x, y, width, height = box
+    rows, columns = np.arange(shape[0])[:, None] + 0.5, np.arange(shape[1]) + 0.5
+    beside_rows = (rows < y - slack * height) | (rows > y + (1 + slack) * height)
+    return beside_rows | (columns < x - slack * width) | (columns > x + (1 + slack) * width)
+
+
 def box_iou(a: Box, b: Box) -> float:
     """Intersection over union of two boxes."""
     width = min(a[0] + a[2], b[0] + b[2]) - max(a[0], b[0])

@@ -24,7 +24,7 @@ STRAYED = 0.7
 """IoU of a correction's box and the box tracker's below which the latter is off the object and begins anew. Above,
 what its filter has learnt over many frames is worth more than a box that fits a little better."""
 
-_CUES = Cues(outline=0.0, background=0.0, novelty=0.0)  # the box does their work
+_CUES = Cues(outline=0.0, background=2.0, novelty=0.0)  # the box does the work of the others
 
 
 class CsrtTracker:

@@ -18,9 +18,11 @@ _STRIDE = 3  # models of motion are fitted on every third pixel: enough, and nin
 _LEAST = 12  # pixels that a model is fitted on
 _AGREEING = 1.5  # pixels
 _LAST_ROW = (0.0, 0.0, 1.0)
+_STILL = 0.5  # pixels within which pixels have to be where a background that stands still has them
 _MORE = 1.1
 """Times as many pixels have to agree with a homography as with a similarity. A floor that a camera walks over moves as
-no similarity does; a still background does, and whatever else moves before it would bend a homography."""
+no similarity does; a still background does, and whatever else moves before it would bend a homography. As many again
+have to agree with a similarity as with a background that stands still."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,12 +52,25 @@ class MaskMotion:
 
 
 def follow_mask(
-    last: NDArray[np.uint8], present: NDArray[np.uint8], mask: NDArray[np.float32], similarity: bool = True
+    last: NDArray[np.uint8],
+    present: NDArray[np.uint8],
+    mask: NDArray[np.float32],
+    similarity: bool = True,
+    shift: tuple[float, float] = (0.0, 0.0),
+    in_frame: NDArray[np.bool_] | None = None,
 ) -> MaskMotion:
-    """Carry ``mask`` ``(S, S)`` of the grey crop ``last`` ``(S, S)`` into the grey crop ``present``.
+    """Carry a mask into the next crop.
 
     DIS optical flow (Kroeger et al. 2016) runs both ways; models of motion are RANSAC fits to the flow that
-    survives the round trip. Without ``similarity`` the mask is moved by the flow alone.
+    survives the round trip.
+
+    Args:
+        last: ``(S, S)`` the last crop, grey.
+        present: ``(S, S)`` the present one.
+        mask: ``(S, S)`` in the last crop.
+        similarity: Whether the mask is moved by a similarity, too; by the flow alone if not.
+        shift: Pixels of the crops from the last crop's place in its frame to the present one's.
+        in_frame: ``(S, S)`` what of the present crop lies in its frame; all if None.
     """
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     backward = dis.calc(present, last, None)
@@ -70,7 +85,8 @@ def follow_mask(
     inside = by_flow > 0.5
     fit = _fit(cv2.estimateAffinePartial2D, source, target, inside & reliable) if similarity else None
     by_similarity = by_flow if fit is None else cv2.warpAffine(mask, fit, mask.shape[::-1])
-    background = _background_motion(target, source, ~inside & reliable)
+    beside = reliable & ~inside if in_frame is None else reliable & ~inside & in_frame
+    background = _background_motion(target, source, beside, shift)
     object_ = _fit(cv2.estimateAffine2D, target, source, inside & reliable)
     cue = _motion_cue(present, source, target, background, object_, reliable)
     return MaskMotion(source, by_flow, by_similarity, cue, background)
@@ -93,7 +109,10 @@ def _motion_cue(
 
 
 def _background_motion(
-    target: NDArray[np.float32], source: NDArray[np.float32], selected: NDArray[np.bool_]
+    target: NDArray[np.float32],
+    source: NDArray[np.float32],
+    selected: NDArray[np.bool_],
+    shift: tuple[float, float],
 ) -> NDArray[np.float64] | None:
     """``(3, 3)`` from present to last pixels ``(S, S, 2)``, by those that are selected; None where they are too few."""
     pick = selected[::_STRIDE, ::_STRIDE]
@@ -103,6 +122,11 @@ def _background_motion(
     similarity, agreeing = cv2.estimateAffinePartial2D(
         here, there, method=cv2.RANSAC, ransacReprojThreshold=_AGREEING, maxIters=500
     )
+    if similarity is not None:
+        ways = here + np.asarray(shift, np.float32), cv2.transform(here[None], similarity)[0]
+        still, moving = (np.count_nonzero(np.linalg.norm(way - there, axis=1) < _STILL) for way in ways)
+        if _MORE * still >= moving:
+            return np.array([[1.0, 0.0, shift[0]], [0.0, 1.0, shift[1]], _LAST_ROW])
     wanted = 0.0 if similarity is None else _MORE * np.count_nonzero(agreeing)
     if wanted <= len(here):
         homography, agreeing = cv2.findHomography(here, there, cv2.RANSAC, _AGREEING, maxIters=500)

@@ -15,11 +15,19 @@ from tracking3d.trackers.crops import cut, inside_frame
 from tracking3d.trackers.outline import both_sides, tidied
 
 _OVERVIEW = 160  # longer side in pixels of the image that is searched
+_UNCHANGED = (
+    6.0  # log-odds, as many as colours can say, that what was seen before without the object is not it
+)
 _LEAST_AREA, _MOST_AREA = (0.1, 2.5)  # of the object's usual area; while it comes in, only a part is seen
 
 
 def find_by_colours(
-    image: Image, colours: GlobalColours, area: float, margin: float, size: int
+    image: Image,
+    colours: GlobalColours,
+    area: float,
+    margin: float,
+    size: int,
+    unchanged: NDArray[np.float32] | None = None,
 ) -> tuple[NDArray[np.bool_], Window, float] | None:
     """Segment what looks most like the object.
 
@@ -29,6 +37,7 @@ def find_by_colours(
         area: Its usual area in pixels of the frame.
         margin: Free space around it in the crop, relative to its size.
         size: Side of the crop in pixels.
+        unchanged: ``(H, W)`` in [0, 1] how surely a pixel is what was seen of the background there, or None.
 
     Returns:
         The mask ``(size, size)`` in a window, the window, and how well its colours tell it from its surroundings,
@@ -37,6 +46,9 @@ def find_by_colours(
     scale = min(_OVERVIEW / max(image.shape[:2]), 1.0)
     overview = lab(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
     likeness = np.tanh(colours.rarity(overview, overview))
+    known = np.zeros(image.shape[:2], np.float32) if unchanged is None else unchanged
+    known_overview = cv2.resize(known, overview.shape[1::-1], interpolation=cv2.INTER_AREA)
+    likeness = np.minimum(likeness, 1 - 2 * known_overview)
     blurred = cv2.GaussianBlur(likeness, (0, 0), max(math.sqrt(area) * scale, 3.0) / 3)
     row, column = np.unravel_index(int(np.argmax(blurred)), blurred.shape)
     side = 1.3 * math.sqrt(area)
@@ -46,6 +58,7 @@ def find_by_colours(
     crop, in_frame = cut(image, window), inside_frame(image.shape, window)
     rows, columns = np.mgrid[:size, :size] + 0.5 - size / 2
     evidence = 2 * colours.rarity(lab(crop), overview) + 1 - np.hypot(rows, columns) / (0.3 * size)
+    evidence -= _UNCHANGED * cut(known, window)
     support = np.tanh(evidence / 3).astype(np.float32)
     smooth = cv2.ximgproc.fastGlobalSmootherFilter(crop, support, 100.0, 12.0)
     found = (smooth > 0) & in_frame

@@ -9,6 +9,8 @@ anew from it only when the mask looks lost. Any box tracker will do. Everything 
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,12 +20,12 @@ from tracking3d.geometry.camera import Window
 from tracking3d.trackers.background import BackgroundMemory
 from tracking3d.trackers.colour_models import GlobalColours, Palette
 from tracking3d.trackers.confidence import Judgement, outline_margin
-from tracking3d.trackers.crops import box_iou, box_of, clip_box, cut, paste
+from tracking3d.trackers.crops import box_iou, box_of, clip_box, cut, outside, paste
 from tracking3d.trackers.cues import Cues, View, colour_and_motion, decide, distance_beyond
 from tracking3d.trackers.first_mask import mask_in_box
 from tracking3d.trackers.mask_motion import follow_mask
 from tracking3d.trackers.opencv_build import why_no_contrib
-from tracking3d.trackers.outline import both_sides, tidied, touches_border
+from tracking3d.trackers.outline import both_sides, signed_distance, tidied, touches_border
 from tracking3d.trackers.search import find_by_colours
 
 SMOOTHER = "ximgproc.fastGlobalSmootherFilter"
@@ -34,6 +36,9 @@ _AREA_CHANGE = 0.35  # a larger relative change against the moved mask is not be
 _LEAST_PART = 0.1  # of the usual area; less of it at the frame's border is out of sight
 _LEAST_PIXELS = 9  # of the crop; fewer are no mask
 _PATIENCE = 3  # doubtful frames in a row before each attempt to begin anew
+_SLACK = 0.1  # of a box's sides: it may be drawn too small
+_FAR = 0.3  # of the root of the area: what is further from the mask is background
+_PARTED = 3.0  # pixels by which something moved as the background does rather than with the object, to be it
 _FOUND_AGAIN = 0.6  # of the first mask's colour separation, for what is found after it was out of sight
 
 _Answer = tuple[NDArray[np.float32], Judgement]
@@ -73,8 +78,8 @@ class ColourSegmentation:
         inside, around = both_sides(cut(self._mask, view.window))
         self._colours = GlobalColours(view.colours, inside, around)
         self._palette = Palette(view.colours)
-        self._background = BackgroundMemory(image.shape)
-        self._learn_background(image, view, around)
+        beside = both_sides(mask)[1] if mask is not None else outside(box, image.shape, _SLACK)
+        self._background = BackgroundMemory(image, beside)
         self._first_separation = self._colours.separation(view.colours, inside, around)
         self._judgement = Judgement(self._first_separation, margin=self._first_separation)
 
@@ -123,7 +128,9 @@ class ColourSegmentation:
         last = View.of(self._image, before)
         present = View.of(image, Window(before.left + right, before.top + down, before.side, self._size))
         last_mask = cut(self._mask, before)
-        motion = follow_mask(last.grey, present.grey, last_mask, self._cues.similarity)
+        shift = (before.scale * right, before.scale * down)
+        seen = present.in_frame
+        motion = follow_mask(last.grey, present.grey, last_mask, self._cues.similarity, shift, seen)
         moved = motion.moved & present.in_frame
         area = np.count_nonzero(moved)
         if area < _LEAST_PIXELS:
@@ -150,7 +157,8 @@ class ColourSegmentation:
             self._usual_area = self._usual_area if at_border else frame_area
             _, around = _sides(mask, present)
             self._colours.update(present.colours, mask, around)
-            self._learn_background(image, present, around)
+            far = signed_distance(mask) < -_FAR * math.sqrt(max(int(np.count_nonzero(mask)), 1))
+            self._learn_background(image, present, around, np.where(far, 1, -motion.cue / _PARTED))
         full = paste(mask, present.window, image.shape)
         agreement = None if witness is None else box_iou(box_of(full) or (0.0, 0.0, 0.0, 0.0), witness)
         separation, margin = self._separation(present, mask), outline_margin(evidence, mask)
@@ -158,7 +166,9 @@ class ColourSegmentation:
 
     def _search(self, image: Image) -> _Answer:
         """Where the object was out of sight: the mask of what has its colours, if anything has."""
-        found = find_by_colours(image, self._colours, self._usual_area, _MARGIN, self._size)
+        self._background.lose()
+        unchanged = self._background.unchanged(image) if self._cues.background else None
+        found = find_by_colours(image, self._colours, self._usual_area, _MARGIN, self._size, unchanged)
         if found is None or found[2] < _FOUND_AGAIN * self._first_separation:
             return _out_of_sight(image)
         mask, window, separation = found
@@ -177,9 +187,9 @@ class ColourSegmentation:
         self._background.forget(fresh > 0.5)
         return fresh, Judgement(separation, 0.0, judgement.agreement)
 
-    def _learn_background(self, image: Image, view: View, around: NDArray[np.bool_]) -> None:
+    def _learn_background(self, image: Image, view: View, around: NDArray[np.bool_], proof: NDArray) -> None:
         if self._cues.background:
-            self._background.learn(image, view.window, around)
+            self._background.learn(image, view.window, around, proof.astype(np.float32))
 
     def _separation(self, view: View, mask: NDArray) -> float:
         return self._colours.separation(view.colours, *_sides(mask, view))
