@@ -8,6 +8,7 @@ import pytest
 from moving_shape import clutter
 
 from tracking3d.geometry.camera import Window
+from tracking3d.trackers import background
 from tracking3d.trackers.background import BackgroundMemory
 
 SHAPE = (90, 120)
@@ -167,3 +168,43 @@ def test_windows_beyond_the_frame_are_answered(window: Window) -> None:
     kept.learn(picture(), window, np.ones((64, 64), bool), np.ones((64, 64), np.float32))
     change = kept.change(picture(), window)
     assert change.shape == (64, 64) and change.max() <= 0
+
+
+def memory_of(rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+    """What is remembered of a part of a frame: mean, variance, frames, and what is proven."""
+    mean = rng.uniform(0, 255, (90, 120, 3)).astype(np.float32)
+    spread, frames, proven = rng.uniform((4, 0, 0), (200, 20, 1), (90, 120, 3)).astype(np.float32).T
+    frames[rng.random(frames.shape) < 0.2] = 0
+    return tuple(plane[10:80, 5:100] for plane in (mean, spread.T, frames.T, proven.T))
+
+
+def test_both_implementations_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(3)
+    kept, seen, proof = memory_of(rng), rng.random((70, 95)) < 0.7, rng.normal(0, 1, (70, 95))
+    present = np.clip(kept[0] + rng.normal(0, 15, kept[0].shape), 0, 255).astype(np.uint8)
+    answers = []
+    for chosen in (True, False):
+        monkeypatch.setattr(background, "compiled", lambda chosen=chosen: chosen)
+        memory = tuple(plane.copy() for plane in kept)
+        difference = background.differences(present, *memory[:2])
+        background.learn(present, difference < 0.2, seen, proof.astype(np.float32), memory)
+        answers.append((difference, *memory))
+    assert 0.1 < (answers[0][0] < 0.2).mean() < 0.9
+    for ours, theirs in zip(*answers, strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-4)
+
+
+def test_values_between_those_of_the_neighbours_do_not_differ() -> None:
+    rng = np.random.default_rng(5)
+    present, mean = (rng.integers(0, 256, (12, 15, 3)).astype(np.uint8) for _ in range(2))
+    variance = rng.uniform(4, 90, (12, 15)).astype(np.float32)
+    found = background.differences(present, mean.astype(np.float32), variance)
+    for row in range(12):
+        for column in range(15):
+            around = (
+                mean[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2].reshape(-1, 3).astype(float)
+            )
+            value = present[row, column].astype(float)
+            beyond = np.maximum(np.maximum(value - around.max(0), around.min(0) - value), 0)
+            expected = (beyond**2).mean() / (variance[row, column] + 3.6**2)
+            assert found[row, column] == pytest.approx(expected, rel=1e-5)

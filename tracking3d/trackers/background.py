@@ -14,14 +14,18 @@ from numpy.typing import NDArray
 
 from tracking3d.frames import Image
 from tracking3d.geometry.camera import Window
+from tracking3d.rendering.backend import compiled
 
 _RATE = 0.1  # at which a pixel that is known well follows its values
 _FAMILIAR = 3.0  # frames until a pixel's memory has full weight
 _LASTING = 20.0  # frames that are remembered: as many that contradict them undo it
 _NOISE, _LEAST_NOISE = (8.0, 3.6)  # standard deviation in grey levels, at first and at least
+_LEAST_VARIANCE = 4.0
 _CHANGED = 6.0  # squared difference, in variances, at which a pixel may or may not have changed
 _UNCHANGED_WEIGHT = 0.5  # what was mistaken for background once does not change either
 _STILL = 0.1  # pixels: a camera that moves less stands still, and the memory is not resampled
+
+_Memory = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
 
 
 class BackgroundMemory:
@@ -39,6 +43,7 @@ class BackgroundMemory:
         self._frames = beside.astype(np.float32)
         self._proven = beside.astype(np.float32)
         self._stands_still = True
+        self._latest: tuple[Window | None, NDArray[np.float32]] = None, self._variance
 
     def move(self, present_to_last: NDArray[np.float64], last: Window, present: Window) -> None:
         """Follow the camera.
@@ -73,10 +78,12 @@ class BackgroundMemory:
         """
         cue = np.zeros((window.side, window.side), np.float32)
         here, within = _overlap(window, self._frames.shape)
-        present, frames = image[here].astype(np.float32), self._frames[here]
+        frames = self._frames[here]
         if not frames.size:
             return np.zeros((window.size, window.size), np.float32)
-        changed = np.clip(self._difference(present, here) / _CHANGED - 1, -1, 1)
+        difference = self._difference(image, here)
+        self._latest = window, difference
+        changed = np.clip(difference / _CHANGED - 1, -1, 1)
         known = np.where(frames < 0.9, 0, np.minimum(frames / _FAMILIAR, 1)) * self._proven[here]
         cue[within] = known * np.where(changed < 0, _UNCHANGED_WEIGHT * changed, changed)
         return cv2.resize(cue, (window.size, window.size), interpolation=_interpolation(window))
@@ -84,7 +91,7 @@ class BackgroundMemory:
     def unchanged(self, image: Image) -> NDArray[np.float32]:
         """``(H, W)`` in [0, 1]: how surely a pixel of the frame is what was seen of the background there."""
         everywhere = (slice(None), slice(None))
-        alike = np.clip(1 - self._difference(image.astype(np.float32), everywhere) / _CHANGED, 0, 1)
+        alike = np.clip(1 - self._difference(image, everywhere) / _CHANGED, 0, 1)
         return np.asarray(alike * self._proven * (self._frames >= 0.9), np.float32)
 
     def learn(
@@ -100,38 +107,84 @@ class BackgroundMemory:
                 for the object.
         """
         here, within = _overlap(window, self._frames.shape)
-        frames, mean, variance, proven = (
-            plane[here] for plane in (self._frames, self._mean, self._variance, self._proven)
-        )
-        if not frames.size:
+        memory = self._mean[here], self._variance[here], self._frames[here], self._proven[here]
+        if not memory[0].size:
             return
         side = (window.side, window.side)
         seen = cv2.resize(background.astype(np.uint8), side, interpolation=cv2.INTER_NEAREST)[within] > 0
-        new = seen & (frames < 0.9)
-        present = image[here].astype(np.float32)
-        familiar = seen & ~new & (self._difference(present, here) < _CHANGED)
-        rate = familiar * np.maximum(1 / (frames + 1), _RATE)
-        difference = present - mean
-        variance += rate * (_mean_square(difference) - variance)
-        np.maximum(variance, 4.0, out=variance)
-        variance[new] = _NOISE**2  # the first value tells nothing of the noise
-        mean += np.where(new, 1, rate)[..., None] * difference
-        frames += np.where(familiar | new, 1, -1) * seen
-        np.clip(frames, 0, _LASTING, out=frames)
-        proven[new] = 0
-        proven += seen * cv2.resize(proof, side, interpolation=cv2.INTER_LINEAR)[within]
-        np.clip(proven, 0, 1, out=proven)
+        proof = cv2.resize(proof, side, interpolation=cv2.INTER_LINEAR)[within]
+        asked, difference = self._latest
+        if asked != window:
+            difference = self._difference(image, here)
+        learn(image[here], difference < _CHANGED, seen, proof, memory)
+        self._latest = None, difference
 
     def forget(self, mask: NDArray[np.bool_]) -> None:
         """Take back what was remembered in ``mask`` ``(H, W)``, which has turned out to be the object."""
         self._frames[mask] = 0
 
-    def _difference(self, present: NDArray[np.float32], here: tuple[slice, slice]) -> NDArray[np.float32]:
-        """Squared difference of pixels ``(h, w, 3)`` from those remembered ``here``, in variances."""
-        mean, square = self._mean[here], np.ones((3, 3), np.uint8)
-        beyond = np.maximum(present - cv2.dilate(mean, square), cv2.erode(mean, square) - present)
-        distance = _mean_square(np.maximum(beyond, 0)) / (self._variance[here] + _LEAST_NOISE**2)
-        return cv2.blur(distance, (3, 3))
+    def _difference(self, image: Image, here: tuple[slice, slice]) -> NDArray[np.float32]:
+        """``(h, w)`` squared difference of a frame's pixels from those remembered ``here``, in variances."""
+        return cv2.blur(differences(image[here], self._mean[here], self._variance[here]), (3, 3))
+
+
+def differences(
+    present: NDArray[np.uint8], mean: NDArray[np.float32], variance: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Squared difference of each pixel from its memory, in variances; values between its neighbours' do not differ.
+
+    Args:
+        present: ``(h, w, 3)``.
+        mean: ``(h, w, 3)`` remembered.
+        variance: ``(h, w)``.
+    """
+    square = np.ones((3, 3), np.uint8)
+    highest, lowest = cv2.dilate(mean, square), cv2.erode(mean, square)
+    if compiled():
+        from tracking3d.trackers.kernels import background
+
+        return background.differences(present, highest, lowest, variance, _LEAST_NOISE**2)
+    values = present.astype(np.float32)
+    beyond = np.maximum(np.maximum(values - highest, lowest - values), 0)
+    return _mean_square(beyond) / (variance + _LEAST_NOISE**2)
+
+
+def learn(
+    present: NDArray[np.uint8],
+    familiar: NDArray[np.bool_],
+    seen: NDArray[np.bool_],
+    proof: NDArray[np.float32],
+    memory: _Memory,
+) -> None:
+    """Take pixels into the memory, in place: new ones as they are, familiar ones slowly, others not.
+
+    Args:
+        present: ``(h, w, 3)``.
+        familiar: ``(h, w)`` which are as remembered.
+        seen: ``(h, w)`` which are outside the mask.
+        proof: ``(h, w)`` see `BackgroundMemory.learn`.
+        memory: Mean ``(h, w, 3)``, and variance, frames and what is proven ``(h, w)``.
+    """
+    if compiled():
+        from tracking3d.trackers.kernels import background
+
+        constants = _RATE, _NOISE**2, _LEAST_VARIANCE, _LASTING
+        background.learn(present, familiar, seen, proof, memory, constants)
+        return
+    mean, variance, frames, proven = memory
+    new = seen & (frames < 0.9)
+    familiar = familiar & seen & ~new
+    rate = familiar * np.maximum(1 / (frames + 1), np.float32(_RATE))
+    difference = present - mean
+    variance += rate * (_mean_square(difference) - variance)
+    np.maximum(variance, _LEAST_VARIANCE, out=variance, where=familiar)
+    variance[new] = _NOISE**2  # the first value tells nothing of the noise
+    mean += np.where(new, 1, rate)[..., None] * difference
+    frames += np.where(familiar | new, 1, -1) * seen
+    np.clip(frames, 0, _LASTING, out=frames)
+    proven[new] = 0
+    proven += seen * proof
+    np.clip(proven, 0, 1, out=proven)
 
 
 def _mean_square(values: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -138,7 +138,9 @@ class ColourSegmentation:
 
         evidence = colour_and_motion(last, present, self._colours, self._palette, motion, self._cues)
         if self._cues.background:
-            if motion.background is not None:
+            if motion.background is None:
+                self._background.lose()
+            else:
                 self._background.move(motion.background, before, present.window)
             evidence += self._cues.background * self._background.change(image, present.window)
         if witness is not None:
