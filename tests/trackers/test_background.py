@@ -38,7 +38,10 @@ def memory(
 
 
 def test_the_same_picture_has_not_changed() -> None:
-    np.testing.assert_allclose(memory(picture()).change(picture(), WINDOW), -0.5)
+    image = picture()
+    image.flags.writeable = False  # as frames are
+    np.testing.assert_allclose(memory(image).change(image, WINDOW), -0.5)
+    np.testing.assert_allclose(memory(image).unchanged(image)[5:80, 20:95], 1)
 
 
 def test_a_patch_of_another_colour_has_changed_and_nothing_else() -> None:

@@ -19,7 +19,8 @@ def differences(
 ) -> NDArray[np.float32]:
     """See `tracking3d.trackers.background.differences`."""
     found = np.empty(variance.shape, np.float32)
-    _differences(present, highest, lowest, variance, np.float32(least_variance), found)
+    # A copy, since frames are read only.
+    _differences(np.array(present), highest, lowest, variance, np.float32(least_variance), found)
     return found
 
 
@@ -33,7 +34,8 @@ def learn(
 ) -> None:
     """See `tracking3d.trackers.background.learn`."""
     mean, variance, frames, proven = memory
-    _learn(present, familiar, seen, proof, mean, variance, frames, proven, np.array(constants, np.float32))
+    limits = np.array(constants, np.float32)
+    _learn(np.array(present), familiar, seen, proof, mean, variance, frames, proven, limits)
 
 
 @kernel("void(uint8[:,:,:], float32[:,:,:], float32[:,:,:], float32[:,:], float32, float32[:,::1])")
