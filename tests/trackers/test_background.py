@@ -147,6 +147,14 @@ def test_the_memory_moves_with_the_camera(right: int, down: int) -> None:
     assert (unmoved > 0).mean() > 0.1
 
 
+def test_of_a_camera_that_moves_only_what_has_not_changed_counts() -> None:
+    kept = memory(picture())
+    kept.move(np.array([[1, 0, 3], [0, 1, 0], [0, 0, 1]], float), WINDOW, WINDOW)
+    assert kept.change(255 - picture(), WINDOW).max() == 0
+    moved = cv2.warpAffine(picture(), np.array([[1, 0, -3], [0, 1, 0]], float), SHAPE[::-1])
+    assert kept.change(moved, WINDOW)[10:-10, 10:-10].max() < -0.4
+
+
 def test_a_motion_of_crops_alone_is_none_of_the_camera() -> None:
     kept = memory(picture())
     elsewhere = Window(26, 9, 80, 80)

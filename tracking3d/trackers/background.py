@@ -74,6 +74,8 @@ class BackgroundMemory:
     def change(self, image: Image, window: Window) -> NDArray[np.float32]:
         """``(S, S)`` in [-0.5, 1]: has a pixel changed against the background? 0 where that is not known.
 
+        Where the camera has moved there is nothing above 0.
+
         Values between a pixel's neighbours count as its own, so that a memory that is off by a pixel is no change.
         """
         cue = np.zeros((window.side, window.side), np.float32)
@@ -85,6 +87,8 @@ class BackgroundMemory:
         self._latest = window, difference
         changed = np.clip(difference / _CHANGED - 1, -1, 1)
         known = np.where(frames < 0.9, 0, np.minimum(frames / _FAMILIAR, 1)) * self._proven[here]
+        if not self._stands_still:  # what lies at another depth changes as the camera moves
+            changed = np.minimum(changed, 0)
         cue[within] = known * np.where(changed < 0, _UNCHANGED_WEIGHT * changed, changed)
         return cv2.resize(cue, (window.size, window.size), interpolation=_interpolation(window))
 
