@@ -27,7 +27,6 @@ OFF = [
     {"global_colours": 0.0},
     {"local_colours": 0.0},
     {"motion": 0.0},
-    {"background": 0.0},
     {"novelty": 0.0},
     {"smoother": False},
 ]
@@ -74,6 +73,19 @@ def a_new_side(count: int = 14) -> tuple[list[Frame], np.ndarray]:
     return frames, np.stack([mask] * count)
 
 
+def past_a_likeness(count: int = 14) -> tuple[list[Frame], np.ndarray]:
+    """A patch moves along something of its colours, which lies there all the time."""
+    background = clutter(1, SIZE, (0, 40, 60), (90, 160, 255))
+    background[110:150, 90:150] = clutter(2, (40, 60), (120, 30, 0), (255, 200, 90))
+    thing = clutter(3, (50, 50), (120, 30, 0), (255, 200, 90))
+    frames, masks = [], np.zeros((count, *SIZE), bool)
+    for index in range(count):
+        image, place = background.copy(), np.s_[60:110, 20 + 6 * index : 70 + 6 * index]
+        image[place], masks[index][place] = thing, True
+        frames.append(Frame(index, image.round().astype(np.uint8)))
+    return frames, masks
+
+
 @pytest.mark.parametrize("witness", ["none", "kcf"])
 def test_it_keeps_to_the_protocol(witness: str) -> None:
     check_tracker(FlowTracker, sizes=[(90, 120)], frames=2, segmentation_size=96, witness=witness)
@@ -97,6 +109,18 @@ def test_every_cue_can_be_switched_off_and_is_missed_by_the_mask(off: dict[str, 
     all_cues, without = track(frames, prompt), track(frames, prompt, **off)
     assert min(ious(without, truth)) > 0.8
     assert any((a.binary != b.binary).any() for a, b in zip(all_cues, without, strict=True))
+
+
+@pytest.mark.parametrize("with_mask", [False, True])
+def test_what_was_there_before_is_not_the_object(with_mask: bool) -> None:
+    frames, truth = past_a_likeness()
+    prompt = Prompt(box_around(truth[0]), truth[0] if with_mask else None)
+    without, some, much = (
+        min(ious(track(frames, prompt, segmentation_size=224, background=weight), truth))
+        for weight in (0.0, 1.0, 2.0)
+    )
+    assert without < 0.8 < some < much
+    assert much > 0.95
 
 
 def test_a_side_that_turns_in_belongs_to_the_object() -> None:

@@ -83,7 +83,8 @@ def check_agreement(fit: Fit, radius: float) -> None:
         raise DisagreementError(
             f"only {frames} frames of their overlap were tracked by both; {FEWEST_FRAMES} are needed"
         )
-    if not similarity.scale > 0:
+    # Where nothing moves, rounding decides whether the size is above 0.
+    if not similarity.scale > 0 and fit.scale_error <= _MOST_SCALE_ERROR:
         raise DisagreementError("their overlap gives no size of one in that of the other")
     angle, wrong = float(np.median(fit.angles)), float(np.mean(fit.angles > _WRONG))
     if angle > MOST_DEGREES or wrong > _MOST_WRONG:
