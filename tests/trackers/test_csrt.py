@@ -297,7 +297,7 @@ def test_real_clips_from_a_box(shared_data: Path, clip: str, expected: float) ->
     ]
     box = json.loads((folder / "init.json").read_text())["bbox_xywh"]
     ious = []
-    for path, estimate in zip(paths, track(frames, Prompt(tuple(box))), strict=True):
+    for path, estimate in zip(paths, track(frames, Prompt(tuple(box)), segmentation_size=224), strict=True):
         truth = folder / "masks" / f"{path.stem}.png"
         if truth.exists() and path.stem != "000000":
             true_mask = cv2.imread(str(truth), cv2.IMREAD_GRAYSCALE) > 127
