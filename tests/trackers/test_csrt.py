@@ -24,8 +24,8 @@ def tracker(**options: object) -> CsrtTracker:
     return CsrtTracker.from_options(CsrtTracker.Options(**{"segmentation_size": 96} | options))
 
 
-def track(frames: list[Frame], prompt: Prompt) -> list[MaskEstimate]:
-    csrt = tracker()
+def track(frames: list[Frame], prompt: Prompt, **options: object) -> list[MaskEstimate]:
+    csrt = tracker(**options)
     return [csrt.init(frames[0], prompt), *(csrt.step(frame) for frame in frames[1:])]
 
 
