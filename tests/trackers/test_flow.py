@@ -295,8 +295,9 @@ def test_real_clips_from_a_box(shared_data: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setenv("TRACKING3D_PLUGINS", "tracking3d.trackers:flow=tracking3d.trackers.flow:FlowTracker")
     clips = open_dataset("real", shared_data, shared_data, 1)
     flow = Contestant.of(PluginChoice(name="flow", witness=witness))
-    results = [one.figures()["iou_mean"] for one in measure_trackers([flow], clips)]
-    assert len(results) == 4
+    figures = [one.figures()["iou_mean"] for one in measure_trackers([flow], clips)]
+    results = [one for one in figures if one is not None]  # some clips have no masks
+    assert len(results) >= 4
     # cube_in_hand hangs in the balance: fingers are taken along, or not (docs/masks.md).
     assert np.mean(results) > 0.75 and min(results) > 0.5
     assert sorted(results)[1] > 0.7
