@@ -219,3 +219,11 @@ def test_values_between_those_of_the_neighbours_do_not_differ() -> None:
             beyond = np.maximum(np.maximum(value - around.max(0), around.min(0) - value), 0)
             expected = (beyond**2).mean() / (variance[row, column] + 3.6**2)
             assert found[row, column] == pytest.approx(expected, rel=1e-5)
+
+
+def test_what_is_learnt_is_compared_with_the_memory_itself() -> None:
+    kept = memory(picture(), frames=10)
+    kept.change(picture(), WINDOW)
+    kept.learn(with_visitor(50), WINDOW, np.ones((80, 80), bool), everywhere())
+    assert kept.change(picture(), WINDOW).max() < -0.4
+    assert kept.change(with_visitor(50), WINDOW)[37:53, 32:48].min() > 0.9

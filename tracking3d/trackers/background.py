@@ -43,7 +43,7 @@ class BackgroundMemory:
         self._frames = beside.astype(np.float32)
         self._proven = beside.astype(np.float32)
         self._stands_still = True
-        self._latest: tuple[Window | None, NDArray[np.float32]] = None, self._variance
+        self._latest: tuple[Image, Window, NDArray[np.float32]] | None = None  # what `change` has found
 
     def move(self, present_to_last: NDArray[np.float64], last: Window, present: Window) -> None:
         """Follow the camera.
@@ -84,7 +84,7 @@ class BackgroundMemory:
         if not frames.size:
             return np.zeros((window.size, window.size), np.float32)
         difference = self._difference(image, here)
-        self._latest = window, difference
+        self._latest = image, window, difference
         changed = np.clip(difference / _CHANGED - 1, -1, 1)
         known = np.where(frames < 0.9, 0, np.minimum(frames / _FAMILIAR, 1)) * self._proven[here]
         if not self._stands_still:  # what lies at another depth changes as the camera moves
@@ -117,11 +117,12 @@ class BackgroundMemory:
         side = (window.side, window.side)
         seen = cv2.resize(background.astype(np.uint8), side, interpolation=cv2.INTER_NEAREST)[within] > 0
         proof = cv2.resize(proof, side, interpolation=cv2.INTER_LINEAR)[within]
-        asked, difference = self._latest
-        if asked != window:
+        latest, self._latest = self._latest, None
+        if latest is not None and latest[0] is image and latest[1] == window:
+            difference = latest[2]
+        else:
             difference = self._difference(image, here)
         learn(image[here], difference < _CHANGED, seen, proof, memory)
-        self._latest = None, difference
 
     def forget(self, mask: NDArray[np.bool_]) -> None:
         """Take back what was remembered in ``mask`` ``(H, W)``, which has turned out to be the object."""

@@ -15,9 +15,7 @@ from tracking3d.trackers.crops import cut, inside_frame
 from tracking3d.trackers.outline import both_sides, tidied
 
 _OVERVIEW = 160  # longer side in pixels of the image that is searched
-_UNCHANGED = (
-    6.0  # log-odds, as many as colours can say, that what was seen before without the object is not it
-)
+_UNCHANGED = 6.0  # log-odds, as many as colours can say, that what was there without the object is not it
 _LEAST_AREA, _MOST_AREA = (0.1, 2.5)  # of the object's usual area; while it comes in, only a part is seen
 
 
