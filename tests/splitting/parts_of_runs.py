@@ -6,8 +6,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tracking3d.estimation.estimate import Status
+from tracking3d.geometry.similarity import Similarity
 from tracking3d.results.records import FrameRecord
-from tracking3d.splitting.similarity import Similarity
 
 
 def record_of(index: int, T_cam_obj: np.ndarray, status: Status = Status.TRACKED) -> FrameRecord:

@@ -16,8 +16,10 @@ from tracking3d import Frame, Session, load_config
 from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.online.belief import Belief
 from tracking3d.estimation.online.final_refinement import keyframe_cost
+from tracking3d.estimation.online.uniting import moved, same_landmarks, united
 from tracking3d.frames import Prompt
 from tracking3d.geometry.camera import Camera
+from tracking3d.geometry.similarity import Similarity
 from tracking3d.parts import build_encoder
 from tracking3d.splitting import joining
 from tracking3d.splitting.agreement import (
@@ -28,8 +30,8 @@ from tracking3d.splitting.agreement import (
     joint_of,
 )
 from tracking3d.splitting.joining import join_beliefs
-from tracking3d.splitting.map_joining import in_space, moved, same_landmarks, through_lens, united
-from tracking3d.splitting.similarity import Similarity, fit_similarity
+from tracking3d.splitting.map_joining import in_space, through_lens
+from tracking3d.splitting.similarity import fit_similarity
 from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
 
 TURN = Similarity(Rotation.from_rotvec([0.4, -0.9, 0.3]).as_matrix(), 1.7, np.array([0.1, -0.2, 0.15]))

@@ -7,7 +7,8 @@ import pytest
 from parts_of_runs import degrees_between, inverse, turning
 from scipy.spatial.transform import Rotation
 
-from tracking3d.splitting.similarity import Similarity, fit_similarity
+from tracking3d.geometry.similarity import Similarity
+from tracking3d.splitting.similarity import fit_similarity
 
 
 def known(seed: int) -> Similarity:

@@ -51,6 +51,11 @@ class MaskSource(StrEnum):
         return self in (MaskSource.RENDERED, MaskSource.WEIGHED, MaskSource.MEAN)
 
 
+GUESSED = "guessed"
+"""In `FrameEstimate.losses` where the object was lost before and started anew, and how its poses lie to those of before
+is a guess."""
+
+
 @dataclass(frozen=True, eq=False)
 class FrameEstimate:
     """The answer for one frame.

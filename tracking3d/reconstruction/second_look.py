@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from tracking3d.estimation.estimate import ObjectModel, Status
+from tracking3d.estimation.estimate import GUESSED, ObjectModel, Status
 from tracking3d.estimation.online.points import grey
 from tracking3d.estimation.online.texture_strength import PLAIN, texture_strength
 from tracking3d.frames import Image
@@ -66,7 +66,7 @@ class SecondLook:
 
     def see(self, record: FrameRecord, image: Image, mask: NDArray[np.bool_]) -> None:
         """Keep a frame, if it is one of those to be bundled and its object was found."""
-        if self.wants(record.index) and record.status is not Status.LOST:
+        if self.wants(record.index) and record.status is not Status.LOST and GUESSED not in record.losses:
             view = self._view(record.T_cam_obj, image, mask)
             if view is not None:
                 self._views[record.index] = view
@@ -114,7 +114,8 @@ class SecondLook:
         # What the nearest frame's pose was moved by in object coordinates: mostly, the object frame itself moved.
         T_before_now = np.linalg.inv(self._as_settled(self._before[self._bundled[nearest]])) @ kept.T_cam_obj
         predicted = self._as_settled(record.T_cam_obj) @ T_before_now
-        view = None if record.status is Status.LOST else self._view(predicted, image, mask)
+        apart = record.status is Status.LOST or GUESSED in record.losses
+        view = None if apart else self._view(predicted, image, mask)
         if view is None:
             return predicted, None
         resected, share = resect(scene, view, around)

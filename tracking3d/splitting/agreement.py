@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.online.belief import Belief
+from tracking3d.estimation.online.uniting import moved, same_landmarks
 from tracking3d.geometry.camera import Camera
 from tracking3d.results.records import FrameRecord
-from tracking3d.splitting.map_joining import moved, same_landmarks, through_lens
+from tracking3d.splitting.map_joining import through_lens
 from tracking3d.splitting.similarity import Fit, fit_similarity
 
 FEWEST_FRAMES = 5

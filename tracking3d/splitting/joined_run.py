@@ -17,6 +17,7 @@ import numpy as np
 from tracking3d.checkpoint.folder import Checkpoint
 from tracking3d.checkpoint.progress import Kept, Progress
 from tracking3d.frames import SkippedFrame
+from tracking3d.geometry.similarity import Similarity
 from tracking3d.results import layout
 from tracking3d.results.files import writing
 from tracking3d.results.frame_lines import FrameLines
@@ -25,7 +26,6 @@ from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_writer import RunWriter
 from tracking3d.session import Session
 from tracking3d.splitting.cutting import Part
-from tracking3d.splitting.similarity import Similarity
 
 
 @dataclass(frozen=True, eq=False)

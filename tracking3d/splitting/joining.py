@@ -16,17 +16,19 @@ from tracking3d.config.solvers import OnlineConfig
 from tracking3d.estimation.online.belief import Belief, ObjectMap
 from tracking3d.estimation.online.final_refinement import keyframe_cost
 from tracking3d.estimation.online.mapping import pose_arrays
+from tracking3d.estimation.online.uniting import moved
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.geometry.camera import Camera
+from tracking3d.geometry.similarity import Similarity
 from tracking3d.parts import build_encoder
 from tracking3d.presented import Presented
 from tracking3d.results.run_reader import RunReader
 from tracking3d.session import Session
 from tracking3d.splitting.agreement import DisagreementError, Joint, by_lens, joint_of
 from tracking3d.splitting.joined_run import PartRun
-from tracking3d.splitting.map_joining import joined, moved
+from tracking3d.splitting.map_joining import joined
 from tracking3d.splitting.plan import Plan, part_folder
-from tracking3d.splitting.similarity import Similarity, fit_similarity
+from tracking3d.splitting.similarity import fit_similarity
 
 MOST_DEARER = 1.75
 """How many times what the parts' keyframes cost by themselves they may cost together; see `keyframe_cost`."""

@@ -6,15 +6,20 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from rendered_solids import pose_of
 
 from tracking3d.estimation.online.motion import led_to, predicted
+from tracking3d.geometry.camera import Camera
 
 
 def lost(frames: int, step: float = 5.0):
     """An object that turned by so many degrees a frame through frames 0 to 9, and has been lost since."""
     trail = tuple((pose_of(step * n, (0, 1, 0)), n) for n in range(10))
-    return SimpleNamespace(trail=trail, lost_for=frames, last=trail[-1], before=None)
+    camera = Camera.from_fov(80, 60)
+    return SimpleNamespace(
+        trail=trail, lost_for=frames, last=trail[-1], before=None, camera=camera, tried=None
+    )
 
 
 @pytest.mark.parametrize("off", [-25.0, 0.0, 25.0])
@@ -36,7 +41,21 @@ def test_without_any_motion_nothing_is_led_to():
 
 
 def test_a_lost_object_is_looked_for_where_it_goes_first():
-    starts = predicted(lost(3), 12)
+    starts = predicted(lost(3), 12, None)
     assert list(starts) == ["coasting", "last"]
     turned = np.degrees(2 * np.arccos(abs(float(starts["coasting"].quaternion[0]))))
     assert turned == pytest.approx(60, abs=1)
+
+
+def test_a_mask_tells_where_a_lost_object_is_again():
+    mask = np.zeros((60, 80), bool)
+    mask[10:20, 60:70] = True
+    state = lost(3)
+    state.tried = pose_of(200.0, (0, 1, 0))
+    starts = predicted(state, 12, mask)
+    assert list(starts) == ["coasting", "last", "coasting in the mask", "last in the mask", "tried"]
+    for name in ("coasting in the mask", "last in the mask", "tried"):
+        x, y, z = starts[name].translation.tolist()
+        K = state.camera.K
+        assert (K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]) == pytest.approx((64.5, 14.5), abs=1e-3)
+    assert torch.equal(starts["tried"].quaternion, state.tried.quaternion)

@@ -138,6 +138,25 @@ class ObjectMap:
 
 
 @dataclass(frozen=True, eq=False)
+class Aside:
+    """A map that the object is not tracked against now: nothing known tells how the present one lies to it.
+
+    Attributes:
+        known: The map.
+        surface: The map's surface.
+        usual: What frames that were tracked against it have cost.
+        spans: First and last index of the frames that it answered.
+        guessed: Whether how it lies to the first map is a guess.
+    """
+
+    known: ObjectMap
+    surface: Surface
+    usual: Usual
+    spans: tuple[tuple[int, int], ...]
+    guessed: bool
+
+
+@dataclass(frozen=True, eq=False)
 class Belief:
     """What the solver knows between two frames.
 
@@ -156,11 +175,17 @@ class Belief:
         leaning: ``(3,)`` how the object turns in that start, as a rotation vector; None if there was none.
         waits_for: Why the start waits, where that is not lack of motion.
         usual: What tracked frames have cost.
-        lost_for: How many frames in a row the object has been lost.
+        lost_for: How many frames in a row the object has been lost; those without a mask, where nothing can be tried,
+            count as one.
         doubted_for: How many frames in a row have been lost or hardly believed.
+        tried: The best pose of the last frame, where that had a mask and was not believed.
         trail: Poses and indices of the last frames that were believed.
         colours: Of object and surroundings in frames that were believed.
         past: The last frames that were believed, for what moves along.
+        anew: A second start, under way while the object is lost and there is a mask; see `anew`.
+        aside: Other maps of the object.
+        spans: First and last index of earlier frames that the present map answered; since: from which index it does.
+        guessed: Whether how it lies to the first map is a guess.
         reversal_tried: How many keyframes there were, and how many degrees they had turned, when depth was last tried
             the other way round.
     """
@@ -181,9 +206,15 @@ class Belief:
     usual: Usual = field(default_factory=Usual)
     lost_for: int = 0
     doubted_for: int = 0
+    tried: Pose | None = None
     trail: tuple[tuple[Pose, int], ...] = ()
     colours: Colours | None = None
     past: tuple[Glimpse, ...] = ()
+    anew: Belief | None = None
+    aside: tuple[Aside, ...] = ()
+    spans: tuple[tuple[int, int], ...] = ()
+    since: int = -1
+    guessed: bool = False
     reversal_tried: tuple[int, float] = (0, 0.0)
 
     def moved(self, pose: Pose, index: int, grey: NDArray[np.uint8], followed: FollowedPoints) -> Belief:
@@ -191,5 +222,5 @@ class Belief:
         return replace(self, last=(pose, index), before=self.last, grey=grey, followed=followed)
 
 
-ONLINE_CLASSES = (Belief, Colours, Glimpse, ObjectMap, View, Surface, FollowedPoints, Keypoints, Usual)
+ONLINE_CLASSES = (Aside, Belief, Colours, Glimpse, ObjectMap, View, Surface, FollowedPoints, Keypoints, Usual)
 """What a `Belief` is made of beside `tracking3d.estimation.solver.STATE_CLASSES`."""

@@ -34,6 +34,8 @@ _REASONS = {
     "stiffness": "hardly anything holds the object against turning about the camera's axis ({axis})",
 }
 _DOUBTED = 0.4  # confidence at most where points agree and pixels do not
+_BY_OUTLINE = 0.2  # confidence at most where only the outline agrees
+_AS_USUAL = 0.97  # of the overlap
 _UNWITNESSED = 0.5  # confidence at most where there is no mask to compare with
 _MEMORY = 0.9  # of the running means
 SETTLED = 15
@@ -52,12 +54,14 @@ class Support:
         strays: Share of such landmarks in the frame that are elsewhere, in [0, 1].
         mask_weight: How far the mask is believed, in [0, 1].
         has_mask: Whether there is one.
+        plain: Whether the object has no points that could agree.
     """
 
     witnesses: int
     strays: float = 0.0
     mask_weight: float = 1.0
     has_mask: bool = True
+    plain: bool = False
 
     @property
     def settles(self) -> bool:
@@ -126,6 +130,14 @@ def looks_wrong(fit: PoseFit, usual: Usual, support: Support) -> bool:
     return unexplained(fit, usual, support.mask_weight) or fit.points > 1.0
 
 
+def fits_outline(fit: PoseFit, usual: Usual) -> bool:
+    """Whether a pose fits the outline of its frame as well as is usual, whatever the pixels inside say.
+
+    On a plain object that turns under a lamp they change, and there is little else to go by.
+    """
+    return fit.overlap > _AS_USUAL * usual.overlap and fit.outline < usual.outline + _OUTLINE_ROOM
+
+
 def unusual(fit: PoseFit, usual: Usual, mask_weight: float) -> float:
     """By how much the losses exceed what is usual: above 0 they are higher, above 1 far higher.
 
@@ -188,25 +200,33 @@ def judge(
         astray: Whether the object was lost in the frame before, and no motion leads to the pose. Then it is no side
             that was never seen, and the mask may be of anything.
     """
-    far, few = unexplained(fit, usual, support.mask_weight), not support.settles
+    odd = unusual(fit, usual, support.mask_weight)
+    far, few = odd > 1, not support.settles
     if few and not support.has_mask:
         return Assessment(Status.LOST, "the object is out of sight: no mask, and no points of it", 0.05)
     if far and guessed and not few:
         return Assessment(Status.LOST, "no pose explains the frame; the best of many turns is a guess", 0.05)
+    confidence = likelihood(fit, support)
+    by_outline = support.plain and support.has_mask and fits_outline(fit, usual)
+    if few and far and by_outline:
+        reason = (
+            f"the outline agrees, pixels do not (loss {fit.appearance:.2f}, usually {usual.appearance:.2f})"
+        )
+        return Assessment(Status.UNCERTAIN, reason, min(confidence, _BY_OUTLINE))
     if few and far:
         reason = (
             f"neither pixels (loss {fit.appearance:.2f}, usually {usual.appearance:.2f}), nor the mask "
             f"(overlap {fit.overlap:.2f}), nor points ({support.witnesses}) agree with any pose"
         )
         return Assessment(Status.LOST, reason, 0.05)
-    confidence = likelihood(fit, support)
     if not support.has_mask:
         confidence = min(confidence, _UNWITNESSED)
     if few and fit.unseen > _MOSTLY:
         confidence *= 0.5
     if astray and few and confidence < BELIEVED:
+        status = Status.UNCERTAIN if by_outline and odd <= 0 else Status.LOST
         return Assessment(
-            Status.LOST, "what was found after the loss may be something else", min(confidence, 0.2)
+            status, "what was found after the loss may be something else", min(confidence, _BY_OUTLINE)
         )
     if far:
         reason = f"points agree, pixels do not (loss {fit.appearance:.2f})"

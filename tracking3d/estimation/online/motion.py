@@ -11,18 +11,31 @@ from numpy.typing import NDArray
 from tracking3d.estimation.online.attempt import Attempt
 from tracking3d.estimation.online.belief import Belief
 from tracking3d.estimation.online.mapping import project_points
-from tracking3d.estimation.online.tracking import coast
+from tracking3d.estimation.online.tracking import coast, placed
 from tracking3d.geometry.pose import Pose, extrapolate, rotation_angle
 
 _BRIEF, _NEAR = 5, 30.0
 """Frames of a loss, and degrees, within which motion still tells a side that was never seen: a thin view of a card."""
 
 
-def predicted(state: Belief, index: int) -> dict[str, Pose]:
-    """Poses to start from in frame ``index``, by name, the likeliest first."""
+def predicted(state: Belief, index: int, mask: NDArray[np.bool_] | None) -> dict[str, Pose]:
+    """Poses to start from in frame ``index``, by name, the likeliest first.
+
+    Args:
+        state: Before the frame.
+        index: Of the frame.
+        mask: ``(H, W)`` its initial mask, or None: of an object that was lost it says where it is again.
+    """
     last, last_index = state.last
     if state.lost_for and state.trail:
-        return {"coasting": coast(state.trail, index), "last": state.trail[-1][0]}
+        starts = {"coasting": coast(state.trail, index), "last": state.trail[-1][0]}
+        if mask is not None:
+            starts |= {
+                f"{name} in the mask": placed(pose, state.camera, mask) for name, pose in starts.items()
+            }
+            if state.tried is not None:
+                starts["tried"] = placed(state.tried, state.camera, mask)
+        return starts
     if state.before is None:
         return {"last": last}
     before, before_index = state.before
@@ -41,7 +54,7 @@ def carried(state: Belief, pose: Pose) -> NDArray[np.float32] | None:
 
 def led_to(state: Belief, pose: Pose, index: int) -> bool:
     """Whether the motion from before a loss leads to a pose: only a while, and only near where it goes on."""
-    if not state.trail or state.lost_for > _BRIEF:
+    if not state.trail or index - state.trail[-1][1] > _BRIEF + 1:
         return False
     away = float(rotation_angle(coast(state.trail, index).quaternion, pose.quaternion))
     return math.degrees(away) < _NEAR
@@ -56,8 +69,10 @@ def moved_on(state: Belief, found: Attempt, pose: Pose, grey: NDArray[np.uint8])
         pose: That it is answered with.
         grey: ``(H, W)`` the frame.
     """
+    searched_for = state.lost_for + 1 if found.view.mask is not None else max(state.lost_for, 1)
     return replace(
         state.moved(pose, found.view.index, grey, found.points),
-        lost_for=found.lost * (state.lost_for + 1),
+        lost_for=found.lost * searched_for,
         doubted_for=found.doubtful * (state.doubted_for + 1),
+        tried=found.fit.pose if found.lost and found.view.mask is not None else None,
     )

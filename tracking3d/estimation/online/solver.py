@@ -14,37 +14,42 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tracking3d.config.models import PipelineConfig
-from tracking3d.config.solvers import OnlineConfig
-from tracking3d.estimation.correction import SIGHTED
-from tracking3d.estimation.estimate import FrameEstimate, ObjectModel
+from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.estimation.feature_space import FeatureSpace, feature_channels
-from tracking3d.estimation.framing import mask_box, projected_box
-from tracking3d.estimation.observation import Observation, observe
+from tracking3d.estimation.online.anew import (
+    adopted,
+    believable,
+    doubted,
+    guess,
+    in_place,
+    is_whole,
+    joined,
+    largest_of,
+    looks_alike,
+    of_frame,
+    of_one_thing,
+    refined_aside,
+    turned_to,
+)
 from tracking3d.estimation.online.answers import solved, unsolved, with_colours
 from tracking3d.estimation.online.attempt import Attempt
 from tracking3d.estimation.online.belief import ONLINE_CLASSES, Belief, ObjectMap, View
 from tracking3d.estimation.online.final_refinement import refined_once_more
+from tracking3d.estimation.online.finding import PoseFinder
 from tracking3d.estimation.online.growing import refined, with_keyframe, with_points
-from tracking3d.estimation.online.judgement import ENOUGH_POINTS, judge, looks_wrong, unexplained
+from tracking3d.estimation.online.judgement import ENOUGH_POINTS, judge, unexplained
 from tracking3d.estimation.online.lens import through
-from tracking3d.estimation.online.mapping import mask_weight, pose_of
-from tracking3d.estimation.online.motion import carried, led_to, moved_on, predicted
+from tracking3d.estimation.online.mapping import pose_of
+from tracking3d.estimation.online.motion import carried, moved_on, predicted
 from tracking3d.estimation.online.moving import moving_beside, with_past
 from tracking3d.estimation.online.object_model import object_model
 from tracking3d.estimation.online.points import FollowedPoints, follow, grey
-from tracking3d.estimation.online.pose_refinement import PoseFit, PoseWeights
 from tracking3d.estimation.online.reversal import turned_round
-from tracking3d.estimation.online.sighting import meets, sighted
 from tracking3d.estimation.online.start import Start
 from tracking3d.estimation.online.steering import trusting, turned_back
 from tracking3d.estimation.online.tracking import (
     agreeing,
     coast,
-    fit_pose,
-    pixel_scale,
-    pose_of_points,
-    searched,
     supported,
     worth_trying,
 )
@@ -52,9 +57,8 @@ from tracking3d.estimation.online.waiting import solved_start, waiting_view
 from tracking3d.estimation.shape import Shape
 from tracking3d.estimation.solver import STATE_CLASSES
 from tracking3d.estimation.start import first_mask, first_translation, mask_ellipse, prototype_mesh
-from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame, MaskEstimate
-from tracking3d.geometry.camera import Camera, Window
+from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, rotation_angle
 from tracking3d.rendering import TexelMap
 from tracking3d.stages import in_stage
@@ -69,7 +73,7 @@ _TRAIL = 5  # believed frames that give the motion where nothing is seen
 
 
 @dataclass(frozen=True)
-class OnlineSolver:
+class OnlineSolver(PoseFinder):
     """See the module; implements `tracking3d.estimation.solver.Solver`, `RefiningSolver` and `SteeredSolver`.
 
     Attributes:
@@ -78,29 +82,8 @@ class OnlineSolver:
         encoder: The feature encoder.
     """
 
-    config: PipelineConfig
-    camera: Camera
-    encoder: FeatureEncoder
-
     state_classes: ClassVar[tuple[type, ...]] = (*STATE_CLASSES, *ONLINE_CLASSES)
     """What a `Belief` is made of, for keeping it."""
-
-    @property
-    def online(self) -> OnlineConfig:
-        """The solver's own part of the configuration."""
-        assert isinstance(self.config.solver, OnlineConfig)
-        return self.config.solver
-
-    @property
-    def weights(self) -> PoseWeights:
-        """Weights of a pose's terms."""
-        online = self.online
-        return PoseWeights(appearance=online.appearance, outline=online.outline, points=online.points)
-
-    @property
-    def device(self) -> torch.device:
-        """Where tensors live."""
-        return torch.device(self.config.runtime.device)
 
     def init(self, frame: Frame, mask: MaskEstimate) -> tuple[Belief, FrameEstimate]:
         """Take the first frame, with the prototype as the shape.
@@ -108,9 +91,14 @@ class OnlineSolver:
         Raises:
             InputError: If the first frame's mask is missing or empty, or the prototype cannot be used.
         """
-        binary = first_mask(frame, mask)
+        return self._first(frame, first_mask(frame, mask), self.camera)
+
+    def _first(
+        self, frame: Frame, binary: NDArray[np.bool_], camera: Camera, space: FeatureSpace | None = None
+    ) -> tuple[Belief, FrameEstimate]:
+        """Take a first frame; ``space`` is that of the features, where there is one."""
         ellipse = mask_ellipse(binary)
-        translation = torch.tensor(first_translation(ellipse, self.camera), dtype=torch.float32)
+        translation = torch.tensor(first_translation(ellipse, camera), dtype=torch.float32)
         pose = Pose.identity(translation.to(self.device))
         shape = Shape.of(prototype_mesh(self.config.object, ellipse), self.config.object.flat, self.device)
         texels = TexelMap.of(shape.face_uvs, self.config.object.texture_size)
@@ -124,21 +112,27 @@ class OnlineSolver:
             renderer=self.config.runtime.renderer,
         )
         image = grey(frame.image)
-        belief = Belief(self.camera, known, None, (pose, frame.index), None, image, FollowedPoints.none())
+        belief = Belief(camera, known, None, (pose, frame.index), None, image, FollowedPoints.none())
         observation = self._observe(belief, frame, binary, pose)
-        channels = feature_channels(self.encoder, self.config.object.texture_channels)
-        space = FeatureSpace.of(observation.features, observation.mask, channels)
+        if space is None:
+            channels = feature_channels(self.encoder, self.config.object.texture_channels)
+            space = FeatureSpace.of(observation.features, observation.mask, channels)
         observation = replace(observation, features=space.project(observation.features))
         view = View(observation, binary, pose, FollowedPoints.none())
-        known, view = with_points(known, self.camera, view, image)
-        answer = unsolved(frame, binary, pose, self.camera)
+        known, view = with_points(known, camera, view, image)
+        answer = unsolved(frame, binary, pose, camera)
         belief = replace(belief, known=known, space=space, followed=view.points, waiting=((view, answer),))
         return belief, answer
 
     def step(self, state: Belief, frame: Frame, mask: MaskEstimate) -> tuple[Belief, FrameEstimate]:
         """Take one more frame."""
-        advance = self._track if state.waiting is None else self._wait
-        return advance(state, frame, grey(frame.image), mask.found)
+        binary = mask.found
+        if state.waiting is not None:
+            return self._wait(state, frame, grey(frame.image), binary)
+        state, answer = self._track(state, frame, grey(frame.image), binary)
+        if answer.status is not Status.LOST or state.known.held or state.known.pointless or binary is None:
+            return state, answer
+        return self._otherwise(state, answer, frame, binary)
 
     turned_back = staticmethod(turned_back)
     trusting = staticmethod(trusting)
@@ -150,15 +144,20 @@ class OnlineSolver:
             if start is None:
                 return state
             state, _ = self._begun(state, start)
+        state = joined(state, self.online, state.known.keyframes)
+        state = largest_of(replace(state, spans=(*state.spans, (state.since, state.last[1]))))
         known, camera = refined_once_more(state.known, state.camera, self.online)
         return replace(
             state,
+            aside=tuple(refined_aside(other, state.camera, camera, self.online) for other in state.aside),
+            guessed=False,
             camera=camera,
             known=known,
             surface=known.surface(),
             before=None,
             lost_for=0,
             doubted_for=0,
+            trail=state.trail and ((known.keyframes[0].pose, known.keyframes[0].index),),
             followed=FollowedPoints.none(),
         )
 
@@ -166,6 +165,7 @@ class OnlineSolver:
         self, state: Belief, frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]
     ) -> tuple[Belief, FrameEstimate]:
         """A frame's pose once more, against the final map."""
+        state = of_frame(state, frame.index)
         binary, image, known = mask.found, grey(frame.image), state.known
         causal = pose_of(T_cam_obj[:3, :3], T_cam_obj[:3, 3], known.vertices)
         if state.surface is None:
@@ -177,15 +177,19 @@ class OnlineSolver:
             starts["keyframe"] = own.pose
             followed = own.points.joined(followed)
         if state.before is not None:
-            starts |= predicted(state, frame.index)
+            starts |= predicted(state, frame.index, binary)
         found = self._found(state, self._view(state, frame, binary, causal, followed), frame, image, starts)
         before = state.last if state.last[1] == frame.index - 1 else None
         belief = replace(moved_on(state, found, found.fit.pose, image), before=before)
+        if not found.lost:
+            belief = replace(belief, trail=(*state.trail, (found.fit.pose, frame.index))[-_TRAIL:])
         answer = solved(belief, unsolved(frame, binary, found.fit.pose, state.camera), found)
-        return belief, replace(answer, refined=True)
+        return belief, replace(doubted(answer) if state.guessed else answer, refined=True)
 
     def result(self, state: Belief) -> ObjectModel:
         """The object with its visible texture back-projected from the keyframes."""
+        if state.aside:
+            state = largest_of(state)
         known = state.known
         if not known.keyframes:
             known = replace(known, keyframes=tuple(view for view, _ in state.waiting or ()))
@@ -246,14 +250,14 @@ class OnlineSolver:
         self, state: Belief, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
     ) -> tuple[Belief, FrameEstimate]:
         """Find the frame's pose, and take it into the map where it shows something new."""
-        starts = predicted(state, frame.index)
+        starts = predicted(state, frame.index, mask)
         likeliest = next(iter(starts.values()))
         followed = follow(state.grey, image, state.followed, carried(state, likeliest))
         found = self._found(state, self._view(state, frame, mask, likeliest, followed), frame, image, starts)
-        key = not found.lost and self._is_keyframe(state, found)
+        usual = not unexplained(found.fit, state.usual, found.view.mask_weight)
+        key = not found.lost and (usual or found.support.settles) and self._is_keyframe(state, found)
         pose = coast(state.trail, frame.index) if found.lost else found.fit.pose
         belief = moved_on(state, found, pose, image)
-        usual = not unexplained(found.fit, state.usual, found.view.mask_weight)
         if usual and not found.lost:
             belief = replace(belief, usual=state.usual.updated(found.fit))
         if key:
@@ -264,6 +268,7 @@ class OnlineSolver:
                 last = known.keyframes[-1].pose, frame.index
                 belief = replace(belief, known=known, surface=surface, last=last, followed=followed)
                 belief = turned_round(belief, self.online)
+                belief = joined(belief, self.online, belief.known.keyframes[-1:])
             pose = belief.last[0]
         if found.lost:
             belief = replace(belief, before=None)
@@ -273,49 +278,41 @@ class OnlineSolver:
         plain, now = unsolved(frame, mask, pose, state.camera), belief
         answer = solved(now, plain, found, lambda: moving_beside(now, found, image))
         belief = with_past(with_colours(belief, answer, found), answer, found, image)
-        return belief, replace(answer, keyframe=key)
+        if not found.lost:
+            belief = replace(belief, anew=None)
+        return belief, replace(doubted(answer) if belief.guessed else answer, keyframe=key)
 
-    def _found(
-        self, state: Belief, view: View, frame: Frame, image: NDArray[np.uint8], starts: dict[str, Pose]
-    ) -> Attempt:
-        """The pose by cheap starts, by costly ones where it looks wrong, and elsewhere where none is believed."""
-        assert state.surface is not None
-        known, camera = state.known, state.camera
-        on_object = view.points.only(~known.candidate[view.points.landmark])
-        points = pose_of_points(known, camera, on_object, pixel_scale(view))
-        if points is not None:
-            starts = {**starts, "points": points[0]}
-        won, fit = self._fit(state, view, starts, view.points)
-        kept = agreeing(known, camera, fit.pose, view.points, view)
-        support = supported(known, camera, fit.pose, kept, view)
-        if state.lost_for or looks_wrong(fit, state.usual, support):
-            won, fit, kept = searched(
-                known, state.surface, camera, view, image, (won, fit, kept), self.weights, state.lost_for
-            )
-            support = supported(known, camera, fit.pose, kept, view)
-        astray = state.lost_for > 0 and not led_to(state, fit.pose, frame.index)
-        judgement = judge(fit, state.usual, support, won == "grid", astray)
-        best = Attempt(view, fit, won, kept, support, judgement)
-        if best.lost or (best.doubtful and worth_trying(state.doubted_for)):
-            other = self._elsewhere(state, frame, image, view.mask)
-            return other if other is not None and other.better_than(best) else best
-        return best
+    def _otherwise(
+        self, state: Belief, answer: FrameEstimate, frame: Frame, mask: NDArray[np.bool_]
+    ) -> tuple[Belief, FrameEstimate]:
+        """A lost object by another map that knows this side of it, or by a second start; see `anew`.
 
-    def _elsewhere(
-        self, state: Belief, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
-    ) -> Attempt | None:
-        """The object somewhere else in the frame than the mask; None where it is not seen there either."""
-        where = sighted(state.known, state.camera, image, state.trail[-1][0])
-        if where is None:
-            return None
-        pose, points = where
-        elsewhere = mask is None or not meets(state.known.silhouette(pose, state.camera), mask)
-        view = self._view(state, frame, None if elsewhere else mask, pose, points)
-        _, fit = self._fit(state, view, {SIGHTED: pose}, points)
-        kept = agreeing(state.known, state.camera, fit.pose, points, view)
-        support = supported(state.known, state.camera, fit.pose, kept, view)
-        found = Attempt(view, fit, SIGHTED, kept, support, judge(fit, state.usual, support, guessed=True))
-        return None if found.lost else found
+        Args:
+            state: After the frame, in which the object is lost.
+            answer: To it.
+            frame: The frame.
+            mask: ``(H, W)`` its initial mask.
+        """
+        image = grey(frame.image)
+        for other in state.aside if worth_trying(state.lost_for) else ():
+            belief, found = self._track(turned_to(state, other, frame.index), frame, image, mask)
+            if found.losses["witnesses"] >= ENOUGH_POINTS and found.status is not Status.LOST:
+                return belief, found
+        begun, last = state.anew, None
+        if begun is not None and begun.waiting:
+            last = begun.waiting[-1][0].mask
+        if begun is None or not of_one_thing(last, mask):
+            if not is_whole(mask) or not looks_alike(state, frame, mask):
+                return replace(state, anew=None), answer
+            camera = replace(state.camera, assumed=False)
+            return replace(state, anew=self._first(frame, mask, camera, state.space)[0]), answer
+        begun, again = self._wait(begun, frame, image, mask)
+        if begun.waiting is not None:
+            return replace(state, anew=begun), answer
+        if not believable(begun, again):
+            return replace(state, anew=None), answer
+        similarity = guess(state, begun)
+        return adopted(state, begun, similarity), in_place(again, similarity, state.camera)
 
     def _is_keyframe(self, state: Belief, found: Attempt) -> bool:
         """Whether the map has something to learn from a frame, and the frame can be relied on."""
@@ -327,34 +324,3 @@ class OnlineSolver:
             return True
         angles = [float(rotation_angle(other.pose.quaternion, fit.pose.quaternion)) for other in keyframes]
         return bool(np.degrees(min(angles)) > self.online.keyframe_rotation)
-
-    def _fit(
-        self, state: Belief, view: View, starts: dict[str, Pose], points: FollowedPoints
-    ) -> tuple[str, PoseFit]:
-        assert state.surface is not None
-        return fit_pose(state.known, state.surface, view, starts, points, self.weights)
-
-    def _view(
-        self,
-        state: Belief,
-        frame: Frame,
-        mask: NDArray[np.bool_] | None,
-        pose: Pose,
-        followed: FollowedPoints,
-    ) -> View:
-        """A frame as it is seen from a pose, with its mask judged by the points."""
-        on_object = followed.only(~state.known.candidate[followed.landmark])
-        observation = self._observe(state, frame, mask, pose)
-        return View(observation, mask, pose, followed, mask_weight=mask_weight(mask, on_object))
-
-    def _observe(
-        self, state: Belief, frame: Frame, mask: NDArray[np.bool_] | None, pose: Pose
-    ) -> Observation:
-        box = mask_box(mask) if mask is not None else projected_box(state.known.vertices, state.camera, pose)
-        if box is None:
-            box = (0.0, 0.0, float(state.camera.width), float(state.camera.height))
-        window = Window.around(box, self.config.window.margin, self.config.window.size)
-        observation = observe(frame, mask, window, state.camera, self.encoder, self.device)
-        if state.space is None:
-            return observation
-        return replace(observation, features=state.space.project(observation.features))

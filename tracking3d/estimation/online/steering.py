@@ -31,6 +31,7 @@ def turned_back(state: Belief, frame: Frame, number: int, T_cam_obj: NDArray[np.
     return replace(
         state,
         last=(pose, number),
+        anew=None,
         before=None,
         grey=grey(frame.image),
         followed=FollowedPoints.none() if own is None else own.points,

@@ -119,7 +119,7 @@ def supported(known: ObjectMap, camera: Camera, pose: Pose, agree: FollowedPoint
     gap = project_points(known.landmarks[names[told]], pose, camera) - view.points.pixel[told]
     stray = np.linalg.norm(gap, axis=1) > _STRAY * pixel_scale(view)
     strays = float(stray.mean()) if len(stray) else 0.0
-    return Support(witnesses(known, agree), strays, view.mask_weight, view.mask is not None)
+    return Support(witnesses(known, agree), strays, view.mask_weight, view.mask is not None, known.pointless)
 
 
 def rematched(
@@ -165,20 +165,21 @@ def matched_poses(
     return found
 
 
+def placed(pose: Pose, camera: Camera, mask: NDArray[np.bool_]) -> Pose:
+    """A pose moved in front of the camera, at its depth, to where a mask ``(H, W)`` is."""
+    x1, y1 = np.argwhere(mask)[:, ::-1].mean(0)
+    x, y, z = pose.translation.tolist()
+    shift = [(x1 - camera.cx) / camera.fx * z - x, (y1 - camera.cy) / camera.fy * z - y, 0.0]
+    return Pose(pose.translation + pose.translation.new_tensor(shift), pose.quaternion)
+
+
 def placed_keyframes(known: ObjectMap, camera: Camera, view: View) -> list[Pose]:
     """The poses of keyframes, moved in front of the camera to where the mask is."""
     if view.mask is None:
         return []
-    x1, y1 = np.argwhere(view.mask)[:, ::-1].mean(0)
     count = len(known.keyframes)
     chosen = np.unique(np.linspace(0, count - 1, _PLACED).round().astype(int))
-    poses = []
-    for position in chosen:
-        pose = known.keyframes[position].pose
-        x, y, z = pose.translation.tolist()
-        shift = [(x1 - camera.cx) / camera.fx * z - x, (y1 - camera.cy) / camera.fy * z - y, 0.0]
-        poses.append(Pose(pose.translation + pose.translation.new_tensor(shift), pose.quaternion))
-    return poses
+    return [placed(known.keyframes[position].pose, camera, view.mask) for position in chosen]
 
 
 def turned_grid(surface: Surface, view: View, pose: Pose, weights: PoseWeights) -> list[Pose]:
