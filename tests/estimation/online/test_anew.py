@@ -14,6 +14,7 @@ from tracking3d.checkpoint.trees import TreeFolder
 from tracking3d.config.loading import load_config
 from tracking3d.estimation.estimate import GUESSED, Status
 from tracking3d.estimation.online.anew import (
+    adopted,
     doubted,
     guess,
     is_whole,
@@ -26,6 +27,7 @@ from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.evaluation.metrics import aligned_rotation_errors
 from tracking3d.features.rgb import RgbEncoder
 from tracking3d.frames import Frame
+from tracking3d.geometry.similarity import Similarity
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 
 FIRST, HIDDEN = 12, 3
@@ -164,6 +166,17 @@ def test_the_guess_goes_on_turning_and_keeps_the_size():
     # A start from the map itself lies where the motion leads at its keyframes.
     assert np.linalg.det(similarity.R) == pytest.approx(1.0)
     assert np.degrees(np.arccos((np.trace(similarity.R) - 1) / 2)) < 60
+
+
+def test_of_many_maps_only_the_larger_ones_stand_aside():
+    state, _ = run(ALONE)
+    small = replace(state.aside[0], known=replace(state.aside[0].known, keyframes=()))
+    large = [replace(state.aside[0], spans=((n, n),)) for n in range(5)]
+    lost, _ = run(FIRST)
+    lost = replace(lost, aside=(large[0], small, *large[1:3]))
+    now = adopted(lost, state, Similarity(np.eye(3), 1.0, np.zeros(3)))
+    assert [other.spans[0][0] for other in now.aside[:3]] == [0, 1, 2] and len(now.aside) == 4
+    assert now.aside[-1].known is lost.known and now.guessed
 
 
 def test_what_is_lost_is_not_doubted_as_well():

@@ -153,6 +153,19 @@ def test_neither_pixels_nor_points_is_lost_and_says_what_disagreed():
     assert verdict.confidence < 0.1
 
 
+def test_a_plain_object_whose_outline_fits_is_not_lost_though_its_shades_change():
+    plain = Support(0, plain=True)
+    verdict = judge(WRONG, USUAL, plain)
+    assert verdict.status is Status.UNCERTAIN and "outline agrees" in verdict.reason
+    assert verdict.confidence <= 0.2
+    assert judge(fit(appearance=0.7, overlap=0.8), USUAL, plain).status is Status.LOST
+    assert judge(fit(appearance=0.7, outline=0.5), USUAL, plain).status is Status.LOST
+    assert judge(WRONG, USUAL, replace(plain, has_mask=False)).status is Status.LOST
+    # After a loss its pixels have to agree, too.
+    assert judge(fit(), USUAL, plain, astray=True).status is Status.UNCERTAIN
+    assert judge(DOUBTFUL, USUAL, plain, astray=True).status is Status.LOST
+
+
 def test_a_guessed_turn_that_explains_nothing_is_lost_whatever_points_agree_with_it():
     verdict = judge(WRONG, USUAL, Support(MANY), guessed=True)
     assert verdict.status is Status.LOST and "guess" in verdict.reason and verdict.confidence < 0.1

@@ -35,6 +35,7 @@ _OTHER_COLOURS = -0.5  # mean log ratio of colours from which a mask is of somet
 _UNPROVEN = 0.2  # confidence at most while how two maps lie to each other is a guess
 _FEWEST_PAIRS = 6  # landmarks of both maps that say how they lie to each other
 _MOST_VIEWS = 24  # of another map that a keyframe is compared with
+_MOST_ASIDE = 4
 _WORSE = 1.2  # times what keyframes cost, from which two maps are none
 _REASON = (
     "lost before and started anew: how this side lies to those seen before is a guess until one is seen again"
@@ -126,7 +127,7 @@ def adopted(state: Belief, begun: Belief, similarity: Similarity) -> Belief:
         before=before and (moved_pose(before[0], similarity), before[1]),
         trail=tuple((moved_pose(pose, similarity), index) for pose, index in begun.trail),
         colours=state.colours,
-        aside=(*state.aside, _aside(state, (*state.spans, (state.since, first - 1)))),
+        aside=_kept((*state.aside, _aside(state, (*state.spans, (state.since, first - 1))))),
         since=first,
         guessed=True,
     )
@@ -136,6 +137,13 @@ def _aside(state: Belief, spans: tuple[tuple[int, int], ...]) -> Aside:
     """The present map as one that stands aside."""
     assert state.surface is not None
     return Aside(state.known, state.surface, state.usual, spans, state.guessed)
+
+
+def _kept(aside: tuple[Aside, ...]) -> tuple[Aside, ...]:
+    """Not more than a few maps: those with most keyframes, in the order that they were in."""
+    fewest_first = sorted(aside, key=lambda other: len(other.known.keyframes))
+    dropped = fewest_first[: max(len(aside) - _MOST_ASIDE, 0)]
+    return tuple(other for other in aside if not any(other is one for one in dropped))
 
 
 def in_place(answer: FrameEstimate, similarity: Similarity, camera: Camera) -> FrameEstimate:
