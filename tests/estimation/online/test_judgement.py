@@ -151,6 +151,9 @@ def test_neither_pixels_nor_points_is_lost_and_says_what_disagreed():
     assert "0.90" in verdict.reason
     assert str(FEW) in verdict.reason
     assert verdict.confidence < 0.1
+    # Only what disagrees is said to.
+    assert "though one fits the mask" in verdict.reason
+    assert "nor the mask" in judge(fit(appearance=0.7, overlap=0.5), USUAL, Support(FEW)).reason
 
 
 def test_a_plain_object_whose_outline_fits_is_not_lost_though_its_shades_change():

@@ -169,10 +169,8 @@ def doubted(answer: FrameEstimate) -> FrameEstimate:
 
 def turned_to(state: Belief, other: Aside, index: int) -> Belief:
     """The belief that goes on from frame ``index`` with a map that stood aside; the object is still lost."""
-    newest = other.known.keyframes[-1]
     return replace(
         _against(state, other, (*state.spans, (state.since, index - 1))),
-        trail=((newest.pose, newest.index),),
         lost_for=max(state.lost_for, 1),
         since=index,
         anew=None,
@@ -217,8 +215,10 @@ def refined_aside(other: Aside, before: Camera, after: Camera, config: OnlineCon
 
 def _against(state: Belief, other: Aside, spans: tuple[tuple[int, int], ...]) -> Belief:
     """The belief with another map, and the present one, which answered ``spans``, aside."""
+    newest = other.known.keyframes[-1]
     return replace(
         state,
+        trail=((newest.pose, newest.index),),
         known=other.known,
         surface=other.surface,
         usual=other.usual,
@@ -240,8 +240,10 @@ def joined(state: Belief, config: OnlineConfig, views: tuple[View, ...]) -> Beli
         config: Of the solver.
         views: Keyframes of the present map that are compared with the others.
     """
+    indices = {view.index for view in views}
     for other in state.aside:
-        for view in views:
+        # Joining gives landmarks new names, so that the views are other ones then.
+        for view in (view for view in state.known.keyframes if view.index in indices):
             similarity = _shown(state.known, other.known, state.camera, view)
             known = None if similarity is None else _as_one(state, other.known, similarity, config)
             if similarity is not None and known is not None:

@@ -214,10 +214,12 @@ def judge(
         )
         return Assessment(Status.UNCERTAIN, reason, min(confidence, _BY_OUTLINE))
     if few and far:
-        reason = (
-            f"neither pixels (loss {fit.appearance:.2f}, usually {usual.appearance:.2f}), nor the mask "
-            f"(overlap {fit.overlap:.2f}), nor points ({support.witnesses}) agree with any pose"
-        )
+        pixels = f"neither pixels (loss {fit.appearance:.2f}, usually {usual.appearance:.2f})"
+        mask, points = f"the mask (overlap {fit.overlap:.2f})", f"points ({support.witnesses})"
+        if fits_outline(fit, usual):
+            reason = f"{pixels} nor {points} agree with any pose, though one fits {mask}"
+        else:
+            reason = f"{pixels}, nor {mask}, nor {points} agree with any pose"
         return Assessment(Status.LOST, reason, 0.05)
     if not support.has_mask:
         confidence = min(confidence, _UNWITNESSED)
