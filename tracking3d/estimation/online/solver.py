@@ -183,6 +183,8 @@ class OnlineSolver(PoseFinder):
         belief = replace(moved_on(state, found, found.fit.pose, image), before=before)
         if not found.lost:
             belief = replace(belief, trail=(*state.trail, (found.fit.pose, frame.index))[-_TRAIL:])
+        if found.lost:  # no pose was found that would be better than where it was taken to be
+            found = replace(found, fit=replace(found.fit, pose=causal))
         answer = solved(belief, unsolved(frame, binary, found.fit.pose, state.camera), found)
         return belief, replace(doubted(answer) if state.guessed else answer, refined=True)
 
