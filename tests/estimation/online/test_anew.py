@@ -138,6 +138,14 @@ def test_maps_that_were_never_joined_are_refined_each_by_itself():
     assert np.array_equal(mesh.vertices, largest_of(state).known.vertices.numpy())
 
 
+def test_a_frame_that_stays_lost_stays_where_it_was_taken_to_be():
+    _, causal = run(ALONE)
+    _, answers = refined(ALONE)
+    for before, after in list(zip(final(causal), answers, strict=True))[FIRST:BACK]:
+        assert before.status is after.status is Status.LOST
+        assert np.allclose(after.T_cam_obj, before.T_cam_obj, atol=1e-5)
+
+
 def test_each_frame_is_looked_at_again_with_the_map_that_answered_it():
     state, _ = refined(ALONE)
     first, second = (of_frame(state, index).known for index in (2, ALONE - 1))
