@@ -66,7 +66,7 @@ class SecondLook:
 
     def see(self, record: FrameRecord, image: Image, mask: NDArray[np.bool_]) -> None:
         """Keep a frame, if it is one of those to be bundled and its object was found."""
-        if self.wants(record.index) and record.status is not Status.LOST and GUESSED not in record.losses:
+        if self.wants(record.index) and record.status is not Status.LOST:
             view = self._view(record.T_cam_obj, image, mask)
             if view is not None:
                 self._views[record.index] = view
@@ -104,7 +104,8 @@ class SecondLook:
             return record.T_cam_obj, None
         after = bisect(self._bundled, record.index)
         around = [at for at in (after - 1, after) if 0 <= at < len(self._bundled)]
-        if record.status is Status.LOST and len(around) == 2:
+        lost = record.status is Status.LOST
+        if lost and GUESSED not in record.losses and len(around) == 2:
             return self._between(record.index, *around), None
         nearest = min(around, key=lambda at: abs(self._bundled[at] - record.index))
         kept = scene.views[nearest]
@@ -114,8 +115,7 @@ class SecondLook:
         # What the nearest frame's pose was moved by in object coordinates: mostly, the object frame itself moved.
         T_before_now = np.linalg.inv(self._as_settled(self._before[self._bundled[nearest]])) @ kept.T_cam_obj
         predicted = self._as_settled(record.T_cam_obj) @ T_before_now
-        apart = record.status is Status.LOST or GUESSED in record.losses
-        view = None if apart else self._view(predicted, image, mask)
+        view = None if lost else self._view(predicted, image, mask)
         if view is None:
             return predicted, None
         resected, share = resect(scene, view, around)

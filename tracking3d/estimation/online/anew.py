@@ -32,7 +32,7 @@ from tracking3d.geometry.similarity import Similarity
 
 _SAME_MASK = 0.3  # IoU of the masks of two frames, below which they are of two things
 _OTHER_COLOURS = -0.5  # mean log ratio of colours from which a mask is of something else
-_UNPROVEN = 0.2  # confidence at most while how two maps lie to each other is a guess
+_UNPROVEN = 0.05  # confidence at most while how two maps lie to each other is a guess
 _FEWEST_PAIRS = 6  # landmarks of both maps that say how they lie to each other
 _MOST_VIEWS = 24  # of another map that a keyframe is compared with
 _MOST_ASIDE = 4
@@ -154,14 +154,13 @@ def in_place(answer: FrameEstimate, similarity: Similarity, camera: Camera) -> F
 
 
 def doubted(answer: FrameEstimate) -> FrameEstimate:
-    """An answer against a map of which it is a guess how it lies to the first."""
+    """An answer against a map of which it is a guess how it lies to the first: lost, whatever its mask is worth."""
     if answer.status is Status.LOST:
         return answer
-    reason = _REASON if answer.status is Status.TRACKED else answer.reason
     return replace(
         answer,
-        status=Status.UNCERTAIN,
-        reason=reason,
+        status=Status.LOST,
+        reason=_REASON,
         confidence=min(answer.confidence, _UNPROVEN),
         losses=dict(answer.losses) | {GUESSED: 1.0},
     )

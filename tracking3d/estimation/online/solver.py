@@ -130,9 +130,13 @@ class OnlineSolver(PoseFinder):
         if state.waiting is not None:
             return self._wait(state, frame, grey(frame.image), binary)
         state, answer = self._track(state, frame, grey(frame.image), binary)
-        if answer.status is not Status.LOST or state.known.held or state.known.pointless or binary is None:
-            return state, answer
-        return self._otherwise(state, answer, frame, binary)
+        if (
+            answer.status is Status.LOST
+            and binary is not None
+            and not state.known.held | state.known.pointless
+        ):
+            state, answer = self._otherwise(state, answer, frame, binary)
+        return state, doubted(answer) if state.guessed else answer
 
     turned_back = staticmethod(turned_back)
     trusting = staticmethod(trusting)
@@ -282,7 +286,7 @@ class OnlineSolver(PoseFinder):
         belief = with_past(with_colours(belief, answer, found), answer, found, image)
         if not found.lost:
             belief = replace(belief, anew=None)
-        return belief, replace(doubted(answer) if belief.guessed else answer, keyframe=key)
+        return belief, replace(answer, keyframe=key)
 
     def _otherwise(
         self, state: Belief, answer: FrameEstimate, frame: Frame, mask: NDArray[np.bool_]
