@@ -10,7 +10,7 @@ from rendered_views import CAMERA, ball, pattern, pose, seen
 from scipy.spatial.transform import Rotation
 
 from tracking3d.bundle_adjustment.reversal import reversal_of
-from tracking3d.estimation.estimate import Status
+from tracking3d.estimation.estimate import GUESSED, Status
 from tracking3d.evaluation.alignment import align_object_frame
 from tracking3d.points import landmarks
 from tracking3d.points.chain import Chain
@@ -87,6 +87,34 @@ def test_a_lost_frame_is_not_looked_at_but_goes_on_from_the_view_before_to_the_o
     turned = [np.rad2deg(Rotation.from_matrix(found[:3, :3] @ T[:3, :3].T).magnitude()) for T in beside]
     assert turned[0] == pytest.approx(turned[1], abs=1e-6)
     np.testing.assert_allclose(found[:3, 3], np.mean(beside, 0)[:3, 3])
+
+
+def test_a_pose_that_lies_to_the_others_by_a_guess_keeps_its_motion():
+    off = disturbed()
+    look, guessed = SecondLook(ball(), CAMERA, range(9), 20), []
+    for index, (image, mask) in enumerate(FRAMES):
+        record = answer(index, off[index])
+        if index in (3, 4):
+            lost = answer(index, off[7] @ turned_by(index), Status.LOST)
+            record = replace(lost, losses={GUESSED: 1.0})
+            guessed.append(record)
+        look.see(record, image, mask)
+    look.settle()
+    found = [look.pose(one, *FRAMES[one.index]) for one in guessed]
+    assert all(landmarks is None for _, landmarks in found)
+    # Not what goes on from the frame before to the one after: what it was, in the object's final coordinates.
+    steps = [
+        b[:3, :3] @ a[:3, :3].T for a, b in ((found[0][0], found[1][0]), [one.T_cam_obj for one in guessed])
+    ]
+    gap = Rotation.from_matrix(steps[0] @ steps[1].T).magnitude()
+    assert np.rad2deg(gap) < 3 and np.rad2deg(Rotation.from_matrix(steps[1]).magnitude()) > 15
+
+
+def turned_by(index: int) -> np.ndarray:
+    """Far more than the ball turns from frame to frame."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec([0.0, 0.0, np.deg2rad(20 * index)]).as_matrix()
+    return T
 
 
 def test_too_few_frames_or_poses_that_are_no_numbers_change_nothing():

@@ -22,6 +22,7 @@ from tracking3d.estimation.online.anew import (
     looks_alike,
     of_frame,
     of_one_thing,
+    refined_aside,
 )
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.evaluation.metrics import aligned_rotation_errors
@@ -167,6 +168,19 @@ def test_a_run_that_is_stopped_meanwhile_goes_on_as_if_it_had_not_been(count, tm
     _, expected = solver().step(state, frame, estimate_of(mask))
     _, answer = solver().step(kept, frame, estimate_of(mask))
     assert np.array_equal(answer.T_cam_obj, expected.T_cam_obj) and answer.status is expected.status
+
+
+def test_a_map_that_stands_aside_goes_through_the_lens_of_the_end():
+    state, _ = run(ALONE)
+    before = state.camera
+    after = before.zoomed(1.2, "solved")
+    other = refined_aside(state.aside[0], before, after, solver().online)
+    # The first keyframe's pose moves with the lens alone.
+    (x, y, z), (u, v, w) = (
+        one.known.keyframes[0].pose.translation.tolist() for one in (state.aside[0], other)
+    )
+    assert (u, v, w) == pytest.approx((x, y, 1.2 * z))
+    assert other.guessed and other.spans == state.aside[0].spans
 
 
 def test_the_guess_goes_on_turning_and_keeps_the_size():

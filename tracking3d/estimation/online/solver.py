@@ -74,13 +74,7 @@ _TRAIL = 5  # believed frames that give the motion where nothing is seen
 
 @dataclass(frozen=True)
 class OnlineSolver(PoseFinder):
-    """See the module; implements `tracking3d.estimation.solver.Solver`, `RefiningSolver` and `SteeredSolver`.
-
-    Attributes:
-        config: The pipeline's configuration.
-        camera: The camera of the full frame.
-        encoder: The feature encoder.
-    """
+    """See the module; implements `tracking3d.estimation.solver.Solver`, `RefiningSolver` and `SteeredSolver`."""
 
     state_classes: ClassVar[tuple[type, ...]] = (*STATE_CLASSES, *ONLINE_CLASSES)
     """What a `Belief` is made of, for keeping it."""
@@ -130,11 +124,8 @@ class OnlineSolver(PoseFinder):
         if state.waiting is not None:
             return self._wait(state, frame, grey(frame.image), binary)
         state, answer = self._track(state, frame, grey(frame.image), binary)
-        if (
-            answer.status is Status.LOST
-            and binary is not None
-            and not state.known.held | state.known.pointless
-        ):
+        may_begin_anew = not state.known.held and not state.known.pointless
+        if answer.status is Status.LOST and binary is not None and may_begin_anew:
             state, answer = self._otherwise(state, answer, frame, binary)
         return state, doubted(answer) if state.guessed else answer
 
