@@ -57,6 +57,28 @@ def test_poses_are_put_right_also_of_frames_that_were_not_kept(most):
     assert np.abs(np.linalg.norm(look.vertices, axis=1) - 1).max() < 0.1
 
 
+def test_a_side_that_is_seen_between_the_evenly_spaced_views_has_landmarks_too():
+    """Every third view shows one side, the two between the other one: as of a long video that goes to and fro."""
+    yaws = np.array([yaw if yaw % 3 == 0 else 150 + yaw for yaw in range(22)], float)
+    true = np.stack([pose(yaw, 0.4 * (yaw % 50)) for yaw in yaws])
+    frames = [seen(T, pattern()) for T in true]
+    off = true.copy()
+    turns = Rotation.from_rotvec(np.deg2rad(np.random.default_rng(2).normal(0, 1.0, (len(true), 3))))
+    off[:, :3, :3] = turns.as_matrix() @ true[:, :3, :3]
+    look = SecondLook(ball(), CAMERA, range(len(true)), len(true))
+    for index, (image, mask) in enumerate(frames):
+        look.see(answer(index, off[index]), image, mask)
+    look.settle()
+    found, supports = zip(
+        *(look.pose(answer(index, off[index]), *frames[index]) for index in range(len(true))), strict=True
+    )
+    assert min(support.followed for support in supports) > 60
+    for side in (yaws < 100, yaws > 100):
+        R = align_object_frame(np.stack(found)[side], true[side]).poses(np.stack(found)[side])[:, :3, :3]
+        left = R @ true[side][:, :3, :3].transpose(0, 2, 1)
+        assert np.rad2deg(Rotation.from_matrix(left).magnitude()).mean() < 0.4
+
+
 def test_a_lens_that_was_assumed_is_put_right_with_them_and_one_that_was_given_stays():
     longer = replace(CAMERA, fx=1.3 * CAMERA.fx, fy=1.3 * CAMERA.fy)
     off = disturbed(0.5)

@@ -7,7 +7,7 @@ points are followed better: it is done several times.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -37,6 +37,8 @@ _LEAST_VIEWS = 6  # of a landmark that moves the surface
 _LEAST_SUPPORT = 60  # points in half of the views; with fewer, poses were wrong more often than put right
 _SETTLED = np.deg2rad(0.06)
 _HELD = 0.1  # deviation of landmarks from the surface, in radii
+
+_Corners = tuple[NDArray[np.int64], Array, Array]
 
 
 @dataclass(frozen=True)
@@ -148,26 +150,28 @@ def _refine_once(scene: Scene, free_focal: bool) -> Scene:
     if not there:
         return scene
     views = [view for view in scene.views if view is not None]
+    T = np.stack([view.T_cam_obj for view in views])
+    corners = [seeds(view, scene.vertices, scene.faces) for view in views]
     spread = np.unique(np.linspace(0, len(there) - 1, START_VIEWS).round().astype(int))
-    begun = [seeds(views[at], scene.vertices, scene.faces) for at in spread]
-    face, barycentric, xy = (np.concatenate(part) for part in zip(*begun, strict=True))
-    if not len(xy):
+    begun = _begin(scene, there, corners, spread)
+    # Spread evenly, the views may all show one side of an object that goes to and fro or round.
+    unreached = np.flatnonzero(begun.followed < [len(xy) for _, _, xy in corners])
+    if len(unreached):
+        further = unreached[_unlike(T[unreached, :3, :3], START_VIEWS)]
+        begun = begun.and_of(_begin(scene, there, corners, further))
+    if not len(begun.face):
         return scene
-    start = np.repeat(np.array(there)[spread], [len(one[2]) for one in begun])
-    chain = follow_chain(scene.warps(), start, xy)
+    face, barycentric, followed = begun.face, begun.barycentric, begun.followed.tolist()
     points = np.einsum("nk,nkd->nd", barycentric, scene.vertices[scene.faces[face]])
-    intrinsics, T = np.stack([v.intrinsics for v in views]), np.stack([v.T_cam_obj for v in views])
-    measured = chain.measured[there]
-    followed = np.isfinite(measured).all(2).sum(1).tolist()
     if np.median(followed) < _LEAST_SUPPORT:
         return replace(
             scene, support={at: Support(count, 0) for at, count in zip(there, followed, strict=True)}
         )
     solved = partial(
         bundle,
-        intrinsics=intrinsics,
-        measured=measured,
-        deviation=np.sqrt(chain.variance[there] + DEVIATION**2),
+        intrinsics=np.stack([view.intrinsics for view in views]),
+        measured=begun.measured,
+        deviation=np.sqrt(begun.variance + DEVIATION**2),
         held=_HELD * scene.radius,
     )
     found, vertices = solved(points, T_cam_obj=T), scene.vertices
@@ -188,7 +192,68 @@ def _refine_once(scene: Scene, free_focal: bool) -> Scene:
     return replace(redrawn, support=support)
 
 
-def seeds(view: View, vertices: Array, faces: NDArray[np.int64]) -> tuple[NDArray[np.int64], Array, Array]:
+@dataclass(frozen=True, eq=False)
+class _Begun:
+    """N landmarks that began in some of T views, and where the images say that they are in each.
+
+    Attributes:
+        face: ``(N,)`` on which each lies.
+        barycentric: ``(N, 3)`` where on it.
+        measured: ``(T, N, 2)`` pixels, see `Chain`.
+        variance: ``(T, N)`` squared pixels.
+    """
+
+    face: NDArray[np.int64]
+    barycentric: Array
+    measured: Array
+    variance: Array
+
+    @property
+    def followed(self) -> NDArray[np.int64]:
+        """``(T,)`` how many were found in each view."""
+        return np.isfinite(self.variance).sum(1)
+
+    def and_of(self, other: _Begun) -> _Begun:
+        """These and others."""
+        return _Begun(
+            np.concatenate([self.face, other.face]),
+            np.concatenate([self.barycentric, other.barycentric]),
+            np.concatenate([self.measured, other.measured], axis=1),
+            np.concatenate([self.variance, other.variance], axis=1),
+        )
+
+
+def _begin(
+    scene: Scene, there: Sequence[int], corners: Sequence[_Corners], starts: NDArray[np.integer]
+) -> _Begun:
+    """Landmarks that begin in some views, followed through all.
+
+    Args:
+        scene: Surface and views.
+        there: Places in the scene of the views that there are.
+        corners: What `seeds` says of each.
+        starts: Which of them landmarks begin in.
+    """
+    face, barycentric, xy = (
+        np.concatenate(part) for part in zip(*(corners[at] for at in starts), strict=True)
+    )
+    start = np.repeat(np.array(there)[starts], [len(corners[at][2]) for at in starts])
+    chain = follow_chain(scene.warps(), start, xy)
+    return _Begun(face, barycentric, chain.measured[there], chain.variance[there])
+
+
+def _unlike(R_cam_obj: Array, count: int) -> NDArray[np.int64]:
+    """Indices of views ``(N, 3, 3)`` that are turned as far from one another as can be, ascending."""
+    chosen, nearest = [0], np.full(len(R_cam_obj), np.inf)
+    while len(chosen) < min(count, len(R_cam_obj)):
+        trace = np.einsum("nij,ij->n", R_cam_obj, R_cam_obj[chosen[-1]])
+        nearest = np.minimum(nearest, np.arccos(np.clip((trace - 1) / 2, -1, 1)))
+        nearest[chosen] = -1
+        chosen.append(int(nearest.argmax()))
+    return np.sort(np.array(chosen))
+
+
+def seeds(view: View, vertices: Array, faces: NDArray[np.int64]) -> _Corners:
     """Where landmarks begin in a view of a surface: face ``(N,)``, weights of its corners ``(N, 3)``, and pixel
     ``(N, 2)`` of each.
     """
