@@ -22,6 +22,7 @@ from tracking3d.report.doubts import doubts_of
 from tracking3d.report.probability_layer import probability_layers
 from tracking3d.report.run_report import write_report
 from tracking3d.report.several import write_reports
+from tracking3d.results import layout
 from tracking3d.results.layout import runs_in
 from tracking3d.results.probabilities import write_probability
 from tracking3d.results.run_reader import RunReader
@@ -154,6 +155,18 @@ def test_doubts_name_the_lost_the_uncertain_and_what_was_handed_back(run_folder)
     assert "The object was lost in 3 of 12 frames" in told
     assert "2 of 12 frames are uncertain" in told
     assert "In 1 of 12 frames that is not lost the mask is the mask tracker's" in told
+
+
+def test_doubts_tell_guessed_poses_from_those_of_frames_in_which_nothing_is_known(run_folder):
+    path = run_folder / layout.FRAMES
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    guessed = [line for line in lines if line["status"] == "lost"][1:]
+    for line in guessed:
+        line["losses"], line["mask_source"] = {"guessed": 1.0}, "weighed"
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    told = " ".join(doubts_of(RunReader(run_folder)))
+    assert "The object was lost in 1 of 12 frames: their poses mean nothing" in told
+    assert "In 2 of 12 frames the object came back by a side that nothing had shown" in told
 
 
 @pytest.mark.parametrize(

@@ -105,6 +105,19 @@ def test_axes_that_begin_beside_the_mask_are_left_out(turning_sphere, shift):
     )
 
 
+def test_axes_that_begin_in_a_hole_of_the_mask_are_drawn(turning_sphere):
+    estimate, camera = turning_sphere.estimates[0], turning_sphere.camera
+    axes = ObjectAxes.of(estimate, camera)
+    rows, columns = (round(float(places.mean())) for places in np.nonzero(estimate.mask))
+    pierced = estimate.mask.copy()
+    pierced[rows - 3 : rows + 4, columns - 3 : columns + 4] = False
+    with_axes, without = (overlay_of(turning_sphere, 0, one, mask=pierced) for one in (axes, None))
+    assert not np.array_equal(with_axes, without)
+    pierced[: rows + 1, columns - 3 : columns + 4] = False
+    with_axes, without = (overlay_of(turning_sphere, 0, one, mask=pierced) for one in (axes, None))
+    assert np.array_equal(with_axes, without), "a hole that is open to the outside is beside the object"
+
+
 def test_axes_of_a_pose_far_outside_of_the_frame_are_left_out(turning_sphere):
     axes, T = ObjectAxes(np.zeros(3), 1.0), np.eye(4)
     T[:3, 3] = 1e9, 0, 1

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("viser", reason="viser is absent: pip install 'tracking3d[view]'")
 
-from tracking3d.viewer.browser_camera import _ASPECT, _FOV, aside_of, framed
+from tracking3d.viewer.browser_camera import _ASPECT, _FOV, _NARROW, aside_of, framed
 
 RING = np.array([[np.sin(turn), 0, -np.cos(turn)] for turn in np.linspace(0, 6, 40)]) * 4
 
@@ -30,14 +30,21 @@ def test_a_path_of_next_to_no_length_is_looked_at_from_aside(path):
     )
 
 
+def test_a_long_path_takes_no_more_than_its_own_room():
+    turns = np.linspace(0, 6, 100_000)  # a square matrix of that side has 80 GB
+    path = 4 * np.stack([np.sin(turns), 0 * turns, -np.cos(turns)], axis=1)
+    assert aside_of(path) == pytest.approx(aside_of(RING), abs=0.05)
+
+
 def test_an_arc_is_seen_from_behind_its_cameras():
     assert aside_of(RING[:14]) @ RING[7] > 0.5 * np.linalg.norm(RING[7])
 
 
 @pytest.mark.parametrize("path", [RING, RING[:14], RING[:1]], ids=["ring", "arc", "one"])
-def test_the_first_look_holds_the_path_and_the_object(path):
+@pytest.mark.parametrize("aspect", [_ASPECT, _NARROW], ids=["one", "beside_one_another"])
+def test_the_first_look_holds_the_path_and_the_object(path, aspect):
     places, aside = np.vstack([path, np.zeros(3)]), aside_of(path)
-    middle, distance = framed(places, aside)
+    middle, distance = framed(places, aside, aspect)
     forward = -aside
     right = np.cross(forward, [0.0, -1.0, 0.0])
     right /= np.linalg.norm(right)
@@ -45,5 +52,5 @@ def test_the_first_look_holds_the_path_and_the_object(path):
     depth = seen @ forward
     half = np.tan(_FOV / 2)
     assert (depth > 0).all()
-    assert (np.abs(seen @ right / depth) < half * _ASPECT).all()
+    assert (np.abs(seen @ right / depth) < half * aspect).all()
     assert (np.abs(seen @ np.cross(forward, right) / depth) < half).all()

@@ -20,7 +20,7 @@ from tracking3d.picker.correction import DrawnCorrection
 from tracking3d.results import layout
 from tracking3d.video import open_source
 from tracking3d.viewer import correcting
-from tracking3d.viewer.correcting import RunCorrection
+from tracking3d.viewer.correcting import Corrections, RunCorrection
 from tracking3d.viewer.followed_run import FollowedRun
 from tracking3d.viewer.opening import open_viewer
 from tracking3d.viewer.run_images import LatestImages
@@ -119,12 +119,21 @@ def test_one_at_a_time_and_it_ends_with_the_viewer(correction, commands, describ
 
 
 @pytest.mark.parametrize(
-    ("frame", "why"), [(0, "in which the object was given"), (12, "no answer for frame 12")]
+    ("frame", "why"), [(0, "In frame 0 the object was given"), (12, "no answer for frame 12")]
 )
 def test_frames_that_cannot_be_corrected_are_refused(correction, commands, frame, why):
     with pytest.raises(InputError, match=why):
         correction.begin(DrawnCorrection(frame, box=(1, 1, 5, 5)))
     assert commands == []
+
+
+def test_a_link_is_offered_for_frames_that_can_be_corrected_only(correction):
+    corrections = Corrections([correction], Access())
+    assert "Correct frame 7" in corrections.offered(7)
+    for frame, why in [(0, "In frame 0 the object was given"), (12, "no answer for frame 12")]:
+        offered = corrections.offered(frame)
+        assert why in offered
+        assert "href" not in offered
 
 
 @pytest.mark.parametrize(

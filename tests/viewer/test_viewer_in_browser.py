@@ -57,6 +57,18 @@ def test_the_timeline_and_the_doubts_lead_to_their_frames(shown, run):
         assert page.locator("canvas").first.bounding_box()["width"] > 200
 
 
+def test_nothing_stands_before_the_model_when_looking_through_the_camera(shown, run):
+    with shown(run) as page:
+        close_notice(page)
+        wait_for_frame(page, 0)
+        for name in ("path of the camera", "present frame"):
+            assert page.get_by_label(name).is_checked()
+        page.click("text=Look through the camera")
+        label = "[...document.querySelectorAll('label')].find(one => one.textContent.trim() === name)"
+        for name in ("path of the camera", "present frame"):
+            page.wait_for_function(f"name => !{label}.control.checked", arg=name)
+
+
 def test_a_run_that_goes_on_is_followed_to_its_end(shown, tmp_path):
     write_frames(tmp_path / "frames", 10)
     with open_run(tmp_path / "run", str(tmp_path / "frames")) as writer:

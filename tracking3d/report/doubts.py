@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tracking3d.estimation.estimate import MaskSource, Status
+from tracking3d.estimation.estimate import GUESSED, MaskSource, Status
 from tracking3d.results.run_reader import RunReader
 
 
@@ -41,7 +41,9 @@ def _about_its_end(run: RunReader) -> list[str]:
 
 def _about_frames(run: RunReader) -> list[str]:
     told, count = [], len(run.frames)
-    lost = sum(record.status is Status.LOST for record in run.frames)
+    losses = [record.losses for record in run.frames if record.status is Status.LOST]
+    guessed = sum(GUESSED in terms for terms in losses)
+    lost = len(losses) - guessed
     uncertain = sum(record.status is Status.UNCERTAIN for record in run.frames)
     failed = sum(bool(record.failure) for record in run.frames)
     skipped = len(run.description.get("skipped") or [])
@@ -49,6 +51,12 @@ def _about_frames(run: RunReader) -> list[str]:
         told.append(
             f"The object was lost in {_of(lost, count)}: their poses mean nothing, and their masks, if they "
             "have any, are the mask tracker's."
+        )
+    if guessed:
+        told.append(
+            f"In {_of(guessed, count)} the object came back by a side that nothing had shown. How that lies to the "
+            "rest is a guess, so that they count as lost; their masks are answers, and their poses right among "
+            "themselves at most."
         )
     if uncertain:
         told.append(

@@ -95,7 +95,7 @@ def draw_overlay(
         record: The same answer as it is recorded.
         camera: The camera of the full frame.
         axes: The object's axes; None leaves them out. So does a frame that is not tracked, and a pose that puts
-            them beside the answer's mask.
+            them beside the object.
 
     Returns:
         ``(height, width, 3)`` as `OverlaySize.of` gives them.
@@ -144,10 +144,18 @@ def _draw_axes(
 
 
 def _is_on(mask: NDArray[np.bool_], pixel: NDArray[np.float64]) -> bool:
-    """Whether the pixel ``(2,)`` x and y is one of the mask's."""
+    """Whether the pixel ``(2,)`` x and y is one of the mask's, or of a hole in it.
+
+    The middle of a mug is seen through its handle at times, that of a gate always: it is not beside the object.
+    """
     column, row = np.clip(pixel, -1, max(mask.shape)).round().astype(int)
-    inside = 0 <= row < mask.shape[0] and 0 <= column < mask.shape[1]
-    return bool(inside and mask[row, column])
+    if not (0 <= row < mask.shape[0] and 0 <= column < mask.shape[1]):
+        return False
+    if mask[row, column]:
+        return True
+    outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    place = (float(column), float(row))
+    return any(cv2.pointPolygonTest(outline, place, False) >= 0 for outline in outlines)
 
 
 def _draw_bar(bar: Image, record: FrameRecord) -> None:

@@ -12,26 +12,40 @@ from tracking3d.viewer.scene import ObjectScene
 
 _FOV = 0.8  # radians, upright
 _ASPECT = 0.6  # width through height of what the panels leave of a usual window
+_NARROW = 0.38  # the same where videos are beside one another, and their panel is wider
 _TILT = 0.5  # of the look onto a path's plane, so that it is seen from aside, too
 _BEHIND = 1.5  # of the look from where the cameras are, so that the sides that they saw are seen
 _MARGIN = 1.15
 
 
-def look_from_aside(server: viser.ViserServer, scenes: Sequence[ObjectScene]) -> None:
+def look_from_aside(server: viser.ViserServer, scenes: Sequence[ObjectScene], narrow: bool = False) -> None:
     """Where a browser looks from at first: from behind the camera's path and aside, at objects and paths together.
 
     Browsers that are open stay where they are; their button that resets the view takes them there.
+
+    Args:
+        server: Serves the browsers.
+        scenes: What is to be in view.
+        narrow: Whether the panel is wide, since it shows several videos, and leaves a narrow view.
     """
     aside = aside_of(scenes[0].path)
     places = np.concatenate([scene.place + np.vstack([scene.path, np.zeros(3)]) for scene in scenes])
     camera = server.initial_camera
-    camera.look_at, distance = framed(places, aside)
+    camera.look_at, distance = framed(places, aside, _NARROW if narrow else _ASPECT)
     camera.position = camera.look_at + distance * aside
     camera.fov = _FOV
 
 
-def framed(places: NDArray[np.float64], aside: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Where to look, and from how far, so that all ``places`` ``(N, 3)`` are in view from the direction ``aside``."""
+def framed(
+    places: NDArray[np.float64], aside: NDArray[np.float64], aspect: float = _ASPECT
+) -> tuple[NDArray[np.float64], float]:
+    """Where to look, and from how far, so that all ``places`` are in view.
+
+    Args:
+        places: ``(N, 3)``.
+        aside: ``(3,)`` of length 1, from where to look.
+        aspect: Width of the view through its height.
+    """
     right = np.cross([0.0, 1.0, 0.0], aside)
     right = right / np.linalg.norm(right) if np.linalg.norm(right) > 1e-6 else np.array([1.0, 0.0, 0.0])
     axes = np.stack([right, np.cross(aside, right), aside])
@@ -40,7 +54,7 @@ def framed(places: NDArray[np.float64], aside: NDArray[np.float64]) -> tuple[NDA
     across, upright = _MARGIN * np.abs(seen - middle)[:, :2].T
     towards = (seen - middle)[:, 2]
     half = np.tan(_FOV / 2)
-    return middle @ axes, float(np.max(np.maximum(across / (half * _ASPECT), upright / half) + towards))
+    return middle @ axes, float(np.max(np.maximum(across / (half * aspect), upright / half) + towards))
 
 
 def aside_of(path: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -54,7 +68,8 @@ def aside_of(path: NDArray[np.float64]) -> NDArray[np.float64]:
     onto = path - middle
     # A little of the plane that is upright: what the path does not say is said by that.
     upright = 0.05 * float(np.abs(path).max()) * np.array([0.0, 1.0, 0.0])
-    normal = np.linalg.svd(np.concatenate([onto, [-middle, upright, -upright]]))[2][2]
+    places = np.concatenate([onto, [-middle, upright, -upright]])
+    normal = np.linalg.svd(places, full_matrices=False)[2][2]
     normal = -normal if normal[1] > 0 else normal
     above = np.array([0.0, -1.0, 0.0]) if abs(normal[1]) < 0.7 else np.zeros(3)
     tilted = normal + _TILT * above + _BEHIND * _mean_direction(path)

@@ -72,6 +72,14 @@ class RunCorrection:
             return "Its masks were made elsewhere; put the better mask among them."
         return ""
 
+    def why_not_frame(self, index: int) -> str:
+        """Why this frame of a run that can be corrected cannot be, in a sentence; empty where it can."""
+        if index not in self.run.frames:
+            return f"The run has no answer for frame {index}."
+        if index == self.run.description["given"]["first_frame"]:
+            return f"In frame {index} the object was given; correct a later one, or make the run anew."
+        return ""
+
     def port(self) -> int:
         """Where its page is served, from the first call on.
 
@@ -110,12 +118,8 @@ class RunCorrection:
                 raise InputError(self.why_not)
             if self.progress().running:
                 raise InputError("A correction goes on; wait for it.")
-            if drawn.frame not in self.run.frames:
-                raise InputError(f"The run has no answer for frame {drawn.frame}.")
-            if drawn.frame == self.run.description["given"]["first_frame"]:
-                raise InputError(
-                    "That is the frame in which the object was given; correct a later one, or make the run anew."
-                )
+            if why := self.why_not_frame(drawn.frame):
+                raise InputError(why)
             if drawn.mask is not None:
                 what = str(self.run.folder.resolve() / layout.DRAWN)
                 write_mask(Path(what), drawn.mask)
@@ -216,7 +220,7 @@ class Corrections:
             share = "" if now.share is None else f' value="{now.share:.3f}"'
             bar = f'<progress max="1"{share} style="width:100%"></progress>'
             return f"<p>{name}{html.escape(now.sentence)}<br>{bar}</p>"
-        if why := one.why_not:
+        if why := one.why_not or one.why_not_frame(index):
             return f"<p>{name}{html.escape(why)}{told}</p>"
         try:
             port = one.port()

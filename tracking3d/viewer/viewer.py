@@ -309,7 +309,9 @@ class Viewer:
             points = None if run.refined else kept_landmarks(run.folder)
             scene.draw_landmarks(points)
             any_landmarks = any_landmarks or points is not None
-        look_from_aside(self._server, self._scenes)  # who is looking already is left where they are
+        look_from_aside(
+            self._server, self._scenes, len(self._videos) > 1
+        )  # who is looking already is left where they are
         self._panel.landmarks.visible = any_landmarks
         for video in self._videos:
             video.axes = [axes_of(run) for run in video.runs]
@@ -331,7 +333,8 @@ class Viewer:
     def _look_through(self) -> None:
         record = self._runs[0].frames.get(self._nearest(self._wanted))
         if record is not None and np.isfinite(record.T_cam_obj).all():
-            self._panel.here.value = False  # its picture would stand before the model
+            # The picture, and frusta of frames near by, would stand before the model.
+            self._panel.here.value = self._panel.path.value = False
             T_world_cam = np.eye(4) if self._panel.still.value else np.linalg.inv(record.T_cam_obj)
             camera = record.through(self._runs[0].camera)
             look_through(self._server, T_world_cam, camera.fov, camera.width / camera.height)
