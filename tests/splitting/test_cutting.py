@@ -7,8 +7,10 @@ import itertools
 import numpy as np
 import pytest
 
+from tracking3d.config.models import PluginChoice
 from tracking3d.errors import InputError
 from tracking3d.splitting.cutting import Sighting, cuts_in, overlap_of, parse_length, parts_at, windows
+from tracking3d.splitting.looking_ahead import stride_of, tracker_for_looking
 
 
 def steady(count: int, **changed: dict[int, object]) -> list[Sighting]:
@@ -116,3 +118,10 @@ def test_no_choice_beats_brute_force():
             if scores[other] > scores[cut.position] and abs(other - middle) < abs(cut.position - middle)
         ]
         assert not no_worse
+
+
+def test_about_twelve_frames_a_second_are_looked_at_by_the_quick_tracker_unless_masks_are_given():
+    assert [stride_of(fps) for fps in (None, 5.0, 12.0, 25.0, 30.0, 240.0)] == [2, 1, 1, 2, 2, 4]
+    assert tracker_for_looking(PluginChoice(name="csrt")).name == "flow"
+    given = PluginChoice(name="precomputed", path="masks")
+    assert tracker_for_looking(given) is given

@@ -69,6 +69,20 @@ def test_nothing_stands_before_the_model_when_looking_through_the_camera(shown, 
             page.wait_for_function(f"name => !{label}.control.checked", arg=name)
 
 
+def test_the_line_of_the_present_frame_goes_along_without_the_plot_being_sent_again(shown, run):
+    with shown(run) as page:
+        close_notice(page)
+        wait_for_frame(page, 0)
+        plot = page.locator(".timeline").evaluate_handle("plot => plot")
+        area = page.locator(".timeline").bounding_box()
+        for share in (5 / 11, 9 / 11):
+            page.mouse.click(area["x"] + area["width"] * share, area["y"] + 60)
+            wait_for_frame(page, round(11 * share))
+            line = page.locator(".timeline > div:last-child").bounding_box()
+            assert line["x"] == pytest.approx(area["x"] + area["width"] * share, abs=3)
+        assert plot.evaluate("plot => plot.isConnected")
+
+
 def test_a_run_that_goes_on_is_followed_to_its_end(shown, tmp_path):
     write_frames(tmp_path / "frames", 10)
     with open_run(tmp_path / "run", str(tmp_path / "frames")) as writer:

@@ -26,6 +26,7 @@ RUN_COLOURS: tuple[Colour, ...] = (
 PLAIN_QUANTITIES = ("confidence", "IoU with the initial mask", "seconds")
 _COLUMNS = 600  # of a curve; more frames than that are drawn by the lowest and highest of each column
 _STRIP, _PLOT = 10, 90
+_PRESENT = "--present-frame"
 
 
 def quantities(runs: Sequence[FollowedRun]) -> list[str]:
@@ -35,7 +36,7 @@ def quantities(runs: Sequence[FollowedRun]) -> list[str]:
 
 
 def draw_timeline(runs: Sequence[FollowedRun], quantity: str, first: int, last: int) -> str:
-    """The plot as HTML, without the line of the present frame.
+    """The plot as HTML, without the line of the present frame; see `cursor`.
 
     Args:
         runs: The runs, in the order of their colours.
@@ -57,7 +58,7 @@ def draw_timeline(runs: Sequence[FollowedRun], quantity: str, first: int, last: 
         for number, curve in enumerate(curves)
     ]
     height = top + _PLOT
-    return (
+    drawn = (
         f'<svg viewBox="0 0 1000 {height}" preserveAspectRatio="none" style="width:100%;height:{height}px;'
         f'display:block;cursor:crosshair">{"".join(strips)}'
         f'<rect x="0" y="{top}" width="1000" height="{_PLOT}" fill="currentColor" opacity="0.05"/>'
@@ -65,18 +66,13 @@ def draw_timeline(runs: Sequence[FollowedRun], quantity: str, first: int, last: 
         f'<div style="position:absolute;left:3px;top:{top}px;opacity:.6">{high:.3g}</div>'
         f'<div style="position:absolute;left:3px;bottom:1px;opacity:.6">{low:.3g}</div>'
     )
+    return _clickable(drawn, first, last)
 
 
-def with_cursor(drawn: str, frame: int, first: int, last: int) -> str:
-    """The plot with the line of the present frame, ready to be clicked."""
+def cursor(frame: int, first: int, last: int) -> str:
+    """Where the line of the present frame is: a few bytes, so that the plot is not sent again for every frame."""
     share = (frame - first) / max(last - first, 1)
-    going = jump(f"{first}+(event.clientX-this.getBoundingClientRect().left)/this.clientWidth*{last - first}")
-    return (
-        f'<div class="timeline" onclick="{going}" style="position:relative;font-size:10px;line-height:12px;'
-        f'margin:2px 12px">{drawn}'
-        f'<div style="position:absolute;top:0;bottom:0;width:2px;margin-left:-1px;left:{100 * share:.3f}%;'
-        f'background:currentColor;opacity:.7;pointer-events:none"></div></div>'
-    )
+    return f"<style>:root{{{_PRESENT}:{100 * share:.3f}%}}</style>"
 
 
 def colour_of(number: int, runs: int) -> Colour | None:
@@ -92,6 +88,17 @@ def jump(frame: str) -> str:
         "var i=document.getElementById(l.htmlFor).parentElement.querySelector('input:not([type=hidden])');"
         "Object.getOwnPropertyDescriptor(HTMLInputElement.prototype,'value').set.call(i,f);"
         "i.dispatchEvent(new Event('input',{bubbles:true}))"
+    )
+
+
+def _clickable(drawn: str, first: int, last: int) -> str:
+    """The plot, ready to be clicked, with a line where `cursor` says."""
+    going = jump(f"{first}+(event.clientX-this.getBoundingClientRect().left)/this.clientWidth*{last - first}")
+    return (
+        f'<div class="timeline" onclick="{going}" style="position:relative;font-size:10px;line-height:12px;'
+        f'margin:2px 12px">{drawn}'
+        f'<div style="position:absolute;top:0;bottom:0;width:2px;margin-left:-1px;left:var({_PRESENT},0%);'
+        f'background:currentColor;opacity:.7;pointer-events:none"></div></div>'
     )
 
 

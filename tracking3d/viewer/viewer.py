@@ -78,7 +78,7 @@ class Viewer:
         self._wanted, self._shown, self._again = 0, -1, True
         self._playing = self._over = False
         self._indices: list[int] = []
-        self._timeline = self._fault = ""
+        self._fault = ""
         live = any(run.going_on for run in self._runs)
         self._server = start_server(access, port)
         self.address = access.address(self._server.get_port())
@@ -228,8 +228,6 @@ class Viewer:
             for scene, picture in zip(self._scenes, pictures.values(), strict=True):
                 scene.go_to(index, picture[::2, ::2], panel.still.value)
                 scene.show(panel.mesh.value, panel.path.value, panel.here.value, panel.landmarks.value)
-            first, last = self._ends()
-            panel.timeline.content = timeline.with_cursor(self._timeline, index, first, last)
             told = "".join(
                 describe(run, run.frames.get(index), timeline.colour_of(number, len(self._runs)))
                 for number, run in enumerate(self._runs)
@@ -237,7 +235,7 @@ class Viewer:
             self._offer_correction(index)
             panel.told.content = (
                 f'<div class="told" data-frame="{index}" style="font-size:12px;line-height:1.4;margin:4px 12px">'
-                f"frame {index}{told}{self._fault}</div>"
+                f"frame {index}{told}{self._fault}</div>{timeline.cursor(index, *self._ends())}"
             )
         self._shown = index
 
@@ -317,7 +315,8 @@ class Viewer:
             video.axes = [axes_of(run) for run in video.runs]
 
     def _redraw_timeline(self) -> None:
-        self._timeline = timeline.draw_timeline(self._runs, self._panel.quantity.value, *self._ends())
+        drawn = timeline.draw_timeline(self._runs, self._panel.quantity.value, *self._ends())
+        self._panel.timeline.content = drawn
         self._want()
 
     def _ends(self) -> tuple[int, int]:
