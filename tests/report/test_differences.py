@@ -180,6 +180,14 @@ def test_the_page_shows_the_frames_that_differ_most_in_every_run(run_of, tmp_pat
     assert json.dumps(comparison.as_json())
 
 
+def test_other_frames_that_were_asked_for_are_a_difference_of_settings(run_of):
+    a, b = run_of("a"), run_of("b")
+    assert not compare_runs([a, b]).settings
+    told = json.loads((b / "run.json").read_text()) | {"selection": "0:12"}
+    (b / "run.json").write_text(json.dumps(told))
+    assert compare_runs([a, b]).settings == {"frames that were asked for": ["all", "0:12"]}
+
+
 def test_any_run_may_be_the_one_that_others_are_held_against(run_of):
     a, b, c = (run_of(name) for name in "abc")
     comparison = compare_runs([a, b, c], against=b)

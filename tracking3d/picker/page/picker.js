@@ -3,7 +3,7 @@
 
 const COLOURS = ["#00a5e0", "#e64ba0", "#7cb518", "#f08c1e", "#8f6ce0", "#e5484d"];
 const HINTS = {
-  box: "Drag a box around the object. The wheel looks closer.",
+  box: "Drag a box around the object." + (matchMedia("(pointer: fine)").matches ? " The wheel looks closer." : ""),
   on: "Click on the object. Right click: beside it.",
   beside: "Click on what is not the object.",
   paint: "Paint over the object.",
