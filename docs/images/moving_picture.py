@@ -1,10 +1,9 @@
 """Makes a moving picture of a finished run: the overlay, cut out around the object, beside the model in the same pose.
 
-The picture of the README is of a synthetic bottle that turns once around; its box is that of clip/masks/000000.png.
+The pictures of the README and of docs/gallery.md, which says how their clips and runs were made:
 
-$ tracking3d synth clip --object bottle --motion turntable --degrees 6 --frames 60 --size 400,300 --seed 5
-$ tracking3d run clip/frames --box BOX --tracker flow --out run
-$ python docs/images/moving_picture.py run
+$ python docs/images/moving_picture.py runs/truck
+$ python docs/images/moving_picture.py runs/tin --out docs/images/tin.webp
 """
 
 from __future__ import annotations

@@ -1,10 +1,7 @@
-"""Makes the picture of the README from a finished run: the overlay, and below it the model in the same poses.
+"""Makes a still picture of a finished run: five frames of the overlay, and below them the model in the same poses.
 
-The run that is shown is of a synthetic bottle that turns once around; its box is that of clip/masks/000000.png.
-
-$ tracking3d synth clip --object bottle --motion turntable --degrees 6 --frames 66 --size 480,360 --seed 5
-$ tracking3d run clip/frames --box BOX --out run
-$ python docs/images/overlay_and_model.py run
+$ tracking3d demo
+$ python docs/images/overlay_and_model.py demo/run --out docs/images/demo.jpg
 """
 
 from __future__ import annotations
@@ -55,7 +52,7 @@ def main() -> None:
     """Write the picture."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("run", type=Path, help="a finished run folder")
-    parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".jpg"), help="the picture")
+    parser.add_argument("--out", type=Path, default=Path("overlay_and_model.jpg"), help="the picture")
     arguments = parser.parse_args()
     drawn = picture(RunReader(arguments.run))[..., ::-1]
     cv2.imwrite(str(arguments.out), drawn, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
