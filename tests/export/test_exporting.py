@@ -204,6 +204,20 @@ def test_the_video_of_another_run_is_refused(run, tmp_path):
             )
 
 
+def test_a_relative_source_is_found_from_another_folder(run, tmp_path, monkeypatch):
+    """Below a folder above the run's, as where it was begun there."""
+    file = run / "run.json"
+    told = json.loads(file.read_text())
+    shutil.copytree(told["source"], tmp_path / "begun/clips/one")
+    moved = shutil.copytree(run, tmp_path / "begun/runs/one")
+    (moved / "run.json").write_text(json.dumps(told | {"source": "clips/one"}))
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert export_run(moved, "cut-outs", tmp_path / "out").frames == 6
+    with pytest.raises(InputError, match="say with source= where"):
+        export_run(moved, "cut-outs", tmp_path / "other", options=ExportOptions(source="clips/one"))
+
+
 def test_a_camera_cannot_be_looked_through_again(run, tmp_path):
     shutil.copytree(run, tmp_path / "live")
     file = tmp_path / "live" / "run.json"

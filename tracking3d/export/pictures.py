@@ -8,6 +8,7 @@ from tracking3d.checkpoint.progress import checksum
 from tracking3d.errors import InputError, argument
 from tracking3d.frames import Frame, SkippedFrame, pixels
 from tracking3d.results.run_reader import RunReader
+from tracking3d.results.run_source import places_of
 from tracking3d.video import open_source
 
 _SOURCE = argument("source=", "--source")
@@ -18,7 +19,7 @@ def read_pictures(run: RunReader, source: str | None, wanted: Container[int]) ->
 
     Args:
         run: The run.
-        source: Where the video is; None where the run found it.
+        source: Where the video is; None where the run found it, from the present folder or from those above the run's.
         wanted: Frame indices.
 
     Raises:
@@ -29,6 +30,8 @@ def read_pictures(run: RunReader, source: str | None, wanted: Container[int]) ->
         raise InputError(
             f"The run {run.folder} is of no video that can be read again; give one as {_SOURCE}."
         )
+    places = places_of(name, run.folder) if source is None else []
+    name = next((str(place) for place in places if place.exists()), name)
     try:
         opened = open_source(name, run.description.get("selection"))
     except InputError as error:
