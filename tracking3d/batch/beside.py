@@ -43,7 +43,9 @@ def videos_of(place: str) -> list[tuple[Row, int]]:
         found = [(one, sizes.get(one, 0)) for one, _ in found]
         beside = set(sizes)
     if not found:
-        raise InputError(f"{place} names no video; give a folder that has some, or a pattern such as 'clips/*.mp4'.")
+        raise InputError(
+            f"{place} names no video; give a folder that has some, or a pattern such as 'clips/*.mp4'."
+        )
     return [(_with_prompt(video, beside), size) for video, size in found]
 
 

@@ -42,7 +42,9 @@ def _text(path: Path) -> str:
             raise InputError(f"The camera file {path} is longer than {_LONGEST >> 10} KiB, which none is.")
         return content.decode("utf-8-sig")
     except FileNotFoundError as error:
-        raise InputError(f"The camera file {path} does not exist; `tracking3d calibrate` makes one.") from error
+        raise InputError(
+            f"The camera file {path} does not exist; `tracking3d calibrate` makes one."
+        ) from error
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "it is no text"
         raise InputError(f"The camera file {path} cannot be read: {reason}.") from error
