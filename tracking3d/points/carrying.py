@@ -21,6 +21,9 @@ from tracking3d.rendering.visibility import NEAR
 LEAST_AGREEMENT = 0.7
 """Correlation of a patch with its template from which a correction is believed."""
 _TELLS = 2 * NOISE  # contrast of a template that can be told from something else
+_EXPECTED = 3.0
+"""Deviation in pixels of the corrections. They are taken for what the images say, and what holds them back is an error
+of surface and poses that stays: with 1 pixel a faint texture corrects half of it, and it takes twice as many rounds."""
 _FLOOR = 0.05  # deviation in pixels of the best alignments: interpolation, shading
 _BEYOND = REACH / 2  # pixels around the surface onto which an image is warped
 _LEAST_ROWS = 64  # below, another thread does not pay
@@ -65,7 +68,8 @@ class Warps:
             return Carried(nothing, nothing, np.full(len(xy), np.inf), np.full(len(xy), -1.0))
         predicted, seen = end.sees(start.surface(xy), self.tolerance)
         warped, known = self._warp(source, target, backend)
-        found = align(warped, known, end.image, np.where(seen[:, None], predicted, np.nan), backend=backend)
+        at = np.where(seen[:, None], predicted, np.nan)
+        found = align(warped, known, end.image, at, prior=_EXPECTED, backend=backend)
         good = found.agreement > LEAST_AGREEMENT
         return Carried(
             predicted,
