@@ -14,6 +14,7 @@ from functools import partial
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from tracking3d.bundle_adjustment.reversal import Reversal
@@ -38,6 +39,9 @@ _LEAST_SUPPORT = 60  # points in half of the views; with fewer, poses were wrong
 _SETTLED = np.deg2rad(0.01)
 """Turn of a round that ends them. Of an object with faint texture a round leaves .8 to .9 of an error, so that five to
 ten times as much is still to come."""
+_TIE = 0.25
+"""Share of the landmarks of two views, of the one with fewer, that both have to hold to be tied together by them. The
+two sides of the sequence card_flip share up to a seventh, all by mistake."""
 _HELD = 0.1  # deviation of landmarks from the surface, in radii
 
 _Corners = tuple[NDArray[np.int64], Array, Array]
@@ -164,6 +168,7 @@ def _refine_once(scene: Scene, free_focal: bool) -> Scene:
     if not len(begun.face):
         return scene
     face, barycentric, followed = begun.face, begun.barycentric, begun.followed.tolist()
+    tied = tied_together(np.isfinite(begun.variance))
     points = np.einsum("nk,nkd->nd", barycentric, scene.vertices[scene.faces[face]])
     if np.median(followed) < _LEAST_SUPPORT:
         return replace(
@@ -173,7 +178,7 @@ def _refine_once(scene: Scene, free_focal: bool) -> Scene:
         bundle,
         intrinsics=np.stack([view.intrinsics for view in views]),
         measured=begun.measured,
-        deviation=np.sqrt(begun.variance + DEVIATION**2),
+        deviation=np.where(tied, np.sqrt(begun.variance + DEVIATION**2), np.inf),
         held=_HELD * scene.radius,
     )
     found, vertices = solved(points, T_cam_obj=T), scene.vertices
@@ -192,6 +197,28 @@ def _refine_once(scene: Scene, free_focal: bool) -> Scene:
     support = {at: Support(count, agreeing) for at, count, agreeing in counts}
     redrawn = scene.redrawn(vertices, dict(zip(there, found.T_cam_obj, strict=True)), found.focal_factor)
     return replace(redrawn, support=support)
+
+
+def tied_together(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The measurements that tie views firmly together; each landmark keeps those of one group of tied views.
+
+    Two sides of a thin object share no landmark, and what is followed round the edge is mistaken. A few of these, left
+    in a bundle, turn one side against the other, further with every round; without them the surface holds both.
+
+    Args:
+        known: ``(T, N)`` which views measured which landmark.
+
+    Returns:
+        ``(T, N)`` bool, those of ``known`` that are to count.
+    """
+    counts = known.sum(1)
+    shared = known.astype(np.int64) @ known.T.astype(np.int64)
+    _, group = connected_components(
+        (shared > 0) & (shared >= _TIE * np.minimum(counts, counts[:, None])), directed=False
+    )
+    by_group = np.zeros((group.max() + 1, known.shape[1]), np.int64)
+    np.add.at(by_group, group, known)
+    return known & (group[:, None] == by_group.argmax(0))
 
 
 @dataclass(frozen=True, eq=False)
