@@ -14,7 +14,6 @@ from functools import partial
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from tracking3d.bundle_adjustment.reversal import Reversal
@@ -39,9 +38,6 @@ _LEAST_SUPPORT = 60  # points in half of the views; with fewer, poses were wrong
 _SETTLED = np.deg2rad(0.01)
 """Turn of a round that ends them. Of an object with faint texture a round leaves .8 to .9 of an error, so that five to
 ten times as much is still to come."""
-_TIE = 0.25
-"""Share of the landmarks of two views, of the one with fewer, that both have to hold to be tied together by them. The
-two sides of the sequence card_flip share up to a seventh, all by mistake."""
 _HELD = 0.1  # deviation of landmarks from the surface, in radii
 
 _Corners = tuple[NDArray[np.int64], Array, Array]
@@ -168,7 +164,6 @@ def _refine_once(scene: Scene, free_focal: bool) -> Scene:
     if not len(begun.face):
         return scene
     face, barycentric, followed = begun.face, begun.barycentric, begun.followed.tolist()
-    tied = tied_together(np.isfinite(begun.variance))
     points = np.einsum("nk,nkd->nd", barycentric, scene.vertices[scene.faces[face]])
     if np.median(followed) < _LEAST_SUPPORT:
         return replace(
@@ -178,7 +173,7 @@ def _refine_once(scene: Scene, free_focal: bool) -> Scene:
         bundle,
         intrinsics=np.stack([view.intrinsics for view in views]),
         measured=begun.measured,
-        deviation=np.where(tied, np.sqrt(begun.variance + DEVIATION**2), np.inf),
+        deviation=np.sqrt(begun.variance + DEVIATION**2),
         held=_HELD * scene.radius,
     )
     found, vertices = solved(points, T_cam_obj=T), scene.vertices
@@ -197,28 +192,6 @@ def _refine_once(scene: Scene, free_focal: bool) -> Scene:
     support = {at: Support(count, agreeing) for at, count, agreeing in counts}
     redrawn = scene.redrawn(vertices, dict(zip(there, found.T_cam_obj, strict=True)), found.focal_factor)
     return replace(redrawn, support=support)
-
-
-def tied_together(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The measurements that tie views firmly together; each landmark keeps those of one group of tied views.
-
-    Two sides of a thin object share no landmark, and what is followed round the edge is mistaken. A few of these, left
-    in a bundle, turn one side against the other, further with every round; without them the surface holds both.
-
-    Args:
-        known: ``(T, N)`` which views measured which landmark.
-
-    Returns:
-        ``(T, N)`` bool, those of ``known`` that are to count.
-    """
-    counts = known.sum(1)
-    shared = known.astype(np.int64) @ known.T.astype(np.int64)
-    _, group = connected_components(
-        (shared > 0) & (shared >= _TIE * np.minimum(counts, counts[:, None])), directed=False
-    )
-    by_group = np.zeros((group.max() + 1, known.shape[1]), np.int64)
-    np.add.at(by_group, group, known)
-    return known & (group[:, None] == by_group.argmax(0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,7 +241,37 @@ def _begin(
     )
     start = np.repeat(np.array(there)[starts], [len(corners[at][2]) for at in starts])
     chain = follow_chain(scene.warps(), start, xy)
-    return _Begun(face, barycentric, chain.measured[there], chain.variance[there])
+    begins = np.repeat(starts, [len(corners[at][2]) for at in starts])
+    T = np.stack([view.T_cam_obj for view in scene.views if view is not None])
+    one_side = of_one_side(T, scene.vertices, scene.faces[face], begins)
+    variance = np.where(one_side, chain.variance[there], np.inf)
+    return _Begun(face, barycentric, chain.measured[there], variance)
+
+
+def of_one_side(
+    T_cam_obj: Array, vertices: Array, triangles: NDArray[np.int64], begins: NDArray[np.integer]
+) -> NDArray[np.bool_]:
+    """Which views look at a landmark's face from the side from which it was first seen.
+
+    The two sides of a card lie closer together than surface and poses are known, so that depth alone does not tell
+    that the one hides the other. Landmarks that are followed round the edge by mistake would turn one side against the
+    other, further with every round.
+
+    Args:
+        T_cam_obj: ``(T, 4, 4)``.
+        vertices: ``(V, 3)``.
+        triangles: ``(N, 3)`` vertices of the face that each landmark lies on.
+        begins: ``(N,)`` the view in which it was first seen.
+
+    Returns:
+        ``(T, N)`` bool.
+    """
+    corner, right, left = vertices[triangles].transpose(1, 0, 2)
+    normal = np.cross(right - corner, left - corner)
+    eye = -np.einsum("tji,tj->ti", T_cam_obj[:, :3, :3], T_cam_obj[:, :3, 3])
+    facing = eye @ normal.T - (corner * normal).sum(1)
+    seen: NDArray[np.bool_] = facing * facing[begins, np.arange(len(begins))] > 0
+    return seen
 
 
 def _unlike(R_cam_obj: Array, count: int) -> NDArray[np.int64]:
