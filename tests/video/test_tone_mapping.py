@@ -99,7 +99,9 @@ def write_10_bits(path, signal, transfer):
     blue, red = (signal[..., 2] - luma) / 1.8814, (signal[..., 0] - luma) / 1.4746
     height, width = luma.shape
     with av.open(str(path), "w") as file:
-        stream = file.add_stream("libx265", rate=25, options={"x265-params": "log-level=none:crf=4:bframes=0"})
+        stream = file.add_stream(
+            "libx265", rate=25, options={"x265-params": "log-level=none:crf=4:bframes=0"}
+        )
         stream.height, stream.width, stream.pix_fmt = height, width, "yuv444p10le"
         codec = stream.codec_context
         codec.colorspace, codec.color_range, codec.color_primaries, codec.color_trc = 9, 1, 9, transfer
