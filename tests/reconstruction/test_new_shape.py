@@ -10,8 +10,8 @@ from rendered_views import ball
 from scipy.spatial.transform import Rotation
 from test_volume import shape_views
 
+from tracking3d.points.outline_fit import fitted_to_outlines
 from tracking3d.reconstruction.judged import Explained, explained, is_left_out
-from tracking3d.reconstruction.outline_fit import fitted_to_outlines
 from tracking3d.reconstruction.pose_polish import coloured_surface, polished
 from tracking3d.reconstruction.seen_vertices import seen_vertices
 from tracking3d.reconstruction.shape import reconstructed

@@ -21,6 +21,7 @@ from tracking3d.points.bundle import bundle, other_way_round
 from tracking3d.points.carrying import Warps
 from tracking3d.points.chain import follow_chain
 from tracking3d.points.meeting import surface_under
+from tracking3d.points.outline_fit import fitted_to_outlines, outline_of
 from tracking3d.points.surface import move_surface
 from tracking3d.points.view import Array, View, draw
 
@@ -130,7 +131,18 @@ def refine_scene(
             last = done + rounds  # all of it is new
         elif _turned(before, scene) < _SETTLED:
             break
-    return scene
+    if not any(support.agreeing for support in scene.support.values()):
+        return scene
+    # Not in every round: where the texture is faint, outlines hold the surface where poses that are wrong want it.
+    return _outlined(_refine_once(replace(_outlined(scene), may_reverse=False), free_focal=False))
+
+
+def _outlined(scene: Scene) -> Scene:
+    """The scene with a surface whose silhouettes lie on the masks: landmarks leave the rim where they found it."""
+    views = {index: view for index, view in enumerate(scene.views) if view is not None}
+    vertices = fitted_to_outlines(scene.vertices, scene.faces, [outline_of(view) for view in views.values()])
+    redrawn = scene.redrawn(vertices, {index: view.T_cam_obj for index, view in views.items()})
+    return replace(redrawn, support=scene.support)
 
 
 def _turned(before: Scene, after: Scene) -> float:

@@ -16,13 +16,13 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from tracking3d.points.outline_fit import fitted_to_outlines
 from tracking3d.reconstruction.depth_maps import Guide, depth_maps
 from tracking3d.reconstruction.fusion import depth_evidence, fused
 from tracking3d.reconstruction.grid import FloatArray, Grid
 from tracking3d.reconstruction.hull import robust_hull
 from tracking3d.reconstruction.judged import Explained, explained
 from tracking3d.reconstruction.mesh_distance import mesh_distance
-from tracking3d.reconstruction.outline_fit import fitted_to_outlines
 from tracking3d.reconstruction.shape_views import ShapeView, turned_apart
 from tracking3d.reconstruction.surface import extracted, is_sound, main_pieces, roughly, simplified
 

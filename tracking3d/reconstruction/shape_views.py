@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.frames import Image
 from tracking3d.geometry.camera import Camera, Window
+from tracking3d.points.outline_fit import depth_inside
 from tracking3d.trackers.crops import box_of, cut, inside_frame
 
 SIDE = 192
@@ -87,7 +87,7 @@ def shape_view(
     return ShapeView(
         index,
         cut(image, window),
-        _depth_inside(inside),
+        depth_inside(inside),
         (edges - 0.5).astype(np.float32),
         window.K(camera),
         np.array(T_cam_obj, np.float64),
@@ -107,10 +107,3 @@ def turned_apart(views: Sequence[ShapeView], degrees: float, most: int) -> list[
         if len(chosen) <= most:
             return [views[n] for n in chosen]
         degrees = max(1.2 * degrees, 0.1)
-
-
-def _depth_inside(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Signed distance to the outline, which runs half-way between pixels inside and outside."""
-    inward = cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    outward = cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return np.where(inside, inward - 0.5, 0.5 - outward).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Vertices moved along their normals until the silhouettes lie on the masks' outlines.
+"""The surface moved along its normals until the silhouettes lie on the masks' outlines.
 
 Gauss-Newton, a few steps. Each point of a silhouette's contour should lie where the distance from the mask's outline
 is zero, robustly; between the contours, and where no view has one, the displacement is smooth and small.
@@ -7,7 +7,10 @@ is zero, robustly; between the contours, and where no view has one, the displace
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
 
+import cv2
 import numpy as np
 import torch
 import trimesh
@@ -15,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csr_matrix, diags, identity
 from scipy.sparse.linalg import spsolve
 
-from tracking3d.reconstruction.shape_views import ShapeView
+from tracking3d.points.view import View
 from tracking3d.rendering import find_contour, render
 from tracking3d.rendering.contour import contour_slopes
 
@@ -26,8 +29,60 @@ _SMOOTH, _SMALL = 3.0, 0.5
 _FARTHEST = 0.02  # of the object's diagonal, in a step
 
 
+class OutlineView(Protocol):
+    """What a view says of the outline."""
+
+    @property
+    def depth_inside(self) -> NDArray[np.float32]:
+        """``(h, w)`` pixels from the mask's outline, positive inside."""
+
+    @property
+    def within(self) -> NDArray[np.float32]:
+        """``(4,)`` left, right, top and bottom edge of the frame in the view's pixels."""
+
+    @property
+    def K(self) -> NDArray[np.float64]:
+        """``(3, 3)`` intrinsics of the view."""
+
+    @property
+    def T_cam_obj(self) -> NDArray[np.float64]:
+        """``(4, 4)``."""
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """The outline in a window; see `OutlineView`."""
+
+    depth_inside: NDArray[np.float32]
+    within: NDArray[np.float32]
+    K: NDArray[np.float64]
+    T_cam_obj: NDArray[np.float64]
+
+
+def outline_of(view: View) -> Outline:
+    """What the mask of a view says of the outline.
+
+    A window ends that near to the object only where the frame does.
+    """
+    height, width = view.mask.shape
+    fx, fy, cx, cy = view.intrinsics
+    return Outline(
+        depth_inside(view.mask > 0.5),
+        np.array([-0.5, width - 0.5, -0.5, height - 0.5], np.float32),
+        np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]),
+        view.T_cam_obj,
+    )
+
+
+def depth_inside(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Signed distance ``(h, w)`` to a mask's outline, which runs half-way between pixels inside and outside."""
+    inward = cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    outward = cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.where(inside, inward - 0.5, 0.5 - outward).astype(np.float32)
+
+
 def fitted_to_outlines(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], views: Sequence[ShapeView]
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], views: Sequence[OutlineView]
 ) -> NDArray[np.float64]:
     """``(V, 3)`` the vertices, moved.
 
@@ -62,14 +117,14 @@ def _equations(
     vertices: NDArray[np.float64],
     faces: NDArray[np.int64],
     normals: NDArray[np.float64],
-    view: ShapeView,
+    view: OutlineView,
 ) -> tuple[csr_matrix, NDArray[np.float64]]:
     """How the distances of the contour's points change with displacements ``(N, V)``, and what they are ``(N,)``."""
     T = torch.from_numpy(view.T_cam_obj[None]).float()
     K = torch.from_numpy(view.K[None]).float()
     drawn = render(
         torch.from_numpy(vertices).float(), torch.from_numpy(faces), torch.zeros(len(faces), 3, 2),
-        torch.zeros(1, 2, 2), T[:, :3, :3], T[:, :3, 3], K, (len(view.mask), len(view.mask)),
+        torch.zeros(1, 2, 2), T[:, :3, :3], T[:, :3, 3], K, view.depth_inside.shape,
     )  # fmt: skip
     contour = find_contour(drawn)
     residual, slope = contour_slopes(contour, torch.from_numpy(-view.depth_inside[None]))

@@ -1,0 +1,62 @@
+"""Landmarks put poses right, and the outlines of masks the surface's rim, where no landmark is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from rendered_views import CAMERA, ball, pattern, pose, seen
+
+from tracking3d.points.landmarks import Scene, refine_scene
+from tracking3d.points.outline_fit import outline_of
+from tracking3d.points.view import open_view
+
+TRUE = [pose(yaw, 0.4 * yaw) for yaw in np.linspace(0, 48, 9)]
+FRAMES = [seen(T, pattern()) for T in TRUE]
+
+
+def opened(vertices: np.ndarray, edited=lambda index, mask: mask) -> Scene:
+    faces = ball().faces
+    views = [
+        open_view(image, edited(index, mask), CAMERA, T, vertices, faces)
+        for index, (T, (image, mask)) in enumerate(zip(TRUE, FRAMES, strict=True))
+    ]
+    return Scene(list(views), vertices, faces)
+
+
+def agreement(scene: Scene) -> float:
+    """Mean IoU of silhouettes and true masks."""
+    shares = []
+    for view, (_, mask) in zip(scene.views, FRAMES, strict=True):
+        left, top = view.corner
+        height, width = view.image.shape
+        drawn, true = view.beyond == 0, mask[top : top + height, left : left + width]
+        shares.append((drawn & true).sum() / (drawn | true).sum())
+    return float(np.mean(shares))
+
+
+@pytest.mark.parametrize("wide", [0.93, 1.08])
+def test_silhouettes_come_to_lie_on_the_masks(wide):
+    scene = opened(ball().vertices * [1, wide, 1])
+    assert agreement(scene) < 0.94
+    assert agreement(refine_scene(scene, 4)) > 0.98
+
+
+def test_what_hides_the_object_in_some_frames_does_not_dent_it():
+    def hidden(index: int, mask: np.ndarray) -> np.ndarray:
+        left = np.indices(mask.shape)[1] < mask.shape[1] // 2 - 20
+        return mask & ~left if index in (3, 4) else mask
+
+    scene = opened(ball().vertices, hidden)
+    refined = refine_scene(scene, 4)
+    assert agreement(refined) > 0.97
+    assert np.abs(np.linalg.norm(refined.vertices, axis=1) - 1).max() < 0.1
+
+
+def test_an_outline_is_half_way_between_pixels_inside_and_outside():
+    view = opened(ball().vertices).views[0]
+    outline = outline_of(view)
+    assert np.array_equal(outline.depth_inside > 0, view.mask > 0.5)
+    assert np.abs(outline.depth_inside).min() == 0.5
+    assert outline.K[0, 0] == view.intrinsics[0] and outline.K[0, 2] == view.intrinsics[2]
+    assert outline.within.tolist() == [-0.5, view.mask.shape[1] - 0.5, -0.5, view.mask.shape[0] - 0.5]
+    assert np.array_equal(outline.T_cam_obj, TRUE[0])
