@@ -96,7 +96,9 @@ class LastPasses:
         self._refinement.together += watch.times
         if self.weighs_masks:
             answers = [self._refinement.answer(index) for index in self._refinement.causal]
-            self._masks = SecondMasks(self._look.camera, self._look.vertices, self._faces, answers)
+            self._masks = SecondMasks(
+                self._look.camera, self._look.vertices_of_landmarks, self._faces, answers
+            )
         return self._look.camera
 
     def put_right(self, frame: Frame) -> None:

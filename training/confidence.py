@@ -22,6 +22,7 @@ import numpy as np
 from tracking3d.benchmark.job import JOB, RUN, Job
 from tracking3d.datasets.run_answers import answers_of_run
 from tracking3d.errors import InputError
+from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.online.judgement import weighed
 from tracking3d.evaluation.calibration import area_under_roc, expected_calibration_error, reliability
 from tracking3d.evaluation.confidence_fit import PENALTY, LogisticConfidence, fit_confidence, halves, paste
@@ -79,7 +80,7 @@ def judged_frames(benchmark: Path, solver: str | None, refined: bool) -> Iterato
 
 def _of_landmarks(record: FrameRecord) -> dict[str, float]:
     """What landmarks say of a refined answer, beside what was believed before they were asked."""
-    if "followed" not in record.losses:
+    if "followed" not in record.losses or record.status is Status.LOST:
         return {}
     followed, agreeing = int(record.losses["followed"]), int(record.losses["landmarks"])
     support = Support(followed, agreeing, bool(record.losses.get("telling", 1.0)))
@@ -108,6 +109,8 @@ def main(words: list[str]) -> None:
     ]
     asked = options.evidence.split(",") if options.evidence else _all_losses(frames)
     names = [name.lstrip("+-") for name in asked]
+    # Of refined answers what is lost is not judged by landmarks, and has none of their evidence.
+    frames = [one for one in frames if any(name in one.evidence for name in names)]
     signs = {name.lstrip("+-"): 1 if name[0] == "+" else -1 for name in asked if name[:1] in ("+", "-")}
     first, second = halves([one.sequence for one in frames])
     if not second:

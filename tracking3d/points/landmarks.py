@@ -131,14 +131,24 @@ def refine_scene(
             last = done + rounds  # all of it is new
         elif _turned(before, scene) < _SETTLED:
             break
+    return scene
+
+
+def outlined(scene: Scene) -> Scene:
+    """The scene with a surface whose silhouettes lie on the masks: landmarks leave the rim where they found it.
+
+    Outlines have no say while `refine_scene` goes on: where the texture is faint, they would hold the surface where
+    poses that are wrong want it.
+
+    Args:
+        scene: As `refine_scene` left it; as it is where the images said little.
+    """
     if not any(support.agreeing for support in scene.support.values()):
         return scene
-    # Not in every round: where the texture is faint, outlines hold the surface where poses that are wrong want it.
-    return _outlined(_refine_once(replace(_outlined(scene), may_reverse=False), free_focal=False))
+    return _fitted(_refine_once(replace(_fitted(scene), may_reverse=False), free_focal=False))
 
 
-def _outlined(scene: Scene) -> Scene:
-    """The scene with a surface whose silhouettes lie on the masks: landmarks leave the rim where they found it."""
+def _fitted(scene: Scene) -> Scene:
     views = {index: view for index, view in enumerate(scene.views) if view is not None}
     vertices = fitted_to_outlines(scene.vertices, scene.faces, [outline_of(view) for view in views.values()])
     redrawn = scene.redrawn(vertices, {index: view.T_cam_obj for index, view in views.items()})

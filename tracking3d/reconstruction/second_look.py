@@ -20,7 +20,7 @@ from tracking3d.estimation.online.points import grey
 from tracking3d.estimation.online.texture_strength import PLAIN, texture_strength
 from tracking3d.frames import Image
 from tracking3d.geometry.camera import Camera
-from tracking3d.points.landmarks import Scene, Support, refine_scene
+from tracking3d.points.landmarks import Scene, Support, outlined, refine_scene
 from tracking3d.points.resection import resect
 from tracking3d.points.view import View, open_view
 from tracking3d.reconstruction.views import TextureView
@@ -48,11 +48,13 @@ class SecondLook:
     Attributes:
         camera: The same, through another lens where nobody gave it and `settle` found it.
         vertices: ``(V, 3)`` of the object; others after `settle`.
+        vertices_of_landmarks: The same as landmarks alone have it, which know nothing of what masks are wrong by.
         faces: ``(F, 3)``.
     """
 
     def __init__(self, model: ObjectModel, camera: Camera, answered: Sequence[int], most: int) -> None:
         self.camera, self.vertices = camera, np.asarray(model.vertices, np.float64)
+        self.vertices_of_landmarks = self.vertices
         self._lens, self.faces = camera.fx, np.asarray(model.faces, np.int64)
         count = min(most, len(answered))
         at = np.linspace(0, len(answered) - 1, count).round().astype(int) if count else ()
@@ -88,7 +90,9 @@ class SecondLook:
             int(np.clip(_DRAWN // len(views), *ROUNDS)),
             free_focal=self.camera.assumed,
         )
-        self._scene, self.vertices = scene, scene.vertices
+        self.vertices_of_landmarks = scene.vertices
+        self._scene = outlined(scene)
+        self.vertices = self._scene.vertices
         if scene.focal_factor != 1:
             self.camera = self.camera.solved(scene.focal_factor)
 

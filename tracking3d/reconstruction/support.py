@@ -1,7 +1,7 @@
 """How far a refined answer is believed, once landmarks were looked for.
 
 What is rendered at a pose can look right though the pose is wrong, because shape and texture were made with such poses.
-Landmarks are independent of that: in wrong poses few points are found in many views, and fewer agree.
+Landmarks are independent of that: in wrong poses fewer of those that are found agree.
 """
 
 from __future__ import annotations
@@ -15,14 +15,13 @@ from tracking3d.results.records import FrameRecord
 
 BELIEVED = 0.5
 """Confidence from which on a frame is tracked."""
-_FEW, _MANY = 60, 150
-"""Agreeing landmarks between which belief grows: of textured objects a quarter of the answers with fewer were right, 19
-of 20 with more (suites ``fresh`` of seeds 501, 602 and 9303)."""
-_INTERCEPT = -0.4355
+_EVEN, _NEARLY_ALL = 0.5, 0.95
+"""Shares of the followed landmarks that agree, between which belief grows: where poses are wrong, what is followed is
+often something else, such as the background, and much of it fits no pose."""
+_INTERCEPT = -0.8803
 _TERMS = {  # weight, and the range that was seen
-    "rendering": (0.8099, -2.671, 2.548),
-    "landmarks": (2.856, 0.0, math.log((1 + _MANY) / (1 + _FEW))),
-    "plain": (1.38, 0.0, 1.0),
+    "rendering": (1.012, -3.861, 2.624),
+    "share": (0.8517, 0.0, math.log(_NEARLY_ALL / (1 - _NEARLY_ALL))),
 }
 
 
@@ -41,8 +40,9 @@ def supported(rendering: Assessment, support: Support) -> Assessment:
     """The judgement of a frame by what is rendered and by landmarks; what is lost stays lost.
 
     A logistic regression of whether the answer is right, that is, within 10 degrees and above an IoU of 0.7. Fitted by
-    ``training/confidence.py --refined`` on the suites ``fresh`` of seeds 501, 602 and 9303; docs/benchmark.md has what
-    it is worth on another.
+    ``training/confidence.py --refined`` on the suites ``fresh`` of seeds 605, 606, 607, 609 and 610, with true masks
+    and those of `csrt` and `flow`; docs/benchmark.md has what it is worth on another. How many landmarks agree, and
+    whether the object is plain, adds nothing to the share that does.
 
     Args:
         rendering: The judgement by what is rendered, and by points that were followed from frame to frame.
@@ -72,9 +72,12 @@ def weighed(rendering: float, support: Support) -> dict[str, float]:
         rendering: The confidence by what is rendered.
         support: What landmarks say.
     """
-    bounded = min(max(rendering, 0.02), 0.98)
+    share = (1 + support.agreeing) / (2 + support.followed)
     return {
-        "rendering": math.log(bounded / (1 - bounded)),
-        "landmarks": math.log((1 + support.agreeing) / (1 + _FEW)) if support.telling else 0.0,
-        "plain": 0.0 if support.telling else 1.0,
+        "rendering": _log_odds(min(max(rendering, 0.02), 0.98)),
+        "share": _log_odds(min(max(share, _EVEN), _NEARLY_ALL)),
     }
+
+
+def _log_odds(probability: float) -> float:
+    return math.log(probability / (1 - probability))

@@ -20,7 +20,7 @@ from tracking3d.errors import InputError, OutputError
 from tracking3d.estimation.estimate import Status
 from tracking3d.frames import Frame, Image
 from tracking3d.points.follow import follow_points
-from tracking3d.points.landmarks import ROUNDS, Scene, refine_scene
+from tracking3d.points.landmarks import ROUNDS, Scene, outlined, refine_scene
 from tracking3d.points.meeting import surface_under
 from tracking3d.points.pictures import Picture
 from tracking3d.points.view import View, open_view
@@ -150,7 +150,7 @@ def open_scene(
     key = _key(run, vertices, rounds)
     if (kept := _read(file, key, scene)) is not None:
         return RunScene(run, kept, pictures)
-    scene = refine_scene(scene, rounds, after_round)
+    scene = outlined(refine_scene(scene, rounds, after_round))
     _write(file, key, scene)
     return RunScene(run, scene, pictures)
 

@@ -120,7 +120,9 @@ def put_together(tell: Tell, job: Weighing) -> SecondMasks:
     """
     answers = job.answers
     before = _answers(job.job.folder)  # which masks are believed is decided before poses are put right
-    masks = SecondMasks(job.look.camera, job.look.vertices, job.look.faces, list(before.values()))
+    masks = SecondMasks(
+        job.look.camera, job.look.vertices_of_landmarks, job.look.faces, list(before.values())
+    )
     for frame in _frames(job.job.source, job.job.whole, answers):
         if masks.wants(frame.index):
             masks.see(_masked(job.job.folder, answers[frame.index], frame))
