@@ -10,14 +10,16 @@ import math
 from dataclasses import replace
 
 import torch
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix, rotation_matrix_to_quaternion
 from torch import Tensor
+from torch.nn import functional
 
 from tracking3d.config.solvers import PaperConfig
 from tracking3d.estimation.observation import Batch, halved
 from tracking3d.estimation.paper.belief import Belief, Keyframe
 from tracking3d.estimation.paper.optimize import Optimum, optimize
 from tracking3d.estimation.paper.problem import Parameters, Problem
-from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
+from tracking3d.geometry.pose import Pose
 
 RATES = (3.0, 8.0)
 """Degrees a frame that the hypotheses turn."""
@@ -65,31 +67,24 @@ def hypotheses(belief: Belief, frames: list[Keyframe]) -> list[Parameters]:
 
     Translations are those found so far: they are seen directly.
     """
-    first = frames[0].pose
-    found = [frame.pose for frame in frames]
-    still = [Pose(pose.translation, first.quaternion) for pose in found]
-    variants = [still, [_mirrored(first, pose) for pose in found]]
+    first, found = frames[0].pose, Pose.stack([frame.pose for frame in frames])
+    elapsed = [frame.observation.index - frames[0].observation.index for frame in frames]
+    rotations = [first.quaternion.expand_as(found.quaternion), _mirrored(first.R, found.R)]
     for direction in range(DIRECTIONS):
         angle = 2 * math.pi * direction / DIRECTIONS
         axis = first.translation.new_tensor([math.cos(angle), math.sin(angle), 0.0])
-        for rate in RATES:
-            variants.append([_turned(first, frame, axis, rate, frames[0]) for frame in frames])
-    return [
-        belief.parameters(
-            [Keyframe(frame.observation, pose) for frame, pose in zip(frames, poses, strict=True)]
-        )
-        for poses in variants
-    ]
+        rotations += [_turned(first.R, axis, rate, elapsed) for rate in RATES]
+    return [Parameters(found.translation, quaternion, belief.offsets, belief.texture) for quaternion in rotations]
 
 
-def _turned(first: Pose, frame: Keyframe, axis: Tensor, rate: float, start: Keyframe) -> Pose:
-    degrees = rate * (frame.observation.index - start.observation.index)
-    degrees = max(min(degrees, 60.0), -60.0)
-    return from_matrix(rotation_about(axis, degrees) @ first.R, frame.pose.translation)
+def _turned(first: Tensor, axis: Tensor, rate: float, elapsed: list[int]) -> Tensor:
+    """``(B, 4)`` the first rotation ``(3, 3)`` turned about ``axis`` by ``rate`` degrees a frame, by 60 at most."""
+    angles = [math.radians(max(min(rate * frames, 60.0), -60.0)) for frames in elapsed]
+    turn = axis_angle_to_rotation_matrix(axis.new_tensor(angles)[:, None] * functional.normalize(axis, dim=0))
+    return rotation_matrix_to_quaternion(turn @ first)
 
 
-def _mirrored(first: Pose, pose: Pose) -> Pose:
-    """The rotation since the first frame with its tilt out of the image plane reversed (Necker)."""
-    delta = pose.R @ first.R.T
-    flip = torch.diag(delta.new_tensor([1.0, 1.0, -1.0]))
-    return from_matrix(flip @ delta @ flip @ first.R, pose.translation)
+def _mirrored(first: Tensor, R: Tensor) -> Tensor:
+    """``(B, 4)`` of ``(B, 3, 3)``: the rotation since the first ``(3, 3)``, its tilt in depth reversed (Necker)."""
+    flip = torch.diag(R.new_tensor([1.0, 1.0, -1.0]))
+    return rotation_matrix_to_quaternion(flip @ (R @ first.T) @ flip @ first)
