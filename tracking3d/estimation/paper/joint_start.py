@@ -10,7 +10,6 @@ import math
 from dataclasses import replace
 
 import torch
-from kornia.geometry.conversions import axis_angle_to_rotation_matrix, rotation_matrix_to_quaternion
 from torch import Tensor
 from torch.nn import functional
 
@@ -19,7 +18,7 @@ from tracking3d.estimation.observation import Batch, halved
 from tracking3d.estimation.paper.belief import Belief, Keyframe
 from tracking3d.estimation.paper.optimize import Optimum, optimize
 from tracking3d.estimation.paper.problem import Parameters, Problem
-from tracking3d.geometry.pose import Pose
+from tracking3d.geometry.pose import Pose, from_matrix, rotation_exponential
 
 RATES = (3.0, 8.0)
 """Degrees a frame that the hypotheses turn."""
@@ -69,22 +68,26 @@ def hypotheses(belief: Belief, frames: list[Keyframe]) -> list[Parameters]:
     """
     first, found = frames[0].pose, Pose.stack([frame.pose for frame in frames])
     elapsed = [frame.observation.index - frames[0].observation.index for frame in frames]
-    rotations = [first.quaternion.expand_as(found.quaternion), _mirrored(first.R, found.R)]
+    still = Pose(found.translation, first.quaternion.expand_as(found.quaternion))
+    variants = [still, _mirrored(first, found)]
     for direction in range(DIRECTIONS):
         angle = 2 * math.pi * direction / DIRECTIONS
         axis = first.translation.new_tensor([math.cos(angle), math.sin(angle), 0.0])
-        rotations += [_turned(first.R, axis, rate, elapsed) for rate in RATES]
-    return [Parameters(found.translation, quaternion, belief.offsets, belief.texture) for quaternion in rotations]
+        variants += [_turned(first, found, axis, rate, elapsed) for rate in RATES]
+    return [
+        Parameters(poses.translation, poses.quaternion, belief.offsets, belief.texture) for poses in variants
+    ]
 
 
-def _turned(first: Tensor, axis: Tensor, rate: float, elapsed: list[int]) -> Tensor:
-    """``(B, 4)`` the first rotation ``(3, 3)`` turned about ``axis`` by ``rate`` degrees a frame, by 60 at most."""
-    angles = [math.radians(max(min(rate * frames, 60.0), -60.0)) for frames in elapsed]
-    turn = axis_angle_to_rotation_matrix(axis.new_tensor(angles)[:, None] * functional.normalize(axis, dim=0))
-    return rotation_matrix_to_quaternion(turn @ first)
+def _turned(first: Pose, found: Pose, axis: Tensor, rate: float, elapsed: list[int]) -> Pose:
+    """The first rotation turned about ``axis`` by ``rate`` degrees in each of the elapsed frames, by 60 at most."""
+    angles = axis.new_tensor([math.radians(max(min(rate * frames, 60.0), -60.0)) for frames in elapsed])
+    turn = rotation_exponential(angles[:, None] * functional.normalize(axis, dim=0))
+    return from_matrix(turn @ first.R, found.translation)
 
 
-def _mirrored(first: Tensor, R: Tensor) -> Tensor:
-    """``(B, 4)`` of ``(B, 3, 3)``: the rotation since the first ``(3, 3)``, its tilt in depth reversed (Necker)."""
-    flip = torch.diag(R.new_tensor([1.0, 1.0, -1.0]))
-    return rotation_matrix_to_quaternion(flip @ (R @ first.T) @ flip @ first)
+def _mirrored(first: Pose, found: Pose) -> Pose:
+    """The rotations since the first frame with their tilt out of the image plane reversed (Necker)."""
+    delta = found.R @ first.R.T
+    flip = torch.diag(delta.new_tensor([1.0, 1.0, -1.0]))
+    return from_matrix(flip @ delta @ flip @ first.R, found.translation)
