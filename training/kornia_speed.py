@@ -27,8 +27,9 @@ from kornia.geometry.linalg import transform_points
 from kornia.geometry.quaternion import Quaternion
 from kornia.geometry.transform import remap, resize, warp_perspective
 from kornia.losses import cauchy_loss
-from kornia.metrics import psnr, ssim
+from kornia.metrics import angle_error_mat, psnr, ssim
 from kornia.morphology import dilation, erosion
+from scipy.spatial.transform import Rotation
 from skimage.metrics import structural_similarity
 from torch import Tensor
 from torch.nn import functional
@@ -110,6 +111,16 @@ def poses(generator: torch.Generator) -> None:
                 quaternion[0],
             ),
         )
+
+
+def rotation_errors() -> None:
+    """Of the poses of a run, as arrays."""
+    found, true = (Rotation.random(200, rng=seed).as_matrix() for seed in (0, 1))
+    row(
+        "rotation errors of 200 frames",
+        lambda: np.degrees((Rotation.from_matrix(found).inv() * Rotation.from_matrix(true)).magnitude()),
+        lambda: angle_error_mat(torch.from_numpy(found), torch.from_numpy(true)),
+    )
 
 
 def cameras(generator: torch.Generator) -> None:
@@ -313,6 +324,7 @@ if __name__ == "__main__":
     random = torch.Generator().manual_seed(0)
     for group in (poses, cameras, losses, features):
         group(random)
+    rotation_errors()
     for count in (VIEWS, 1):
         erosions(count, random)
     for pixels in (4, 8):
