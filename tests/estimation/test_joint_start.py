@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -72,6 +73,32 @@ def test_the_others_turn_steadily_in_every_direction(waiting):
     ends = [Pose(start.translation[-1], start.quaternion[-1]) for start in turning]
     apart = [degrees(a, -1, b) for i, a in enumerate(turning) for b in ends[:i]]
     assert min(apart) > 5
+
+
+def test_rotations_of_a_batch_are_those_of_one_frame_after_another(waiting):
+    """Frames may be far apart: none turns by more than 60 degrees."""
+    belief, found = waiting
+    frames = [
+        Keyframe(replace(keyframe.observation, index=index), keyframe.pose)
+        for keyframe, index in zip(found, (3, 4, 7, 12, 30), strict=True)
+    ]
+    first = frames[0].pose
+    flip = torch.diag(torch.tensor([1.0, 1.0, -1.0]))
+
+    def turned(axis: torch.Tensor, rate: float, keyframe: Keyframe) -> Pose:
+        angle = min(rate * (keyframe.observation.index - 3), 60.0)
+        return from_matrix(rotation_about(axis, angle) @ first.R, keyframe.pose.translation)
+
+    expected = [[first for _ in frames]]
+    expected.append(
+        [from_matrix(flip @ f.pose.R @ first.R.T @ flip @ first.R, f.pose.translation) for f in frames]
+    )
+    for direction in range(DIRECTIONS):
+        angle = 2 * math.pi * direction / DIRECTIONS
+        axis = torch.tensor([math.cos(angle), math.sin(angle), 0.0])
+        expected += [[turned(axis, rate, keyframe) for keyframe in frames] for rate in RATES]
+    for start, poses in zip(hypotheses(belief, frames), expected, strict=True):
+        torch.testing.assert_close(start.poses.R, torch.stack([pose.R for pose in poses]))
 
 
 def test_the_answer_is_the_best_of_what_was_tried_and_keeps_the_gauge(waiting):

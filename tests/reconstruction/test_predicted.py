@@ -9,7 +9,7 @@ import pytest
 from rendered_views import ball, pattern, pose, seen, view
 from test_volume import CAMERA, shape_views
 
-from tracking3d.reconstruction import textured
+from tracking3d.reconstruction import predicted, textured
 from tracking3d.reconstruction.predicted import picture_scores
 from tracking3d.reconstruction.shape_views import shape_view
 
@@ -43,3 +43,19 @@ def test_what_is_beside_the_mask_is_not_judged(out):
     elsewhere = picture_scores(model, shape_views(YAWS), [(shape, replace(texture, image=other))])
     assert elsewhere.psnr == pytest.approx(picture_scores(model, shape_views(YAWS), [out]).psnr, abs=1e-6)
     assert np.isfinite(elsewhere.ssim)
+
+
+def test_the_signal_to_noise_ratio_is_that_of_the_pixels_within_the_mask(out, monkeypatch):
+    """Of a model out of sight every pixel is predicted as middle grey; of two like pictures the ratio is 60 dB."""
+    shape, texture = out
+    away = ball()
+    away = replace(away, vertices=away.vertices + 100)
+    monkeypatch.setattr(predicted, "polished", lambda surface, views: views)
+    picture, inside = texture.image / 255.0, texture.valid > 0
+    scores = picture_scores(away, shape_views(YAWS), [out])
+    assert scores.covered == 0
+    assert scores.psnr == pytest.approx(-10 * np.log10(np.square(picture - 0.5)[inside].mean()), abs=1e-9)
+
+    monkeypatch.setattr(predicted, "_UNCOVERED", 0.0)
+    black = replace(texture, image=np.zeros_like(texture.image))
+    assert picture_scores(away, shape_views(YAWS), [(shape, black)]).psnr == 60
