@@ -287,8 +287,8 @@ def main() -> None:
     sys.exit(int(differ or not sequences))
 
 
-def arguments() -> argparse.Namespace:
-    """What the command line says."""
+def options() -> argparse.ArgumentParser:
+    """The options of this script."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -306,6 +306,12 @@ def arguments() -> argparse.Namespace:
     parser.add_argument(
         "--jobs", type=int, default=1, choices=(1, 2), help="2: both versions at the same time"
     )
+    return parser
+
+
+def arguments() -> argparse.Namespace:
+    """What the command line says."""
+    parser = options()
     given = parser.parse_args()
     given.only = [name.strip() for name in given.only.split(",")]
     if unknown := set(given.only) - set(SEQUENCES):

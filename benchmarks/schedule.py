@@ -31,7 +31,7 @@ def schedule(
     retries: Annotated[int, typer.Option(min=0, help="Times that a task is tried again.")] = 3,
     resume: Annotated[
         bool,
-        typer.Option("--resume/--anew", help="Whether what lost workers did is kept.", show_default=False),
+        typer.Option("--resume/--restart", help="Whether what lost workers did is kept.", show_default=False),
     ] = True,
     seed: Annotated[int, typer.Option(min=0, help="Of what is random.")] = 0,
     plot: Annotated[

@@ -149,6 +149,22 @@ def test_the_solvers_are_tenants_that_never_import_each_other():
                 assert parts[:2] != ["tracking3d", "estimation"] or parts[2] not in rooms - {tenant}, path
 
 
+def test_the_package_does_without_the_scripts_of_the_authors():
+    scripts = {path.stem for path in (PACKAGE.parent / "benchmarks").glob("*.py")}
+    assert scripts
+    for path in modules():
+        imported = {
+            name.partition(".")[0]
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+            for name in (
+                [alias.name for alias in node.names]
+                if isinstance(node, ast.Import)
+                else [node.module or ""] * isinstance(node, ast.ImportFrom)
+            )
+        }
+        assert not imported & {"benchmarks", *scripts}, path
+
+
 def test_no_module_is_longer_than_a_reader_keeps_in_mind():
     assert not [path for path, lines in lengths().items() if lines > LONGEST_MODULE]
 
