@@ -149,6 +149,19 @@ def test_the_solvers_are_tenants_that_never_import_each_other():
                 assert parts[:2] != ["tracking3d", "estimation"] or parts[2] not in rooms - {tenant}, path
 
 
+def test_the_package_does_without_the_scripts_of_the_authors():
+    scripts = {path.stem for path in (PACKAGE.parent / "benchmarks").glob("*.py")}
+    assert scripts
+    for path in modules():
+        names = set()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                names |= {alias.name.partition(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                names.add(str(node.module).partition(".")[0])
+        assert not names & {"benchmarks", *scripts}, path
+
+
 def test_no_module_is_longer_than_a_reader_keeps_in_mind():
     assert not [path for path, lines in lengths().items() if lines > LONGEST_MODULE]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import statistics
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -13,7 +14,6 @@ from tracking3d.errors import InputError
 from tracking3d.rendering import prepare_backend, render
 from tracking3d.rendering.backend import threads_kept, why_no_numba
 from tracking3d.speed.dense import render_dense
-from tracking3d.speed.pytorch3d import ABSENT, render_pytorch3d, why_no_pytorch3d
 from tracking3d.speed.scene import Backend, Problem, Scene
 
 DENSE = "dense"
@@ -52,15 +52,7 @@ def backends(device: torch.device) -> dict[str, Backend]:
     found: dict[str, Backend] = {"torch": partial(render, backend="torch")}
     if device.type == "cpu" and not why_no_numba():
         found["numba"] = partial(render, backend="numba")
-    if not why_no_pytorch3d(device):
-        found["pytorch3d"] = render_pytorch3d
     return found
-
-
-def left_out(device: torch.device) -> dict[str, str]:
-    """Backends of others that are installed and cannot render on a device, and why."""
-    why = why_no_pytorch3d(device)
-    return {"pytorch3d": why} if why not in ("", ABSENT) else {}
 
 
 def give_threads(name: str, device: torch.device, threads: int) -> None:
@@ -69,7 +61,12 @@ def give_threads(name: str, device: torch.device, threads: int) -> None:
 
 
 def time_backends(
-    problem: Problem, device: torch.device, repeats: int, threads: int, dense: bool = False
+    problem: Problem,
+    device: torch.device,
+    repeats: int,
+    threads: int,
+    dense: bool = False,
+    others: Mapping[str, Backend] | None = None,
 ) -> dict[str, list[Duration]]:
     """Time every backend on one problem.
 
@@ -82,11 +79,12 @@ def time_backends(
         repeats: Measurements of each backend.
         threads: CPU threads of every backend.
         dense: Whether to time the dense implementation, too, once and for a single frame.
+        others: Further renderers to time beside those of `backends`, by name.
 
     Returns:
         Measurements by name.
     """
-    scene, candidates = Scene.make(problem, device), backends(device)
+    scene, candidates = Scene.make(problem, device), {**backends(device), **(others or {})}
     times: dict[str, list[Duration]] = {name: [] for name in candidates}
     with threads_kept():
         for done in range(0, repeats, _PER_TURN):

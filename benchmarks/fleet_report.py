@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from tracking3d.benchmark.scheduling import ORDERS, Fleet, Outcome, Splitting, simulate
+from fleet_simulation import ORDERS, Fleet, Outcome, Splitting, simulate
 from tracking3d.results.files import writing
 
 NAMES = {"longest": "longest first", "first": "as they come", "random": "random"}
