@@ -9,7 +9,6 @@ from tracking3d.benchmark import soak as module
 from tracking3d.benchmark.soak import Sample, SoakReport, format_soak, looped_clip, plot_soak, soak, trends
 from tracking3d.config.loading import load_config
 from tracking3d.frames import SkippedFrame
-from tracking3d.process_memory import resident_memory
 from tracking3d.results.run_reader import RunReader
 
 QUICK = [
@@ -93,7 +92,5 @@ def test_stopped_by_hand_it_tells_what_it_measured(tmp_path, monkeypatch, taken)
 
 @pytest.mark.slow
 def test_nine_hundred_frames_are_flat(tmp_path):
-    if resident_memory() is None:
-        pytest.skip("this system does not tell how much memory a process holds")
     report = soak(load_config(overrides=QUICK), tmp_path / "run", frames=900, size=(96, 72))
     assert report.trends["memory"].flat and report.trends["descriptors"].flat, report.trends

@@ -6,7 +6,6 @@ The object of a short synthetic clip turns to and fro, and leaves the frame and 
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -15,6 +14,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import psutil
 from numpy.typing import NDArray
 from rich.table import Table
 
@@ -38,7 +38,6 @@ SPEED = 0.25
 _TURNING = 60  # frames of a round in which the object turns in sight; it comes back the way it went
 _LEAVING = 12  # frames in which it leaves, and as many in which it returns
 _ABSENT = 6  # frames without it
-_DESCRIPTORS = Path("/proc/self/fd")
 
 
 @dataclass(frozen=True)
@@ -48,15 +47,15 @@ class Sample:
     Attributes:
         index: The frame.
         seconds: From the frame before to this one.
-        memory: Megabytes of the process; None where the system does not tell.
-        descriptors: Open files of the process; None where the system does not tell.
+        memory: Megabytes of the process.
+        descriptors: Open files of the process.
         status: Of the answer.
     """
 
     index: int
     seconds: float
-    memory: float | None
-    descriptors: int | None
+    memory: float
+    descriptors: int
     status: str
 
 
@@ -182,9 +181,9 @@ def soak(
 
     def measure(answer: FrameRecord | SkippedFrame) -> None:
         nonlocal before
-        now, memory = time.perf_counter(), resident_memory()
+        now, (memory, _) = time.perf_counter(), resident_memory()
         status = str(answer.status) if isinstance(answer, FrameRecord) else "skipped"
-        samples.append(Sample(answer.index, now - before, memory and memory[0], _open_descriptors(), status))
+        samples.append(Sample(answer.index, now - before, memory, _open_descriptors(), status))
         before = time.perf_counter()
 
     solver = config.solver.model_copy(update={"final_refine": False})
@@ -214,8 +213,6 @@ def trends(samples: list[Sample], round_length: int) -> dict[str, Trend]:
         ("seconds", SPEED, np.median),
     ):
         values = [getattr(sample, name) for sample in settled]
-        if any(value is None for value in values):
-            continue
         # Whole rounds are alike; single frames are not: some enter the map, in some the object is searched for.
         rounds = len(values) // round_length
         levels = [float(level_of(values[n * round_length : (n + 1) * round_length])) for n in range(rounds)]
@@ -263,8 +260,6 @@ def plot_soak(report: SoakReport, path: Path) -> None:
     ):
         values = [getattr(sample, name) for sample in report.samples]
         panel.set_ylabel(label)
-        if any(value is None for value in values):
-            continue
         panel.plot(index, values, linewidth=0.5, color="grey")
         width = min(100, len(values))
         means = np.convolve(np.asarray(values, float), np.ones(width) / width, "valid")
@@ -301,8 +296,6 @@ def _moved(
     return result
 
 
-def _open_descriptors() -> int | None:
-    try:
-        return len(os.listdir(_DESCRIPTORS)) - 1  # noqa: PTH208 (one of them lists the folder)
-    except OSError:
-        return None
+def _open_descriptors() -> int:
+    process = psutil.Process()
+    return process.num_fds() if psutil.POSIX else process.num_handles()

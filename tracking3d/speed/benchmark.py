@@ -123,6 +123,5 @@ def _ratio(one: dict[str, Any], other: dict[str, Any]) -> float:
     return float(f"{one['total_ms'] / other['total_ms']:.3g}")
 
 
-def _rounded(name: str, problem: Problem, device: torch.device, threads: int) -> float | None:
-    memory = peak_memory(name, problem, device, threads)
-    return None if memory is None else round(memory, 1)
+def _rounded(name: str, problem: Problem, device: torch.device, threads: int) -> float:
+    return round(peak_memory(name, problem, device, threads), 1)
