@@ -14,15 +14,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tracking3d.config.models import PipelineConfig
 from tracking3d.config.solvers import PaperConfig
 from tracking3d.estimation.appearance import visible_texture
 from tracking3d.estimation.assessment import Assessment, assess
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource, ObjectModel, Status
 from tracking3d.estimation.feature_space import TAU, FeatureSpace, feature_channels
-from tracking3d.estimation.framing import mask_box, projected_box
 from tracking3d.estimation.keyframes import Candidate, is_new_view, select_keyframes
-from tracking3d.estimation.observation import Batch, Observation, observe
+from tracking3d.estimation.observation import Batch, Observation
 from tracking3d.estimation.paper.belief import Belief, Keyframe
 from tracking3d.estimation.paper.joint_start import joint_start
 from tracking3d.estimation.paper.optimize import Optimum, optimize
@@ -30,28 +28,17 @@ from tracking3d.estimation.paper.prediction import candidate_poses
 from tracking3d.estimation.paper.problem import Problem
 from tracking3d.estimation.shape import Shape
 from tracking3d.estimation.solver import STATE_CLASSES
+from tracking3d.estimation.solver_base import SolverBase
 from tracking3d.estimation.start import first_mask, first_translation, mask_ellipse, prototype_mesh
-from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame, MaskEstimate
-from tracking3d.geometry.camera import Camera, Window
 from tracking3d.geometry.pose import Pose
 from tracking3d.rendering import BackProjection, TexelMap
 from tracking3d.stages import in_stage
 
 
 @dataclass(frozen=True)
-class PaperSolver:
-    """See the module; implements `tracking3d.estimation.solver.Solver`.
-
-    Attributes:
-        config: The pipeline's configuration.
-        camera: The camera of the full frame.
-        encoder: The feature encoder.
-    """
-
-    config: PipelineConfig
-    camera: Camera
-    encoder: FeatureEncoder
+class PaperSolver(SolverBase):
+    """See the module; implements `tracking3d.estimation.solver.Solver`."""
 
     state_classes: ClassVar[tuple[type, ...]] = (*STATE_CLASSES, Belief, Keyframe)
     """What a `Belief` is made of, for keeping it."""
@@ -71,11 +58,6 @@ class PaperSolver:
     @property
     def _channels(self) -> int:
         return feature_channels(self.encoder, self.config.object.texture_channels)
-
-    @property
-    def device(self) -> torch.device:
-        """Where tensors live."""
-        return torch.device(self.config.runtime.device)
 
     def init(self, frame: Frame, mask: MaskEstimate) -> tuple[Belief, FrameEstimate]:
         """Fit prototype, shape and texture to the first frame.
@@ -142,14 +124,7 @@ class PaperSolver:
     def _observe(
         self, belief: Belief, frame: Frame, mask: NDArray[np.bool_] | None, pose: Pose
     ) -> Observation:
-        box = mask_box(mask) if mask is not None else projected_box(belief.vertices, belief.camera, pose)
-        if box is None:
-            box = (0.0, 0.0, float(self.camera.width), float(self.camera.height))
-        window = Window.around(box, self.config.window.margin, self.config.window.size)
-        observation = observe(frame, mask, window, self.camera, self.encoder, self.device)
-        if belief.space is None:
-            return observation
-        return replace(observation, features=belief.space.project(observation.features))
+        return self.observe(frame, mask, pose, belief.vertices, belief.camera, belief.space)
 
     def _best_candidate(self, belief: Belief, observation: Observation, candidates: list[Pose]) -> Pose:
         """The pose with the least loss as it stands."""
