@@ -83,7 +83,8 @@ AT_LEAST = {
     "tracking3d.synthesis.suite": "SUITES SUITE_VERSION load_suite make_suite",
     "tracking3d.synthesis.convex_clips": """SyntheticClip SyntheticSpec degrade_masks make_demo_clip
         synthesize""",
-    "tracking3d.export.exporter": "Exporter ExportOptions",
+    "tracking3d.export.exporter": "Exporter",
+    "tracking3d.export.options": "ExportOptions",
     "tracking3d.export.exporting": "Export export_run find_format",
     "tracking3d.export.formats": "FORMATS",
     "tracking3d.export.supervision_detections": "detections",

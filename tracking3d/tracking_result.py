@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from tracking3d.arguments import checked_folder
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import ObjectModel, Status
-from tracking3d.export.exporter import ExportOptions
 from tracking3d.export.exporting import Export, export_run
+from tracking3d.export.options import ExportOptions
 from tracking3d.geometry.camera import Camera
 from tracking3d.results.correspondences import PointTracks, track_points
 from tracking3d.results.files import writing

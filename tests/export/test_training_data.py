@@ -78,7 +78,7 @@ def test_colmap_has_a_camera_for_every_lens(export, zooming_run, silhouettes):
 def test_points_are_those_that_are_seen(export, run):
     """A vertex of the far side is in no image."""
     from tracking3d.export.exported_run import ExportedRun
-    from tracking3d.export.exporter import ExportOptions
+    from tracking3d.export.options import ExportOptions
     from tracking3d.export.seen_surface import seen_surface
 
     exported = ExportedRun(RunReader(run), ExportOptions())

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tracking3d.datasets.clip import is_rigid
 from tracking3d.errors import InputError, argument
 from tracking3d.estimation.estimate import ObjectModel, Status
-from tracking3d.export.exporter import ExportOptions
+from tracking3d.export.options import ExportOptions
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.results.mesh_export import load_model

@@ -21,7 +21,8 @@ from tracking3d.estimation.online.mapping import (
     tracks_of,
 )
 from tracking3d.estimation.online.points import FollowedPoints
-from tracking3d.estimation.online.pose_refinement import PoseWeights, refine_pose
+from tracking3d.estimation.online.pose_refinement import refine_pose
+from tracking3d.estimation.online.pose_refinement_types import PoseWeights
 from tracking3d.estimation.online.shape_modes import Modes
 from tracking3d.estimation.online.structure import structure_hypotheses
 from tracking3d.estimation.online.surface_fit import FitWeights

@@ -16,7 +16,7 @@ from tracking3d.bundle_adjustment.kernels.reprojection import (
     turned_by,
 )
 from tracking3d.bundle_adjustment.reprojection import BEHIND, NEAREST, FloatArray
-from tracking3d.estimation.online.pose_from_points import (
+from tracking3d.estimation.online.pnp_types import (
     CONVERGED,
     FIRST_DAMPING,
     MOST_DAMPING,
