@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from tracking3d.checkpoint.folder import Checkpoint
-from tracking3d.checkpoint.progress import Kept, Progress, TakenFrame, check_picture, checksum
+from tracking3d.checkpoint.progress import Kept, RunProgress, TakenFrame, check_picture, checksum
 from tracking3d.checkpoint.trees import UnkeptError
 from tracking3d.corrections import Correction, prompts_in
 from tracking3d.errors import OutputError, PluginError
@@ -64,7 +64,7 @@ class ObjectRecording:
         self._work = WorkBehind()  # all that touches writer and checkpoint while frames come
         self.latest: FrameEstimate | None = None
         self.foreseen: Foreseen | None = None
-        self._progress = kept.progress if kept else Progress()
+        self._progress = kept.progress if kept else RunProgress()
         self._until = self._progress  # what was done before
         self._past = {*kept.taken, *(one.index for one in kept.skipped)} if kept else set()
         self._answered = kept is not None

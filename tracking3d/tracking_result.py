@@ -46,7 +46,7 @@ class TemporaryRun:
         weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)
 
 
-class Masks(Sequence[NDArray[np.bool_]]):
+class MaskSequence(Sequence[NDArray[np.bool_]]):
     """The answers' masks in the order of the frames, each read when it is asked for; ``np.asarray`` reads all.
 
     Args:
@@ -125,9 +125,9 @@ class TrackingResult:
         return np.array([record.T_cam_obj for record in self.frames]).reshape(-1, 4, 4)
 
     @property
-    def masks(self) -> Masks:
+    def masks(self) -> MaskSequence:
         """``(N, H, W)`` bool, read as they are asked for."""
-        return Masks(self.run)
+        return MaskSequence(self.run)
 
     @property
     def statuses(self) -> tuple[Status, ...]:

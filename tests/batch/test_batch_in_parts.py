@@ -16,10 +16,10 @@ from tracking3d.batch.tasks import Tasks
 from tracking3d.batch.video_job import VideoJob
 from tracking3d.config.loading import load_config
 from tracking3d.engines.in_this_process import InThisProcess
-from tracking3d.engines.protocol import Ended as TaskEnded
 from tracking3d.engines.protocol import Fault
+from tracking3d.engines.protocol import SplitResult as TaskEnded
 from tracking3d.errors import OutputError
-from tracking3d.splitting.long_video import Ended
+from tracking3d.splitting.long_video import SplitResult
 from tracking3d.splitting.steps import Step
 
 
@@ -56,7 +56,7 @@ def cut(monkeypatch, finished_run):
         assert answers == [10, 20]
         folders = [begun.folder / "parts" / f"part_{n}" for n in (0, 1)] if refused else [begun.folder]
         yield [Step(end, folders, "its end")]
-        return Ended(tuple(folders), 2, *refused)
+        return SplitResult(tuple(folders), 2, *refused)
 
     monkeypatch.setattr(in_parts, "begin", begin)
     monkeypatch.setattr(tasks, "steps_of", steps_of)

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from tracking3d.benchmark.split_benefit import Measured, looped
+from tracking3d.benchmark.split_benefit import SplitMeasurement, looped
 from tracking3d.errors import OutputError
-from tracking3d.splitting.long_video import Ended
+from tracking3d.splitting.long_video import SplitResult
 
 BOX = ("--box", "20,10,20,20")
 
@@ -33,7 +33,7 @@ def parts(monkeypatch):
 
 def test_what_is_given_reaches_the_library(call, clip, parts):
     asked, answers = parts
-    answers.append(Ended((Path("run"),), 3))
+    answers.append(SplitResult((Path("run"),), 3))
     result = call(
         "run", clip, *BOX, "--split", "40f", "--workers", 3, "--out", "run", "--frames", "0:4", "--resume"
     )
@@ -48,7 +48,7 @@ def test_what_is_given_reaches_the_library(call, clip, parts):
 
 def test_parts_that_were_not_joined_are_named_with_the_reason(call, clip, parts):
     parts[1].append(
-        Ended((Path("run/parts/part_0"), Path("run/parts/part_1")), 2, "parts 1 and 2: they differ")
+        SplitResult((Path("run/parts/part_0"), Path("run/parts/part_1")), 2, "parts 1 and 2: they differ")
     )
     result = call("run", clip, *BOX, "--split", "40f", "--out", "run")
     assert result.exit_code == 0, result.output
@@ -58,7 +58,7 @@ def test_parts_that_were_not_joined_are_named_with_the_reason(call, clip, parts)
 
 
 def test_a_video_that_was_not_cut_says_why(call, clip, parts):
-    parts[1].append(Ended((Path("run"),), 1, "clip has 5 frames, which is one part"))
+    parts[1].append(SplitResult((Path("run"),), 1, "clip has 5 frames, which is one part"))
     result = call("run", clip, *BOX, "--split", "40f", "--out", "run")
     assert "one part" in result.stderr
 
@@ -104,8 +104,8 @@ def test_the_benefit_is_told_side_by_side(call, monkeypatch):
     def measured(config, folder, **named):
         assert (named["frames"], named["length"], named["size"]) == (100, 50, (320, 240))
         return {
-            "whole": Measured(100.0, 2.0, 1.5, 1.0, {}),
-            "split": Measured(60.0, 2.1, 1.6, 0.9, {"join": 5.0}, 2),
+            "whole": SplitMeasurement(100.0, 2.0, 1.5, 1.0, {}),
+            "split": SplitMeasurement(60.0, 2.1, 1.6, 0.9, {"join": 5.0}, 2),
         }
 
     monkeypatch.setattr("tracking3d.benchmark.split_benefit.measure_split", measured)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tracking3d.evidence import colours, consensus, motion
-from tracking3d.evidence.scene import Scene
+from tracking3d.evidence.scene import FrameWindow
 from tracking3d.geometry.camera import Camera, Window
 
 CAMERA = Camera(200.0, 200.0, 79.5, 59.5, 160, 120)
@@ -69,7 +69,7 @@ def test_both_motions_lead_to_the_same_places(both_ways):
     nothing = np.zeros((48, 48), bool)
     inverse_depth = np.where(np.mgrid[:48, :48][0] > 5, rng.uniform(0.1, 0.2, (48, 48)), 0).astype(np.float32)
     image = np.zeros((120, 160, 3), np.uint8)
-    scene = Scene(
+    scene = FrameWindow(
         window, image[:48, :48], window.K(CAMERA), pose, nothing, nothing, nothing, inverse_depth, 1, ~nothing
     )
     H = np.array([[1.02, 0.01, -6.0], [0.0, 0.98, 3.0], [1e-4, 0.0, 1.0]])

@@ -16,7 +16,7 @@ from tracking3d.evidence.hindsight import Hindsight, all_decided
 from tracking3d.evidence.hindsight_weights import WEIGHTS
 from tracking3d.evidence.motion import apart, background_motion, motion_cue, small_grey
 from tracking3d.evidence.order import InOrder
-from tracking3d.evidence.scene import Answered, Scene
+from tracking3d.evidence.scene import Answered, FrameWindow
 from tracking3d.evidence.sources import Said
 from tracking3d.geometry.camera import Camera
 from tracking3d.trackers.outline import signed_distance
@@ -124,8 +124,8 @@ def test_a_mask_that_would_change_beyond_belief_stands():
     )
 
 
-def scenes(count: int, spoil=lambda mask: mask) -> list[Scene]:
-    found = [Scene.of(answered(number, spoil), CAMERA, VERTICES, FACES) for number in range(count)]
+def scenes(count: int, spoil=lambda mask: mask) -> list[FrameWindow]:
+    found = [FrameWindow.of(answered(number, spoil), CAMERA, VERTICES, FACES) for number in range(count)]
     return [scene for scene in found if scene is not None]
 
 

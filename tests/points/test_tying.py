@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.prototypes import sphere
 from tracking3d.points.follow import Followed
-from tracking3d.points.landmarks import Scene
+from tracking3d.points.landmarks import LandmarkScene
 from tracking3d.points.tying import joined, meetings
 from tracking3d.points.uncertainty import FEATURES
 from tracking3d.points.view import open_view
@@ -31,10 +31,10 @@ def poses(step: float = 4.0) -> list[np.ndarray]:
     return result
 
 
-def scene(Ts: list[np.ndarray]) -> Scene:
+def scene(Ts: list[np.ndarray]) -> LandmarkScene:
     image, mask = np.zeros((480, 640, 3), np.uint8), np.zeros((480, 640), bool)
     views = [open_view(image, mask, CAMERA, T, MESH.vertices, MESH.faces) for T in Ts]
-    return Scene(list(views), np.asarray(MESH.vertices, float), np.asarray(MESH.faces))
+    return LandmarkScene(list(views), np.asarray(MESH.vertices, float), np.asarray(MESH.faces))
 
 
 def seen(points: np.ndarray, Ts: list[np.ndarray]) -> np.ndarray:

@@ -13,7 +13,7 @@ import torch
 from tracking3d import process_memory
 from tracking3d.process_memory import resident_memory
 from tracking3d.speed.memory import peak_memory
-from tracking3d.speed.scene import Problem
+from tracking3d.speed.scene import RenderWorkload
 
 CPU = torch.device("cpu")
 needs_proc = pytest.mark.skipif(
@@ -68,6 +68,6 @@ def test_windows_knows_the_peak_itself(monkeypatch):
 @pytest.mark.slow
 @needs_proc
 def test_a_backend_needs_at_least_the_gradient_of_the_texture():
-    problem = Problem(size=32, frames=1, channels=32, texture=256)
+    problem = RenderWorkload(size=32, frames=1, channels=32, texture=256)
     gradient = 4e-6 * problem.channels * problem.texture**2  # 8.4 MB
     assert gradient <= peak_memory("numba", problem, CPU) < 10 * gradient

@@ -14,7 +14,7 @@ from scenes import bumpy_sphere
 from tracking3d.rendering import SoftBand, render
 from tracking3d.speed import pytorch3d
 from tracking3d.speed.pytorch3d import ABSENT, render_pytorch3d, to_pytorch3d, why_no_pytorch3d
-from tracking3d.speed.scene import Problem, Scene
+from tracking3d.speed.scene import RenderScene, RenderWorkload
 from tracking3d.speed.table import format_left_out
 from tracking3d.speed.timing import backends, left_out
 
@@ -77,7 +77,7 @@ def test_an_installation_without_a_part_is_broken_and_not_absent(stand_in, monke
 @pytest.mark.slow
 @torch.no_grad()
 def test_covered_pixels_stay_covered_only_with_enough_faces(stand_in, monkeypatch):
-    scene = Scene.make(Problem(size=24, frames=1, texture=24, frequency=14), CPU)
+    scene = RenderScene.make(RenderWorkload(size=24, frames=1, texture=24, frequency=14), CPU)
     arguments = {**scene.parameters, **scene.constants}
     covered = render(**arguments).face_index >= 0
     assert ((render_pytorch3d(**arguments).face_index >= 0) == covered).all()
@@ -97,7 +97,7 @@ def test_pytorch3d_draws_the_same_picture(stand_in):
 
 
 def test_pytorch3d_is_timed_on_the_same_loss_and_gradients(stand_in):
-    scene = Scene.make(Problem(size=24, frames=2, texture=24, frequency=3), CPU)
+    scene = RenderScene.make(RenderWorkload(size=24, frames=2, texture=24, frequency=3), CPU)
     answers = []
     for backend in (render, render_pytorch3d):
         scene.forget_gradients()

@@ -42,7 +42,7 @@ class Failure:
 
 
 @dataclass(frozen=True)
-class Progress:
+class BatchProgress:
     """How far a batch is.
 
     Attributes:
@@ -80,7 +80,7 @@ class Progress:
         return self.state
 
 
-def write_progress(out: str, progress: Progress) -> Progress:
+def write_progress(out: str, progress: BatchProgress) -> BatchProgress:
     """Write how far the batch is, with the time of now.
 
     Raises:
@@ -93,7 +93,7 @@ def write_progress(out: str, progress: Progress) -> Progress:
     return progress
 
 
-def read_progress(out: str) -> Progress:
+def read_progress(out: str) -> BatchProgress:
     """How far a batch is.
 
     Raises:
@@ -106,7 +106,7 @@ def read_progress(out: str) -> Progress:
         document = json.loads(content)
         if document.pop("format") != FORMAT:
             raise ValueError("another format")
-        return Progress(**document)
+        return BatchProgress(**document)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{joined(out, PROGRESS)} is damaged ({error}); run the batch once more.") from error
 

@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
-from tracking3d.batch.folder import Failure, Progress, write_progress, write_tables
+from tracking3d.batch.folder import BatchProgress, Failure, write_progress, write_tables
 from tracking3d.batch.networks import share_networks
 from tracking3d.batch.one_video import LOGS, WORK, send_log
 from tracking3d.batch.overview import write_overview
@@ -45,7 +45,7 @@ class Happening:
     event: str
     video: str
     about: Mapping[str, Any]
-    progress: Progress
+    progress: BatchProgress
 
 
 Listener = Callable[[Happening], None]
@@ -80,7 +80,7 @@ class Batch:
         self._clock = time.monotonic()
         self._refused = 0
         self.failures: dict[str, Failure] = {}
-        self.progress = Progress(
+        self.progress = BatchProgress(
             "running", len(jobs), engine=engine.name, workers=engine.workers, began=time.time()
         )
 
@@ -254,7 +254,7 @@ def run_batch(
     command: str = "",
     listener: Listener = lambda happening: None,
     pause: float = PAUSE,
-) -> Progress:
+) -> BatchProgress:
     """Track all videos; how far it came.
 
     What an earlier command has finished is left alone, and what it has begun goes on from its last finished frame.

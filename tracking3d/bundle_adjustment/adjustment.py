@@ -115,7 +115,7 @@ class System:
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class AdjustmentProblem:
     """What stays the same during one adjustment; arguments of `adjust`, with nothing in them that is not finite."""
 
     pixels: FloatArray
@@ -263,7 +263,7 @@ def adjust(
     known = finite_rows(start.points)
     prior = np.full((count, 3), np.nan) if point_prior is None else point_prior
     held = known & finite_rows(prior)
-    problem = Problem(
+    problem = AdjustmentProblem(
         pixels=np.where(tracks.visible[..., None], np.nan_to_num(tracks.pixels), 0.0),
         weight=tracks.weights() * known,
         K=np.asarray(K, np.float64),

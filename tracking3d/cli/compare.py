@@ -10,7 +10,7 @@ import typer
 from tracking3d.cli.options import Debug
 
 if TYPE_CHECKING:
-    from tracking3d.report.differences import Comparison
+    from tracking3d.report.differences import RunComparison
 
 
 def compare(
@@ -49,7 +49,7 @@ def compare(
         typer.echo(out)
 
 
-def _print(comparison: Comparison) -> None:
+def _print(comparison: RunComparison) -> None:
     from rich.markup import escape
     from rich.table import Table
 
@@ -84,7 +84,7 @@ def _print(comparison: Comparison) -> None:
         table("frames that differ most", worst, names[1:])
 
 
-def _every_two(comparison: Comparison) -> dict[str, list[Any]]:
+def _every_two(comparison: RunComparison) -> dict[str, list[Any]]:
     iou, turn = comparison.iou_between, comparison.rotation_between
     return {
         name: [

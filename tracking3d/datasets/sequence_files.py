@@ -13,7 +13,7 @@ from tracking3d.datasets.bop import Annotation, read_scene_camera, read_scene_gt
 from tracking3d.datasets.cameras import camera_of, read_intrinsics
 from tracking3d.datasets.clip import read_poses, symmetries_of
 from tracking3d.datasets.frame_matching import frame_numbers, match_frames
-from tracking3d.datasets.layout import DatasetLayout, Masks, Regions
+from tracking3d.datasets.layout import DatasetLayout, MaskLayout, Regions
 from tracking3d.datasets.masks import IndexedMask, RegionMask
 from tracking3d.datasets.placeholders import Place
 from tracking3d.datasets.pose_files import read_matrices, read_matrix_lines
@@ -71,12 +71,12 @@ class SequenceFiles:
         }
         return {n: file for n, file in sorted(found.items()) if file is not None}
 
-    def masks(self, told: Masks | None) -> dict[int, MaskReference]:
+    def masks(self, told: MaskLayout | None) -> dict[int, MaskReference]:
         """Masks in images by frame index."""
         files = self.matched(told.files) if told else {}
         return {n: self.mask(file, told) for n, file in files.items()} if told else {}
 
-    def mask(self, file: Path, told: Masks) -> MaskReference:
+    def mask(self, file: Path, told: MaskLayout) -> MaskReference:
         """The mask that an image holds."""
         if told.values == "threshold":
             return MaskFile(file)

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tracking3d.evidence.scene import Scene
+from tracking3d.evidence.scene import FrameWindow
 from tracking3d.rendering.backend import compiled
 from tracking3d.trackers.outline import signed_distance
 
@@ -42,7 +42,7 @@ class Consensus:
         self._views: list[NDArray[np.int8]] = []
         self._hulls: NDArray[np.float32] | None = None
 
-    def see(self, scene: Scene) -> None:
+    def see(self, scene: FrameWindow) -> None:
         """Add a frame whose pose and mask are believed."""
         # Beyond the window nothing is the object, beyond the frame nothing is known.
         size = scene.window.size
@@ -69,7 +69,7 @@ class Consensus:
         self._hulls = with_peaks(hull.reshape(len(RANKS), CELLS, CELLS, CELLS))
         self._views = []
 
-    def drawn(self, scene: Scene) -> NDArray[np.float32] | None:
+    def drawn(self, scene: FrameWindow) -> NDArray[np.float32] | None:
         """``(R, S, S)`` pixels within (positive) or from the hulls in a frame; None where they are not known."""
         if self._hulls is None or not np.isfinite(scene.T_cam_obj).all():
             return None

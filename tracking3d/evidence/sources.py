@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tracking3d.evidence.alignment import alignment, edge_strength
 from tracking3d.evidence.colours import Colours, as_lab, beside_outline, relative_distance
-from tracking3d.evidence.scene import Scene
+from tracking3d.evidence.scene import FrameWindow
 from tracking3d.trackers.outline import signed_distance
 
 Plane = NDArray[np.float32]
@@ -47,7 +47,7 @@ class Said:
     confidence: float
 
     @classmethod
-    def of(cls, scene: Scene, hulls: Plane | None, colours: Colours | None, motion: Plane) -> Said:
+    def of(cls, scene: FrameWindow, hulls: Plane | None, colours: Colours | None, motion: Plane) -> Said:
         """Ask all of them.
 
         Args:

@@ -63,7 +63,7 @@ class Difference:
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class RunComparison:
     """Runs over one video.
 
     Attributes:
@@ -124,7 +124,7 @@ class Comparison:
         return told
 
 
-def compare_runs(folders: Sequence[Path], against: Path | None = None) -> Comparison:
+def compare_runs(folders: Sequence[Path], against: Path | None = None) -> RunComparison:
     """Hold runs against one of them, and every two against each other.
 
     Poses are compared after the similarity that fits best, since object frame and unit of a run are its own.
@@ -152,7 +152,7 @@ def compare_runs(folders: Sequence[Path], against: Path | None = None) -> Compar
     keys = dict.fromkeys(key for config in configs for key in config)
     values = {key: [config.get(key) for config in configs] for key in keys}
     values["frames that were asked for"] = [run.description.get("selection") or "all" for run in runs]
-    return Comparison(
+    return RunComparison(
         runs=runs,
         names=names,
         settings={key: told for key, told in values.items() if len(set(told)) > 1},

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tracking3d.frames import Frame
 from tracking3d.points.follow import Followed, follow_points
 from tracking3d.points.image_following import ImageTracks, follow_in_images
-from tracking3d.points.landmarks import Scene
+from tracking3d.points.landmarks import LandmarkScene
 from tracking3d.points.meeting import surface_under
 from tracking3d.points.pictures import Picture, open_picture
 from tracking3d.points.tying import joined, meetings
@@ -61,7 +61,7 @@ def read_pictures(run: RunReader, source: FrameSource) -> list[Picture | None]:
 
 def follow_beside_mesh(
     run: RunReader,
-    scene: Scene,
+    scene: LandmarkScene,
     pictures: Sequence[Picture | None],
     start: int,
     xy: Array,

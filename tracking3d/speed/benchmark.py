@@ -20,7 +20,7 @@ import torch
 from tracking3d.results.description import versions
 from tracking3d.speed.growth import measure_growth
 from tracking3d.speed.memory import peak_memory
-from tracking3d.speed.scene import Problem, default_texture
+from tracking3d.speed.scene import RenderWorkload, default_texture
 from tracking3d.speed.timing import DENSE, Duration, find_device, left_out, median, time_backends
 
 
@@ -62,7 +62,7 @@ def benchmark(
         InputError: If the device is not there.
     """
     place = find_device(device)
-    problem = Problem(size, frames, channels, texture or default_texture(channels))
+    problem = RenderWorkload(size, frames, channels, texture or default_texture(channels))
     times = time_backends(problem, place, repeats, threads, dense)
     results = {
         name: _figures(measured, frames, 1 if name == DENSE else frames) for name, measured in times.items()
@@ -123,5 +123,5 @@ def _ratio(one: dict[str, Any], other: dict[str, Any]) -> float:
     return float(f"{one['total_ms'] / other['total_ms']:.3g}")
 
 
-def _rounded(name: str, problem: Problem, device: torch.device, threads: int) -> float:
+def _rounded(name: str, problem: RenderWorkload, device: torch.device, threads: int) -> float:
     return round(peak_memory(name, problem, device, threads), 1)

@@ -14,7 +14,7 @@ from tracking3d.rendering import prepare_backend, render
 from tracking3d.rendering.backend import threads_kept, why_no_numba
 from tracking3d.speed.dense import render_dense
 from tracking3d.speed.pytorch3d import ABSENT, render_pytorch3d, why_no_pytorch3d
-from tracking3d.speed.scene import Backend, Problem, Scene
+from tracking3d.speed.scene import Backend, RenderScene, RenderWorkload
 
 DENSE = "dense"
 _PER_TURN = 3
@@ -69,7 +69,7 @@ def give_threads(name: str, device: torch.device, threads: int) -> None:
 
 
 def time_backends(
-    problem: Problem, device: torch.device, repeats: int, threads: int, dense: bool = False
+    problem: RenderWorkload, device: torch.device, repeats: int, threads: int, dense: bool = False
 ) -> dict[str, list[Duration]]:
     """Time every backend on one problem.
 
@@ -86,7 +86,7 @@ def time_backends(
     Returns:
         Measurements by name.
     """
-    scene, candidates = Scene.make(problem, device), backends(device)
+    scene, candidates = RenderScene.make(problem, device), backends(device)
     times: dict[str, list[Duration]] = {name: [] for name in candidates}
     with threads_kept():
         for done in range(0, repeats, _PER_TURN):
@@ -96,7 +96,7 @@ def time_backends(
                 times[name] += [_measure(scene, backend) for _ in range(min(_PER_TURN, repeats - done))]
         if dense:
             _begin_turn(DENSE, device, threads)
-            times[DENSE] = [_measure(Scene.make(replace(problem, frames=1), device), render_dense)]
+            times[DENSE] = [_measure(RenderScene.make(replace(problem, frames=1), device), render_dense)]
     return times
 
 
@@ -113,7 +113,7 @@ def _begin_turn(name: str, device: torch.device, threads: int) -> None:
         time.sleep(_PAUSE)
 
 
-def _measure(scene: Scene, backend: Backend) -> Duration:
+def _measure(scene: RenderScene, backend: Backend) -> Duration:
     device = scene.mask.device
     scene.forget_gradients()
     start = _now(device)

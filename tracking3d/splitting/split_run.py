@@ -12,8 +12,8 @@ from tracking3d.frames import SkippedFrame
 from tracking3d.passes import Listener
 from tracking3d.results.records import FrameRecord
 from tracking3d.splitting.beginning import begin
-from tracking3d.splitting.long_video import Ended, LongVideo
-from tracking3d.splitting.part_runs import Given
+from tracking3d.splitting.long_video import LongVideo, SplitResult
+from tracking3d.splitting.part_runs import InitialPrompt
 from tracking3d.splitting.processes import side_by_side
 from tracking3d.splitting.steps import Step, steps_of
 
@@ -25,7 +25,7 @@ def record_in_parts(
     source: str | Path,
     config: PipelineConfig,
     folder: Path,
-    given: Given,
+    given: InitialPrompt,
     *,
     length: str,
     workers: int = 2,
@@ -35,7 +35,7 @@ def record_in_parts(
     resume: bool = False,
     listener: Listener = lambda frame: None,
     map_jobs: SideBySide | None = None,
-) -> Ended:
+) -> SplitResult:
     """Track a long video in parts, side by side, and write one run folder; see the module.
 
     Parts that cannot be joined are finished each by itself, in folders within ``folder``. What there is only one of is
@@ -64,7 +64,7 @@ def record_in_parts(
     )
     told, map_jobs = _once(listener), map_jobs or partial(side_by_side, workers=workers)
     begun = begin(told, video)
-    if isinstance(begun, Ended):
+    if isinstance(begun, SplitResult):
         return begun
     steps = steps_of(begun)
     answers: list[Any] | None = None
@@ -72,7 +72,7 @@ def record_in_parts(
         try:
             wanted = next(steps) if answers is None else steps.send(answers)
         except StopIteration as stop:
-            ended: Ended = stop.value
+            ended: SplitResult = stop.value
             return ended
         answers = map_jobs(take_step, wanted, told=told)
 

@@ -17,7 +17,7 @@ _SAME = 1e-3  # depth in object radii within which a ray's hit and a point are o
 
 
 @dataclass(frozen=True, eq=False)
-class PointTracks:
+class GroundTruthTracks:
     """N surface points in T frames.
 
     Attributes:
@@ -31,7 +31,7 @@ class PointTracks:
     object_points: Array
 
 
-def track_points(scene: Scene, count: int = 200) -> PointTracks:
+def track_points(scene: Scene, count: int = 200) -> GroundTruthTracks:
     """Random points, evenly spread over what is seen of the object in at least one frame.
 
     Fewer than ``count`` only where hardly anything of the object is seen.
@@ -41,7 +41,7 @@ def track_points(scene: Scene, count: int = 200) -> PointTracks:
     tracks = [_in_frame(scene, n, T, points, faces) for n, T in enumerate(scene.T_cam_obj)]
     positions, visible = (np.stack(part) for part in zip(*tracks, strict=True))
     chosen = np.flatnonzero(visible.any(0))[:count]
-    return PointTracks(positions[:, chosen], visible[:, chosen], points[chosen])
+    return GroundTruthTracks(positions[:, chosen], visible[:, chosen], points[chosen])
 
 
 def _on_surface(scene: Scene, count: int, rng: np.random.Generator) -> tuple[Array, NDArray[np.int64]]:

@@ -22,7 +22,7 @@ from tracking3d.results.files import write_atomic, write_image, write_mask, writ
 from tracking3d.results.layout import partial_path
 from tracking3d.synthesis.camera_effects import compressed
 from tracking3d.synthesis.frame_rendering import RenderedFrame, render_frame
-from tracking3d.synthesis.point_tracks import PointTracks, track_points
+from tracking3d.synthesis.point_tracks import GroundTruthTracks, track_points
 from tracking3d.synthesis.scene import Scene, make_scene
 from tracking3d.synthesis.solid import Solid
 from tracking3d.synthesis.spec import SequenceSpec
@@ -118,7 +118,7 @@ def _write_frame(folder: Path, name: str, frame: RenderedFrame, spec: SequenceSp
     write_atomic(folder / "depth" / f"{name}.png", cv2.imencode(".png", counts)[1].tobytes())
 
 
-def _write_points(folder: Path, tracks: PointTracks) -> None:
+def _write_points(folder: Path, tracks: GroundTruthTracks) -> None:
     arrays = io.BytesIO()
     np.savez_compressed(
         arrays,

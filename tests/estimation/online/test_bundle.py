@@ -9,7 +9,7 @@ import pytest
 from tracked_solids import degrees_between, disturbed, scene
 
 from tracking3d.bundle_adjustment import adjustment
-from tracking3d.bundle_adjustment.adjustment import Problem, Structure, Tracks, _damped, adjust
+from tracking3d.bundle_adjustment.adjustment import AdjustmentProblem, Structure, Tracks, _damped, adjust
 from tracking3d.bundle_adjustment.reprojection import to_camera
 
 
@@ -23,7 +23,7 @@ def problem(given, fixed=1, free_focal=False, prior_weight=0.0):
     pixels = np.nan_to_num(given.tracks.pixels)
     prior = given.truth.points + 0.1
     weights = np.full(count, prior_weight)
-    return Problem(pixels, given.tracks.weights(), given.K, fixed, 2.0, free_focal, prior, weights)
+    return AdjustmentProblem(pixels, given.tracks.weights(), given.K, fixed, 2.0, free_focal, prior, weights)
 
 
 def size_free_errors(found: Structure, truth: Structure) -> np.ndarray:

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
-from tracking3d.batch.folder import Progress as HowFar
+from tracking3d.batch.folder import BatchProgress as HowFar
 from tracking3d.batch.running import Happening, Listener
 
 _MOST_WORKERS = 32

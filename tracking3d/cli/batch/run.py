@@ -13,7 +13,7 @@ import typer
 from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quality, Quiet, configure, numbers
 
 if TYPE_CHECKING:
-    from tracking3d.batch.rows import Row
+    from tracking3d.batch.rows import VideoRow
     from tracking3d.batch.video_job import VideoJob
     from tracking3d.config.models import PipelineConfig
 
@@ -109,7 +109,7 @@ def run(
     from tracking3d.engines.choosing import open_engine
     from tracking3d.engines.protocol import Needs
 
-    def of_row(row: Row) -> PipelineConfig:
+    def of_row(row: VideoRow) -> PipelineConfig:
         return _configured(row, config, preset, quality, overrides, threads)
 
     if quiet:
@@ -165,7 +165,7 @@ def _check_split(
 
 
 def _configured(
-    row: Row,
+    row: VideoRow,
     config: Path | None,
     preset: str | None,
     quality: str | None,

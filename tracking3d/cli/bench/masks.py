@@ -64,7 +64,7 @@ def masks(
     import cv2
 
     from tracking3d.benchmark.mask_table import format_masks, report
-    from tracking3d.benchmark.mask_trackers import Contestant, Measured, measure_trackers
+    from tracking3d.benchmark.mask_trackers import Contestant, TrackerMeasurement, measure_trackers
     from tracking3d.benchmark.mask_trackers import ablation as switched_off
     from tracking3d.benchmark.sequences import open_dataset
     from tracking3d.cli.evaluate.progress import making_progress
@@ -81,7 +81,7 @@ def masks(
     with making_progress(quiet or as_json) as made:
         dataset = open_dataset(name, data, out, 1, made).only(sequences or [])
 
-    def told(measured: Measured) -> None:
+    def told(measured: TrackerMeasurement) -> None:
         iou = measured.figures()["iou_mean"]
         what = measured.error or f"IoU {iou:.3f}"
         typer.echo(f"{measured.sequence} ({measured.tracker}): {what}", err=True)

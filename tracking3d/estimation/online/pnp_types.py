@@ -55,7 +55,7 @@ class PointEquations:
 
 
 @dataclass(frozen=True, eq=False)
-class PoseFit:
+class PnPFit:
     """A pose refined from a start.
 
     Attributes:

@@ -26,8 +26,8 @@ from tracking3d.estimation.online.pnp_types import (
     CONVERGED,
     FIRST_DAMPING,
     MOST_DAMPING,
+    PnPFit,
     PointEquations,
-    PoseFit,
     PoseHypothesis,
 )
 from tracking3d.rendering.backend import compiled
@@ -81,7 +81,7 @@ def pose_of_tracks(
     t: FloatArray,
     scale: float,
     iterations: int = 10,
-) -> PoseFit:
+) -> PnPFit:
     """The pose of least robust reprojection error near a start; never worse than the start.
 
     Args:
@@ -114,7 +114,7 @@ def pose_of_tracks(
         R, t, at, damping = R_new, t_new, new, damping / 10
         if settled:
             break
-    return PoseFit(R, t, at)
+    return PnPFit(R, t, at)
 
 
 def point_equations(
