@@ -17,7 +17,7 @@ from tracking3d.batch.video_job import VideoJob
 from tracking3d.config.loading import load_config
 from tracking3d.engines.in_this_process import InThisProcess
 from tracking3d.engines.protocol import Fault
-from tracking3d.engines.protocol import SplitResult as TaskEnded
+from tracking3d.engines.protocol import Ended as TaskEnded
 from tracking3d.errors import OutputError
 from tracking3d.splitting.long_video import SplitResult
 from tracking3d.splitting.steps import Step
