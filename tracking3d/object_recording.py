@@ -20,7 +20,7 @@ from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.evidence.scene import Mask
 from tracking3d.frames import Frame, MaskEstimate, SkippedFrame
 from tracking3d.last_passes import Foreseen, LastPasses
-from tracking3d.reconstruction import BELIEVED, TextureView, kept_views, texture_view, textured
+from tracking3d.reconstruction import BELIEVED, TextureView, bake_texture, kept_views, texture_view
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.refinement_writer import RefinementWriter
@@ -278,7 +278,7 @@ class ObjectRecording:
             self._last.rest(self._work.do)
             self._work.wait()
             model, views = self._last.moved(model, views)
-        model = textured(model, views, self._session.config.object.largest_texture)
+        model = bake_texture(model, views, self._session.config.object.largest_texture)
         if self._refinement is not None:
             self._writer.end_refinement()
             self._causal_model = None

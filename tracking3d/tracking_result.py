@@ -24,7 +24,7 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.results.correspondences import PointTracks, track_points
 from tracking3d.results.files import writing
 from tracking3d.results.following import RunScene, open_scene
-from tracking3d.results.making_room import make_room
+from tracking3d.results.making_room import clear_run_folder
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
@@ -229,7 +229,7 @@ class TrackingResult:
         into = checked_folder(folder)
         with writing(into):
             into.mkdir(parents=True, exist_ok=True)
-        make_room(into, overwrite)
+        clear_run_folder(into, overwrite)
         with writing(into):
             shutil.copytree(self.run.folder, into, dirs_exist_ok=True)
         return RunReader(into, refined=self.run.refined)

@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterable
 from pathlib import PurePosixPath
 
-from tracking3d.batch.places import base, is_folder, joined, matches, names_in, parent, read
+from tracking3d.batch.places import base, is_folder, join_path, matches, names_in, parent, read
 from tracking3d.batch.rows import VideoRow, read_row
 from tracking3d.errors import InputError
 
@@ -34,12 +34,14 @@ def videos_of(place: str) -> list[tuple[VideoRow, int]]:
     if is_folder(place):
         sizes = names_in(place, everything=True)
         names = _videos_among(sizes)
-        found = [(joined(place, name), sizes.get(name, 0)) for name in names]
-        beside = {joined(place, name) for name in sizes}
+        found = [(join_path(place, name), sizes.get(name, 0)) for name in names]
+        beside = {join_path(place, name) for name in sizes}
     else:
         found = [(one, 0) for one in matches(place) if not _is_prompt(one)]
         folders = {parent(one) for one, _ in found}
-        sizes = {joined(folder, name): size for folder in folders for name, size in names_in(folder).items()}
+        sizes = {
+            join_path(folder, name): size for folder in folders for name, size in names_in(folder).items()
+        }
         found = [(one, sizes.get(one, 0)) for one, _ in found]
         beside = set(sizes)
     if not found:

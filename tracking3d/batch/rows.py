@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, ValidationError
 
-from tracking3d.config.explain import describe
+from tracking3d.config.explain import describe_validation_error
 from tracking3d.config.section import Section
 from tracking3d.errors import InputError
 
@@ -91,7 +91,7 @@ def read_row(values: Mapping[str, Any], where: str) -> VideoRow:
     try:
         return VideoRow.model_validate(given)
     except ValidationError as error:
-        raise InputError(f"{where}: {describe(error, VideoRow, 'column')}") from error
+        raise InputError(f"{where}: {describe_validation_error(error, VideoRow, 'column')}") from error
 
 
 def _empty(value: Any) -> bool:

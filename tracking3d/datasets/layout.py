@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, field_validator, model_validator
 
-from tracking3d.config.explain import describe, hint
+from tracking3d.config.explain import describe_validation_error, hint
 from tracking3d.config.models import Section
 from tracking3d.config.yaml_files import read_mapping
 from tracking3d.errors import InputError
@@ -228,4 +228,4 @@ def _read(file: Path) -> DatasetLayout:
     try:
         return DatasetLayout.model_validate(read_mapping(file))
     except ValidationError as error:
-        raise InputError(f"{file}: {describe(error, DatasetLayout, 'key')}") from error
+        raise InputError(f"{file}: {describe_validation_error(error, DatasetLayout, 'key')}") from error

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.datasets.bop import Annotation, read_scene_camera, read_scene_gt, read_symmetries
-from tracking3d.datasets.cameras import camera_of, read_intrinsics
+from tracking3d.datasets.cameras import camera_from_matrix, read_dataset_intrinsics
 from tracking3d.datasets.clip import read_poses, symmetries_of
 from tracking3d.datasets.frame_matching import frame_numbers, match_frames
 from tracking3d.datasets.layout import DatasetLayout, MaskLayout, Regions
@@ -142,14 +142,18 @@ class SequenceFiles:
         size = self.size[::-1]
         if told.values is not None:
             fx, fy, cx, cy = told.values
-            return camera_of([fx, 0, cx, 0, fy, cy, 0, 0, 1], *size, f"the description {self.layout.name}")
+            return camera_from_matrix(
+                [fx, 0, cx, 0, fy, cy, 0, 0, 1], *size, f"the description {self.layout.name}"
+            )
         assert told.file is not None  # the model sees to it
         file = self.place.required(told.file, "camera")
         if told.form != "bop":
-            return read_intrinsics(file, told.form, size)
+            return read_dataset_intrinsics(file, told.form, size)
         index = frame_numbers(self.frames)
         cameras = {
-            camera_of(K, *size, str(file)) for n, (K, _) in read_scene_camera(file).items() if n in index
+            camera_from_matrix(K, *size, str(file))
+            for n, (K, _) in read_scene_camera(file).items()
+            if n in index
         }
         return cameras.pop() if len(cameras) == 1 else None
 

@@ -21,7 +21,7 @@ from tracking3d.points.carrying import Warps
 from tracking3d.points.chain import STEPS, Chain, extend
 from tracking3d.points.follow import RIM, agreed
 from tracking3d.points.landmarks import TOLERANCE
-from tracking3d.points.view import Array, SurfaceView, draw, sample
+from tracking3d.points.view import Array, SurfaceView, redraw_surface, sample
 
 KEPT = 16
 """Views that are kept; no fewer than the templates reach back."""
@@ -107,7 +107,7 @@ class CausalPoints:
             if better is not None:
                 camera, T_cam_obj = better
                 view = replace(view, intrinsics=view.intrinsics_of(camera))
-            row.view = draw(view, vertices, faces, T_cam_obj)
+            row.view = redraw_surface(view, vertices, faces, T_cam_obj)
 
     def again(self, radius: float) -> dict[int, PointAnswers]:
         """Answer for the kept frames once more, by frame; nothing unless that of the question is among them."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tracking3d.points.bundle import intersect
 from tracking3d.points.chain import Chain, follow_chain
 from tracking3d.points.landmarks import LandmarkScene
-from tracking3d.points.uncertainty import FEATURES, Evidence, expected_error, features
+from tracking3d.points.uncertainty import FEATURES, Evidence, error_features, expected_error
 from tracking3d.points.view import Array, SurfaceView, sample
 
 RIM = 3.0
@@ -34,8 +34,8 @@ class Followed:
             no position.
         measured: ``(T, N)`` bool: whether the image had a say.
         points: ``(N, 3)`` in object coordinates; NaN for points beside the object.
-        features: ``(T, N, F)`` what the uncertainty was told from, see `tracking3d.points.uncertainty.features`; NaN
-            where there is no position.
+        features: ``(T, N, F)`` what the uncertainty is estimated from, see
+            `tracking3d.points.uncertainty.error_features`; NaN if there is no position.
     """
 
     positions: Array
@@ -127,7 +127,12 @@ def agreed(
         [one.to_frame(xy) for one, xy in zip(views, predicted + gain[..., None] * left, strict=True)]
     )
     return Followed(
-        positions, seen & ~unlike, expected_error(evidence) / scales, believed, moved, features(evidence)
+        positions,
+        seen & ~unlike,
+        expected_error(evidence) / scales,
+        believed,
+        moved,
+        error_features(evidence),
     )
 
 

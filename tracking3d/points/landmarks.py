@@ -23,7 +23,7 @@ from tracking3d.points.chain import follow_chain
 from tracking3d.points.meeting import surface_under
 from tracking3d.points.outline_fit import fitted_to_outlines, outline_of
 from tracking3d.points.surface import move_surface
-from tracking3d.points.view import Array, SurfaceView, draw
+from tracking3d.points.view import Array, SurfaceView, redraw_surface
 
 ROUNDS = 6
 START_VIEWS = 8
@@ -99,7 +99,9 @@ class LandmarkScene:
         views = [
             None
             if view is None
-            else draw(replace(view, intrinsics=view.intrinsics * lens), vertices, self.faces, poses[index])
+            else redraw_surface(
+                replace(view, intrinsics=view.intrinsics * lens), vertices, self.faces, poses[index]
+            )
             for index, view in enumerate(self.views)
         ]
         return replace(

@@ -9,7 +9,7 @@ import numpy as np
 from tracking3d.points.bundle import bundle
 from tracking3d.points.carrying import Warps
 from tracking3d.points.landmarks import DEVIATION, TOLERANCE, LandmarkScene, seeds
-from tracking3d.points.view import Array, SurfaceView, draw
+from tracking3d.points.view import Array, SurfaceView, redraw_surface
 
 TURNS = 2
 _FIXED = 1e-6  # deviation in radii of points that stay where they are
@@ -44,7 +44,7 @@ def resect(scene: LandmarkScene, view: SurfaceView, known: Sequence[int]) -> tup
             _FIXED * scene.radius,
         )
         share = float(placed.agreeing[0].mean()) if len(points) else 0.0
-        view = draw(view, scene.vertices, scene.faces, placed.T_cam_obj[0])
+        view = redraw_surface(view, scene.vertices, scene.faces, placed.T_cam_obj[0])
     return view, share
 
 

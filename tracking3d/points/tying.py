@@ -88,7 +88,9 @@ def _turned_enough(views: list[SurfaceView], point: Array) -> bool:
     return bool((direction @ direction.T).min() < _LEAST_TURN)
 
 
-def joined(surface: Followed, xy: Array, uncertainty: Array, visible: NDArray[np.bool_]) -> Followed:
+def merge_image_points(
+    surface: Followed, xy: Array, uncertainty: Array, visible: NDArray[np.bool_]
+) -> Followed:
     """Points carried by the surface, with what the images alone said of them.
 
     Their mean by variance counts where they agree; where they do not, the image does in the frames that show the point,

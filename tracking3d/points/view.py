@@ -182,10 +182,12 @@ def open_view(
         cv2.GaussianBlur(grey, (0, 0), 0.5), inside, (left, top), scale,
         np.concatenate([whole[:2] * scale, centre]), T_cam_obj, empty, empty,
     )  # fmt: skip
-    return draw(view, vertices, faces, T_cam_obj)
+    return redraw_surface(view, vertices, faces, T_cam_obj)
 
 
-def draw(view: SurfaceView, vertices: Array, faces: NDArray[np.int64], T_cam_obj: Array) -> SurfaceView:
+def redraw_surface(
+    view: SurfaceView, vertices: Array, faces: NDArray[np.int64], T_cam_obj: Array
+) -> SurfaceView:
     """The view with the mesh drawn into it at another pose."""
     view = replace(view, T_cam_obj=T_cam_obj)
     screen, depth = view.project(vertices)

@@ -19,7 +19,7 @@ from tracking3d.evaluation.alignment import align_object_frame
 from tracking3d.report.figures import angles_between, believed_poses, stage_times, status_counts
 from tracking3d.report.settings import flat
 from tracking3d.results.files import read_mask
-from tracking3d.results.records import jsonable, mask_iou
+from tracking3d.results.records import jsonable, mask_iou_or_none
 from tracking3d.results.run_reader import RunReader
 from tracking3d.stages import STAGES
 
@@ -235,7 +235,7 @@ def _iou(first: RunReader, other: RunReader, index: int) -> float:
     a, b = read_mask(first.mask_path(index)), read_mask(other.mask_path(index))
     if a is None or b is None or a.shape != b.shape:
         return np.nan
-    iou = mask_iou(a, b)
+    iou = mask_iou_or_none(a, b)
     return np.nan if iou is None else iou
 
 

@@ -34,7 +34,7 @@ from tracking3d.results.correspondences import (
     tracked_record,
 )
 from tracking3d.results.files import write_atomic
-from tracking3d.results.image_points import follow_beside_mesh, read_pictures, with_image_points
+from tracking3d.results.image_points import follow_beside_mesh, read_run_images, with_image_points
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_source import open_run_source
@@ -143,7 +143,7 @@ def open_scene(
             f"The video has no frame of the run {run.folder}; say by --source which one it was made on."
         )
     scene = LandmarkScene([images.get(one.index) for one in run.frames], vertices, faces)
-    pictures = cache(partial(read_pictures, run, source)) if getattr(source, "repeatable", True) else None
+    pictures = cache(partial(read_run_images, run, source)) if getattr(source, "repeatable", True) else None
     if not rounds:
         return RunScene(run, scene, pictures)
     file = run.mesh_folder / layout.LANDMARKS

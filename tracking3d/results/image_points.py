@@ -14,7 +14,7 @@ from tracking3d.points.image_following import ImageTracks, follow_in_images
 from tracking3d.points.landmarks import LandmarkScene
 from tracking3d.points.meeting import surface_under
 from tracking3d.points.pictures import Picture, open_picture
-from tracking3d.points.tying import joined, meetings
+from tracking3d.points.tying import meetings, merge_image_points
 from tracking3d.points.uncertainty import FEATURES
 from tracking3d.results.correspondences import PointKind, PointTracks
 from tracking3d.results.run_reader import RunReader
@@ -40,7 +40,7 @@ class ImagePoints:
     barycentric: Array
 
 
-def read_pictures(run: RunReader, source: FrameSource) -> list[Picture | None]:
+def read_run_images(run: RunReader, source: FrameSource) -> list[Picture | None]:
     """The frames of a run, in the order of its records; None where there is no image.
 
     Args:
@@ -95,7 +95,7 @@ def follow_beside_mesh(
         positions = np.stack(
             [camera.to_picture(at) for camera, at in zip(cameras, found.positions, strict=True)]
         )
-        both = joined(
+        both = merge_image_points(
             Followed(
                 positions, found.visible, found.uncertainty, found.measured, found.points, found.features
             ),

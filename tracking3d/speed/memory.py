@@ -20,7 +20,7 @@ import torch
 
 from tracking3d.process_memory import forget_peak, resident_memory
 from tracking3d.speed.scene import RenderScene, RenderWorkload
-from tracking3d.speed.timing import backends, give_threads
+from tracking3d.speed.timing import backends, set_benchmark_threads
 
 ITERATIONS = 3
 _TINY = RenderWorkload(size=16, frames=1, channels=1, texture=8, frequency=2)
@@ -40,7 +40,7 @@ def peak_memory(name: str, problem: RenderWorkload, device: torch.device, thread
 
 def _in_this_process(name: str, problem: RenderWorkload, threads: int) -> float:
     device = torch.device("cpu")
-    give_threads(name, device, threads)
+    set_benchmark_threads(name, device, threads)
     backend = backends(device)[name]
     RenderScene.make(_TINY, device).loss(backend).backward()
     scene = RenderScene.make(problem, device)

@@ -63,7 +63,7 @@ def left_out(device: torch.device) -> dict[str, str]:
     return {"pytorch3d": why} if why not in ("", ABSENT) else {}
 
 
-def give_threads(name: str, device: torch.device, threads: int) -> None:
+def set_benchmark_threads(name: str, device: torch.device, threads: int) -> None:
     """What a run of the product with that backend and ``--threads`` does; see `prepare_backend`."""
     prepare_backend("numba" if name == "numba" else "torch", str(device), threads)
 
@@ -108,7 +108,7 @@ def median(measured: list[Duration]) -> Duration:
 
 
 def _begin_turn(name: str, device: torch.device, threads: int) -> None:
-    give_threads(name, device, threads)
+    set_benchmark_threads(name, device, threads)
     if threads > 1:
         time.sleep(_PAUSE)
 

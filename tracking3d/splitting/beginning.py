@@ -11,7 +11,7 @@ from tracking3d.config.models import PipelineConfig
 from tracking3d.prompts import make_prompt
 from tracking3d.recording import record, with_tracker
 from tracking3d.results import layout
-from tracking3d.results.making_room import make_room
+from tracking3d.results.making_room import clear_run_folder
 from tracking3d.results.run_reader import is_finished
 from tracking3d.splitting.cutting import windows
 from tracking3d.splitting.long_video import LongVideo, SplitResult, Tell, frames_of_part
@@ -77,7 +77,7 @@ def begin(tell: Tell, video: LongVideo) -> Begun | SplitResult:
         remove_parts(folder)
         return SplitResult((folder,), 1)
     if not resume:
-        make_room(folder, video.overwrite)
+        clear_run_folder(folder, video.overwrite)
         remove_parts(folder)
     first, _ = begin_session(opened, video.config, given)
     prompt = None if given.untold else make_prompt(first, given.box, given.mask, points=given.points)

@@ -16,7 +16,7 @@ AMBIENT, DIFFUSE = 0.6, 0.5
 """Share of a colour that is seen in the shade, and what facing the light adds."""
 
 
-def draw(
+def draw_convex(
     pose: NDArray[np.float64],
     camera: Camera,
     surface: ConvexSurface,

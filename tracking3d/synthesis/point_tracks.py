@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.synthesis.pixel_rays import project
+from tracking3d.synthesis.pixel_rays import camera_to_pixels
 from tracking3d.synthesis.scene import Scene
 
 Array = NDArray[np.float64]
@@ -31,7 +31,7 @@ class GroundTruthTracks:
     object_points: Array
 
 
-def track_points(scene: Scene, count: int = 200) -> GroundTruthTracks:
+def sample_point_tracks(scene: Scene, count: int = 200) -> GroundTruthTracks:
     """Random points, evenly spread over what is seen of the object in at least one frame.
 
     Fewer than ``count`` only where hardly anything of the object is seen.
@@ -60,7 +60,7 @@ def _in_frame(
 ) -> tuple[Array, NDArray[np.bool_]]:
     R, t = T[:3, :3], T[:3, 3]
     in_camera = points @ R.T + t
-    pixels = project(scene.camera, in_camera)
+    pixels = camera_to_pixels(scene.camera, in_camera)
     inside = ((pixels >= -0.5) & (pixels < (scene.camera.width - 0.5, scene.camera.height - 0.5))).all(1)
     origin = -R.T @ t
     ahead = np.flatnonzero(inside)  # NaN is not inside

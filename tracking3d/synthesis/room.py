@@ -56,7 +56,7 @@ class Room:
     textures: list[list[NDArray[np.float32]]]
 
 
-def make_room(spec: SequenceSpec, solid: Solid, path: Path) -> Room | None:
+def build_room(spec: SequenceSpec, solid: Solid, path: Path) -> Room | None:
     """The room of a sequence in which the camera walks round the object; None for other motions."""
     if spec.motion != "walk_round":
         return None

@@ -20,7 +20,7 @@ from tracking3d.synthesis.motions import Path, make_path
 from tracking3d.synthesis.occluder import Hand, make_hand
 from tracking3d.synthesis.procedural_solids import PROCEDURAL, make_procedural_solid
 from tracking3d.synthesis.ray_casting import RayMesh
-from tracking3d.synthesis.room import Room, make_room
+from tracking3d.synthesis.room import Room, build_room
 from tracking3d.synthesis.solid import Solid, faded
 from tracking3d.synthesis.spec import SequenceSpec
 
@@ -77,7 +77,7 @@ def make_scene(spec: SequenceSpec) -> Scene:
     background = linear(make_background(spec))
     texture = _resolved_texture(solid, camera, path, spec.supersample)
     told = _told_camera(spec, camera)
-    room = make_room(spec, solid, path)
+    room = build_room(spec, solid, path)
     return Scene(spec, camera, told, solid, surface, path, background, hand, texture, room)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.synthesis.frame_rendering import RenderedFrame, render_frame
-from tracking3d.synthesis.point_tracks import GroundTruthTracks, track_points
+from tracking3d.synthesis.point_tracks import GroundTruthTracks, sample_point_tracks
 from tracking3d.synthesis.scene import Scene, make_scene
 from tracking3d.synthesis.spec import SequenceSpec
 
@@ -55,5 +55,5 @@ def render_sequence(spec: SequenceSpec) -> RenderedSequence:
         np.stack([frame.mask for frame in frames]),
         np.stack([frame.visible_mask for frame in frames]),
         np.stack([frame.depth for frame in frames]),
-        track_points(scene),
+        sample_point_tracks(scene),
     )

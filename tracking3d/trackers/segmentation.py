@@ -20,12 +20,12 @@ from tracking3d.geometry.camera import Window
 from tracking3d.trackers.background import BackgroundMemory
 from tracking3d.trackers.colour_models import GlobalColours, Palette
 from tracking3d.trackers.confidence import Judgement, outline_margin
-from tracking3d.trackers.crops import box_iou, box_of, clip_box, cut, outside, paste
+from tracking3d.trackers.crops import box_iou, box_of, clip_box, cut, outside, paste_mask
 from tracking3d.trackers.cues import Cues, FrameCrop, colour_and_motion, decide, distance_beyond
 from tracking3d.trackers.first_mask import mask_in_box
 from tracking3d.trackers.mask_motion import follow_mask
 from tracking3d.trackers.opencv_build import why_no_contrib
-from tracking3d.trackers.outline import both_sides, signed_distance, tidied, touches_border
+from tracking3d.trackers.outline import both_sides, inside_distance, remove_specks, touches_border
 from tracking3d.trackers.search import find_by_colours
 
 SMOOTHER = "ximgproc.fastGlobalSmootherFilter"
@@ -145,7 +145,7 @@ class ColourSegmentation:
             evidence += self._cues.background * self._background.change(image, present.window)
         if witness is not None:
             evidence -= self._cues.witness * distance_beyond(witness, present.window)
-        mask = tidied(decide(present, evidence, last_mask, motion, self._cues), moved, motion.cue)
+        mask = remove_specks(decide(present, evidence, last_mask, motion, self._cues), moved, motion.cue)
 
         at_border = touches_border(moved, present.in_frame)
         believed = bool(abs(np.count_nonzero(mask) / area - 1) <= _AREA_CHANGE)
@@ -159,9 +159,9 @@ class ColourSegmentation:
             self._usual_area = self._usual_area if at_border else frame_area
             _, around = _sides(mask, present)
             self._colours.update(present.colours, mask, around)
-            far = signed_distance(mask) < -_FAR * math.sqrt(max(int(np.count_nonzero(mask)), 1))
+            far = inside_distance(mask) < -_FAR * math.sqrt(max(int(np.count_nonzero(mask)), 1))
             self._learn_background(image, present, around, np.where(far, 1, -motion.cue / _PARTED))
-        full = paste(mask, present.window, image.shape)
+        full = paste_mask(mask, present.window, image.shape)
         agreement = None if witness is None else box_iou(box_of(full) or (0.0, 0.0, 0.0, 0.0), witness)
         separation, margin = self._separation(present, mask), outline_margin(evidence, mask)
         return full, Judgement(separation, margin, agreement, believed)
@@ -174,7 +174,7 @@ class ColourSegmentation:
         if found is None or found[2] < _FOUND_AGAIN * self._first_separation:
             return _out_of_sight(image)
         mask, window, separation = found
-        return paste(mask, window, image.shape), Judgement(separation, margin=separation)
+        return paste_mask(mask, window, image.shape), Judgement(separation, margin=separation)
 
     def _begin_anew(
         self, image: Image, witness: Box, mask: NDArray[np.float32], judgement: Judgement

@@ -10,7 +10,7 @@ from tracked_solids import degrees_between, disturbed, scene
 
 from tracking3d.bundle_adjustment import adjustment
 from tracking3d.bundle_adjustment.adjustment import AdjustmentProblem, Structure, Tracks, _damped, adjust
-from tracking3d.bundle_adjustment.reprojection import to_camera
+from tracking3d.bundle_adjustment.reprojection import transform_to_camera
 
 
 @pytest.fixture(autouse=True, params=[True, False], ids=["compiled", "numpy"])
@@ -28,7 +28,7 @@ def problem(given, fixed=1, free_focal=False, prior_weight=0.0):
 
 def size_free_errors(found: Structure, truth: Structure) -> np.ndarray:
     """Distances of points after the one scaling about frame 0's camera that no image shows."""
-    x, y = (to_camera(s.R[0], s.t[0], s.points) for s in (found, truth))
+    x, y = (transform_to_camera(s.R[0], s.t[0], s.points) for s in (found, truth))
     factor = np.median(y[:, 2]) / np.median(x[:, 2])
     return np.linalg.norm(factor * x - y, axis=1)
 

@@ -22,7 +22,7 @@ _EVERY = 10.0  # seconds between two events of progress
 
 
 @contextmanager
-def shown(quiet: bool, as_json: bool) -> Iterator[Listener]:
+def show_batch_progress(quiet: bool, as_json: bool) -> Iterator[Listener]:
     """Show how a batch goes on; yields what is to be told.
 
     Args:

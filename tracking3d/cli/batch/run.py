@@ -105,7 +105,7 @@ def run(
     from tracking3d.batch.places import absolute
     from tracking3d.batch.running import run_batch
     from tracking3d.benchmark.sequences import open_dataset
-    from tracking3d.cli.batch.progress import shown
+    from tracking3d.cli.batch.progress import show_batch_progress
     from tracking3d.engines.choosing import open_engine
     from tracking3d.engines.protocol import Needs
 
@@ -126,7 +126,7 @@ def run(
     gpus = any(video.config.runtime.device.startswith("cuda") for video in videos)
     needs = Needs(threads, memory or 0.0, 1.0 if gpus else 0.0)
     command = shlex.join(sys.argv)
-    with open_engine(address, workers, needs) as engine, shown(quiet, as_json) as listener:
+    with open_engine(address, workers, needs) as engine, show_batch_progress(quiet, as_json) as listener:
         try:
             progress = run_batch(
                 videos,

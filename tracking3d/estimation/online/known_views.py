@@ -87,7 +87,7 @@ def known_map(
     seen: list[tuple[View, RenderedSide]] = []
     for number, R in enumerate(sides(SIDES)):
         pose = pose_of(R, np.array([0.0, 0.0, distance]), shape.rest)
-        drawing = draw(shape, colours, pose, camera, renderer)
+        drawing = render_side(shape, colours, pose, camera, renderer)
         # Drawn sides come before the first frame.
         frame = Frame(number - SIDES, drawing.image)
         window = Window.around(mask_box(drawing.mask), config.window.margin, config.window.size)
@@ -127,7 +127,9 @@ def sides(count: int) -> list[NDArray[np.float64]]:
 
 
 @torch.no_grad()
-def draw(shape: Shape, colours: Tensor, pose: Pose, camera: Camera, renderer: str = "auto") -> RenderedSide:
+def render_side(
+    shape: Shape, colours: Tensor, pose: Pose, camera: Camera, renderer: str = "auto"
+) -> RenderedSide:
     """Draw an object before a background of its mean colour, which puts no edge of its own along the outline.
 
     Args:
@@ -197,7 +199,7 @@ def _sampled(points: NDArray[np.float32], pixel: NDArray[np.float32]) -> NDArray
 
 
 def _colours(known: KnownObject) -> Tensor:
-    """``(4, T, T)`` see `draw`; no finer than pictures show them, with nothing mixed in that was never seen."""
+    """``(4, T, T)`` see `render_side`; no finer than pictures show them, with nothing mixed in that was never seen."""
     texture = known.model.texture.astype(np.float32) / 255
     seen = (known.model.texture_weight > 0).astype(np.float32)
     layers = np.concatenate([texture * seen[..., None], seen[..., None]], 2)

@@ -15,12 +15,12 @@ import numpy as np
 from tracking3d.bundle_adjustment.reprojection import (
     BEHIND,
     FloatArray,
+    apply_pose_steps,
     finite_rows,
-    moved,
     pixel_by_point,
     pixel_by_pose,
-    project,
-    to_camera,
+    project_camera_points,
+    transform_to_camera,
 )
 from tracking3d.estimation.online.pnp_types import (
     CONVERGED,
@@ -105,7 +105,9 @@ def pose_of_tracks(
         diagonal = at.matrix.diagonal()
         floor = 1e-9 * diagonal.max() + 1e-12
         step = -np.linalg.solve(at.matrix + np.diag(damping * diagonal + floor), at.gradient)
-        R_new, t_new = (part[0] for part in moved(R[None], t[None], np.asarray(step[None], np.float64)))
+        R_new, t_new = (
+            part[0] for part in apply_pose_steps(R[None], t[None], np.asarray(step[None], np.float64))
+        )
         new = point_equations(points, pixels, weight, K, R_new, t_new, scale)
         if not new.cost < at.cost:
             damping = min(10 * damping, MOST_DAMPING)
@@ -128,8 +130,8 @@ def point_equations(
 ) -> PointEquations:
     """The points' normal equations at a pose; all zero if there is no point. Arguments as of `pose_of_tracks`."""
     share = _shares(points, pixels, weight)
-    x_cam = to_camera(R, t, np.where(finite_rows(points)[:, None], points, 0.0))
-    difference = project(x_cam, K) - pixels
+    x_cam = transform_to_camera(R, t, np.where(finite_rows(points)[:, None], points, 0.0))
+    difference = project_camera_points(x_cam, K) - pixels
     residual = np.where(share > 0, np.hypot(difference[:, 0], difference[:, 1]), np.nan)
     used = np.isfinite(residual)
     relative = np.where(used, residual / scale, BEHIND)

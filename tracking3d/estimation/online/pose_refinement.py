@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tracking3d.bundle_adjustment.reprojection import FloatArray, moved
+from tracking3d.bundle_adjustment.reprojection import FloatArray, apply_pose_steps
 from tracking3d.estimation.observation import Observation
 from tracking3d.estimation.online.pose_refinement_types import (
     ENOUGH,
@@ -118,7 +118,9 @@ def _minimized(
     going, damping = np.arange(len(R)), np.full(len(R), FIRST_DAMPING)
     for _ in range(steps):
         present = best[going]
-        trial = _evaluated(surface, evidence, *moved(present.R, present.t, present.steps(damping[going])))
+        trial = _evaluated(
+            surface, evidence, *apply_pose_steps(present.R, present.t, present.steps(damping[going]))
+        )
         trial.moved[:] = True
         gain = present.cost - trial.cost
         better = gain > 0
