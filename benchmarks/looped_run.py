@@ -6,7 +6,6 @@ The object of a short synthetic clip turns to and fro, and leaves the frame and 
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -14,6 +13,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import psutil
 from numpy.typing import NDArray
 
 from tracking3d.config.models import PipelineConfig
@@ -35,7 +35,6 @@ SPEED = 0.25
 _TURNING = 60  # frames of a round in which the object turns in sight; it comes back the way it went
 _LEAVING = 12  # frames in which it leaves, and as many in which it returns
 _ABSENT = 6  # frames without it
-_DESCRIPTORS = Path("/proc/self/fd")
 
 
 @dataclass(frozen=True)
@@ -45,15 +44,15 @@ class Sample:
     Attributes:
         index: The frame.
         seconds: From the frame before to this one.
-        memory: Megabytes of the process; None where the system does not tell.
-        descriptors: Open files of the process; None where the system does not tell.
+        memory: Megabytes of the process.
+        descriptors: Open files of the process.
         status: Of the answer.
     """
 
     index: int
     seconds: float
-    memory: float | None
-    descriptors: int | None
+    memory: float
+    descriptors: int
     status: str
 
 
@@ -179,9 +178,9 @@ def track_looped(
 
     def measure(answer: FrameRecord | SkippedFrame) -> None:
         nonlocal before
-        now, memory = time.perf_counter(), resident_memory()
+        now, (memory, _) = time.perf_counter(), resident_memory()
         status = str(answer.status) if isinstance(answer, FrameRecord) else "skipped"
-        samples.append(Sample(answer.index, now - before, memory and memory[0], _open_descriptors(), status))
+        samples.append(Sample(answer.index, now - before, memory, _open_descriptors(), status))
         before = time.perf_counter()
 
     solver = config.solver.model_copy(update={"final_refine": False})
@@ -211,8 +210,6 @@ def trends(samples: list[Sample], round_length: int) -> dict[str, Trend]:
         ("seconds", SPEED, np.median),
     ):
         values = [getattr(sample, name) for sample in settled]
-        if any(value is None for value in values):
-            continue
         # Whole rounds are alike; single frames are not: some enter the map, in some the object is searched for.
         rounds = len(values) // round_length
         levels = [float(level_of(values[n * round_length : (n + 1) * round_length])) for n in range(rounds)]
@@ -243,8 +240,6 @@ def _moved(
     return result
 
 
-def _open_descriptors() -> int | None:
-    try:
-        return len(os.listdir(_DESCRIPTORS)) - 1  # noqa: PTH208 (one of them lists the folder)
-    except OSError:
-        return None
+def _open_descriptors() -> int:
+    process = psutil.Process()
+    return process.num_fds() if psutil.POSIX else process.num_handles()

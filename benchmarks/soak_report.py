@@ -49,8 +49,6 @@ def plot_soak(report: SoakReport, path: Path) -> None:
     ):
         values = [getattr(sample, name) for sample in report.samples]
         panel.set_ylabel(label)
-        if any(value is None for value in values):
-            continue
         panel.plot(index, values, linewidth=0.5, color="grey")
         width = min(100, len(values))
         means = np.convolve(np.asarray(values, float), np.ones(width) / width, "valid")

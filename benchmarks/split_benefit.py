@@ -21,7 +21,7 @@ from tracking3d.recording import record
 from tracking3d.results import layout
 from tracking3d.results.files import write_image, write_mask, writing
 from tracking3d.results.run_reader import RunReader, is_finished
-from tracking3d.splitting.part_runs import Given
+from tracking3d.splitting.part_runs import InitialPrompt
 from tracking3d.splitting.split_run import record_in_parts
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, degrade_masks, synthesize
 from tracking3d.video import open_source
@@ -30,7 +30,7 @@ _TAKEN = "seconds.json"
 
 
 @dataclass(frozen=True)
-class Measured:
+class SplitMeasurement:
     """One way of tracking the video.
 
     Attributes:
@@ -93,7 +93,7 @@ def measure_split(
     masks: str = "truth",
     size: tuple[int, int] = (320, 240),
     told: Callable[[str], None] = lambda sentence: None,
-) -> dict[str, Measured]:
+) -> dict[str, SplitMeasurement]:
     """Track the video whole and in parts; a run that is finished in ``folder`` is not done again.
 
     Args:
@@ -114,10 +114,10 @@ def measure_split(
     spec = SyntheticSpec(frames=min(frames, 90), size=size, degrees_per_frame=2.0, fill=0.55)
     source, clip, order = write_looped(folder / "video", spec, frames)
     update: dict[str, Any] = {"camera": config.camera.model_copy(update={"fov": spec.fov})}
-    given = Given(box=clip.box)
+    given = InitialPrompt(box=clip.box)
     if masks == "truth":
         update["tracker"] = PluginChoice(name="precomputed", path=str(folder / "video" / "masks"))
-        given = Given()
+        given = InitialPrompt()
     config = config.model_copy(update=update)
     measured = {}
     for name in ("whole", "split"):
@@ -138,21 +138,21 @@ def measure_split(
     return measured
 
 
-def _measured(folder: Path, T_true: NDArray[np.float64]) -> Measured:
+def _measured(folder: Path, T_true: NDArray[np.float64]) -> SplitMeasurement:
     taken = json.loads((folder / _TAKEN).read_text(encoding="utf-8"))
     if not (folder / layout.RUN).is_file():  # the parts were not joined
-        return Measured(taken["seconds"], np.nan, np.nan, np.nan, {}, taken["parts"], taken["reason"])
+        return SplitMeasurement(taken["seconds"], np.nan, np.nan, np.nan, {}, taken["parts"], taken["reason"])
     run = RunReader(folder)
     R = np.stack([one.T_cam_obj[:3, :3] for one in run.frames])
     errors = aligned_rotation_errors(R, T_true[[one.index for one in run.frames], :3, :3])
     stages = (run.description.get("split") or {}).get("seconds", {})
     tracked = float(np.mean([one.status == "tracked" for one in run.frames]))
-    return Measured(
+    return SplitMeasurement(
         taken["seconds"], float(errors.mean()), float(np.median(errors)), tracked, stages, taken["parts"]
     )
 
 
-def format_split(measured: dict[str, Measured]) -> Table:
+def format_split(measured: dict[str, SplitMeasurement]) -> Table:
     """Whole and in parts, side by side."""
     table = Table("", *measured)
     rows = {

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from tracking3d.checkpoint.folder import Checkpoint
-from tracking3d.checkpoint.progress import Kept, Progress, TakenFrame, check_picture, checksum
+from tracking3d.checkpoint.progress import Kept, RunProgress, TakenFrame, check_picture, checksum
 from tracking3d.checkpoint.trees import UnkeptError
 from tracking3d.corrections import Correction, prompts_in
 from tracking3d.errors import OutputError, PluginError
@@ -20,7 +20,7 @@ from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.evidence.scene import Mask
 from tracking3d.frames import Frame, MaskEstimate, SkippedFrame
 from tracking3d.last_passes import Foreseen, LastPasses
-from tracking3d.reconstruction import BELIEVED, TextureView, kept_views, texture_view, textured
+from tracking3d.reconstruction import BELIEVED, TextureView, bake_texture, kept_views, texture_view
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.refinement_writer import RefinementWriter
@@ -64,7 +64,7 @@ class ObjectRecording:
         self._work = WorkBehind()  # all that touches writer and checkpoint while frames come
         self.latest: FrameEstimate | None = None
         self.foreseen: Foreseen | None = None
-        self._progress = kept.progress if kept else Progress()
+        self._progress = kept.progress if kept else RunProgress()
         self._until = self._progress  # what was done before
         self._past = {*kept.taken, *(one.index for one in kept.skipped)} if kept else set()
         self._answered = kept is not None
@@ -278,7 +278,7 @@ class ObjectRecording:
             self._last.rest(self._work.do)
             self._work.wait()
             model, views = self._last.moved(model, views)
-        model = textured(model, views, self._session.config.object.largest_texture)
+        model = bake_texture(model, views, self._session.config.object.largest_texture)
         if self._refinement is not None:
             self._writer.end_refinement()
             self._causal_model = None

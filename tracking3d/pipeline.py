@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.arguments import check_known, checked_config, needs_prompt, with_known
+from tracking3d.arguments import check_single_known_object, checked_config, needs_prompt, with_known
 from tracking3d.config.camera import choose_camera
 from tracking3d.config.models import PipelineConfig
 from tracking3d.corrections import Correction, check_corrections_fit, checked_corrections, prompts_in
@@ -140,7 +140,7 @@ def track_objects(
     source, config = open_frames(frames), checked_config(config)
     check_order(source, config, start_frame)
     check_prompts(boxes, masks, points)
-    check_known(config, len(boxes) + len(masks) + len(points))
+    check_single_known_object(config, len(boxes) + len(masks) + len(points))
     told = checked_corrections(corrections, len(boxes) + len(masks) + len(points))
     prompts = partial(make_prompts, boxes=boxes, masks=masks, tracker=config.tracker.name, points=points)
     return _track_objects(source, prompts, told, config, start_frame, skip_damaged)

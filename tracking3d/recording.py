@@ -13,7 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.arguments import check_known, check_source, checked_config, checked_folder, needs_prompt
+from tracking3d.arguments import (
+    check_single_known_object,
+    check_source,
+    checked_config,
+    checked_folder,
+    needs_prompt,
+)
 from tracking3d.checkpoint.folder import Checkpoint, finish_state
 from tracking3d.checkpoint.resuming import earlier_run, given_of
 from tracking3d.checkpoint.staging import corrected_aside, take_over
@@ -21,7 +27,7 @@ from tracking3d.config.models import PipelineConfig, PluginChoice
 from tracking3d.corrections import Correction, check_corrections_fit, checked_corrections
 from tracking3d.errors import InputError
 from tracking3d.frames import Box, Frame, Prompt, SkippedFrame
-from tracking3d.object_files import camera_of
+from tracking3d.object_files import select_camera
 from tracking3d.object_recording import ObjectRecording
 from tracking3d.parts import build_encoder, check_turns
 from tracking3d.passes import Listener, go_through, timed
@@ -34,7 +40,7 @@ from tracking3d.results.run_writer import RunWriter, WrittenSoFar
 from tracking3d.session import Session
 from tracking3d.tracker_choice import AUTO, choose_tracker
 from tracking3d.video.both_ways import both_ways, check_start_frame
-from tracking3d.video.source import FrameSource, notes_of
+from tracking3d.video.source import FrameSource, source_notes
 
 _log = logging.getLogger(__name__)
 
@@ -166,7 +172,7 @@ def record_objects(
     check_source(source)
     config, folder = checked_config(config), checked_folder(folder)
     check_prompts(boxes, masks, points)
-    check_known(config, len(boxes) + len(masks) + len(points))
+    check_single_known_object(config, len(boxes) + len(masks) + len(points))
     told = checked_corrections(corrections, len(boxes) + len(masks) + len(points))
     begin = partial(
         begun, source, command=command, selection=selection, overwrite=overwrite, resume=resume,
@@ -283,12 +289,12 @@ def begun(
     writer = RunWriter(
         folder,
         config=config,
-        camera=camera_of(session.config, width, height, source.intrinsics, source.intrinsics_origin),
+        camera=select_camera(session.config, width, height, source.intrinsics, source.intrinsics_origin),
         source=source.name,
         seed=session.config.runtime.seed,
         renderer=session.renderer,
         fps=source.fps,
-        source_notes=notes_of(source),
+        source_notes=source_notes(source),
         command=command,
         selection=selection,
         given=given,

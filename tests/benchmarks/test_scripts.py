@@ -21,7 +21,7 @@ from schedule import schedule
 from script import as_program
 from soak import soak
 from split import split
-from split_benefit import Measured, looped
+from split_benefit import SplitMeasurement, looped
 
 FOLDER = Path(__file__).resolve().parents[2] / "benchmarks"
 SCRIPTS = ("batch", "cost", "render", "same_answers", "schedule", "soak", "split")
@@ -64,8 +64,8 @@ def test_the_benefit_is_told_side_by_side(call, monkeypatch):
     def measured(config, folder, **named):
         assert (named["frames"], named["length"], named["size"]) == (100, 50, (320, 240))
         return {
-            "whole": Measured(100.0, 2.0, 1.5, 1.0, {}),
-            "split": Measured(60.0, 2.1, 1.6, 0.9, {"join": 5.0}, 2),
+            "whole": SplitMeasurement(100.0, 2.0, 1.5, 1.0, {}),
+            "split": SplitMeasurement(60.0, 2.1, 1.6, 0.9, {"join": 5.0}, 2),
         }
 
     monkeypatch.setattr("split_benefit.measure_split", measured)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tracking3d.errors import OutputError
-from tracking3d.splitting.long_video import Ended
+from tracking3d.splitting.long_video import SplitResult
 
 BOX = ("--box", "20,10,20,20")
 
@@ -31,7 +31,7 @@ def parts(monkeypatch):
 
 def test_what_is_given_reaches_the_library(call, clip, parts):
     asked, answers = parts
-    answers.append(Ended((Path("run"),), 3))
+    answers.append(SplitResult((Path("run"),), 3))
     result = call(
         "run", clip, *BOX, "--split", "40f", "--workers", 3, "--out", "run", "--frames", "0:4", "--resume"
     )
@@ -46,7 +46,7 @@ def test_what_is_given_reaches_the_library(call, clip, parts):
 
 def test_parts_that_were_not_joined_are_named_with_the_reason(call, clip, parts):
     parts[1].append(
-        Ended((Path("run/parts/part_0"), Path("run/parts/part_1")), 2, "parts 1 and 2: they differ")
+        SplitResult((Path("run/parts/part_0"), Path("run/parts/part_1")), 2, "parts 1 and 2: they differ")
     )
     result = call("run", clip, *BOX, "--split", "40f", "--out", "run")
     assert result.exit_code == 0, result.output
@@ -56,7 +56,7 @@ def test_parts_that_were_not_joined_are_named_with_the_reason(call, clip, parts)
 
 
 def test_a_video_that_was_not_cut_says_why(call, clip, parts):
-    parts[1].append(Ended((Path("run"),), 1, "clip has 5 frames, which is one part"))
+    parts[1].append(SplitResult((Path("run"),), 1, "clip has 5 frames, which is one part"))
     result = call("run", clip, *BOX, "--split", "40f", "--out", "run")
     assert "one part" in result.stderr
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from short_runs import quick_solver, run, short_clip
 
-from tracking3d.estimation.paper.belief import Belief, Keyframe
+from tracking3d.estimation.paper.belief import PaperState, PosedObservation
 from tracking3d.estimation.paper.joint_start import DIRECTIONS, RATES, hypotheses, joint_start
 from tracking3d.estimation.paper.problem import Parameters
 from tracking3d.evaluation.metrics import aligned_rotation_errors
@@ -18,7 +18,7 @@ from tracking3d.geometry.pose import Pose, from_matrix, rotation_about, rotation
 
 
 @pytest.fixture(scope="module")
-def waiting() -> tuple[Belief, list[Keyframe]]:
+def waiting() -> tuple[PaperState, list[PosedObservation]]:
     """Five frames found one by one, and what is known after them."""
     _, belief = run(quick_solver("rerendering", solver={"start_frames": 8}), range(5))
     return belief, [keyframe for keyframe, _ in belief.waiting]
@@ -58,7 +58,7 @@ def test_one_hypothesis_is_mirrored_in_depth(waiting, axis, mirrored):
         turn = rotation_about(torch.tensor(about, dtype=torch.float32), 20)
         return from_matrix(turn @ first.pose.R, first.pose.translation)
 
-    start = hypotheses(belief, [first, Keyframe(frames[1].observation, tilted(axis))])[1]
+    start = hypotheses(belief, [first, PosedObservation(frames[1].observation, tilted(axis))])[1]
     assert degrees(start, 1, tilted(mirrored)) < 0.1
 
 
@@ -79,13 +79,13 @@ def test_rotations_of_a_batch_are_those_of_one_frame_after_another(waiting):
     """Frames may be far apart: none turns by more than 60 degrees."""
     belief, found = waiting
     frames = [
-        Keyframe(replace(keyframe.observation, index=index), keyframe.pose)
+        PosedObservation(replace(keyframe.observation, index=index), keyframe.pose)
         for keyframe, index in zip(found, (3, 4, 7, 12, 30), strict=True)
     ]
     first = frames[0].pose
     flip = torch.diag(torch.tensor([1.0, 1.0, -1.0]))
 
-    def turned(axis: torch.Tensor, rate: float, keyframe: Keyframe) -> Pose:
+    def turned(axis: torch.Tensor, rate: float, keyframe: PosedObservation) -> Pose:
         angle = min(rate * (keyframe.observation.index - 3), 60.0)
         return from_matrix(rotation_about(axis, angle) @ first.R, keyframe.pose.translation)
 

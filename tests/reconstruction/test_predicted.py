@@ -9,7 +9,7 @@ import pytest
 from rendered_views import ball, pattern, pose, seen, view
 from test_volume import CAMERA, shape_views
 
-from tracking3d.reconstruction import predicted, textured
+from tracking3d.reconstruction import bake_texture, predicted
 from tracking3d.reconstruction.predicted import picture_scores
 from tracking3d.reconstruction.shape_views import shape_view
 
@@ -26,9 +26,9 @@ def out():
 
 def test_the_right_model_predicts_what_a_wrong_one_does_not(out):
     views = [view(n, yaw) for n, yaw in enumerate(YAWS)]
-    right = picture_scores(textured(ball(), views), shape_views(YAWS), [out])
+    right = picture_scores(bake_texture(ball(), views), shape_views(YAWS), [out])
     small = ball()
-    small = textured(replace(small, vertices=0.7 * small.vertices), views)
+    small = bake_texture(replace(small, vertices=0.7 * small.vertices), views)
     wrong = picture_scores(small, shape_views(YAWS), [out])
     assert right.frames == 1 and right.psnr > 22 and right.ssim > 0.8 and right.covered > 0.97
     assert wrong.psnr < right.psnr - 3 and wrong.ssim < right.ssim - 0.1 and wrong.covered < 0.8
@@ -37,7 +37,7 @@ def test_the_right_model_predicts_what_a_wrong_one_does_not(out):
 def test_what_is_beside_the_mask_is_not_judged(out):
     shape, texture = out
     views = [view(n, yaw) for n, yaw in enumerate(YAWS)]
-    model = textured(ball(), views)
+    model = bake_texture(ball(), views)
     other = texture.image.copy()
     other[texture.valid <= 0] = 255
     elsewhere = picture_scores(model, shape_views(YAWS), [(shape, replace(texture, image=other))])

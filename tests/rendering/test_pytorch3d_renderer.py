@@ -19,7 +19,7 @@ from render import render as render_script
 from script import as_program
 from tracking3d.rendering import SoftBand, render
 from tracking3d.speed import benchmark as bench_render
-from tracking3d.speed.scene import Problem, Scene
+from tracking3d.speed.scene import RenderScene, RenderWorkload
 from tracking3d.speed.timing import time_backends
 
 CPU = torch.device("cpu")
@@ -58,7 +58,10 @@ def test_an_absent_pytorch3d_is_refused_in_a_sentence():
 
 def test_an_installed_pytorch3d_is_timed_beside_the_backends(stand_in):
     assert why_no_pytorch3d(CPU) == ""
-    problem, others = Problem(size=16, frames=1, texture=16, frequency=2), {"pytorch3d": render_pytorch3d}
+    problem, others = (
+        RenderWorkload(size=16, frames=1, texture=16, frequency=2),
+        {"pytorch3d": render_pytorch3d},
+    )
     times = time_backends(problem, CPU, repeats=1, threads=1, others=others)
     assert {"torch", "numba", "pytorch3d"} == set(times)
     assert all(len(measured) == 1 for measured in times.values())
@@ -96,7 +99,7 @@ def test_an_installation_without_a_part_is_broken_and_not_absent(stand_in, monke
 @pytest.mark.slow
 @torch.no_grad()
 def test_covered_pixels_stay_covered_only_with_enough_faces(stand_in, monkeypatch):
-    scene = Scene.make(Problem(size=24, frames=1, texture=24, frequency=14), CPU)
+    scene = RenderScene.make(RenderWorkload(size=24, frames=1, texture=24, frequency=14), CPU)
     arguments = {**scene.parameters, **scene.constants}
     covered = render(**arguments).face_index >= 0
     assert ((render_pytorch3d(**arguments).face_index >= 0) == covered).all()
@@ -116,7 +119,7 @@ def test_pytorch3d_draws_the_same_picture(stand_in):
 
 
 def test_pytorch3d_is_timed_on_the_same_loss_and_gradients(stand_in):
-    scene = Scene.make(Problem(size=24, frames=2, texture=24, frequency=3), CPU)
+    scene = RenderScene.make(RenderWorkload(size=24, frames=2, texture=24, frequency=3), CPU)
     answers = []
     for backend in (render, render_pytorch3d):
         scene.forget_gradients()

@@ -51,7 +51,7 @@ def track_in_parts(
     """
     from tracking3d.cli.progress import print_summary, progress
     from tracking3d.cli.report import reported
-    from tracking3d.splitting.part_runs import Given as GivenOfPart
+    from tracking3d.splitting.part_runs import InitialPrompt as GivenOfPart
     from tracking3d.splitting.split_run import record_in_parts
     from tracking3d.video import open_source
 

@@ -23,7 +23,7 @@ from tracking3d.results import description, layout
 from tracking3d.results.files import decoded_mask, mask_file, read_mask, write_atomic, write_mask, writing
 from tracking3d.results.pictures import Pictures
 from tracking3d.results.probabilities import take_over_probability, write_probability
-from tracking3d.results.records import FrameRecord, mask_iou
+from tracking3d.results.records import FrameRecord, mask_iou_or_none
 from tracking3d.results.run_reader import read_records
 from tracking3d.stages import StageTimes, measured
 
@@ -119,7 +119,7 @@ class RefinementWriter:
         self._records[index] = replace(
             record,
             area=int(np.count_nonzero(mask)),
-            iou_initial=mask_iou(mask, initial),
+            iou_initial=mask_iou_or_none(mask, initial),
             mask_source=MaskSource.WEIGHED,
         )
         self._decided[index] = mask_file(mask)

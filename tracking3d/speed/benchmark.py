@@ -21,7 +21,7 @@ import torch
 from tracking3d.results.description import versions
 from tracking3d.speed.growth import measure_growth
 from tracking3d.speed.memory import peak_memory
-from tracking3d.speed.scene import Backend, Problem, default_texture
+from tracking3d.speed.scene import Backend, RenderWorkload, default_texture
 from tracking3d.speed.timing import DENSE, Duration, find_device, median, time_backends
 
 
@@ -64,7 +64,7 @@ def benchmark(
         InputError: If the device is not there.
     """
     place = find_device(device)
-    problem = Problem(size, frames, channels, texture or default_texture(channels))
+    problem = RenderWorkload(size, frames, channels, texture or default_texture(channels))
     times = time_backends(problem, place, repeats, threads, dense, others)
     results = {
         name: _figures(measured, frames, 1 if name == DENSE else frames) for name, measured in times.items()
@@ -125,6 +125,5 @@ def _ratio(one: dict[str, Any], other: dict[str, Any]) -> float:
     return float(f"{one['total_ms'] / other['total_ms']:.3g}")
 
 
-def _rounded(name: str, problem: Problem, device: torch.device, threads: int) -> float | None:
-    memory = peak_memory(name, problem, device, threads)
-    return None if memory is None else round(memory, 1)
+def _rounded(name: str, problem: RenderWorkload, device: torch.device, threads: int) -> float:
+    return round(peak_memory(name, problem, device, threads), 1)

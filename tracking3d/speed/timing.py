@@ -14,7 +14,7 @@ from tracking3d.errors import InputError
 from tracking3d.rendering import prepare_backend, render
 from tracking3d.rendering.backend import threads_kept, why_no_numba
 from tracking3d.speed.dense import render_dense
-from tracking3d.speed.scene import Backend, Problem, Scene
+from tracking3d.speed.scene import Backend, RenderScene, RenderWorkload
 
 DENSE = "dense"
 _PER_TURN = 3
@@ -55,13 +55,13 @@ def backends(device: torch.device) -> dict[str, Backend]:
     return found
 
 
-def give_threads(name: str, device: torch.device, threads: int) -> None:
+def set_benchmark_threads(name: str, device: torch.device, threads: int) -> None:
     """What a run of the product with that backend and ``--threads`` does; see `prepare_backend`."""
     prepare_backend("numba" if name == "numba" else "torch", str(device), threads)
 
 
 def time_backends(
-    problem: Problem,
+    problem: RenderWorkload,
     device: torch.device,
     repeats: int,
     threads: int,
@@ -84,7 +84,7 @@ def time_backends(
     Returns:
         Measurements by name.
     """
-    scene, candidates = Scene.make(problem, device), {**backends(device), **(others or {})}
+    scene, candidates = RenderScene.make(problem, device), {**backends(device), **(others or {})}
     times: dict[str, list[Duration]] = {name: [] for name in candidates}
     with threads_kept():
         for done in range(0, repeats, _PER_TURN):
@@ -94,7 +94,7 @@ def time_backends(
                 times[name] += [_measure(scene, backend) for _ in range(min(_PER_TURN, repeats - done))]
         if dense:
             _begin_turn(DENSE, device, threads)
-            times[DENSE] = [_measure(Scene.make(replace(problem, frames=1), device), render_dense)]
+            times[DENSE] = [_measure(RenderScene.make(replace(problem, frames=1), device), render_dense)]
     return times
 
 
@@ -106,12 +106,12 @@ def median(measured: list[Duration]) -> Duration:
 
 
 def _begin_turn(name: str, device: torch.device, threads: int) -> None:
-    give_threads(name, device, threads)
+    set_benchmark_threads(name, device, threads)
     if threads > 1:
         time.sleep(_PAUSE)
 
 
-def _measure(scene: Scene, backend: Backend) -> Duration:
+def _measure(scene: RenderScene, backend: Backend) -> Duration:
     device = scene.mask.device
     scene.forget_gradients()
     start = _now(device)

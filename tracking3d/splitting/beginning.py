@@ -11,10 +11,10 @@ from tracking3d.config.models import PipelineConfig
 from tracking3d.prompts import make_prompt
 from tracking3d.recording import record, with_tracker
 from tracking3d.results import layout
-from tracking3d.results.making_room import make_room
+from tracking3d.results.making_room import clear_run_folder
 from tracking3d.results.run_reader import is_finished
 from tracking3d.splitting.cutting import windows
-from tracking3d.splitting.long_video import Ended, LongVideo, Tell, frames_of_part
+from tracking3d.splitting.long_video import LongVideo, SplitResult, Tell, frames_of_part
 from tracking3d.splitting.part_runs import PartJob, begin_session
 from tracking3d.splitting.plan import (
     Plan,
@@ -53,7 +53,7 @@ class Begun:
     jobs: tuple[PartJob, ...]
 
 
-def begin(tell: Tell, video: LongVideo) -> Begun | Ended:
+def begin(tell: Tell, video: LongVideo) -> Begun | SplitResult:
     """Cut a video, unless it is one part, or done; ``tell`` is given the answers where it is tracked here.
 
     Raises:
@@ -71,13 +71,13 @@ def begin(tell: Tell, video: LongVideo) -> Begun | Ended:
     assert count is not None
     if not windows(count, frames):
         one_part()
-        return Ended((folder,), 1, f"{opened.name} has {count} frames, which is one part")
+        return SplitResult((folder,), 1, f"{opened.name} has {count} frames, which is one part")
     if resume and (layout.has_state(folder) or is_there(folder)):  # joined already
         one_part()
         remove_parts(folder)
-        return Ended((folder,), 1)
+        return SplitResult((folder,), 1)
     if not resume:
-        make_room(folder, video.overwrite)
+        clear_run_folder(folder, video.overwrite)
         remove_parts(folder)
     first, _ = begin_session(opened, video.config, given)
     prompt = None if given.untold else make_prompt(first, given.box, given.mask, points=given.points)
@@ -90,10 +90,10 @@ def begin(tell: Tell, video: LongVideo) -> Begun | Ended:
     if len(plan.parts) == 1:
         remove_parts(folder)
         one_part()
-        return Ended((folder,), 1, "no frame near to where it was to be cut shows the object well")
+        return SplitResult((folder,), 1, "no frame near to where it was to be cut shows the object well")
     jobs = _part_jobs(video, config, count, plan, resume=kept is not None)
     if kept is not None and all(is_finished(job.folder) for job in jobs):
-        return Ended(tuple(job.folder for job in jobs), len(jobs), BEFORE)
+        return SplitResult(tuple(job.folder for job in jobs), len(jobs), BEFORE)
     return Begun(video, config, choice, count, plan, jobs)
 
 

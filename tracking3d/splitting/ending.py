@@ -30,7 +30,7 @@ from tracking3d.splitting.beginning import Begun
 from tracking3d.splitting.joined_run import write_causal_mesh, write_joined
 from tracking3d.splitting.joining import Whole, joined_parts
 from tracking3d.splitting.long_video import Tell
-from tracking3d.splitting.part_runs import Given, PartJob, Revisit, begin_session
+from tracking3d.splitting.part_runs import InitialPrompt, PartJob, Revisit, begin_session
 from tracking3d.splitting.plan import PARTS, part_folder, put_cut_mask, remove_parts
 from tracking3d.video import open_source
 
@@ -170,7 +170,7 @@ def end(tell: Tell, ending: Ending) -> None:
     remove_parts(video.folder)
 
 
-def _prompt(first: Frame, given: Given) -> Prompt | None:
+def _prompt(first: Frame, given: InitialPrompt) -> Prompt | None:
     return None if given.untold else make_prompt(first, given.box, given.mask, points=given.points)
 
 
@@ -193,7 +193,7 @@ def _begun_elsewhere(tracked: Tracked) -> Again | None:
         if smaller and np.count_nonzero(answer & began) < _SAME_OBJECT * smaller:
             _log.warning("Part %d began on something else and is tracked again.", part.number + 1)
             put_cut_mask(folder, part, answer)
-            job = replace(tracked.jobs[part.number], given=Given(mask=answer), resume=False)
+            job = replace(tracked.jobs[part.number], given=InitialPrompt(mask=answer), resume=False)
             return Again(part.number, job)
     return None
 

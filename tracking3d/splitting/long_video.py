@@ -11,7 +11,7 @@ from tracking3d.config.models import PipelineConfig
 from tracking3d.config.solvers import OnlineConfig
 from tracking3d.errors import InputError
 from tracking3d.splitting.cutting import parse_length
-from tracking3d.splitting.part_runs import Given
+from tracking3d.splitting.part_runs import InitialPrompt
 from tracking3d.video.selection import parse_selection
 from tracking3d.video.source import FrameSource
 
@@ -38,7 +38,7 @@ class LongVideo:
     source: str
     config: PipelineConfig
     folder: Path
-    given: Given
+    given: InitialPrompt
     length: str
     workers: int = 2
     selection: str | None = None
@@ -58,7 +58,7 @@ class LongVideo:
 
 
 @dataclass(frozen=True)
-class Ended:
+class SplitResult:
     """What became of a video that was to be split.
 
     Attributes:

@@ -36,7 +36,7 @@ Tell = Callable[[Any], None]
 
 
 @dataclass(frozen=True, eq=False)
-class Given:
+class InitialPrompt:
     """What the object is in a first frame; nothing where the mask tracker knows. See `tracking3d.recording.record`."""
 
     box: Box | None = None
@@ -68,7 +68,7 @@ class PartJob:
     selection: str
     config: PipelineConfig
     folder: Path
-    given: Given
+    given: InitialPrompt
     command: str | None = None
     resume: bool = False
     first_pass_only: bool = True
@@ -108,7 +108,7 @@ def is_tracked(folder: Path, source: FrameSource) -> bool:
     return len(run.frames) + len(run.description["skipped"]) == source.count
 
 
-def begin_session(source: FrameSource, config: PipelineConfig, given: Given) -> tuple[Frame, Session]:
+def begin_session(source: FrameSource, config: PipelineConfig, given: InitialPrompt) -> tuple[Frame, Session]:
     """The first frame of a video, and a session for its object that has seen nothing yet.
 
     Raises:
@@ -139,7 +139,7 @@ class Revisit:
     selection: str
     config: PipelineConfig
     folder: Path
-    given: Given
+    given: InitialPrompt
     out: Path
 
 

@@ -19,7 +19,7 @@ from tracking3d.results.files import read_mask, write_atomic, write_mask, writin
 from tracking3d.results.records import jsonable
 from tracking3d.splitting.cutting import Part, cuts_in, overlap_of, parts_at, windows
 from tracking3d.splitting.looking_ahead import full_size, look_ahead, tracker_for_looking
-from tracking3d.splitting.part_runs import Given
+from tracking3d.splitting.part_runs import InitialPrompt
 from tracking3d.video.source import FrameSource
 
 PARTS = "parts"
@@ -53,11 +53,11 @@ def part_folder(folder: Path, part: Part) -> Path:
     return folder / PARTS / f"part_{part.number}"
 
 
-def given_at(folder: Path, part: Part, given: Given, precomputed: bool) -> Given:
+def given_at(folder: Path, part: Part, given: InitialPrompt, precomputed: bool) -> InitialPrompt:
     """What the object is in a part's first frame."""
     if part.number == 0 or precomputed:
         return given
-    return Given(mask=_cut_mask(folder, part))
+    return InitialPrompt(mask=_cut_mask(folder, part))
 
 
 def make_plan(

@@ -12,7 +12,7 @@ from tracking3d.cli.evaluate.options import Data, Out, Sequences
 from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quiet
 
 if TYPE_CHECKING:
-    from tracking3d.benchmark.mask_trackers import Measured
+    from tracking3d.benchmark.mask_trackers import TrackerMeasurement
 
 
 class Start(StrEnum):
@@ -98,7 +98,7 @@ def masks(
         raise typer.Exit(1)
 
 
-def _print_measured(measured: Measured) -> None:
+def _print_measured(measured: TrackerMeasurement) -> None:
     """Print on the standard error how a tracker did on a sequence."""
     what = measured.error or f"IoU {measured.figures()['iou_mean']:.3f}"
     typer.echo(f"{measured.sequence} ({measured.tracker}): {what}", err=True)

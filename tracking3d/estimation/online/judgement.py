@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from tracking3d.estimation.assessment import Assessment
 from tracking3d.estimation.estimate import Status
-from tracking3d.estimation.online.pose_refinement import PoseFit, PoseWeights
+from tracking3d.estimation.online.pose_refinement_types import PoseFit, PoseWeights
 from tracking3d.estimation.online.stiffness import least_held
 
 ENOUGH_POINTS = 15

@@ -14,8 +14,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from tracking3d.config.solvers import PaperConfig
-from tracking3d.estimation.observation import Batch, halved
-from tracking3d.estimation.paper.belief import Belief, Keyframe
+from tracking3d.estimation.observation import ObservationBatch, halved
+from tracking3d.estimation.paper.belief import PaperState, PosedObservation
 from tracking3d.estimation.paper.optimize import Optimum, optimize
 from tracking3d.estimation.paper.problem import Parameters, Problem
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_exponential
@@ -27,7 +27,9 @@ _SEMIFINALISTS = 6
 _FINALISTS = 2
 
 
-def joint_start(belief: Belief, frames: list[Keyframe], config: PaperConfig, tau: float) -> Optimum:
+def joint_start(
+    belief: PaperState, frames: list[PosedObservation], config: PaperConfig, tau: float
+) -> Optimum:
     """Solve shape, texture and all poses of ``frames``; the first pose is fixed.
 
     Args:
@@ -38,7 +40,7 @@ def joint_start(belief: Belief, frames: list[Keyframe], config: PaperConfig, tau
     """
     config = config.model_copy(update={"stop": "plateau", "patience": config.start_iterations})
     coarse, fine = (
-        Problem(belief.shape, Batch.of(observations), config, backend=belief.renderer)
+        Problem(belief.shape, ObservationBatch.of(observations), config, backend=belief.renderer)
         for observations in (
             [halved(frame.observation) for frame in frames],
             [frame.observation for frame in frames],
@@ -61,7 +63,7 @@ def joint_start(belief: Belief, frames: list[Keyframe], config: PaperConfig, tau
     return replace(optima[0], iterations=spent)
 
 
-def hypotheses(belief: Belief, frames: list[Keyframe]) -> list[Parameters]:
+def hypotheses(belief: PaperState, frames: list[PosedObservation]) -> list[Parameters]:
     """No rotation; the rotations found so far mirrored in depth; turning in eight directions at two rates.
 
     Translations are those found so far: they are seen directly.
