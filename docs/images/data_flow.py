@@ -70,7 +70,7 @@ STAGES = (
     Stage("initialization", "first map", 352, 100, 124, ONLINE, "initialization"),
     Stage("tracking", "pose, confidence", 526, 100, 116, ONLINE, "tracking"),
     Stage("mapping", "keyframes, shape", 670, 100, 114, ONLINE, "mapping"),
-    Stage("atlas", "several maps, merging", 348, 202, 132, ONLINE, "atlas"),
+    Stage("atlas", "maps, merging", 348, 202, 132, ONLINE, "atlas"),
     Stage("relocalization", "pose without prediction", 512, 202, 144, ONLINE, "relocalization"),
     Stage("masks", "fused mask", 846, 100, 110, MASKS, "masks"),
     Stage("run folder", "estimates, one a frame", 828, 312, 146, FILES),
