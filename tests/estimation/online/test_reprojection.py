@@ -4,15 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from tracked_solids import intrinsics
+from twins.reprojection import pixel_by_point, pixel_by_pose
 
-from tracking3d.bundle_adjustment.reprojection import (
-    finite_rows,
-    moved,
-    pixel_by_point,
-    pixel_by_pose,
-    project,
-    to_camera,
-)
+from tracking3d.bundle_adjustment.reprojection import finite_rows, moved, project, to_camera
 
 K = intrinsics(45.0)
 RANDOM = np.random.default_rng(0)
