@@ -59,17 +59,16 @@ def align(template: Plane, weight: Plane, image: Plane, xy: Array, prior: float 
         xy: ``(N, 2)`` pixels of the template; a point that is not finite is not aligned.
         prior: Deviation in pixels of the shifts that are expected.
     """
-    planes = [np.ascontiguousarray(plane, dtype=np.float32) for plane in (template, weight, image)]
-    points = np.ascontiguousarray(xy, dtype=np.float64)
-    window = _window()
-    from tracking3d.points.kernels.alignment import align as compiled
+    from tracking3d.points.kernels import alignment
     from tracking3d.rendering.kernels.threads import share
 
+    planes = (np.ascontiguousarray(plane, dtype=np.float32) for plane in (template, weight, image))
+    points = np.ascontiguousarray(xy, dtype=np.float64)
+    settings = alignment.AlignmentSettings(_window(), float(prior), NOISE, LEAST_COVER, STEPS)
     count = len(points)
-    shift, covariance, agreement = np.empty((count, 2)), np.empty((count, 3)), np.empty((count, 2))
-    out = shift, covariance, agreement
-    share(compiled, count, _LEAST_SHARED, *planes, points, window, prior, NOISE, LEAST_COVER, STEPS, *out)
-    return Alignment(shift, covariance, agreement[:, 0], agreement[:, 1])
+    found = alignment.AlignmentArrays(np.empty((count, 2)), np.empty((count, 3)), np.empty((count, 2)))
+    share(alignment.align, count, _LEAST_SHARED, alignment.AlignedPlanes(*planes), points, settings, found)
+    return Alignment(found.shift, found.covariance, found.agreement[:, 0], found.agreement[:, 1])
 
 
 def _window() -> Array:
