@@ -74,16 +74,21 @@ class Warps:
 
 def _warped(source: View, target: View, tolerance: float) -> tuple[Plane, Plane]:
     """The image of ``source`` as ``target`` would see it, and where it is known."""
-    from tracking3d.points.kernels.warping import warp
+    from tracking3d.points.kernels.warping import WarpSource, WarpTarget, warp
     from tracking3d.rendering.kernels.threads import share
 
     height, width = target.image.shape
     warped, known = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
     share(
-        warp, height, _LEAST_ROWS,
-        target.inverse_depth, target.beyond, _BEYOND, target.intrinsics,
+        warp,
+        height,
+        _LEAST_ROWS,
+        WarpTarget(target.inverse_depth, target.beyond, target.intrinsics, float(_BEYOND)),
+        WarpSource(source.intrinsics, source.image, source.mask, source.inverse_depth),
         np.ascontiguousarray(source.T_cam_obj @ np.linalg.inv(target.T_cam_obj)),
-        source.intrinsics, source.image, source.mask, source.inverse_depth, NEAR, tolerance,
-        warped, known,
-    )  # fmt: skip
+        NEAR,
+        tolerance,
+        warped,
+        known,
+    )
     return warped, known

@@ -202,14 +202,20 @@ def patch_scores(
         and ``(N,)`` the deviation of the patches' grey values, 0 where there is no patch.
     """
     agreeing = min(AGREEING, len(others))
-    from tracking3d.reconstruction.kernels.plane_sweep import sweep
+    from tracking3d.reconstruction.kernels.plane_sweep import OtherViews, ReferenceView, SweptPatches, sweep
 
     scores = np.empty((len(pixels), len(offsets)), np.float32)
     contrast = np.empty(len(pixels), np.float32)
     sweep(
-        image, inside, np.ascontiguousarray(K_inverse), others, np.ascontiguousarray(P), pixels, depth, normal,
-        offsets, RADIUS, LEAST_CONTRAST, agreeing, scores, contrast,
-    )  # fmt: skip
+        ReferenceView(image, inside, np.ascontiguousarray(K_inverse)),
+        OtherViews(others, np.ascontiguousarray(P)),
+        SweptPatches(pixels, depth, normal, offsets),
+        RADIUS,
+        LEAST_CONTRAST,
+        agreeing,
+        scores,
+        contrast,
+    )
     return scores, contrast
 
 
