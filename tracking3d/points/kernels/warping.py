@@ -122,7 +122,7 @@ def warp(
 
 @_inner
 def _write_projection(T, intrinsics, source_intrinsics, P, q):
-    """Homogeneous pixels of the other view are ``P (x, y, 1) + q / depth``: what is common to a row is added up once."""
+    """Homogeneous pixels of the other view are ``P (x, y, 1) + q / depth``: a row has much in common."""
     fx, fy, cx, cy = intrinsics
     for j in range(4):
         across, along, ahead = T[0, j], T[1, j], T[2, j]

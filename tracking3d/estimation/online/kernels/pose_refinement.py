@@ -28,21 +28,23 @@ from tracking3d.estimation.online.pose_refinement import (
 )
 from tracking3d.rendering import MatchedPoints, PoseTarget, Surface
 from tracking3d.rendering.kernels.compilation import kernel, record
-from tracking3d.rendering.kernels.pose_terms import (
-    APPEARANCE,
-    BOTH,
-    COMPARABLE,
-    EITHER,
-    KNOWN,
+from tracking3d.rendering.kernels.pose_inputs import (
     MATCHES,
-    OUTLINE,
-    POINTS,
     SCALES,
     SURFACE,
     TARGET,
     LossScales,
     drawing_buffers,
     packed,
+)
+from tracking3d.rendering.kernels.pose_terms import (
+    APPEARANCE,
+    BOTH,
+    COMPARABLE,
+    EITHER,
+    KNOWN,
+    OUTLINE,
+    POINTS,
     terms_of_pose,
 )
 from tracking3d.rendering.kernels.threads import share
