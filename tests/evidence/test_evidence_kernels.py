@@ -27,7 +27,7 @@ def test_cells_have_the_same_distances_in_a_view():
     unknown = np.broadcast_to(np.arange(40) < 6, (40, 40))
     view = np.array([[3.0, 0.1, 0.9, -30.0], [0.2, 2.8, -0.5, -25.0], [0.01, 0.02, 0.1, 4.0]])
     given = distance, unknown, view, 0.3, -40
-    fast, plain = consensus.carried(*given), soft_visual_hull.carried(*given)
+    fast, plain = consensus.sample_grid_distances(*given), soft_visual_hull.carried(*given)
     assert np.mean(fast != plain) < 1e-3  # where rounding decides
     assert 0.01 < np.mean(fast == 127) < 0.9 and len(np.unique(fast)) > 50
 
@@ -36,7 +36,7 @@ def test_a_view_from_within_the_grid_says_nothing():
     within = np.array([[30.0, 0, 0, 0], [0, 30.0, 0, 0], [0, 0, 1.0, -5.0]])
     plane = np.zeros((40, 40), np.float32)
     given = plane, plane > 0, within, 0.3, -40
-    assert consensus.carried(*given) is None and soft_visual_hull.carried(*given) is None
+    assert consensus.sample_grid_distances(*given) is None and soft_visual_hull.carried(*given) is None
 
 
 def test_rays_come_as_deep_into_the_hulls():
