@@ -142,7 +142,7 @@ def test_a_folder_of_somebody_s_parts_is_left_alone(short, tmp_path, monkeypatch
     own = tmp_path / "run" / PARTS / "mine.txt"
     own.parent.mkdir(parents=True)
     own.write_text("mine")
-    monkeypatch.setattr(beginning, "record", lambda *given, **named: None)
+    monkeypatch.setattr(beginning, "record_tracking", lambda *given: None)
     record_in_parts(short, settings(short), tmp_path / "run", PromptSet(), length="1000f", overwrite=True)
     assert own.read_text() == "mine"
 
