@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any
 
-from tracking3d.checkpoint.progress import Kept, TakenFrame, check_picture, checksum
+from tracking3d.checkpoint.progress import JournalEntry, Kept, check_picture, checksum
 from tracking3d.checkpoint.run_state import RunState
 from tracking3d.corrections import prompts_in
 from tracking3d.errors import OutputError
@@ -113,7 +113,7 @@ class ObjectRecording:
             self._initial[frame.index] = initial.score, initial.reason
         taken = kept = None
         if self._state.checkpoint:
-            taken = TakenFrame(
+            taken = JournalEntry(
                 frame.index,
                 checksum(frame.image),
                 initial.score,
@@ -131,7 +131,11 @@ class ObjectRecording:
         return frame
 
     def _write(
-        self, estimate: FrameEstimate, frame: Frame, taken: TakenFrame | None, session: dict[str, Any] | None
+        self,
+        estimate: FrameEstimate,
+        frame: Frame,
+        taken: JournalEntry | None,
+        session: dict[str, Any] | None,
     ) -> FrameRecord:
         record, checkpoint = self._writer.write(estimate, frame), self._state.checkpoint
         if checkpoint and taken is not None and session is not None:
@@ -202,8 +206,11 @@ class ObjectRecording:
         """Refine everything, unless the stopped run has done so; None if there is no refinement."""
         before = self._state.before
         if before.refining:
-            self._causal_model = load_model(self._writer.folder)
-            return self._writer.begin_refinement(None, before.refined_lines, before.refinement_seconds)
+            estimates = self._writer.begin_refinement(None, before.refined_lines, before.refinement_seconds)
+            self._causal_model = load_model(
+                self._writer.folder
+            )  # in its place again, if it was being replaced
+            return estimates
         if not self._refines:
             return None
         if not self._session.can_refine or not source.repeatable:

@@ -113,7 +113,13 @@ def go_through(
         for recording in recordings if source.repeatable else ():
             threads.enter_context(recording.writing_beside())
         try:
-            _run_first_pass(source, frames, active)
+            waits = any(one.takes for one in active)
+            for frame, coming in read_with_next(source, frames) if waits else ():
+                shared = with_share(frame, len(recordings)) if isinstance(frame, Frame) else frame
+                for recording in active:
+                    with active.guard(recording):
+                        active.tell(recording.take(shared, coming))
+            _finish_writing(active)
             if first_pass_only:
                 for recording in active:
                     with active.guard(recording):
@@ -125,19 +131,6 @@ def go_through(
             raise
     if active.errors:
         raise active.errors[0]
-
-
-def _run_first_pass(
-    source: FrameSource, frames: Iterable[Frame | SkippedFrame], active: ActiveRecordings
-) -> None:
-    """Estimate every frame as it comes."""
-    objects = len(active)
-    for frame, coming in read_with_next(source, frames) if any(one.takes for one in active) else ():
-        shared = with_share(frame, objects) if isinstance(frame, Frame) else frame
-        for recording in active:
-            with active.guard(recording):
-                active.tell(recording.take(shared, coming))
-    _finish_writing(active)
 
 
 def look_again(source: FrameSource, active: ActiveRecordings) -> None:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from tracking3d.checkpoint.folder import Checkpoint
-from tracking3d.checkpoint.progress import Kept, Progress, TakenFrame
+from tracking3d.checkpoint.progress import JournalEntry, Kept, Progress
 from tracking3d.checkpoint.trees import UnkeptError
 
 _log = logging.getLogger(__name__)
@@ -40,7 +40,7 @@ class RunState:
     def save(
         self,
         session: dict[str, Any],
-        taken: TakenFrame | None = None,
+        taken: JournalEntry | None = None,
         revised: Iterable[int] = (),
         **changes: Any,
     ) -> None:
