@@ -160,7 +160,7 @@ def test_small_arrays_have_no_file(tmp_path):
     assert not files(tmp_path)
 
 
-@pytest.mark.parametrize("value", [object(), {1, 2}, np.array([object()]), Progress(), Leaf])
+@pytest.mark.parametrize("value", [object(), {1, 2}, np.array([object()]), RunProgress(), Leaf])
 def test_what_nobody_has_named_is_refused(tmp_path, value):
     with pytest.raises(UnkeptError):
         TreeFolder(tmp_path, CLASSES).text(value)

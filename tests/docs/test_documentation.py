@@ -71,8 +71,8 @@ def field_named(model: Any, key: str) -> Any:
 
 
 @pytest.mark.parametrize("preset", [name for name in list_presets() if name != "paper"])
-def test_method_lists_exactly_what_a_preset_changes(preset):
-    page = (ROOT / "docs/method.md").read_text(encoding="utf-8")
+def test_page_of_the_paper_lists_exactly_what_a_preset_changes(preset):
+    page = (ROOT / "docs/method/paper.md").read_text(encoding="utf-8")
     section = re.search(
         rf"^#+ What (?:the {preset} preset|preset {preset}) changes\n(.*?)^#", page, re.M | re.S
     )

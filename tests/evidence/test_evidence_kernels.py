@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tracking3d.evidence import colours, consensus, motion
-from tracking3d.evidence.scene import Scene
+from tracking3d.evidence.scene import FrameWindow
 from tracking3d.geometry.camera import Camera, Window
 
 CAMERA = Camera(200.0, 200.0, 79.5, 59.5, 160, 120)
@@ -37,7 +37,7 @@ def test_cells_have_the_same_distances_in_a_view(both_ways):
     distance = rng.normal(0, 9, (40, 40)).astype(np.float32)
     unknown = np.broadcast_to(np.arange(40) < 6, (40, 40))
     view = np.array([[3.0, 0.1, 0.9, -30.0], [0.2, 2.8, -0.5, -25.0], [0.01, 0.02, 0.1, 4.0]])
-    fast, plain = both_ways(consensus, "carried", distance, unknown, view, 0.3, -40)
+    fast, plain = both_ways(consensus, "sample_grid_distances", distance, unknown, view, 0.3, -40)
     assert np.mean(fast != plain) < 1e-3  # where rounding decides
     assert 0.01 < np.mean(fast == 127) < 0.9 and len(np.unique(fast)) > 50
 
@@ -45,7 +45,7 @@ def test_cells_have_the_same_distances_in_a_view(both_ways):
 def test_a_view_from_within_the_grid_says_nothing(both_ways):
     within = np.array([[30.0, 0, 0, 0], [0, 30.0, 0, 0], [0, 0, 1.0, -5.0]])
     plane = np.zeros((40, 40), np.float32)
-    assert both_ways(consensus, "carried", plane, plane > 0, within, 0.3, -40) == (None, None)
+    assert both_ways(consensus, "sample_grid_distances", plane, plane > 0, within, 0.3, -40) == (None, None)
 
 
 def test_rays_come_as_deep_into_the_hulls(both_ways):
@@ -69,7 +69,7 @@ def test_both_motions_lead_to_the_same_places(both_ways):
     nothing = np.zeros((48, 48), bool)
     inverse_depth = np.where(np.mgrid[:48, :48][0] > 5, rng.uniform(0.1, 0.2, (48, 48)), 0).astype(np.float32)
     image = np.zeros((120, 160, 3), np.uint8)
-    scene = Scene(
+    scene = FrameWindow(
         window, image[:48, :48], window.K(CAMERA), pose, nothing, nothing, nothing, inverse_depth, 1, ~nothing
     )
     H = np.array([[1.02, 0.01, -6.0], [0.0, 0.98, 3.0], [1e-4, 0.0, 1.0]])

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from tracking3d.checkpoint.progress import checksum
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
-from tracking3d.export.exporter import ExportOptions
 from tracking3d.export.exporting import export_run
+from tracking3d.export.options import ExportOptions
 from tracking3d.frames import Frame, SkippedFrame
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.prototypes import ellipsoid

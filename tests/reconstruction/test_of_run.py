@@ -111,7 +111,7 @@ def test_a_shape_that_cannot_be_told_leaves_the_mesh_and_its_texture(tmp_path):
 def test_a_new_shape_takes_the_place_of_the_old_one_which_is_kept(tmp_path, monkeypatch):
     run = written(tmp_path)
     before, smaller = load_model(run), ball().vertices * 0.97
-    made = Shape(smaller, ball().faces, "it is better", None, None)
+    made = ReconstructedShape(smaller, ball().faces, "it is better", None, None)
     monkeypatch.setattr(of_run, "reconstructed", lambda vertices, faces, views, left_out: made)
     shaped = shape_run(run)
     after = load_model(run)

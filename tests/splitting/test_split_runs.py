@@ -168,7 +168,7 @@ def test_a_video_in_two_parts_is_one_run_as_good_as_a_whole_one(workers, clip, t
         frames, config, tmp_path / "split", PromptSet(), length="30f", workers=workers,
         listener=lambda one: told.append((one.index, one.refined)),
     )  # fmt: skip
-    assert ended == Ended((tmp_path / "split",), 2)
+    assert ended == SplitResult((tmp_path / "split",), 2)
     assert sorted(told) == sorted([(index, refined) for index in range(LONG) for refined in (False, True)])
     record(open_source(str(frames)), config, tmp_path / "whole")
 
@@ -233,7 +233,7 @@ def test_a_split_run_that_was_stopped_anywhere_goes_on(clip, tmp_path, monkeypat
         except KeyboardInterrupt:
             stops += 1
     assert (stops, due) == (4, set())
-    assert ended == Ended((run,), ended.parts)
+    assert ended == SplitResult((run,), ended.parts)
     assert RunReader(run).state == "finished"
     assert json.loads((run / layout.RUN).read_bytes())["split"]["parts"]
     R = np.stack([one.T_cam_obj[:3, :3] for one in RunReader(run).frames])

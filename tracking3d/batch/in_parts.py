@@ -42,7 +42,7 @@ def begin_in_parts(
     with worked_on(job, out, networks) as work:
         attempts = counted(work)
         begun = begin(counting(tell, None), _video(fetched(job, work / "source"), work, command, workers))
-        if isinstance(begun, Ended):
+        if isinstance(begun, SplitResult):
             return put_away(job, out, work, begun.folders, report, attempts, _note(begun))
         return begun
 
@@ -72,7 +72,7 @@ def step_in_parts(
 
 
 def settle_in_parts(
-    tell: Tell, job: VideoJob, out: str, report: bool, ended: Ended, again: int
+    tell: Tell, job: VideoJob, out: str, report: bool, ended: SplitResult, again: int
 ) -> dict[str, Any]:
     """Put what became of a video into its place.
 
@@ -111,5 +111,5 @@ def _video(job: VideoJob, work: Path, command: str, workers: int) -> LongVideo:
     )
 
 
-def _note(ended: Ended) -> str:
+def _note(ended: SplitResult) -> str:
     return f"its {ended.parts} parts could not be joined: {ended.reason}" if len(ended.folders) > 1 else ""

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from tracking3d.batch.networks import SharedNetwork, keep_networks
-from tracking3d.batch.places import absolute, fetch, joined, local, remove, send, write
+from tracking3d.batch.places import absolute, copy_to_local, join_path, local, remove, send, write
 from tracking3d.batch.summary import MARKER, write_marker
 from tracking3d.batch.video_job import VideoJob
 from tracking3d.config.models import PipelineConfig
@@ -142,7 +142,7 @@ def put_away(
     if report:
         write_reports(runs)
     told = write_marker(work / RUN, job, attempts, runs, note)
-    _put_into_place(work / RUN, joined(out, job.name))
+    _put_into_place(work / RUN, join_path(out, job.name))
     send_log(out, job)
     _forget(work)
     return told
@@ -191,7 +191,7 @@ def fetched(job: VideoJob, folder: Path) -> VideoJob:
     def here(place: str, number: int) -> str:
         if local(place) is not None:
             return absolute(place)
-        return str(fetch(place, folder / str(number)))
+        return str(copy_to_local(place, folder / str(number)))
 
     if job.sequence is not None:
         return job
@@ -231,7 +231,7 @@ def send_log(out: str, job: VideoJob) -> bool:
     log = log_file(out, job)
     if local(out) is None and log.is_file():
         with suppress(OutputError):  # the results are what counts
-            write(joined(out, LOGS, f"{job.name}.log"), log.read_bytes())
+            write(join_path(out, LOGS, f"{job.name}.log"), log.read_bytes())
     return log.is_file()
 
 

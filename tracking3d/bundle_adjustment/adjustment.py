@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from tracking3d.bundle_adjustment.reprojection import (
     BEHIND,
     FloatArray,
+    apply_pose_steps,
     finite_rows,
-    moved,
     pixel_by_point,
     pixel_by_pose,
-    project,
-    to_camera,
+    project_camera_points,
+    transform_to_camera,
 )
 from tracking3d.rendering.backend import compiled
 
@@ -115,7 +115,7 @@ class System:
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class AdjustmentProblem:
     """What stays the same during one adjustment; arguments of `adjust`, with nothing in them that is not finite."""
 
     pixels: FloatArray
@@ -143,7 +143,7 @@ class Problem:
             given = self.pixels, self.weight, K, at.R, at.t, at.points
             total, residual = normal_equations.evaluated(*given, self.scale)
         else:
-            difference = project(to_camera(at.R, at.t, at.points), K) - self.pixels
+            difference = project_camera_points(transform_to_camera(at.R, at.t, at.points), K) - self.pixels
             distance = np.hypot(difference[..., 0], difference[..., 1])
             residual = np.where(self.weight > 0, distance, np.nan)
             relative = np.where(np.isfinite(residual), residual / self.scale, BEHIND)
@@ -167,8 +167,8 @@ class Problem:
     def _linearised(self, at: Structure) -> System:
         """The same without the prior."""
         K = self.intrinsics(at.focal_factor)
-        x_cam = to_camera(at.R, at.t, at.points)
-        difference = project(x_cam, K) - self.pixels
+        x_cam = transform_to_camera(at.R, at.t, at.points)
+        difference = project_camera_points(x_cam, K) - self.pixels
         used = (self.weight > 0) & np.isfinite(difference).all(-1)
         difference = np.where(used[..., None], difference, 0.0)
         # The Cauchy loss as weights of least squares: its derivative is 2 r / (scale^2 + r^2).
@@ -194,7 +194,7 @@ class Problem:
         )
         if self.free_focal:
             # Depths go with the focal length: to first order the image of the object's origin plane stays.
-            pixel = project(x_cam, K) - K[:2, 2]
+            pixel = project_camera_points(x_cam, K) - K[:2, 2]
             by_focal = np.where(used[..., None], root[..., None] * pixel, 0.0)
             by_focal += by_point[..., 2] * at.t[:, None, 2:]
             poses[count, count] = np.sum(by_focal**2)
@@ -213,7 +213,7 @@ class Problem:
             factor = float(np.exp(np.clip(d_poses[-1], -0.5, 0.5)))
             t = t * [1.0, 1.0, factor]
             d_poses = d_poses[:-1]
-        R_moved, t_moved = moved(at.R[self.fixed :], t[self.fixed :], d_poses.reshape(-1, 6))
+        R_moved, t_moved = apply_pose_steps(at.R[self.fixed :], t[self.fixed :], d_poses.reshape(-1, 6))
         R, t = np.concatenate([at.R[: self.fixed], R_moved]), np.concatenate([t[: self.fixed], t_moved])
         return replace(at, R=R, t=t, points=at.points + d_points, focal_factor=at.focal_factor * factor)
 
@@ -263,7 +263,7 @@ def adjust(
     known = finite_rows(start.points)
     prior = np.full((count, 3), np.nan) if point_prior is None else point_prior
     held = known & finite_rows(prior)
-    problem = Problem(
+    problem = AdjustmentProblem(
         pixels=np.where(tracks.visible[..., None], np.nan_to_num(tracks.pixels), 0.0),
         weight=tracks.weights() * known,
         K=np.asarray(K, np.float64),
@@ -300,7 +300,8 @@ def _with_depth_of(reference: Structure, structure: Structure, used: NDArray[np.
     if not used.any():
         return structure
     before, after = (
-        float(np.median(to_camera(s.R[0], s.t[0], s.points[used])[:, 2])) for s in (reference, structure)
+        float(np.median(transform_to_camera(s.R[0], s.t[0], s.points[used])[:, 2]))
+        for s in (reference, structure)
     )
     factor = before / after * structure.focal_factor / reference.focal_factor
     if not (math.isfinite(factor) and factor > 0):

@@ -60,7 +60,7 @@ class Checkpoint:
 
     def save(
         self,
-        progress: Progress,
+        progress: RunProgress,
         session: dict[str, Any],
         taken: JournalEntry | None = None,
         revised: Iterable[int] = (),
@@ -118,7 +118,7 @@ class Checkpoint:
                 raise ValueError(f"{journal.name} is too short")
             taken, skipped = read_journal(text)
             self._taken = {index: number for number, index in enumerate(taken, 1)}
-            kept = Kept(Progress(**state["progress"]), self._trees.read(state["session"]), taken, skipped)
+            kept = Kept(RunProgress(**state["progress"]), self._trees.read(state["session"]), taken, skipped)
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise InputError(f"{path} is damaged ({error}); start anew with {layout.OVERWRITE}.") from error
         return kept

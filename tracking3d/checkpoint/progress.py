@@ -15,7 +15,7 @@ from tracking3d.frames import Frame, SkippedFrame
 
 
 @dataclass(frozen=True)
-class Progress:
+class RunProgress:
     """Where a run stands.
 
     Attributes:
@@ -68,7 +68,7 @@ class Kept:
         skipped: Those that were not.
     """
 
-    progress: Progress
+    progress: RunProgress
     session: dict[str, Any]
     taken: dict[int, JournalEntry] = field(default_factory=dict)
     skipped: tuple[SkippedFrame, ...] = ()

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tracking3d.rendering.backend import compiled
 from tracking3d.trackers.colour_models import Palette, histograms, local_shares, log_ratio
-from tracking3d.trackers.outline import signed_distance
+from tracking3d.trackers.outline import inside_distance
 
 _RATE = 0.1
 _INSIDE, _BESIDE = 0.03, (0.06, 0.4)
@@ -111,7 +111,7 @@ def relative_distance(
     area = int(np.count_nonzero(mask))
     if area in (0, mask.size):  # without an outline everything is far on one side of it
         return np.full(mask.shape, 1.0 if area else -1.0, np.float32)
-    return (signed_distance(mask) if distance is None else distance) / math.sqrt(area)
+    return (inside_distance(mask) if distance is None else distance) / math.sqrt(area)
 
 
 def as_lab(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

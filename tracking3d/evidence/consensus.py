@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tracking3d.evidence.scene import Scene
+from tracking3d.evidence.scene import FrameWindow
 from tracking3d.rendering.backend import compiled
-from tracking3d.trackers.outline import signed_distance
+from tracking3d.trackers.outline import inside_distance
 
 CELLS = 64
 RANKS = (0.04, 0.15)
@@ -42,16 +42,16 @@ class Consensus:
         self._views: list[NDArray[np.int8]] = []
         self._hulls: NDArray[np.float32] | None = None
 
-    def see(self, scene: Scene) -> None:
+    def see(self, scene: FrameWindow) -> None:
         """Add a frame whose pose and mask are believed."""
         # Beyond the window nothing is the object, beyond the frame nothing is known.
         size = scene.window.size
-        distance = np.clip(signed_distance(scene.answer), -size, size)
+        distance = np.clip(inside_distance(scene.answer), -size, size)
         P = scene.K @ scene.T_cam_obj[:3]
         step = self._side / CELLS
         to_pixels = np.column_stack([step * P[:, :3], P[:, :3] @ (self._low + step / 2) + P[:, 3]])
         by_depth = 1 / (float(scene.K[0, 0]) * self._unit)
-        values = carried(distance, ~scene.valid, to_pixels, by_depth, -size)
+        values = sample_grid_distances(distance, ~scene.valid, to_pixels, by_depth, -size)
         if values is not None:
             self._views.append(values)
 
@@ -69,7 +69,7 @@ class Consensus:
         self._hulls = with_peaks(hull.reshape(len(RANKS), CELLS, CELLS, CELLS))
         self._views = []
 
-    def drawn(self, scene: Scene) -> NDArray[np.float32] | None:
+    def drawn(self, scene: FrameWindow) -> NDArray[np.float32] | None:
         """``(R, S, S)`` pixels within (positive) or from the hulls in a frame; None where they are not known."""
         if self._hulls is None or not np.isfinite(scene.T_cam_obj).all():
             return None
@@ -99,7 +99,7 @@ class Consensus:
         return np.stack([cv2.resize(one, (size, size), interpolation=cv2.INTER_LINEAR) for one in nearest])
 
 
-def carried(
+def sample_grid_distances(
     distance: NDArray[np.float32],
     unknown: NDArray[np.bool_],
     to_pixels: NDArray[np.float64],
@@ -121,7 +121,9 @@ def carried(
     if compiled():
         from tracking3d.evidence.kernels import consensus
 
-        return consensus.carried(distance, unknown, to_pixels, by_depth, beyond, _NEAR, CELLS, _UNKNOWN)
+        return consensus.sample_grid_distances(
+            distance, unknown, to_pixels, by_depth, beyond, _NEAR, CELLS, _UNKNOWN
+        )
     z, y, x = np.mgrid[:CELLS, :CELLS, :CELLS].reshape(3, -1)
     u, v, depth = to_pixels @ np.stack([x, y, z, np.ones_like(x)])
     if (depth <= _NEAR).any():

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.evidence.scene import Mask, Plane, Scene
+from tracking3d.evidence.scene import FrameWindow, Mask, Plane
 from tracking3d.frames import Image
 from tracking3d.geometry.camera import Camera
 from tracking3d.rendering.backend import compiled
@@ -78,7 +78,7 @@ def background_motion(
     return np.asarray(np.linalg.inv(to_small) @ H @ to_small)
 
 
-def apart(scene: Scene, camera: Camera, target: Target) -> float:
+def apart(scene: FrameWindow, camera: Camera, target: Target) -> float:
     """Median of the frame pixels by which the two motions part in the answer; 0 where it cannot be told."""
     step = max(scene.window.size // 24, 1)
     parted = np.linalg.norm(
@@ -88,7 +88,7 @@ def apart(scene: Scene, camera: Camera, target: Target) -> float:
     return float(np.median(parted)) if parted.size else 0.0
 
 
-def motion_cue(scene: Scene, camera: Camera, targets: Sequence[Target]) -> NDArray[np.float32]:
+def motion_cue(scene: FrameWindow, camera: Camera, targets: Sequence[Target]) -> NDArray[np.float32]:
     """``(2, S, S)`` log of how badly the background's motion explains a pixel over how badly the object's does.
 
     Args:
@@ -119,7 +119,7 @@ def motion_cue(scene: Scene, camera: Camera, targets: Sequence[Target]) -> NDArr
 
 
 def _parted_ways(
-    scene: Scene, camera: Camera, target: Target
+    scene: FrameWindow, camera: Camera, target: Target
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Where pixels are in another frame.
 
@@ -169,13 +169,13 @@ def parted_ways(
     return ways, np.clip((parted - apart[0]) / (apart[1] - apart[0]), 0, 1) * inside
 
 
-def _through(scene: Scene, camera: Camera, T_cam_obj: Matrix) -> tuple[Matrix, Matrix]:
+def _through(scene: FrameWindow, camera: Camera, T_cam_obj: Matrix) -> tuple[Matrix, Matrix]:
     """``(3, 3)`` and ``(3,)`` that take the window's ``u, v, 1`` and one over a depth to the other frame's pixels."""
     T = T_cam_obj @ np.linalg.inv(scene.T_cam_obj)
     return camera.K @ T[:3, :3] @ np.linalg.inv(scene.K), camera.K @ T[:3, 3]
 
 
-def _object_flow(scene: Scene, camera: Camera, T_cam_obj: Matrix, step: int = 1) -> NDArray[np.float32]:
+def _object_flow(scene: FrameWindow, camera: Camera, T_cam_obj: Matrix, step: int = 1) -> NDArray[np.float32]:
     """``(S, S, 2)`` where in the other frame a pixel's surface point is; NaN where there is none."""
     inverse_depth = scene.inverse_depth[::step, ::step, None]
     through, shift = _through(scene, camera, T_cam_obj)
@@ -183,7 +183,7 @@ def _object_flow(scene: Scene, camera: Camera, T_cam_obj: Matrix, step: int = 1)
     return _projected(np.where(inverse_depth > 0, moved, np.nan))
 
 
-def _background_flow(scene: Scene, H: Matrix, step: int = 1) -> NDArray[np.float32]:
+def _background_flow(scene: FrameWindow, H: Matrix, step: int = 1) -> NDArray[np.float32]:
     """``(S, S, 2)`` where in the other frame a pixel of the background is."""
     return _projected(_carried(scene.window.size, H @ scene.window.to_frame, step))
 

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from tracking3d.points.alignment import NOISE, align
-from tracking3d.points.view import REACH, Array, Plane, View
+from tracking3d.points.view import REACH, Array, Plane, SurfaceView
 from tracking3d.rendering.backend import use_numba
 from tracking3d.rendering.visibility import NEAR
 
@@ -54,7 +54,7 @@ class Warps:
         tolerance: How far behind a drawn surface a point may lie and be seen, in object units.
     """
 
-    def __init__(self, views: list[View | None], tolerance: float) -> None:
+    def __init__(self, views: list[SurfaceView | None], tolerance: float) -> None:
         self.views, self.tolerance = views, tolerance
         self._pixels: tuple[int, NDArray[np.bool_], Array] | None = (
             None  # of the view that was last asked for
@@ -110,7 +110,7 @@ class Warps:
         return self._pixels[1:]
 
 
-def _warped(source: View, target: View, tolerance: float) -> tuple[Plane, Plane]:
+def _warped(source: SurfaceView, target: SurfaceView, tolerance: float) -> tuple[Plane, Plane]:
     """The same by the kernel, rows shared among threads."""
     from tracking3d.points.kernels.warping import warp
     from tracking3d.rendering.kernels.threads import share

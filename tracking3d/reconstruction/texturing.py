@@ -34,7 +34,7 @@ Seen = tuple[NDArray[np.int64], FloatArray, FloatArray]
 """The texels ``(N,)`` that a view shows, their colours ``(3, N)`` in [0, 1], and how well each is seen ``(N,)``."""
 
 
-def textured(model: ObjectModel, views: Sequence[TextureView], largest: int = 2048) -> ObjectModel:
+def bake_texture(model: ObjectModel, views: Sequence[TextureView], largest: int = 2048) -> ObjectModel:
     """The model with a texture at the views' resolution; the same where no view shows it.
 
     Args:

@@ -131,7 +131,6 @@ def summary(
     causal = records if causal is None else causal
     per_frame = [record.seconds for record in causal]
     own = [record for record in records if record.mask_source is not None and record.mask_source.is_own]
-    memory = resident_memory()
     failures = Counter(record.failure for record in records if record.failure)
     return {
         "counts": {
@@ -155,7 +154,7 @@ def summary(
         },
         "iou_initial_mean": _mean_iou(records),
         "iou_initial_mean_own": _mean_iou(own),
-        "peak_memory_mb": memory and memory[1],
+        "peak_memory_mb": resident_memory()[1],
     }
 
 

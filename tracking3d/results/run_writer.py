@@ -30,7 +30,7 @@ from tracking3d.results.files import (
     writing,
 )
 from tracking3d.results.frame_lines import FrameLines, WrittenSoFar
-from tracking3d.results.making_room import make_room
+from tracking3d.results.making_room import clear_run_folder
 from tracking3d.results.mesh_export import export_mesh
 from tracking3d.results.notes import notes_of_run
 from tracking3d.results.pictures import Pictures
@@ -85,7 +85,7 @@ class RunWriter:
         self._lines = FrameLines(self.folder)
         try:
             if resume is None:
-                make_room(self.folder, overwrite)
+                clear_run_folder(self.folder, overwrite)
             with writing(self.folder):
                 if resume is None:
                     self._lines.begin()

@@ -10,7 +10,7 @@ from tracking3d.config.models import PipelineConfig
 from tracking3d.open_tracking import open_tracking, request_tracking
 from tracking3d.recording import RecordOptions, record_tracking
 from tracking3d.results import layout
-from tracking3d.results.making_room import make_room
+from tracking3d.results.making_room import clear_run_folder
 from tracking3d.results.run_reader import is_finished
 from tracking3d.splitting.cutting import windows
 from tracking3d.splitting.long_video import Ended, LongVideo, Tell, frames_of_part
@@ -52,7 +52,7 @@ class Begun:
     jobs: tuple[PartJob, ...]
 
 
-def begin(tell: Tell, video: LongVideo) -> Begun | Ended:
+def begin(tell: Tell, video: LongVideo) -> Begun | SplitResult:
     """Cut a video, unless it is one part, or done; ``tell`` is given the answers where it is tracked here.
 
     Raises:
@@ -72,9 +72,9 @@ def begin(tell: Tell, video: LongVideo) -> Begun | Ended:
     if resume and (layout.has_state(folder) or is_there(folder)):  # joined already
         record_tracking(request, folder, options, tell)
         remove_parts(folder)
-        return Ended((folder,), 1)
+        return SplitResult((folder,), 1)
     if not resume:
-        make_room(folder, video.overwrite)
+        clear_run_folder(folder, video.overwrite)
         remove_parts(folder)
     with open_tracking(replace(request, skip_damaged=True), folder if resume else None) as tracking:
         config, choice, first = tracking.config, tracking.tracker_choice, tracking.first
@@ -90,7 +90,7 @@ def begin(tell: Tell, video: LongVideo) -> Begun | Ended:
         return Ended((folder,), 1, "no frame near to where it was to be cut shows the object well")
     jobs = _part_jobs(video, config, count, plan, resume=kept is not None)
     if kept is not None and all(is_finished(job.folder) for job in jobs):
-        return Ended(tuple(job.folder for job in jobs), len(jobs), BEFORE)
+        return SplitResult(tuple(job.folder for job in jobs), len(jobs), BEFORE)
     return Begun(video, config, choice, count, plan, jobs)
 
 

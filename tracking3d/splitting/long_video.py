@@ -58,7 +58,7 @@ class LongVideo:
 
 
 @dataclass(frozen=True)
-class Ended:
+class SplitResult:
     """What became of a video that was to be split.
 
     Attributes:

@@ -11,7 +11,7 @@ from tracking3d.last_passes import PrecomputedRefinement
 from tracking3d.splitting.beginning import Begun
 from tracking3d.splitting.ending import Again, Ending, Joined, Refused, Tracked, end, join
 from tracking3d.splitting.last_looks import Placing, Settling, Weighing, place, put_together, settle, weigh
-from tracking3d.splitting.long_video import Ended
+from tracking3d.splitting.long_video import SplitResult
 from tracking3d.splitting.part_runs import PartJob, Revisit, look_again, track_part
 
 
@@ -32,7 +32,7 @@ class Step:
     frames: int = 0
 
 
-Steps = Generator[list[Step], list[Any], Ended]
+Steps = Generator[list[Step], list[Any], SplitResult]
 """Gives steps that may be done side by side, and is sent what they returned, in their order."""
 
 
@@ -54,7 +54,7 @@ def steps_of(begun: Begun) -> Steps:
     if isinstance(found, Refused):
         whole = [replace(job, resume=True, first_pass_only=False) for job in jobs]
         yield [Step(track_part, job, f"end of part {number} of {of}") for number, job in enumerate(whole, 1)]
-        return Ended(tuple(job.folder for job in jobs), of, found.reason)
+        return SplitResult(tuple(job.folder for job in jobs), of, found.reason)
     assert isinstance(found, Joined)
     clock = time.monotonic()
     looks = found.looks
@@ -64,7 +64,7 @@ def steps_of(begun: Begun) -> Steps:
     ]
     seconds = {**found.seconds, "second_look": time.monotonic() - clock}
     yield from steps_to_the_end(replace(found, seconds=seconds))
-    return Ended((begun.video.folder,), of)
+    return SplitResult((begun.video.folder,), of)
 
 
 def steps_to_the_end(joined: Joined) -> Generator[list[Step], list[Any], None]:

@@ -9,7 +9,7 @@ import pytest
 from tracked_solids import disturbed, scene
 
 from tracking3d.bundle_adjustment import adjustment
-from tracking3d.bundle_adjustment.adjustment import Problem, adjust
+from tracking3d.bundle_adjustment.adjustment import AdjustmentProblem, adjust
 from tracking3d.estimation.online import pose_from_points
 from tracking3d.estimation.online.pose_from_points import pose_of_tracks
 from tracking3d.rendering.kernels.threads import get_num_threads, set_num_threads
@@ -47,7 +47,7 @@ def posed(given, fixed, free_focal):
     prior = given.truth.points + 0.1
     weights = random.uniform(0, 0.3, len(prior))
     pixels = np.nan_to_num(given.tracks.pixels)
-    return Problem(pixels, weight, given.K, fixed, 2.0, free_focal, prior, weights), replace(
+    return AdjustmentProblem(pixels, weight, given.K, fixed, 2.0, free_focal, prior, weights), replace(
         at, focal_factor=1.1
     )
 

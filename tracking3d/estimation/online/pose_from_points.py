@@ -8,21 +8,27 @@ Cauchy loss.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from tracking3d.bundle_adjustment.reprojection import (
     BEHIND,
     FloatArray,
+    apply_pose_steps,
     finite_rows,
-    moved,
     pixel_by_point,
     pixel_by_pose,
-    project,
-    to_camera,
+    project_camera_points,
+    transform_to_camera,
+)
+from tracking3d.estimation.online.pnp_types import (
+    CONVERGED,
+    FIRST_DAMPING,
+    MOST_DAMPING,
+    PnPFit,
+    PointEquations,
+    PoseHypothesis,
 )
 from tracking3d.rendering.backend import compiled
 
@@ -30,64 +36,6 @@ _FEWEST = 4
 _SAMPLES = 500
 _CONFIDENCE = 0.999
 _REFINEMENTS = 2
-FIRST_DAMPING, MOST_DAMPING = 1e-4, 1e9
-CONVERGED = 1e-6
-
-
-@dataclass(frozen=True, eq=False)
-class PoseHypothesis:
-    """One pose and who agrees with it.
-
-    Attributes:
-        R: ``(3, 3)`` and
-        t: ``(3,)`` of ``T_cam_obj``.
-        inliers: ``(N,)`` bool, which points are seen within the threshold.
-        residual: Root of the inliers' mean squared distance, in pixels.
-    """
-
-    R: FloatArray
-    t: FloatArray
-    inliers: NDArray[np.bool_]
-    residual: float
-
-    @property
-    def count(self) -> int:
-        """How many points agree."""
-        return int(np.count_nonzero(self.inliers))
-
-
-@dataclass(frozen=True, eq=False)
-class PointEquations:
-    """A quadratic model ``cost + gradient d + d matrix d / 2`` of the points' mean Cauchy loss in ``d = (v, w)``.
-
-    As `tracking3d.rendering.NormalEquations`, of one frame, with ``t`` as pivot.
-
-    Attributes:
-        matrix: ``(6, 6)``.
-        gradient: ``(6,)``.
-        cost: By weight; a point behind the camera costs a large constant.
-        residual: ``(N,)`` distance in pixels; nan for points without weight or behind the camera.
-    """
-
-    matrix: FloatArray
-    gradient: FloatArray
-    cost: float
-    residual: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class PoseFit:
-    """A pose refined from a start.
-
-    Attributes:
-        R: ``(3, 3)`` and
-        t: ``(3,)`` of ``T_cam_obj``.
-        equations: The model at this pose.
-    """
-
-    R: FloatArray
-    t: FloatArray
-    equations: PointEquations
 
 
 def pose_from_points(
@@ -133,7 +81,7 @@ def pose_of_tracks(
     t: FloatArray,
     scale: float,
     iterations: int = 10,
-) -> PoseFit:
+) -> PnPFit:
     """The pose of least robust reprojection error near a start; never worse than the start.
 
     Args:
@@ -157,7 +105,9 @@ def pose_of_tracks(
         diagonal = at.matrix.diagonal()
         floor = 1e-9 * diagonal.max() + 1e-12
         step = -np.linalg.solve(at.matrix + np.diag(damping * diagonal + floor), at.gradient)
-        R_new, t_new = (part[0] for part in moved(R[None], t[None], np.asarray(step[None], np.float64)))
+        R_new, t_new = (
+            part[0] for part in apply_pose_steps(R[None], t[None], np.asarray(step[None], np.float64))
+        )
         new = point_equations(points, pixels, weight, K, R_new, t_new, scale)
         if not new.cost < at.cost:
             damping = min(10 * damping, MOST_DAMPING)
@@ -166,7 +116,7 @@ def pose_of_tracks(
         R, t, at, damping = R_new, t_new, new, damping / 10
         if settled:
             break
-    return PoseFit(R, t, at)
+    return PnPFit(R, t, at)
 
 
 def point_equations(
@@ -180,8 +130,8 @@ def point_equations(
 ) -> PointEquations:
     """The points' normal equations at a pose; all zero if there is no point. Arguments as of `pose_of_tracks`."""
     share = _shares(points, pixels, weight)
-    x_cam = to_camera(R, t, np.where(finite_rows(points)[:, None], points, 0.0))
-    difference = project(x_cam, K) - pixels
+    x_cam = transform_to_camera(R, t, np.where(finite_rows(points)[:, None], points, 0.0))
+    difference = project_camera_points(x_cam, K) - pixels
     residual = np.where(share > 0, np.hypot(difference[:, 0], difference[:, 1]), np.nan)
     used = np.isfinite(residual)
     relative = np.where(used, residual / scale, BEHIND)

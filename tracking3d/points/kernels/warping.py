@@ -49,7 +49,7 @@ def warp(
     """Fill rows ``first`` to before ``last`` of ``warped`` and ``known``, both ``(h, w)``.
 
     Args:
-        inverse_depth, beyond, intrinsics: Of the view that is written; see `tracking3d.points.view.View`.
+        inverse_depth, beyond, intrinsics: Of the view that is written; see `tracking3d.points.view.SurfaceView`.
         reach: Pixels beyond its outline up to which there is something.
         T_source_target: ``(4, 4)`` from its camera coordinates to the other view's.
         source_intrinsics, source_image, source_mask, source_inverse_depth: Of the other view.

@@ -20,7 +20,7 @@ from tracking3d.rendering.kernels.texture_losses import bilinear_weights, taps_o
 from tracking3d.rendering.kernels.threads import share
 from tracking3d.rendering.kernels.visibility import draw_view
 from tracking3d.rendering.normal_equations import NormalEquations
-from tracking3d.rendering.pose_terms import MatchedPoints, PoseTarget, PoseTerms, Scales
+from tracking3d.rendering.pose_comparison import MatchedPoints, PoseTarget, PoseTerms, Scales
 from tracking3d.rendering.surface import Surface
 from tracking3d.rendering.visibility import NEAR
 

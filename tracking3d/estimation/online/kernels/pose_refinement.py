@@ -14,7 +14,7 @@ from tracking3d.bundle_adjustment.kernels.reprojection import (
     turned_by,
 )
 from tracking3d.bundle_adjustment.reprojection import FloatArray
-from tracking3d.estimation.online.pose_refinement import (
+from tracking3d.estimation.online.pose_refinement_types import (
     ENOUGH,
     FIRST_DAMPING,
     LEAST_DAMPING,
@@ -39,7 +39,7 @@ from tracking3d.rendering.kernels.pose_terms import (
     terms_of_pose,
 )
 from tracking3d.rendering.kernels.threads import share
-from tracking3d.rendering.pose_terms import NEAREST_POINT, check_comparison
+from tracking3d.rendering.pose_comparison import NEAREST_POINT, check_comparison
 
 _COST, _APPEARANCE, _OUTLINE, _POINTS, _OVERLAP, _UNSEEN = range(6)
 

@@ -1,4 +1,7 @@
-"""``tracking3d bench soak``: does a long run stay as it is?"""
+"""Does a long run stay flat in memory, open files and seconds a frame?
+
+python benchmarks/soak.py --frames 10000 --plot soak.png
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,8 @@ from typing import Annotated
 
 import typer
 
-from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset
+from script import run
+from tracking3d.cli.options import ConfigFile, Overrides, Preset
 
 
 def soak(
@@ -29,15 +33,14 @@ def soak(
     preset: Preset = None,
     overrides: Overrides = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON only.")] = False,
-    debug: Debug = False,
 ) -> None:
-    """Track an object that leaves and returns for 10,000 frames: memory, open files, seconds a frame stay flat."""
+    """Track an object that leaves and returns for 10,000 frames; the exit code is 1 if memory or time keeps growing."""
     import json
     import tempfile
     from dataclasses import asdict
 
-    from tracking3d.benchmark.soak import format_soak, plot_soak
-    from tracking3d.benchmark.soak import soak as run_soak
+    from looped_run import track_looped
+    from soak_report import format_soak, plot_soak
     from tracking3d.cli.options import configure
     from tracking3d.cli.tables import print_table
     from tracking3d.speed.plot import check_plot
@@ -46,7 +49,9 @@ def soak(
         check_plot(plot)
     settings = configure(config, preset, overrides)
     with tempfile.TemporaryDirectory() as temporary:
-        report = run_soak(settings, out or Path(temporary) / "run", frames, hours, (width, width * 3 // 4))
+        report = track_looped(
+            settings, out or Path(temporary) / "run", frames, hours, (width, width * 3 // 4)
+        )
     if plot:
         plot_soak(report, plot)
     if as_json:
@@ -55,3 +60,7 @@ def soak(
         print_table(format_soak(report))
     if not report.flat:
         raise typer.Exit(1)
+
+
+if __name__ == "__main__":
+    run(soak)

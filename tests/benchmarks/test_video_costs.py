@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from recorded_runs import write_run
 
-from tracking3d.benchmark.video_costs import Machine, RunFigures, cost_of, figures_of, markdown
 from tracking3d.errors import InputError
+from video_costs import Machine, RunFigures, cost_of, figures_of, markdown
 
 FIGURES = RunFigures(
     seconds=0.5, decoding=0.01, seconds_once=30, bytes_read=1e4, bytes_written=2e4, bytes_once=6e6, memory=1e9

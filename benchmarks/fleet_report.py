@@ -9,14 +9,16 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from tracking3d.benchmark.scheduling import ORDERS, Fleet, Outcome, Splitting, simulate
+from fleet_simulation import ORDERS, Fleet, ScheduleOutcome, Splitting, simulate
 from tracking3d.results.files import writing
 
 NAMES = {"longest": "longest first", "first": "as they come", "random": "random"}
 _COLOURS = {"longest": "#1b7837", "first": "#2166ac", "random": "#b2182b"}
 
 
-def compared(work: Any, fleet: Fleet, splitting: Splitting | None, seed: int = 0) -> dict[str, Outcome]:
+def compared(
+    work: Any, fleet: Fleet, splitting: Splitting | None, seed: int = 0
+) -> dict[str, ScheduleOutcome]:
     """Every order with whole videos and, where ``splitting`` says how, with long ones cut; by a name in words."""
     outcomes = {}
     for order in ORDERS:
@@ -26,7 +28,7 @@ def compared(work: Any, fleet: Fleet, splitting: Splitting | None, seed: int = 0
     return outcomes
 
 
-def format_outcomes(outcomes: Mapping[str, Outcome]) -> Table:
+def format_outcomes(outcomes: Mapping[str, ScheduleOutcome]) -> Table:
     """A row for each."""
     table = Table("order", "hours", "busy", "last 1 % of videos", "done twice", "tasks", "given up")
     for name, one in outcomes.items():
@@ -34,14 +36,14 @@ def format_outcomes(outcomes: Mapping[str, Outcome]) -> Table:
     return table
 
 
-def markdown(outcomes: Mapping[str, Outcome]) -> str:
+def markdown(outcomes: Mapping[str, ScheduleOutcome]) -> str:
     """The same as a table of Markdown."""
     head = "| order | hours | busy | last 1 % of videos | done twice | tasks | given up |\n"
     head += "|---|---|---|---|---|---|---|\n"
     return head + "".join(f"| {name} | {' | '.join(row_of(one))} |\n" for name, one in outcomes.items())
 
 
-def row_of(outcome: Outcome) -> list[str]:
+def row_of(outcome: ScheduleOutcome) -> list[str]:
     """An outcome in words."""
     return [
         f"{outcome.makespan / 3600:.1f}",
@@ -53,13 +55,13 @@ def row_of(outcome: Outcome) -> list[str]:
     ]
 
 
-def as_json(outcome: Outcome) -> dict[str, Any]:
+def as_json(outcome: ScheduleOutcome) -> dict[str, Any]:
     """An outcome as JSON has it."""
     names = ("makespan", "busy", "tail", "wasted", "attempts", "given_up")
     return {name: getattr(outcome, name) for name in names}
 
 
-def plot_outcomes(outcomes: Mapping[str, Outcome], workers: int, path: Path) -> None:
+def plot_outcomes(outcomes: Mapping[str, ScheduleOutcome], workers: int, path: Path) -> None:
     """Draw how many workers work over time, and how many videos are done.
 
     Args:

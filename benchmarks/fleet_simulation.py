@@ -66,7 +66,7 @@ class Splitting:
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class ScheduleOutcome:
     """How it went.
 
     Attributes:
@@ -121,7 +121,7 @@ def simulate(
     order: Order = "longest",
     splitting: Splitting | None = None,
     seed: int = 0,
-) -> Outcome:
+) -> ScheduleOutcome:
     """Run all videos.
 
     Args:
@@ -164,7 +164,7 @@ class _Simulation:
         self.attempts = 0
         self.changes: list[tuple[float, int]] = []
 
-    def run(self) -> Outcome:
+    def run(self) -> ScheduleOutcome:
         """To the end."""
         for video in range(len(self.work)):
             self.add(video, self._first_work(video), 0)
@@ -189,7 +189,7 @@ class _Simulation:
                 self._ended(ended, now, again=worker < 0)
         last = float(np.nanmax(self.ends, initial=0.0))
         busy = self.worked / (self.fleet.workers * last) if last else 0.0
-        return Outcome(
+        return ScheduleOutcome(
             last, self.ends, busy, self.wasted, self.attempts, int(np.isnan(self.ends).sum()), self._working()
         )
 

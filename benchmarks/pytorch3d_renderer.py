@@ -2,7 +2,7 @@
 
 Written against its documented interface. Where the package is absent, as in this project's own tests, it cannot be
 tried: the tests call it with a stand-in of that interface. Check the first figures of an installation with
-``Scene.loss``, which has to agree with that of ``render`` to about a per cent.
+``RenderScene.loss``, which has to agree with that of ``render`` to about a per cent.
 
 Two things differ from `tracking3d.rendering`. At most `FACES_PER_PIXEL` faces are kept at a pixel, the nearest instead
 of the first ones; and a face counts within a distance of ``boxlen`` instead of within its grown box. The number kept

@@ -1,4 +1,7 @@
-"""``tracking3d bench schedule``: many videos over many workers, simulated."""
+"""Simulate many videos over many workers: in which order, cut or whole?
+
+python benchmarks/schedule.py --workers 1000 --part 300
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from tracking3d.cli.options import Debug
+from script import run
 
 
 def schedule(
@@ -28,21 +31,19 @@ def schedule(
     retries: Annotated[int, typer.Option(min=0, help="Times that a task is tried again.")] = 3,
     resume: Annotated[
         bool,
-        typer.Option("--resume/--anew", help="Whether what lost workers did is kept.", show_default=False),
+        typer.Option("--resume/--restart", help="Whether what lost workers did is kept.", show_default=False),
     ] = True,
     seed: Annotated[int, typer.Option(min=0, help="Of what is random.")] = 0,
     plot: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draw it into an .svg, .png or .pdf.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON only.")] = False,
-    debug: Debug = False,
+    json_only: Annotated[bool, typer.Option("--json", help="Print JSON only.")] = False,
 ) -> None:
     """Simulate many videos of skewed length over many workers: order, retries, stragglers, cut or whole."""
     import json
 
-    from tracking3d.benchmark.scheduling import Fleet, Splitting, skewed_lengths
-    from tracking3d.benchmark.scheduling_plot import as_json as told
-    from tracking3d.benchmark.scheduling_plot import compared, format_outcomes, plot_outcomes
+    from fleet_report import as_json, compared, format_outcomes, plot_outcomes
+    from fleet_simulation import Fleet, Splitting, skewed_lengths
     from tracking3d.cli.tables import print_table
     from tracking3d.speed.plot import check_plot
 
@@ -53,7 +54,11 @@ def schedule(
     outcomes = compared(work * skewed_lengths(videos, median, spread, seed), fleet, splitting, seed)
     if plot:
         plot_outcomes(outcomes, workers, plot)
-    if as_json:
-        typer.echo(json.dumps({name: told(one) for name, one in outcomes.items()}))
+    if json_only:
+        typer.echo(json.dumps({name: as_json(one) for name, one in outcomes.items()}))
     else:
         print_table(format_outcomes(outcomes))
+
+
+if __name__ == "__main__":
+    run(schedule)

@@ -31,7 +31,7 @@ _TAKEN = "seconds.json"
 
 
 @dataclass(frozen=True)
-class Measured:
+class SplitMeasurement:
     """One way of tracking the video.
 
     Attributes:
@@ -94,7 +94,7 @@ def measure_split(
     masks: str = "truth",
     size: tuple[int, int] = (320, 240),
     told: Callable[[str], None] = lambda sentence: None,
-) -> dict[str, Measured]:
+) -> dict[str, SplitMeasurement]:
     """Track the video whole and in parts; a run that is finished in ``folder`` is not done again.
 
     Args:
@@ -145,21 +145,21 @@ def measure_split(
     return measured
 
 
-def _measured(folder: Path, T_true: NDArray[np.float64]) -> Measured:
+def _measured(folder: Path, T_true: NDArray[np.float64]) -> SplitMeasurement:
     taken = json.loads((folder / _TAKEN).read_text(encoding="utf-8"))
     if not (folder / layout.RUN).is_file():  # the parts were not joined
-        return Measured(taken["seconds"], np.nan, np.nan, np.nan, {}, taken["parts"], taken["reason"])
+        return SplitMeasurement(taken["seconds"], np.nan, np.nan, np.nan, {}, taken["parts"], taken["reason"])
     run = RunReader(folder)
     R = np.stack([one.T_cam_obj[:3, :3] for one in run.frames])
     errors = aligned_rotation_errors(R, T_true[[one.index for one in run.frames], :3, :3])
     stages = (run.description.get("split") or {}).get("seconds", {})
     tracked = float(np.mean([one.status == "tracked" for one in run.frames]))
-    return Measured(
+    return SplitMeasurement(
         taken["seconds"], float(errors.mean()), float(np.median(errors)), tracked, stages, taken["parts"]
     )
 
 
-def format_split(measured: dict[str, Measured]) -> Table:
+def format_split(measured: dict[str, SplitMeasurement]) -> Table:
     """Whole and in parts, side by side."""
     table = Table("", *measured)
     rows = {

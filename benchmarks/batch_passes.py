@@ -12,17 +12,18 @@ import os
 import shutil
 import signal
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
+from rich.table import Table
 
-from tracking3d.batch import fault_plugins
+import faulty_trackers
+from machine_load import Load, measured_load
 from tracking3d.batch.folder import read_failures
-from tracking3d.batch.load import Load, measured_load
 from tracking3d.batch.one_video import WORK
 from tracking3d.batch.running import Happening, run_batch
 from tracking3d.batch.video_job import VideoJob
@@ -181,7 +182,7 @@ def _with_faults(jobs: Sequence[VideoJob], folder: Path, disk: bool) -> list[Vid
     """The same clips, and beside them one that is damaged, one whose plug-in aborts, and one that fills the disk."""
     trackers = {"Aborting": ABORTING, "Filling": FILLING}
     entries = [
-        f"tracking3d.trackers:{name}={fault_plugins.__file__}:{kind}" for kind, name in trackers.items()
+        f"tracking3d.trackers:{name}={faulty_trackers.__file__}:{kind}" for kind, name in trackers.items()
     ]
     os.environ[VARIABLE] = ";".join(entries)
     note = (folder / "disk_was_full").absolute()
@@ -345,3 +346,37 @@ def speed_up(passes: Sequence[Pass]) -> float | None:
     if len(plain) < 2:
         return None
     return (plain[-1].finished / plain[-1].seconds) / (plain[0].finished / plain[0].seconds)
+
+
+def format_passes(passes: Sequence[Pass]) -> Table:
+    """A row for each pass."""
+    table = Table("", "workers", "seconds", "videos", "frames/s", "difference", "tried again", "failed")
+    for one in passes:
+        table.add_row(
+            one.label,
+            str(one.workers),
+            f"{one.seconds:.1f}",
+            str(one.finished),
+            f"{one.frames_per_second:.2f}",
+            f"{one.different:.1e}",
+            str(len(one.again)),
+            str(len(one.failed)),
+        )
+    return table
+
+
+def load_in_words(one: Pass) -> Iterator[str]:
+    """What a pass took of the machine at most, and how much it grew; nothing if that was not measured."""
+    if most := one.load:
+        yield (
+            f"{one.label}: at most {most['memory']:.0f} MB in {most['processes']:.0f} processes "
+            f"({most['own_memory']:.0f} MB in the first), {most['descriptors']:.0f} open files, "
+            f"{most['shared_memory']:.1f} MB of shared memory, {most['unfinished']:.1f} MB of unfinished work"
+        )
+    if grown := one.growth:
+        yield (
+            f"{one.label}: from the second quarter to the last {grown['own_memory']:+.1f} MB and "
+            f"{grown['own_descriptors']:+.1f} open files in the first process, {grown['memory']:+.1f} MB and "
+            f"{grown['descriptors']:+.1f} open files in all, {grown['shared_memory']:+.1f} MB of shared memory, "
+            f"{grown['unfinished']:+.1f} MB of unfinished work"
+        )

@@ -6,20 +6,17 @@ The object of a short synthetic clip turns to and fro, and leaves the frame and 
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
+import psutil
 from numpy.typing import NDArray
-from rich.table import Table
 
 from tracking3d.config.models import PipelineConfig
-from tracking3d.errors import OutputError
 from tracking3d.frames import Frame, SkippedFrame
 from tracking3d.geometry.camera import Camera
 from tracking3d.process_memory import resident_memory
@@ -38,7 +35,6 @@ SPEED = 0.25
 _TURNING = 60  # frames of a round in which the object turns in sight; it comes back the way it went
 _LEAVING = 12  # frames in which it leaves, and as many in which it returns
 _ABSENT = 6  # frames without it
-_DESCRIPTORS = Path("/proc/self/fd")
 
 
 @dataclass(frozen=True)
@@ -48,15 +44,15 @@ class Sample:
     Attributes:
         index: The frame.
         seconds: From the frame before to this one.
-        memory: Megabytes of the process; None where the system does not tell.
-        descriptors: Open files of the process; None where the system does not tell.
+        memory: Megabytes of the process.
+        descriptors: Open files of the process.
         status: Of the answer.
     """
 
     index: int
     seconds: float
-    memory: float | None
-    descriptors: int | None
+    memory: float
+    descriptors: int
     status: str
 
 
@@ -154,7 +150,7 @@ def looped_clip(size: tuple[int, int]) -> tuple[NDArray[np.uint8], NDArray[np.bo
     return np.clip(noisy.round(), 0, 255).astype(np.uint8), mask, clip.camera
 
 
-def soak(
+def track_looped(
     config: PipelineConfig,
     folder: Path,
     frames: int = 10_000,
@@ -182,9 +178,9 @@ def soak(
 
     def measure(answer: FrameRecord | SkippedFrame) -> None:
         nonlocal before
-        now, memory = time.perf_counter(), resident_memory()
+        now, (memory, _) = time.perf_counter(), resident_memory()
         status = str(answer.status) if isinstance(answer, FrameRecord) else "skipped"
-        samples.append(Sample(answer.index, now - before, memory and memory[0], _open_descriptors(), status))
+        samples.append(Sample(answer.index, now - before, memory, _open_descriptors(), status))
         before = time.perf_counter()
 
     solver = config.solver.model_copy(update={"final_refine": False})
@@ -214,8 +210,6 @@ def trends(samples: list[Sample], round_length: int) -> dict[str, Trend]:
         ("seconds", SPEED, np.median),
     ):
         values = [getattr(sample, name) for sample in settled]
-        if any(value is None for value in values):
-            continue
         # Whole rounds are alike; single frames are not: some enter the map, in some the object is searched for.
         rounds = len(values) // round_length
         levels = [float(level_of(values[n * round_length : (n + 1) * round_length])) for n in range(rounds)]
@@ -224,61 +218,6 @@ def trends(samples: list[Sample], round_length: int) -> dict[str, Trend]:
         flat = end <= start * (1 + allowed) + 1e-6
         found[name] = Trend(start, end, float(min(values)), float(max(values)), flat)
     return found
-
-
-def format_soak(report: SoakReport) -> Table:
-    """The report for the terminal."""
-    table = Table("", f"at frame {SETTLED}", "at the end", "least", "most", "", box=None, pad_edge=False)
-    for name, label, digits in (
-        ("memory", "memory, MB", 1),
-        ("descriptors", "open files", 1),
-        ("seconds", "seconds a frame", 4),
-    ):
-        if trend := report.trends.get(name):
-            numbers = (trend.start, trend.end, trend.least, trend.most)
-            verdict = "flat" if trend.flat else "[red]grows[/]"
-            table.add_row(label, *(f"{number:.{digits}f}" for number in numbers), verdict)
-    counts = ", ".join(f"{count} {status}" for status, count in sorted(report.counts.items()))
-    table.caption = f"{report.frames} frames ({counts}); the object left and returned {report.rounds} times"
-    table.caption_justify = "left"
-    return table
-
-
-def plot_soak(report: SoakReport, path: Path) -> None:
-    """Draw what was measured over the frames.
-
-    Raises:
-        OutputError: If the file cannot be written.
-    """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9, 8), layout="constrained")
-    index = [sample.index for sample in report.samples]
-    panels: Any = figure.subplots(3, 1, sharex=True)
-    for panel, name, label in zip(
-        panels,
-        ("memory", "descriptors", "seconds"),
-        ("memory, MB", "open files", "seconds a frame"),
-        strict=True,
-    ):
-        values = [getattr(sample, name) for sample in report.samples]
-        panel.set_ylabel(label)
-        if any(value is None for value in values):
-            continue
-        panel.plot(index, values, linewidth=0.5, color="grey")
-        width = min(100, len(values))
-        means = np.convolve(np.asarray(values, float), np.ones(width) / width, "valid")
-        panel.plot(index[width - 1 :], means, linewidth=1.5, label=f"mean of {width} frames")
-        if name == "seconds":
-            panel.set_ylim(0, 1.3 * float(np.percentile(values, 99)))
-        panel.axvline(SETTLED, linestyle="--", linewidth=1, color="grey")
-        panel.legend(loc="lower right", fontsize="small")
-        panel.grid(alpha=0.3)
-    panels[-1].set_xlabel("frame")
-    try:
-        figure.savefig(path, dpi=120)
-    except OSError as error:
-        raise OutputError(f"--plot {path} cannot be written: {error.strerror}") from error
 
 
 def _without_object(images: NDArray[np.uint8], masks: NDArray[np.bool_]) -> NDArray[np.uint8]:
@@ -301,8 +240,6 @@ def _moved(
     return result
 
 
-def _open_descriptors() -> int | None:
-    try:
-        return len(os.listdir(_DESCRIPTORS)) - 1  # noqa: PTH208 (one of them lists the folder)
-    except OSError:
-        return None
+def _open_descriptors() -> int:
+    process = psutil.Process()
+    return process.num_fds() if psutil.POSIX else process.num_handles()

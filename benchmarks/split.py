@@ -1,4 +1,7 @@
-"""``tracking3d bench split``: is a long video tracked faster in parts, and as well?"""
+"""Is a long video tracked faster in parts than whole, and as well?
+
+python benchmarks/split.py --frames 1200 --workers 2
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,8 @@ from typing import Annotated
 
 import typer
 
-from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset
+from script import run
+from tracking3d.cli.options import ConfigFile, Overrides, Preset
 
 
 def split(
@@ -31,14 +35,13 @@ def split(
     preset: Preset = None,
     overrides: Overrides = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON only.")] = False,
-    debug: Debug = False,
 ) -> None:
     """Track a synthetic clip, played to and fro, whole and in parts: seconds, and rotation against the truth."""
     import json
     import tempfile
     from dataclasses import asdict
 
-    from tracking3d.benchmark.split_benefit import format_split, measure_split
+    from split_benefit import format_split, measure_split
     from tracking3d.cli.options import configure
     from tracking3d.cli.tables import print_table
 
@@ -58,3 +61,7 @@ def split(
         typer.echo(json.dumps({name: asdict(one) for name, one in measured.items()}))
     else:
         print_table(format_split(measured))
+
+
+if __name__ == "__main__":
+    run(split)

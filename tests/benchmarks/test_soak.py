@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tracking3d.benchmark import soak as module
-from tracking3d.benchmark.soak import Sample, SoakReport, format_soak, looped_clip, plot_soak, soak, trends
+import looped_run
+from looped_run import Sample, SoakReport, looped_clip, track_looped, trends
+from soak_report import format_soak, plot_soak
 from tracking3d.config.loading import load_config
 from tracking3d.frames import SkippedFrame
-from tracking3d.process_memory import resident_memory
 from tracking3d.results.run_reader import RunReader
 
 QUICK = [
@@ -65,8 +65,8 @@ def test_a_short_soak_says_nothing_of_growth():
 
 
 def test_every_frame_is_measured_and_drawn(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "SETTLED", 2)
-    report = soak(load_config(overrides=QUICK), tmp_path / "run", frames=4, size=(96, 72))
+    monkeypatch.setattr(looped_run, "SETTLED", 2)
+    report = track_looped(load_config(overrides=QUICK), tmp_path / "run", frames=4, size=(96, 72))
     run = RunReader(tmp_path / "run")
     assert (run.state, len(run.frames), report.frames) == ("finished", 4, 4)
     assert run.description["refinement"] is None
@@ -82,18 +82,16 @@ def test_stopped_by_hand_it_tells_what_it_measured(tmp_path, monkeypatch, taken)
             listener(SkippedFrame(index, "none"))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(module, "record", record)
+    monkeypatch.setattr(looped_run, "record", record)
     if not taken:
         with pytest.raises(KeyboardInterrupt):
-            soak(load_config(overrides=QUICK), tmp_path / "run", frames=10, size=(80, 60))
+            track_looped(load_config(overrides=QUICK), tmp_path / "run", frames=10, size=(80, 60))
         return
-    report = soak(load_config(overrides=QUICK), tmp_path / "run", frames=10, size=(80, 60))
+    report = track_looped(load_config(overrides=QUICK), tmp_path / "run", frames=10, size=(80, 60))
     assert report.frames == taken and report.counts == {"skipped": taken}
 
 
 @pytest.mark.slow
 def test_nine_hundred_frames_are_flat(tmp_path):
-    if resident_memory() is None:
-        pytest.skip("this system does not tell how much memory a process holds")
-    report = soak(load_config(overrides=QUICK), tmp_path / "run", frames=900, size=(96, 72))
+    report = track_looped(load_config(overrides=QUICK), tmp_path / "run", frames=900, size=(96, 72))
     assert report.trends["memory"].flat and report.trends["descriptors"].flat, report.trends

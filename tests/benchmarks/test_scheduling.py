@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from tracking3d.benchmark.scheduling import ORDERS, Fleet, Splitting, simulate, skewed_lengths
+from fleet_simulation import ORDERS, Fleet, Splitting, simulate, skewed_lengths
 from tracking3d.errors import InputError
 
 CALM = {"slow": 0.0, "losses": 0.0}

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import threading
-from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-_PROCESSES = Path("/proc")
+import psutil
+
 _SHARED_MEMORY = Path("/dev/shm")
-_PAGE = os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else 4096
 
 
 @dataclass(frozen=True)
@@ -40,7 +38,7 @@ class Load:
 
 @contextmanager
 def measured_load(every: float = 1.0, unfinished: Path | None = None) -> Iterator[list[Load]]:
-    """Measure again and again while something goes on; the list grows, and stays empty where there is no ``/proc``.
+    """Measure again and again while something goes on; the list that is given grows.
 
     Args:
         every: Seconds between two samples.
@@ -51,8 +49,7 @@ def measured_load(every: float = 1.0, unfinished: Path | None = None) -> Iterato
 
     def sample() -> None:
         while not over.wait(every):
-            if (load := load_now(unfinished)) is not None:
-                samples.append(load)
+            samples.append(load_now(unfinished))
 
     thread = threading.Thread(target=sample, daemon=True)
     thread.start()
@@ -63,48 +60,32 @@ def measured_load(every: float = 1.0, unfinished: Path | None = None) -> Iterato
         thread.join()
 
 
-def load_now(unfinished: Path | None = None) -> Load | None:
-    """What this process and those that it began take; None where the system does not tell."""
-    if not (_PROCESSES / "self/stat").is_file():
-        return None
-    own, family = os.getpid(), _family(os.getpid())
-    memory = {number: _memory(number) for number in family}
-    descriptors = {number: _descriptors(number) for number in family}
+def load_now(unfinished: Path | None = None) -> Load:
+    """What this process and its descendants take at this moment."""
+    own = psutil.Process()
+    family = [own, *own.children(recursive=True)]
+    memory = [_memory(process) for process in family]
+    descriptors = [_descriptors(process) for process in family]
     return Load(
-        sum(memory.values()),
-        memory[own],
-        sum(descriptors.values()),
-        descriptors[own],
+        sum(memory),
+        memory[0],
+        sum(descriptors),
+        descriptors[0],
         len(family),
         _megabytes_in(_SHARED_MEMORY),
         _megabytes_in(unfinished) if unfinished is not None else 0.0,
     )
 
 
-def _family(first: int) -> list[int]:
-    """A process and all that it began, and those began in turn."""
-    children: defaultdict[int, list[int]] = defaultdict(list)
-    for folder in _PROCESSES.iterdir():
-        if folder.name.isdecimal():
-            with suppress(OSError, ValueError, IndexError):
-                # The name of a program, in brackets, may hold anything.
-                fields = (folder / "stat").read_text(errors="replace").rpartition(")")[2].split()
-                children[int(fields[1])].append(int(folder.name))
-    found = [first]
-    for number in found:
-        found += children[number]
-    return found
-
-
-def _memory(number: int) -> float:
-    with suppress(OSError, ValueError, IndexError):
-        return 1e-6 * _PAGE * int((_PROCESSES / str(number) / "statm").read_text().split()[1])
+def _memory(process: psutil.Process) -> float:
+    with suppress(psutil.Error):
+        return 1e-6 * process.memory_info().rss
     return 0.0
 
 
-def _descriptors(number: int) -> int:
-    with suppress(OSError):
-        return len(os.listdir(_PROCESSES / str(number) / "fd"))  # noqa: PTH208 (counted, not read)
+def _descriptors(process: psutil.Process) -> int:
+    with suppress(psutil.Error):
+        return process.num_fds() if psutil.POSIX else process.num_handles()
     return 0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import sys
 from functools import partial
 
@@ -10,13 +11,16 @@ import pytest
 import pytorch3d_stand_in
 import torch
 from scenes import bumpy_sphere
+from typer.testing import CliRunner
 
+import pytorch3d_renderer
+from pytorch3d_renderer import ABSENT, render_pytorch3d, to_pytorch3d, why_no_pytorch3d
+from render import render as render_script
+from script import as_program
 from tracking3d.rendering import SoftBand, render
-from tracking3d.speed import pytorch3d
-from tracking3d.speed.pytorch3d import ABSENT, render_pytorch3d, to_pytorch3d, why_no_pytorch3d
-from tracking3d.speed.scene import Problem, Scene
-from tracking3d.speed.table import format_left_out
-from tracking3d.speed.timing import backends, left_out
+from tracking3d.speed import benchmark as bench_render
+from tracking3d.speed.scene import RenderScene, RenderWorkload
+from tracking3d.speed.timing import time_backends
 
 CPU = torch.device("cpu")
 BAND = SoftBand(sigma=7000.0, boxlen=0.06)
@@ -45,43 +49,61 @@ def test_pixels_lie_where_pytorch3d_expects_them(pixel, size, expected):
 
 
 @pytest.mark.skipif(importlib.util.find_spec("pytorch3d") is not None, reason="PyTorch3D is installed")
-def test_an_absent_pytorch3d_is_left_out():
+def test_an_absent_pytorch3d_is_refused_in_a_sentence():
     assert why_no_pytorch3d(CPU) == ABSENT
-    assert "pytorch3d" not in backends(CPU)
-    assert not left_out(CPU)
+    result = CliRunner().invoke(as_program(render_script), [])
+    assert result.exit_code == 2
+    assert result.stderr.startswith(f"error: PyTorch3D cannot be timed: {ABSENT}")
 
 
-def test_an_installed_pytorch3d_takes_part(stand_in):
-    assert "pytorch3d" in backends(CPU)
-    assert not left_out(CPU)
+def test_an_installed_pytorch3d_is_timed_beside_the_backends(stand_in):
+    assert why_no_pytorch3d(CPU) == ""
+    problem, others = (
+        RenderWorkload(size=16, frames=1, texture=16, frequency=2),
+        {"pytorch3d": render_pytorch3d},
+    )
+    times = time_backends(problem, CPU, repeats=1, threads=1, others=others)
+    assert {"torch", "numba", "pytorch3d"} == set(times)
+    assert all(len(measured) == 1 for measured in times.values())
 
 
-def test_an_installation_that_cannot_draw_is_left_out_with_the_reason(stand_in, monkeypatch):
+def test_the_script_prints_its_times_without_the_dense_implementation(stand_in, monkeypatch):
+    asked = {}
+
+    def benchmark(*given, **named):
+        asked.update(named, given=given)
+        return {"backends": {}}
+
+    monkeypatch.setattr(bench_render, "benchmark", benchmark)
+    result = CliRunner().invoke(as_program(render_script), ["--size", "32", "--frames", "2", "--json"])
+    assert json.loads(result.stdout) == {"backends": {}}
+    assert (asked["given"], asked["dense"]) == ((32, 2, 3), False)
+    assert asked["others"] == {"pytorch3d": render_pytorch3d}
+
+
+def test_an_installation_that_cannot_draw_says_why(stand_in, monkeypatch):
     def broken(*_, **__):
         raise RuntimeError("not compiled with GPU support\nand more")
 
     monkeypatch.setattr(sys.modules["pytorch3d.renderer.mesh"], "rasterize_meshes", broken)
-    assert "pytorch3d" not in backends(CPU)
     why = "it is installed but cannot render here (RuntimeError: not compiled with GPU support)"
-    assert left_out(CPU) == {"pytorch3d": why}
-    assert format_left_out({"left_out": left_out(CPU)}) == [f"pytorch3d takes no part: {why}."]
+    assert why_no_pytorch3d(CPU) == why
 
 
 @pytest.mark.parametrize("part", ["pytorch3d.ops", "pytorch3d.renderer.mesh", "pytorch3d.structures"])
 def test_an_installation_without_a_part_is_broken_and_not_absent(stand_in, monkeypatch, part):
     monkeypatch.setitem(sys.modules, part, None)  # its import then fails
-    assert "pytorch3d" not in backends(CPU)
-    assert f"import of {part} halted" in left_out(CPU)["pytorch3d"]
+    assert f"import of {part} halted" in why_no_pytorch3d(CPU)
 
 
 @pytest.mark.slow
 @torch.no_grad()
 def test_covered_pixels_stay_covered_only_with_enough_faces(stand_in, monkeypatch):
-    scene = Scene.make(Problem(size=24, frames=1, texture=24, frequency=14), CPU)
+    scene = RenderScene.make(RenderWorkload(size=24, frames=1, texture=24, frequency=14), CPU)
     arguments = {**scene.parameters, **scene.constants}
     covered = render(**arguments).face_index >= 0
     assert ((render_pytorch3d(**arguments).face_index >= 0) == covered).all()
-    monkeypatch.setattr(pytorch3d, "FACES_PER_PIXEL", 10)
+    monkeypatch.setattr(pytorch3d_renderer, "FACES_PER_PIXEL", 10)
     assert (covered & (render_pytorch3d(**arguments).face_index < 0)).any()
 
 
@@ -97,7 +119,7 @@ def test_pytorch3d_draws_the_same_picture(stand_in):
 
 
 def test_pytorch3d_is_timed_on_the_same_loss_and_gradients(stand_in):
-    scene = Scene.make(Problem(size=24, frames=2, texture=24, frequency=3), CPU)
+    scene = RenderScene.make(RenderWorkload(size=24, frames=2, texture=24, frequency=3), CPU)
     answers = []
     for backend in (render, render_pytorch3d):
         scene.forget_gradients()
