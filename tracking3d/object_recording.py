@@ -17,7 +17,7 @@ from tracking3d.final_refinement import FinalRefinement
 from tracking3d.frames import Frame, SkippedFrame
 from tracking3d.last_passes import PrecomputedRefinement
 from tracking3d.open_tracking import TrackedObject
-from tracking3d.reconstruction import textured
+from tracking3d.reconstruction import bake_texture
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.refinement_writer import RefinementWriter
@@ -249,7 +249,7 @@ class ObjectRecording:
         if self.refinement is not None:
             self.refinement.draw_rest()
             self._work.wait()
-            model = textured(*self.refinement.final_model(), largest)
+            model = bake_texture(*self.refinement.final_model(), largest)
             self._writer.end_refinement()
             self._causal_model = None
         self._writer.finish(model, "finished")

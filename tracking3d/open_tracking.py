@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
-from tracking3d.arguments import check_known, check_source, checked_config, needs_prompt
+from tracking3d.arguments import check_single_known_object, check_source, checked_config, needs_prompt
 from tracking3d.config.models import PipelineConfig, PluginChoice
 from tracking3d.corrections import Correction, check_corrections_fit, checked_corrections, prompts_in
 from tracking3d.errors import InputError
@@ -73,7 +73,7 @@ def request_tracking(
     check_source(source)
     config = checked_config(config)
     prompts.check(needed=needs_prompt(config))
-    check_known(config, len(prompts))
+    check_single_known_object(config, len(prompts))
     by_object = checked_corrections(corrections, max(len(prompts), 1))
     if prompts.start_frame is not None:
         check_start_frame(prompts.start_frame, source.repeatable, source.name)

@@ -21,7 +21,7 @@ from tracking3d.config.models import PipelineConfig
 from tracking3d.corrections import Correction
 from tracking3d.errors import InputError
 from tracking3d.frames import Box
-from tracking3d.object_files import camera_of
+from tracking3d.object_files import select_camera
 from tracking3d.object_recording import ObjectRecording
 from tracking3d.open_tracking import OpenTracking, TrackRequest, open_tracking, request_tracking
 from tracking3d.passes import Listener, go_through
@@ -33,7 +33,7 @@ from tracking3d.results.layout import object_folders
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_writer import RunWriter, WrittenSoFar
 from tracking3d.session import Session
-from tracking3d.video.source import FrameSource, notes_of
+from tracking3d.video.source import FrameSource, source_notes
 
 __all__ = ["Listener", "RecordOptions", "record", "record_objects", "record_tracking"]
 
@@ -264,12 +264,12 @@ def _header(
     height, width = opened.first.size
     return RunHeader(
         config=config.model_dump(mode="json"),
-        camera=camera_of(config, width, height, source.intrinsics, source.intrinsics_origin),
+        camera=select_camera(config, width, height, source.intrinsics, source.intrinsics_origin),
         source=source.name,
         seed=config.runtime.seed,
         fps=source.fps,
         command=options.command,
-        source_notes=notes_of(source),
+        source_notes=source_notes(source),
         selection=options.selection,
         renderer=session.renderer,
         given=given,

@@ -18,7 +18,7 @@ from tracking3d.estimation.estimate import FrameEstimate, Status
 from tracking3d.frames import Frame
 from tracking3d.reconstruction import of_run
 from tracking3d.reconstruction.of_run import shape_run, texture_run
-from tracking3d.reconstruction.shape import Shape
+from tracking3d.reconstruction.shape import ReconstructedShape
 from tracking3d.results.description import RunHeader
 from tracking3d.results.files import write_image
 from tracking3d.results.mesh_export import load_model

@@ -20,7 +20,7 @@ from tracking3d.results.mesh_export import load_model
 from tracking3d.results.run_reader import RunReader
 from tracking3d.splitting import beginning, ending, steps
 from tracking3d.splitting.agreement import DisagreementError
-from tracking3d.splitting.long_video import Ended
+from tracking3d.splitting.long_video import SplitResult
 from tracking3d.splitting.plan import PARTS
 from tracking3d.splitting.split_run import record_in_parts
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, degrade_masks, synthesize
@@ -104,7 +104,7 @@ def test_parts_that_cannot_be_joined_are_finished_each_by_itself(short, tmp_path
     ended = record_in_parts(
         short, settings(short), run, PromptSet(), length="25f", workers=1, selection="2:50"
     )
-    assert ended == Ended((run / PARTS / "part_0", run / PARTS / "part_1"), 2, ended.reason)
+    assert ended == SplitResult((run / PARTS / "part_0", run / PARTS / "part_1"), 2, ended.reason)
     assert "two objects" in ended.reason
     assert [(name, first) for name, first, _ in done] == [
         ("part_0", True), ("part_1", True), ("part_0", False), ("part_1", False),
@@ -202,7 +202,7 @@ def test_a_video_in_two_parts_is_one_run_as_good_as_a_whole_one(workers, clip, t
 def test_a_split_run_that_was_stopped_anywhere_goes_on(clip, tmp_path, monkeypatch):
     frames, run = written(clip, tmp_path / "clip"), tmp_path / "run"
 
-    def go_on() -> Ended:
+    def go_on() -> SplitResult:
         return record_in_parts(
             frames, settings(frames), run, PromptSet(), length="30f", workers=1, resume=True
         )

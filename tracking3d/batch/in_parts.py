@@ -12,7 +12,7 @@ from tracking3d.engines.protocol import Tell
 from tracking3d.point_prompts import parse_points
 from tracking3d.prompts import PromptSet, parse_box
 from tracking3d.splitting.beginning import Begun, begin
-from tracking3d.splitting.long_video import Ended, LongVideo
+from tracking3d.splitting.long_video import LongVideo, SplitResult
 from tracking3d.splitting.steps import Step
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.checkpoint.milestones import Milestones, keep_milestones_only
-from tracking3d.checkpoint.progress import JournalEntry, Kept, Progress, journal_line, read_journal
+from tracking3d.checkpoint.progress import JournalEntry, Kept, RunProgress, journal_line, read_journal
 from tracking3d.checkpoint.trees import TreeFolder
 from tracking3d.errors import InputError
 from tracking3d.frames import SkippedFrame

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from tracking3d.checkpoint.folder import Checkpoint
-from tracking3d.checkpoint.progress import JournalEntry, Kept, Progress
+from tracking3d.checkpoint.progress import JournalEntry, Kept, RunProgress
 from tracking3d.checkpoint.trees import UnkeptError
 
 _log = logging.getLogger(__name__)
@@ -30,7 +30,7 @@ class RunState:
 
     def __init__(self, checkpoint: Checkpoint | None = None, kept: Kept | None = None) -> None:
         self.checkpoint, self.kept = checkpoint, kept
-        self.progress = self.before = kept.progress if kept else Progress()
+        self.progress = self.before = kept.progress if kept else RunProgress()
         self._past = {*kept.taken, *(one.index for one in kept.skipped)} if kept else set()
 
     def has(self, index: int) -> bool:

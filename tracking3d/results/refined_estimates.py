@@ -14,7 +14,7 @@ from tracking3d.frames import Frame
 from tracking3d.results import layout
 from tracking3d.results.files import decoded_mask, mask_file, read_mask, write_mask
 from tracking3d.results.probabilities import write_probability
-from tracking3d.results.records import FrameRecord, mask_iou
+from tracking3d.results.records import FrameRecord, mask_iou_or_none
 from tracking3d.results.run_reader import RunReader, read_records
 from tracking3d.stages import measured
 
@@ -93,7 +93,7 @@ class RefinedEstimates:
         self._records[index] = replace(
             record,
             area=int(np.count_nonzero(mask)),
-            iou_initial=mask_iou(mask, self.initial_mask(index)),
+            iou_initial=mask_iou_or_none(mask, self.initial_mask(index)),
             mask_source=MaskSource.WEIGHED,
         )
         self._decided[index] = mask_file(mask)

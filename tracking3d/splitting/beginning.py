@@ -13,7 +13,7 @@ from tracking3d.results import layout
 from tracking3d.results.making_room import clear_run_folder
 from tracking3d.results.run_reader import is_finished
 from tracking3d.splitting.cutting import windows
-from tracking3d.splitting.long_video import Ended, LongVideo, Tell, frames_of_part
+from tracking3d.splitting.long_video import LongVideo, SplitResult, Tell, frames_of_part
 from tracking3d.splitting.part_runs import PartJob
 from tracking3d.splitting.plan import (
     Plan,
@@ -68,7 +68,7 @@ def begin(tell: Tell, video: LongVideo) -> Begun | SplitResult:
     assert count is not None
     if not windows(count, frames):
         record_tracking(request, folder, options, tell)
-        return Ended((folder,), 1, f"{opened.name} has {count} frames, which is one part")
+        return SplitResult((folder,), 1, f"{opened.name} has {count} frames, which is one part")
     if resume and (layout.has_state(folder) or is_there(folder)):  # joined already
         record_tracking(request, folder, options, tell)
         remove_parts(folder)
@@ -87,7 +87,7 @@ def begin(tell: Tell, video: LongVideo) -> Begun | SplitResult:
     if len(plan.parts) == 1:
         remove_parts(folder)
         record_tracking(request, folder, options, tell)
-        return Ended((folder,), 1, "no frame near to where it was to be cut shows the object well")
+        return SplitResult((folder,), 1, "no frame near to where it was to be cut shows the object well")
     jobs = _part_jobs(video, config, count, plan, resume=kept is not None)
     if kept is not None and all(is_finished(job.folder) for job in jobs):
         return SplitResult(tuple(job.folder for job in jobs), len(jobs), BEFORE)

@@ -13,8 +13,8 @@ from tracking3d.passes import Listener
 from tracking3d.prompts import PromptSet
 from tracking3d.results.records import FrameRecord
 from tracking3d.splitting.beginning import begin
-from tracking3d.splitting.long_video import Ended, LongVideo
-from tracking3d.splitting.processes import side_by_side
+from tracking3d.splitting.long_video import LongVideo, SplitResult
+from tracking3d.splitting.processes import run_in_processes
 from tracking3d.splitting.steps import Step, steps_of
 
 SideBySide = Callable[..., list[Any]]
