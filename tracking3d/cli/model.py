@@ -36,7 +36,7 @@ def model(
 ) -> None:
     """Re-texture the mesh of a run from its video, and with --quality fine reconstruct its shape too.
 
-    `tracking3d run` does this at the end of a run with a final refinement, as its option --model says.
+    `tracking3d run` does this at its end; its option --model chooses how.
     """
     from tracking3d.reconstruction.of_run import shape_run, texture_run
 

@@ -202,7 +202,7 @@ def _strength(item: str) -> tuple[str, float]:
 
 @contextmanager
 def _progress(total: int, what: str, quiet: bool) -> Iterator[Callable[[str], None]]:
-    """A progress bar on the standard error; yields the function to call with the name of every finished part."""
+    """A progress bar on the standard error; yields the function to call with the name of each finished part."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 

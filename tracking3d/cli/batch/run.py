@@ -118,22 +118,23 @@ class EngineOptions:
 @grouped
 def run(
     jobs: Jobs,
-    out: Out,
-    settings: SettingsOptions,
-    engine: EngineOptions,
+    *,
     data: Data = None,
     sequences: Sequences = None,
-    retries: Retries = 1,
-    split: Split = None,
+    settings: SettingsOptions,
+    out: Out,
     overwrite: Overwrite = False,
     report: Report = True,
+    engine: EngineOptions,
+    retries: Retries = 1,
+    split: Split = None,
     as_json: JsonEvents = False,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Track every video of JOBS into a run folder of its own in DIR; the same command continues a stopped batch.
+    """Track every video of JOBS, each into a run folder of its own in DIR.
 
-    DIR/results.csv (and .parquet), DIR/failures.csv and DIR/index.html grow as videos finish. The exit code is 1 if a
+    To continue a stopped batch, repeat the command. DIR/results.csv (and .parquet), DIR/failures.csv and DIR/index.html grow as videos finish. The exit code is 1 if a
     video failed.
     """
     from tracking3d.batch.listing import dataset_jobs, list_jobs

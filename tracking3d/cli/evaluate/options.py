@@ -49,7 +49,7 @@ Address = Annotated[
     str | None,
     typer.Option(
         metavar="ADDRESS",
-        help="Ray cluster to run on: auto, HOST:PORT, ray://HOST:PORT, or local for a Ray on this machine.",
+        help="Ray cluster to run on: auto, HOST:PORT, ray://HOST:PORT, or local to start Ray on this machine.",
         rich_help_panel=PERFORMANCE,
     ),
 ]
