@@ -85,7 +85,7 @@ def print_board(
         f"{out}: {board.columns} x {board.rows} squares of {board.square:g} mm, {width:.0f} x {height:.0f} mm in total"
     )
     typer.echo(
-        "Print it at 100 % and mount it on something flat. Film it near and far, tilted, and in the corners of the image."
+        "Print it at 100 %, mount it on something flat, and film it near and far, tilted, and in the image corners."
     )
 
 

@@ -13,12 +13,12 @@ if TYPE_CHECKING:
     from tracking3d.synthesis.spec import SequenceSpec
 
 Count = Annotated[
-    int | None, typer.Option(metavar="N", help="Number of sequences of the suite fresh; default 24.")
+    int | None, typer.Option(metavar="N", help="Number of sequences in the suite 'fresh'; default 24.")
 ]
 Meshes = Annotated[
     Path | None,
     typer.Option(
-        metavar="DIR", help="Folder of mesh files, which a third of the sequences of the suite fresh show."
+        metavar="DIR", help="Folder of mesh files, which a third of the sequences in the suite 'fresh' show."
     ),
 ]
 

@@ -53,7 +53,7 @@ class SequenceOptions:
         float | None,
         typer.Option(
             metavar="DEGREES",
-            help="Rotation per frame; the maximum, if the motion is fast.",
+            help="Rotation per frame; with the motion fast, its maximum.",
             rich_help_panel=_ONE,
         ),
     ] = None
@@ -83,7 +83,7 @@ class SequenceOptions:
     ] = None
     seed: Annotated[
         int | None,
-        typer.Option(metavar="N", help="Random seed, of the suite fresh too.", rich_help_panel=_ONE),
+        typer.Option(metavar="N", help="Random seed; of the suite 'fresh' too.", rich_help_panel=_ONE),
     ] = None
 
     def given(self) -> dict[str, Any]:
@@ -102,7 +102,9 @@ def synth(
     ] = Path("synthetic"),
     suite: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="Suite: smoke, standard, hard or full; or fresh, with --seed."),
+        typer.Option(
+            metavar="NAME", help="Suite: smoke, standard, hard or full; or fresh, which --seed draws."
+        ),
     ] = None,
     count: Count = None,
     meshes: Meshes = None,

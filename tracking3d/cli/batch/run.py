@@ -134,8 +134,8 @@ def run(
 ) -> None:
     """Track every video of JOBS, each into a run folder of its own in DIR.
 
-    To continue a stopped batch, repeat the command. DIR/results.csv (and .parquet), DIR/failures.csv and DIR/index.html grow as videos finish. The exit code is 1 if a
-    video failed.
+    To continue a stopped batch, repeat the command. DIR/results.csv (and .parquet), DIR/failures.csv and DIR/index.html
+    grow as videos finish. The exit code is 1 if a video failed.
     """
     from tracking3d.batch.listing import dataset_jobs, list_jobs
     from tracking3d.batch.places import absolute

@@ -27,8 +27,8 @@ def spread(
     config: ConfigFile = None,
     preset: Preset = None,
     overrides: Overrides = None,
-    jobs: Jobs = 1,
     out: Out = Path("benchmark"),
+    jobs: Jobs = 1,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:

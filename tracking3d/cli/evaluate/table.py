@@ -66,18 +66,18 @@ def table(
     preset: Preset = None,
     overrides: Overrides = None,
     plot: Plot = None,
+    out: Out = Path("benchmark"),
     jobs: Jobs = 1,
     address: Address = None,
-    out: Out = Path("benchmark"),
     as_json: AsJson = False,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
     """Run what a table of the paper needs, and print the paper's figures and ours side by side.
 
-    With --data the real dataset is used, otherwise a synthetic suite, which the caption names. Writes
-    DIR/tables/TABLE.md, .csv and .json. The table online takes clips in this project's layout with --data, and --masks;
-    the rows of the other tables define their masks themselves.
+    With --data the real dataset is used, otherwise a synthetic suite; the caption says which. Writes
+    DIR/tables/TABLE.md, .csv and .json. Only the table online takes --masks, and with --data clips in this project's
+    layout; the rows of the other tables define their masks.
     """
     from tracking3d.benchmark import solver_table
     from tracking3d.benchmark.sequences import REAL, open_dataset

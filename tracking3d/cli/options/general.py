@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from tracking3d.cli.options.panels import VIDEO
+
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON only.")]
@@ -16,5 +18,10 @@ RunOrParent = Annotated[
 ]
 Video = Annotated[
     str | None,
-    typer.Option("--source", metavar="VIDEO", help="Path of the video, if it has moved since the run."),
+    typer.Option(
+        "--source",
+        metavar="VIDEO",
+        help="Path of the video, if it has moved since the run.",
+        rich_help_panel=VIDEO,
+    ),
 ]
