@@ -226,7 +226,7 @@ def _parse_override(item: str) -> dict[str, Any]:
     path, equals, text = item.partition("=")
     keys = [key.strip() for key in path.split(".")]
     if not equals or not all(keys):
-        raise InputError(f"{_called(item)} is not section.key=value; write it like window.size=96.")
+        raise InputError(f"{_called(item)} is not section.key=value; write it like runtime.seed=1.")
     value: Any = parse_yaml(text, _called(item))
     for key in reversed(keys[1:]):
         value = {key: value}

@@ -112,7 +112,7 @@ class ObjectConfig(Section):
         le=512,
         description=(
             "Features with more channels are reduced to this number by a principal component analysis inside the first "
-            "mask, and scaled to equal variance; null keeps them unchanged (paper)."
+            "mask, and scaled to a common spread; null keeps them unchanged (paper)."
         ),
     )
     landmark_views: int = Field(

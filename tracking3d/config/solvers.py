@@ -183,8 +183,8 @@ class PaperConfig(Section):
         None,
         ge=0,
         description=(
-            "Loss of a pixel whose texture has never been seen, in place of its appearance loss; null treats it like any "
-            "other pixel (paper)."
+            "Loss of a pixel whose texture has never been seen, in place of its appearance loss; null treats it like "
+            "any other pixel (paper)."
         ),
     )
     start_frames: int = Field(
