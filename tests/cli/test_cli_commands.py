@@ -233,7 +233,7 @@ def test_points_beside_the_object_are_followed_in_the_images_with_any(call, fini
     rows = list(csv.DictReader(io.StringIO(result.stdout)))
     assert [row["kind"] for row in rows[:2]] == ["surface", "image"]
     assert float(rows[1]["x"]) == 1 and rows[1]["on_object"] == "0" and float(rows[1]["uncertainty"]) > 0
-    assert "Followed in the images: 1 of 2 points; 0 of them came to lie on the mesh" in result.stderr
+    assert "Tracked in the images: 1 of 2 points; 0 of them reached the mesh" in result.stderr
     quiet = call("points", finished, "--xy", "1,1", "--any", "--quiet", "--json")
     assert quiet.stderr == ""
     assert json.loads(quiet.stdout)["kind"] == ["image"]
@@ -277,7 +277,7 @@ def test_points_without_their_video_are_carried_by_the_mesh_and_that_is_said(cal
         ("points run --xy 1,1", "or --any to follow them in the images alone"),
         (
             "points run --xy 1,1 --any --by-mesh",
-            "--any follows points in the images, and --by-mesh looks at none",
+            "--any tracks points in the images, which --by-mesh does not read",
         ),
         ("points run --xy 99,1 --any", "There is no pixel 99,1 in frame 0"),
     ],

@@ -86,7 +86,7 @@ def test_get_takes_several_and_goes_on_after_one_that_fails(call, catalogue):
     result = call("models", "get", "open", "closed")
     assert result.exit_code == 2
     assert result.stdout == f"{catalogue / 'closed.onnx'}: closed, mine\n"
-    assert "open could not be fetched" in result.stderr
+    assert "open could not be downloaded" in result.stderr
 
 
 def test_get_all_is_what_has_an_address_and_a_licence_for_everyone(call, catalogue):

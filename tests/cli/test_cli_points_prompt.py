@@ -35,12 +35,12 @@ def test_points_are_numbers_with_a_sign_behind():
     ("text", "sentence"),
     [
         ("", "names no point"),
-        ("10,20", "'10,20' is no point; write them as"),
+        ("10,20", "'10,20' is not a point; write points as"),
         ("10,20+ x,y-", "'x,y-' is no point"),
         ("10+", "'10\\+' is no point"),
         ("1,2,3+", "'1,2,3\\+' is no point"),
-        ("nan,2+", "no number of pixels"),
-        ("1e99,2+", "no number of pixels"),
+        ("nan,2+", "not a number of pixels"),
+        ("1e99,2+", "not a number of pixels"),
         ("10,20-", "no point on the object"),
         ("10,20+ 10,20-", "says of 10,20 both"),
         ("10,20+ 10.4,20.4-", "says of 10,20 both"),
@@ -73,7 +73,7 @@ def test_points_outside_the_frame_are_refused_with_its_size():
 
 
 def test_points_that_tell_nothing_are_refused():
-    with pytest.raises(InputError, match="nothing in frame 0 tells the object from the rest"):
+    with pytest.raises(InputError, match="do not separate an object from the background in frame 0"):
         make_prompt(Frame(0, np.zeros((2, 2, 3), np.uint8)), points=[(0, 0, 1)])
 
 
@@ -128,7 +128,7 @@ def test_corrections_that_cannot_be_are_refused(given, sentence):
 BAD = {
     "points outside": (["--points", "70,20+"], "--points 70,20 lies outside 000.png"),
     "nothing on the object": (["--points", "7,20-"], "no point on the object"),
-    "box and points": (["--box", "20,10,20,20", "--points", "7,20+"], "either --box, --mask or --points"),
+    "box and points": (["--box", "20,10,20,20", "--points", "7,20+"], "only one of --box, --mask and --points"),
     "no such frame": (
         ["--box", "20,10,20,20", "--start-frame", "9"],
         "--start-frame 9 is not among the frames",

@@ -58,7 +58,7 @@ def test_box_inside_the_frame_is_kept(caplog):
 def test_box_partly_outside_is_clipped_with_a_note(caplog):
     with caplog.at_level(logging.WARNING):
         assert make_prompt(FRAME, box=(-5, 40, 20, 30)).box == (0, 40, 15, 8)
-    assert "The box -5,40,20,30 reaches beyond the frame" in caplog.text
+    assert "The box -5,40,20,30 extends beyond the frame" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -105,7 +105,7 @@ def test_mask_file_is_any_image(tmp_path: Path, image):
     ("mask", "sentence"),
     [
         (np.zeros((48, 64), dtype=bool), "mask=.* ?is empty"),
-        (np.ones((48, 64), dtype=bool), r"covers the whole of 000\.png"),
+        (np.ones((48, 64), dtype=bool), r"covers all of 000\.png"),
         (np.ones((24, 32), dtype=bool), r"is 32 x 24 pixels but 000\.png is 64 x 48"),
         (np.ones((64, 48), dtype=bool), "is 48 x 64 pixels"),
     ],

@@ -174,7 +174,7 @@ def refused(*arguments: object) -> str:
     ("more", "sentence"),
     [
         (("--model", "fine"), "is held"),
-        (("--split", "4f"), "leave it out with --object"),
+        (("--split", "4f"), "leave out --split, or --object"),
         (("--box", "1,2,30,40", "--box", "50,60,30,40"), "2 are given"),
         (("--flat",), "flat or not"),
         (("--preset", "paper"), "the solver paper"),

@@ -86,14 +86,14 @@ def test_without_a_network_one_sentence_says_what_to_download_and_where_to_put_i
     with socket.socket() as closed:  # a port on which nobody listens
         closed.bind(("127.0.0.1", 0))
         address = f"http://127.0.0.1:{closed.getsockname()[1]}/tiny-net.onnx"
-    told = refused(cache, InputError, "could not be fetched", fetch, network(address=address))
+    told = refused(cache, InputError, "could not be downloaded", fetch, network(address=address))
     for part in (address, "tracking3d models get tiny-net --from FILE", str(cache / "models/tiny-net.onnx")):
         assert part in told
 
 
 def test_a_host_that_does_not_exist_is_told(cache, network):
     refused(
-        cache, InputError, "could not be fetched", fetch, network(address="http://nowhere.invalid/n.onnx")
+        cache, InputError, "could not be downloaded", fetch, network(address="http://nowhere.invalid/n.onnx")
     )
 
 
@@ -194,7 +194,7 @@ def test_a_mirror_of_ones_own_is_checked_like_any_other(cache, network, serve):
     unknown = network(address=None, sha256=None, size=None, how="export net.pth")
     exported = network(address=None, how="export net.pth")
     refused(cache, InputError, "SHA-256 is", fetch, exported, mirror=folder)
-    refused(cache, InputError, "SHA-256 is not known", fetch, unknown, mirror=folder)
+    refused(cache, InputError, "SHA-256 is unknown", fetch, unknown, mirror=folder)
     for wrong in ("ftp://mirror", "/etc", "file:///etc"):
         refused(cache, InputError, "is no address", fetch, network(), mirror=wrong)
 
@@ -266,7 +266,7 @@ def test_a_network_without_an_address_says_how_to_come_by_it(cache, network):
     told = refused(cache, InputError, r"export net\.pth \(https://example.org/tiny\), then", fetch, exported)
     assert "models get tiny-net --from FILE" in told
     measured = network(address=None, how="export net.pth")
-    refused(cache, InputError, "use your file by its path; if you have the one with SHA-256", fetch, measured)
+    refused(cache, InputError, "give the path of your file; if its SHA-256 is", fetch, measured)
 
 
 def test_a_file_fetched_elsewhere_is_taken_if_it_is_the_known_one(cache, network, tmp_path):

@@ -58,7 +58,7 @@ WRONG_BOXES = {
     "a dictionary": (dict(zip("xywh", BOX, strict=True)), r"^box=.* is not four numbers"),
     "complex": ((1j, 2, 3, 4), r"^box=.* is not four numbers"),
     "beyond floats": ((10**400, 0, 5, 5), r"^box=.* is not four numbers"),
-    "nan": ((math.nan, 0, 5, 5), r"^box=nan,0,5,5 has a value that is no finite number"),
+    "nan": ((math.nan, 0, 5, 5), r"^box=nan,0,5,5 has a value that is not a finite number"),
     "no size": ((5, 5, 0, 5), r"^box=5,5,0,5 has no size"),
 }
 
@@ -68,7 +68,7 @@ WRONG_MASKS = {
     "three axes": (IMAGE, r"^mask= is an array of shape \(48, 64, 3\) and type uint8; give an \(H, W\)"),
     "objects": (np.full((48, 64), None), r"^mask= is .*type object"),
     "a number": (7, r"^mask= is an int of shape \(\)"),
-    "ragged lists": ([[1], [1, 2]], r"^mask= is a list that numpy cannot read"),
+    "ragged lists": ([[1], [1, 2]], r"^mask= is a list that NumPy cannot convert"),
     "nan": (np.full((48, 64), np.nan), r"^mask= has values that are no finite numbers"),
     "empty": (np.zeros((48, 64), bool), r"^mask= is empty; mark the object in it"),
 }
@@ -135,7 +135,7 @@ def test_either_a_box_or_a_mask_is_asked_for_by_their_names(config, prompt):
 
 def test_objects_are_asked_for_by_lists(config):
     for boxes in (None, "box", 5):
-        with pytest.raises(InputError, match=r"^boxes=.*; give a list with one for each object"):
+        with pytest.raises(InputError, match=r"^boxes=.*; give a list with one item per object"):
             track_objects([IMAGE], boxes=boxes, config=config)
     with pytest.raises(InputError, match=r"boxes or masks .*: boxes=, masks= or points=\.$"):
         track_objects([IMAGE], config=config)
@@ -197,9 +197,9 @@ def test_record_names_its_own_arguments_where_a_folder_is_taken(config, tmp_path
         ({"prompt": Prompt((1, 2))}, r"^prompt\.box=\(1, 2\) is not four numbers"),
         ({"prompt": Prompt(BOX, "mask.png")}, r"^prompt\.mask='mask.png' is text"),
         ({"prompt": None}, r"either a box or a mask"),
-        ({"intrinsics": (1, 2)}, r"^intrinsics=\(1, 2\) is not fx, fy, cx, cy"),
+        ({"intrinsics": (1, 2)}, r"^intrinsics=\(1, 2\) must be fx, fy, cx, cy"),
         ({"intrinsics": (0, 50, 32, 24)}, r"^intrinsics=.* positive fx and fy"),
-        ({"intrinsics": (math.nan, 50, 32, 24)}, r"^intrinsics=.* is not fx"),
+        ({"intrinsics": (math.nan, 50, 32, 24)}, r"^intrinsics=.* must be fx"),
     ],
 )
 def test_a_session_refuses_wrong_arguments(config, changed, sentence):
