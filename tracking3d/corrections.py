@@ -120,8 +120,9 @@ def checked_corrections(corrections: Any, objects: int = 1) -> list[dict[int, Co
     for one in corrections:
         correction = _checked(one)
         if correction.object >= objects:
+            count = "is 1 object" if objects == 1 else f"are {objects} objects"
             raise InputError(
-                f"{correction.name} is for object {correction.object}, but there are {objects}, counted from 0."
+                f"{correction.name} is for object {correction.object}, but there {count}, counted from 0."
             )
         theirs = by_object[correction.object]
         if correction.frame in theirs:

@@ -225,7 +225,9 @@ def checked_box(box: Any, name: str = BOX) -> Box:
     except Exception as error:  # iterating over a foreign object can raise anything
         raise InputError(f"{name}{shown(box)} is not four numbers x, y, width, height in pixels.") from error
     if not all(math.isfinite(value) for value in (x, y, width, height)):
-        raise InputError(f"{name}{_shown((x, y, width, height))} has a value that is not a finite number.")
+        raise InputError(
+            f"{name}{_shown((x, y, width, height))} has a value that is not a finite number; give four finite numbers."
+        )
     if width <= 0 or height <= 0:
         raise InputError(
             f"{name}{_shown((x, y, width, height))} has no size; its width and height must be positive."

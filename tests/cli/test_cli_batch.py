@@ -62,7 +62,7 @@ def test_a_table_is_tracked_with_the_settings_of_its_rows(call, table, script, o
     status = call("batch", "status", "out")
     assert status.exit_code == 0 and "finished" in status.stdout and "2 of 2 videos" in status.stdout
     again = call("batch", table, "--out", "out", "--no-report", "--set", "window.size=64", "--threads", 2)
-    assert again.exit_code == 0 and len(script.built) == 3 and "2 of them before" in again.stderr
+    assert again.exit_code == 0 and len(script.built) == 3 and "2 of them earlier" in again.stderr
 
 
 def test_events_are_lines_of_json_and_a_failure_is_the_exit_code(call, shots, script, opened):

@@ -234,9 +234,9 @@ def test_a_run_is_corrected_with_its_own_settings(call, clip, script):
     ("words", "told"),
     [
         (["nowhere", "3:1,1,9,9"], "nowhere is not a run folder"),
-        (["run", "3;1,1,9,9"], "is not FRAME:X,Y,W,H"),
-        (["run", "77:1,1,9,9"], "there is no frame 77"),
-        (["run", "3@2:1,1,9,9"], "is of object 2, but there are 1"),
+        (["run", "3;1,1,9,9"], "is not of the form FRAME:X,Y,W,H"),
+        (["run", "77:1,1,9,9"], "frame 77 is not among"),
+        (["run", "3@2:1,1,9,9"], "is for object 2, but there is 1 object"),
         (["run", "0:1,1,9,9"], "is the frame of the prompt"),
         (["run", "3:mask.png"], "mask.png"),
         (["run", "3:1,1,9,9", "--source", "gone.mp4"], "gone.mp4"),
@@ -308,7 +308,7 @@ def test_folder_that_cannot_be_written_is_named(refused, clip, script, tmp_path)
         ("--box 1,2,3", "error: --box '1,2,3' is not four numbers"),
         ("--box here", "'here' is not four numbers"),
         ("--box a,b,c,d", "'a,b,c,d' is not four numbers"),
-        ("--box 1,2,nan,4", "no finite number"),
+        ("--box 1,2,nan,4", "not a finite number"),
         ("--box 1,2,0,4", "has no size"),
         ("--box 1,2,3,-4", "has no size"),
         ("--box 100,100,9,9", "error: --box 100,100,9,9 lies outside 000.png, which is 64 x 48"),
@@ -359,8 +359,8 @@ def test_bad_sources_are_refused_in_one_sentence(refused, script, tmp_path):
     ("mask", "words"),
     [
         (np.zeros((48, 64)), "is empty"),
-        (np.ones((48, 64)), "covers the whole"),
-        (np.eye(20), "is 20 x 20 pixels but 000.png is 64 x 48"),
+        (np.ones((48, 64)), "covers all"),
+        (np.eye(20), "is 20 x 20 pixels, but 000.png is 64 x 48"),
     ],
 )
 def test_bad_mask_is_refused_in_one_sentence(refused, clip, script, mask_file, mask, words):

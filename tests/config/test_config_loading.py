@@ -130,7 +130,7 @@ def test_another_solver_drops_the_settings_of_the_one_below(yaml_file):
             "solver: {online: {points: 1}}",
             "'solver.online' is not a section; write the settings of the solver 'online' directly under 'solver'",
         ),
-        ("preset: paper\nsolver: {online: {points: 1}}", "beside 'name: online'"),
+        ("preset: paper\nsolver: {online: {points: 1}}", "next to 'name: online'"),
         ("iterations: 3", "did you mean 'solver.iterations'?"),
     ],
 )
@@ -186,9 +186,9 @@ def test_yaml_merge_keys_are_plain_data():
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("- tracker: csrt", "holds a list at its top level"),
-        ("just words", "holds a single value at its top level"),
-        ("42", "holds a single value"),
+        ("- tracker: csrt", "has a list at its top level"),
+        ("just words", "has a single value at its top level"),
+        ("42", "has a single value"),
         ("tracker: [1", "not valid YAML"),
         ("a: b: c", "not valid YAML"),
         ("\tsolver: 1", "not valid YAML"),

@@ -67,7 +67,7 @@ def test_a_page_that_is_not_there_is_told_with_its_number(cache, network, serve)
 
 def test_a_body_that_breaks_off_is_refused_and_what_came_is_kept_beside_the_place(cache, network, serve):
     net = network(address=serve(BYTES[:1000], claimed=len(BYTES)))
-    with pytest.raises(InputError, match=f"broke off after 1000 of {len(BYTES)} bytes"):
+    with pytest.raises(InputError, match=f"broke after 1000 of {len(BYTES)} bytes"):
         fetch(net)
     assert not network_path(net).exists()
     [kept] = files_in(cache)
@@ -154,7 +154,7 @@ def test_a_server_whose_file_is_shorter_than_what_was_kept_is_asked_anew(cache, 
     part = cache / f"models/.tiny-net.onnx.{net.sha256[:12]}.part"
     part.parent.mkdir(parents=True)
     part.write_bytes(BYTES[:2000])
-    with pytest.raises(InputError, match="broke off after 1000"):
+    with pytest.raises(InputError, match="broke after 1000"):
         fetch(net)
 
 
@@ -196,7 +196,7 @@ def test_a_mirror_of_ones_own_is_checked_like_any_other(cache, network, serve):
     refused(cache, InputError, "SHA-256 is", fetch, exported, mirror=folder)
     refused(cache, InputError, "SHA-256 is unknown", fetch, unknown, mirror=folder)
     for wrong in ("ftp://mirror", "/etc", "file:///etc"):
-        refused(cache, InputError, "is no address", fetch, network(), mirror=wrong)
+        refused(cache, InputError, "is not an address", fetch, network(), mirror=wrong)
 
 
 def test_a_proxy_of_the_environment_is_asked_instead(cache, network, serve_and_note, monkeypatch):

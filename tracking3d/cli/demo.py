@@ -44,8 +44,10 @@ def demo(
     source = open_source(clip / "frames")
     box = read_truth(clip).box
     command = f"tracking3d demo --seed {seed}"
-    with reported([folder]) as told, progress(source.count, quiet) as listener:
-        record(source, settings, folder, box=box, command=command, overwrite=True, listener=told(listener))
+    with reported([folder]) as reporting, progress(source.count, quiet) as listener:
+        record(
+            source, settings, folder, box=box, command=command, overwrite=True, listener=reporting(listener)
+        )
 
     scores = score_run(folder, clip)
     summary = {

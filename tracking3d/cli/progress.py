@@ -113,11 +113,8 @@ def print_summary(folder: Path) -> None:
         table.add_row("final refinement", took if refinement["frames"] else escape(refinement["reason"]))
     own = own_masks(run)
     if own is not None:
-        handed_back = counts["frames"] - own
-        told = f" of {counts['frames']}" + (
-            "; the others are the initial masks" if own and handed_back else ""
-        )
-        table.add_row("masks of its own", f"{own}{told if own else told + ': all are the initial masks'}")
+        rest = "" if own == counts["frames"] else "; the others keep the initial mask"
+        table.add_row("frames with an estimated mask", f"{own} of {counts['frames']}{rest if own else ''}")
     if own is None or own:
         table.add_row(
             "mean IoU with the initial masks"

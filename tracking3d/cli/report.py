@@ -75,4 +75,4 @@ def _write(folders: Sequence[Path]) -> None:
             err=True,
         )
     except KeyboardInterrupt:
-        typer.echo("The report was interrupted. Write it with `tracking3d report`.", err=True)
+        typer.echo("The report was interrupted. Try again with `tracking3d report`.", err=True)

@@ -41,8 +41,8 @@ def _line(outcome: Outcome) -> str:
     if outcome.scores is None:
         return f"{what} failed: {outcome.error}"
     scores = outcome.scores
-    told = [f"IoU {scores['iou_mean']:.3f}"] if scores["iou_mean"] is not None else []
+    parts = [f"IoU {scores['iou_mean']:.3f}"] if scores["iou_mean"] is not None else []
     if scores["rotation_error_mean_deg"] is not None:
-        told.append(f"rotation {scores['rotation_error_mean_deg']:.1f} degrees")
+        parts.append(f"rotation {scores['rotation_error_mean_deg']:.1f} degrees")
     took = "from an earlier run" if outcome.cached else f"{outcome.seconds:.0f} s"
-    return f"{what}: {', '.join([*told, took])}"
+    return f"{what}: {', '.join([*parts, took])}"
