@@ -143,7 +143,7 @@ BAD = {
     ),
     "a solver that goes forwards": (
         ["--box", "20,10,20,20", "--start-frame", "2", "--preset", "paper"],
-        "The solver paper goes forwards only",
+        "Solver 'paper' cannot track backwards. Use solver.name=online, or start at the prompt frame",
     ),
     "a box outside": (["--box", "20,10,20,20", "--correct", "3:70,2,5,5"], "--correct 3:"),
     "the first frame": (["--box", "20,10,20,20", "--correct", "0:1,2,5,5"], "is the frame of the prompt"),
