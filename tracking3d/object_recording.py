@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
@@ -14,12 +14,13 @@ import numpy as np
 from tracking3d.checkpoint.folder import Checkpoint
 from tracking3d.checkpoint.progress import Kept, Progress, TakenFrame, check_picture, checksum
 from tracking3d.checkpoint.trees import UnkeptError
-from tracking3d.corrections import Correction, prompts_in
+from tracking3d.corrections import prompts_in
 from tracking3d.errors import OutputError, PluginError
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.evidence.scene import Mask
 from tracking3d.frames import Frame, MaskEstimate, SkippedFrame
 from tracking3d.last_passes import Foreseen, LastPasses
+from tracking3d.open_tracking import TrackedObject
 from tracking3d.reconstruction import BELIEVED, TextureView, kept_views, texture_view, textured
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord
@@ -36,12 +37,12 @@ class ObjectRecording:
     """One object on its way from the frames to its run folder.
 
     Args:
-        session: Answers for the frames.
+        tracked: The object.
         writer: Keeps the answers.
         checkpoint: Keeps the state after each; None where that is of no use, since the source cannot be read again.
-        kept: The state of a stopped run that this one goes on with, which ``session`` was given.
-        corrections: What the user has said of the object in later frames, by their index.
+        kept: The state of a stopped run that this one resumes, which the object's session was given.
         redraw: Whether frames come in another order than that of time, and are drawn once more in that order.
+        temporary: Whether the run folder is removed in the end, so that errors do not name it.
 
     Attributes:
         latest: The answer for the frame that was taken last.
@@ -50,16 +51,17 @@ class ObjectRecording:
 
     def __init__(
         self,
-        session: Session,
+        tracked: TrackedObject,
         writer: RunWriter,
         checkpoint: Checkpoint | None = None,
         kept: Kept | None = None,
-        corrections: Mapping[int, Correction] | None = None,
         redraw: bool = False,
+        temporary: bool = False,
     ) -> None:
-        self._session, self._writer, self._checkpoint = session, writer, checkpoint
-        self._corrections, self._unmet = corrections or {}, set(corrections or {})
-        self._redraw = redraw
+        self._tracked, self._session = tracked, tracked.session
+        self._writer, self._checkpoint = writer, checkpoint
+        self._unmet = set(tracked.corrections)
+        self._redraw, self._temporary = redraw, temporary
         self._kept = kept
         self._work = WorkBehind()  # all that touches writer and checkpoint while frames come
         self.latest: FrameEstimate | None = None
@@ -70,7 +72,7 @@ class ObjectRecording:
         self._answered = kept is not None
         self._said = False
         self._initial: dict[int, tuple[float, str]] = {}
-        if kept and session.config.solver.final_refine:
+        if kept and self._session.config.solver.final_refine:
             self._initial = {one.index: (one.score, one.reason) for one in kept.taken.values()}
         self._causal_model: ObjectModel | None = None
         self._refinement: RefinementWriter | None = None
@@ -110,8 +112,7 @@ class ObjectRecording:
             return self._work.do(partial(self._skip, frame))
         if not isinstance(coming, Frame) or coming.index in self._past:
             coming = None
-        self._session.coming = coming
-        estimate = self._session.step(frame, *prompts_in(frame, self._corrections))
+        estimate = self._tracked.step(frame, coming)
         self._answered, self.latest = True, estimate
         initial = self._session.initial_mask
         if self._session.config.solver.final_refine:
@@ -160,14 +161,14 @@ class ObjectRecording:
         """All frames were taken: solve everything once more, or record why not though it was asked for."""
         for index in sorted(self._unmet):
             _log.warning(
-                "Frame %d, which was to be corrected, is not among the frames that could be read.", index
+                "Frame %d, which was to be corrected, is not among the frames that can be read.", index
             )
         self._begin_refinement(source)
         if self._refinement is not None:
             wanted, camera = self._session.config.object, self._session.camera
             self._last = LastPasses(
                 self._refinement, self._session.result(), camera, wanted.landmark_views, wanted.evidence,
-                self._corrections, self.foreseen,
+                self._tracked.corrections, self.foreseen,
             )  # fmt: skip
         elif self._redraw:
             self._writer.begin_drawing_anew()
@@ -295,11 +296,11 @@ class ObjectRecording:
         self._work.end()
         failed = isinstance(error, Exception)
         folder = self._writer.folder
-        if self._causal_model is not None:
+        if self._causal_model is not None and not self._temporary:
             error.add_note(
                 f"The final refinement was not finished; the causal answers are whole in {folder}."
             )
-        elif self._answered:
+        elif self._answered and not self._temporary:
             error.add_note(f"What was finished until then is kept in {folder}.")
         model = self._causal_model or _model(self._session)
         with suppress(OutputError):  # the first error is the one to tell
@@ -318,13 +319,11 @@ class ObjectRecording:
             correction = None
             if taken.corrected and self._checkpoint:
                 correction = self._checkpoint.correction(frame.index)
-            answer = self._session.replay(frame, first, correction, *prompts_in(frame, self._corrections))
-            if (
-                not self._said
-                and not taken.failure
-                and answer
-                and not self._writer.is_initial_mask(frame, answer)
-            ):
+            answer = self._session.replay(
+                frame, first, correction, *prompts_in(frame, self._tracked.corrections)
+            )
+            other = answer and not taken.failure and not self._writer.is_initial_mask(frame, answer)
+            if other and not self._said:
                 self._said = True
                 _log.warning(
                     "The mask tracker gives another mask of %s than before the run was stopped; what follows may "

@@ -19,6 +19,7 @@ from tracking3d.cli.view import show_address
 if TYPE_CHECKING:
     from tracking3d.config.models import PipelineConfig
     from tracking3d.picker.session import Picked
+    from tracking3d.prompts import PromptSet
 
 
 def pick(
@@ -56,7 +57,8 @@ def pick(
 
     The page shows at once the mask that the tracker makes from it. It also offers the command and a YAML file to copy.
     """
-    from tracking3d.cli.tracking import Given, RunDisplay, default_folder, track
+    from tracking3d.cli.tracking import RunDisplay, RunRequest, default_folder, track
+    from tracking3d.recording import RecordOptions
     from tracking3d.viewer.opening import check_viser
 
     if view:
@@ -64,14 +66,17 @@ def pick(
     settings = configure(config, preset, overrides, tracker={"name": tracker})
     folder = out or default_folder(source)
     picked = picked_in_browser(source, frames, settings, folder, host, port, browser, overwrite)
-    arguments = {
-        "command": shlex.join(sys.argv),
-        "selection": frames,
-        "overwrite": overwrite,
-        "start_frame": picked.frame,
-    }
-    given = Given(picked.boxes, picked.masks)
-    track(source, settings, folder, given, arguments, RunDisplay(quiet, view=view, host=host))
+    prompts = prompts_of(picked)
+    options = RecordOptions(shlex.join(sys.argv), frames, overwrite)
+    track(RunRequest(source, settings, folder, prompts, options), RunDisplay(quiet, view=view, host=host))
+
+
+def prompts_of(picked: Picked) -> PromptSet:
+    """The prompts that were marked in the browser."""
+    from tracking3d.prompts import PromptSet
+
+    several = len(picked.boxes) + len(picked.masks) > 1
+    return PromptSet(picked.boxes, picked.masks, start_frame=picked.frame, as_lists=several)
 
 
 def picked_in_browser(

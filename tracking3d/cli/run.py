@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -19,11 +19,13 @@ from tracking3d.cli.options.prompt import PromptOptions
 from tracking3d.cli.options.tracking import TrackingOptions
 from tracking3d.cli.options.video import Source, VideoOptions
 from tracking3d.cli.split import track_in_parts
-from tracking3d.cli.tracking import Given, RunDisplay, a_person_is_there, default_folder, track
+from tracking3d.cli.tracking import RunDisplay, RunRequest, a_person_is_there, default_folder, track
 from tracking3d.errors import InputError
 
 if TYPE_CHECKING:
     from tracking3d.config.models import PipelineConfig
+    from tracking3d.corrections import Correction
+    from tracking3d.prompts import PromptSet
 
 
 @grouped
@@ -44,32 +46,33 @@ def run(
     Give the object with --box, --mask, --points, --masks or --object. Each box, mask or --points is an object with a
     run folder of its own.
     """
+    from tracking3d.arguments import needs_prompt
+    from tracking3d.recording import RecordOptions
+
     prompt = prompt.completed_from(settings.config)
     output.check()
     performance.check()
     if output.model is ModelChoice.FINE:
         check_fine(source)
     config = _configure(prompt, camera, tracking, settings, output, performance)
-    given = _parse_prompt(prompt, video.frames)
-    arguments = _recording_arguments(prompt, video, output, len(given))
+    prompts = _parse_prompts(prompt, video.frames)
+    corrections = _parse_corrections(prompt, len(prompts))
     folder = output.out or default_folder(source)
-    check_known(config, len(given), output.model is ModelChoice.FINE, performance.split is not None)
-    if not given and _needs_prompt(config):
+    check_known(config, len(prompts), output.model is ModelChoice.FINE, performance.split is not None)
+    if not prompts and needs_prompt(config):
         if not a_person_is_there() or quiet or output.resume or source.isdigit():
             raise InputError(
                 "Give the object in the first frame with --box X,Y,W,H, --mask FILE, --points 'X,Y+ X,Y-' or "
                 "--masks DIR, or draw it with `tracking3d pick`."
             )
-        given, start_frame = _ask_in_browser(source, config, folder, video.frames, output.overwrite)
-        arguments["start_frame"] = start_frame
+        prompts = _ask_in_browser(source, config, folder, video.frames, output.overwrite)
+    options = RecordOptions(_command(), video.frames, output.overwrite, output.resume)
+    request = RunRequest(source, config, folder, prompts, options, corrections, video.skip_damaged, video.fps)
     display = RunDisplay(quiet, output.report, output.view, output.host)
     if performance.split is not None:
-        length, workers = performance.split, performance.workers
-        track_in_parts(
-            source, config, folder, given, arguments, length, workers=workers, fps=video.fps, display=display
-        )
+        track_in_parts(request, performance.split, performance.workers, display)
     else:
-        track(source, config, folder, given, arguments, display, fps=video.fps)
+        track(request, display)
 
 
 def _configure(
@@ -103,51 +106,41 @@ def _configure(
     )
 
 
-def _parse_prompt(prompt: PromptOptions, frames: str | None) -> Given:
+def _parse_prompts(prompt: PromptOptions, frames: str | None) -> PromptSet:
     """The objects that the options give."""
     from tracking3d.point_prompts import parse_points
+    from tracking3d.prompts import PromptSet
     from tracking3d.video.selection import parse_selection
 
-    first = prompt.start_frame if prompt.start_frame is not None else parse_selection(frames).start
-    return Given(
-        [given_box(text, first) for text in prompt.box or ()],
-        [one for file in prompt.mask or () for one in given_masks(file)],
-        [parse_points(text) for text in prompt.points or ()],
-    )
+    start = prompt.start_frame
+    first = start if start is not None else parse_selection(frames).start
+    boxes = [given_box(text, first) for text in prompt.box or ()]
+    masks = [one for file in prompt.mask or () for one in given_masks(file)]
+    points = [parse_points(text) for text in prompt.points or ()]
+    several = len(boxes) + len(masks) + len(points) > 1
+    return PromptSet(boxes, masks, points, start, as_lists=several)
 
 
-def _recording_arguments(
-    prompt: PromptOptions, video: VideoOptions, output: OutputOptions, objects: int
-) -> dict[str, Any]:
-    """Keyword arguments of `tracking3d.recording.record`."""
+def _parse_corrections(prompt: PromptOptions, objects: int) -> list[Correction]:
     from tracking3d.corrections import checked_corrections, parse_correction
-    from tracking3d.video.stream import without_password
 
     corrections = [parse_correction(text) for text in prompt.correct or ()]
     checked_corrections(corrections, max(objects, 1))  # before anything is written
-    return {
-        "command": shlex.join(map(without_password, sys.argv)),
-        "selection": video.frames,
-        "overwrite": output.overwrite,
-        "skip_damaged": video.skip_damaged,
-        "resume": output.resume,
-        "start_frame": prompt.start_frame,
-        "corrections": corrections,
-    }
+    return corrections
 
 
-def _needs_prompt(config: PipelineConfig) -> bool:
-    from tracking3d.arguments import needs_prompt
+def _command() -> str:
+    """The command line, for the record; without the passwords in it."""
+    from tracking3d.video.stream import without_password
 
-    return needs_prompt(config)
+    return shlex.join(map(without_password, sys.argv))
 
 
 def _ask_in_browser(
     source: str, config: PipelineConfig, folder: Path, frames: str | None, overwrite: bool
-) -> tuple[Given, int]:
-    """The objects that a person marks in the browser, and the frame in which they are marked."""
-    from tracking3d.cli.pick import picked_in_browser
+) -> PromptSet:
+    """The objects that a person marks in the browser."""
+    from tracking3d.cli.pick import picked_in_browser, prompts_of
 
     typer.echo("Mark the object in the browser; Ctrl-C cancels.", err=True)
-    picked = picked_in_browser(source, frames, config, folder, overwrite=overwrite)
-    return Given(picked.boxes, picked.masks), picked.frame
+    return prompts_of(picked_in_browser(source, frames, config, folder, overwrite=overwrite))

@@ -6,41 +6,24 @@ import logging
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import typer
 
 from tracking3d.errors import InputError
 
 if TYPE_CHECKING:
-    from tracking3d.cli.tracking import Given, RunDisplay
-    from tracking3d.config.models import PipelineConfig
+    from tracking3d.cli.tracking import RunDisplay, RunRequest
     from tracking3d.splitting.long_video import Ended
 
 
-def track_in_parts(
-    source: str,
-    settings: PipelineConfig,
-    folder: Path,
-    given: Given,
-    arguments: dict[str, Any],
-    length: str,
-    *,
-    workers: int | None,
-    fps: float | None,
-    display: RunDisplay,
-) -> None:
-    """Track a video in parts, show the progress, and print a summary; see `tracking3d.cli.tracking.track`.
+def track_in_parts(request: RunRequest, length: str, workers: int | None, display: RunDisplay) -> None:
+    """Track a video in parts, show the progress, and print a summary.
 
     Args:
-        source: The command's argument SOURCE.
-        settings: The configuration.
-        folder: The run folder.
-        given: What the object is.
-        arguments: Further arguments of `tracking3d.recording.record`.
+        request: What is tracked.
         length: Length of a part, as ``--split`` has it.
         workers: Processes at the same time; one per processor if None.
-        fps: Value of ``--fps``.
         display: What is shown.
 
     Raises:
@@ -48,30 +31,29 @@ def track_in_parts(
     """
     from tracking3d.cli.progress import progress
     from tracking3d.cli.report import reported
-    from tracking3d.splitting.part_runs import Given as GivenOfPart
     from tracking3d.splitting.split_run import record_in_parts
     from tracking3d.video import open_source
 
-    _check(given, arguments, workers, display.view, fps)
+    _check(request, workers, display)
     if display.quiet:
         logging.getLogger("tracking3d").setLevel(logging.ERROR)
-    box, mask, points = (next(iter(one), None) for one in (given.boxes, given.masks, given.points))
+    folder, options = request.folder, request.options
     with ExitStack() as ends:
         ends.enter_context(_resumable(folder))
         reporting = ends.enter_context(reported([folder] if display.report else []))
-        count = open_source(source, arguments["selection"]).count
+        count = open_source(request.source, options.selection).count
         listener = reporting(ends.enter_context(progress(count, display.quiet)))
         ended = record_in_parts(
-            source,
-            settings,
+            request.source,
+            request.config,
             folder,
-            GivenOfPart(box, mask, points),
+            request.prompts,
             length=length,
             workers=workers or _processors(),
-            selection=arguments["selection"],
-            command=arguments["command"],
-            overwrite=arguments["overwrite"],
-            resume=arguments["resume"],
+            selection=options.selection,
+            command=options.command,
+            overwrite=options.overwrite,
+            resume=options.resume,
             listener=listener,
         )
     if not display.quiet:
@@ -94,19 +76,18 @@ def _print_summaries(ended: Ended) -> None:
         typer.echo(f"Tracked as one part: {ended.reason}.", err=True)
 
 
-def _check(
-    given: Given, arguments: dict[str, Any], workers: int | None, view: bool, fps: float | None
-) -> None:
+def _check(request: RunRequest, workers: int | None, display: RunDisplay) -> None:
     if workers is not None and workers < 1:
         raise InputError(f"--workers {workers}: give at least 1.")
-    if len(given) > 1:
+    if len(request.prompts) > 1:
         raise InputError("--split tracks one object; give one object, or leave out --split.")
-    for option, value in {
-        "--start-frame": arguments["start_frame"] is not None,
-        "--correct": bool(arguments["corrections"]),
-        "--view": view,
-        "--fps": fps is not None,
-    }.items():
+    given = {
+        "--start-frame": request.prompts.start_frame is not None,
+        "--correct": bool(request.corrections),
+        "--view": display.view,
+        "--fps": request.fps is not None,
+    }
+    for option, value in given.items():
         if value:
             raise InputError(f"{option} cannot be combined with --split; leave out one of them.")
 

@@ -9,25 +9,40 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import typer
 
 if TYPE_CHECKING:
     from tracking3d.config.models import PipelineConfig
-    from tracking3d.video.source import FrameSource
+    from tracking3d.corrections import Correction
+    from tracking3d.prompts import PromptSet
+    from tracking3d.recording import RecordOptions
 
 
 @dataclass(frozen=True)
-class Given:
-    """What the objects are: one prompt for each, or none if the mask tracker or a known object replaces it."""
+class RunRequest:
+    """What a run tracks, and the folder it writes.
 
-    boxes: Sequence[Any] = ()
-    masks: Sequence[Any] = ()
-    points: Sequence[Any] = ()
+    Attributes:
+        source: The command's argument SOURCE.
+        config: The configuration.
+        folder: The run folder.
+        prompts: The objects; none if the mask tracker or a known object replaces the prompt.
+        options: How the run is recorded, ``selection`` of the frames included.
+        corrections: Prompts in later frames.
+        skip_damaged: If the first frame cannot be decoded, apply the prompts to the first frame that can.
+        fps: Frame rate of a source that has no timestamps.
+    """
 
-    def __len__(self) -> int:
-        return len(self.boxes) + len(self.masks) + len(self.points)
+    source: str
+    config: PipelineConfig
+    folder: Path
+    prompts: PromptSet
+    options: RecordOptions
+    corrections: Sequence[Correction] = ()
+    skip_damaged: bool = False
+    fps: float | None = None
 
 
 @dataclass(frozen=True)
@@ -47,65 +62,38 @@ class RunDisplay:
     host: str | None = None
 
 
-def track(
-    source: str,
-    settings: PipelineConfig,
-    folder: Path,
-    given: Given,
-    arguments: dict[str, Any],
-    display: RunDisplay,
-    *,
-    fps: float | None = None,
-) -> None:
-    """Track, show the progress, and print a summary.
-
-    Args:
-        source: The command's argument SOURCE.
-        settings: The configuration.
-        folder: The run folder.
-        given: What the objects are.
-        arguments: Further arguments of `tracking3d.recording.record`, ``selection`` among them.
-        display: What is shown.
-        fps: Frame rate of a source that has no timestamps.
-    """
+def track(request: RunRequest, display: RunDisplay) -> None:
+    """Track, show the progress, and print a summary."""
     from tracking3d.cli.progress import progress
     from tracking3d.cli.report import reported
     from tracking3d.cli.view import watched
+    from tracking3d.open_tracking import request_tracking
+    from tracking3d.recording import record_tracking
     from tracking3d.results.layout import object_folders
     from tracking3d.results.run_reader import is_finished
     from tracking3d.video import open_source
 
-    opened = open_source(source, arguments.get("selection"), fps)
+    folder, options, prompts = request.folder, request.options, request.prompts
+    source = open_source(request.source, options.selection, request.fps)
     if display.quiet:
         logging.getLogger("tracking3d").setLevel(logging.ERROR)
-    objects = max(len(given), 1)
+    objects = max(len(prompts), 1)
     folders = object_folders(folder, objects) if objects > 1 else [folder]
-    finished = {one: _written(one) for one in folders if arguments.get("resume") and is_finished(one)}
+    finished = {one: _written(one) for one in folders if options.resume and is_finished(one)}
     with ExitStack() as ends:
         ends.enter_context(resumable(folders))
         reporting = ends.enter_context(reported(folders if display.report else []))
-        listener = reporting(ends.enter_context(progress(opened.count, display.quiet, objects)))
+        listener = reporting(ends.enter_context(progress(source.count, display.quiet, objects)))
         if display.view:
-            opened, listener = ends.enter_context(
-                watched(opened, folder, listener, display.host, display.quiet)
+            source, listener = ends.enter_context(
+                watched(source, folder, listener, display.host, display.quiet)
             )
-        _record(opened, settings, folder, given, {**arguments, "listener": listener})
+        tracking = request_tracking(
+            source, request.config, prompts, request.corrections, request.skip_damaged
+        )
+        record_tracking(tracking, folder, options, listener)
     if not display.quiet:
         _print_summaries(folders, finished)
-
-
-def _record(
-    source: FrameSource, settings: PipelineConfig, folder: Path, given: Given, arguments: dict[str, Any]
-) -> None:
-    """Record one object in ``folder``, or several in folders of their own."""
-    from tracking3d.recording import record, record_objects
-
-    if len(given) > 1:
-        several: dict[str, Any] = {"boxes": given.boxes, "masks": given.masks, "points": given.points}
-        record_objects(source, settings, folder, **several, **arguments)
-    else:
-        box, mask, points = (next(iter(one), None) for one in (given.boxes, given.masks, given.points))
-        record(source, settings, folder, box=box, mask=mask, points=points, **arguments)
 
 
 def _print_summaries(folders: Sequence[Path], finished: Mapping[Path, int]) -> None:
