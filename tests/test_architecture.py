@@ -34,6 +34,7 @@ FLOORS = [
         "arguments",
         "checkpoint",
         "corrected_run",
+        "final_refinement",
         "frame_reading",
         "given_frames",
         "images",

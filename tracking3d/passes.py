@@ -1,16 +1,19 @@
 """The passes over a video: every frame is estimated, again with the final model if that is asked for, and drawn.
 
-for frame in frames:                # first pass: causal estimates
+In short::
+
+    for frame in frames:                             # first pass: causal estimates
+        for recording in active:
+            recording.take(frame)                    # TrackedObject.step, Session.step, Solver.step
     for recording in active:
-        recording.take(frame)       # -> TrackedObject.step -> Session.step -> Solver.step
-refine everything, then:
-for frame in frames:                # second pass: estimates with the final model
-    recording.take_again(frame)
-adjust poses and surface by all frames together, then:
-for frame in frames:                # third pass: masks
-    recording.put_right(frame)
-for frame in frames:                # last pass: pictures
-    recording.draw(frame)
+        recording.begin_refinement(source)           # everything is refined
+    for frame in frames:                             # second pass: estimates with the final model
+        recording.take_again(frame)
+    recording.refinement.adjust_all()                # poses, surface and lens by all frames together
+    for frame in frames:                             # third pass: what masks have in common
+        recording.refinement.collect_mask(frame)
+    for frame in frames:                             # last pass: masks and pictures
+        recording.refinement.draw(frame)
 """
 
 from __future__ import annotations
@@ -18,8 +21,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 
-import cv2
-
+from tracking3d.final_refinement import FinalRefinement
 from tracking3d.frame_reading import read_again, read_with_next, with_share
 from tracking3d.frames import Frame, SkippedFrame
 from tracking3d.object_recording import ObjectRecording
@@ -56,6 +58,12 @@ class ActiveRecordings:
         yield from tuple(self._active)
         if not self._active:
             raise self.errors[0]
+
+    def refining(self) -> Iterator[tuple[ObjectRecording, FinalRefinement]]:
+        """Give each active recording that has a final refinement, with it; see `__iter__`."""
+        for recording in self:
+            if recording.refinement is not None:
+                yield recording, recording.refinement
 
     @contextmanager
     def guard(self, recording: ObjectRecording) -> Iterator[None]:
@@ -105,7 +113,13 @@ def go_through(
         for recording in recordings if source.repeatable else ():
             threads.enter_context(recording.writing_beside())
         try:
-            _run_first_pass(source, frames, active)
+            waits = any(one.takes for one in active)
+            for frame, coming in read_with_next(source, frames) if waits else ():
+                shared = with_share(frame, len(recordings)) if isinstance(frame, Frame) else frame
+                for recording in active:
+                    with active.guard(recording):
+                        active.tell(recording.take(shared, coming))
+            _finish_writing(active)
             if first_pass_only:
                 for recording in active:
                     with active.guard(recording):
@@ -117,19 +131,6 @@ def go_through(
             raise
     if active.errors:
         raise active.errors[0]
-
-
-def _run_first_pass(
-    source: FrameSource, frames: Iterable[Frame | SkippedFrame], active: ActiveRecordings
-) -> None:
-    """Estimate every frame as it comes."""
-    objects = len(active)
-    for frame, coming in read_with_next(source, frames) if any(one.takes for one in active) else ():
-        shared = with_share(frame, objects) if isinstance(frame, Frame) else frame
-        for recording in active:
-            with active.guard(recording):
-                active.tell(recording.take(shared, coming))
-    _finish_writing(active)
 
 
 def look_again(source: FrameSource, active: ActiveRecordings) -> None:
@@ -149,22 +150,29 @@ def look_again(source: FrameSource, active: ActiveRecordings) -> None:
                 with active.guard(recording):
                     active.tell(recording.take_again(with_share(frame, objects)))
         _finish_writing(active)
-        with shared_among(cv2.getNumThreads()):
-            for recording in active:
-                with active.guard(recording):
-                    recording.settle()
-        for frame in read_again(source) if any(one.weighs_masks for one in active) else ():
-            for recording in active:
-                with active.guard(recording):
-                    recording.put_right(frame)
-        for frame in read_again(source) if any(one.draws for one in active) else ():
-            for recording in active:
-                with active.guard(recording):
-                    recording.draw(frame)
-        _finish_writing(active)
+        _run_last_passes(source, active)
         for recording in active:
             with active.guard(recording):
                 recording.finish()
+
+
+def _run_last_passes(source: FrameSource, active: ActiveRecordings) -> None:
+    """Adjust poses, surface and lens by all frames together, then masks; and draw."""
+    for recording, refinement in active.refining():
+        with active.guard(recording):
+            refinement.adjust_all()
+    for frame in read_again(source) if any(each.decides_masks for _, each in active.refining()) else ():
+        for recording, refinement in active.refining():
+            with active.guard(recording):
+                refinement.collect_mask(frame)
+    for recording, refinement in active.refining():
+        with active.guard(recording):
+            refinement.settle_masks()
+    for frame in read_again(source) if any(active.refining()) else ():
+        for recording, refinement in active.refining():
+            with active.guard(recording):
+                refinement.draw(frame)
+    _finish_writing(active)
 
 
 def _finish_writing(active: ActiveRecordings) -> None:

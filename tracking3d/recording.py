@@ -15,6 +15,7 @@ from tracking3d.arguments import checked_folder
 from tracking3d.checkpoint.folder import Checkpoint, finish_state
 from tracking3d.checkpoint.progress import Kept
 from tracking3d.checkpoint.resuming import Earlier, earlier_run, given_of
+from tracking3d.checkpoint.run_state import RunState
 from tracking3d.checkpoint.staging import corrected_aside, take_over
 from tracking3d.config.models import PipelineConfig
 from tracking3d.corrections import Correction
@@ -251,7 +252,8 @@ def begin_recording(
         writer.use_camera(session.camera)
     elif not temporary and source.repeatable:
         checkpoint = Checkpoint(folder, session.state_classes, runtime.device, runtime.milestones)
-    return ObjectRecording(one, writer, checkpoint, kept, opened.start_frame is not None, temporary)
+    state = RunState(checkpoint, kept)
+    return ObjectRecording(one, writer, state, opened.start_frame is not None, temporary)
 
 
 def _header(

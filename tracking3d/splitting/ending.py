@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from tracking3d.checkpoint.resuming import given_of
-from tracking3d.last_passes import Foreseen
+from tracking3d.last_passes import PrecomputedRefinement
 from tracking3d.open_tracking import OpenTracking, TrackRequest, open_tracking, request_tracking
 from tracking3d.passes import go_through
 from tracking3d.prompts import PromptSet
@@ -131,11 +131,11 @@ class Ending:
 
     Attributes:
         joined: The run; its ``seconds`` tell what all steps took.
-        foreseen: What its frames are answered with in the end.
+        precomputed: What the last steps of its final refinement come to.
     """
 
     joined: Joined
-    foreseen: Foreseen
+    precomputed: PrecomputedRefinement
 
 
 def end(tell: Tell, ending: Ending) -> None:
@@ -157,7 +157,7 @@ def end(tell: Tell, ending: Ending) -> None:
         opened = replace(opened, tracker_choice=begun.choice)
         recording = begin_recording(opened, 0, video.folder, options, writers)
         if recording is not None:
-            recording.foreseen = ending.foreseen
+            recording.precomputed = ending.precomputed
             go_through(opened.source, opened.frames, [recording], tell)
     if recording is not None:
         shape_as_asked(video.folder, config, opened.source)

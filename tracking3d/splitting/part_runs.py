@@ -6,7 +6,7 @@ What is here runs in processes of its own.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,19 +15,18 @@ import numpy as np
 from tracking3d.checkpoint.folder import Checkpoint
 from tracking3d.checkpoint.progress import Kept
 from tracking3d.config.models import PipelineConfig
-from tracking3d.errors import PluginError
 from tracking3d.frame_reading import read_timed
 from tracking3d.frames import Frame, MaskEstimate
+from tracking3d.last_passes import estimate_again
 from tracking3d.open_tracking import open_tracking, request_tracking
 from tracking3d.prompts import PromptSet
 from tracking3d.recording import RecordOptions, record_tracking
 from tracking3d.results import layout
-from tracking3d.results.files import read_mask, write_mask, writing
-from tracking3d.results.probabilities import write_probability
+from tracking3d.results.files import read_mask, writing
 from tracking3d.results.records import FrameRecord
+from tracking3d.results.refined_estimates import write_refined
 from tracking3d.results.run_reader import RunReader
 from tracking3d.session import Session
-from tracking3d.stages import measured
 from tracking3d.video import open_source
 from tracking3d.video.source import FrameSource
 
@@ -155,16 +154,8 @@ def _second_answer(
     mask = read_mask(layout.initial_mask_path(job.folder, frame.index))
     taken = kept.taken[frame.index]
     initial = MaskEstimate(None if mask is None else mask.astype(np.float32), taken.score, taken.reason)
-    try:
-        estimate = session.revisit(frame, initial, causal.T_cam_obj)
-    except PluginError:
-        if job.config.runtime.on_plugin_failure == "stop":
-            raise
+    estimate = estimate_again(session, frame, causal, initial)
+    if estimate is None:
         return None
-    with measured("write") as watch:
-        estimate = replace(estimate, refined=True, keyframe=estimate.keyframe or causal.keyframe)
-        record_ = FrameRecord.of(estimate, frame.name, mask, revision=True)
-        write_mask(layout.mask_path(job.out, frame.index), estimate.mask)
-        if (job.folder / layout.PROBABILITIES).is_dir():
-            write_probability(job.out, frame.index, estimate.probability)
-    return record_.and_wrote(watch.times.write)
+    probabilities = (job.folder / layout.PROBABILITIES).is_dir()
+    return write_refined(job.out, estimate, frame, causal, mask, probabilities)
