@@ -91,17 +91,17 @@ def chosen_renderer(runtime: RuntimeConfig) -> dict[str, str | int]:
 
 
 def check_turns(config: PipelineConfig) -> None:
-    """Make sure that the solver can track backwards from the first frame.
+    """Make sure that the solver can track backwards from the prompt frame.
 
     Raises:
-        InputError: If it cannot.
+        InputError: It cannot.
     """
     name = config.solver.name
     if not hasattr(SOLVERS[name], "turned_back"):
-        turning = ", ".join(other for other, solver in SOLVERS.items() if hasattr(solver, "turned_back"))
+        turning = " or ".join(other for other, solver in SOLVERS.items() if hasattr(solver, "turned_back"))
         raise InputError(
-            f"The solver {name} goes forwards only; frames from before the first one need another ({turning}), or "
-            "are left out: --frames N: begins with frame N."
+            f"Solver '{name}' cannot track backwards. Use solver.name={turning}, or start at the prompt frame with "
+            "--frames N:."
         )
 
 

@@ -124,7 +124,7 @@ def test_another_tracker_is_left_as_it_is():
 def test_auto_has_no_options_and_is_nothing_for_a_session():
     with pytest.raises(InputError, match=r"tracker\.every is an option of one tracker"):
         check_tracker_options(load_config(tracker={"name": "auto", "every": 5}))
-    with pytest.raises(InputError, match="chosen by the first frame"):
+    with pytest.raises(InputError, match="chosen from the first frame"):
         Session(AUTO, PROMPT)
 
 
