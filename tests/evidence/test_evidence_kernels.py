@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from twins import colour_models, motion_cue, soft_visual_hull
+import twins.colour_models as plain_colours
+import twins.motion_cue as plain_motion
+import twins.soft_visual_hull as plain_hull
 
 from tracking3d.evidence import colours, consensus, motion
 from tracking3d.evidence.scene import FrameWindow
@@ -19,7 +21,7 @@ def test_labels_around_a_pixel_are_counted_alike(radius):
     labels = rng.integers(0, 7, (48, 48)).astype(np.uint8)
     mask = np.hypot(*(np.mgrid[:48, :48] - 20)) < 13
     fast = colours.alike_around(labels, mask, radius, 7)
-    np.testing.assert_allclose(fast, colour_models.alike_around(labels, mask, radius), atol=1e-5)
+    np.testing.assert_allclose(fast, plain_colours.alike_around(labels, mask, radius), atol=1e-5)
 
 
 def test_cells_have_the_same_distances_in_a_view():
@@ -27,7 +29,7 @@ def test_cells_have_the_same_distances_in_a_view():
     unknown = np.broadcast_to(np.arange(40) < 6, (40, 40))
     view = np.array([[3.0, 0.1, 0.9, -30.0], [0.2, 2.8, -0.5, -25.0], [0.01, 0.02, 0.1, 4.0]])
     given = distance, unknown, view, 0.3, -40
-    fast, plain = consensus.sample_grid_distances(*given), soft_visual_hull.carried(*given)
+    fast, plain = consensus.sample_grid_distances(*given), plain_hull.carried(*given)
     assert np.mean(fast != plain) < 1e-3  # where rounding decides
     assert 0.01 < np.mean(fast == 127) < 0.9 and len(np.unique(fast)) > 50
 
@@ -36,7 +38,7 @@ def test_a_view_from_within_the_grid_says_nothing():
     within = np.array([[30.0, 0, 0, 0], [0, 30.0, 0, 0], [0, 0, 1.0, -5.0]])
     plane = np.zeros((40, 40), np.float32)
     given = plane, plane > 0, within, 0.3, -40
-    assert consensus.sample_grid_distances(*given) is None and soft_visual_hull.carried(*given) is None
+    assert consensus.sample_grid_distances(*given) is None and plain_hull.carried(*given) is None
 
 
 def test_rays_come_as_deep_into_the_hulls():
@@ -49,7 +51,7 @@ def test_rays_come_as_deep_into_the_hulls():
     rays = np.stack([u, v, np.where(u == v, 0, 1)], -1).astype(np.float32)
     origin, depths = np.array([30, 32, -60], np.float32), np.linspace(50, 140, 40, dtype=np.float32)
     given = hulls, origin, rays, rng.permutation(depths), 90.0, -99.0
-    fast, plain = consensus.marched(*given), soft_visual_hull.marched(*given)
+    fast, plain = consensus.marched(*given), plain_hull.marched(*given)
     np.testing.assert_allclose(fast, plain, atol=2e-3)
     assert 0.05 < np.mean(plain == -99) < 0.9 and (plain > 0).any()
 
@@ -67,7 +69,7 @@ def test_both_motions_lead_to_the_same_places(monkeypatch):
     H = np.array([[1.02, 0.01, -6.0], [0.0, 0.98, 3.0], [1e-4, 0.0, 1.0]])
     target = image, moved, H
     fast = motion._parted_ways(scene, CAMERA, target)
-    monkeypatch.setattr(motion, "parted_ways", motion_cue.parted_ways)
+    monkeypatch.setattr(motion, "parted_ways", plain_motion.parted_ways)
     plain = motion._parted_ways(scene, CAMERA, target)
     for one, other in zip(fast, plain, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-3)
