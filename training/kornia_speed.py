@@ -22,8 +22,8 @@ from kornia.geometry.transform import remap, warp_perspective
 from kornia.morphology import erosion
 from torch import Tensor
 
-from tracking3d.estimation.losses import erode
 from tracking3d.estimation.observation import mask_distance
+from tracking3d.estimation.paper.losses import erode
 from tracking3d.geometry.pose import Pose
 from tracking3d.rendering import sample_texture
 from tracking3d.rendering.renderer import project

@@ -28,7 +28,8 @@ def videos(tmp_path):
 
 
 class Recorded:
-    """Stands for `tracking3d.recording.record`: a run of two frames is there at once, unless it is told to fail first.
+    """Stands for `tracking3d.pipeline.record.record`: a run of two frames is there at once, unless it is told to fail
+    first.
 
     Args:
         run: That run.
@@ -55,7 +56,7 @@ class Recorded:
         shutil.copytree(self._run, folder)
 
     def several(self, source: Any, config: Any, folder: Path, *, boxes, masks, points, **about: Any) -> None:
-        """Stands for `tracking3d.recording.record_objects`."""
+        """Stands for `tracking3d.pipeline.record.record_objects`."""
         folder.mkdir(parents=True, exist_ok=True)
         for number in range(len(boxes) + len(masks) + len(points)):
             self(source, config, folder / f"object_{number}", **about)

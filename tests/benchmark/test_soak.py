@@ -9,11 +9,11 @@ from tracking3d.benchmark import soak as module
 from tracking3d.benchmark.soak import Sample, SoakReport, format_soak, looped_clip, plot_soak, soak, trends
 from tracking3d.config.loading import load_config
 from tracking3d.frames import SkippedFrame
-from tracking3d.process_memory import resident_memory
 from tracking3d.results.run_reader import RunReader
+from tracking3d.runtime.memory import resident_memory
 
 QUICK = [
-    "window.size=32",
+    "crop.size=32",
     "object.frequency=3",
     "object.texture_size=48",
     "tracker.name=flow",

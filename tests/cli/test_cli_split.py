@@ -9,7 +9,7 @@ import pytest
 
 from tracking3d.benchmark.split_benefit import Measured, looped
 from tracking3d.errors import OutputError
-from tracking3d.splitting.long_video import Ended
+from tracking3d.submaps.job import Ended
 
 BOX = ("--box", "20,10,20,20")
 
@@ -26,7 +26,7 @@ def parts(monkeypatch):
             raise answer
         return answer
 
-    monkeypatch.setattr("tracking3d.splitting.split_run.record_in_parts", record_in_parts)
+    monkeypatch.setattr("tracking3d.submaps.split_run.record_in_parts", record_in_parts)
     monkeypatch.setattr("tracking3d.cli.progress.print_summary", lambda folder: print(f"summary of {folder}"))
     return asked, answers
 

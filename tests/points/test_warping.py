@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.prototypes import sphere
-from tracking3d.points.carrying import Warps
 from tracking3d.points.view import open_view
+from tracking3d.points.warping import Warps
 from tracking3d.rendering.backend import compiled
 
 MESH = sphere(12)

@@ -10,8 +10,8 @@ import torch
 from rendered_views import FINE, ball, pattern, view
 
 from tracking3d.estimation.estimate import ObjectModel
-from tracking3d.reconstruction import textured, texturing
-from tracking3d.reconstruction.texturing import filled, texture_size
+from tracking3d.reconstruction import make_texture, texturing
+from tracking3d.reconstruction.texturing import fill_holes, texture_size
 from tracking3d.rendering import sample_texture
 
 YAWS = (-40, -20, 0, 20, 40)
@@ -30,7 +30,7 @@ def error(model: ObjectModel, truth: np.ndarray) -> float:
 
 def test_the_texture_is_as_fine_as_the_views():
     views = [view(n, yaw) for n, yaw in enumerate(YAWS)]
-    model = textured(ball(), views)
+    model = make_texture(ball(), views)
     assert len(model.texture) == texture_size(views, 2048) == 512
     assert error(model, pattern()) < 0.04
     # What a texture of the size that the solver works with could say at best.
@@ -40,7 +40,7 @@ def test_the_texture_is_as_fine_as_the_views():
 
 
 def test_what_no_view_shows_is_marked_and_continues_what_is_seen():
-    model = textured(ball(), [view(0, 0.0)])
+    model = make_texture(ball(), [view(0, 0.0)])
     known = model.texture_weight > 0
     assert 0.2 < known.mean() < 0.5
     low, high = model.texture[known].min(0), model.texture[known].max(0)
@@ -49,7 +49,7 @@ def test_what_no_view_shows_is_marked_and_continues_what_is_seen():
 
 def test_shape_and_features_stay():
     before = ball()
-    after = textured(before, [view(0, 0.0)])
+    after = make_texture(before, [view(0, 0.0)])
     for name in ("vertices", "faces", "face_uvs", "features"):
         assert getattr(after, name) is getattr(before, name)
 
@@ -57,11 +57,11 @@ def test_shape_and_features_stay():
 def test_one_view_that_shows_something_else_is_outvoted():
     """A hand, a highlight: nearly white, over a third of the ball."""
     views = [view(n, yaw) for n, yaw in enumerate(YAWS)]
-    clean = error(textured(ball(), views), pattern())
+    clean = error(make_texture(ball(), views), pattern())
     image = views[2].image.copy()
     image[: len(image) // 2, len(image) // 3 :] = 250
-    alone = error(textured(ball(), [replace(views[2], image=image)]), pattern())
-    among = error(textured(ball(), [*views[:2], replace(views[2], image=image), *views[3:]]), pattern())
+    alone = error(make_texture(ball(), [replace(views[2], image=image)]), pattern())
+    among = error(make_texture(ball(), [*views[:2], replace(views[2], image=image), *views[3:]]), pattern())
     assert alone > 0.1
     assert among < clean + 0.2 * (alone - clean)
 
@@ -72,40 +72,42 @@ def test_exposures_are_brought_to_one_level():
         replace(one, image=(one.image * (0.85 if n % 2 else 1.0)).round().astype(np.uint8))
         for n, one in enumerate(views)
     ]
-    level = textured(ball(), darker).texture.astype(float)
-    even = textured(ball(), views).texture.astype(float)
-    well = textured(ball(), views).texture_weight > 0.3
+    level = make_texture(ball(), darker).texture.astype(float)
+    even = make_texture(ball(), views).texture.astype(float)
+    well = make_texture(ball(), views).texture_weight > 0.3
     ratio = level[well].mean(-1) / even[well].mean(-1)
     assert ratio.std() < 0.03  # 0.075 where each texel has its own view's exposure
 
 
 def test_the_kernel_adds_up_what_numpy_adds_up(monkeypatch):
     views = [view(n, yaw) for n, yaw in enumerate(YAWS)]
-    fast = textured(ball(), views)
+    fast = make_texture(ball(), views)
     monkeypatch.setattr(texturing, "compiled", lambda: False)
-    plain = textured(ball(), views)
+    plain = make_texture(ball(), views)
     assert np.abs(fast.texture.astype(int) - plain.texture).max() <= 1
     assert fast.texture_weight == pytest.approx(plain.texture_weight, rel=1e-4)
 
 
 def test_the_largest_texture_is_bounded():
-    assert len(textured(ball(), [view(0, 0.0)], largest=128).texture) == 128
+    assert len(make_texture(ball(), [view(0, 0.0)], largest=128).texture) == 128
 
 
 def test_without_views_or_where_none_shows_it_the_model_is_the_same():
     model = ball()
-    assert textured(model, []) is model
+    assert make_texture(model, []) is model
     behind = view(0, 0.0)
     T_cam_obj = behind.T_cam_obj.copy()
     T_cam_obj[2, 3] = -5.0
-    assert textured(model, [replace(behind, T_cam_obj=T_cam_obj)]) is model
+    assert make_texture(model, [replace(behind, T_cam_obj=T_cam_obj)]) is model
 
 
 def test_a_uniform_texture_is_continued_as_it_is():
     known = np.zeros((50, 37), bool)
     known[10:12, 5] = True
     texture = np.where(known[..., None], (0.2, 0.5, 0.7), 0.0).astype(np.float32)
-    assert filled(texture, known) == pytest.approx(np.broadcast_to((0.2, 0.5, 0.7), (50, 37, 3)), abs=1e-5)
+    assert fill_holes(texture, known) == pytest.approx(
+        np.broadcast_to((0.2, 0.5, 0.7), (50, 37, 3)), abs=1e-5
+    )
 
 
 def test_what_is_continued_goes_around_the_seam_in_u():
@@ -113,7 +115,7 @@ def test_what_is_continued_goes_around_the_seam_in_u():
     known[:, :8] = known[:, 40:44] = True
     texture = np.zeros((64, 64, 3), np.float32)
     texture[:, :8] = 1.0
-    result = filled(texture, known)
+    result = fill_holes(texture, known)
     assert result[:, 62].mean() > 0.5 > result[:, 46].mean()  # two texels from white, across the seam
     assert result[known] == pytest.approx(texture[known])
 
@@ -121,4 +123,4 @@ def test_what_is_continued_goes_around_the_seam_in_u():
 @pytest.mark.parametrize("known", [True, False])
 def test_all_or_nothing_known_is_left(known):
     texture = np.random.default_rng(0).random((8, 8, 3)).astype(np.float32)
-    assert filled(texture, np.full((8, 8), known)) is texture
+    assert fill_holes(texture, np.full((8, 8), known)) is texture

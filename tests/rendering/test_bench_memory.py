@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from tracking3d import process_memory
-from tracking3d.process_memory import resident_memory
+from tracking3d.runtime import memory
+from tracking3d.runtime.memory import resident_memory
 from tracking3d.speed.memory import peak_memory
 from tracking3d.speed.scene import Problem
 
@@ -21,7 +21,7 @@ needs_proc = pytest.mark.skipif(
 
 
 PEAKS = """
-from tracking3d.process_memory import forget_peak, resident_memory
+from tracking3d.runtime.memory import forget_peak, resident_memory
 forget_peak()
 now, _ = resident_memory()
 block = b"x" * int(64e6)
@@ -43,7 +43,7 @@ def test_the_peak_is_that_since_it_was_forgotten():
 
 def test_without_proc_the_operating_system_is_asked_in_its_unit(monkeypatch):
     resource = pytest.importorskip("resource", reason="this system has no module resource")
-    monkeypatch.setattr(process_memory, "_STATUS", Path("no such file"))
+    monkeypatch.setattr(memory, "_STATUS", Path("no such file"))
     monkeypatch.setattr(resource, "getrusage", lambda who: type("usage", (), {"ru_maxrss": 3_000_000}))
     monkeypatch.setattr(sys, "platform", "linux")
     assert resident_memory() == pytest.approx((3072.0, 3072.0))
@@ -52,7 +52,7 @@ def test_without_proc_the_operating_system_is_asked_in_its_unit(monkeypatch):
 
 
 def test_where_nobody_tells_there_is_no_answer(monkeypatch):
-    monkeypatch.setattr(process_memory, "_STATUS", Path("no such file"))
+    monkeypatch.setattr(memory, "_STATUS", Path("no such file"))
     monkeypatch.setitem(sys.modules, "resource", None)
     assert resident_memory() is None
     assert peak_memory("torch", Problem(), CPU) is None

@@ -10,7 +10,7 @@ from scipy.spatial import HalfspaceIntersection
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.frames import Frame
 from tracking3d.results.correspondences import PointKind, check_asked, on_mask, track_points
-from tracking3d.results.following import open_scene
+from tracking3d.results.point_tracking import open_scene
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_writer import RunWriter
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize

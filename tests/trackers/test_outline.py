@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tracking3d.trackers.outline import both_sides, prior, shifted_to, signed_distance, tidied, touches_border
+from tracking3d.trackers.outline import (
+    both_sides,
+    clean_mask,
+    prior,
+    shift_to,
+    signed_distance,
+    touches_border,
+)
 
 
 def square(top: int = 30, left: int = 30, side: int = 40, size: int = 100) -> np.ndarray:
@@ -30,13 +37,13 @@ def test_the_prior_is_the_weighted_mean_of_opinions_in_units_of_the_size() -> No
 @pytest.mark.parametrize(("down", "right"), [(0, 0), (6, -4), (-8, 10)])
 def test_a_mask_is_shifted_to_where_the_evidence_is(down: int, right: int) -> None:
     evidence = np.where(square(30 + down, 30 + right), 1, -1).astype(np.float32)
-    found = shifted_to(square().astype(np.float32), evidence)
+    found = shift_to(square().astype(np.float32), evidence)
     np.testing.assert_array_equal(found > 0.5, square(30 + down, 30 + right))
 
 
 def test_without_evidence_a_mask_stays_where_it_is() -> None:
     mask = square().astype(np.float32)
-    np.testing.assert_array_equal(shifted_to(mask, np.zeros((100, 100), np.float32)), mask)
+    np.testing.assert_array_equal(shift_to(mask, np.zeros((100, 100), np.float32)), mask)
 
 
 def test_the_sides_leave_a_band_out() -> None:
@@ -64,19 +71,19 @@ def test_specks_pinholes_and_parts_that_were_not_there_are_dropped() -> None:
     mask[50, 50] = False
     mask[5, 5] = True
     mask[80:95, 75:95] = True
-    assert_same_but_corners(tidied(mask, square()), square())
+    assert_same_but_corners(clean_mask(mask, square()), square())
 
 
 def test_a_hole_that_is_no_pinhole_stays() -> None:
     mask = square()
     mask[40:50, 40:50] = False
-    assert_same_but_corners(tidied(mask, mask), mask)
+    assert_same_but_corners(clean_mask(mask, mask), mask)
 
 
 def test_a_part_that_moves_with_the_background_is_dropped() -> None:
     other = square(80, 75, 15)
     mask = square() | other
-    assert_same_but_corners(tidied(mask, mask), mask)
+    assert_same_but_corners(clean_mask(mask, mask), mask)
     motion = np.where(other, -1.0, 1.0).astype(np.float32)
-    assert_same_but_corners(tidied(mask, mask, motion), square())
-    assert_same_but_corners(tidied(mask, mask, -np.ones_like(motion)), mask)
+    assert_same_but_corners(clean_mask(mask, mask, motion), square())
+    assert_same_but_corners(clean_mask(mask, mask, -np.ones_like(motion)), mask)

@@ -12,7 +12,7 @@ from tracking3d.errors import InputError
 from tracking3d.evaluation.metrics import mask_iou
 from tracking3d.frames import Frame
 from tracking3d.vot import VotTracker
-from tracking3d.vot.regions import MaskRows, placed, prompt_of, rectangle_of
+from tracking3d.vot.regions import MaskRows, place_region, prompt_of, rectangle_of
 from tracking3d.vot.sessions import configuration
 
 
@@ -168,8 +168,8 @@ def test_the_preset_may_be_in_the_environment_and_an_argument_wins(monkeypatch):
 
 def test_a_file_and_overrides_are_heard(tmp_path):
     (tmp_path / "fast.yaml").write_text("solver: {points: 3}\n")
-    config = configuration(str(tmp_path / "fast.yaml"), overrides="window.size=48 object.texture_size=32")
-    assert (config.solver.points, config.window.size, config.object.texture_size) == (3, 48, 32)
+    config = configuration(str(tmp_path / "fast.yaml"), overrides="crop.size=48 object.texture_size=32")
+    assert (config.solver.points, config.crop.size, config.object.texture_size) == (3, 48, 32)
 
 
 # Regions
@@ -188,11 +188,14 @@ def test_a_mask_smaller_than_the_frame_lies_at_its_offset():
 
 def test_a_mask_beyond_the_frame_is_cut_off():
     ones = np.ones((10, 10), bool)
-    assert placed(ones, (-4, -7), (20, 30))[:3, :6].all() and placed(ones, (-4, -7), (20, 30)).sum() == 6 * 3
-    assert placed(ones, (25, 15), (20, 30)).sum() == 5 * 5
-    assert placed(ones, (40, 0), (20, 30)).sum() == 0
-    assert placed(ones, (-10, -20), (20, 30)).sum() == 0
-    assert placed(np.ones((40, 50), bool), (0, 0), (20, 30)).all()
+    assert (
+        place_region(ones, (-4, -7), (20, 30))[:3, :6].all()
+        and place_region(ones, (-4, -7), (20, 30)).sum() == 6 * 3
+    )
+    assert place_region(ones, (25, 15), (20, 30)).sum() == 5 * 5
+    assert place_region(ones, (40, 0), (20, 30)).sum() == 0
+    assert place_region(ones, (-10, -20), (20, 30)).sum() == 0
+    assert place_region(np.ones((40, 50), bool), (0, 0), (20, 30)).all()
 
 
 def test_a_polygon_is_filled():

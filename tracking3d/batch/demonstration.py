@@ -22,16 +22,16 @@ import numpy as np
 
 from tracking3d.batch import fault_plugins
 from tracking3d.batch.folder import read_failures
-from tracking3d.batch.load import Load, measured_load
 from tracking3d.batch.one_video import WORK
+from tracking3d.batch.resource_usage import Load, measure_load
 from tracking3d.batch.running import Happening, run_batch
 from tracking3d.batch.video_job import VideoJob
 from tracking3d.config.models import PipelineConfig
 from tracking3d.engines.choosing import open_engine
 from tracking3d.engines.protocol import Needs
+from tracking3d.pipeline.record import record
 from tracking3d.plugins import VARIABLE
-from tracking3d.prompts import parse_box
-from tracking3d.recording import record
+from tracking3d.prompts.prompt import parse_box
 from tracking3d.results.run_reader import RunReader
 from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
 from tracking3d.video import VideoWriter, open_source
@@ -244,7 +244,7 @@ class _Pass:
         unfinished = out / WORK
         with (
             open_engine(self.asked.address, self.workers, Needs()) as engine,
-            measured_load(unfinished=unfinished) as samples,
+            measure_load(unfinished=unfinished) as samples,
         ):
             started = time.monotonic()
             try:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from tracking3d.batch.folder import Failure, Progress
-from tracking3d.batch.places import base, joined, write
+from tracking3d.batch.storage import base, join_path, write
 from tracking3d.report.rendering import render_page
 from tracking3d.results import layout
 
@@ -55,4 +55,4 @@ def write_overview(
         frames=sum(row["frames"] for row in rows),
         seconds=sum(row["seconds"] for row in rows),
     )
-    write(joined(out, layout.INDEX), page)
+    write(join_path(out, layout.INDEX), page)

@@ -14,7 +14,7 @@ from tracking3d.batch.folder import Failure, Progress, write_progress, write_tab
 from tracking3d.batch.networks import share_networks
 from tracking3d.batch.one_video import LOGS, WORK, send_log
 from tracking3d.batch.overview import write_overview
-from tracking3d.batch.places import joined, local, read_many
+from tracking3d.batch.storage import join_path, local, read_many
 from tracking3d.batch.summary import MARKER, read_marker
 from tracking3d.batch.tasks import Tasks, is_whole
 from tracking3d.batch.video_job import VideoJob
@@ -86,7 +86,7 @@ class Batch:
 
     def find_finished(self, overwrite: bool) -> list[int]:
         """Take in what an earlier command has finished; the numbers of the jobs that are still to be done."""
-        places = [joined(self._out, job.name, MARKER) for job in self._jobs]
+        places = [join_path(self._out, job.name, MARKER) for job in self._jobs]
         contents = {} if overwrite else read_many(places)
         left = []
         for number, (job, place) in enumerate(zip(self._jobs, places, strict=True)):
@@ -111,7 +111,7 @@ class Batch:
         self._tasks = tasks
         return [tasks.first(number) for number in sorted(left, key=lambda number: -self._jobs[number].size)]
 
-    def told(self, event: Event) -> None:
+    def report_outcome(self, event: Event) -> None:
         """Take in what an engine tells."""
         assert self._tasks is not None
         job = self._jobs[self._tasks.video(event.number)]
@@ -158,13 +158,13 @@ class Batch:
             raise problem
 
     def _write_tables(self) -> None:
-        write_tables(self._out, *self._told_so_far())
+        write_tables(self._out, *self._reported_so_far())
 
     def _write_page(self) -> None:
-        rows, failures = self._told_so_far()
+        rows, failures = self._reported_so_far()
         write_overview(self._out, self.progress, rows, self._pictures, failures, self._report)
 
-    def _told_so_far(self) -> tuple[list[Mapping[str, Any]], list[Failure]]:
+    def _reported_so_far(self) -> tuple[list[Mapping[str, Any]], list[Failure]]:
         rows = [row for rows in self._rows.values() for row in rows]
         return rows, sorted(self.failures.values(), key=lambda one: one.run)
 
@@ -174,7 +174,7 @@ class Batch:
 
     def _why_taken(self, job: VideoJob, marker: Mapping[str, Any] | None) -> str:
         """Why a video's run folder cannot be had, in a sentence; empty where it can, or is there already."""
-        place = joined(self._out, job.name)
+        place = join_path(self._out, job.name)
         if marker is not None:
             what = "" if marker["key"] == job.key else "a run of another video, prompt or setting"
         else:  # what is whole comes with its marker, but elsewhere, where a part of it may have been sent
@@ -289,7 +289,7 @@ def run_batch(
                 first,
                 retries=retries,
                 pause=pause,
-                listener=batch.told,
+                listener=batch.report_outcome,
                 further=tasks.further,
                 meanwhile=batch.write,
             )

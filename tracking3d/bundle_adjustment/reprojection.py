@@ -63,6 +63,6 @@ def pixel_by_pose(by_point: FloatArray, from_pivot: FloatArray) -> FloatArray:
     return np.concatenate([by_point, turned], -1)
 
 
-def moved(R: FloatArray, t: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray]:
+def apply_update(R: FloatArray, t: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Poses ``(F, 3, 3)`` and ``(F, 3)`` after steps ``(F, 6)``."""
     return Rotation.from_rotvec(step[:, 3:]).as_matrix() @ R, t + step[:, :3]

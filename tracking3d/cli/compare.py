@@ -53,16 +53,16 @@ def _print(comparison: Comparison) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from tracking3d.cli.tables import print_table, shown
+    from tracking3d.cli.tables import format_cell, print_table
     from tracking3d.report.differences import run_figures
-    from tracking3d.stages import STAGES
+    from tracking3d.runtime.stage_times import STAGES
 
     names = [escape(name) for name in comparison.names]
 
     def table(title: str, rows: dict[str, list[Any]], columns: list[str]) -> None:
         drawn = Table("", *columns, title=title, title_justify="left")
         for name, values in rows.items():
-            drawn.add_row(escape(name), *(escape(shown(value)) for value in values))
+            drawn.add_row(escape(name), *(escape(format_cell(value)) for value in values))
         print_table(drawn)
 
     figures = [run_figures(run) for run in comparison.runs]

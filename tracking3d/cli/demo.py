@@ -25,11 +25,11 @@ def demo(
     import json
 
     from tracking3d.cli.progress import print_summary, progress
-    from tracking3d.cli.report import reported
+    from tracking3d.cli.report import report_progress
     from tracking3d.cli.tables import print_figures
     from tracking3d.datasets.clip import read_truth
     from tracking3d.evaluation.score import score_run
-    from tracking3d.recording import record
+    from tracking3d.pipeline.record import record
     from tracking3d.results.files import write_atomic
     from tracking3d.results.layout import REPORT
     from tracking3d.synthesis.convex_clips import make_demo_clip
@@ -40,7 +40,7 @@ def demo(
     source = open_source(clip / "frames")
     box = read_truth(clip).box
     command = f"tracking3d demo --seed {seed}"
-    with reported([folder]) as told, progress(source.count, quiet) as listener:
+    with report_progress([folder]) as told, progress(source.count, quiet) as listener:
         record(source, settings, folder, box=box, command=command, overwrite=True, listener=told(listener))
 
     scores = score_run(folder, clip)

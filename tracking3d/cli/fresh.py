@@ -21,7 +21,7 @@ Meshes = Annotated[
 ]
 
 
-def drawn_suite(
+def draw_suite(
     name: str, seed: int | None, count: int | None, meshes: Path | None
 ) -> tuple[str, list[SequenceSpec] | None]:
     """What a suite is called, and its sequences if it is drawn from a seed.

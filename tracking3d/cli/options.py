@@ -53,18 +53,20 @@ def configure(
 ) -> PipelineConfig:
     """The configuration, the options of its plug-ins checked too; None in ``direct`` is no setting."""
     from tracking3d.config.loading import load_config
+    from tracking3d.pipeline.tracker_selection import check_tracker_options
     from tracking3d.plugins import FEATURES, check_options
-    from tracking3d.tracker_choice import check_tracker_options
 
-    config = load_config(file, preset, overrides or (), quality=quality, **_given(direct))
+    config = load_config(file, preset, overrides or (), quality=quality, **_given_options(direct))
     check_tracker_options(config)
     check_options(FEATURES, config.features)
     return config
 
 
-def _given(values: dict[str, Any]) -> dict[str, Any]:
+def _given_options(values: dict[str, Any]) -> dict[str, Any]:
     """``values`` without those that are None, section by section."""
-    sections = {key: _given(value) if isinstance(value, dict) else value for key, value in values.items()}
+    sections = {
+        key: _given_options(value) if isinstance(value, dict) else value for key, value in values.items()
+    }
     return {key: value for key, value in sections.items() if value is not None and value != {}}
 
 

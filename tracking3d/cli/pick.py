@@ -90,7 +90,7 @@ def picked_in_browser(
         OutputError: If there is a run in the folder.
     """
     from tracking3d.errors import InputError, OutputError
-    from tracking3d.picker.outcome import command_of, save_picked, settings_as_yaml
+    from tracking3d.picker.outcome import command_of, save_outcome, settings_as_yaml
     from tracking3d.picker.server import Picker
     from tracking3d.picker.session import PickingSession
     from tracking3d.results import layout
@@ -108,7 +108,7 @@ def picked_in_browser(
     session = PickingSession(source, images, within(selection, images.count or opened.count or 1), settings)
 
     def save(picked: Picked) -> tuple[str, str]:
-        save_picked(picked, settings, folder, source)
+        save_outcome(picked, settings, folder, source)
         return command_of(picked, folder, source, frames), settings_as_yaml(settings)
 
     picker = Picker(session, save, Access.on(host), port)

@@ -59,8 +59,8 @@ def points(
     cover is followed in the images. A pixel outside the frame is an error, and so is none on the object without --any.
     """
     from tracking3d.results.correspondences import check_asked, grid_on_object, on_mask, track_points
-    from tracking3d.results.following import open_scene
     from tracking3d.results.point_files import points_to_csv, points_to_json
+    from tracking3d.results.point_tracking import open_scene
     from tracking3d.results.point_trails import write_trails
     from tracking3d.results.run_reader import RunReader
 

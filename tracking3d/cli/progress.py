@@ -12,14 +12,14 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from tracking3d.cli.tables import print_table, shown
+from tracking3d.cli.tables import format_cell, print_table
 from tracking3d.frames import SkippedFrame
-from tracking3d.recording import Listener
+from tracking3d.pipeline.record import Listener
 from tracking3d.results import layout
 from tracking3d.results.description import own_masks, time_per_frame
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
-from tracking3d.stages import STAGES
+from tracking3d.runtime.stage_times import STAGES
 
 _EVERY = 10.0  # seconds between lines of a log
 _COLOURS = {"tracked": "green", "uncertain": "yellow", "lost": "red", "skipped": "red"}
@@ -42,7 +42,7 @@ def progress(count: int | None, quiet: bool, objects: int = 1) -> Iterator[Liste
     """
     console = Console(stderr=True)
     if not console.is_terminal:
-        yield _silent if quiet else _logged(console, count and count * objects)
+        yield _silent if quiet else _log_progress(console, count and count * objects)
         return
     bar = Progress(
         BarColumn(bar_width=24),
@@ -70,7 +70,7 @@ def _silent(frame: FrameRecord | SkippedFrame) -> None:
     pass
 
 
-def _logged(console: Console, count: int | None) -> Listener:
+def _log_progress(console: Console, count: int | None) -> Listener:
     """Prints how far it is, at most once in `_EVERY` seconds and not before these are over."""
     last, done = time.monotonic(), {False: 0, True: 0}
 
@@ -109,7 +109,7 @@ def print_summary(folder: Path) -> None:
         for failure in run["failures"]:
             table.add_row(f"    {failure['frames']} of them", escape(failure["reason"]))
     if refinement := run.get("refinement"):
-        took = f"{refinement['frames']} frames in {shown(refinement['seconds'])} s"
+        took = f"{refinement['frames']} frames in {format_cell(refinement['seconds'])} s"
         table.add_row("final refinement", took if refinement["frames"] else escape(refinement["reason"]))
     own = own_masks(run)
     if own is not None:
@@ -123,11 +123,11 @@ def print_summary(folder: Path) -> None:
             "mean IoU with the initial masks"
             if own is None
             else "  mean IoU of these with the initial masks",
-            shown(run["iou_initial_mean"] if own is None else run["iou_initial_mean_own"]),
+            format_cell(run["iou_initial_mean"] if own is None else run["iou_initial_mean_own"]),
         )
-    table.add_row("seconds per frame", shown(whole))
+    table.add_row("seconds per frame", format_cell(whole))
     for stage in STAGES if stages else ():
-        table.add_row(f"  {stage}", shown(getattr(stages, stage)))
+        table.add_row(f"  {stage}", format_cell(getattr(stages, stage)))
     if shape := run.get("shape"):
         table.add_row("shape", escape(str(shape)))
     for note in run["notes"]:
@@ -154,5 +154,5 @@ def _line(frame: FrameRecord | SkippedFrame) -> str:
     once_more = "once more: " if frame.refined else ""
     return (
         f"{once_more}frame {frame.index} [{_COLOURS[frame.status]}]{frame.status}[/] "
-        f"IoU {shown(frame.iou_initial)} {frame.seconds:.2f} s"
+        f"IoU {format_cell(frame.iou_initial)} {frame.seconds:.2f} s"
     )

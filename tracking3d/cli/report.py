@@ -14,7 +14,7 @@ from tracking3d.errors import Tracking3dError
 
 if TYPE_CHECKING:
     from tracking3d.frames import SkippedFrame
-    from tracking3d.passes import Listener
+    from tracking3d.pipeline.passes import Listener
     from tracking3d.results.records import FrameRecord
 
 
@@ -36,7 +36,7 @@ def report(
 
 
 @contextmanager
-def reported(folders: Sequence[Path]) -> Iterator[Callable[[Listener], Listener]]:
+def report_progress(folders: Sequence[Path]) -> Iterator[Callable[[Listener], Listener]]:
     """Write the reports of runs when what is within ends, in whatever way, if it got as far as a frame.
 
     That a report cannot be written is said, and changes nothing about how the run ended.

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from tracking3d.cli.model import check_fine
-from tracking3d.cli.objects import check_known, given_box, given_masks
+from tracking3d.cli.objects import check_known, parse_given_box, parse_given_masks
 from tracking3d.cli.options import (
     ConfigFile,
     Debug,
@@ -294,20 +294,20 @@ def run(
         solver={"final_refine": final_refine},
         runtime={"device": device, "seed": seed, "on_plugin_failure": on_plugin_failure},
     )
-    from tracking3d.arguments import needs_prompt
-    from tracking3d.corrections import checked_corrections, parse_correction
-    from tracking3d.point_prompts import parse_points
+    from tracking3d.pipeline.validation import needs_prompt
+    from tracking3d.prompts.corrections import parse_correction, validate_corrections
+    from tracking3d.prompts.points import parse_points
     from tracking3d.video.selection import parse_selection
     from tracking3d.video.stream import without_password
 
     first = start_frame if start_frame is not None else parse_selection(frames).start
     given = Given(
-        [given_box(text, first) for text in boxes],
-        [one for file in object_masks for one in given_masks(file)],
+        [parse_given_box(text, first) for text in boxes],
+        [one for file in object_masks for one in parse_given_masks(file)],
         [parse_points(text) for text in object_points],
     )
     corrections = [parse_correction(text) for text in correct or told.correct]
-    checked_corrections(corrections, max(len(given), 1))  # before anything is written
+    validate_corrections(corrections, max(len(given), 1))  # before anything is written
     folder = out or default_folder(source)
     check_known(settings, len(given), fine, split is not None)
     if not given and needs_prompt(settings):

@@ -38,7 +38,7 @@ def track_in_parts(
         settings: The configuration.
         folder: The run folder.
         given: What the object is.
-        about: Further arguments of `tracking3d.recording.record`.
+        about: Further arguments of `tracking3d.pipeline.record.record`.
         length: Of a part, as ``--split`` has it.
         workers: Processes at a time; as many as the machine has processors if None.
         fps: Whether ``--fps`` was given.
@@ -50,9 +50,9 @@ def track_in_parts(
         InputError: If options do not go together.
     """
     from tracking3d.cli.progress import print_summary, progress
-    from tracking3d.cli.report import reported
-    from tracking3d.splitting.part_runs import Given as GivenOfPart
-    from tracking3d.splitting.split_run import record_in_parts
+    from tracking3d.cli.report import report_progress
+    from tracking3d.submaps.split_run import record_in_parts
+    from tracking3d.submaps.submap_runs import PromptSet as GivenOfPart
     from tracking3d.video import open_source
 
     _check(given, about, workers, view, fps)
@@ -60,8 +60,8 @@ def track_in_parts(
         logging.getLogger("tracking3d").setLevel(logging.ERROR)
     box, mask, points = (next(iter(one), None) for one in (given.boxes, given.masks, given.points))
     with ExitStack() as ends:
-        ends.enter_context(_to_be_resumed(folder))
-        reporting = ends.enter_context(reported([folder] if report else []))
+        ends.enter_context(_allow_resuming(folder))
+        reporting = ends.enter_context(report_progress([folder] if report else []))
         listener = reporting(
             ends.enter_context(progress(open_source(source, about["selection"]).count, quiet))
         )
@@ -114,9 +114,9 @@ def _processors() -> int:
 
 
 @contextmanager
-def _to_be_resumed(folder: Path) -> Iterator[None]:
+def _allow_resuming(folder: Path) -> Iterator[None]:
     """Whatever stops it, it says how to go on."""
-    from tracking3d.splitting.plan import PARTS
+    from tracking3d.submaps.plan import PARTS
 
     try:
         yield

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tracking3d.cli.fresh import Count, Meshes, drawn_suite
+from tracking3d.cli.fresh import Count, Meshes, draw_suite
 from tracking3d.cli.options import Debug, Quiet, numbers
 from tracking3d.errors import InputError
 
@@ -109,7 +109,7 @@ def synth(
         "seed": seed,
     }
     settings = {name: value for name, value in given.items() if value is not None}
-    drawn = drawn_suite(suite or "one sequence", seed if suite else None, count, meshes)
+    drawn = draw_suite(suite or "one sequence", seed if suite else None, count, meshes)
     others = next((name for name in settings if (suite, name) != ("fresh", "seed")), None)
     if suite is not None and others:
         raise InputError(f"--suite {suite} is fixed and does not go with --{others}; leave one of them out.")

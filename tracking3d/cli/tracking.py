@@ -49,7 +49,7 @@ def track(
         settings: The configuration.
         folder: The run folder.
         given: What the objects are.
-        about: Further arguments of `tracking3d.recording.record`, ``selection`` among them.
+        about: Further arguments of `tracking3d.pipeline.record.record`, ``selection`` among them.
         fps: Images per second of a source that has no times of its own.
         quiet: Print nothing.
         report: Write a report at the end.
@@ -57,9 +57,9 @@ def track(
         host: Where that is served.
     """
     from tracking3d.cli.progress import print_summary, progress
-    from tracking3d.cli.report import reported
-    from tracking3d.cli.view import watched
-    from tracking3d.recording import record, record_objects
+    from tracking3d.cli.report import report_progress
+    from tracking3d.cli.view import watch
+    from tracking3d.pipeline.record import record, record_objects
     from tracking3d.results.layout import object_folders
     from tracking3d.results.run_reader import is_finished
     from tracking3d.video import open_source
@@ -69,13 +69,13 @@ def track(
         logging.getLogger("tracking3d").setLevel(logging.ERROR)
     objects = max(len(given), 1)
     folders = object_folders(folder, objects) if objects > 1 else [folder]
-    finished = {one: _written(one) for one in folders if about.get("resume") and is_finished(one)}
+    finished = {one: _time_written(one) for one in folders if about.get("resume") and is_finished(one)}
     with ExitStack() as ends:
         ends.enter_context(resumable(folders))
-        reporting = ends.enter_context(reported(folders if report else []))
+        reporting = ends.enter_context(report_progress(folders if report else []))
         listener = reporting(ends.enter_context(progress(opened.count, quiet, objects)))
         if view:
-            opened, listener = ends.enter_context(watched(opened, folder, listener, host, quiet))
+            opened, listener = ends.enter_context(watch(opened, folder, listener, host, quiet))
         about = {**about, "listener": listener}
         if objects > 1:
             several: dict[str, Any] = {"boxes": given.boxes, "masks": given.masks, "points": given.points}
@@ -84,7 +84,7 @@ def track(
             box, mask, points = (next(iter(one), None) for one in (given.boxes, given.masks, given.points))
             record(opened, settings, folder, box=box, mask=mask, points=points, **about)
     for one in () if quiet else folders:
-        if one in finished and finished[one] == _written(one):
+        if one in finished and finished[one] == _time_written(one):
             typer.echo(f"The run {one} is finished already; there is nothing to resume.")
         else:
             print_summary(one)
@@ -125,7 +125,7 @@ def default_folder(source: str) -> Path:
     return Path("runs", path.stem if path.is_file() else path.name)
 
 
-def _written(folder: Path) -> int:
+def _time_written(folder: Path) -> int:
     """When the description of a run was written last."""
     from tracking3d.results.layout import RUN
 

@@ -16,7 +16,7 @@ from tracking3d.cli.options import Debug
 
 if TYPE_CHECKING:
     from tracking3d.frames import SkippedFrame
-    from tracking3d.recording import Listener
+    from tracking3d.pipeline.record import Listener
     from tracking3d.results.records import FrameRecord
     from tracking3d.video.any_frame import FrameImages
     from tracking3d.video.source import FrameSource
@@ -67,7 +67,7 @@ def view(
 
 
 @contextmanager
-def watched(
+def watch(
     source: FrameSource, folder: Path, listener: Listener, host: str | None, quiet: bool
 ) -> Iterator[tuple[FrameSource, Listener]]:
     """Show a run while it goes on, from its first answer; at its end, until Ctrl-C.

@@ -43,9 +43,9 @@ def choose_camera(
             then left aside, and the log says so.
     """
     if config.file is not None:
-        return _measured(read_camera(config.file), width, height)
+        return _measured_camera(read_camera(config.file), width, height)
     camera = _pinhole(config, width, height, known, known_origin)
-    coefficients = given_distortion(config)
+    coefficients = parse_distortion(config)
     if not coefficients:
         return camera
     if camera.assumed:
@@ -60,10 +60,10 @@ def choose_camera(
         None,
         camera.origin,
     )
-    return _measured(taken, width, height)
+    return _measured_camera(taken, width, height)
 
 
-def given_distortion(config: CameraConfig) -> tuple[float, ...]:
+def parse_distortion(config: CameraConfig) -> tuple[float, ...]:
     """The coefficients, as many as their model has; none where there is no distortion.
 
     Raises:
@@ -72,7 +72,7 @@ def given_distortion(config: CameraConfig) -> tuple[float, ...]:
     return as_coefficients(config.distortion_model, config.distortion or (), DISTORTION)
 
 
-def _measured(taken: CalibratedCamera, width: int, height: int) -> Camera:
+def _measured_camera(taken: CalibratedCamera, width: int, height: int) -> Camera:
     """The pinhole camera that pictures of a measured one are turned into.
 
     Raises:
@@ -107,7 +107,7 @@ def _pinhole(
         if _usual(camera):
             return camera
         _log.warning(
-            "%s by the %s; that is hardly a camera's, and is left aside.", _told(camera), known_origin
+            "%s by the %s; that is hardly a camera's, and is left aside.", _describe(camera), known_origin
         )
     origin = f"default field of view of {DEFAULT_FIELD_OF_VIEW:g} degrees"
     return replace(Camera.from_fov(width, height, DEFAULT_FIELD_OF_VIEW, origin), assumed=True)
@@ -126,10 +126,11 @@ def warn_of_unlikely(camera: Camera) -> None:
     inside = 0 <= camera.cx < camera.width and 0 <= camera.cy < camera.height
     if not _usual(camera):
         _log.warning(
-            "%s; that is hardly a camera's, so look whether they are of images of that size.", _told(camera)
+            "%s; that is hardly a camera's, so look whether they are of images of that size.",
+            _describe(camera),
         )
     elif not inside:
-        _log.warning("%s, whose centre %g, %g lies outside them.", _told(camera), camera.cx, camera.cy)
+        _log.warning("%s, whose centre %g, %g lies outside them.", _describe(camera), camera.cx, camera.cy)
 
 
 def _usual(camera: Camera) -> bool:
@@ -139,12 +140,14 @@ def _usual(camera: Camera) -> bool:
 
 def _check(camera: Camera) -> None:
     if not all(1 <= angle <= 170 for angle in _angles(camera)):
-        raise InputError(f"{_told(camera)}; camera.intrinsics is fx, fy, cx, cy in pixels of these images.")
+        raise InputError(
+            f"{_describe(camera)}; camera.intrinsics is fx, fy, cx, cy in pixels of these images."
+        )
     if not (
         -camera.width <= camera.cx <= 2 * camera.width and -camera.height <= camera.cy <= 2 * camera.height
     ):
         raise InputError(
-            f"{_told(camera)}, but their centre {camera.cx:g}, {camera.cy:g} lies far outside them; "
+            f"{_describe(camera)}, but their centre {camera.cx:g}, {camera.cy:g} lies far outside them; "
             "camera.intrinsics is fx, fy, cx, cy in pixels of these images."
         )
 
@@ -155,7 +158,7 @@ def _angles(camera: Camera) -> tuple[float, float]:
     return math.degrees(horizontal), math.degrees(2 * math.atan2(camera.height / 2, camera.fy))
 
 
-def _told(camera: Camera) -> str:
+def _describe(camera: Camera) -> str:
     given = ",".join(f"{value:g}" for value in (camera.fx, camera.fy, camera.cx, camera.cy))
     horizontal, vertical = _angles(camera)
     return (

@@ -89,11 +89,11 @@ class CameraConfig(Section):
 class ObjectConfig(Section):
     """How the object is represented (paper section 3.1)."""
 
-    known: str | None = Field(
+    model: str | None = Field(
         None,
         description=(
             "The folder of an earlier run or a mesh file: the object is that one, and is found in the video without a "
-            "start by motion. Shape and colours are held: landmark_views and texture_views are 0, shape is online, and "
+            "start by motion. Shape and colours are held: adjustment_views and texture_views are 0, shape is online, and "
             "prototype is not asked."
         ),
     )
@@ -111,7 +111,7 @@ class ObjectConfig(Section):
             "first mask, and given one spread; empty keeps them as they are (paper)."
         ),
     )
-    landmark_views: int = Field(
+    adjustment_views: int = Field(
         120,
         ge=0,
         le=2000,
@@ -120,7 +120,7 @@ class ObjectConfig(Section):
             "final refinement; the others follow them. 0 leaves them as rendering has them."
         ),
     )
-    evidence: bool = Field(
+    refine_masks: bool = Field(
         True,
         description=(
             "Masks are weighed once more, against the image, at the end of the final refinement: by shapes, colours "
@@ -136,7 +136,7 @@ class ObjectConfig(Section):
             "0 leaves the solver's, of texture_size."
         ),
     )
-    largest_texture: int = Field(
+    max_texture_size: int = Field(
         2048, ge=64, le=8192, description="Most texels along a side of the mesh's texture."
     )
     shape: Literal["online", "fine"] = Field(
@@ -154,11 +154,11 @@ class ObjectConfig(Section):
     @classmethod
     def _is_held_where_known(cls, value: Any) -> Any:
         if isinstance(value, dict) and value.get("known") is not None:
-            return {**value, "landmark_views": 0, "texture_views": 0, "shape": "online"}
+            return {**value, "adjustment_views": 0, "texture_views": 0, "shape": "online"}
         return value
 
 
-class WindowConfig(Section):
+class CropConfig(Section):
     """The window of the frame that is rendered."""
 
     size: int = Field(128, ge=32, le=1024, description="Working resolution: side of the window in pixels.")
@@ -188,7 +188,7 @@ class RuntimeConfig(Section):
         "auto",
         description="What renders: torch everywhere, numba on the CPU, or the fastest that can be used here.",
     )
-    milestones: int = Field(
+    rollback_points: int = Field(
         8,
         ge=0,
         le=64,
@@ -216,6 +216,6 @@ class PipelineConfig(Section):
     features: PluginChoice = PluginChoice(name="rgb")
     camera: CameraConfig = CameraConfig()
     object: ObjectConfig = ObjectConfig()
-    window: WindowConfig = WindowConfig()
+    crop: CropConfig = CropConfig()
     solver: SolverConfig = OnlineConfig()
     runtime: RuntimeConfig = RuntimeConfig()

@@ -28,7 +28,7 @@ class OnlineConfig(Section):
 
     name: Literal["online"] = Field("online", description="Which solver: paper or online.")
     final_refine: FinalRefine = True
-    correct_tracker: CorrectTracker = True
+    tracker_feedback: CorrectTracker = True
     appearance: float = Field(1.0, ge=0, description="Weight of the pixels' loss in a frame's pose.")
     outline: float = Field(0.3, ge=0, description="Weight of the outline's distance from the mask, robust.")
     points: float = Field(1.0, ge=0, description="Weight of the followed points' distances, robust.")
@@ -37,13 +37,13 @@ class OnlineConfig(Section):
         gt=0,
         description="A frame is a keyframe if it is turned more than so many degrees from all others.",
     )
-    window: int = Field(
+    local_window: int = Field(
         12,
         ge=2,
         le=64,
         description="Keyframes that are refined together: half recent, half spread over the older.",
     )
-    most_keyframes: int = Field(
+    max_keyframes: int = Field(
         64, ge=8, le=512, description="Keyframes that are kept; the one nearest to another view goes first."
     )
     smoothness: float = Field(300.0, gt=0, description="Weight of the shape's Laplacian.")
@@ -52,7 +52,7 @@ class OnlineConfig(Section):
     )
 
 
-class Weights(Section):
+class LossWeights(Section):
     """Weights of the loss terms; 0 switches a term off (paper section 3.3)."""
 
     features: float = Field(1.0, ge=0, description="Appearance loss, eq. 1.")
@@ -96,7 +96,7 @@ class PaperConfig(Section):
 
     name: Literal["paper"] = Field("paper", description="Which solver: paper or online.")
     final_refine: FinalRefine = False
-    correct_tracker: CorrectTracker = False
+    tracker_feedback: CorrectTracker = False
     iterations: int = Field(500, ge=1, le=100_000, description="Most iterations a frame.")
     tau: float | None = Field(
         None,
@@ -109,7 +109,7 @@ class PaperConfig(Section):
         0.02, gt=0, lt=1, description="Reach of the soft silhouette beyond a face's box, NDC."
     )
     knum: int = Field(30, ge=1, description="Most faces that a soft-silhouette pixel counts.")
-    band: Literal["erode", "soften", "none"] = Field(
+    silhouette_bias: Literal["erode", "soften", "none"] = Field(
         "erode",
         description=(
             "How the bias of the soft band is removed: erode the silhouette 3x3, soften the target by the "
@@ -126,7 +126,7 @@ class PaperConfig(Section):
         "vertices",
         description="Smooth the vertices themselves (SoftRas), or their offsets from the prototype.",
     )
-    agreement: float = Field(
+    min_mask_iou: float = Field(
         0.0,
         ge=0,
         le=1,
@@ -155,18 +155,18 @@ class PaperConfig(Section):
         ge=0,
         description="Iterations on the new frame's pose alone before the joint ones; 0 for none (paper).",
     )
-    joint: Literal["always", "new_view"] = Field(
+    joint_when: Literal["always", "new_view"] = Field(
         "always",
         description=(
             "Optimize shape, texture and all poses in every frame (paper), or only in frames that show a "
             "new view or that their pose alone cannot explain; needs pose_iterations."
         ),
     )
-    texture_start: Literal["zero", "backprojected"] = Field(
+    texture_init: Literal["zero", "backprojected"] = Field(
         "zero",
         description="Texels not seen before start at zero (paper), or at what the new frame shows there.",
     )
-    unseen_charge: float | None = Field(
+    unseen_penalty: float | None = Field(
         None,
         ge=0,
         description=(
@@ -174,7 +174,7 @@ class PaperConfig(Section):
             "is made (paper)."
         ),
     )
-    start_frames: int = Field(
+    init_frames: int = Field(
         1,
         ge=1,
         le=32,
@@ -182,13 +182,13 @@ class PaperConfig(Section):
             "Solve this many first frames together from several hypotheses of rotation; 1 for none (paper)."
         ),
     )
-    start_iterations: int = Field(60, ge=1, description="Iterations of each hypothesis of that joint start.")
-    weights: Weights = Weights()
+    init_iterations: int = Field(60, ge=1, description="Iterations of each hypothesis of that joint start.")
+    weights: LossWeights = LossWeights()
     learning_rates: LearningRates = LearningRates()
     keyframes: KeyframeConfig = KeyframeConfig()
 
 
-def _written_out(value: Any) -> Any:
+def _expand(value: Any) -> Any:
     """``paper`` is short for ``{name: paper}``, and settings without a name are those of the default solver.
 
     A section whose every line is commented out changes nothing.
@@ -201,7 +201,5 @@ def _written_out(value: Any) -> Any:
     return {"name": OnlineConfig().name, **{key: value[key] for key in value if key not in empty}}
 
 
-SolverConfig = Annotated[
-    OnlineConfig | PaperConfig, Field(discriminator="name"), BeforeValidator(_written_out)
-]
+SolverConfig = Annotated[OnlineConfig | PaperConfig, Field(discriminator="name"), BeforeValidator(_expand)]
 """The solver that ``name`` chooses, with its own settings and no other's."""

@@ -149,7 +149,7 @@ class Truth:
     frames: tuple[Path, ...]
     box: Box | None = None
     camera: Camera | None = None
-    told_camera: Camera | None = None
+    given_camera: Camera | None = None
     camera_told: bool = True
     T_cam_obj: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
     masks: Mapping[int, MaskReference] = field(default_factory=dict)

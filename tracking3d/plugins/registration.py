@@ -49,13 +49,13 @@ class Registered:
         return f"{KIND.get(self.group, 'plug-in')} '{self.name}' ({origin})"
 
 
-def registered_plugins(*groups: str) -> list[Registered]:
+def find_plugins(*groups: str) -> list[Registered]:
     """Registered plug-ins of some groups, of all if none is named; imports none of them.
 
     Those come first that win over others of the same name. To ask for one group takes half the time.
     """
     groups = groups or tuple(KIND)
-    packaged = [plugin for group in groups for plugin in _packaged(group, _search_path())]
+    packaged = [plugin for group in groups for plugin in _packaged_plugins(group, _search_path())]
     packaged.sort(key=lambda plugin: (plugin.package != "tracking3d", plugin.package.lower()))
     return _from_environment() + packaged
 
@@ -74,7 +74,7 @@ def import_plugin(plugin: Registered) -> type[Any]:
     return cls
 
 
-def told(error: BaseException) -> str:
+def describe_exception(error: BaseException) -> str:
     """An exception in one short line, without a full stop."""
     text = " ".join(str(error).split()).rstrip(".")
     if not isinstance(error, Tracking3dError):
@@ -92,7 +92,7 @@ def _search_path() -> tuple[tuple[str, int], ...]:
 
 
 @functools.lru_cache(maxsize=8)
-def _packaged(group: str, search_path: tuple[tuple[str, int], ...]) -> tuple[Registered, ...]:
+def _packaged_plugins(group: str, search_path: tuple[tuple[str, int], ...]) -> tuple[Registered, ...]:
     """The plug-ins of installed packages; reading all their metadata is slow, so once for a state of the folders."""
     origin = functools.cache(_origin)
     points = metadata.entry_points(group=group)

@@ -15,9 +15,9 @@ from tracking3d.plugins.registration import (
     KIND,
     TRACKERS,
     Registered,
+    describe_exception,
+    find_plugins,
     import_plugin,
-    registered_plugins,
-    told,
 )
 
 _ATTRIBUTES: dict[str, tuple[str, ...]] = {TRACKERS: (), FEATURES: ("channels", "stride", "tau")}
@@ -52,7 +52,7 @@ def list_plugins() -> list[PluginInfo]:
     """Every registered plug-in with its status; imports all of them, and none can stop it."""
     infos = []
     first: dict[tuple[str, str], Registered] = {}
-    for plugin in registered_plugins():
+    for plugin in find_plugins():
         winner = first.setdefault((plugin.group, plugin.name), plugin)
         status: Literal["ok", "broken", "duplicate"] = "ok"
         reason, options = "", None
@@ -62,7 +62,7 @@ def list_plugins() -> list[PluginInfo]:
             try:
                 options = import_plugin(plugin).Options.model_json_schema()
             except (Exception, SystemExit) as error:
-                status, reason = "broken", told(error)
+                status, reason = "broken", describe_exception(error)
         infos.append(
             PluginInfo(plugin.name, plugin.group, plugin.package, plugin.version, status, reason, options)
         )
@@ -100,10 +100,10 @@ def check_options(group: str, choice: PluginChoice) -> BaseModel:
     Raises:
         PluginError: As `load_plugin`; or an option that is unknown, missing or out of range.
     """
-    return _checked(_find(group, choice.name), choice)
+    return _validate_options(_find(group, choice.name), choice)
 
 
-def _checked(plugin: Registered, choice: PluginChoice) -> BaseModel:
+def _validate_options(plugin: Registered, choice: PluginChoice) -> BaseModel:
     model: type[BaseModel] = _load(plugin).Options
     unknown = [key for key in choice.options if key not in model.model_fields]
     if unknown and model.model_config.get("extra", "ignore") == "ignore":  # in silence, as pydantic would
@@ -124,20 +124,20 @@ def build_plugin(group: str, choice: PluginChoice) -> Any:
         PluginError: As `check_options`; or the plug-in fails while it is built.
     """
     plugin = _find(group, choice.name)
-    options = _checked(plugin, choice)
+    options = _validate_options(plugin, choice)
     try:
         instance = _load(plugin).from_options(options)
     except Tracking3dError:
         raise
     except (Exception, SystemExit) as error:
-        raise PluginError(f"{plugin.label} could not be started: {told(error)}.") from error
+        raise PluginError(f"{plugin.label} could not be started: {describe_exception(error)}.") from error
     if absent := [name for name in _ATTRIBUTES[group] if not hasattr(instance, name)]:
         raise PluginError(f"{plugin.label} is broken: it has no attribute {', '.join(absent)}.")
     return instance
 
 
 def _find(group: str, name: str) -> Registered:
-    plugins = [plugin for plugin in registered_plugins(group) if plugin.group == group]
+    plugins = [plugin for plugin in find_plugins(group) if plugin.group == group]
     for plugin in plugins:
         if plugin.name == name:
             return plugin
@@ -154,5 +154,5 @@ def _load(plugin: Registered) -> type[Any]:
         return import_plugin(plugin)
     except (Exception, SystemExit) as error:
         raise PluginError(
-            f"{plugin.label} is broken: {told(error)}; `tracking3d plugins` lists those that work."
+            f"{plugin.label} is broken: {describe_exception(error)}; `tracking3d plugins` lists those that work."
         ) from error

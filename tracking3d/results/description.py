@@ -15,11 +15,11 @@ import numpy as np
 
 from tracking3d.estimation.estimate import MaskSource, Status
 from tracking3d.geometry.camera import Camera
-from tracking3d.process_memory import resident_memory
 from tracking3d.results.layout import CONVENTIONS, FORMAT, FORMAT_VERSION
 from tracking3d.results.process import this_process
 from tracking3d.results.records import FrameRecord
-from tracking3d.stages import StageTimes
+from tracking3d.runtime.memory import resident_memory
+from tracking3d.runtime.stage_times import StageTimes
 
 MOST_FAILURES = 20
 """Different reasons of plug-in failures that a summary lists; the commonest come first."""

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from tracking3d.frames import Frame
 from tracking3d.points.follow import Followed, follow_points
 from tracking3d.points.image_following import ImageTracks, follow_in_images
-from tracking3d.points.landmarks import Scene
-from tracking3d.points.meeting import surface_under
+from tracking3d.points.landmark_adjustment import Scene
 from tracking3d.points.pictures import Picture, open_picture
-from tracking3d.points.tying import joined, meetings
+from tracking3d.points.ray_intersection import surface_under
+from tracking3d.points.surface_association import join_tracks, meetings
 from tracking3d.points.uncertainty import FEATURES
 from tracking3d.results.correspondences import PointKind, PointTracks
 from tracking3d.results.run_reader import RunReader
@@ -95,7 +95,7 @@ def follow_beside_mesh(
         positions = np.stack(
             [camera.to_picture(at) for camera, at in zip(cameras, found.positions, strict=True)]
         )
-        both = joined(
+        both = join_tracks(
             Followed(
                 positions, found.visible, found.uncertainty, found.measured, found.points, found.features
             ),

@@ -14,7 +14,7 @@ _BOOT = Path("/proc/sys/kernel/random/boot_id")
 
 def this_process() -> dict[str, Any]:
     """Number, machine and start of this process, for ``run.json``."""
-    return {"pid": os.getpid(), "host": socket.gethostname(), "started": _started(os.getpid())}
+    return {"pid": os.getpid(), "host": socket.gethostname(), "started": _start_time(os.getpid())}
 
 
 def is_gone(process: Mapping[str, Any]) -> bool | None:
@@ -33,11 +33,11 @@ def is_gone(process: Mapping[str, Any]) -> bool | None:
         return True
     except OSError:  # of another user, but there
         pass
-    now = _started(pid)
+    now = _start_time(pid)
     return now != started if now and started else False
 
 
-def _started(pid: int) -> str | None:
+def _start_time(pid: int) -> str | None:
     """When a process began: the machine's start and the clock ticks since then; None where nobody tells."""
     try:
         # The name in parentheses may hold spaces and parentheses itself.

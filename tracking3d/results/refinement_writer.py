@@ -20,12 +20,12 @@ from tracking3d.estimation.estimate import FrameEstimate, MaskSource
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.results import description, layout
-from tracking3d.results.files import decoded_mask, mask_file, read_mask, write_atomic, write_mask, writing
+from tracking3d.results.files import decode_mask, mask_file, read_mask, write_atomic, write_mask, writing
 from tracking3d.results.pictures import Pictures
 from tracking3d.results.probabilities import take_over_probability, write_probability
 from tracking3d.results.records import FrameRecord, mask_iou
 from tracking3d.results.run_reader import read_records
-from tracking3d.stages import StageTimes, measured
+from tracking3d.runtime.stage_times import StageTimes, measure
 
 
 class RefinementWriter:
@@ -86,13 +86,13 @@ class RefinementWriter:
         """The answer for frame ``index`` as it is now: the second one, or the causal one where there is none."""
         return self._records.get(index) or self.causal[index]
 
-    def put(self, answer: FrameRecord) -> None:
+    def put(self, estimate: FrameRecord) -> None:
         """Let a second answer be what it is in the end, see `put_right`; causal ones stand.
 
         It is not kept for a run that is stopped here and goes on later: that finds it anew.
         """
-        if answer.index in self._records:
-            self._records[answer.index] = answer
+        if estimate.index in self._records:
+            self._records[estimate.index] = estimate
 
     def put_mask(
         self,
@@ -138,7 +138,7 @@ class RefinementWriter:
             OutputError: If the video cannot be written.
         """
         record = self.answer(frame.index)
-        with measured("write") as watch:
+        with measure("write") as watch:
             self.pictures.add_kept(frame, record, mask, initial)
         if frame.index in self._records:
             self._records[frame.index] = record.and_wrote(watch.times.write)
@@ -165,7 +165,7 @@ class RefinementWriter:
         estimate = replace(
             estimate, refined=True, initial_mask=initial, keyframe=estimate.keyframe or causal.keyframe
         )
-        with measured("write") as watch:
+        with measure("write") as watch:
             record = FrameRecord.of(estimate, frame.name, initial, revision=True)
             write_mask(layout.mask_path(self._aside, frame.index), estimate.mask)
             if (self._folder / layout.PROBABILITIES).is_dir():
@@ -179,7 +179,7 @@ class RefinementWriter:
     def mask(self, record: FrameRecord) -> NDArray[np.bool_]:
         """The mask ``(H, W)`` of an answer, empty where it cannot be read."""
         if record.refined and (decided := self._decided.get(record.index)) is not None:
-            mask = decoded_mask(decided)
+            mask = decode_mask(decided)
         else:
             mask = read_mask(layout.mask_path(self._aside if record.refined else self._folder, record.index))
         return (
@@ -238,32 +238,34 @@ class RefinementWriter:
         if not keep:
             clear_refinement(self._folder)
 
-    def described(self, state: str, reason: str = "") -> dict[str, Any]:
+    def describe(self, state: str, reason: str = "") -> dict[str, Any]:
         """What ``run.json`` says of it, see `tracking3d.results.description.refinement`."""
         refined = list(self._records.values()) if self._taken_over else []
         causal = list(self.causal.values())
         return description.refinement(state, reason, causal, refined, self.seconds, self.together)
 
 
-def put_right(
-    answer: FrameRecord,
+def adjusted_record(
+    estimate: FrameRecord,
     T_cam_obj: NDArray[np.float64],
-    judgement: Assessment | None = None,
+    assessment: Assessment | None = None,
     evidence: Mapping[str, float] | None = None,
 ) -> FrameRecord:
     """A second answer with the pose that it has in the end.
 
     Args:
-        answer: As it was.
+        estimate: As it was.
         T_cam_obj: ``(4, 4)``, of the camera of the end.
-        judgement: How far it is believed in the end; as before, if left out.
+        assessment: How far it is believed in the end; as before, if left out.
         evidence: What that comes from, kept among the losses.
     """
-    losses = answer.losses | dict(evidence or {})
-    answer = replace(answer, T_cam_obj=T_cam_obj, camera=None, losses=losses)
-    if judgement is None:
-        return answer
-    return replace(answer, status=judgement.status, reason=judgement.reason, confidence=judgement.confidence)
+    losses = estimate.losses | dict(evidence or {})
+    estimate = replace(estimate, T_cam_obj=T_cam_obj, camera=None, losses=losses)
+    if assessment is None:
+        return estimate
+    return replace(
+        estimate, status=assessment.status, reason=assessment.reason, confidence=assessment.confidence
+    )
 
 
 def clear_refinement(folder: Path) -> None:

@@ -70,7 +70,7 @@ def benchmark(
     for name, figures in results.items():
         figures["ratio_to_torch"] = _ratio(figures, results["torch"])
         figures["speedup_over_dense"] = _ratio(results[DENSE], figures) if dense else None
-        figures["peak_memory_mb"] = None if name == DENSE else _rounded(name, problem, place, threads)
+        figures["peak_memory_mb"] = None if name == DENSE else _round(name, problem, place, threads)
     report = {
         **{name: value for name, value in asdict(problem).items() if name != "frequency"},
         "faces": problem.faces,
@@ -123,6 +123,6 @@ def _ratio(one: dict[str, Any], other: dict[str, Any]) -> float:
     return float(f"{one['total_ms'] / other['total_ms']:.3g}")
 
 
-def _rounded(name: str, problem: Problem, device: torch.device, threads: int) -> float | None:
+def _round(name: str, problem: Problem, device: torch.device, threads: int) -> float | None:
     memory = peak_memory(name, problem, device, threads)
     return None if memory is None else round(memory, 1)

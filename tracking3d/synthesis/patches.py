@@ -67,7 +67,7 @@ def prism(outline: Array, half_depth: float) -> list[Patch]:
     return [polygon(front), polygon(back[::-1]), *sides]
 
 
-def revolved(profile: Array, sectors: int, steps: int = 96) -> list[Patch]:
+def revolve(profile: Array, sectors: int, steps: int = 96) -> list[Patch]:
     """A surface of revolution about the y axis.
 
     Args:
@@ -89,7 +89,7 @@ def rectangle(x: float, y: float) -> Array:
     return np.array([(-x, -y), (x, -y), (x, y), (-x, y)])
 
 
-def refined(profile: Array, step: float = 0.04) -> Array:
+def subdivide(profile: Array, step: float = 0.04) -> Array:
     """The same polyline with points at most ``step`` apart."""
     pieces = []
     for start, end in pairwise(profile):

@@ -34,7 +34,7 @@ def prior(moved: list[tuple[float, NDArray[np.float32]]], area: int) -> NDArray[
     return np.clip(distance / (0.12 * math.sqrt(area)), -4.0, 4.0).astype(np.float32)
 
 
-def shifted_to(mask: NDArray[np.float32], evidence: NDArray[np.float32]) -> NDArray[np.float32]:
+def shift_to(mask: NDArray[np.float32], evidence: NDArray[np.float32]) -> NDArray[np.float32]:
     """``mask``, shifted without a turn to where ``evidence`` ``(S, S)`` supports it most.
 
     A side that turns away takes its texture along, and flow with it, while the outline stays where it is.
@@ -65,7 +65,7 @@ def touches_border(mask: NDArray[np.bool_], in_frame: NDArray[np.bool_]) -> bool
     return bool((mask & in_frame & ~within).any())
 
 
-def tidied(
+def clean_mask(
     mask: NDArray[np.bool_], moved: NDArray[np.bool_], motion: NDArray[np.float32] | None = None
 ) -> NDArray[np.bool_]:
     """Drop specks, parts that are not the object's, and pinholes.

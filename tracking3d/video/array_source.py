@@ -12,7 +12,7 @@ import numpy as np
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, SkippedFrame
 from tracking3d.video.selection import EVERY_FRAME, within
-from tracking3d.video.source import Intrinsics, checked
+from tracking3d.video.source import Intrinsics, check_frames
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ class ArraySource:
 
     def __iter__(self) -> Iterator[Frame | SkippedFrame]:
         """Give the selected frames; an `InputError` ends it at the first item that is no RGB array."""
-        return checked(self._frames(), self.name)
+        return check_frames(self._frames(), self.name)
 
     def _frames(self) -> Iterator[Frame]:
         wanted = self.selection

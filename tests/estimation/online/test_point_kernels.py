@@ -10,8 +10,8 @@ from tracked_solids import disturbed, scene
 
 from tracking3d.bundle_adjustment import adjustment
 from tracking3d.bundle_adjustment.adjustment import Problem, adjust
-from tracking3d.estimation.online import pose_from_points
-from tracking3d.estimation.online.pose_from_points import pose_of_tracks
+from tracking3d.estimation.online.optimization import pnp
+from tracking3d.estimation.online.optimization.pnp import pose_of_tracks
 from tracking3d.rendering.kernels.threads import get_num_threads, set_num_threads
 
 SCENES = {
@@ -28,12 +28,12 @@ def both(monkeypatch):
     """Call a function with the kernels and without."""
 
     def both(function):
-        answers = []
+        estimates = []
         for chosen in (True, False):
             monkeypatch.setattr(adjustment, "compiled", lambda chosen=chosen: chosen)
-            monkeypatch.setattr(pose_from_points, "compiled", lambda chosen=chosen: chosen)
-            answers.append(function())
-        return answers
+            monkeypatch.setattr(pnp, "compiled", lambda chosen=chosen: chosen)
+            estimates.append(function())
+        return estimates
 
     return both
 
@@ -56,10 +56,10 @@ def posed(given, fixed, free_focal):
 @pytest.mark.parametrize(("fixed", "free_focal"), [(0, False), (1, False), (1, True), (2, True)])
 def test_cost_residuals_equations_and_step_of_a_bundle(both, settings, fixed, free_focal):
     problem, at = posed(scene(**settings), fixed, free_focal)
-    mine, expected = both(lambda: problem.evaluated(at))
+    mine, expected = both(lambda: problem.evaluate(at))
     assert mine.cost == pytest.approx(expected.cost, rel=1e-12)
     np.testing.assert_allclose(mine.residual, expected.residual, rtol=1e-9, atol=1e-9)
-    mine, expected = both(lambda: problem.linearised(at))
+    mine, expected = both(lambda: problem.linearize(at))
     for field in fields(mine):
         values = getattr(expected, field.name)
         np.testing.assert_allclose(
@@ -81,7 +81,7 @@ def test_an_adjustment_ends_in_the_same_place(both, settings):
 
 def test_threads_change_no_digit_of_a_step():
     problem, at = posed(scene(frames=41, count=70), 1, True)
-    system = problem.linearised(at)
+    system = problem.linearize(at)
     before, steps = get_num_threads(), []
     for threads in (1, 2, 5):
         set_num_threads(threads)
@@ -96,7 +96,7 @@ def test_threads_change_no_digit_of_a_step():
 
 def test_equations_that_are_not_finite_give_no_step(both):
     problem, at = posed(scene(), 1, False)
-    system = problem.linearised(at)
+    system = problem.linearize(at)
     for broken in (
         replace(system, poses=np.full_like(system.poses, np.nan)),
         replace(system, points_gradient=np.full_like(system.points_gradient, np.inf)),

@@ -6,8 +6,8 @@ import numpy as np
 from tracked_solids import intrinsics
 
 from tracking3d.bundle_adjustment.reprojection import (
+    apply_update,
     finite_rows,
-    moved,
     pixel_by_point,
     pixel_by_pose,
     project,
@@ -17,7 +17,7 @@ from tracking3d.bundle_adjustment.reprojection import (
 K = intrinsics(45.0)
 RANDOM = np.random.default_rng(0)
 POINTS = RANDOM.uniform(-1, 1, size=(5, 3))
-R = moved(np.eye(3)[None], np.zeros((1, 3)), RANDOM.normal(size=(1, 6)))[0]
+R = apply_update(np.eye(3)[None], np.zeros((1, 3)), RANDOM.normal(size=(1, 6)))[0]
 T = np.array([[0.3, -0.2, 6.0]])
 
 
@@ -44,7 +44,7 @@ def test_the_derivative_by_the_point_is_the_finite_difference():
 
 def test_the_derivative_by_the_pose_is_the_finite_difference_of_moved():
     def seen(step):
-        return project(to_camera(*moved(R, T, step[None]), POINTS)[0], K)
+        return project(to_camera(*apply_update(R, T, step[None]), POINTS)[0], K)
 
     x = to_camera(R, T, POINTS)[0]
     finite = np.stack([(seen(d) - seen(-d)) / 2e-6 for d in 1e-6 * np.eye(6)], -1)
@@ -52,7 +52,7 @@ def test_the_derivative_by_the_pose_is_the_finite_difference_of_moved():
 
 
 def test_a_rotation_turns_about_the_objects_origin_and_not_about_the_camera():
-    turned = moved(np.eye(3)[None], T, np.array([[0, 0, 0, 0.1, 0.2, 0.3]]))
+    turned = apply_update(np.eye(3)[None], T, np.array([[0, 0, 0, 0.1, 0.2, 0.3]]))
     assert np.array_equal(turned[1], T)
     assert np.allclose(to_camera(*turned, np.zeros((1, 3)))[0], T)
 

@@ -12,7 +12,7 @@ from tracking3d.bundle_adjustment.reprojection import BEHIND, NEAREST, FloatArra
 from tracking3d.rendering.kernels.compilation import kernel
 
 
-def evaluated(
+def evaluate(
     pixels: FloatArray,
     weight: FloatArray,
     K: FloatArray,
@@ -23,10 +23,10 @@ def evaluated(
 ) -> tuple[float, FloatArray]:
     """The sum of weighted losses, and ``(F, N)`` residuals; nan where nothing is seen."""
     residual = np.empty(weight.shape)
-    return float(_evaluate(*_packed(pixels, weight, K, R, t, points), float(scale), residual)), residual
+    return float(_evaluate(*_pack(pixels, weight, K, R, t, points), float(scale), residual)), residual
 
 
-def linearised(
+def linearize(
     pixels: FloatArray,
     weight: FloatArray,
     K: FloatArray,
@@ -42,13 +42,13 @@ def linearised(
     poses, blocks, coupling = np.zeros((size, size)), np.zeros((many, 3, 3)), np.zeros((many, 3, size))
     poses_gradient, points_gradient = np.zeros(size), np.zeros((many, 3))
     _linearise(
-        *_packed(pixels, weight, K, R, t, points), float(scale), fixed, free_focal,
+        *_pack(pixels, weight, K, R, t, points), float(scale), fixed, free_focal,
         poses, blocks, coupling, poses_gradient, points_gradient,
     )  # fmt: skip
     return poses, blocks, coupling, poses_gradient, points_gradient
 
 
-def _packed(*arrays: FloatArray) -> list[FloatArray]:
+def _pack(*arrays: FloatArray) -> list[FloatArray]:
     return [np.ascontiguousarray(array, np.float64) for array in arrays]
 
 

@@ -102,15 +102,15 @@ def run(
     video came to nothing.
     """
     from tracking3d.batch.listing import dataset_jobs, list_jobs
-    from tracking3d.batch.places import absolute
     from tracking3d.batch.running import run_batch
+    from tracking3d.batch.storage import absolute
     from tracking3d.benchmark.sequences import open_dataset
-    from tracking3d.cli.batch.progress import shown
+    from tracking3d.cli.batch.progress import show_progress
     from tracking3d.engines.choosing import open_engine
     from tracking3d.engines.protocol import Needs
 
     def of_row(row: Row) -> PipelineConfig:
-        return _configured(row, config, preset, quality, overrides, threads)
+        return _build_config(row, config, preset, quality, overrides, threads)
 
     if quiet:
         logging.getLogger("tracking3d").setLevel(logging.ERROR)
@@ -126,7 +126,7 @@ def run(
     gpus = any(video.config.runtime.device.startswith("cuda") for video in videos)
     needs = Needs(threads, memory or 0.0, 1.0 if gpus else 0.0)
     command = shlex.join(sys.argv)
-    with open_engine(address, workers, needs) as engine, shown(quiet, as_json) as listener:
+    with open_engine(address, workers, needs) as engine, show_progress(quiet, as_json) as listener:
         try:
             progress = run_batch(
                 videos,
@@ -148,10 +148,10 @@ def run(
 def _check_split(
     split: str, settings: PipelineConfig, out: str, data: Path | None, address: str | None
 ) -> None:
-    from tracking3d.batch.places import local
+    from tracking3d.batch.storage import local
     from tracking3d.errors import InputError
-    from tracking3d.splitting.cutting import parse_length
-    from tracking3d.splitting.long_video import refuse_what_cannot_be_joined
+    from tracking3d.submaps.cuts import parse_length
+    from tracking3d.submaps.job import refuse_what_cannot_be_joined
 
     refuse_what_cannot_be_joined(settings)
     parse_length(split, 1e9)  # what is no length at all; the rate of each video tells the rest
@@ -164,7 +164,7 @@ def _check_split(
         )
 
 
-def _configured(
+def _build_config(
     row: Row,
     config: Path | None,
     preset: str | None,

@@ -42,7 +42,7 @@ def pose_terms(
     """See `tracking3d.rendering.pose_terms`; ``nearest`` is the least depth of matched points."""
     sums, counts = np.zeros((len(R), 3, 7, 7)), np.zeros((len(R), 4))
     share(
-        _pose_terms, len(R), 2, *packed(surface, target, matched), array(R), array(t),
+        _pose_terms, len(R), 2, *pack(surface, target, matched), array(R), array(t),
         scales.appearance, scales.outline, scales.points, nearest, sums, counts,
     )  # fmt: skip
     models = (
@@ -57,7 +57,7 @@ def pose_terms(
     return PoseTerms(appearance, outline, by_points, of_pixels[:, COMPARABLE], of_pixels[:, KNOWN], overlap)
 
 
-def packed(surface: Surface, target: PoseTarget, matched: MatchedPoints | None) -> list[NDArray[Any]]:
+def pack(surface: Surface, target: PoseTarget, matched: MatchedPoints | None) -> list[NDArray[Any]]:
     """The arrays that `terms_of_pose` takes first; what a frame does not have is empty.
 
     Raises:

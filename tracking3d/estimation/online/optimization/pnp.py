@@ -1,0 +1,235 @@
+"""The pose of a known object from places where its surface points are seen, with and without a start.
+
+Sampling is OpenCV's USAC over minimal sets of three points with local optimisation; its answer depends on the seed
+alone, whatever OpenCV's global generator holds. What it finds, and a start if there is one, is refined under the
+Cauchy loss.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.bundle_adjustment.reprojection import (
+    BEHIND,
+    FloatArray,
+    apply_update,
+    finite_rows,
+    pixel_by_point,
+    pixel_by_pose,
+    project,
+    to_camera,
+)
+from tracking3d.rendering.backend import compiled
+
+_FEWEST = 4
+_SAMPLES = 500
+_CONFIDENCE = 0.999
+_REFINEMENTS = 2
+FIRST_DAMPING, MOST_DAMPING = 1e-4, 1e9
+CONVERGED = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class PoseHypothesis:
+    """One pose and who agrees with it.
+
+    Attributes:
+        R: ``(3, 3)`` and
+        t: ``(3,)`` of ``T_cam_obj``.
+        inliers: ``(N,)`` bool, which points are seen within the threshold.
+        residual: Root of the inliers' mean squared distance, in pixels.
+    """
+
+    R: FloatArray
+    t: FloatArray
+    inliers: NDArray[np.bool_]
+    residual: float
+
+    @property
+    def count(self) -> int:
+        """How many points agree."""
+        return int(np.count_nonzero(self.inliers))
+
+
+@dataclass(frozen=True, eq=False)
+class PointEquations:
+    """A quadratic model ``cost + gradient d + d matrix d / 2`` of the points' mean Cauchy loss in ``d = (v, w)``.
+
+    As `tracking3d.rendering.NormalEquations`, of one frame, with ``t`` as pivot.
+
+    Attributes:
+        matrix: ``(6, 6)``.
+        gradient: ``(6,)``.
+        cost: By weight; a point behind the camera costs a large constant.
+        residual: ``(N,)`` distance in pixels; nan for points without weight or behind the camera.
+    """
+
+    matrix: FloatArray
+    gradient: FloatArray
+    cost: float
+    residual: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class PoseFit:
+    """A pose refined from a start.
+
+    Attributes:
+        R: ``(3, 3)`` and
+        t: ``(3,)`` of ``T_cam_obj``.
+        equations: The model at this pose.
+    """
+
+    R: FloatArray
+    t: FloatArray
+    equations: PointEquations
+
+
+def pose_from_points(
+    points: FloatArray,
+    pixels: FloatArray,
+    K: FloatArray,
+    start: tuple[FloatArray, FloatArray] | None = None,
+    *,
+    threshold: float,
+    seed: int,
+) -> PoseHypothesis | None:
+    """The pose that most points agree with; None if fewer than four do.
+
+    Args:
+        points: ``(N, 3)`` in object coordinates.
+        pixels: ``(N, 2)`` where they are seen. Rows that are not finite here or in ``points`` are never inliers.
+        K: ``(3, 3)``.
+        start: ``R`` and ``t`` of a pose to refine beside what sampling finds; the better one is the answer.
+        threshold: Largest distance in pixels of an inlier.
+        seed: Of the sampling.
+    """
+    usable = finite_rows(points) & finite_rows(pixels)
+    if np.count_nonzero(usable) < _FEWEST:
+        return None
+    x, u = points[usable], pixels[usable]
+    sampled = _sample_pose(x, u, K, threshold, seed)
+    starts = [pose for pose in (sampled, start) if pose is not None]
+    found = [_refine_on_inliers(x, u, K, R, t, threshold) for R, t in starts]
+    best = max(found, key=lambda one: (one.count, -one.residual), default=None)
+    if best is None or best.count < _FEWEST:
+        return None
+    inliers = np.zeros(len(points), bool)
+    inliers[usable] = best.inliers
+    return PoseHypothesis(best.R, best.t, inliers, best.residual)
+
+
+def pose_of_tracks(
+    points: FloatArray,
+    pixels: FloatArray,
+    weight: FloatArray | None,
+    K: FloatArray,
+    R: FloatArray,
+    t: FloatArray,
+    scale: float,
+    iterations: int = 10,
+) -> PoseFit:
+    """The pose of least robust reprojection error near a start; never worse than the start.
+
+    Args:
+        points: ``(N, 3)`` in object coordinates; rows that are not finite do not count.
+        pixels: ``(N, 2)``, likewise.
+        weight: ``(N,)``; all the same if None.
+        K: ``(3, 3)``.
+        R: ``(3, 3)`` and
+        t: ``(3,)`` of the start.
+        scale: Residual in pixels at which the loss is ``log 2``.
+        iterations: The most steps that are tried.
+    """
+    if compiled():
+        from tracking3d.estimation.online.optimization.kernels import pnp
+
+        share = _shares(points, pixels, weight)
+        return pnp.pose_of_tracks(points, pixels, share, K, R, t, scale, iterations)
+    at = point_equations(points, pixels, weight, K, R, t, scale)
+    damping = FIRST_DAMPING
+    for _ in range(iterations):
+        diagonal = at.matrix.diagonal()
+        floor = 1e-9 * diagonal.max() + 1e-12
+        step = -np.linalg.solve(at.matrix + np.diag(damping * diagonal + floor), at.gradient)
+        R_new, t_new = (
+            part[0] for part in apply_update(R[None], t[None], np.asarray(step[None], np.float64))
+        )
+        new = point_equations(points, pixels, weight, K, R_new, t_new, scale)
+        if not new.cost < at.cost:
+            damping = min(10 * damping, MOST_DAMPING)
+            continue
+        settled = at.cost - new.cost < CONVERGED * at.cost
+        R, t, at, damping = R_new, t_new, new, damping / 10
+        if settled:
+            break
+    return PoseFit(R, t, at)
+
+
+def point_equations(
+    points: FloatArray,
+    pixels: FloatArray,
+    weight: FloatArray | None,
+    K: FloatArray,
+    R: FloatArray,
+    t: FloatArray,
+    scale: float,
+) -> PointEquations:
+    """The points' normal equations at a pose; all zero if there is no point. Arguments as of `pose_of_tracks`."""
+    share = _shares(points, pixels, weight)
+    x_cam = to_camera(R, t, np.where(finite_rows(points)[:, None], points, 0.0))
+    difference = project(x_cam, K) - pixels
+    residual = np.where(share > 0, np.hypot(difference[:, 0], difference[:, 1]), np.nan)
+    used = np.isfinite(residual)
+    relative = np.where(used, residual / scale, BEHIND)
+    cost = float(np.sum(share * np.log1p(relative**2)))
+    difference = np.where(used[:, None], difference, 0.0)
+    # The Cauchy loss as weights of least squares: its derivative is 2 r / (scale^2 + r^2).
+    robust = np.where(used, 2 * share / (scale**2 + np.sum(difference**2, 1)), 0.0)
+    motion = pixel_by_pose(pixel_by_point(x_cam, K), x_cam - t)
+    rows = motion.reshape(-1, 6)
+    weighted = (robust[:, None, None] * motion).reshape(-1, 6)
+    return PointEquations(rows.T @ weighted, weighted.T @ difference.ravel(), cost, residual)
+
+
+def _shares(points: FloatArray, pixels: FloatArray, weight: FloatArray | None) -> FloatArray:
+    """``(N,)`` shares of the weight; 0 for rows that are not finite."""
+    usable = finite_rows(points) & finite_rows(pixels)
+    given = 1.0 if weight is None else np.nan_to_num(weight).clip(0.0)
+    share = np.where(usable, given, 0.0)
+    return share / max(float(share.sum()), 1e-12)
+
+
+def _sample_pose(
+    points: FloatArray, pixels: FloatArray, K: FloatArray, threshold: float, seed: int
+) -> tuple[FloatArray, FloatArray] | None:
+    settings = cv2.UsacParams()
+    settings.threshold, settings.confidence = threshold, _CONFIDENCE
+    settings.maxIterations, settings.randomGeneratorState = _SAMPLES, seed
+    try:
+        found, _, turn, t, _ = cv2.solvePnPRansac(
+            points, pixels, K.astype(np.float64), np.zeros(4), params=settings
+        )
+    except cv2.error:
+        return None
+    if not found or not (np.isfinite(turn).all() and np.isfinite(t).all()):
+        return None
+    return cv2.Rodrigues(turn)[0], t.ravel()
+
+
+def _refine_on_inliers(
+    points: FloatArray, pixels: FloatArray, K: FloatArray, R: FloatArray, t: FloatArray, threshold: float
+) -> PoseHypothesis:
+    """A pose after refinement over its inliers."""
+    for _ in range(_REFINEMENTS):
+        fit = pose_of_tracks(points, pixels, None, K, R, t, threshold / 2)
+        R, t = fit.R, fit.t
+    residual = fit.equations.residual
+    inliers = residual <= threshold
+    rms = math.sqrt(np.mean(residual[inliers] ** 2)) if inliers.any() else math.inf
+    return PoseHypothesis(R, t, inliers, rms)

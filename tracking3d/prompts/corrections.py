@@ -1,0 +1,179 @@
+"""What the user says of the object in later frames: a box, a mask or points, from which tracking goes on there."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.config.explain import a_kind, format_value
+from tracking3d.errors import InputError, argument
+from tracking3d.frames import Box, Frame, Prompt, pixels
+from tracking3d.prompts.points import check_points_inside, looks_like_points, parse_points, validate_points
+from tracking3d.prompts.prompt import make_prompt, parse_box, read_mask_file, validate_box, validate_mask
+from tracking3d.trackers.crops import clip_box
+
+CORRECT = argument("corrections=", "--correct ")
+"""What sentences call them, before their values."""
+_FORM = "FRAME:X,Y,W,H, FRAME:MASK.png or 'FRAME:X,Y+ X,Y-'; of several objects FRAME@OBJECT, counted from 0"
+_HEAD = re.compile(r"(\d{1,12})(?:@(\d{1,6}))?:(.+)", re.DOTALL)
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """The object in one later frame; one of box, mask and points is given.
+
+    Attributes:
+        frame: Index of the frame.
+        box: ``(x, y, width, height)`` in pixels.
+        mask: ``(H, W)``, or the image file of one.
+        points: ``(N, 3)``: x, y in pixels, and 1 on the object or 0 beside it.
+        object: Of which object, where there are several, counted from 0.
+    """
+
+    frame: int
+    box: Box | None = None
+    mask: NDArray[np.bool_] | Path | None = None
+    points: Any = None
+    object: int = 0
+
+    @property
+    def name(self) -> str:
+        """What sentences call it, before its value."""
+        return f"{CORRECT}{self.frame}:"
+
+    def prompt(self, frame: Frame) -> Prompt:
+        """The prompt that it is in its frame.
+
+        Raises:
+            InputError: If it cannot be one there.
+        """
+        names = {"box_name": self.name, "mask_name": self.name, "points_name": self.name}
+        return make_prompt(frame, self.box, self.mask, points=self.points, **names)
+
+    def check_fits(self, size: tuple[int, int]) -> None:
+        """Make sure that it can be one of a frame of ``size`` ``(height, width)``.
+
+        Raises:
+            InputError: If it cannot.
+        """
+        label = f"frame {self.frame}"
+        if self.box is not None and clip_box(self.box, size) is None:
+            raise InputError(
+                f"{self.name}{format_value(self.box)} lies outside {label}, which is {pixels(size)} pixels."
+            )
+        if isinstance(self.mask, np.ndarray) and self.mask.shape != size:
+            raise InputError(
+                f"{self.name} the mask is {pixels(self.mask.shape)} pixels but {label} {pixels(size)}; they must be "
+                "alike."
+            )
+        if self.points is not None:
+            check_points_inside(self.points, size, label, self.name)
+
+
+def prompts_in(frame: Frame, corrections: Mapping[int, Correction]) -> list[Prompt]:
+    """What `tracking3d.Session.step` is given with a frame: the correction of it, where there is one."""
+    correction = corrections.get(frame.index)
+    return [] if correction is None else [correction.prompt(frame)]
+
+
+def parse_correction(text: str) -> Correction:
+    """Read ``FRAME:X,Y,W,H``, ``FRAME:MASK.png`` or ``FRAME:X,Y+ X,Y-``, FRAME with ``@OBJECT`` behind it or without.
+
+    Raises:
+        InputError: If it is none of them.
+    """
+    head = _HEAD.fullmatch(text.strip())
+    if head is None:
+        raise InputError(f"{CORRECT}'{text}' is not {_FORM}.")
+    frame, number, what = int(head[1]), int(head[2] or 0), head[3].strip()
+    name = f"{CORRECT}{frame}:"
+    if looks_like_points(what):
+        return Correction(frame, points=parse_points(what, name), object=number)
+    if re.fullmatch(r"[-+.\deE,\s]+", what):
+        return Correction(frame, box=parse_box(what, name), object=number)
+    return Correction(frame, mask=Path(what), object=number)
+
+
+def validate_corrections(corrections: Any, objects: int = 1) -> list[dict[int, Correction]]:
+    """Corrections by frame, for each of several objects; what can be read without the frames is read.
+
+    Args:
+        corrections: Any number of them.
+        objects: How many objects there are.
+
+    Raises:
+        InputError: If one is no correction, two are of the same frame, or one is of an object that there is not.
+    """
+    if not isinstance(corrections, Iterable) or isinstance(corrections, str | bytes | Mapping):
+        raise InputError(
+            f"{CORRECT}{format_value(corrections)} is {a_kind(corrections)}; give a list of Correction."
+        )
+    by_object: list[dict[int, Correction]] = [{} for _ in range(objects)]
+    for one in corrections:
+        correction = _validate_correction(one)
+        if correction.object >= objects:
+            raise InputError(
+                f"{correction.name} is of object {correction.object}, but there are {objects}, counted from 0."
+            )
+        theirs = by_object[correction.object]
+        if correction.frame in theirs:
+            raise InputError(
+                f"{correction.name} frame {correction.frame} is corrected twice; say one thing of it."
+            )
+        theirs[correction.frame] = correction
+    return by_object
+
+
+def check_corrections_fit(
+    corrections: Iterable[Correction], first: Frame, tracker: str, selection: Sequence[int] | None = None
+) -> None:
+    """Make sure of corrections by the first frame, so that a long run does not end at a wrong one.
+
+    Args:
+        corrections: Of one object.
+        first: The frame in which it was given.
+        tracker: Name of the mask tracker.
+        selection: Indices of the frames, where they are known.
+
+    Raises:
+        InputError: If one cannot be used.
+    """
+    for one in corrections:
+        if tracker == "precomputed":
+            raise InputError(
+                f"{one.name} masks that were made elsewhere are what they are; put the better mask among them."
+            )
+        if one.frame == first.index:
+            raise InputError(
+                f"{one.name} frame {one.frame} is the one in which the object is given; say it there, and not twice."
+            )
+        if selection is not None and one.frame not in selection:
+            raise InputError(f"{one.name} there is no frame {one.frame} among those that are tracked.")
+        one.check_fits(first.size)
+
+
+def _validate_correction(correction: Any) -> Correction:
+    if not isinstance(correction, Correction):
+        raise InputError(
+            f"{CORRECT}{format_value(correction)} is {a_kind(correction)}; give a list of Correction."
+        )
+    for value in (correction.frame, correction.object):
+        if not isinstance(value, int) or isinstance(value, bool) or value < 0:
+            raise InputError(f"{CORRECT}{format_value(value)} is no index; frames and objects count from 0.")
+    given = (correction.box, correction.mask, correction.points)
+    if sum(one is not None for one in given) != 1:
+        raise InputError(f"{correction.name} give either a box, a mask or points.")
+    if correction.box is not None:
+        return replace(correction, box=validate_box(correction.box, correction.name))
+    if correction.points is not None:
+        return replace(correction, points=validate_points(correction.points, correction.name))
+    if isinstance(correction.mask, Path):
+        mask = read_mask_file(correction.mask, f"{correction.name}{correction.mask}")
+        return replace(correction, mask=validate_mask(mask, correction.name))
+    return replace(correction, mask=validate_mask(correction.mask, correction.name))
