@@ -30,9 +30,9 @@ from tracking3d.batch.video_job import VideoJob
 from tracking3d.config.models import PipelineConfig
 from tracking3d.engines.choosing import open_engine
 from tracking3d.engines.protocol import Needs
+from tracking3d.pipeline.record import record
 from tracking3d.plugins import VARIABLE
-from tracking3d.prompts import parse_box
-from tracking3d.recording import record
+from tracking3d.prompts.prompt import parse_box
 from tracking3d.results.run_reader import RunReader
 from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
 from tracking3d.video import VideoWriter, open_source

@@ -186,7 +186,7 @@ class _Simulation:
             if worker >= 0:
                 free.append(worker)
             if ended is not None:
-                self._ended(ended, now, again=worker < 0)
+                self._end(ended, now, again=worker < 0)
         last = float(np.nanmax(self.ends, initial=0.0))
         busy = self.worked / (self.fleet.workers * last) if last else 0.0
         return ScheduleOutcome(
@@ -221,7 +221,7 @@ class _Simulation:
             done = 0.0
         return now + until, _Task(task.rank, task.video, task.work - done, task.stage, task.tries + 1)
 
-    def _ended(self, task: _Task, now: float, again: bool) -> None:
+    def _end(self, task: _Task, now: float, again: bool) -> None:
         """What comes after a task: the same once more, or what waited for it."""
         video = task.video
         if again:

@@ -1,7 +1,7 @@
 """Does a long run stay as it is? Memory, open files and seconds a frame over thousands of frames.
 
 The object of a short synthetic clip turns to and fro, and leaves the frame and returns in every round. The whole of
-`tracking3d.recording.record` is run, with everything that it writes.
+`tracking3d.pipeline.record.record` is run, with everything that it writes.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from tracking3d.config.models import PipelineConfig
 from tracking3d.frames import Frame, SkippedFrame
 from tracking3d.geometry.camera import Camera
-from tracking3d.process_memory import resident_memory
-from tracking3d.recording import record
+from tracking3d.pipeline.record import record
 from tracking3d.results.records import FrameRecord
+from tracking3d.runtime.memory import resident_memory
 from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
 from tracking3d.video.source import Intrinsics
 

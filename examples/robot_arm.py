@@ -28,9 +28,9 @@ from numpy.typing import NDArray
 
 from tracking3d import Frame, FrameEstimate, ObjectModel, Session, Status, load_config
 from tracking3d.errors import InputError, Tracking3dError
-from tracking3d.export.exported_run import seen_side
+from tracking3d.export.exported_run import visible_side
 from tracking3d.frames import SkippedFrame
-from tracking3d.prompts import make_prompt, parse_box
+from tracking3d.prompts.prompt import make_prompt, parse_box
 from tracking3d.video import open_source
 
 MEASURED_EVERY = 15
@@ -101,7 +101,7 @@ def grasps(
             yield Grasp(frame.index, None, estimate.confidence, waiting)
             continue
         if metres == 0 or sure % MEASURED_EVERY == 0:
-            metres = object_size / seen_side(tracking.result())
+            metres = object_size / visible_side(tracking.result())
         T_cam_obj = estimate.T_cam_obj.copy()
         T_cam_obj[:3, 3] *= metres
         T_base_obj = T_base_cam @ T_cam_obj

@@ -20,7 +20,7 @@ _IMPORTED = [
     "torch",
     "tracking3d.cli.run",
     "tracking3d.estimation.online.solver",
-    "tracking3d.recording",
+    "tracking3d.pipeline.record",
     "tracking3d.rendering.kernels.compilation",
     "tracking3d.synthesis.convex_clips",
     "tracking3d.trackers.csrt",

@@ -17,7 +17,8 @@ from typing import Any, ClassVar
 import torch
 
 from tracking3d.benchmark import feature_encoders
-from tracking3d.estimation.online import solver, waiting
+from tracking3d.estimation.online import solver
+from tracking3d.estimation.online.initialization import initializer
 from tracking3d.synthesis import convex_clips, ray_casting, scene
 from tracking3d.trackers import first_mask
 
@@ -44,7 +45,7 @@ class MadeOnce:
             return self._function(*arguments, **named)
         name = self._name((self._key(*arguments), sorted(named.items())))
         if name not in self._made:
-            self._made[name] = self._found(name) or self._kept(name, self._function(*arguments, **named))
+            self._made[name] = self._find(name) or self._kept(name, self._function(*arguments, **named))
         return pickle.loads(self._made[name])
 
     def _name(self, key: Any) -> str:
@@ -53,7 +54,7 @@ class MadeOnce:
         _BitsOfTensors(told).dump(key)
         return hashlib.sha256(told.getbuffer()).hexdigest()
 
-    def _found(self, name: str) -> bytes | None:
+    def _find(self, name: str) -> bytes | None:
         if self.folder is not None:
             with contextlib.suppress(FileNotFoundError):
                 return (self.folder / name).read_bytes()
@@ -93,5 +94,5 @@ def make_once() -> None:
         lambda spec: (spec.object, spec.textured, spec.print_strength == 0, spec.seed),
     )
     ray_casting._corner_normals = MadeOnce(ray_casting._corner_normals, lambda *mesh: mesh[:2])
-    waiting.solve_start = MadeOnce(waiting.solve_start)
-    solver.refined_once_more = MadeOnce(solver.refined_once_more)
+    initializer.solve_start = MadeOnce(initializer.solve_start)
+    solver.refine_globally = MadeOnce(solver.refine_globally)

@@ -33,9 +33,9 @@ if TYPE_CHECKING:
     from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
     from tracking3d.export.exporting import export_run
     from tracking3d.frames import Frame, Prompt
-    from tracking3d.pipeline import Session, track, track_objects
-    from tracking3d.tracking import Tracking
-    from tracking3d.tracking_result import TrackingResult
+    from tracking3d.pipeline.result import TrackingResult
+    from tracking3d.pipeline.track import Session, track, track_objects
+    from tracking3d.pipeline.tracking import Tracking
 
 _HOME = {
     "Frame": "tracking3d.frames",
@@ -43,14 +43,14 @@ _HOME = {
     "ObjectModel": "tracking3d.estimation.estimate",
     "PipelineConfig": "tracking3d.config.models",
     "Prompt": "tracking3d.frames",
-    "Session": "tracking3d.pipeline",
+    "Session": "tracking3d.pipeline.track",
     "Status": "tracking3d.estimation.estimate",
-    "Tracking": "tracking3d.tracking",
-    "TrackingResult": "tracking3d.tracking_result",
+    "Tracking": "tracking3d.pipeline.tracking",
+    "TrackingResult": "tracking3d.pipeline.result",
     "export_run": "tracking3d.export.exporting",
     "load_config": "tracking3d.config.loading",
-    "track": "tracking3d.pipeline",
-    "track_objects": "tracking3d.pipeline",
+    "track": "tracking3d.pipeline.track",
+    "track_objects": "tracking3d.pipeline.track",
 }
 
 

@@ -3,9 +3,9 @@
 ``python training/confidence.py BENCHMARK ... --evidence silhouette,features,matching`` reads every run in the folders
 ``--out`` of ``tracking3d evaluate suite``. Evidence are names of losses in ``frames.jsonl``, and ``has_mask``,
 ``iou_initial`` and ``recorded`` (the confidence that the run said itself), and of the online solver's runs what its
-confidence is made of (`tracking3d.estimation.online.judgement.weighed`), and of refined answers what landmarks say of
-them (`tracking3d.reconstruction.support.refined_confidence_features`). Without ``--evidence`` all losses count. A
-name with a sign, ``--evidence=-silhouette,+matching``, can only speak against an answer, or for it.
+confidence is made of (`tracking3d.estimation.online.state.confidence.confidence_features`), and of refined answers what
+landmarks say of them (`tracking3d.reconstruction.confidence.refined_confidence_features`). Without ``--evidence`` all
+losses count. A name with a sign, ``--evidence=-silhouette,+matching``, can only speak against an answer, or for it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from tracking3d.benchmark.job import JOB, RUN, Job
 from tracking3d.datasets.run_answers import answers_of_run
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import Status
-from tracking3d.estimation.online.judgement import weighed
+from tracking3d.estimation.online.state.confidence import confidence_features
 from tracking3d.evaluation.calibration import area_under_roc, expected_calibration_error, reliability
 from tracking3d.evaluation.confidence_fit import (
     PENALTY,
@@ -35,8 +35,8 @@ from tracking3d.evaluation.confidence_fit import (
 from tracking3d.evaluation.confidence_scores import right_frames
 from tracking3d.evaluation.mask_scores import compare_masks
 from tracking3d.evaluation.pose_scores import pair_poses, rotation_errors
-from tracking3d.points.landmarks import Support
-from tracking3d.reconstruction.support import refined_confidence_features as supported_by
+from tracking3d.points.landmark_adjustment import Support
+from tracking3d.reconstruction.confidence import refined_confidence_features as supported_by
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
 
@@ -75,7 +75,7 @@ def judged_frames(benchmark: Path, solver: str | None, refined: bool) -> Iterato
                 known = record.iou_initial is not None
                 evidence = {
                     **record.losses,
-                    **(weighed(record.losses) if "witnesses" in record.losses else {}),
+                    **(confidence_features(record.losses) if "witnesses" in record.losses else {}),
                     "has_mask": float(known),
                     "iou_initial": record.iou_initial if record.iou_initial is not None else np.nan,
                     "recorded": record.confidence,

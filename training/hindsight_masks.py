@@ -3,9 +3,9 @@
 ``python training/hindsight_masks.py FOLDER --runs BENCHMARK ...`` reads the runs that ``tracking3d evaluate suite`` has
 left in ``BENCHMARK/runs`` (of any masks: trackers' ones say how they err, exact ones that they are to be kept), goes
 over their frames as the final refinement does, asks at pixels near the outlines, and some elsewhere, what the sources
-of `tracking3d.evidence.sources` say and whether the object is there, fits a logistic regression without a constant, and
-writes ``tracking3d/evidence/hindsight_weights.py``. ``FOLDER`` holds the sequences. Runs with exact masks count as much
-as all others together.
+of `tracking3d.segmentation.whole_video_features` say and whether the object is there, fits a logistic regression
+without a constant, and writes ``tracking3d/segmentation/whole_video_weights.py``. ``FOLDER`` holds the sequences. Runs
+with exact masks count as much as all others together.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from numpy.typing import NDArray
 
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import Status
-from tracking3d.evidence.hindsight import Hindsight
-from tracking3d.evidence.order import REACH
-from tracking3d.evidence.scene import Answered
-from tracking3d.evidence.sources import Said
 from tracking3d.results.files import read_mask
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.run_reader import RunReader
-from tracking3d.trackers.crops import cut
+from tracking3d.segmentation.frame_window import Answered
+from tracking3d.segmentation.temporal_neighbours import REACH
+from tracking3d.segmentation.whole_video import VideoSegmenter
+from tracking3d.segmentation.whole_video_features import PixelEvidence
+from tracking3d.trackers.crops import crop_window
 
 PIXELS = 400
 """Of a frame, at most; three in four of them near an outline."""
@@ -50,24 +50,26 @@ def answered_frames(run: RunReader, clip: Path) -> Iterator[Answered]:
         yield Answered(record.index, image, initial, answer, pose, record.confidence)
 
 
-def seen_once(run: RunReader, clip: Path) -> Hindsight:
+def seen_once(run: RunReader, clip: Path) -> VideoSegmenter:
     """What all frames of a finished run say together."""
     model = load_model(run.mesh_folder)
     confidences = {one.index: one.confidence for one in run.frames if one.status is not Status.LOST}
-    hindsight = Hindsight(run.camera, model.vertices, model.faces, confidences)
+    hindsight = VideoSegmenter(run.camera, model.vertices, model.faces, confidences)
     for frame in answered_frames(run, clip):
         hindsight.see(frame)
     hindsight.settle()
     return hindsight
 
 
-def asked(run: RunReader, clip: Path, every: int) -> Iterator[tuple[Answered, NDArray[np.bool_], Said]]:
+def asked(
+    run: RunReader, clip: Path, every: int
+) -> Iterator[tuple[Answered, NDArray[np.bool_], PixelEvidence]]:
     """What is said of every so many frames, and where the object is in their windows ``(S, S)``."""
     hindsight = seen_once(run, clip)
     wanted = {one.index for one in run.frames[::every]}
     waiting: deque[Answered] = deque()
 
-    def said(frame: Answered) -> Iterator[tuple[Answered, NDArray[np.bool_], Said]]:
+    def said(frame: Answered) -> Iterator[tuple[Answered, NDArray[np.bool_], PixelEvidence]]:
         exact = read_mask(clip / "masks" / f"{frame.index:06d}.png") if frame.index in wanted else None
         if (
             exact is None
@@ -75,7 +77,7 @@ def asked(run: RunReader, clip: Path, every: int) -> Iterator[tuple[Answered, ND
         ):
             return
         if (found := hindsight.said(frame)) is not None:
-            yield frame, cut(exact.astype(np.float32), found[0].window) > 0.5, found[1]
+            yield frame, crop_window(exact.astype(np.float32), found[0].window) > 0.5, found[1]
 
     for frame in answered_frames(run, clip):
         hindsight.order.add(frame)
@@ -151,7 +153,7 @@ def main(words: list[str]) -> None:
     _WEIGHTS.write_text(head + "\n".join(lines) + "\n}\n", encoding="utf-8")
 
 
-def _sampled(said: Said, seed: int) -> NDArray[np.intp]:
+def _sampled(said: PixelEvidence, seed: int) -> NDArray[np.intp]:
     random = np.random.default_rng(seed)
     near = np.min([np.abs(one) for name, one in said.distances.items() if "hull" not in name], 0) < _NEAR
     band, anywhere = np.flatnonzero(near & said.in_reach), np.flatnonzero(said.in_reach)

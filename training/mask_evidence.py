@@ -3,7 +3,7 @@
 ``python training/mask_evidence.py FOLDER ... --out DIR`` tracks every sequence (clips as ``tracking3d synth`` writes
 them) causally with the masks of a tracker, asks at pixels near either outline what the sources said and whether the
 object is there, fits a logistic regression without a constant, and prints what
-`tracking3d.evidence.weighing` holds: first the weights of the shapes alone, by which the outline is guessed
+`tracking3d.segmentation.online_features` holds: first the weights of the shapes alone, by which the outline is guessed
 whose colours are compared, then all. ``--folds N`` prints before how good fits on other sequences are.
 """
 
@@ -25,9 +25,9 @@ from tracking3d import load_config
 from tracking3d.benchmark.job import Job, run_job
 from tracking3d.benchmark.variant import Variant
 from tracking3d.errors import InputError
-from tracking3d.estimation.online import answers
-from tracking3d.estimation.online.answer_mask import finer, seen_through
-from tracking3d.evidence import SOURCES, as_lab, pixel_features, weighing
+from tracking3d.estimation.online.masks import frame_estimates
+from tracking3d.estimation.online.masks.mask_fusion import mask_in_window, upsampled_window
+from tracking3d.segmentation import SOURCES, as_lab, online_features, pixel_features
 
 PIXELS = 500
 """Of a frame, at most; each frame counts the same."""
@@ -86,14 +86,14 @@ def sampled(found: NDArray[np.float32], seed: int) -> NDArray[np.intp]:
 @contextmanager
 def told(truth: Any, sequence: int, into: list[Samples]) -> Iterator[None]:
     """While a sequence is tracked, note what the sources say in each frame."""
-    original = answers.answer_mask
+    original = frame_estimates.fuse_mask
 
     def noting(rendered, initial, observation, confidence, colours, moving=None):
         exact = truth.masks[observation.index].read() if observation.index in truth.masks else None
         asked = exact is not None and initial is not None and exact.any()
         if asked and max(_overlap(initial, exact), _overlap(rendered, exact)) >= _LEAST_OVERLAP:
-            window, image = finer(observation)
-            masks = [seen_through(mask, window) for mask in (initial, rendered, exact)]
+            window, image = upsampled_window(observation)
+            masks = [mask_in_window(mask, window) for mask in (initial, rendered, exact)]
             found = pixel_features(as_lab(image), *masks[:2], confidence, colours)
             chosen = sampled(found, observation.index)
             rows = found.reshape(-1, found.shape[-1])[chosen].astype(np.float64)
@@ -102,11 +102,11 @@ def told(truth: Any, sequence: int, into: list[Samples]) -> Iterator[None]:
             into.append(Samples(rows, masks[2].ravel()[chosen], weight, number))
         return original(rendered, initial, observation, confidence, colours, moving)
 
-    answers.answer_mask = noting
+    frame_estimates.fuse_mask = noting
     try:
         yield
     finally:
-        answers.answer_mask = original
+        frame_estimates.fuse_mask = original
 
 
 def collected(folders: list[Path], out: Path, tracker: str) -> Samples:
@@ -142,7 +142,7 @@ def main(words: list[str]) -> None:
             print(f"fold {fold}: {right_share(samples.of(held), weights):.3f} of other sequences' pixels")
     print(f"as it is: {right_share(samples, np.array(list(SOURCES.values()))):.3f}")
     shapes, everything = fitted(samples, _SHAPES), fitted(samples)
-    print("_BY_SHAPE =", [round(float(one), 3) for one in shapes], "was", weighing._BY_SHAPE.tolist())
+    print("_BY_SHAPE =", [round(float(one), 3) for one in shapes], "was", online_features._BY_SHAPE.tolist())
     for name, weight in zip(SOURCES, everything, strict=True):
         print(f'    "{name}": {weight:.3f},')
 

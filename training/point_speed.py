@@ -18,7 +18,7 @@ import trimesh
 from scipy.spatial import HalfspaceIntersection
 
 from tracking3d.points.follow import follow_points
-from tracking3d.points.landmarks import LandmarkScene
+from tracking3d.points.landmark_adjustment import LandmarkScene
 from tracking3d.points.view import open_view
 from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
 

@@ -16,7 +16,7 @@ Box = tuple[float, float, float, float]
 
 def track(video: str, box: Box, folder: str) -> str:
     """Track one video; what a lost worker had done is gone on with."""
-    from tracking3d.recording import record
+    from tracking3d.pipeline.record import record
     from tracking3d.video import open_source
 
     record(open_source(video), None, Path(folder), box=box, resume=True)

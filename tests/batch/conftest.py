@@ -28,7 +28,8 @@ def videos(tmp_path):
 
 
 class Recorded:
-    """Stands for `tracking3d.recording.record_tracking`: two frames are there at once, unless it is to fail first.
+    """Stands for `tracking3d.pipeline.record.record_tracking`: two frames are there at once, unless it is to fail
+    first.
 
     Args:
         run: That run.

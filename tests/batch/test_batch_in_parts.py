@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tracking3d.batch import in_parts, tasks
+from tracking3d.batch import submap_tasks, tasks
 from tracking3d.batch.folder import read_failures, read_result_rows
 from tracking3d.batch.listing import list_jobs
 from tracking3d.batch.running import run_batch
@@ -19,8 +19,8 @@ from tracking3d.engines.in_this_process import InThisProcess
 from tracking3d.engines.protocol import Ended as TaskEnded
 from tracking3d.engines.protocol import Fault
 from tracking3d.errors import OutputError
-from tracking3d.splitting.long_video import SplitResult
-from tracking3d.splitting.steps import Step
+from tracking3d.submaps.job import SplitResult
+from tracking3d.submaps.steps import Step
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def cut(monkeypatch, finished_run):
         yield [Step(end, folders, "its end")]
         return SplitResult(tuple(folders), 2, *refused)
 
-    monkeypatch.setattr(in_parts, "begin", begin)
+    monkeypatch.setattr(submap_tasks, "begin", begin)
     monkeypatch.setattr(tasks, "steps_of", steps_of)
     return done, faults, refused
 

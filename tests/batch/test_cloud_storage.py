@@ -8,7 +8,7 @@ import fsspec
 import pytest
 
 from tracking3d.batch.folder import read_failures, read_progress, read_result_rows
-from tracking3d.batch.places import join_path
+from tracking3d.batch.storage import join_path
 from tracking3d.batch.summary import MARKER
 
 pytestmark = [

@@ -14,7 +14,7 @@ from recorded_runs import write_frames
 from small_videos import BOX, write_video
 
 from tracking3d.batch.listing import NO_PROMPT, dataset_jobs, list_jobs
-from tracking3d.batch.places import absolute, join_path, local
+from tracking3d.batch.storage import absolute, join_path, local
 from tracking3d.benchmark.sequences import open_dataset
 from tracking3d.config.loading import load_config
 from tracking3d.datasets.clip import write_clip

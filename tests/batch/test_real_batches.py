@@ -36,7 +36,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning"),
 ]
 
-QUICK = ["window.size=32", "object.frequency=2", "camera.fov=45", "solver.final_refine=false"]
+QUICK = ["crop.size=32", "object.frequency=2", "camera.fov=45", "solver.final_refine=false"]
 
 
 @pytest.fixture
@@ -120,7 +120,7 @@ def test_parts_of_a_long_video_are_tracked_by_all_workers_and_joined(tmp_path):
         for kind, write, content in (("frames", write_image, image), ("masks", write_mask, mask)):
             (tmp_path / kind).mkdir(exist_ok=True)
             write(tmp_path / kind / f"{index:03d}.png", content)
-    small = ["window.size=64", "object.frequency=3", "object.texture_size=64", "camera.fov=45"]
+    small = ["crop.size=64", "object.frequency=3", "object.texture_size=64", "camera.fov=45"]
     tracker = {"name": "precomputed", "path": str(tmp_path / "masks")}
     job = VideoJob(
         "long", str(tmp_path / "frames"), load_config(overrides=small, tracker=tracker), split="25f"

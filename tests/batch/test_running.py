@@ -12,7 +12,7 @@ import pytest
 
 from tracking3d.batch import folder as batch_folder
 from tracking3d.batch.folder import read_failures, read_progress, read_result_rows
-from tracking3d.batch.places import _opened
+from tracking3d.batch.storage import _open
 from tracking3d.batch.summary import COLUMNS, MARKER
 from tracking3d.config.loading import load_config
 from tracking3d.errors import InputError, OutputError
@@ -148,7 +148,7 @@ def test_several_objects_are_one_video_with_a_row_each(batch, videos, recorded, 
 
 
 def test_results_elsewhere_have_their_marker_last(batch, videos, monkeypatch):
-    files, _ = _opened("memory://results")
+    files, _ = _open("memory://results")
     put = []
     put_file = type(files).put_file
 

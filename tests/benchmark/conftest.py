@@ -11,7 +11,7 @@ from tracking3d.config.loading import load_config
 from tracking3d.datasets.clip import write_clip
 from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
 
-QUICK = ["window.size=32", "object.frequency=2", "camera.fov=45"]
+QUICK = ["crop.size=32", "object.frequency=2", "camera.fov=45"]
 
 TRACKER = '''
 import os

@@ -16,7 +16,7 @@ from tracking3d.cli import app
 from tracking3d.config.loading import load_config
 from tracking3d.datasets.clip import read_truth
 from tracking3d.errors import InputError
-from tracking3d.stages import StageTimes
+from tracking3d.runtime.stage_times import StageTimes
 
 
 @pytest.fixture

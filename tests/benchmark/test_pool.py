@@ -48,7 +48,7 @@ def test_the_memory_of_a_refined_run_is_that_of_the_first_pass_and_both_its_answ
 
 
 def test_a_job_tells_whether_memory_grew_and_scores_both_answers_of_a_refined_run(jobs, scripted):
-    [job] = jobs(scripted().changed("causal", solver__final_refine=False), ["narrow"])
+    [job] = jobs(scripted().with_changes("causal", solver__final_refine=False), ["narrow"])
     job.write()
     scores = job_module.run_job(job)
     held = json.loads((job.folder / job_module.MEMORY).read_text())
@@ -125,10 +125,10 @@ def test_what_a_result_depends_on_is_in_its_key(jobs, scripted, clips, tmp_path,
 
 
 def test_the_camera_of_the_dataset_is_used_unless_the_settings_say_one(jobs, scripted):
-    [one] = jobs(scripted().changed("unsaid", camera__fov=None), ["narrow"])
+    [one] = jobs(scripted().with_changes("unsaid", camera__fov=None), ["narrow"])
     camera = one.truth.camera
     assert one.config.camera.intrinsics == (camera.fx, camera.fy, camera.cx, camera.cy)
-    [other] = jobs(scripted().changed("fov", camera__fov=30.0), ["narrow"])
+    [other] = jobs(scripted().with_changes("fov", camera__fov=30.0), ["narrow"])
     assert (other.config.camera.intrinsics, other.config.camera.fov) == (None, 30.0)
 
 

@@ -57,7 +57,7 @@ def table():
 
 @pytest.mark.usefixtures("both")
 def test_the_columns_differ_by_solver_and_features_and_the_paper_has_nothing_that_came_later():
-    base = BASE.changed("x", solver__final_refine=True, solver__correct_tracker=True)
+    base = BASE.with_changes("x", solver__final_refine=True, solver__correct_tracker=True)
     variants = plan(base)
     assert list(variants) == ["paper, RGB", "paper, S2DNet", "online, RGB", "online, S2DNet"]
     found = {
@@ -66,8 +66,8 @@ def test_the_columns_differ_by_solver_and_features_and_the_paper_has_nothing_tha
     }
     assert found["paper, RGB"] == ("paper", "rgb", False) and found["online, RGB"] == ("online", "rgb", True)
     assert found["paper, S2DNet"] == ("paper", "s2dnet", False)
-    assert not variants["paper, RGB"].config.solver.correct_tracker
-    assert variants["online, RGB"].config.solver.correct_tracker
+    assert not variants["paper, RGB"].config.solver.tracker_feedback
+    assert variants["online, RGB"].config.solver.tracker_feedback
     assert {one.masks for one in variants.values()} == {"truth"}
 
 

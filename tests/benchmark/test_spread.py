@@ -87,7 +87,7 @@ def test_what_is_one_computation_is_run_once_and_what_cannot_be_run_is_named():
 
 @pytest.mark.usefixtures("kernels")
 def test_the_renderer_that_is_chosen_anyway_is_no_variant():
-    variants, _ = plan(BASE.changed("torch", runtime__renderer="torch"))
+    variants, _ = plan(BASE.with_changes("torch", runtime__renderer="torch"))
     assert [one.label for one in variants if "renderer" in one.label] == ["renderer numba"]
 
 
@@ -201,7 +201,7 @@ def test_the_command_prints_the_spread_of_a_short_sequence(tmp_path):
     command = [sys.executable, "-c", "from tracking3d.cli import main; main()", "evaluate", "spread", "smoke"]
     options = ["--sequence", "box*", "--masks", "truth", "--out", "bench", "--jobs", "2", "--set"]
     found = subprocess.run(
-        [*command, *options, "window.size=64"], cwd=tmp_path, capture_output=True, text=True,
+        [*command, *options, "crop.size=64"], cwd=tmp_path, capture_output=True, text=True,
         env={**os.environ, "NUMBA_NUM_THREADS": "1"},
     )  # fmt: skip
     assert found.returncode == 0, found.stderr

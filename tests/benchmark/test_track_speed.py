@@ -9,11 +9,11 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from tracking3d.benchmark import track_speed
-from tracking3d.benchmark.track_speed import Contender, TrackSpeed, as_figures, checked_out
+from tracking3d.benchmark.track_speed import Contender, TrackSpeed, as_figures, check_out
 from tracking3d.benchmark.track_speed_table import plot_stages, speed_table, stage_table
 from tracking3d.cli import app
 from tracking3d.errors import InputError, OutputError
-from tracking3d.stages import STAGES, StageTimes
+from tracking3d.runtime.stage_times import STAGES, StageTimes
 
 
 def speed(name: str, factor: float, refinement: float | None = 0.1) -> TrackSpeed:
@@ -66,7 +66,7 @@ def test_stages_are_drawn_over_time(tmp_path):
 
 def test_a_version_that_git_does_not_know_is_refused(tmp_path):
     with pytest.raises(InputError, match="--against v0-never"):
-        checked_out("v0-never", tmp_path)
+        check_out("v0-never", tmp_path)
 
 
 def test_an_earlier_version_is_the_one_that_runs_wherever_the_command_is_given(tmp_path, monkeypatch):
@@ -87,7 +87,7 @@ def test_what_is_wrong_is_said_before_anything_runs(clips, tmp_path):
 
 @pytest.mark.slow
 def test_a_clip_is_tracked_by_all_contenders(clips):
-    settings = ["--set", "window.size=32", "--set", "object.frequency=2", "--no-final-refine"]
+    settings = ["--set", "crop.size=32", "--set", "object.frequency=2", "--no-final-refine"]
     result = CliRunner().invoke(
         app, ["bench", "track", str(clips / "narrow"), "--paper-frames", "0", "--json", *settings]
     )

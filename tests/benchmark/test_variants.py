@@ -18,7 +18,7 @@ from tracking3d.results.files import read_mask
 
 def test_a_changed_setting_is_the_only_change():
     base = Variant(label="base", config=load_config(preset="paper"))
-    changed = base.changed("no motion", solver__weights__motion=0.0, masks="degraded:0.7")
+    changed = base.with_changes("no motion", solver__weights__motion=0.0, masks="degraded:0.7")
     expected = load_config(preset="paper", overrides=["solver.weights.motion=0"])
     assert (changed.label, changed.masks, changed.config) == ("no motion", "degraded:0.7", expected)
     assert base.config == load_config(preset="paper")
@@ -63,7 +63,7 @@ def test_rough_masks_are_made_for_a_clip_and_the_first_one_is_true(clips, tmp_pa
 
 def test_a_camera_that_is_not_told_is_not_in_the_configuration(clips, scripted, tmp_path):
     def config(clip):
-        variant = scripted().changed("unsaid", camera__fov=None)
+        variant = scripted().with_changes("unsaid", camera__fov=None)
         return Job("clip", clips, clip, variant, tmp_path / "out").config.camera.intrinsics
 
     assert config("narrow") is not None

@@ -13,7 +13,7 @@ from tracking3d.frames import SkippedFrame
 from tracking3d.results.run_reader import RunReader
 
 QUICK = [
-    "window.size=32",
+    "crop.size=32",
     "object.frequency=3",
     "object.texture_size=48",
     "tracker.name=flow",

@@ -50,18 +50,18 @@ def table(shots, tmp_path):
 
 
 def test_a_table_is_tracked_with_the_settings_of_its_rows(call, table, script, opened):
-    result = call("batch", table, "--out", "out", "--no-report", "--set", "window.size=64", "--threads", 2)
+    result = call("batch", table, "--out", "out", "--no-report", "--set", "crop.size=64", "--threads", 2)
     assert result.exit_code == 0, result.output
     assert opened == [(None, None, Needs(2, 0.0, 0.0))]
     (cup, _), *plate = sorted(script.built, key=lambda one: one[0].runtime.seed != 5)
-    assert (cup.runtime.seed, cup.window.size, cup.runtime.threads) == (5, 64, 2)
+    assert (cup.runtime.seed, cup.crop.size, cup.runtime.threads) == (5, 64, 2)
     assert [config.camera.fov for config, _ in plate] == [40, 40]
     assert [prompt.box for _, prompt in plate] == [(20, 10, 20, 20), (5, 5, 9, 9)]
     assert "cup: 5 frames" in result.stderr and "2 of 2 videos" in result.stderr
 
     status = call("batch", "status", "out")
     assert status.exit_code == 0 and "finished" in status.stdout and "2 of 2 videos" in status.stdout
-    again = call("batch", table, "--out", "out", "--no-report", "--set", "window.size=64", "--threads", 2)
+    again = call("batch", table, "--out", "out", "--no-report", "--set", "crop.size=64", "--threads", 2)
     assert again.exit_code == 0 and len(script.built) == 3 and "2 of them earlier" in again.stderr
 
 

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tracking3d.corrections import Correction, checked_corrections, parse_correction
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame
-from tracking3d.point_prompts import checked_points, parse_points
-from tracking3d.prompts import make_prompt
+from tracking3d.prompts.corrections import Correction, parse_correction, validate_corrections
+from tracking3d.prompts.points import parse_points, validate_points
+from tracking3d.prompts.prompt import make_prompt
 
 
 @pytest.fixture(autouse=True)
@@ -57,7 +57,7 @@ def test_bad_points_are_refused(text, sentence):
 )
 def test_what_is_no_list_of_points_is_refused_by_the_library(given):
     with pytest.raises(InputError, match=r"points="):
-        checked_points(given)
+        validate_points(given)
 
 
 def test_points_make_a_mask_and_its_box():
@@ -122,7 +122,7 @@ def test_bad_corrections_are_refused(text, sentence):
 )
 def test_corrections_that_cannot_be_are_refused(given, sentence):
     with pytest.raises(InputError, match=sentence):
-        checked_corrections(given)
+        validate_corrections(given)
 
 
 BAD = {

@@ -48,7 +48,7 @@ def test_options_reach_the_configuration(call, clip, script, tmp_path):
     [(config, prompt)] = script.built
     assert (config.solver.knum, config.solver.iterations) == (7, 3)
     assert (config.object.flat, config.object.prototype) == (True, "ellipsoid")
-    assert (config.window.size, config.runtime.device, config.runtime.seed) == (64, "cpu", 5)
+    assert (config.crop.size, config.runtime.device, config.runtime.seed) == (64, "cpu", 5)
     assert (config.camera.fov, config.camera.intrinsics) == (30, (70, 70, 32, 24))
     assert prompt.box == (20, 10, 20, 20)
     assert RunReader(Path("runs/clip")).description["seed"] == 5
@@ -325,7 +325,7 @@ def test_folder_that_cannot_be_written_is_named(refused, clip, script, tmp_path)
         ("--box 1,1,9,9 --set tracker.paddin=1", "did you mean 'padding'?"),
         ("--box 1,1,9,9 --set window", "section.key=value"),
         ("--box 1,1,9,9 --config absent.yaml", "absent.yaml does not exist"),
-        ("--box 1,1,9,9 --size 3", "'window.size' must be greater than or equal to 32, not 3"),
+        ("--box 1,1,9,9 --size 3", "'crop.size' must be greater than or equal to 32, not 3"),
         ("--box 1,1,9,9 --size big", "--size"),
         ("--box 1,1,9,9 --fov 200", "'camera.fov'"),
         ("--box 1,1,9,9 --fov wide", "--fov"),
@@ -402,7 +402,7 @@ def test_the_shape_is_made_anew_once_and_the_run_says_what_came_of_it(
 ):
     made = []
     monkeypatch.setattr(
-        "tracking3d.reconstruction.asked_shape.shape_run",
+        "tracking3d.reconstruction.final_shape.rebuild_shape",
         lambda folder, source: made.append(folder) or SimpleNamespace(sentence="It is better."),
     )
     assert "It is better." in call("run", clip, *BOX, *options, "--out", "run").stdout

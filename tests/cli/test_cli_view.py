@@ -100,7 +100,7 @@ def test_a_source_that_gives_each_frame_once_is_shown_as_it_passes(viewers):
 
     frames = [np.full((48, 64, 3), 40 * n, np.uint8) for n in range(4)]
     source = open_source(iter(frames))
-    with view_module.watched(source, Path("run"), lambda frame: None, None, True) as (watched, listener):
+    with view_module.watch(source, Path("run"), lambda frame: None, None, True) as (watched, listener):
         assert watched is not source and not watched.repeatable
         listener(None)
         assert [frame.index for frame in watched] == [0, 1, 2, 3]

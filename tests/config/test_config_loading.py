@@ -44,7 +44,7 @@ def test_presets_choose_the_solver_and_only_the_default_one_looks_twice_and_corr
         "paper": "paper",
     }
     assert [name for name, one in solvers.items() if one.final_refine] == ["default"]
-    assert [name for name, one in solvers.items() if one.correct_tracker] == ["default"]
+    assert [name for name, one in solvers.items() if one.tracker_feedback] == ["default"]
 
 
 def test_later_layers_win_key_by_key(yaml_file):
@@ -58,13 +58,13 @@ def test_later_layers_win_key_by_key(yaml_file):
     assert (config.solver.iterations, config.solver.sigma, config.solver.knum) == (7, 20, 9)
     assert config.solver.weights.motion == 2
     assert config.solver.weights.laplacian == 1000
-    assert config.window.size == 64
+    assert config.crop.size == 64
     assert config.tracker.name == "precomputed"
 
 
 def test_named_preset_wins_over_the_files(yaml_file):
     file = yaml_file("preset: does_not_exist\nwindow: {size: 64}")
-    assert load_config(file, preset="paper").window.size == 64
+    assert load_config(file, preset="paper").crop.size == 64
     with pytest.raises(InputError, match="no preset 'does_not_exist'"):
         load_config(file)
 
@@ -89,12 +89,12 @@ def test_a_solver_is_chosen_by_its_name_and_has_its_own_defaults(yaml_file, text
 
 @pytest.mark.parametrize("section", [{"points": 0.5}, OnlineConfig(points=0.5)])
 def test_settings_without_a_name_are_those_of_the_default_solver(section):
-    assert PipelineConfig(solver=section) == load_config(overrides=["solver.points=0.5"])
+    assert PipelineConfig(solver=section) == load_config(overrides=["solver.weights.points=0.5"])
 
 
 def test_a_configuration_holds_only_what_its_solver_reads():
     online, paper = (load_config(preset=name).model_dump()["solver"] for name in ("default", "paper"))
-    assert online.keys() & paper.keys() == {"name", "final_refine", "correct_tracker"}
+    assert online.keys() & paper.keys() == {"name", "final_refine", "tracker_feedback"}
     assert {"points", "window"} <= online.keys() and {"iterations", "weights"} <= paper.keys()
 
 
@@ -123,7 +123,7 @@ def test_another_solver_drops_the_settings_of_the_one_below(yaml_file):
         ),
         ("solver: {weights: {motion: 1}}", "'solver.weights' is a setting of the solver 'paper'"),
         (
-            "solver: {sigma: 1, tau: 1, knum: 1, band: none, stop: plateau}",
+            "solver: {sigma: 1, tau: 1, knum: 1, silhouette_bias: none, stop: plateau}",
             "'solver.sigma', 'solver.tau', 'solver.knum' and 2 more are settings of the solver 'paper'.*leave them out",
         ),
         (
@@ -198,7 +198,7 @@ def test_yaml_merge_keys_are_plain_data():
         ("solver: !!python/object/apply:os.system ['touch {marker}']", "never run code"),
         ("solver: !!python/name:os.system", "never run code"),
         ("solver: !mine {sigma: 3}", "'!mine' is refused"),
-        ("window: {size: 64}\nwindow: {margin: 1}", r"'window' is given twice \(line 2"),
+        ("crop: {size: 64}\nwindow: {margin: 1}", r"'window' is given twice \(line 2"),
         ("solver: {sigma: 1, sigma: 2}", "'sigma' is given twice"),
         ("1: 2", "key 1 is not text"),
         ("? [a, b]\n: 1", "is not text"),
@@ -208,10 +208,10 @@ def test_yaml_merge_keys_are_plain_data():
         ("solver: {name: paper, weights: {featurs: 3}}", r"did you mean 'solver.weights.features'\?"),
         ("zzz: 30", "no setting 'zzz'; valid are camera, features"),
         ("solver: {name: paper, sigma: lots}", "'solver.sigma' must be a valid number, not 'lots'"),
-        ("window: {size: 4}", "'window.size' must be greater than or equal to 32, not 4"),
+        ("crop: {size: 4}", "'crop.size' must be greater than or equal to 32, not 4"),
         (
-            "solver: {name: paper, band: erod}",
-            "'solver.band' must be 'erode', 'soften' or 'none', not 'erod'",
+            "solver: {name: paper, silhouette_bias: erod}",
+            "'solver.silhouette_bias' must be 'erode', 'soften' or 'none', not 'erod'",
         ),
         ("solver: {points: .nan}", "must be a finite number, not nan"),
         ("solver: papre", "'solver.name' must be 'online' or 'paper', not 'papre'"),
@@ -317,11 +317,11 @@ def test_malformed_override_says_how_to_write_it(item):
 
 
 @pytest.mark.parametrize(
-    "item", ["window.size=4", "solver.points=-4", "solver.points=!!python/name:os.system"]
+    "item", ["crop.size=4", "solver.weights.points=-4", "solver.weights.points=!!python/name:os.system"]
 )
 def test_bad_override_is_quoted(item):
     with pytest.raises(InputError) as caught:
-        load_config(overrides=["window.size=64", item])
+        load_config(overrides=["crop.size=64", item])
     assert f"overrides: {item}" in str(caught.value)
     assert f"--set {item}" in caught.value.at_the_command_line
 
@@ -351,7 +351,7 @@ def test_schema_covers_presets_and_the_short_form_of_plugins():
 
 def test_configuration_is_frozen():
     with pytest.raises(ValidationError):
-        load_config(preset="paper").window.size = 64
+        load_config(preset="paper").crop.size = 64
 
 
 def test_configs_of_the_repository_are_valid():

@@ -25,16 +25,16 @@ def test_each_quality_looks_closer_than_the_one_before():
     configs = [load_config(quality=name) for name in list_qualities()]
     assert [config.tracker.name for config in configs] == ["flow", "csrt", "auto"]
     assert [config.solver.final_refine for config in configs] == [False, True, True]
-    assert [config.window.size for config in configs] == sorted({config.window.size for config in configs})
+    assert [config.crop.size for config in configs] == sorted({config.crop.size for config in configs})
 
 
 def test_what_lies_above_wins(tmp_path: Path):
     file = tmp_path / "mine.yaml"
     file.write_text("quality: draft\nwindow: {size: 64}\n")
     config = load_config(file, overrides=["solver.final_refine=true"])
-    assert (config.tracker.name, config.window.size, config.solver.final_refine) == ("flow", 64, True)
+    assert (config.tracker.name, config.crop.size, config.solver.final_refine) == ("flow", 64, True)
     config = load_config(file, quality="best", tracker="csrt")
-    assert (config.tracker.name, config.window.size, config.object.texture_size) == ("csrt", 64, 300)
+    assert (config.tracker.name, config.crop.size, config.object.texture_size) == ("csrt", 64, 300)
 
 
 def test_layers_are_told_in_words(tmp_path: Path):
@@ -42,7 +42,7 @@ def test_layers_are_told_in_words(tmp_path: Path):
     file.write_text("preset: paper\nquality: draft\ntracker: csrt\n")
     words = layers_in_words(file)
     assert [line.partition(":")[0] for line in words] == ["preset paper", "quality draft", str(file)]
-    assert "window.size=96" in words[1]
+    assert "crop.size=96" in words[1]
     assert words[2].endswith("tracker.name=csrt")
 
 

@@ -165,7 +165,7 @@ def test_a_demo_clip_has_name_box_camera_and_rough_masks(demo):
     np.testing.assert_allclose(truth.camera.K, made.K)
     assert (truth.camera.width, truth.camera.height) == (96, 72)
     assert (truth.initial_masks[1].read() == read_mask(demo / "rough_masks/000001.png")).all()
-    assert truth.told_camera is truth.mesh is truth.points is truth.millimetres is None
+    assert truth.given_camera is truth.mesh is truth.points is truth.millimetres is None
     assert truth.symmetries.tolist() == [np.eye(4).tolist()]
     assert not truth.visible_masks and not truth.depth and not truth.boxes
 
@@ -205,9 +205,9 @@ def test_the_true_camera_may_differ_from_the_one_that_a_tracker_is_told(clip):
     assert told is not None
     edit(clip / "truth_camera.json", K=[[90, 0, 40], [0, 91, 30], [0, 0, 1]], width=96, height=72)
     truth = read_truth(clip)
-    assert truth.camera is not None and truth.told_camera is not None
+    assert truth.camera is not None and truth.given_camera is not None
     assert (truth.camera.fx, truth.camera.fy) == (90, 91)
-    assert (truth.told_camera.K == told.K).all()
+    assert (truth.given_camera.K == told.K).all()
 
 
 @pytest.mark.parametrize(

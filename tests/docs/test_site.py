@@ -103,4 +103,4 @@ def test_the_site_is_built_without_a_broken_link_and_fetches_nothing(tmp_path):
         assert re.findall(r"<link(?![^>]*rel=\"?canonical)[^>]+href=\"?https?:[^>]*", text) == [], page.name
         assert "arithmatex" not in text, page.name
     reference = (tmp_path / "site/reference.html").read_text(encoding="utf-8")
-    assert 'id="tracking3d.pipeline.track"' in reference
+    assert 'id="tracking3d.pipeline.track.track"' in reference

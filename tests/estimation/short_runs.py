@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from tracking3d.config.loading import load_config
 from tracking3d.estimation.estimate import FrameEstimate
-from tracking3d.estimation.paper.belief import PaperState
 from tracking3d.estimation.paper.solver import PaperSolver
+from tracking3d.estimation.paper.state import PaperState
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.features.rgb import RgbEncoder
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 
-_COARSE: dict[str, Any] = {"window": {"size": 32}, "object": {"frequency": 4, "texture_size": 32}}
+_COARSE: dict[str, Any] = {"crop": {"size": 32}, "object": {"frequency": 4, "texture_size": 32}}
 QUICK: dict[str, dict[str, Any]] = {
     "paper": {
         **_COARSE,
@@ -35,8 +35,8 @@ QUICK: dict[str, dict[str, Any]] = {
             "iterations": 8,
             "tau": 0.5,
             "pose_iterations": 8,
-            "start_frames": 3,
-            "start_iterations": 4,
+            "init_frames": 3,
+            "init_iterations": 4,
         },
     },
 }
@@ -56,7 +56,7 @@ def quick_solver(
     """A solver of a preset; ``sections`` change settings of a section on top of the quick ones."""
     quick = QUICK[preset]
     # So few iterations fit the mask roughly; the rendered mask is what these tests look at.
-    quick = {**quick, "solver": {"agreement": 0.0, **quick.get("solver", {})}}
+    quick = {**quick, "solver": {"min_mask_iou": 0.0, **quick.get("solver", {})}}
     names = {*quick, *sections}
     merged = {name: {**quick.get(name, {}), **sections.get(name, {})} for name in names}
     return PaperSolver(load_config(preset=preset, **merged), short_clip().camera, encoder or RgbEncoder())
@@ -96,17 +96,17 @@ def run(
     """
     torch.manual_seed(0)
     given = masks or {}
-    answers: list[FrameEstimate] = list(after[0]) if after else []
+    estimates: list[FrameEstimate] = list(after[0]) if after else []
     state: PaperState | None = after[1] if after else None
     for index in frames:
         mask = estimate_of(given.get(index, true_mask(index)))
         if state is None:
-            state, answer = solver.init(frame(index), mask)
+            state, estimate = solver.init(frame(index), mask)
         else:
-            state, answer = solver.step(state, frame(index), mask)
-        answers.append(answer)
+            state, estimate = solver.step(state, frame(index), mask)
+        estimates.append(estimate)
     assert state is not None
-    return answers, state
+    return estimates, state
 
 
 @cache
@@ -115,10 +115,10 @@ def known_run(preset: str = "rerendering", count: int = 6) -> Run:
     return run(quick_solver(preset), [count - 1], after=known_run(preset, count - 1) if count > 1 else None)
 
 
-def revised(answers: Iterable[FrameEstimate]) -> list[FrameEstimate]:
+def revised(estimates: Iterable[FrameEstimate]) -> list[FrameEstimate]:
     """The final answer of every frame."""
     final: dict[int, FrameEstimate] = {}
-    for answer in answers:
-        final |= {better.index: better for better in answer.revised}
-        final[answer.index] = answer
+    for estimate in estimates:
+        final |= {better.index: better for better in estimate.revised}
+        final[estimate.index] = estimate
     return list(final.values())

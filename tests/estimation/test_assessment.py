@@ -15,35 +15,35 @@ def judged(
 
 
 def test_an_explained_frame_that_agrees_with_its_mask_is_tracked():
-    answer = judged()
-    assert (answer.status, answer.reason) == (Status.TRACKED, "")
-    assert answer.confidence == pytest.approx(0.9 * 0.75)
+    estimate = judged()
+    assert (estimate.status, estimate.reason) == (Status.TRACKED, "")
+    assert estimate.confidence == pytest.approx(0.9 * 0.75)
 
 
 @pytest.mark.parametrize("appearance", [0.2, 0.5, float("inf"), float("nan")])
 def test_a_frame_whose_appearance_loss_stays_at_tau_or_above_is_lost(appearance):
-    answer = judged(appearance)
-    assert (answer.status, answer.confidence) == (Status.LOST, 0.0)
-    assert "appearance loss" in answer.reason
-    assert "0.2" in answer.reason
+    estimate = judged(appearance)
+    assert (estimate.status, estimate.confidence) == (Status.LOST, 0.0)
+    assert "appearance loss" in estimate.reason
+    assert "0.2" in estimate.reason
 
 
 def test_a_numerical_failure_is_lost_with_its_own_reason():
-    answer = judged(failure="the loss became nan in iteration 3")
-    assert (answer.status, answer.reason) == (Status.LOST, "the loss became nan in iteration 3")
+    estimate = judged(failure="the loss became nan in iteration 3")
+    assert (estimate.status, estimate.reason) == (Status.LOST, "the loss became nan in iteration 3")
 
 
 def test_a_silhouette_that_disagrees_is_uncertain():
-    answer = judged(silhouette=0.3)
-    assert answer.status is Status.UNCERTAIN
-    assert "0.30" in answer.reason
+    estimate = judged(silhouette=0.3)
+    assert estimate.status is Status.UNCERTAIN
+    assert "0.30" in estimate.reason
 
 
 def test_without_a_mask_a_frame_is_uncertain_and_its_silhouette_not_looked_at():
-    answer = judged(silhouette=5.0, has_mask=False)
-    assert answer.status is Status.UNCERTAIN
-    assert "no initial mask" in answer.reason
-    assert answer == judged(silhouette=0.0, has_mask=False)
+    estimate = judged(silhouette=5.0, has_mask=False)
+    assert estimate.status is Status.UNCERTAIN
+    assert "no initial mask" in estimate.reason
+    assert estimate == judged(silhouette=0.0, has_mask=False)
 
 
 def test_confidence_falls_with_either_loss_and_stays_in_its_range():

@@ -27,34 +27,34 @@ FAILS = {"tau": 1e-6}
 @pytest.mark.parametrize("absent", [None, np.zeros((80, 100), bool)], ids=["none", "empty"])
 @PRESETS
 def test_a_frame_without_a_mask_is_tracked(preset, absent):
-    answers, _ = run(quick_solver(preset), (5, 6), {5: absent}, after=known_run(preset, 5))
-    answer = answers[5]
-    assert answer.status is Status.UNCERTAIN
-    assert "no initial mask" in answer.reason
-    assert answer.initial_mask is None
-    assert answer.confidence > 0
-    assert mask_iou(answer.mask, answers[4].mask) > 0.6
-    assert answers[6].initial_mask is not None
+    estimates, _ = run(quick_solver(preset), (5, 6), {5: absent}, after=known_run(preset, 5))
+    estimate = estimates[5]
+    assert estimate.status is Status.UNCERTAIN
+    assert "no initial mask" in estimate.reason
+    assert estimate.initial_mask is None
+    assert estimate.confidence > 0
+    assert mask_iou(estimate.mask, estimates[4].mask) > 0.6
+    assert estimates[6].initial_mask is not None
 
 
 def test_a_gap_of_several_frames_is_tracked_through():
     before = known_run("rerendering", 4)
     final, _ = run(quick_solver("rerendering"), range(4, 9), dict.fromkeys((4, 5, 6, 7)), before)
-    assert all(mask_iou(answer.mask, true_mask(answer.index)) > 0.6 for answer in final[4:])
+    assert all(mask_iou(estimate.mask, true_mask(estimate.index)) > 0.6 for estimate in final[4:])
     assert final[8].status is Status.TRACKED
 
 
 def test_a_gap_within_the_first_frames_is_tracked_through():
-    answers, _ = run(quick_solver("rerendering", solver={"start_frames": 4}), range(5), {1: None, 2: None})
-    final = revised(answers)
-    assert all(mask_iou(answer.mask, true_mask(answer.index)) > 0.6 for answer in final)
-    assert [answer.initial_mask is None for answer in final] == [False, True, True, False, False]
+    estimates, _ = run(quick_solver("rerendering", solver={"init_frames": 4}), range(5), {1: None, 2: None})
+    final = revised(estimates)
+    assert all(mask_iou(estimate.mask, true_mask(estimate.index)) > 0.6 for estimate in final)
+    assert [estimate.initial_mask is None for estimate in final] == [False, True, True, False, False]
 
 
 def test_frames_that_are_missing_altogether_are_passed_over():
-    answers, _ = run(quick_solver("rerendering"), (3, 4, 7, 8), after=known_run("rerendering", 2))
-    assert [answer.index for answer in answers] == [0, 1, 3, 4, 7, 8]
-    assert all(mask_iou(answer.mask, true_mask(answer.index)) > 0.6 for answer in answers)
+    estimates, _ = run(quick_solver("rerendering"), (3, 4, 7, 8), after=known_run("rerendering", 2))
+    assert [estimate.index for estimate in estimates] == [0, 1, 3, 4, 7, 8]
+    assert all(mask_iou(estimate.mask, true_mask(estimate.index)) > 0.6 for estimate in estimates)
 
 
 # Failure is data
@@ -68,20 +68,20 @@ def test_the_first_frame_must_have_a_mask(mask):
 
 @PRESETS
 def test_a_frame_that_is_not_explained_is_lost_and_answered_with_its_initial_mask(preset):
-    answers, state = run(quick_solver(preset, solver=FAILS), range(3))
-    for answer in answers[1:]:
-        assert (answer.status, answer.confidence) == (Status.LOST, 0.0)
-        assert "appearance loss" in answer.reason
-        np.testing.assert_array_equal(answer.mask, true_mask(answer.index))
-        assert not answer.keyframe
+    estimates, state = run(quick_solver(preset, solver=FAILS), range(3))
+    for estimate in estimates[1:]:
+        assert (estimate.status, estimate.confidence) == (Status.LOST, 0.0)
+        assert "appearance loss" in estimate.reason
+        np.testing.assert_array_equal(estimate.mask, true_mask(estimate.index))
+        assert not estimate.keyframe
     assert len(state.keyframes) <= 1
 
 
 def test_a_lost_frame_without_a_mask_has_an_empty_answer():
-    answers, _ = run(quick_solver("paper", solver=FAILS), range(3), {2: None})
-    assert answers[2].status is Status.LOST
-    assert answers[2].initial_mask is None
-    assert not answers[2].mask.any()
+    estimates, _ = run(quick_solver("paper", solver=FAILS), range(3), {2: None})
+    assert estimates[2].status is Status.LOST
+    assert estimates[2].initial_mask is None
+    assert not estimates[2].mask.any()
 
 
 class BrokenEncoder(RgbEncoder):
@@ -97,14 +97,14 @@ class BrokenEncoder(RgbEncoder):
 
 @PRESETS
 def test_a_frame_whose_loss_is_no_number_is_lost_and_the_run_goes_on(preset):
-    answers, state = run(quick_solver(preset, BrokenEncoder(0)), range(4, 8), after=known_run(preset, 4))
-    assert (answers[4].status, answers[4].confidence) == (Status.LOST, 0.0)
-    assert "nan" in answers[4].reason
-    np.testing.assert_array_equal(answers[4].mask, true_mask(4))
-    assert np.isfinite(answers[4].T_cam_obj).all()
-    for answer in answers[5:]:
-        assert answer.status is not Status.LOST, answer.reason
-        assert math.isfinite(answer.losses["features"])
+    estimates, state = run(quick_solver(preset, BrokenEncoder(0)), range(4, 8), after=known_run(preset, 4))
+    assert (estimates[4].status, estimates[4].confidence) == (Status.LOST, 0.0)
+    assert "nan" in estimates[4].reason
+    np.testing.assert_array_equal(estimates[4].mask, true_mask(4))
+    assert np.isfinite(estimates[4].T_cam_obj).all()
+    for estimate in estimates[5:]:
+        assert estimate.status is not Status.LOST, estimate.reason
+        assert math.isfinite(estimate.losses["features"])
     assert state.texture.isfinite().all()
     assert all(keyframe.observation.index != 4 for keyframe in state.keyframes)
 
@@ -112,8 +112,8 @@ def test_a_frame_whose_loss_is_no_number_is_lost_and_the_run_goes_on(preset):
 def test_a_broken_frame_leaves_shape_and_texture_as_they_were():
     solver = quick_solver("rerendering", BrokenEncoder(0))
     _, before = known_run("rerendering", 5)
-    after, answer = solver.step(before, frame(5), estimate_of(true_mask(5)))
-    assert answer.status is Status.LOST
+    after, estimate = solver.step(before, frame(5), estimate_of(true_mask(5)))
+    assert estimate.status is Status.LOST
     assert torch.equal(after.offsets, before.offsets)
     assert torch.equal(after.texture, before.texture)
     assert after.keyframes == before.keyframes
@@ -122,8 +122,8 @@ def test_a_broken_frame_leaves_shape_and_texture_as_they_were():
 def test_a_lost_frame_leaves_shape_and_texture_as_they_were():
     _, before = known_run("rerendering", 5)
     solver = quick_solver("rerendering", solver=FAILS)
-    after, answer = solver.step(before, frame(9), estimate_of(true_mask(9)))
-    assert answer.status is Status.LOST
+    after, estimate = solver.step(before, frame(9), estimate_of(true_mask(9)))
+    assert estimate.status is Status.LOST
     assert torch.equal(after.offsets, before.offsets)
     assert torch.equal(after.texture, before.texture)
 
@@ -132,14 +132,14 @@ def test_a_lost_frame_leaves_shape_and_texture_as_they_were():
 @pytest.mark.parametrize("broken", [0, 1, 2])
 @PRESETS
 def test_a_broken_frame_among_the_first_does_not_spoil_the_others(preset, broken):
-    answers, state = run(quick_solver(preset, BrokenEncoder(broken)), range(8))
-    final = revised(answers)
+    estimates, state = run(quick_solver(preset, BrokenEncoder(broken)), range(8))
+    final = revised(estimates)
     assert final[broken].status is Status.LOST
     assert "nan" in final[broken].reason
     np.testing.assert_array_equal(final[broken].mask, true_mask(broken))
-    for answer in final[5:]:
-        assert answer.status is not Status.LOST, answer.reason
-        assert mask_iou(answer.mask, true_mask(answer.index)) > 0.5
+    for estimate in final[5:]:
+        assert estimate.status is not Status.LOST, estimate.reason
+        assert mask_iou(estimate.mask, true_mask(estimate.index)) > 0.5
     assert state.waiting is None
 
 
@@ -151,9 +151,9 @@ def test_an_infinite_loss_in_the_middle_of_a_frame_loses_that_frame_only(monkeyp
         return replace(losses, features=losses.features + (math.inf if 4 in self.batch.index else 0.0))
 
     monkeypatch.setattr(Problem, "losses", failing)
-    answers, _ = run(quick_solver("rerendering"), range(4, 7), after=before)
-    assert [answer.status is Status.LOST for answer in answers] == [index == 4 for index in range(7)]
-    assert "inf" in answers[4].reason
+    estimates, _ = run(quick_solver("rerendering"), range(4, 7), after=before)
+    assert [estimate.status is Status.LOST for estimate in estimates] == [index == 4 for index in range(7)]
+    assert "inf" in estimates[4].reason
 
 
 def test_an_object_that_leaves_the_picture_stops_nothing():
@@ -168,19 +168,19 @@ def test_an_object_that_leaves_the_picture_stops_nothing():
         [0.0, 0.0, -20.0],
     ):
         moved = replace(far, translation=far.translation + torch.tensor(shift))
-        _, answer = solver.step(replace(state, last=(moved, 3), before=None), frame(4), away)
-        assert answer.status is not Status.TRACKED
-        assert np.isfinite(answer.T_cam_obj).all()
-        assert answer.initial_mask is None
+        _, estimate = solver.step(replace(state, last=(moved, 3), before=None), frame(4), away)
+        assert estimate.status is not Status.TRACKED
+        assert np.isfinite(estimate.T_cam_obj).all()
+        assert estimate.initial_mask is None
 
 
 def test_after_lost_frames_the_object_is_found_again():
     solver = quick_solver("rerendering")
     _, known = known_run("rerendering", 5)
     astray = replace(known.last[0], translation=known.last[0].translation + torch.tensor([1.5, 0.0, 0.5]))
-    state, answer = solver.step(
+    state, estimate = solver.step(
         replace(known, last=(astray, 8), before=None), frame(9), estimate_of(true_mask(9))
     )
-    assert answer.status is Status.TRACKED
-    assert mask_iou(answer.mask, true_mask(9)) > 0.6
+    assert estimate.status is Status.TRACKED
+    assert mask_iou(estimate.mask, true_mask(9)) > 0.6
     assert state.last[1] == 9

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tracking3d.config.solvers import KeyframeConfig
-from tracking3d.estimation.keyframes import KeyframeCandidate, select_keyframes, thin_out
+from tracking3d.estimation.paper.keyframes import KeyframeCandidate, select_keyframes, thin_out
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
 
 TAU = 0.2

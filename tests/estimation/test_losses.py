@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from tracking3d.estimation.losses import (
+from tracking3d.estimation.paper.losses import (
     appearance_loss,
     distance_loss,
     erode,
@@ -63,9 +63,9 @@ def test_an_object_out_of_sight_explains_nothing():
 
 def test_unknown_texture_costs_the_charge_in_place_of_its_residual():
     first, second = math.log(2) / 2, (math.log(5) + math.log(2)) / 2
-    charged = appearance(seen=torch.tensor([0.0, 1.0, 0.25]), unseen_charge=0.2)
+    charged = appearance(seen=torch.tensor([0.0, 1.0, 0.25]), unseen_penalty=0.2)
     assert charged == pytest.approx([(0.2 + second) / 2, 0.75 * 0.2])
-    half = appearance(seen=torch.tensor([0.5, 1.0, 1.0]), unseen_charge=0.2)
+    half = appearance(seen=torch.tensor([0.5, 1.0, 1.0]), unseen_penalty=0.2)
     assert half == pytest.approx([((0.2 + first) / 2 + second) / 2, 0.0])
 
 

@@ -8,7 +8,7 @@ import torch
 from scipy.ndimage import distance_transform_edt
 from small_scenes import observed, pose_of, small_shape
 
-from tracking3d.estimation.observation import ObservationBatch, crop, halved, mask_distance, observe
+from tracking3d.estimation.observation import ObservationBatch, crop, downsample, mask_distance, observe
 from tracking3d.features.rgb import RgbEncoder
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera, Window
@@ -171,14 +171,14 @@ def test_mask_distance_is_zero_inside_and_for_an_empty_mask():
 def test_halving_keeps_projections_where_they_are():
     window = Window(20, 10, 40, 32)
     frame = Frame(0, np.zeros((60, 80, 3), np.uint8))
-    half = halved(observe(frame, disc(), window, CAMERA, RgbEncoder(), CPU))
+    half = downsample(observe(frame, disc(), window, CAMERA, RgbEncoder(), CPU))
     assert half.window == Window(20, 10, 40, 16)
     torch.testing.assert_close(half.K.double(), torch.tensor(half.window.K(CAMERA)), rtol=1e-6, atol=1e-5)
 
 
 def test_halving_averages_two_by_two():
     whole = observed(pose_of(20))
-    half = halved(whole)
+    half = downsample(whole)
     size = whole.window.size // 2
     blocks = whole.features.reshape(3, size, 2, size, 2).mean((2, 4))
     torch.testing.assert_close(half.features, blocks)
@@ -188,13 +188,13 @@ def test_halving_averages_two_by_two():
 
 def test_halving_keeps_distances_in_ndc():
     whole = observed(pose_of(20))
-    half = halved(whole)
+    half = downsample(whole)
     assert (half.distance - mask_distance(half.mask)).abs().max() < 2 * 2 / half.window.size
 
 
 def test_halving_calls_a_pixel_valid_that_is_mostly_so():
     frame = Frame(0, np.zeros((60, 80, 3), np.uint8))
-    half = halved(observe(frame, disc(8, 30), Window(-15, 14, 32, 32), CAMERA, RgbEncoder(), CPU))
+    half = downsample(observe(frame, disc(8, 30), Window(-15, 14, 32, 32), CAMERA, RgbEncoder(), CPU))
     assert not half.valid[:, :8].any()
     assert half.valid[:, 8:].all()
 

@@ -92,7 +92,9 @@ def test_the_answer_has_unit_quaternions_and_no_graph():
 
 def test_pose_is_found_against_a_known_object():
     truth = pose_of(8, x=0.05)
-    problem = problem_of([observed(truth)], learning_rates=SLOW, stop="plateau", patience=30, band="none")
+    problem = problem_of(
+        [observed(truth)], learning_rates=SLOW, stop="plateau", patience=30, silhouette_bias="none"
+    )
     end = optimize(problem, parameters_of([pose_of(0)]), iterations=60, tau=NEVER, free="pose")
     error = math.degrees(rotation_angle(end.parameters.quaternion[0], truth.quaternion))
     assert error < 1

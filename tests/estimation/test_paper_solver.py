@@ -28,26 +28,26 @@ FAILS = {"tau": 1e-6}
 
 @PRESETS
 def test_every_frame_is_answered(preset):
-    answers, _ = known_run(preset, 10)
-    assert [answer.index for answer in answers] == list(range(10))
-    for answer in answers:
-        T_cam_obj = answer.T_cam_obj
+    estimates, _ = known_run(preset, 10)
+    assert [estimate.index for estimate in estimates] == list(range(10))
+    for estimate in estimates:
+        T_cam_obj = estimate.T_cam_obj
         assert T_cam_obj.shape == (4, 4)
         assert T_cam_obj.dtype == np.float64
         np.testing.assert_allclose(T_cam_obj[:3, :3] @ T_cam_obj[:3, :3].T, np.eye(3), atol=1e-5)
         assert np.linalg.det(T_cam_obj[:3, :3]) == pytest.approx(1, abs=1e-5)
         assert T_cam_obj[3].tolist() == [0, 0, 0, 1]
         assert T_cam_obj[2, 3] > 0
-        assert answer.mask.shape == (80, 100)
-        assert answer.mask.dtype == bool
-        np.testing.assert_array_equal(answer.initial_mask, true_mask(answer.index))
-        assert set(answer.losses) == {field.name for field in fields(Losses)}
-        assert all(math.isfinite(value) for value in answer.losses.values())
-        assert 0 <= answer.confidence <= 1
-        assert answer.iterations >= 1
-        assert answer.mask_source is MaskSource.RENDERED
-        assert (answer.reason == "") == (answer.status is Status.TRACKED)
-    assert sum(answer.keyframe for answer in answers) >= 1
+        assert estimate.mask.shape == (80, 100)
+        assert estimate.mask.dtype == bool
+        np.testing.assert_array_equal(estimate.initial_mask, true_mask(estimate.index))
+        assert set(estimate.losses) == {field.name for field in fields(Losses)}
+        assert all(math.isfinite(value) for value in estimate.losses.values())
+        assert 0 <= estimate.confidence <= 1
+        assert estimate.iterations >= 1
+        assert estimate.mask_source is MaskSource.RENDERED
+        assert (estimate.reason == "") == (estimate.status is Status.TRACKED)
+    assert sum(estimate.keyframe for estimate in estimates) >= 1
 
 
 @PRESETS
@@ -60,20 +60,20 @@ def test_times_of_frames_are_passed_on(preset):
 
 def test_the_paper_recipe_as_it_is_published():
     published = PaperSolver(load_config(preset="paper"), short_clip().camera, RgbEncoder())
-    answers, state = run(published, range(2))
-    assert [answer.status for answer in answers] == [Status.TRACKED, Status.TRACKED]
-    assert all(1 < answer.iterations < 500 for answer in answers)
+    estimates, state = run(published, range(2))
+    assert [estimate.status for estimate in estimates] == [Status.TRACKED, Status.TRACKED]
+    assert all(1 < estimate.iterations < 500 for estimate in estimates)
     assert len(state.vertices) == 1212
     assert state.texture.shape == (3, 300, 300)
-    assert all(mask_iou(answer.mask, true_mask(answer.index)) > 0.8 for answer in answers)
+    assert all(mask_iou(estimate.mask, true_mask(estimate.index)) > 0.8 for estimate in estimates)
 
 
 @PRESETS
 def test_the_same_input_gives_the_same_answers(preset):
     (once, model), (again, other) = (
-        (revised(answers), solver.result(state))
+        (revised(estimates), solver.result(state))
         for solver in [quick_solver(preset)]
-        for answers, state in (known_run(preset), run(solver))
+        for estimates, state in (known_run(preset), run(solver))
     )
     for a, b in zip(once, again, strict=True):
         assert np.array_equal(a.T_cam_obj, b.T_cam_obj)
@@ -89,58 +89,58 @@ def test_the_same_input_gives_the_same_answers(preset):
 
 
 def test_the_first_frame_does_not_move():
-    answers, state = known_run("rerendering", 8)
+    estimates, state = known_run("rerendering", 8)
     first = state.keyframes[0]
     assert first.observation.index == 0
-    np.testing.assert_array_equal(first.pose.matrix().numpy(), answers[0].T_cam_obj)
-    np.testing.assert_array_equal(revised(answers)[0].T_cam_obj, answers[0].T_cam_obj)
-    np.testing.assert_allclose(answers[0].T_cam_obj[:3, :3], np.eye(3), atol=1e-7)
+    np.testing.assert_array_equal(first.pose.matrix().numpy(), estimates[0].T_cam_obj)
+    np.testing.assert_array_equal(revised(estimates)[0].T_cam_obj, estimates[0].T_cam_obj)
+    np.testing.assert_allclose(estimates[0].T_cam_obj[:3, :3], np.eye(3), atol=1e-7)
 
 
 def test_the_oldest_keyframe_does_not_move_in_the_paper_recipe():
-    answers, state = known_run("paper", 4)
+    estimates, state = known_run("paper", 4)
     [keyframe] = state.keyframes
-    np.testing.assert_array_equal(keyframe.pose.matrix().numpy(), answers[0].T_cam_obj)
+    np.testing.assert_array_equal(keyframe.pose.matrix().numpy(), estimates[0].T_cam_obj)
 
 
 # The joint start
 
 
 def test_first_frames_are_uncertain_until_they_are_solved_together_and_then_answered_anew():
-    answers, state = run(quick_solver("rerendering", solver={"start_frames": 4}), range(6))
-    assert [len(answer.revised) for answer in answers] == [0, 0, 0, 3, 0, 0]
-    assert [better.index for better in answers[3].revised] == [0, 1, 2]
-    assert all(answer.status is Status.UNCERTAIN for answer in answers[1:3])
-    assert all("together" in answer.reason for answer in answers[1:3])
-    for better in answers[3].revised:
+    estimates, state = run(quick_solver("rerendering", solver={"init_frames": 4}), range(6))
+    assert [len(estimate.revised) for estimate in estimates] == [0, 0, 0, 3, 0, 0]
+    assert [better.index for better in estimates[3].revised] == [0, 1, 2]
+    assert all(estimate.status is Status.UNCERTAIN for estimate in estimates[1:3])
+    assert all("together" in estimate.reason for estimate in estimates[1:3])
+    for better in estimates[3].revised:
         assert better.status is Status.TRACKED
         assert better.reason == ""
         assert better.revised == ()
         assert mask_iou(better.mask, true_mask(better.index)) > 0.7
-    assert not np.array_equal(answers[2].T_cam_obj, answers[3].revised[2].T_cam_obj)
+    assert not np.array_equal(estimates[2].T_cam_obj, estimates[3].revised[2].T_cam_obj)
     assert state.waiting is None
 
 
 def test_revised_answers_and_the_one_that_carries_them_are_one_solution():
-    answers, _ = known_run("rerendering", 3)
-    together = {better.losses["laplacian"] for better in answers[2].revised} | {
-        answers[2].losses["laplacian"]
+    estimates, _ = known_run("rerendering", 3)
+    together = {better.losses["laplacian"] for better in estimates[2].revised} | {
+        estimates[2].losses["laplacian"]
     }
     assert len(together) == 1
 
 
 def test_after_the_joint_start_its_own_motion_goes_on():
-    answers, state = known_run("rerendering", 3)
+    estimates, state = known_run("rerendering", 3)
     (before, index), last = state.before, state.last[0]
     assert index == 1
-    np.testing.assert_array_equal(before.matrix().numpy(), answers[2].revised[1].T_cam_obj)
-    np.testing.assert_array_equal(last.matrix().numpy(), answers[2].T_cam_obj)
+    np.testing.assert_array_equal(before.matrix().numpy(), estimates[2].revised[1].T_cam_obj)
+    np.testing.assert_array_equal(last.matrix().numpy(), estimates[2].T_cam_obj)
 
 
 def test_a_video_that_ends_before_the_joint_start_has_a_result():
-    solver = quick_solver("rerendering", solver={"start_frames": 8})
-    answers, state = run(solver, range(3))
-    assert all(answer.revised == () for answer in answers)
+    solver = quick_solver("rerendering", solver={"init_frames": 8})
+    estimates, state = run(solver, range(3))
+    assert all(estimate.revised == () for estimate in estimates)
     assert (solver.result(state).texture_weight > 0).any()
 
 
@@ -175,20 +175,20 @@ def test_memory_is_bounded_by_keyframes(preset):
         "tau": 2.0,
         "stop": "plateau",
         "iterations": 6,
-        "start_frames": 1,
+        "init_frames": 1,
     }
     solver = quick_solver(preset, solver=settings)
-    answers, state = run(solver, range(15))
+    estimates, state = run(solver, range(15))
     held = list(observations_in(state))
     assert len(held) == len(state.keyframes) == 3
-    assert sum(answer.keyframe for answer in answers) > 10
-    assert not list(observations_in(answers))
+    assert sum(estimate.keyframe for estimate in estimates) > 10
+    assert not list(observations_in(estimates))
 
 
 @pytest.mark.slow
 def test_memory_during_the_joint_start_is_bounded_by_its_frames():
     solver = quick_solver(
-        "rerendering", solver={"start_frames": 5, "keyframes": {"maximum": 2, "rotation": 0}}
+        "rerendering", solver={"init_frames": 5, "keyframes": {"maximum": 2, "rotation": 0}}
     )
     state = None
     for index in range(12):
@@ -228,10 +228,10 @@ def test_the_object_is_a_closed_textured_mesh(preset):
 def test_the_visible_texture_is_that_of_the_video():
     sharp = {"frequency": 8, "texture_size": 100}
     solver = quick_solver("rerendering", window={"size": 64}, object=sharp)
-    answers, state = run(solver, range(4))
+    estimates, state = run(solver, range(4))
     model = solver.result(state)
     camera = short_clip().camera
-    T_cam_obj = torch.tensor(revised(answers)[0].T_cam_obj).float()
+    T_cam_obj = torch.tensor(revised(estimates)[0].T_cam_obj).float()
     drawn = render(
         torch.tensor(model.vertices).float(),
         torch.tensor(model.faces),
@@ -252,35 +252,35 @@ def test_the_visible_texture_is_that_of_the_video():
 def test_flat_prior_answers_with_a_flat_object():
     for preset in ("paper", "rerendering"):
         solver = quick_solver(preset, object={"flat": True})
-        answers, state = run(solver, range(5))
+        estimates, state = run(solver, range(5))
         vertices = solver.result(state).vertices
         spread = np.linalg.svd(vertices - vertices.mean(0), compute_uv=False)
         assert spread[2] < 1e-4 * spread[1]
         # Seen from the front at the start, not edge-on.
-        assert all(mask_iou(answer.mask, true_mask(answer.index)) > 0.6 for answer in answers)
+        assert all(mask_iou(estimate.mask, true_mask(estimate.index)) > 0.6 for estimate in estimates)
 
 
 def test_answers_do_not_share_memory_with_what_was_given():
     solver = quick_solver()
     given = estimate_of(true_mask(0))
-    _, answer = solver.init(frame(0), given)
-    assert isinstance(answer, FrameEstimate)
+    _, estimate = solver.init(frame(0), given)
+    assert isinstance(estimate, FrameEstimate)
     given.mask[:] = 0
-    assert answer.initial_mask.any()
+    assert estimate.initial_mask.any()
 
 
 def test_a_rendered_mask_that_differs_too_much_yields_to_the_initial_one():
-    solver = quick_solver("rerendering", solver={"agreement": 0.8})
+    solver = quick_solver("rerendering", solver={"min_mask_iou": 0.8})
     initial = np.zeros((20, 20), dtype=bool)
     initial[5:15, 5:15] = True
-    judgement = Assessment(Status.TRACKED, "", 0.9)
+    assessment = Assessment(Status.TRACKED, "", 0.9)
     near = initial.copy()
     near[5, 5:15] = False  # IoU 0.9
-    kept, source, same = solver._supported(near, initial, judgement)
-    assert kept is near and same is judgement and source is MaskSource.RENDERED
+    kept, source, same = solver._assess_support(near, initial, assessment)
+    assert kept is near and same is assessment and source is MaskSource.RENDERED
     far = np.roll(initial, 3, axis=1)  # IoU 70 / 130
-    answer, source, doubtful = solver._supported(far, initial, judgement)
-    assert answer is initial and source is MaskSource.INITIAL
+    estimate, source, doubtful = solver._assess_support(far, initial, assessment)
+    assert estimate is initial and source is MaskSource.INITIAL
     assert doubtful.status is Status.UNCERTAIN and "0.54" in doubtful.reason
-    alone, _, _ = solver._supported(far, None, judgement)
+    alone, _, _ = solver._assess_support(far, None, assessment)
     assert alone is far  # there is nothing to fall back on

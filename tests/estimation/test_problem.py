@@ -9,7 +9,7 @@ import pytest
 import torch
 from small_scenes import observed, parameters_of, pose_of, problem_of
 
-from tracking3d.config.solvers import PaperConfig, Weights
+from tracking3d.config.solvers import LossWeights, PaperConfig
 from tracking3d.estimation.paper.problem import Losses, Parameters
 from tracking3d.estimation.shape import flatten
 
@@ -21,11 +21,11 @@ LOSSES = Losses(
     laplacian=torch.tensor(0.002),
     total_variation=torch.tensor(7.0),
 )
-NOTHING = dict.fromkeys(Weights.model_fields, 0.0)
+NOTHING = dict.fromkeys(LossWeights.model_fields, 0.0)
 
 
 def test_total_is_the_weighted_sum_with_the_mean_over_frames():
-    weights = Weights(features=2, silhouette=3, distance=5, motion=7, laplacian=11, total_variation=13)
+    weights = LossWeights(features=2, silhouette=3, distance=5, motion=7, laplacian=11, total_variation=13)
     expected = 2 * 0.2 + 3 * (0.3 + 5 * 0.02) + 7 * 0.5 + 11 * 0.002 + 13 * 7.0
     assert LOSSES.total(weights).item() == pytest.approx(expected)
 
@@ -40,11 +40,11 @@ def test_weights_of_the_paper():
     [("features", 0.2), ("silhouette", 0.3), ("motion", 0.5), ("laplacian", 0.002), ("total_variation", 7.0)],
 )
 def test_each_weight_alone_gives_its_own_term(term, value):
-    assert LOSSES.total(Weights(**{**NOTHING, term: 1.0})).item() == pytest.approx(value)
+    assert LOSSES.total(LossWeights(**{**NOTHING, term: 1.0})).item() == pytest.approx(value)
 
 
 def test_no_weight_no_loss():
-    assert LOSSES.total(Weights(**NOTHING)) == 0
+    assert LOSSES.total(LossWeights(**NOTHING)) == 0
 
 
 def test_terms_of_one_frame_by_name():
@@ -59,7 +59,7 @@ def test_terms_of_one_frame_by_name():
             "total_variation": 7.0,
         }
     )
-    assert set(terms) == set(Weights.model_fields)
+    assert set(terms) == set(LossWeights.model_fields)
 
 
 def leaves(parameters: Parameters) -> Parameters:
@@ -113,7 +113,7 @@ def test_terms_without_weight_are_not_evaluated():
 
 def test_the_truth_explains_its_frames():
     poses = [pose_of(0), pose_of(20)]
-    problem = problem_of([observed(pose, index) for index, pose in enumerate(poses)], band="none")
+    problem = problem_of([observed(pose, index) for index, pose in enumerate(poses)], silhouette_bias="none")
     losses = problem.losses(parameters_of(poses))
     assert losses.features.max() < 1e-6
     assert losses.distance.max() < 0.01  # the soft band alone
@@ -124,7 +124,7 @@ def test_the_truth_explains_its_frames():
 def test_erosion_and_softening_remove_the_bias_of_the_soft_band():
     seen = [observed(pose_of(20), size=128)]
     loss = {
-        band: problem_of(seen, band=band).losses(parameters_of([pose_of(20)])).silhouette.item()
+        band: problem_of(seen, silhouette_bias=band).losses(parameters_of([pose_of(20)])).silhouette.item()
         for band in ("none", "erode", "soften")
     }
     assert loss["soften"] < 0.7 * loss["none"]
@@ -185,7 +185,7 @@ def test_laplacian_of_the_vertices_or_of_their_offsets():
 
 
 def test_pixels_of_texture_never_seen_cost_the_charge():
-    problem = problem_of([observed(pose_of(0))], unseen_charge=0.2)
+    problem = problem_of([observed(pose_of(0))], unseen_penalty=0.2)
     at = parameters_of([pose_of(40)])
     size = at.texture.shape[1:]
     unknown = replace(problem, seen=torch.zeros(1, *size)).losses(at).features

@@ -31,7 +31,7 @@ def test_the_texture_has_the_channels_that_are_kept(limit, channels, tau):
     config = load_config(
         preset="rerendering",
         overrides=[f"object.texture_channels={limit}", "object.texture_size=32", "solver.iterations=2",
-                   "solver.pose_iterations=2", "window.size=32"],
+                   "solver.pose_iterations=2", "crop.size=32"],
     )  # fmt: skip
     image = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
     mask = np.zeros((48, 64), np.float32)
@@ -39,8 +39,8 @@ def test_the_texture_has_the_channels_that_are_kept(limit, channels, tau):
     solver = PaperSolver(config, Camera.from_fov(64, 48), ManyChannels())
     assert solver.tau == tau
     state, _ = solver.init(Frame(0, image), MaskEstimate(mask))
-    state, answer = solver.step(state, Frame(1, image), MaskEstimate(mask))
+    state, estimate = solver.step(state, Frame(1, image), MaskEstimate(mask))
     assert state.texture.shape == (channels, 32, 32)
     assert (state.space is None) == (channels == 21)
     assert torch.isfinite(state.texture).all()
-    assert np.isfinite(answer.losses["features"])
+    assert np.isfinite(estimate.losses["features"])

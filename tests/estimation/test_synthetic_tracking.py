@@ -12,7 +12,7 @@ from tracking3d.estimation.estimate import FrameEstimate, Status
 from tracking3d.evaluation.metrics import Angles, aligned_rotation_errors, mask_iou
 from tracking3d.features.rgb import RgbEncoder
 from tracking3d.frames import Frame, MaskEstimate
-from tracking3d.session import SOLVERS
+from tracking3d.pipeline.session import SOLVERS
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 
 PRESETS = ["default", "rerendering"]
@@ -33,7 +33,7 @@ class Tracked:
     @property
     def rotation_errors(self) -> Angles:
         """Aligned, of every frame."""
-        found = np.stack([answer.T_cam_obj[:3, :3] for answer in self.answers])
+        found = np.stack([estimate.T_cam_obj[:3, :3] for estimate in self.answers])
         return aligned_rotation_errors(found, self.clip.T_cam_obj[:, :3, :3])
 
     @property
@@ -51,9 +51,9 @@ def tracked(preset: str, spec: SyntheticSpec) -> Tracked:
     state = None
     for index, image in enumerate(clip.images):
         frame, mask = Frame(index, image), MaskEstimate(clip.masks[index].astype(np.float32))
-        state, answer = solver.init(frame, mask) if state is None else solver.step(state, frame, mask)
-        final |= {better.index: better for better in answer.revised}
-        final[index] = answer
+        state, estimate = solver.init(frame, mask) if state is None else solver.step(state, frame, mask)
+        final |= {better.index: better for better in estimate.revised}
+        final[index] = estimate
     return Tracked(clip, list(final.values()))
 
 
@@ -80,7 +80,7 @@ def test_the_object_turns_as_far_as_it_does(run):
 
 
 def test_every_frame_is_called_tracked(run):
-    assert [answer.status for answer in run.answers] == [Status.TRACKED] * len(run.clip.images)
+    assert [estimate.status for estimate in run.answers] == [Status.TRACKED] * len(run.clip.images)
 
 
 @pytest.mark.slow
@@ -92,4 +92,4 @@ def test_longer_sequences_of_every_shape(shape, seed, preset):
     assert np.mean(run.ious) > 0.95
     assert np.median(run.rotation_errors) < 6
     assert run.angle_turned == pytest.approx(69, abs=8)
-    assert sum(answer.status is Status.LOST for answer in run.answers) == 0
+    assert sum(estimate.status is Status.LOST for estimate in run.answers) == 0

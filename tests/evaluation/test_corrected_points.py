@@ -18,7 +18,7 @@ from tracking3d.evaluation.point_tracks import score_points
 from tracking3d.evaluation.score import Scores, score
 from tracking3d.evaluation.score_table import format_scores
 from tracking3d.results import layout
-from tracking3d.results.following import has_landmarks, open_scene
+from tracking3d.results.point_tracking import has_landmarks, open_scene
 from tracking3d.results.run_reader import RunReader
 from tracking3d.video import open_source
 

@@ -122,7 +122,7 @@ def shifted_run(tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def zooming_run(tmp_path_factory) -> Path:
     """A run whose first two frames were solved with a shorter lens, as where nobody gave one."""
-    shorter = CENTRED.zoomed(0.8, "a test")
+    shorter = CENTRED.zoom(0.8, "a test")
     return write_run(tmp_path_factory.mktemp("zooming"), CENTRED, {0: shorter, 1: shorter})
 
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from tracking3d.datasets.pose_files import read_matrix_lines
 from tracking3d.estimation.estimate import ObjectModel
-from tracking3d.export.exported_run import ExportedRun, longest_side, seen_side
+from tracking3d.export.exported_run import ExportedRun, longest_side, visible_side
 from tracking3d.export.options import ExportOptions
 from tracking3d.results.run_reader import RunReader
 
@@ -152,6 +152,6 @@ def test_only_what_the_video_has_shown_is_measured():
     weight[:, :4] = 1
     model = ObjectModel(deep, ball.faces, uvs, texture.astype(np.uint8), weight, texture)
     assert longest_side(deep) > 4
-    assert seen_side(model) == pytest.approx(2, rel=0.02)
+    assert visible_side(model) == pytest.approx(2, rel=0.02)
     hardly = replace(model, texture_weight=np.zeros_like(weight))
-    assert seen_side(hardly) == longest_side(deep)
+    assert visible_side(hardly) == longest_side(deep)

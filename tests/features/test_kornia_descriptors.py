@@ -158,7 +158,7 @@ def test_weights_of_another_network_and_other_files_are_refused(weights, tmp_pat
 
 def test_an_object_is_tracked_with_them():
     clip = synthesize(SyntheticSpec(frames=2, size=(80, 64)))
-    config = load_config(overrides=["window.size=64", "solver.final_refine=false"], features="kornia")
+    config = load_config(overrides=["crop.size=64", "solver.final_refine=false"], features="kornia")
     assert len(list(track(clip.images, mask=clip.masks[0], config=config))) == 2
 
 

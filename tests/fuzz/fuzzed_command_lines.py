@@ -20,7 +20,7 @@ RUN_FLAGS = (
     "--nonsense",
 )
 SETTINGS = (
-    "window.size=32", "tracker.resolution=0.5", "tracker.path=x", "solver.name=paper", "solver.iterations=1",
+    "crop.size=32", "tracker.resolution=0.5", "tracker.path=x", "solver.name=paper", "solver.iterations=1",
     "object.texture_size=16", "camera.fov=1e-3", "features.scale=2", "runtime.threads=2", "=", "a", "a=", "a.b.c=1",
     ".=1", "tracker=flow", "tracker=csrt", "tracker.name=nope", "solver.online=5", "window=[32]", "solver={}",
 )  # fmt: skip

@@ -17,8 +17,8 @@ from PIL import Image
 import tracking3d
 from tracking3d import Frame, PipelineConfig, Prompt, Session
 from tracking3d.frames import SkippedFrame
-from tracking3d.prompts import make_prompt
-from tracking3d.recording import record, record_objects
+from tracking3d.pipeline.record import record, record_objects
+from tracking3d.prompts.prompt import make_prompt
 from tracking3d.results.correspondences import track_points
 from tracking3d.results.run_reader import RunReader
 from tracking3d.video import LatestFrames, open_source
@@ -122,13 +122,13 @@ CONFIGS: dict[str, Callable[[Case], Any]] = {
     "sound": lambda case: case.material.config,
     "file": lambda case: case.material.folder / "tiny.yaml",
     "text": lambda case: str(case.material.folder / "tiny.yaml"),
-    "dictionary": lambda case: {"window": {"size": 32}},
+    "dictionary": lambda case: {"crop": {"size": 32}},
     "number": lambda case: 5,
     "class": lambda case: PipelineConfig,
     "no file": lambda case: "nowhere.yaml",
     "folder": lambda case: case.material.folder,
     "video": lambda case: case.material.folder / "clip.mp4",
-    "section": lambda case: case.material.config.window,
+    "section": lambda case: case.material.config.crop,
     "list": lambda case: [],
     "word": lambda case: word(case.random),
 }

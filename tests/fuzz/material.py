@@ -15,14 +15,14 @@ from PIL import Image
 from tracking3d.config.loading import load_config
 from tracking3d.config.models import PipelineConfig
 from tracking3d.datasets.clip import write_clip
-from tracking3d.recording import record
+from tracking3d.pipeline.record import record
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.video import VideoWriter, open_source
 
 FRAMES, WIDTH, HEIGHT = 3, 64, 48
 
 TINY = {
-    "window": {"size": 32},
+    "crop": {"size": 32},
     "object": {"frequency": 2, "texture_size": 16},
     "solver": {"final_refine": False},
     "features": "rgb",

@@ -74,7 +74,7 @@ def test_straight_lines_of_the_world_are_straight_again(lens):
         return 127 + 60 * np.sin(x / 9) + 60 * np.sin(y / 9)
 
     taken = np.repeat(grid(seen[..., 0], seen[..., 1])[..., None], 3, 2).round().astype(np.uint8)
-    found = lens.undistorted(taken)[..., 0].astype(float)
+    found = lens.undistort(taken)[..., 0].astype(float)
     inside = lens.mask_to_pinhole(np.ones((HEIGHT, WIDTH), bool))
     inside = cv2.erode(inside.astype(np.uint8), np.ones((5, 5))).astype(bool)
     assert np.abs(found - grid(columns, rows))[inside].mean() < 3.5
@@ -100,7 +100,7 @@ def test_a_camera_with_its_lens_is_kept_with_the_state_of_a_run(tmp_path):
     """As a stopped run goes on with it: equal, and still of use as a key."""
     import json
 
-    from tracking3d.checkpoint.trees import TreeFolder
+    from tracking3d.checkpoint.serialization import TreeFolder
     from tracking3d.geometry.camera import Camera
 
     model, k = LENSES["barrel"]

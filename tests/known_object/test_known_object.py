@@ -10,18 +10,18 @@ from typer.testing import CliRunner
 from tracking3d import Frame, Prompt, Session, Status, track, track_objects
 from tracking3d.config.models import PluginChoice
 from tracking3d.errors import InputError
-from tracking3d.estimation.correction import SIGHTED
-from tracking3d.estimation.online import known_views
-from tracking3d.estimation.online.known_solver import NOT_SEEN
+from tracking3d.estimation.online.known_object import rendered_keyframes
+from tracking3d.estimation.online.known_object.solver import NOT_SEEN
+from tracking3d.estimation.tracker_feedback import SIGHTED
 from tracking3d.evaluation.metrics import mask_iou
-from tracking3d.mask_tracking import PromptedTracker
-from tracking3d.object_files import read_known_object
+from tracking3d.pipeline.known_object import read_known_object
+from tracking3d.pipeline.prompted_tracker import PromptedTracker
 
 
 @pytest.fixture
 def few_sides(monkeypatch):
     """Enough for a box, and drawn in a moment."""
-    monkeypatch.setattr(known_views, "SIDES", 14)
+    monkeypatch.setattr(rendered_keyframes, "SIDES", 14)
 
 
 @pytest.fixture(scope="module")
@@ -69,22 +69,22 @@ def test_where_it_is_not_seen_frames_are_lost_and_say_so(clip, tmp_path, few_sid
     path = written(clip.scene.solid, tmp_path)
     wall = np.random.default_rng(0).integers(0, 255, (2, 150, 200, 3), dtype=np.uint8)
     frames = [*wall, *clip.images[:1]]
-    answers = list(track(frames, object=path, config=config()))
-    assert [one.status for one in answers] == [Status.LOST, Status.LOST, Status.TRACKED]
-    assert all(one.reason.startswith(NOT_SEEN) and not one.mask.any() for one in answers[:2])
-    assert degrees_between(answers[2].T_cam_obj, clip.scene.T_cam_obj[0]) < 2
+    estimates = list(track(frames, object=path, config=config()))
+    assert [one.status for one in estimates] == [Status.LOST, Status.LOST, Status.TRACKED]
+    assert all(one.reason.startswith(NOT_SEEN) and not one.mask.any() for one in estimates[:2])
+    assert degrees_between(estimates[2].T_cam_obj, clip.scene.T_cam_obj[0]) < 2
 
 
 @pytest.mark.slow
 def test_a_session_goes_on_where_another_was_stopped(clip, tmp_path, few_sides):
-    settings = config(object={"known": str(written(clip.scene.solid, tmp_path))})
+    settings = config(object={"model": str(written(clip.scene.solid, tmp_path))})
     frames = [Frame(n, image) for n, image in enumerate(clip.images)]
     whole, stopped = Session(settings, None), Session(settings, None)
     corrections = []
     for frame in frames[:2]:
         whole.step(frame)
-        answer = stopped.step(frame)
-        corrections.append(answer.mask if stopped.corrected else None)
+        estimate = stopped.step(frame)
+        corrections.append(estimate.mask if stopped.corrected else None)
     assert corrections[0] is not None  # where the tracker was told at last where the object is
     resumed = Session(settings, None)
     resumed.resume(frames[0], stopped.kept(), {})
@@ -98,7 +98,7 @@ def test_a_session_goes_on_where_another_was_stopped(clip, tmp_path, few_sides):
 
 @pytest.mark.slow
 def test_an_object_of_an_earlier_run_is_found_under_another_light(tmp_path):
-    from tracking3d.recording import record
+    from tracking3d.pipeline.record import record
     from tracking3d.results.run_reader import RunReader
     from tracking3d.video import open_source
 
@@ -121,16 +121,16 @@ def test_an_object_of_an_earlier_run_is_found_under_another_light(tmp_path):
 
 def test_points_of_a_drawn_side_lie_where_its_pixels_show_them(clip, tmp_path, few_sides):
     known = read_known_object(written(clip.scene.solid, tmp_path))
-    from tracking3d.estimation.online.mapping import project_points
+    from tracking3d.estimation.online.mapping.local_mapping import project_points
     from tracking3d.geometry.camera import Camera
-    from tracking3d.parts import build_encoder
+    from tracking3d.pipeline.components import build_encoder
 
     settings = config()
-    learnt, space = known_views.known_map(
-        known, settings, build_encoder(settings), known_views.torch.device("cpu")
+    learnt, space = rendered_keyframes.map_of_known_object(
+        known, settings, build_encoder(settings), rendered_keyframes.torch.device("cpu")
     )
     camera = Camera.from_fov(320, 320, 30.0)
-    assert learnt.held == len(learnt.keyframes) == 14 and space is not None
+    assert learnt.fixed_keyframes == len(learnt.keyframes) == 14 and space is not None
     gaps = []
     for view in learnt.keyframes:
         place = project_points(learnt.landmarks[view.points.landmark], view.pose, camera)
@@ -140,8 +140,8 @@ def test_points_of_a_drawn_side_lie_where_its_pixels_show_them(clip, tmp_path, f
 
 
 def test_sides_are_spread_all_around():
-    axes = np.stack([R[2] for R in known_views.sides(42)])
-    for R in known_views.sides(42):
+    axes = np.stack([R[2] for R in rendered_keyframes.sides(42)])
+    for R in rendered_keyframes.sides(42):
         np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(R) > 0
     nearest = np.degrees(np.arccos(np.sort(axes @ axes.T, 1)[:, -2]))
@@ -198,6 +198,6 @@ def test_the_library_says_what_it_cannot_take(clip):
         track(frames, object=3)
     with pytest.raises(InputError, match="is held"):
         track(frames, object="nowhere", model="fine")
-    known = config(object={"known": "nowhere"})
+    known = config(object={"model": "nowhere"})
     with pytest.raises(InputError, match="2 objects are given"):
         list(track_objects(frames, boxes=[(0, 0, 9, 9), (9, 9, 9, 9)], config=known))

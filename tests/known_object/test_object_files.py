@@ -17,11 +17,11 @@ from tracking3d.config.loading import load_config
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.known_object import KnownObject
-from tracking3d.estimation.start import RADIUS
+from tracking3d.estimation.prototype_start import RADIUS
 from tracking3d.geometry.camera import Camera
-from tracking3d.object_files import known_object, read_known_object, select_camera
+from tracking3d.pipeline.known_object import load_known_object, read_known_object, select_camera
 from tracking3d.rendering import TexelMap
-from tracking3d.rendering.face_atlas import face_atlas, on_faces, painted, shares_no_texel
+from tracking3d.rendering.face_atlas import face_atlas, on_faces, paint_faces, shares_no_texel
 
 
 def coloured_box() -> trimesh.Trimesh:
@@ -63,7 +63,7 @@ def test_the_solver_s_unit_is_left_again_as_it_was_entered():
 
 
 def read_model(mesh: trimesh.Trimesh):
-    from tracking3d.object_files import _model_of
+    from tracking3d.pipeline.known_object import _model_of
 
     return _model_of(mesh)
 
@@ -87,7 +87,7 @@ def test_faces_that_lie_on_one_another_in_an_atlas_share_texels():
 
 def test_beside_the_faces_a_texture_goes_on_as_at_their_rim():
     texels = TexelMap.of(torch.from_numpy(face_atlas(1)).float(), 32)
-    picture = painted(np.full((len(texels.texel), 3), 77.0), texels)
+    picture = paint_faces(np.full((len(texels.texel), 3), 77.0), texels)
     assert (picture == 77).all()
 
 
@@ -184,12 +184,12 @@ def test_damaged_meshes_of_runs_are_refused(tmp_path):
 def test_the_lens_of_the_run_is_taken_over_where_it_was_told_and_fits(tmp_path):
     given = Camera.from_fov(WIDTH, HEIGHT, 30, "given field of view of 30 degrees")
     path = str(run_folder(tmp_path / "run", camera=given))
-    config = load_config(object={"known": path})
+    config = load_config(object={"model": path})
     taken = select_camera(config, WIDTH, HEIGHT, None, "")
     assert taken.fov == pytest.approx(30) and not taken.assumed and path in taken.origin
     assert select_camera(config, WIDTH + 2, HEIGHT, None, "").assumed
     assert (
-        select_camera(load_config(object={"known": path}, camera={"fov": 50}), WIDTH, HEIGHT, None, "").fov
+        select_camera(load_config(object={"model": path}, camera={"fov": 50}), WIDTH, HEIGHT, None, "").fov
         == 50
     )
     assert select_camera(config, WIDTH, HEIGHT, (90.0, 90.0, 40.0, 30.0), "EXIF").origin == "EXIF"
@@ -198,17 +198,17 @@ def test_the_lens_of_the_run_is_taken_over_where_it_was_told_and_fits(tmp_path):
     (tmp_path / "run/run.json").write_text(json.dumps(description))
     assert select_camera(config, WIDTH, HEIGHT, None, "").assumed
     # What nobody gave, but the run has solved, is known too.
-    description["camera"]["origin"] = given.solved(1.0).origin
+    description["camera"]["origin"] = given.with_solved_focal(1.0).origin
     (tmp_path / "run/run.json").write_text(json.dumps(description))
     solved = select_camera(config, WIDTH, HEIGHT, None, "")
     assert solved.fov == pytest.approx(30) and not solved.assumed and "solved" in solved.origin
 
 
 def test_a_known_shape_is_held_and_said_once():
-    settings = load_config(object={"known": "runs/thing"}, quality="best").object
-    assert settings.texture_views == settings.landmark_views == 0
+    settings = load_config(object={"model": "runs/thing"}, quality="best").object
+    assert settings.texture_views == settings.adjustment_views == 0
     with pytest.raises(InputError, match="flat or not"):
-        known_object(load_config(object={"known": "runs/thing", "flat": True}))
+        load_known_object(load_config(object={"model": "runs/thing", "flat": True}))
     with pytest.raises(InputError, match="the solver paper"):
-        known_object(load_config(preset="paper", object={"known": "runs/thing"}))
-    assert known_object(load_config()) is None
+        load_known_object(load_config(preset="paper", object={"model": "runs/thing"}))
+    assert load_known_object(load_config()) is None

@@ -15,7 +15,7 @@ from recorded_runs import write_frames
 from tracking3d.config.loading import load_config
 from tracking3d.frames import MaskEstimate
 from tracking3d.picker import session as session_module
-from tracking3d.picker.outcome import command_of, save_picked, settings_as_yaml
+from tracking3d.picker.outcome import command_of, save_outcome, settings_as_yaml
 from tracking3d.picker.server import Picker
 from tracking3d.picker.session import PickingSession
 from tracking3d.video import open_source
@@ -44,7 +44,7 @@ def picker(session, tmp_path):
     folder = tmp_path / "out"
 
     def save(picked):
-        save_picked(picked, session.config, folder, session.source)
+        save_outcome(picked, session.config, folder, session.source)
         return command_of(picked, folder, session.source, None), settings_as_yaml(session.config)
 
     picker = Picker(session, save, Access(), 0)

@@ -15,7 +15,7 @@ from tracking3d.config.loading import load_config
 from tracking3d.errors import InputError
 from tracking3d.picker.drawing import Drawing, DrawnObject, Point, Stroke, parse_object, read_drawing
 from tracking3d.picker.drawn_mask import drawn_mask
-from tracking3d.picker.outcome import command_of, save_picked
+from tracking3d.picker.outcome import command_of, save_outcome
 from tracking3d.picker.session import Picked
 
 OBJECT = {"name": "cup", "colour": "#00a5e0", "frame": 0}
@@ -131,7 +131,7 @@ def test_the_command_is_one_that_the_program_takes(tmp_path):
     boxes = Picked(7, (drawn(box=(1, 2, 3, 4)),), boxes=[(1.0, 2.0, 3.5, 4.0)])
     masks = Picked(0, (drawn(), drawn()), masks=[TRUTH, TRUTH])
     for picked in (boxes, masks):
-        save_picked(picked, config, folder, "my clip.mp4")
+        save_outcome(picked, config, folder, "my clip.mp4")
         given = understood(command_of(picked, folder, "my clip.mp4", None))
         assert (given["source"], given["out"]) == ("my clip.mp4", folder)
         assert load_config(given["config"]) == config
@@ -144,7 +144,7 @@ def test_the_command_is_one_that_the_program_takes(tmp_path):
 
 def test_names_and_colours_are_kept_in_the_run_folder_and_nothing_is_written_elsewhere(tmp_path):
     before = set(tmp_path.rglob("*"))
-    save_picked(Picked(0, (drawn(),), masks=[TRUTH]), load_config(), tmp_path / "run", "a.mp4")
+    save_outcome(Picked(0, (drawn(),), masks=[TRUTH]), load_config(), tmp_path / "run", "a.mp4")
     told = json.loads((tmp_path / "run" / "picked.json").read_text())
     assert [(one["name"], one["colour"]) for one in told["objects"]] == [("cup", "#00a5e0")]
     assert all(path.is_relative_to(tmp_path / "run") for path in set(tmp_path.rglob("*")) - before)

@@ -29,11 +29,11 @@ class CausalSolver:
         return state + 1, self._answer(frame, mask)
 
     @staticmethod
-    def turned_back(state: int, frame: Frame, number: int, T_cam_obj) -> int:
+    def restart_backwards(state: int, frame: Frame, number: int, T_cam_obj) -> int:
         return state
 
     @staticmethod
-    def trusting(state: int, frame: Frame, mask) -> int:
+    def trust_mask(state: int, frame: Frame, mask) -> int:
         return state
 
     def result(self, state: int) -> ObjectModel:
@@ -79,16 +79,21 @@ class StandInSolver(CausalSolver):
     def refine(self, state: int) -> int:
         return -1
 
-    def revisit(self, state: int, frame: Frame, mask: MaskEstimate, T_cam_obj):
+    def refine_frame(self, state: int, frame: Frame, mask: MaskEstimate, T_cam_obj):
         assert state < 0
         self.seen.append((frame.index, mask))
         if frame.index in self.revisit_faults:
             raise self.revisit_faults[frame.index]
         T = T_cam_obj.copy()
         T[2, 3] += 1
-        answer = self._answer(frame, mask)
+        estimate = self._answer(frame, mask)
         return state - 1, replace(
-            answer, T_cam_obj=T, mask=answer.initial_mask, status=Status.TRACKED, reason="", keyframe=False
+            estimate,
+            T_cam_obj=T,
+            mask=estimate.initial_mask,
+            status=Status.TRACKED,
+            reason="",
+            keyframe=False,
         )
 
     def result(self, state: int) -> ObjectModel:

@@ -14,12 +14,12 @@ from tracking3d import Frame, Session, load_config, track, track_objects
 from tracking3d.config.models import PipelineConfig
 from tracking3d.frames import MaskEstimate
 from tracking3d.plugins import VARIABLE
-from tracking3d.prompts import make_prompt
+from tracking3d.prompts.prompt import make_prompt
 from tracking3d.rendering.kernels import threads as kernels
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 
 SETTINGS = [
-    "window.size=32",
+    "crop.size=32",
     "object.frequency=2",
     "object.texture_size=16",
     "camera.fov=45",
@@ -107,9 +107,9 @@ def test_between_frames_and_at_the_end_everything_is_the_caller_s(clip, config, 
 
 def test_a_generator_that_is_left_in_the_middle_leaves_nothing_behind(clip, config, mine):
     before = mine()
-    answers = track(clip.images, mask=clip.masks[0], config=config)
-    next(answers)
-    del answers
+    estimates = track(clip.images, mask=clip.masks[0], config=config)
+    next(estimates)
+    del estimates
     assert mine() == before
     with pytest.raises(ZeroDivisionError):
         for _ in track_objects(clip.images, masks=[clip.masks[0]] * 2, config=config):

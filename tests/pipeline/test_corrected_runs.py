@@ -16,15 +16,15 @@ from resumable_runs import assert_alike, files_of
 from tracking3d import load_config
 from tracking3d.checkpoint import folder as checkpoint_folder
 from tracking3d.checkpoint import milestones, staging
-from tracking3d.corrected_run import correct_run, object_folders_of
-from tracking3d.corrections import Correction
 from tracking3d.errors import InputError, OutputError
 from tracking3d.estimation.online.solver import OnlineSolver
-from tracking3d.recording import record, record_objects
+from tracking3d.pipeline.correct import correct_run, object_folders_of
+from tracking3d.pipeline.record import record, record_objects
+from tracking3d.pipeline.session import SOLVERS, Session
+from tracking3d.prompts.corrections import Correction
 from tracking3d.results import layout
 from tracking3d.results.files import write_image
 from tracking3d.results.run_reader import RunReader
-from tracking3d.session import SOLVERS, Session
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.video import open_source
 
@@ -73,7 +73,7 @@ def settings(*overrides: str):
     quick = [
         "tracker.name=flow",
         "tracker.segmentation_size=64",
-        "window.size=32",
+        "crop.size=32",
         "object.frequency=2",
         "camera.fov=45",
     ]
@@ -85,7 +85,7 @@ def settings(*overrides: str):
 def run(clip, images, folder: Path, *overrides: str, **given) -> Path:
     """Without evidence, which is weighed anew whatever is corrected."""
     given.setdefault("mask", clip.masks[given.get("start_frame") or 0])
-    record(open_source(str(images)), settings("object.evidence=false", *overrides), folder, **given)
+    record(open_source(str(images)), settings("object.refine_masks=false", *overrides), folder, **given)
     return folder
 
 
@@ -258,15 +258,15 @@ def test_two_corrections_at_a_time_are_refused(clip, images, tmp_path):
 
 
 def test_milestones_are_few_and_evenly_spread(clip, images, tmp_path):
-    run(clip, images, tmp_path / "run", "runtime.milestones=3")
+    run(clip, images, tmp_path / "run", "runtime.rollback_points=3")
     state = tmp_path / "run" / layout.STATE
     assert [one.taken for one in milestones.milestones_in(state)] == [4, 8]
-    run(clip, images, tmp_path / "none", "runtime.milestones=0")
+    run(clip, images, tmp_path / "none", "runtime.rollback_points=0")
     assert not (tmp_path / "none" / layout.STATE).exists()
 
 
 def test_nothing_is_kept_that_no_milestone_needs(clip, images, tmp_path):
-    run(clip, images, tmp_path / "run", "runtime.milestones=2")
+    run(clip, images, tmp_path / "run", "runtime.rollback_points=2")
     state = tmp_path / "run" / layout.STATE
     kept = milestones.milestones_in(state)
     assert 1 <= len(kept) <= 2
@@ -294,10 +294,10 @@ def test_no_milestone_stands_between_a_frame_and_what_revised_it(clip, images, t
     step = CausalSolver.step
 
     def revising(self, state, frame, mask):
-        state, answer = step(self, state, frame, mask)
+        state, estimate = step(self, state, frame, mask)
         if frame.index == 5:
-            answer = replace(answer, revised=(replace(answer, index=2, keyframe=False),))
-        return state, answer
+            estimate = replace(estimate, revised=(replace(estimate, index=2, keyframe=False),))
+        return state, estimate
 
     monkeypatch.setattr(CausalSolver, "step", revising)
     run(clip, images, tmp_path / "run")

@@ -8,7 +8,7 @@ import pytest
 
 from tracking3d.config.loading import load_config
 from tracking3d.geometry.lens import Lens, _picture_to_pinhole
-from tracking3d.recording import record
+from tracking3d.pipeline.record import record
 from tracking3d.results.run_reader import RunReader
 from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
 from tracking3d.video import open_source

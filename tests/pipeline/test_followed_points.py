@@ -7,11 +7,11 @@ import pytest
 
 from tracking3d import load_config, track
 from tracking3d.errors import InputError
-from tracking3d.point_following import checked_queries
+from tracking3d.pipeline.point_queries import validate_queries
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 
 SETTINGS = [
-    "window.size=64",
+    "crop.size=64",
     "object.frequency=4",
     "object.texture_size=16",
     "object.texture_views=0",
@@ -48,9 +48,9 @@ def test_what_holds_no_points_is_refused_at_once(clip, config, follow, sentence)
 
 
 def test_pixels_alone_are_of_the_frame_in_which_the_object_is_given():
-    np.testing.assert_array_equal(checked_queries([(3, 4)]), [(-1, 3, 4)])
-    np.testing.assert_array_equal(checked_queries([(5, 3, 4)]), [(5, 3, 4)])
-    assert checked_queries(None) is None
+    np.testing.assert_array_equal(validate_queries([(3, 4)]), [(-1, 3, 4)])
+    np.testing.assert_array_equal(validate_queries([(5, 3, 4)]), [(5, 3, 4)])
+    assert validate_queries(None) is None
 
 
 def test_a_pixel_outside_the_frame_is_told_by_the_first(clip, config):
@@ -66,19 +66,19 @@ def middle(clip, index: int) -> tuple[float, float]:
 
 def test_every_answer_says_where_the_points_are_by_the_frames_until_then(clip, config):
     queries = [(0, *middle(clip, 0)), (0, 1.0, 1.0), (5, *middle(clip, 5))]
-    answers, revised = [], {}
-    for answer in track(clip.images, mask=clip.masks[0], config=config, follow=queries):
-        answers.append(answer)
-        revised.update({one.index: one.points for one in answer.revised})
-    positions = np.stack([answer.points.positions for answer in answers])
+    estimates, revised = [], {}
+    for estimate in track(clip.images, mask=clip.masks[0], config=config, follow=queries):
+        estimates.append(estimate)
+        revised.update({one.index: one.points for one in estimate.revised})
+    positions = np.stack([estimate.points.positions for estimate in estimates])
     assert positions.shape == (10, 3, 2)
     np.testing.assert_array_equal(positions[0, 0], queries[0][1:])
     assert np.isfinite(positions[:, 0]).all()
     assert np.isnan(positions[:, 1]).all()  # beside the object
     assert np.isnan(positions[:5, 2]).all() and np.isfinite(positions[5:, 2]).all()
-    assert answers[-1].points.visible.tolist() == [True, False, True]
-    assert np.isfinite(answers[-1].points.points[[0, 2]]).all()
-    assert (answers[-1].points.uncertainty[[0, 2]] > 0).all()
+    assert estimates[-1].points.visible.tolist() == [True, False, True]
+    assert np.isfinite(estimates[-1].points.points[[0, 2]]).all()
+    assert (estimates[-1].points.uncertainty[[0, 2]] > 0).all()
     # The object turns: its front goes on, and so do the points; both are asked again after the start is solved.
     moved = np.linalg.norm(positions[-1, 0] - positions[0, 0])
     assert moved > 2

@@ -19,11 +19,11 @@ from refining_solver import StandInSolver
 from resumable_runs import assert_alike, finished_frames
 
 from tracking3d import load_config
-from tracking3d.recording import record
+from tracking3d.pipeline.record import record
+from tracking3d.pipeline.session import SOLVERS, Session
 from tracking3d.results.files import write_image
 from tracking3d.results.layout import CAUSAL, has_state
 from tracking3d.results.run_reader import RunReader
-from tracking3d.session import SOLVERS, Session
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.video import open_source
 
@@ -35,11 +35,11 @@ KILLS = int(os.environ.get("TRACKING3D_KILLS", "100"))
 QUICK = [
     "tracker.name=flow",
     "tracker.segmentation_size=64",
-    "window.size=32",
+    "crop.size=32",
     "object.frequency=2",
     "camera.fov=45",
     "object.texture_size=48",
-    "solver.window=4",
+    "solver.local_window=4",
     "solver.keyframe_rotation=25",
 ]
 

@@ -9,8 +9,8 @@ import pytest
 
 from tracking3d.config.loading import load_config
 from tracking3d.frames import Frame, Prompt
-from tracking3d.pipeline import SOLVERS, Session
-from tracking3d.process_memory import resident_memory
+from tracking3d.pipeline.track import SOLVERS, Session
+from tracking3d.runtime.memory import resident_memory
 from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
 
 FRAMES, SETTLED = 3000, 300
@@ -18,8 +18,8 @@ ALLOWED = 15.0
 """Megabytes by which memory may vary after the first 300 frames; an image kept of every frame would be 56."""
 
 PRESETS = {"online": "default", "paper": "rerendering"}
-QUICK = ["window.size=32", "object.texture_size=64"]
-OF_PAPER = ["solver.iterations=2", "solver.pose_iterations=2", "solver.start_frames=1"]
+QUICK = ["crop.size=32", "object.texture_size=64"]
+OF_PAPER = ["solver.iterations=2", "solver.pose_iterations=2", "solver.init_frames=1"]
 
 TRACKER = '''
 import numpy as np

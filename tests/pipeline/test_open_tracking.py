@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from tracking3d import load_config
-from tracking3d.corrections import Correction
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, Image, SkippedFrame
-from tracking3d.open_tracking import NoFrameError, open_tracking, request_tracking
-from tracking3d.prompts import PromptSet
-from tracking3d.recording import RecordOptions, record_tracking
+from tracking3d.pipeline.open_tracking import NoFrameError, open_tracking, request_tracking
+from tracking3d.pipeline.record import RecordOptions, record_tracking
+from tracking3d.prompts.corrections import Correction
+from tracking3d.prompts.prompt import PromptSet
 from tracking3d.video import open_source
 
 SIZE = 48, 64

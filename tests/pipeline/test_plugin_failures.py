@@ -12,8 +12,8 @@ from failing_plugins import there_and_back
 from tracking3d import Session, Status, load_config, track
 from tracking3d.errors import InputError, PluginError
 from tracking3d.frames import Prompt
+from tracking3d.pipeline.record import record
 from tracking3d.plugins import VARIABLE
-from tracking3d.recording import record
 from tracking3d.results.files import write_image
 from tracking3d.results.run_reader import RunReader
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
@@ -22,7 +22,7 @@ from tracking3d.video import open_source
 FILE = Path(__file__).parent / "failing_plugins.py"
 REGISTERED = f"tracking3d.trackers:bad={FILE}:FailingTracker;tracking3d.features:bad={FILE}:FailingEncoder"
 QUICK = [
-    "window.size=32",
+    "crop.size=32",
     "object.frequency=2",
     "camera.fov=45",
     "object.texture_size=16",
@@ -33,7 +33,7 @@ QUICK_PRESETS = {
         *QUICK,
         "solver.iterations=2",
         "solver.pose_iterations=2",
-        "solver.start_frames=1",
+        "solver.init_frames=1",
         "solver.tau=2",
     ],
 }
@@ -132,78 +132,78 @@ def encoder_faults(failing_run):
 def test_where_the_tracker_fails_its_last_mask_stands_in_and_the_reason_is_told(
     clip, tracker_faults, fault, told
 ):
-    firsts, answers = tracker_faults
+    firsts, estimates = tracker_faults
     first = firsts[fault]
-    assert [answer.index for answer in answers] == list(range(len(answers)))
+    assert [estimate.index for estimate in estimates] == list(range(len(estimates)))
     for index in (first, first + 1):
-        answer = answers[index]
-        assert answer.failure.startswith("mask tracker 'bad' (TRACKING3D_PLUGINS ")
-        assert told in answer.failure
-        assert answer.reason.startswith(answer.failure)
-        assert answer.status is not Status.TRACKED
-        assert answer.confidence <= 0.5
-        np.testing.assert_array_equal(answer.initial_mask, answers[first - 1].initial_mask)
+        estimate = estimates[index]
+        assert estimate.failure.startswith("mask tracker 'bad' (TRACKING3D_PLUGINS ")
+        assert told in estimate.failure
+        assert estimate.reason.startswith(estimate.failure)
+        assert estimate.status is not Status.TRACKED
+        assert estimate.confidence <= 0.5
+        np.testing.assert_array_equal(estimate.initial_mask, estimates[first - 1].initial_mask)
     for index in (0, 1, first - 1, first + 2):
-        assert answers[index].failure == ""
+        assert estimates[index].failure == ""
         expected = np.roll(clip.masks[0], there_and_back(index), axis=1)
-        np.testing.assert_array_equal(answers[index].initial_mask, expected)
+        np.testing.assert_array_equal(estimates[index].initial_mask, expected)
 
 
 @pytest.mark.parametrize(("fault", "told"), ENCODER_FAULTS.items())
 def test_where_the_encoder_fails_the_initial_mask_is_the_answer_and_the_frame_is_lost(
     clip, encoder_faults, fault, told
 ):
-    firsts, answers = encoder_faults
+    firsts, estimates = encoder_faults
     first = firsts[fault]
-    lost = answers[first]
+    lost = estimates[first]
     assert (lost.status, lost.confidence) == (Status.LOST, 0.0)
     assert lost.failure == lost.reason
     assert lost.failure.startswith("feature encoder 'bad' (TRACKING3D_PLUGINS ")
     assert told in lost.failure
     for mask in (lost.mask, lost.initial_mask):
         np.testing.assert_array_equal(mask, np.roll(clip.masks[0], there_and_back(first), axis=1))
-    np.testing.assert_array_equal(lost.T_cam_obj, answers[first - 1].T_cam_obj)
+    np.testing.assert_array_equal(lost.T_cam_obj, estimates[first - 1].T_cam_obj)
     assert lost.seconds > 0
-    assert [answers[index].failure for index in (0, 1, first - 1, first + 1)] == [""] * 4
-    assert answers[first + 1].status is not Status.LOST
+    assert [estimates[index].failure for index in (0, 1, first - 1, first + 1)] == [""] * 4
+    assert estimates[first + 1].status is not Status.LOST
 
 
 def test_a_frame_in_which_both_fail_tells_both(clip, settings):
-    answer = run(clip, settings(tracker=bad("raises", 2), features=bad("nan", 2)))[2]
-    assert "no pixels; feature encoder 'bad'" in answer.failure
-    np.testing.assert_array_equal(answer.mask, np.roll(clip.masks[0], 1, axis=1))
+    estimate = run(clip, settings(tracker=bad("raises", 2), features=bad("nan", 2)))[2]
+    assert "no pixels; feature encoder 'bad'" in estimate.failure
+    np.testing.assert_array_equal(estimate.mask, np.roll(clip.masks[0], 1, axis=1))
 
 
 def test_all_later_frames_may_fail(clip, settings):
-    answers = run(clip, settings(tracker=bad("raises", 1, 2, 3, 4), features=bad("raises", 1, 2, 3, 4)))
-    assert [answer.status for answer in answers[1:]] == [Status.LOST] * 4
-    for answer in answers[1:]:
-        np.testing.assert_array_equal(answer.mask, clip.masks[0])
+    estimates = run(clip, settings(tracker=bad("raises", 1, 2, 3, 4), features=bad("raises", 1, 2, 3, 4)))
+    assert [estimate.status for estimate in estimates[1:]] == [Status.LOST] * 4
+    for estimate in estimates[1:]:
+        np.testing.assert_array_equal(estimate.mask, clip.masks[0])
 
 
 @pytest.mark.slow
 def test_a_failed_frame_among_the_first_keeps_its_reason_when_it_is_answered_anew(clip):
     config = load_config(
         preset="rerendering",
-        overrides=[*QUICK_PRESETS["rerendering"], "solver.start_frames=4"],
+        overrides=[*QUICK_PRESETS["rerendering"], "solver.init_frames=4"],
         tracker=bad("raises", 1),
     )
-    answers = run(clip, config)
-    [revision] = [earlier for earlier in answers[3].revised if earlier.index == 1]
-    assert revision.failure == answers[1].failure != ""
+    estimates = run(clip, config)
+    [revision] = [earlier for earlier in estimates[3].revised if earlier.index == 1]
+    assert revision.failure == estimates[1].failure != ""
     assert revision.reason.startswith(revision.failure)
     assert revision.status is not Status.TRACKED
-    assert all(not earlier.failure for earlier in answers[3].revised if earlier.index != 1)
+    assert all(not earlier.failure for earlier in estimates[3].revised if earlier.index != 1)
 
 
 @pytest.mark.parametrize(("section", "kind"), [("tracker", "mask tracker"), ("features", "feature encoder")])
 def test_with_stop_the_run_ends_and_the_message_names_plugin_version_and_frame(clip, section, kind, settings):
     config = settings("stop", **{"tracker": bad("raises"), section: bad("raises", 2)})
-    answers = track(clip.images, mask=clip.masks[0], config=config)
-    assert [next(answers).index for _ in range(2)] == [0, 1]
+    estimates = track(clip.images, mask=clip.masks[0], config=config)
+    assert [next(estimates).index for _ in range(2)] == [0, 1]
     told = rf"^{kind} 'bad' \(TRACKING3D_PLUGINS [0-9a-f]{{12}}\) failed at frame 2: ZeroDivisionError: no \w+\.$"
     with pytest.raises(PluginError, match=told) as caught:
-        next(answers)
+        next(estimates)
     assert isinstance(caught.value.__cause__, ZeroDivisionError)
 
 

@@ -18,14 +18,14 @@ from tracking3d.checkpoint.folder import Checkpoint
 from tracking3d.errors import InputError, OutputError
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.geometry.camera import Camera
-from tracking3d.open_tracking import request_tracking
-from tracking3d.prompts import PromptSet
-from tracking3d.recording import RecordOptions, record, record_objects, record_tracking
+from tracking3d.pipeline.open_tracking import request_tracking
+from tracking3d.pipeline.record import RecordOptions, record, record_objects, record_tracking
+from tracking3d.pipeline.session import SOLVERS, Session
+from tracking3d.prompts.prompt import PromptSet
 from tracking3d.results import layout, run_writer
 from tracking3d.results.files import write_image
 from tracking3d.results.frame_lines import FrameLines
 from tracking3d.results.run_reader import RunReader
-from tracking3d.session import SOLVERS, Session
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.trackers.flow import FlowTracker
 from tracking3d.video import open_source
@@ -69,7 +69,7 @@ def settings(*overrides: str):
     return load_config(
         overrides=[
             *quick,
-            "window.size=32",
+            "crop.size=32",
             "object.frequency=2",
             "object.texture_size=32",
             "camera.fov=45",
@@ -223,10 +223,10 @@ def test_several_objects_go_on_from_where_each_is(clip, images, tmp_path, monkey
 def test_a_resumed_run_names_the_lens_that_the_stopped_one_had_come_to(clip, images, tmp_path, monkeypatch):
     class FindsTheLens(CausalSolver):
         def step(self, state, frame, mask):
-            state, answer = super().step(state, frame, mask)
+            state, estimate = super().step(state, frame, mask)
             return state, replace(
-                answer, camera=Camera.from_fov(80, 64, 20.0)
-            ) if frame.index == 2 else answer
+                estimate, camera=Camera.from_fov(80, 64, 20.0)
+            ) if frame.index == 2 else estimate
 
     monkeypatch.setitem(SOLVERS, "online", FindsTheLens)
     stopped(monkeypatch, clip, images, tmp_path / "run", Session, "step", 4)
@@ -245,7 +245,7 @@ def test_a_resumed_run_names_the_lens_that_the_stopped_one_had_come_to(clip, ima
 
 
 def test_what_was_handed_back_to_the_tracker_is_handed_back_again(clip, images, tmp_path, monkeypatch):
-    monkeypatch.setattr("tracking3d.session.corrects", lambda estimate: estimate.index in (1, 3))
+    monkeypatch.setattr("tracking3d.pipeline.session.corrects", lambda estimate: estimate.index in (1, 3))
     corrections = []
     correct = FlowTracker.correct
     monkeypatch.setattr(
@@ -253,7 +253,7 @@ def test_what_was_handed_back_to_the_tracker_is_handed_back_again(clip, images, 
         "correct",
         lambda self, frame, mask: (corrections.append((frame.index, mask.sum())), correct(self, frame, mask)),
     )
-    config = settings("solver.correct_tracker=true")
+    config = settings("solver.tracker_feedback=true")
     record(open_source(str(images)), config, tmp_path / "whole", mask=clip.masks[0])
     expected, corrections[:] = list(corrections), []
     with monkeypatch.context() as patch:
@@ -355,7 +355,7 @@ def test_other_settings_or_another_source_are_refused_with_the_difference(
     mask = clip.masks[0].copy()
     mask[30:34, 30:34] = False
     for what, source, config, prompt, selection in (
-        ("window.size was 32 and is 48", images, settings("window.size=48"), {"mask": clip.masks[0]}, None),
+        ("crop.size was 32 and is 48", images, settings("crop.size=48"), {"mask": clip.masks[0]}, None),
         ("the first picture is another one", other, settings(), {"mask": clip.masks[0]}, None),
         ("the object's mask is another one", images, settings(), {"mask": mask}, None),
         ("the object's box was .* and is", images, settings(), {"box": (10.0, 10.0, 30.0, 30.0)}, None),

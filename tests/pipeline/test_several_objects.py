@@ -12,10 +12,10 @@ from refining_solver import CausalSolver, StandInSolver
 from tracking3d import PipelineConfig, Status, load_config, track, track_objects
 from tracking3d.errors import InputError, OutputError, PluginError
 from tracking3d.frames import SkippedFrame
-from tracking3d.recording import record, record_objects
+from tracking3d.pipeline.record import record, record_objects
+from tracking3d.pipeline.session import SOLVERS
 from tracking3d.results.files import write_image
 from tracking3d.results.run_reader import RunReader
-from tracking3d.session import SOLVERS
 from tracking3d.video import LatestFrames, open_source
 from tracking3d.video.image_sequence import ImageSequence
 
@@ -72,22 +72,26 @@ def same(a, b) -> bool:
 
 def test_each_is_tracked_as_if_it_were_alone(images):
     together = list(track_objects(images, boxes=[LEFT, RIGHT], config=settings()))
-    assert [len(answers) for answers in together] == [2] * 5
+    assert [len(estimates) for estimates in together] == [2] * 5
     for number, box in enumerate((LEFT, RIGHT)):
         alone = list(track(images, box=box, config=settings()))
-        assert all(same(answers[number], answer) for answers, answer in zip(together, alone, strict=True))
+        assert all(
+            same(estimates[number], estimate) for estimates, estimate in zip(together, alone, strict=True)
+        )
     assert not np.array_equal(together[3][0].mask, together[3][1].mask)
 
 
 def test_the_papers_solver_too(images):
     quick = load_config(
         preset="paper",
-        overrides=["window.size=32", "object.frequency=2", "object.texture_size=16", "solver.iterations=2"],
+        overrides=["crop.size=32", "object.frequency=2", "object.texture_size=16", "solver.iterations=2"],
     )
     together = list(track_objects(images[:3], boxes=[LEFT, RIGHT], config=quick))
     for number, box in enumerate((LEFT, RIGHT)):
         alone = list(track(images[:3], box=box, config=quick))
-        assert all(same(answers[number], answer) for answers, answer in zip(together, alone, strict=True))
+        assert all(
+            same(estimates[number], estimate) for estimates, estimate in zip(together, alone, strict=True)
+        )
 
 
 def test_masks_come_after_boxes(images):
@@ -104,14 +108,14 @@ def test_frames_come_once_and_answers_as_they_do(images):
             taken.append(number)
             yield SkippedFrame(1, "damaged") if number == 1 else image
 
-    answers = track_objects(camera(), boxes=[LEFT, RIGHT], config=settings())
+    estimates = track_objects(camera(), boxes=[LEFT, RIGHT], config=settings())
     assert taken == []
-    assert [next(answers)[0].index for _ in range(3)] == [0, 2, 3]
+    assert [next(estimates)[0].index for _ in range(3)] == [0, 2, 3]
     assert taken == [0, 1, 2, 3]
 
 
 def test_one_object_is_a_tuple_of_one(images):
-    assert [len(answers) for answers in track_objects(images, boxes=[LEFT], config=settings())] == [1] * 5
+    assert [len(estimates) for estimates in track_objects(images, boxes=[LEFT], config=settings())] == [1] * 5
 
 
 @pytest.mark.parametrize(
@@ -154,23 +158,23 @@ def fails_for_the_first_object(monkeypatch, frame: int, error: Exception) -> Non
 
 def test_an_object_that_stops_is_answered_as_lost_and_the_other_goes_on(images, monkeypatch):
     fails_for_the_first_object(monkeypatch, 2, PluginError("The encoder gave up."))
-    answers = list(track_objects(images, boxes=[LEFT, RIGHT], config=settings()))
-    for first, second in answers[2:]:
+    estimates = list(track_objects(images, boxes=[LEFT, RIGHT], config=settings()))
+    for first, second in estimates[2:]:
         assert (first.status, first.failure, first.reason) == (Status.LOST, *["The encoder gave up."] * 2)
         assert first.T_cam_obj[0, 3] == 1  # where it was last
         assert not first.mask.any()
         assert second.status is Status.UNCERTAIN
         assert second.failure == ""
     alone = list(track(images, box=RIGHT, config=settings()))
-    assert all(same(both[1], answer) for both, answer in zip(answers, alone, strict=True))
+    assert all(same(both[1], estimate) for both, estimate in zip(estimates, alone, strict=True))
 
 
 def test_when_the_last_object_stops_so_does_all(images, monkeypatch):
     monkeypatch.setattr(CausalSolver, "faults", {3: PluginError("The encoder gave up.")})
-    answers = track_objects(images, boxes=[LEFT, RIGHT], config=settings())
-    assert [both[0].index for both in (next(answers), next(answers), next(answers))] == [0, 1, 2]
+    estimates = track_objects(images, boxes=[LEFT, RIGHT], config=settings())
+    assert [both[0].index for both in (next(estimates), next(estimates), next(estimates))] == [0, 1, 2]
     with pytest.raises(PluginError, match="gave up"):
-        next(answers)
+        next(estimates)
 
 
 def test_every_object_has_a_run_folder_as_if_it_were_alone(source, tmp_path):
@@ -183,11 +187,11 @@ def test_every_object_has_a_run_folder_as_if_it_were_alone(source, tmp_path):
         record(source, settings(), tmp_path / f"alone_{number}", box=box)
         one, alone = RunReader(tmp_path / "run" / f"object_{number}"), RunReader(tmp_path / f"alone_{number}")
         assert one.state == "finished"
-        answers, expected = (
+        estimates, expected = (
             [replace(frame, seconds=0.0, stages=None).to_json() for frame in run.frames]
             for run in (one, alone)
         )
-        assert answers == expected
+        assert estimates == expected
         assert all(np.array_equal(one.mask(n), alone.mask(n)) for n in range(5))
         files = {path.relative_to(one.folder) for path in one.folder.rglob("*")}
         assert files == {path.relative_to(alone.folder) for path in alone.folder.rglob("*")}
@@ -218,7 +222,7 @@ def test_an_object_that_fails_leaves_the_others_finished(source, tmp_path, monke
 
 
 def test_an_object_that_fails_in_the_second_pass_keeps_its_causal_answers(source, tmp_path, monkeypatch):
-    revisit = StandInSolver.revisit
+    revisit = StandInSolver.refine_frame
 
     def failing(self, state, frame, mask, T_cam_obj):
         if frame.index == 1 and mask.binary[:, :30].any():

@@ -10,26 +10,26 @@ import pytest
 from sleeping_plugins import ENCODING, TRACKING
 
 from tracking3d import load_config, track
+from tracking3d.pipeline.record import record, record_objects
 from tracking3d.plugins import VARIABLE
-from tracking3d.recording import record, record_objects
 from tracking3d.results import overlay
 from tracking3d.results.description import time_per_frame
 from tracking3d.results.files import write_image
 from tracking3d.results.run_reader import RunReader
-from tracking3d.stages import STAGES, StageTimes, in_stage, measured
+from tracking3d.runtime.stage_times import STAGES, StageTimes, in_stage, measure
 from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
 from tracking3d.video import open_source
 from tracking3d.video.image_sequence import ImageSequence
 
 HERE = Path(__file__).parent
-QUICK = ["window.size=32", "object.frequency=2", "object.texture_size=16", "camera.fov=45"]
+QUICK = ["crop.size=32", "object.frequency=2", "object.texture_size=16", "camera.fov=45"]
 QUICK_PRESETS = {
     "default": QUICK,
     "rerendering": [
         *QUICK,
         "solver.iterations=2",
         "solver.pose_iterations=2",
-        "solver.start_frames=1",
+        "solver.init_frames=1",
         "solver.tau=2",
     ],
 }
@@ -147,12 +147,12 @@ def test_several_objects_share_what_a_frame_takes_to_decode(source, clip, tmp_pa
 
 @PRESETS
 def test_track_times_what_it_does_itself_and_the_reading(preset, clip):
-    answers = list(track(clip.images, mask=clip.masks[0], config=settings(preset)))
-    for answer in answers:
-        assert slept(answer.stages.track, TRACKING)
-        assert answer.stages.encode >= ENCODING
-        assert answer.stages.decode > 0 == answer.stages.write
-        assert answer.seconds == answer.stages.whole
+    estimates = list(track(clip.images, mask=clip.masks[0], config=settings(preset)))
+    for estimate in estimates:
+        assert slept(estimate.stages.track, TRACKING)
+        assert estimate.stages.encode >= ENCODING
+        assert estimate.stages.decode > 0 == estimate.stages.write
+        assert estimate.seconds == estimate.stages.whole
 
 
 def test_a_run_of_an_older_version_is_read(source, clip, tmp_path):
@@ -173,7 +173,7 @@ def test_a_run_of_an_older_version_is_read(source, clip, tmp_path):
 
 
 def test_a_stage_within_a_stage_stops_the_outer_one():
-    with measured("solve") as watch:
+    with measure("solve") as watch:
         time.sleep(0.02)
         with in_stage("map"), in_stage("encode"):
             time.sleep(0.03)
@@ -184,7 +184,7 @@ def test_a_stage_within_a_stage_stops_the_outer_one():
 
 
 def test_a_stage_that_fails_is_over():
-    with measured("solve") as watch:
+    with measure("solve") as watch:
         with pytest.raises(ZeroDivisionError), in_stage("track"):
             raise ZeroDivisionError
         time.sleep(0.02)

@@ -13,18 +13,18 @@ from resumable_runs import assert_alike
 import tracking3d
 from tracking3d import load_config
 from tracking3d.checkpoint.folder import finish_state
-from tracking3d.corrections import Correction
 from tracking3d.errors import InputError
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.frames import Frame, SkippedFrame
-from tracking3d.mask_tracking import PromptedTracker
-from tracking3d.prompts import make_prompt
-from tracking3d.recording import record, record_objects
+from tracking3d.pipeline.prompted_tracker import PromptedTracker
+from tracking3d.pipeline.record import record, record_objects
+from tracking3d.pipeline.session import SOLVERS, Session
+from tracking3d.prompts.corrections import Correction
+from tracking3d.prompts.prompt import make_prompt
 from tracking3d.results import layout
 from tracking3d.results.files import write_image, write_mask
 from tracking3d.results.pictures import Pictures
 from tracking3d.results.run_reader import RunReader, read_records
-from tracking3d.session import SOLVERS, Session
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.video import both_ways as both_ways_module
 from tracking3d.video import open_source
@@ -71,7 +71,7 @@ def settings(*overrides: str):
     return load_config(
         overrides=[
             *quick,
-            "window.size=32",
+            "crop.size=32",
             "object.frequency=2",
             "object.texture_size=32",
             "camera.fov=45",
@@ -91,7 +91,7 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
 def run(clip, images, folder: Path, *overrides: str, **given) -> RunReader:
     """Without evidence, which is weighed alike whichever way the frames come."""
     given.setdefault("mask", clip.masks[given.get("start_frame") or 0])
-    record(open_source(str(images)), settings("object.evidence=false", *overrides), folder, **given)
+    record(open_source(str(images)), settings("object.refine_masks=false", *overrides), folder, **given)
     return RunReader(folder)
 
 
@@ -142,16 +142,16 @@ def test_both_ways_are_tracked_with_one_model(clip, monkeypatch, online):
         return init(self, *given)
 
     monkeypatch.setattr(OnlineSolver, "init", counted)
-    answers, order = {}, []
+    estimates, order = {}, []
     for estimate in tracking3d.track(
         list(clip.images), mask=clip.masks[START], start_frame=START, config=settings()
     ):
         order.append(estimate.index)
-        answers |= {answer.index: answer for answer in (*estimate.revised, estimate)}
+        estimates |= {answer.index: answer for answer in (*estimate.revised, estimate)}
     assert order == [3, 4, 5, 6, 2, 1, 0]
     assert len(begun) == 1
-    assert "lost" not in [answers[index].status for index in range(FRAMES)]
-    assert min(iou(answers[index].mask, clip.masks[index]) for index in range(FRAMES)) > 0.8
+    assert "lost" not in [estimates[index].status for index in range(FRAMES)]
+    assert min(iou(estimates[index].mask, clip.masks[index]) for index in range(FRAMES)) > 0.8
 
 
 @pytest.mark.slow
@@ -245,10 +245,10 @@ def test_a_correction_puts_mask_and_pose_where_the_object_is(clip, online):
     ]
 
     def tracked(corrections):
-        answers = {}
+        estimates = {}
         for estimate in tracking3d.track(frames, mask=long.masks[0], corrections=corrections):
-            answers |= {answer.index: answer for answer in (*estimate.revised, estimate)}
-        return answers
+            estimates |= {answer.index: answer for answer in (*estimate.revised, estimate)}
+        return estimates
 
     alone, corrected = tracked([]), tracked([Correction(10, mask=long.masks[10])])
     assert alone[9].status != "tracked" and corrected[9].T_cam_obj == pytest.approx(alone[9].T_cam_obj)
@@ -308,8 +308,8 @@ def test_a_tracker_that_is_on_the_object_keeps_what_it_has_learnt(clip):
     tracker = PromptedTracker(settings().tracker, make_prompt(Frame(0, clip.images[0]), mask=clip.masks[0]))
     tracker.start(Frame(0, clip.images[0]))
     mask = clip.masks[1]
-    answer = tracker.step(Frame(1, clip.images[1]), make_prompt(Frame(1, clip.images[1]), mask=mask))
-    assert (answer.binary == mask).all()
+    estimate = tracker.step(Frame(1, clip.images[1]), make_prompt(Frame(1, clip.images[1]), mask=mask))
+    assert (estimate.binary == mask).all()
     assert not tracker.anew
     elsewhere = make_prompt(Frame(2, clip.images[2]), mask=wrong_place(clip))
     tracker.step(Frame(2, clip.images[2]), elsewhere)
@@ -323,7 +323,7 @@ def test_boxes_and_points_correct_too_and_backwards_as_well(clip):
         Correction(5, points=[(x, y, 1), (2, 2, 0)]),
         Correction(1, box=make_prompt(Frame(1, clip.images[1]), mask=clip.masks[1]).box),
     ]
-    answers = {}
+    estimates = {}
     for estimate in tracking3d.track(
         list(clip.images),
         mask=clip.masks[START],
@@ -331,8 +331,8 @@ def test_boxes_and_points_correct_too_and_backwards_as_well(clip):
         corrections=corrections,
         config=settings(),
     ):
-        answers[estimate.index] = estimate
-    assert min(iou(answers[index].initial_mask, clip.masks[index]) for index in (0, 1, 5, 6)) > 0.7
+        estimates[estimate.index] = estimate
+    assert min(iou(estimates[index].initial_mask, clip.masks[index]) for index in (0, 1, 5, 6)) > 0.7
 
 
 def test_a_run_that_was_stopped_takes_a_correction_of_a_later_frame(clip, images, tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""With ``solver.correct_tracker`` a sure answer is handed back to the mask tracker, and nothing else is."""
+"""With ``solver.tracker_feedback`` a sure answer is handed back to the mask tracker, and nothing else is."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from refining_solver import CausalSolver
 
 from tracking3d import Frame, FrameEstimate, Status, load_config, track
 from tracking3d.errors import PluginError
-from tracking3d.estimation.correction import MOVES, MOVING, SIGHTED, SURE, WORTH_CORRECTING, corrects
+from tracking3d.estimation.tracker_feedback import MOVES, MOVING, SIGHTED, SURE, WORTH_CORRECTING, corrects
 from tracking3d.frames import MaskEstimate, Prompt
+from tracking3d.pipeline.session import SOLVERS
 from tracking3d.plugins import VARIABLE
-from tracking3d.session import SOLVERS
 from tracking3d.trackers.precomputed import PrecomputedMasks
 from tracking3d.trackers.protocol import CorrectableTracker
 
@@ -142,7 +142,7 @@ def answers(tracker: dict | str, correct: bool = True, policy: str = "continue",
     CHANGES.clear()
     CHANGES.update({"status": Status.TRACKED, "confidence": 0.9} | changes)
     config = load_config(
-        overrides=[f"solver.correct_tracker={str(correct).lower()}"],
+        overrides=[f"solver.tracker_feedback={str(correct).lower()}"],
         tracker=tracker,
         runtime={"on_plugin_failure": policy},
     )
@@ -196,4 +196,4 @@ def test_a_tracker_that_fails_at_it_is_recorded_like_any_failure():
 
 
 def test_the_papers_setting_never_corrects():
-    assert load_config(preset="paper").solver.correct_tracker is False
+    assert load_config(preset="paper").solver.tracker_feedback is False

@@ -18,20 +18,20 @@ from refining_solver import CausalSolver, StandInSolver
 import tracking3d
 from tracking3d import Status, TrackingResult, load_config, track
 from tracking3d.errors import InputError, OutputError
-from tracking3d.reconstruction import of_run
+from tracking3d.pipeline.record import record, record_objects
+from tracking3d.pipeline.session import SOLVERS
+from tracking3d.reconstruction import rebuild
 from tracking3d.reconstruction.shape import ReconstructedShape
-from tracking3d.recording import record, record_objects
 from tracking3d.rendering.kernels import threads as kernels
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.run_reader import RunReader
-from tracking3d.session import SOLVERS
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.video import open_source
 
 SETTINGS = [
-    "window.size=32",
+    "crop.size=32",
     "object.texture_views=4",
-    "object.landmark_views=0",  # the stand-in is judged as it says
+    "object.adjustment_views=0",  # the stand-in is judged as it says
     "tracker.name=flow",
     "tracker.segmentation_size=64",
 ]
@@ -89,10 +89,10 @@ def test_the_result_is_that_of_the_command_line(result, by_command):
 def test_what_was_known_at_the_time_is_kept_beside_it(result, clip, config):
     causal = result.causal
     assert not causal.refined
-    answers = {}
-    for answer in track(clip.images, mask=clip.masks[0], config=config):
-        answers.update({one.index: one for one in (*answer.revised, answer)})
-    np.testing.assert_array_equal(causal.poses, [answers[index].T_cam_obj for index in range(6)])
+    estimates = {}
+    for estimate in track(clip.images, mask=clip.masks[0], config=config):
+        estimates.update({one.index: one for one in (*estimate.revised, estimate)})
+    np.testing.assert_array_equal(causal.poses, [estimates[index].T_cam_obj for index in range(6)])
     assert len(causal.timings) == 6
     assert all(stages is not None and stages.whole > 0 for stages in causal.timings)
     assert causal.confidences.shape == (6,)
@@ -136,8 +136,8 @@ def test_a_fine_model_has_a_new_shape_where_that_explains_the_frames_better(clip
     def reshaped(model, vertices, faces, views):  # the stand-in's texture is too small to be taken apart
         return replace(model, vertices=vertices)
 
-    monkeypatch.setattr(of_run, "reconstructed", smaller)
-    monkeypatch.setattr(of_run, "with_shape", reshaped)
+    monkeypatch.setattr(rebuild, "reconstruct_shape", smaller)
+    monkeypatch.setattr(rebuild, "replace_shape", reshaped)
     result = track(clip.images, mask=clip.masks[0], config=config, model="fine").result()
     assert result.about_shape == "It is better."
     assert sorted(given) == [record.index for record in result.frames if record.status is Status.TRACKED]
@@ -154,7 +154,7 @@ def test_a_shape_that_cannot_be_told_stays_and_the_result_says_why(clip, config)
 
 
 def test_a_fine_model_needs_packages_and_says_which(clip, config, monkeypatch):
-    monkeypatch.setattr(of_run, "find_spec", lambda name: None)
+    monkeypatch.setattr(rebuild, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"pip install 'tracking3d\[model\]'"):
         track(clip.images, mask=clip.masks[0], config=config, model="fine")
 
@@ -261,7 +261,7 @@ def test_what_the_source_knows_of_its_lens_counts(clip, config):
 
 def test_awaited_answers_are_the_same_and_the_loop_goes_on(clip, config):
     async def together():
-        turns, answers = 0, []
+        turns, estimates = 0, []
 
         async def count():
             nonlocal turns
@@ -270,15 +270,15 @@ def test_awaited_answers_are_the_same_and_the_loop_goes_on(clip, config):
                 turns += 1
 
         counting = asyncio.create_task(count())
-        async for answer in track(clip.images, mask=clip.masks[0], config=config):
+        async for estimate in track(clip.images, mask=clip.masks[0], config=config):
             assert threading.current_thread() is threading.main_thread()
-            answers.append(answer)
+            estimates.append(estimate)
         counting.cancel()
-        return answers, turns
+        return estimates, turns
 
-    answers, turns = asyncio.run(together())
+    estimates, turns = asyncio.run(together())
     assert turns > 6
-    for one, other in zip(answers, track(clip.images, mask=clip.masks[0], config=config), strict=True):
+    for one, other in zip(estimates, track(clip.images, mask=clip.masks[0], config=config), strict=True):
         np.testing.assert_array_equal(one.T_cam_obj, other.T_cam_obj)
 
 
@@ -366,5 +366,5 @@ def test_paths_are_tracked(clip, config, tmp_path):
     for index, image in enumerate(clip.images[:2]):
         Image.fromarray(image).save(tmp_path / f"{index}.png")
     for frames in (tmp_path, str(tmp_path), sorted(tmp_path.iterdir()), map(str, sorted(tmp_path.iterdir()))):
-        answers = list(track(frames, mask=clip.masks[0], config=config))
-        assert [one.index for one in answers] == [0, 1]
+        estimates = list(track(frames, mask=clip.masks[0], config=config))
+        assert [one.index for one in estimates] == [0, 1]

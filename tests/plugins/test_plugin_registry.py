@@ -103,7 +103,7 @@ def register(monkeypatch):
 
     monkeypatch.setattr(metadata, "entry_points", entry_points)
     # What was read of the installed packages is kept until their folders change, which they do not do here.
-    monkeypatch.setattr(registration, "_packaged", registration._packaged.__wrapped__)
+    monkeypatch.setattr(registration, "_packaged_plugins", registration._packaged_plugins.__wrapped__)
 
     def add(name: str, cls: object, group: str = TRACKERS, package: str = "acme", value: str = "") -> None:
         if cls is not None:

@@ -7,7 +7,7 @@ import pytest
 from solid_of_clip import mesh_of
 
 from tracking3d.points.answers import PointAnswers
-from tracking3d.points.causal import KEPT, CausalPoints
+from tracking3d.points.online import KEPT, CausalPoints
 from tracking3d.points.view import open_view
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 
@@ -52,8 +52,8 @@ def truth(clip, surface, xy):
     return pixels[..., :2] / pixels[..., 2:]
 
 
-def errors(answers, clip, surface, xy):
-    return np.linalg.norm(np.stack([one.positions for one in answers]) - truth(clip, surface, xy), axis=2)
+def errors(estimates, clip, surface, xy):
+    return np.linalg.norm(np.stack([one.positions for one in estimates]) - truth(clip, surface, xy), axis=2)
 
 
 @pytest.fixture(scope="module")
@@ -72,35 +72,39 @@ def test_images_correct_poses_that_are_off(clip, surface, radius, xy):
     shifted = clip.T_cam_obj.copy()
     shifted[:, 0, 3] += 0.01 * np.arange(FRAMES)  # half a pixel more in every frame
     points = CausalPoints(xy)
-    answers = [points.step(index, view, radius) for index, view in enumerate(views(clip, surface, shifted))]
+    estimates = [points.step(index, view, radius) for index, view in enumerate(views(clip, surface, shifted))]
     seen = shifted[:, None, :3, 3] - clip.T_cam_obj[:, None, :3, 3]
     by_pose = np.abs(seen[1:, 0, 0] * clip.K[0, 0] / clip.T_cam_obj[1:, 2, 3]).mean()
-    assert np.median(errors(answers, clip, surface, xy)[1:]) < 0.5 * by_pose
+    assert np.median(errors(estimates, clip, surface, xy)[1:]) < 0.5 * by_pose
 
 
 def test_what_comes_later_changes_nothing_that_was_said(followed, clip, surface, radius, xy):
     points = CausalPoints(xy)
     for index, view in enumerate(views(clip, surface)[:4]):
-        answer = points.step(index, view, radius)
-        np.testing.assert_array_equal(answer.positions, followed[index].positions)
+        estimate = points.step(index, view, radius)
+        np.testing.assert_array_equal(estimate.positions, followed[index].positions)
 
 
 def test_where_the_object_is_lost_nothing_is_said_and_points_come_back(followed, clip, surface, radius, xy):
     gone = views(clip, surface)
     gone[3] = gone[4] = None
     points = CausalPoints(xy)
-    answers = [points.step(index, view, radius) for index, view in enumerate(gone)]
+    estimates = [points.step(index, view, radius) for index, view in enumerate(gone)]
     for index in (3, 4):
-        assert np.isnan(answers[index].positions).all()
-        assert not answers[index].visible.any()
-    assert np.median(errors(answers, clip, surface, xy)[5:]) < 0.3
+        assert np.isnan(estimates[index].positions).all()
+        assert not estimates[index].visible.any()
+    assert np.median(errors(estimates, clip, surface, xy)[5:]) < 0.3
 
 
 def test_a_pixel_beside_the_object_has_no_answer(clip, surface, radius):
     points = CausalPoints(np.array([(0.0, 0.0)]))
     for index, view in enumerate(views(clip, surface)[:2]):
-        answer = points.step(index, view, radius)
-        assert np.isnan(answer.positions).all() and np.isnan(answer.points).all() and not answer.visible.any()
+        estimate = points.step(index, view, radius)
+        assert (
+            np.isnan(estimate.positions).all()
+            and np.isnan(estimate.points).all()
+            and not estimate.visible.any()
+        )
 
 
 def test_better_poses_of_the_past_make_its_answers_anew(followed, clip, surface, radius, xy):
@@ -122,7 +126,7 @@ def test_views_do_not_add_up_and_backwards_begins_at_the_question(clip, surface,
     assert len(points._rows) == KEPT
     points = CausalPoints(xy)
     for index in (4, 5, 6, 7, 3, 2):
-        answer = points.step(index, some[index], radius)
+        estimate = points.step(index, some[index], radius)
         if index == 4:
-            start = answer.points
-    np.testing.assert_allclose(answer.points, start, atol=0.05 * radius)
+            start = estimate.points
+    np.testing.assert_allclose(estimate.points, start, atol=0.05 * radius)

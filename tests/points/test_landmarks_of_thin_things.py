@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tracking3d.points.bundle import bundle
-from tracking3d.points.landmarks import of_one_side
+from tracking3d.points.landmark_adjustment import of_one_side
+from tracking3d.points.robust_bundle import bundle
 
 ANGLES = np.array([0, 10, 20, 80, 100, 180, 190, 200])
 INTRINSICS = np.tile([300.0, 300.0, 80.0, 60.0], (len(ANGLES), 1))

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from twins import ray_intersection
 
 from tracking3d.bundle_adjustment.reversal import reversal_of
-from tracking3d.points.bundle import LEAST_MEASURED, bundle, intersect, other_way_round
+from tracking3d.points.robust_bundle import LEAST_MEASURED, bundle, intersect, other_way_round
 
 RNG = np.random.default_rng(3)
 POINTS = RNG.uniform(-1, 1, (40, 3))

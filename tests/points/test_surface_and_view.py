@@ -4,7 +4,7 @@ import numpy as np
 
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.prototypes import sphere
-from tracking3d.points.meeting import surface_under
+from tracking3d.points.ray_intersection import surface_under
 from tracking3d.points.surface import move_surface
 from tracking3d.points.view import open_view, sample
 

@@ -7,10 +7,10 @@ import pytest
 from solid_of_clip import mesh_of
 
 from tracking3d.points.answers import PointAnswers
-from tracking3d.points.causal import KEPT, CausalPoints
 from tracking3d.points.image_following import ImageFollower
+from tracking3d.points.image_only import UncoveredPoints
+from tracking3d.points.online import KEPT, CausalPoints
 from tracking3d.points.pictures import open_picture
-from tracking3d.points.uncovered import UncoveredPoints
 from tracking3d.points.view import open_view
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 
@@ -68,25 +68,25 @@ def test_the_images_carry_them_until_the_surface_covers_them(clip, surface, pict
     assert group.on_surface().tolist() == [True, False, False, False, False, False]
     uncovered = UncoveredPoints(0, pictures[0], xy, group.on_surface())
     assert uncovered
-    answers = [uncovered.completed(0, by_surface[0], group.on_surface())]
+    estimates = [uncovered.complete(0, by_surface[0], group.on_surface())]
     for index in range(1, FRAMES):
         by_surface.append(group.step(index, views[index], radius))
         uncovered.step(index, pictures[index])
-        answers.append(uncovered.completed(index, by_surface[-1], group.on_surface()))
-    positions = np.stack([one.positions for one in answers])
+        estimates.append(uncovered.complete(index, by_surface[-1], group.on_surface()))
+    positions = np.stack([one.positions for one in estimates])
     assert np.isnan(np.stack([one.positions for one in by_surface])[:, 1:]).all()
     assert np.isnan(positions[:, 5]).all()  # beside the object
     error = np.linalg.norm(positions - truth(clip, surface, xy), axis=2)[:, 1:5]
     assert np.median(error) < 1.0
-    told = np.stack([one.uncertainty for one in answers])[:, 1:5]
+    told = np.stack([one.uncertainty for one in estimates])[:, 1:5]
     assert (error <= 2 * told).mean() > 0.9
-    assert np.isnan(answers[-1].points[1:]).all()
+    assert np.isnan(estimates[-1].points[1:]).all()
     np.testing.assert_array_equal(positions[0, 1:5], xy[1:5])
 
     group.redrawn(lambda index: None, *surface)
     again = group.again(2 * radius)
     assert group.on_surface().tolist() == [True] * 5 + [False]
-    last = uncovered.completed(FRAMES - 1, again[FRAMES - 1], group.on_surface())
+    last = uncovered.complete(FRAMES - 1, again[FRAMES - 1], group.on_surface())
     np.testing.assert_array_equal(last.positions, again[FRAMES - 1].positions)
     assert np.isfinite(last.points[:5]).all()
     tied = np.linalg.norm(last.positions - truth(clip, surface, xy)[-1], axis=1)[:5]
@@ -98,7 +98,7 @@ def test_where_everything_is_covered_nothing_is_followed(pictures, xy):
     assert not uncovered
     uncovered.step(1, pictures[1])
     unknown = PointAnswers.unknown(6)
-    assert uncovered.completed(1, unknown, np.zeros(6, bool)) is unknown
+    assert uncovered.complete(1, unknown, np.zeros(6, bool)) is unknown
 
 
 def test_what_is_kept_does_not_grow(pictures, xy):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rendered_views import CAMERA, ball, pattern, pose, seen
 
-from tracking3d.points.landmarks import LandmarkScene, outlined, refine_scene
+from tracking3d.points.landmark_adjustment import LandmarkScene, fit_outlines, refine_scene
 from tracking3d.points.outline_fit import outline_of
 from tracking3d.points.view import open_view
 
@@ -38,7 +38,7 @@ def agreement(scene: LandmarkScene) -> float:
 def test_silhouettes_come_to_lie_on_the_masks(wide):
     scene = opened(ball().vertices * [1, wide, 1])
     assert agreement(scene) < 0.94
-    assert agreement(outlined(refine_scene(scene, 4))) > 0.98
+    assert agreement(fit_outlines(refine_scene(scene, 4))) > 0.98
 
 
 def test_what_hides_the_object_in_some_frames_does_not_dent_it():
@@ -47,7 +47,7 @@ def test_what_hides_the_object_in_some_frames_does_not_dent_it():
         return mask & ~left if index in (3, 4) else mask
 
     scene = opened(ball().vertices, hidden)
-    refined = outlined(refine_scene(scene, 4))
+    refined = fit_outlines(refine_scene(scene, 4))
     assert agreement(refined) > 0.97
     assert np.abs(np.linalg.norm(refined.vertices, axis=1) - 1).max() < 0.1
 

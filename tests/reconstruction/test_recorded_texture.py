@@ -12,10 +12,10 @@ from rendered_views import ball, pattern, pose, seen
 from tracking3d import load_config
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.frames import Frame, MaskEstimate
-from tracking3d.recording import record
+from tracking3d.pipeline.record import record
+from tracking3d.pipeline.session import SOLVERS
 from tracking3d.results.files import write_image
 from tracking3d.results.mesh_export import load_model
-from tracking3d.session import SOLVERS
 from tracking3d.video import open_source
 
 YAWS = (0, 15, 30)
@@ -38,7 +38,7 @@ class KnowingSolver:
     def refine(self, state: int) -> int:
         return state
 
-    def revisit(self, state: int, frame: Frame, mask: MaskEstimate, T_cam_obj):
+    def refine_frame(self, state: int, frame: Frame, mask: MaskEstimate, T_cam_obj):
         return state, replace(self._answer(frame), refined=True)
 
     def result(self, state: int) -> ObjectModel:
@@ -75,7 +75,7 @@ def test_the_refined_mesh_has_the_texture_of_the_video(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "override", ["object.texture_views=0", "solver.final_refine=false", "object.largest_texture=64"]
+    "override", ["object.texture_views=0", "solver.final_refine=false", "object.max_texture_size=64"]
 )
 def test_settings_leave_it_out_or_bound_it(tmp_path, override):
     assert len(recorded(tmp_path, override).texture) == (64 if "largest" in override else 16)

@@ -6,8 +6,8 @@ import pytest
 
 from tracking3d.estimation.assessment import Assessment
 from tracking3d.estimation.estimate import Status
-from tracking3d.points.landmarks import Support
-from tracking3d.reconstruction.support import BELIEVED, judge_with_landmarks, refined_confidence_features
+from tracking3d.points.landmark_adjustment import Support
+from tracking3d.reconstruction.confidence import BELIEVED, judge_with_landmarks, refined_confidence_features
 
 TRACKED = Assessment(Status.TRACKED, "", 0.9)
 DOUBTED = Assessment(Status.UNCERTAIN, "points agree, pixels do not", 0.3)

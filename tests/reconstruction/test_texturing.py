@@ -12,7 +12,7 @@ from rendered_views import FINE, ball, pattern, view
 
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.reconstruction import bake_texture, texturing
-from tracking3d.reconstruction.texturing import filled, texture_size
+from tracking3d.reconstruction.texturing import fill_holes, texture_size
 from tracking3d.rendering import sample_texture
 
 YAWS = (-40, -20, 0, 20, 40)
@@ -106,7 +106,9 @@ def test_a_uniform_texture_is_continued_as_it_is():
     known = np.zeros((50, 37), bool)
     known[10:12, 5] = True
     texture = np.where(known[..., None], (0.2, 0.5, 0.7), 0.0).astype(np.float32)
-    assert filled(texture, known) == pytest.approx(np.broadcast_to((0.2, 0.5, 0.7), (50, 37, 3)), abs=1e-5)
+    assert fill_holes(texture, known) == pytest.approx(
+        np.broadcast_to((0.2, 0.5, 0.7), (50, 37, 3)), abs=1e-5
+    )
 
 
 def test_what_is_continued_goes_around_the_seam_in_u():
@@ -114,7 +116,7 @@ def test_what_is_continued_goes_around_the_seam_in_u():
     known[:, :8] = known[:, 40:44] = True
     texture = np.zeros((64, 64, 3), np.float32)
     texture[:, :8] = 1.0
-    result = filled(texture, known)
+    result = fill_holes(texture, known)
     assert result[:, 62].mean() > 0.5 > result[:, 46].mean()  # two texels from white, across the seam
     assert result[known] == pytest.approx(texture[known])
 
@@ -122,4 +124,4 @@ def test_what_is_continued_goes_around_the_seam_in_u():
 @pytest.mark.parametrize("known", [True, False])
 def test_all_or_nothing_known_is_left(known):
     texture = np.random.default_rng(0).random((8, 8, 3)).astype(np.float32)
-    assert filled(texture, np.full((8, 8), known)) is texture
+    assert fill_holes(texture, np.full((8, 8), known)) is texture

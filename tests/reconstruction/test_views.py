@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rendered_views import CAMERA, pattern, pose, seen, view
 
-from tracking3d.reconstruction import kept_views, texture_view
+from tracking3d.reconstruction import keep_best_views, texture_view
 
 
 def test_a_view_is_the_frame_around_the_object_at_its_own_resolution():
@@ -54,7 +54,7 @@ def test_a_large_object_is_seen_smaller():
 def test_those_that_are_kept_are_spread_over_all_that_was_seen():
     one, views = view(0, 0.0), ()
     for index, yaw in enumerate(np.linspace(0, 180, 61)):
-        views = kept_views(views, replace(one, index=index, T_cam_obj=pose(yaw)), 7)
+        views = keep_best_views(views, replace(one, index=index, T_cam_obj=pose(yaw)), 7)
     angles = [np.degrees(np.arccos(np.clip(a.direction @ b.direction, -1, 1))) for a, b in pairwise(views)]
     assert len(views) == 7
     assert sum(angles) > 150 and min(angles) > 10
@@ -68,9 +68,9 @@ def test_of_two_that_see_the_same_the_sharper_one_stays():
     for order in ((blurred, sharp, other), (other, sharp, blurred)):
         views = ()
         for one in order:
-            views = kept_views(views, one, 2)
+            views = keep_best_views(views, one, 2)
         assert {one.index for one in views} == {0, 2}
 
 
 def test_none_are_kept_where_none_are_asked_for():
-    assert kept_views((), view(0, 0.0), 0) == ()
+    assert keep_best_views((), view(0, 0.0), 0) == ()

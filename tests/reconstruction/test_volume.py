@@ -10,12 +10,12 @@ from rendered_views import CAMERA, pattern, pose, seen
 from twins import plane_sweep, visual_hull
 
 from tracking3d.geometry.prototypes import sphere
-from tracking3d.reconstruction.depth_maps import DepthMap, Guide, depth_maps, patch_scores
-from tracking3d.reconstruction.fusion import depth_evidence, fused
 from tracking3d.reconstruction.grid import Grid
-from tracking3d.reconstruction.hull import robust_hull
 from tracking3d.reconstruction.mesh_distance import mesh_distance
-from tracking3d.reconstruction.shape_views import ShapeView, shape_view, turned_apart
+from tracking3d.reconstruction.plane_sweep import DepthMap, Guide, depth_maps, patch_scores
+from tracking3d.reconstruction.shape_views import ShapeView, shape_view, spread_by_rotation
+from tracking3d.reconstruction.tsdf_fusion import depth_evidence, fuse_depth
+from tracking3d.reconstruction.visual_hull import carve_hull
 
 SIDE = 96
 
@@ -36,7 +36,7 @@ def around() -> list[ShapeView]:
 
 def test_the_hull_of_a_ball_is_the_ball(around):
     points = np.random.default_rng(1).uniform(-1.3, 1.3, (2000, 3)).astype(np.float32)
-    hull, known = robust_hull(points, around, 0.4, 0.0, 0)
+    hull, known = carve_hull(points, around, 0.4, 0.0, 0)
     radius = np.linalg.norm(points, axis=1)
     inside = radius < 0.95
     beside = (np.hypot(*points[:, [0, 2]].T) > 1.1) & (np.abs(points[:, 1]) < 0.8)
@@ -48,21 +48,21 @@ def test_wrong_masks_carve_nothing_as_long_as_they_are_few(around):
     nothing = replace(around[3], depth_inside=np.full_like(around[3].depth_inside, -5.0))
     middle = np.zeros((1, 3), np.float32)
     views = [*around[:3], nothing, *around[4:]]
-    assert robust_hull(middle, views, 0.4, 0.0, 1)[0] > 0
-    assert robust_hull(middle, views, 0.4, 0.0, 0)[0] < 0
+    assert carve_hull(middle, views, 0.4, 0.0, 1)[0] > 0
+    assert carve_hull(middle, views, 0.4, 0.0, 0)[0] < 0
 
 
 def test_nothing_is_known_beyond_the_frame(around):
     half = replace(around[0], within=np.array([SIDE / 2, SIDE, 0, SIDE], np.float32))
     left = np.array([[-0.5, 0, 0]], np.float32)
-    assert robust_hull(left, [half], 0.4)[1] == 0
-    assert robust_hull(left, [around[0]], 0.4)[1] == 1
+    assert carve_hull(left, [half], 0.4)[1] == 0
+    assert carve_hull(left, [around[0]], 0.4)[1] == 1
 
 
 def test_kernel_and_twin_of_the_hull_agree(around):
     points = np.random.default_rng(2).uniform(-1.3, 1.3, (500, 3)).astype(np.float32)
     given = points, around, 0.4, 0.1, 1
-    kernel, twin = robust_hull(*given), visual_hull.robust_hull(*given)
+    kernel, twin = carve_hull(*given), visual_hull.robust_hull(*given)
     np.testing.assert_allclose(kernel[0], twin[0], atol=1e-5)
     np.testing.assert_array_equal(kernel[1], twin[1])
 
@@ -83,10 +83,10 @@ def test_patches_find_the_depth_of_a_ball():
     (found,) = depth_maps(views, [views[2]], guide, 0.12, 8)[:1] or [None]
     assert not np.isfinite(found.depth).any()  # nobody confirms the only map
     maps = depth_maps(views, views[1:4], guide, 0.12, 8)
-    true, _ = Guide(small.vertices, small.faces).seen_by(maps[1].view)
+    true, _ = Guide(small.vertices, small.faces).visible_to(maps[1].view)
     known = np.isfinite(maps[1].depth) & np.isfinite(true)
     assert known.sum() > 100
-    at_first, _ = guide.seen_by(maps[1].view)
+    at_first, _ = guide.visible_to(maps[1].view)
     error, before = (np.abs(depth[known] - true[known]) for depth in (maps[1].depth, at_first))
     assert np.median(error) < 0.3 * np.median(before)
 
@@ -113,16 +113,16 @@ def test_a_depth_is_a_surface_and_free_space_before_it(around):
     total, weight = depth_evidence(points, [one], 0.2)
     assert total[0] < 0 and abs(total[1]) < 1e-6 and weight[1] == 1 and weight[2] == 0
     everywhere = np.full(3, 0.1, np.float32)
-    inside = fused((1, 1, 3), everywhere, everywhere, 5 * total, 5 * weight, 0.2, variation=0)
+    inside = fuse_depth((1, 1, 3), everywhere, everywhere, 5 * total, 5 * weight, 0.2, variation=0)
     assert inside[0] < 0 < inside[2]
-    hull = fused((1, 1, 3), -everywhere, everywhere, total, weight, 0.2)
+    hull = fuse_depth((1, 1, 3), -everywhere, everywhere, total, weight, 0.2)
     assert (hull < 0).all()  # nothing is beyond it
 
 
 def test_views_that_show_the_same_are_one(around):
-    assert len(turned_apart([around[0]] * 5, 1.0, 10)) == 1
-    assert len(turned_apart(around, 1.0, 100)) == len(around)
-    assert len(turned_apart(around, 1.0, 5)) <= 5
+    assert len(spread_by_rotation([around[0]] * 5, 1.0, 10)) == 1
+    assert len(spread_by_rotation(around, 1.0, 100)) == len(around)
+    assert len(spread_by_rotation(around, 1.0, 5)) <= 5
 
 
 def test_noise_and_holes_go_and_the_surface_stays():
@@ -133,8 +133,8 @@ def test_noise_and_holes_go_and_the_surface_stays():
     weight = np.where(rng.random(len(ball)) < 0.7, 4.0, 0.0).astype(np.float32)  # the rest is known to nobody
     noisy = np.clip(ball + rng.normal(0, 0.2, len(ball)), -truncation, truncation).astype(np.float32)
     far = np.full_like(ball, 1.0)
-    made = fused(grid.shape, far, -far, noisy * weight, weight, truncation)
-    rough = fused(grid.shape, far, -far, noisy * weight, weight, truncation, variation=0)
+    made = fuse_depth(grid.shape, far, -far, noisy * weight, weight, truncation)
+    rough = fuse_depth(grid.shape, far, -far, noisy * weight, weight, truncation, variation=0)
     wrong, before = ((one > 0) != (ball > 0) for one in (made, rough))
     assert wrong.mean() < 0.5 * before.mean()
 

@@ -10,8 +10,8 @@ import psutil
 import pytest
 import torch
 
-from tracking3d import process_memory
-from tracking3d.process_memory import resident_memory
+from tracking3d.runtime import memory
+from tracking3d.runtime.memory import resident_memory
 from tracking3d.speed.memory import peak_memory
 from tracking3d.speed.scene import RenderWorkload
 
@@ -22,7 +22,7 @@ needs_proc = pytest.mark.skipif(
 
 
 PEAKS = """
-from tracking3d.process_memory import forget_peak, resident_memory
+from tracking3d.runtime.memory import forget_peak, resident_memory
 forget_peak()
 now, _ = resident_memory()
 block = b"x" * int(64e6)
@@ -51,7 +51,7 @@ def test_the_peak_is_never_below_the_present_size():
 def test_without_proc_the_operating_system_is_asked_in_its_unit(monkeypatch, system, unit):
     resource = pytest.importorskip("resource", reason="this system has no module resource")
     most = 10**12 // unit  # above what this process holds
-    monkeypatch.setattr(process_memory, "_STATUS", Path("no such file"))
+    monkeypatch.setattr(memory, "_STATUS", Path("no such file"))
     monkeypatch.setattr(resource, "getrusage", lambda who: type("usage", (), {"ru_maxrss": most}))
     monkeypatch.setattr(sys, "platform", system)
     now, peak = resident_memory()

@@ -20,9 +20,9 @@ def read_everything(folder):
     _ = run.camera, run.config, run.state
     for record in run.frames:
         run.mask(record.index)
-    answers = answers_of_run(folder, Truth("clip", tuple(folder / f"{n}.png" for n in range(8))))
-    assert answers.mesh is not None
-    answers.mesh()
+    estimates = answers_of_run(folder, Truth("clip", tuple(folder / f"{n}.png" for n in range(8))))
+    assert estimates.mesh is not None
+    estimates.mesh()
     track_points(run, 0, [[50, 60]])
 
 

@@ -14,7 +14,7 @@ from tracking3d.export.exporting import export_run
 from tracking3d.export.options import ExportOptions
 from tracking3d.geometry.lens import Lens
 from tracking3d.results.correspondences import grid_on_object, track_points
-from tracking3d.results.following import open_scene
+from tracking3d.results.point_tracking import open_scene
 from tracking3d.results.run_reader import RunReader
 
 

@@ -11,7 +11,7 @@ from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.frames import Frame
 from tracking3d.results.correspondences import PointKind, check_asked, on_mask, track_points
 from tracking3d.results.description import RunHeader
-from tracking3d.results.following import open_scene
+from tracking3d.results.point_tracking import open_scene
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_writer import RunWriter
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize

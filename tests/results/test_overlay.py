@@ -54,11 +54,11 @@ def test_an_overlay_has_its_size_and_leaves_the_frame_alone(make_turning_sphere,
 
 def test_outlines_lie_on_the_edges_of_the_masks(make_turning_sphere):
     clip = make_turning_sphere(1, 640, 480)
-    answer, initial = np.zeros((480, 640), dtype=bool), np.zeros((480, 640), dtype=bool)
-    answer[100:200, 100:200] = True
-    answer[140:160, 140:160] = False  # a hole has an edge too
+    estimate, initial = np.zeros((480, 640), dtype=bool), np.zeros((480, 640), dtype=bool)
+    estimate[100:200, 100:200] = True
+    estimate[140:160, 140:160] = False  # a hole has an edge too
     initial[300:400, 300:400] = True
-    image = overlay_of(clip, 0, mask=answer, initial_mask=initial)
+    image = overlay_of(clip, 0, mask=estimate, initial_mask=initial)
     for y, x in [(100, 150), (199, 150), (150, 100), (140, 150)]:
         assert tuple(image[y, x]) == drawing.REFINED
     assert tuple(image[300, 350]) == drawing.INITIAL

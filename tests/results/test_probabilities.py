@@ -14,14 +14,14 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "pipeline"))  # ref
 from refining_solver import CausalSolver, StandInSolver
 
 from tracking3d import load_config
-from tracking3d.corrected_run import correct_run
-from tracking3d.corrections import Correction
-from tracking3d.recording import record
+from tracking3d.pipeline.correct import correct_run
+from tracking3d.pipeline.record import record
+from tracking3d.pipeline.session import SOLVERS
+from tracking3d.prompts.corrections import Correction
 from tracking3d.results import layout
 from tracking3d.results.files import write_image
 from tracking3d.results.probabilities import read_probability, write_probability
 from tracking3d.results.run_reader import RunReader
-from tracking3d.session import SOLVERS
 from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
 from tracking3d.video import open_source
 
@@ -40,7 +40,7 @@ def clip(tmp_path):
 @pytest.fixture(autouse=True)
 def solver(monkeypatch):
     """Says a quarter in causal answers and three quarters in refined ones; of frame 1 nothing in the end."""
-    step, init, revisit = CausalSolver.step, CausalSolver.init, StandInSolver.revisit
+    step, init, revisit = CausalSolver.step, CausalSolver.init, StandInSolver.refine_frame
 
     def likely(estimate, value):
         return replace(estimate, probability=np.full(estimate.mask.shape, value, np.float32))
@@ -63,7 +63,7 @@ def solver(monkeypatch):
 
 
 def run(clip, folder: Path, *overrides: str) -> Path:
-    quick = ["tracker.name=flow", "tracker.segmentation_size=64", "window.size=32", "object.evidence=false"]
+    quick = ["tracker.name=flow", "tracker.segmentation_size=64", "crop.size=32", "object.refine_masks=false"]
     record(
         open_source(str(folder.parent / "clip")),
         load_config(overrides=[*quick, *overrides]),

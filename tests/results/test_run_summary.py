@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from tracking3d.cli.progress import print_summary
-from tracking3d.estimation.estimate import MaskSource, unanswered
+from tracking3d.estimation.estimate import MaskSource, lost_estimate
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.results.contact_sheet import CROPS, TILE
 from tracking3d.results.notes import describe_camera_and_model, notes_of_run, notes_of_times, unseen_share
 from tracking3d.results.records import FrameRecord
-from tracking3d.stages import STAGES, StageTimes
+from tracking3d.runtime.stage_times import STAGES, StageTimes
 from tracking3d.video.image_file import read_image
 
 pytestmark = pytest.mark.usefixtures("as_users_see_it")
@@ -119,7 +119,7 @@ def test_a_surface_that_was_mostly_never_seen_is_noted(turning_sphere):
 def timed(*milliseconds: int) -> list[FrameRecord]:
     image = np.zeros((4, 4, 3), np.uint8)
     frames = [Frame(2 * n, image, time / 1000) for n, time in enumerate(milliseconds)]
-    return [FrameRecord.of(unanswered(frame, MaskEstimate(None), np.eye(4))) for frame in frames]
+    return [FrameRecord.of(lost_estimate(frame, MaskEstimate(None), np.eye(4))) for frame in frames]
 
 
 @pytest.mark.parametrize("times", [(), (0,), (0, 40), (0, 40, 80, 120), (0, 33, 67, 100), (0, 0, 40)])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
 
-from tracking3d.synthesis.camera_effects import compressed, jpeg_quality
+from tracking3d.synthesis.camera_effects import compress, jpeg_quality
 from tracking3d.synthesis.occluder import MOST_HIDDEN
 from tracking3d.synthesis.sequences import render_sequence
 from tracking3d.synthesis.spec import Disturbances, SequenceSpec
@@ -139,17 +139,17 @@ def test_a_wrong_field_of_view_is_told_but_not_rendered(plain):
     wrong = sequence({"wrong_fov": 0.5}, fov=40.0)
     true = sequence(fov=40.0)
     assert (wrong.images == true.images).all()
-    told = wrong.scene.told_camera
+    told = wrong.scene.given_camera
     assert told.fy == pytest.approx(0.5 * 72 / np.tan(np.radians(60) / 2))
-    assert true.scene.told_camera == true.scene.camera
-    assert sequence({"wrong_fov": 1.0}, fov=90.0, frames=1).scene.told_camera.fy > 0
+    assert true.scene.given_camera == true.scene.camera
+    assert sequence({"wrong_fov": 1.0}, fov=90.0, frames=1).scene.given_camera.fy > 0
 
 
 def test_stronger_jpeg_means_smaller_files_further_from_the_image(plain, tmp_path):
     image = plain.images[0]
     sizes, errors = [], []
     for strength in (0.01, 0.5, 1.0):
-        (tmp_path / "a.jpg").write_bytes(compressed(image, strength))
+        (tmp_path / "a.jpg").write_bytes(compress(image, strength))
         sizes.append((tmp_path / "a.jpg").stat().st_size)
         errors.append(np.abs(read_image(tmp_path / "a.jpg").astype(int) - image).mean())
     assert sizes[0] > sizes[1] > sizes[2] and errors[0] < errors[1] < errors[2]

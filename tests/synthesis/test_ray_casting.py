@@ -93,7 +93,7 @@ def test_edges_of_a_box_stay_sharp_and_a_texture_seam_of_a_cylinder_does_not_sho
 def test_no_rays_meet_nothing():
     surface = RayMesh.of(trimesh.creation.box())
     none = np.zeros((0, 3))
-    assert len(surface.cast(none, none).face) == 0 and len(surface.blocked(none, none)) == 0
+    assert len(surface.cast(none, none).face) == 0 and len(surface.is_blocked(none, none)) == 0
 
 
 def test_without_embree_one_sentence_says_how_to_get_it(monkeypatch):

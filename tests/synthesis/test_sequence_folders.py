@@ -68,8 +68,8 @@ def test_depth_reads_back_to_a_thousandth_of_the_object_and_0_where_it_is_not(re
 def test_the_true_camera_and_the_told_one_are_both_there(rendered, written):
     truth = read_truth(written)
     assert np.allclose(truth.camera.K, rendered.scene.camera.K)
-    assert np.allclose(truth.told_camera.K, rendered.scene.told_camera.K)
-    assert truth.told_camera.fy < 0.7 * truth.camera.fy
+    assert np.allclose(truth.given_camera.K, rendered.scene.given_camera.K)
+    assert truth.given_camera.fy < 0.7 * truth.camera.fy
     assert "wrong on purpose" in json.loads((written / "camera.json").read_text())["note"]
 
 
@@ -108,7 +108,7 @@ def test_only_what_is_needed_is_written(tmp_path):
     folder = write_sequence(tmp_path / "plain", SequenceSpec(frames=1, size=(32, 24), supersample=1))
     assert not (folder / "visible_masks").exists() and not (folder / "truth_camera.json").exists()
     truth = read_truth(folder)
-    assert truth.told_camera is None and not truth.visible_masks and len(truth.symmetries) == 1
+    assert truth.given_camera is None and not truth.visible_masks and len(truth.symmetries) == 1
 
 
 def test_jpeg_frames_are_jpeg_files(tmp_path):

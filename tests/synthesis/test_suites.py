@@ -89,7 +89,7 @@ def test_a_tracker_can_be_told_nothing_of_the_camera(tmp_path):
     spec = TINY[0].model_copy(update={"camera_told": False, "fov": 20.0})
     told, untold = (read_truth(write_sequence(tmp_path / s.name, s)) for s in (TINY[1], spec))
     assert told.camera_told and not untold.camera_told
-    assert untold.told_camera is None and untold.camera == Camera.from_fov(
+    assert untold.given_camera is None and untold.camera == Camera.from_fov(
         32, 24, 20.0, origin=untold.camera.origin
     )
 

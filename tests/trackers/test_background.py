@@ -42,7 +42,7 @@ def test_the_same_picture_has_not_changed() -> None:
     image = picture()
     image.flags.writeable = False  # as frames are
     np.testing.assert_allclose(memory(image).change(image, WINDOW), -0.5)
-    np.testing.assert_allclose(memory(image).unchanged(image)[5:80, 20:95], 1)
+    np.testing.assert_allclose(memory(image).unchanged_score(image)[5:80, 20:95], 1)
 
 
 def test_a_patch_of_another_colour_has_changed_and_nothing_else() -> None:
@@ -85,7 +85,7 @@ def test_what_lay_beside_the_object_in_the_first_frame_is_known_everywhere() -> 
     kept = BackgroundMemory(picture(), beside)
     image = picture()
     image[:20, :20] = 255 - image[:20, :20] // 2
-    unchanged = kept.unchanged(image)
+    unchanged = kept.unchanged_score(image)
     np.testing.assert_array_equal(unchanged[30:60, 40:80], 0)
     assert unchanged[:18, :18].max() < 0.1
     beside[:22, :22] = False

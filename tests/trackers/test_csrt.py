@@ -308,9 +308,9 @@ def test_real_clips_from_a_box(shared_data: Path, clip: str, expected: float) ->
 def test_a_box_that_was_corrected_keeps_its_offset() -> None:
     followed, told = (40.0, 30.0, 20.0, 10.0), (38.0, 30.0, 30.0, 12.0)
     offset = BoxOffset.between(followed, told)
-    assert offset.applied(followed) == pytest.approx(told)
-    assert offset.applied((80.0, 60.0, 40.0, 20.0)) == pytest.approx((76.0, 60.0, 60.0, 24.0))
-    assert BoxOffset().applied(followed) == followed
+    assert offset.apply(followed) == pytest.approx(told)
+    assert offset.apply((80.0, 60.0, 40.0, 20.0)) == pytest.approx((76.0, 60.0, 60.0, 24.0))
+    assert BoxOffset().apply(followed) == followed
 
 
 def test_what_a_correction_adds_is_not_held_back_by_the_box_of_before() -> None:

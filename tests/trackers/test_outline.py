@@ -10,7 +10,7 @@ from tracking3d.trackers.outline import (
     inside_distance,
     prior,
     remove_specks,
-    shifted_to,
+    shift_to,
     touches_border,
 )
 
@@ -37,13 +37,13 @@ def test_the_prior_is_the_weighted_mean_of_opinions_in_units_of_the_size() -> No
 @pytest.mark.parametrize(("down", "right"), [(0, 0), (6, -4), (-8, 10)])
 def test_a_mask_is_shifted_to_where_the_evidence_is(down: int, right: int) -> None:
     evidence = np.where(square(30 + down, 30 + right), 1, -1).astype(np.float32)
-    found = shifted_to(square().astype(np.float32), evidence)
+    found = shift_to(square().astype(np.float32), evidence)
     np.testing.assert_array_equal(found > 0.5, square(30 + down, 30 + right))
 
 
 def test_without_evidence_a_mask_stays_where_it_is() -> None:
     mask = square().astype(np.float32)
-    np.testing.assert_array_equal(shifted_to(mask, np.zeros((100, 100), np.float32)), mask)
+    np.testing.assert_array_equal(shift_to(mask, np.zeros((100, 100), np.float32)), mask)
 
 
 def test_the_sides_leave_a_band_out() -> None:

@@ -8,7 +8,7 @@ from moving_shape import SIZE, iou, moving_shape
 
 from tracking3d.geometry.camera import Window
 from tracking3d.trackers.colour_models import GlobalColours, lab
-from tracking3d.trackers.crops import cut, paste_mask
+from tracking3d.trackers.crops import crop_window, paste_mask
 from tracking3d.trackers.outline import both_sides
 from tracking3d.trackers.search import find_by_colours
 
@@ -18,8 +18,8 @@ def known() -> tuple[GlobalColours, float]:
     """The hexagon's colours and area."""
     frames, truth = moving_shape(1)
     window = Window(0, -30, 240, 224)
-    mask = cut(truth[0].astype(np.float32), window)
-    return GlobalColours(lab(cut(frames[0].image, window)), *both_sides(mask)), float(truth[0].sum())
+    mask = crop_window(truth[0].astype(np.float32), window)
+    return GlobalColours(lab(crop_window(frames[0].image, window)), *both_sides(mask)), float(truth[0].sum())
 
 
 @pytest.mark.parametrize("start", [40.0, 120.0, 190.0])

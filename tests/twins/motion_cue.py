@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.evidence.motion import Matrix, _carried, _projected
-from tracking3d.evidence.scene import Plane
+from tracking3d.segmentation.frame_window import Plane
+from tracking3d.segmentation.motion_cue import Matrix, _carry_through, _project
 
 
 def parted_ways(
@@ -16,11 +16,11 @@ def parted_ways(
     image_size: tuple[int, int],
     apart: tuple[float, float],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """See `tracking3d.evidence.motion.parted_ways`."""
+    """See `tracking3d.segmentation.motion_cue.motion_parallax`."""
     near = inverse_depth[..., None]
-    moved = _carried(len(inverse_depth), of_surface[:, :3]) + near * of_surface[:, 3]
-    beyond = _carried(len(inverse_depth), of_background)
-    ways = np.stack([_projected(np.where(near > 0, moved, np.nan)), _projected(beyond)])
+    moved = _carry_through(len(inverse_depth), of_surface[:, :3]) + near * of_surface[:, 3]
+    beyond = _carry_through(len(inverse_depth), of_background)
+    ways = np.stack([_project(np.where(near > 0, moved, np.nan)), _project(beyond)])
     limit = np.array([image_size[1] - 1, image_size[0] - 1])
     with np.errstate(invalid="ignore"):
         inside = np.asarray(((ways > 0) & (ways < limit)).all((0, -1)))

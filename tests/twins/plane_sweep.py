@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tracking3d.reconstruction.depth_maps import AGREEING, LEAST_CONTRAST, RADIUS
 from tracking3d.reconstruction.grid import FloatArray
+from tracking3d.reconstruction.plane_sweep import AGREEING, LEAST_CONTRAST, RADIUS
 
 
 def patch_scores(
@@ -21,7 +21,7 @@ def patch_scores(
     normal: NDArray[np.float64],
     offsets: NDArray[np.float64],
 ) -> tuple[FloatArray, FloatArray]:
-    """See `tracking3d.reconstruction.depth_maps.patch_scores`."""
+    """See `tracking3d.reconstruction.plane_sweep.patch_scores`."""
     agreeing = min(AGREEING, len(others))
     side = len(image)
     count, depths = len(pixels), len(offsets)

@@ -12,14 +12,14 @@ from tracking3d.bundle_adjustment.reprojection import (
     project_camera_points,
     transform_to_camera,
 )
-from tracking3d.estimation.online.pnp_types import (
+from tracking3d.estimation.online.optimization.pnp import _shares
+from tracking3d.estimation.online.optimization.pnp_types import (
     CONVERGED,
     FIRST_DAMPING,
     MOST_DAMPING,
     PnPFit,
     PointEquations,
 )
-from tracking3d.estimation.online.pose_from_points import _shares
 from twins.reprojection import pixel_by_point, pixel_by_pose
 
 
@@ -33,7 +33,7 @@ def pose_of_tracks(
     scale: float,
     iterations: int = 10,
 ) -> PnPFit:
-    """See `tracking3d.estimation.online.pose_from_points.pose_of_tracks`."""
+    """See `tracking3d.estimation.online.optimization.pnp.pose_of_tracks`."""
     at = point_equations(points, pixels, weight, K, R, t, scale)
     damping = FIRST_DAMPING
     for _ in range(iterations):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tracking3d.points.bundle import _AHEAD, _OUTLIER, TURNS
+from tracking3d.points.robust_bundle import _AHEAD, _OUTLIER, TURNS
 from tracking3d.points.view import Array
 
 
@@ -17,7 +17,7 @@ def intersect(
     held: float,
     turns: int = TURNS,
 ) -> tuple[Array, Array]:
-    """See `tracking3d.points.bundle.intersect`."""
+    """See `tracking3d.points.robust_bundle.intersect`."""
     start, weight = points, np.zeros(deviation.shape)
     for _ in range(turns):
         points, weight = _move_points(points, start, intrinsics, T_cam_obj, measured, deviation, held)

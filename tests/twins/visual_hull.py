@@ -14,7 +14,7 @@ from tracking3d.reconstruction.shape_views import ShapeView
 def robust_hull(
     points: FloatArray, views: Sequence[ShapeView], far: float, share: float, least: int
 ) -> tuple[FloatArray, FloatArray]:
-    """See `tracking3d.reconstruction.hull.robust_hull`."""
+    """See `tracking3d.reconstruction.visual_hull.carve_hull`."""
     P = np.stack([view.P for view in views])
     focal = np.array([view.K[0, 0] for view in views])
     inside = np.stack([view.depth_inside for view in views])

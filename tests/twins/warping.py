@@ -5,12 +5,12 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from tracking3d.points.carrying import _BEYOND
 from tracking3d.points.view import Plane, SurfaceView
+from tracking3d.points.warping import _BEYOND
 
 
 def warped(source: SurfaceView, target: SurfaceView, tolerance: float) -> tuple[Plane, Plane]:
-    """See `tracking3d.points.carrying._warped`."""
+    """See `tracking3d.points.warping._warp`."""
     near = (target.beyond < _BEYOND) & (target.inverse_depth > 0)
     rows, columns = np.nonzero(near)
     points = target.back_project(np.stack([columns, rows], 1).astype(float), target.inverse_depth[near])

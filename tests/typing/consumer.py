@@ -20,12 +20,12 @@ from tracking3d import (
     Status,
     TrackingResult,
 )
-from tracking3d.corrections import Correction
 from tracking3d.errors import InputError, Tracking3dError
 from tracking3d.export.options import ExportOptions
 from tracking3d.frames import MaskEstimate
-from tracking3d.prompts import make_prompt
-from tracking3d.recording import record, record_objects
+from tracking3d.pipeline.record import record, record_objects
+from tracking3d.prompts.corrections import Correction
+from tracking3d.prompts.prompt import make_prompt
 from tracking3d.results.correspondences import PointTracks
 from tracking3d.results.run_reader import RunReader
 from tracking3d.video import open_source
@@ -76,7 +76,7 @@ def by_hand(image: NDArray[np.uint8]) -> ObjectModel:
     """Frame by frame."""
     first = Frame(0, image, time=0.0)
     prompt: Prompt = make_prompt(first, box=(1, 2, 3, 4))
-    session = Session(tracking3d.load_config(overrides=["solver.window=8"]), prompt)
+    session = Session(tracking3d.load_config(overrides=["solver.local_window=8"]), prompt)
     try:
         estimate = session.step(first)
     except InputError as error:

@@ -11,7 +11,7 @@ import pytest
 from tracking3d.frames import Frame
 from tracking3d.video import open_source
 from tracking3d.video.any_frame import frame_images
-from tracking3d.video.deinterlacing import deinterlaced
+from tracking3d.video.deinterlacing import deinterlace
 
 HEIGHT, WIDTH, COUNT = 64, 96, 8
 
@@ -86,7 +86,7 @@ def test_what_cannot_be_decoded_stays_in_its_place(clip):
     assert all(picture.interlaced_frame for picture in pictures)
     items = [*pictures[:3], "damaged", *pictures[3:5], "damaged", "too", pictures[5]]
     given = [item if isinstance(item, str) else item.pts for item in items]
-    assert [item if isinstance(item, str) else item.pts for item in deinterlaced(items)] == given
+    assert [item if isinstance(item, str) else item.pts for item in deinterlace(items)] == given
 
 
 def test_progressive_video_is_left_alone(tmp_path):

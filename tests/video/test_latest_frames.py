@@ -11,7 +11,7 @@ import pytest
 
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, SkippedFrame
-from tracking3d.pipeline import checked_image
+from tracking3d.pipeline.track import validate_image
 from tracking3d.video import FrameSource, LatestFrames, open_source
 from tracking3d.video.latest_frames import DROPPED, newest
 
@@ -166,7 +166,7 @@ def test_a_source_is_played_at_a_rate_and_every_frame_is_taken_or_told_of():
     for item in source:
         items.append(item)
         if isinstance(item, Frame):
-            checked_image(item.image, item.index)
+            validate_image(item.image, item.index)
             lags.append(time.monotonic() - started - item.time)
             time.sleep(0.035)  # three and a half frames
     assert [item.index for item in items] == list(range(30))

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("viser", reason="viser is absent: pip install 'tracking3d[view]'")
 
-from tracking3d.viewer.browser_camera import _ASPECT, _FOV, _NARROW, aside_of, framed
+from tracking3d.viewer.browser_camera import _ASPECT, _FOV, _NARROW, aside_of, frame_object
 
 RING = np.array([[np.sin(turn), 0, -np.cos(turn)] for turn in np.linspace(0, 6, 40)]) * 4
 
@@ -44,7 +44,7 @@ def test_an_arc_is_seen_from_behind_its_cameras():
 @pytest.mark.parametrize("aspect", [_ASPECT, _NARROW], ids=["one", "beside_one_another"])
 def test_the_first_look_holds_the_path_and_the_object(path, aspect):
     places, aside = np.vstack([path, np.zeros(3)]), aside_of(path)
-    middle, distance = framed(places, aside, aspect)
+    middle, distance = frame_object(places, aside, aspect)
     forward = -aside
     right = np.cross(forward, [0.0, -1.0, 0.0])
     right /= np.linalg.norm(right)

@@ -129,9 +129,9 @@ def test_frames_that_cannot_be_corrected_are_refused(correction, commands, frame
 
 def test_a_link_is_offered_for_frames_that_can_be_corrected_only(correction):
     corrections = Corrections([correction], Access())
-    assert "Correct frame 7" in corrections.offered(7)
+    assert "Correct frame 7" in corrections.offer(7)
     for frame, why in [(0, "In frame 0 the object was given"), (12, "no answer for frame 12")]:
-        offered = corrections.offered(frame)
+        offered = corrections.offer(frame)
         assert why in offered
         assert "href" not in offered
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from recorded_runs import estimate_of, frame_of, model, open_run, write_run
 
-from tracking3d.checkpoint.trees import TreeFolder
+from tracking3d.checkpoint.serialization import TreeFolder
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import Status
+from tracking3d.viewer.checkpoint_landmarks import landmarks_of_checkpoint
 from tracking3d.viewer.followed_run import FollowedRun, Streak, open_followed_runs
-from tracking3d.viewer.kept_landmarks import kept_landmarks
 
 
 def followed(folder: Path) -> FollowedRun:
@@ -129,12 +129,12 @@ def kept_state(folder: Path, points: np.ndarray) -> Path:
 def test_landmarks_are_read_from_the_state_of_a_run(tmp_path):
     points = np.random.default_rng(0).normal(size=(200, 3))
     points[5] = np.nan
-    assert kept_landmarks(tmp_path) is None
+    assert landmarks_of_checkpoint(tmp_path) is None
     state = kept_state(tmp_path, points)
-    assert np.allclose(kept_landmarks(tmp_path), np.delete(points, 5, axis=0))
+    assert np.allclose(landmarks_of_checkpoint(tmp_path), np.delete(points, 5, axis=0))
     for file in ("../../secret.npz", "00000000.npy", 7):
         state.write_text(state.read_text().replace('"00000000.npz"', json.dumps(file)))
-        assert kept_landmarks(tmp_path) is None
+        assert landmarks_of_checkpoint(tmp_path) is None
         state.write_text(state.read_text().replace(json.dumps(file), '"00000000.npz"'))
     np.savez(tmp_path / ".state" / "00000000.npz", array=np.array([{"a": 1}], dtype=object))
-    assert kept_landmarks(tmp_path) is None
+    assert landmarks_of_checkpoint(tmp_path) is None

@@ -49,8 +49,8 @@ def answers(port: int) -> bool:
 
 def test_the_page_is_served_and_its_socket_opens(server):
     assert answers(server.get_port())
-    answer = raw_request(server.get_port(), request("GET", "/"))
-    assert b"frame-ancestors 'none'" in answer and b"no-referrer" in answer
+    estimate = raw_request(server.get_port(), request("GET", "/"))
+    assert b"frame-ancestors 'none'" in estimate and b"no-referrer" in estimate
 
 
 @pytest.mark.parametrize(
@@ -76,8 +76,8 @@ def test_a_socket_of_another_page_is_refused(server, origin):
 @pytest.mark.parametrize("upgrade", ["websocket", "WebSocket", "h2c"])
 def test_an_upgrade_in_any_spelling_passes_the_check(server, upgrade):
     headers = {"Connection": "Upgrade", "Upgrade": upgrade, "Origin": "http://evil.example"}
-    answer = raw_request(server.get_port(), request("GET", "/", Sec_WebSocket_Version="13", **headers))
-    assert status(answer) == 403
+    estimate = raw_request(server.get_port(), request("GET", "/", Sec_WebSocket_Version="13", **headers))
+    assert status(estimate) == 403
 
 
 @pytest.mark.parametrize(
@@ -107,9 +107,9 @@ def test_elsewhere_the_token_opens_the_page_and_its_cookie_the_socket():
         port = server.get_port()
         assert status(raw_request(port, request("GET", "/"))) == 401
         assert status(raw_request(port, request("GET", "/?token=wrong"))) == 401
-        answer = raw_request(port, request("GET", "/?token=secret"))
-        assert status(answer) == 303 and b"\r\nLocation: /\r\n" in answer
-        cookie = answer.partition(b"Set-Cookie: ")[2].partition(b";")[0].decode()
+        estimate = raw_request(port, request("GET", "/?token=secret"))
+        assert status(estimate) == 303 and b"\r\nLocation: /\r\n" in estimate
+        cookie = estimate.partition(b"Set-Cookie: ")[2].partition(b";")[0].decode()
         assert status(raw_request(port, request("GET", "/", Cookie=cookie))) == 200
         with pytest.raises(websockets.exceptions.InvalidStatus):
             our_socket(port)

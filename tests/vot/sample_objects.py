@@ -7,7 +7,7 @@ from pathlib import Path
 from tracking3d.results.files import write_image
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 
-QUICK = "window.size=32 object.frequency=2 object.texture_size=16"
+QUICK = "crop.size=32 object.frequency=2 object.texture_size=16"
 
 
 def sample_clip(frames: int = 3) -> SyntheticClip:

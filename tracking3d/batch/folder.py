@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from tracking3d.batch.places import join_path, read, write
+from tracking3d.batch.storage import join_path, read, write
 from tracking3d.batch.summary import COLUMNS
 from tracking3d.errors import InputError
 

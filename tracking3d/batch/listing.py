@@ -10,11 +10,10 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from tracking3d.arguments import needs_prompt
-from tracking3d.batch.beside import videos_of
 from tracking3d.batch.one_video import LOGS
-from tracking3d.batch.places import absolute, is_folder, local, parent
 from tracking3d.batch.rows import VideoRow
+from tracking3d.batch.sidecar_files import videos_of
+from tracking3d.batch.storage import absolute, is_folder, local, parent
 from tracking3d.batch.tables import is_table, read_table
 from tracking3d.batch.video_job import VideoJob
 from tracking3d.benchmark.sequences import Dataset
@@ -22,6 +21,7 @@ from tracking3d.config.models import PipelineConfig
 from tracking3d.datasets.layout import load_layout
 from tracking3d.datasets.reading import read_sequence
 from tracking3d.errors import InputError, Tracking3dError
+from tracking3d.pipeline.validation import needs_prompt
 
 Configure = Callable[[VideoRow], PipelineConfig]
 """Makes the pipeline of a row."""
@@ -67,14 +67,14 @@ def dataset_jobs(dataset: Dataset, config: PipelineConfig) -> list[VideoJob]:
 def _of_sequence(dataset: Dataset, name: str, config: PipelineConfig) -> VideoJob:
     root = str(dataset.root.absolute())
     layout = str(Path(dataset.layout).absolute()) if Path(dataset.layout).is_file() else dataset.layout
-    job = VideoJob(name, joined_name(root, name), config, sequence=(layout, root, name))
+    job = VideoJob(name, join_name(root, name), config, sequence=(layout, root, name))
     try:
         truth = read_sequence(load_layout(layout), dataset.root, name)
     except Tracking3dError as error:
         return replace(job, fault=str(error))
     if truth.box is None and needs_prompt(config):
         return replace(job, fault=f"{name} has no box in its first frame; a mask tracker cannot start.")
-    camera, given = truth.told_camera or truth.camera, config.camera
+    camera, given = truth.given_camera or truth.camera, config.camera
     if camera is not None and truth.camera_told and given.intrinsics is None and given.fov is None:
         told = given.model_copy(update={"intrinsics": (camera.fx, camera.fy, camera.cx, camera.cy)})
         config = config.model_copy(update={"camera": told})
@@ -83,7 +83,7 @@ def _of_sequence(dataset: Dataset, name: str, config: PipelineConfig) -> VideoJo
     return replace(job, config=config, box=box, size=size)
 
 
-def joined_name(root: str, name: str) -> str:
+def join_name(root: str, name: str) -> str:
     """A sequence of a dataset as messages call it."""
     return posixpath.join(root, name)
 

@@ -14,20 +14,20 @@ from pathlib import Path
 from typing import Any
 
 from tracking3d.batch.networks import SharedNetwork, keep_networks
-from tracking3d.batch.places import absolute, copy_to_local, join_path, local, remove, send, write
+from tracking3d.batch.storage import absolute, copy_to_local, join_path, local, remove, send, write
 from tracking3d.batch.summary import MARKER, write_marker
 from tracking3d.batch.video_job import VideoJob
 from tracking3d.config.models import PipelineConfig
-from tracking3d.corrections import parse_correction
 from tracking3d.datasets.layout import load_layout
 from tracking3d.datasets.reading import read_sequence
 from tracking3d.engines.protocol import Tell
 from tracking3d.errors import InputError, OutputError
 from tracking3d.frames import SkippedFrame
-from tracking3d.open_tracking import request_tracking
-from tracking3d.point_prompts import parse_points
-from tracking3d.prompts import PromptSet, parse_box
-from tracking3d.recording import RecordOptions, record_tracking
+from tracking3d.pipeline.open_tracking import request_tracking
+from tracking3d.pipeline.record import RecordOptions, record_tracking
+from tracking3d.prompts.corrections import parse_correction
+from tracking3d.prompts.points import parse_points
+from tracking3d.prompts.prompt import PromptSet, parse_box
 from tracking3d.report.several import write_reports
 from tracking3d.results import layout
 from tracking3d.results.files import write_atomic, writing
@@ -90,15 +90,15 @@ def track_video(
     Raises:
         Tracking3dError: If it cannot be tracked; what is finished is kept for another time.
     """
-    with worked_on(job, out, networks) as work:
-        attempts = counted(work)
+    with local_work_folder(job, out, networks) as work:
+        attempts = count_attempt(work)
         run = work / RUN
-        _track(tell, fetched(job, work / "source"), run, command)
+        _track(tell, fetch_inputs(job, work / "source"), run, command)
         return put_away(job, out, work, layout.runs_in(run), report, attempts)
 
 
 @contextmanager
-def worked_on(job: VideoJob, out: str, networks: tuple[SharedNetwork, ...] = ()) -> Iterator[Path]:
+def local_work_folder(job: VideoJob, out: str, networks: tuple[SharedNetwork, ...] = ()) -> Iterator[Path]:
     """The folder that a video is worked on in; what went wrong within leaves there what can be gone on from.
 
     Args:
@@ -185,7 +185,7 @@ def _source(job: VideoJob) -> FrameSource:
     return ImageSequence(name, frames, range(len(frames)))
 
 
-def fetched(job: VideoJob, folder: Path) -> VideoJob:
+def fetch_inputs(job: VideoJob, folder: Path) -> VideoJob:
     """The same job with files that are elsewhere copied to this machine."""
 
     def here(place: str, number: int) -> str:
@@ -235,14 +235,14 @@ def send_log(out: str, job: VideoJob) -> bool:
     return log.is_file()
 
 
-def counted(work: Path) -> int:
+def count_attempt(work: Path) -> int:
     """How often a video has been begun, with this time."""
-    times = begun_before(work) + 1
+    times = count_earlier_attempts(work) + 1
     write_atomic(work / _ATTEMPTS, str(times).encode())
     return times
 
 
-def begun_before(work: Path) -> int:
+def count_earlier_attempts(work: Path) -> int:
     """How often a video has been begun; what a full disk has left of the note counts as nothing."""
     with suppress(OSError, ValueError):
         return int((work / _ATTEMPTS).read_text())

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from tracking3d.batch.folder import BatchProgress, Failure
-from tracking3d.batch.places import base, join_path, write
+from tracking3d.batch.storage import base, join_path, write
 from tracking3d.report.rendering import render_page
 from tracking3d.results import layout
 

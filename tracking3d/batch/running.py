@@ -14,7 +14,7 @@ from tracking3d.batch.folder import BatchProgress, Failure, write_progress, writ
 from tracking3d.batch.networks import share_networks
 from tracking3d.batch.one_video import LOGS, WORK, send_log
 from tracking3d.batch.overview import write_overview
-from tracking3d.batch.places import join_path, local, read_many
+from tracking3d.batch.storage import join_path, local, read_many
 from tracking3d.batch.summary import MARKER, read_marker
 from tracking3d.batch.tasks import Tasks, is_finished_video
 from tracking3d.batch.video_job import VideoJob
@@ -111,7 +111,7 @@ class Batch:
         self._tasks = tasks
         return [tasks.first(number) for number in sorted(left, key=lambda number: -self._jobs[number].size)]
 
-    def told(self, event: Event) -> None:
+    def report_outcome(self, event: Event) -> None:
         """Take in what an engine tells."""
         assert self._tasks is not None
         job = self._jobs[self._tasks.video(event.number)]
@@ -158,13 +158,13 @@ class Batch:
             raise problem
 
     def _write_tables(self) -> None:
-        write_tables(self._out, *self._told_so_far())
+        write_tables(self._out, *self._reported_so_far())
 
     def _write_page(self) -> None:
-        rows, failures = self._told_so_far()
+        rows, failures = self._reported_so_far()
         write_overview(self._out, self.progress, rows, self._pictures, failures, self._report)
 
-    def _told_so_far(self) -> tuple[list[Mapping[str, Any]], list[Failure]]:
+    def _reported_so_far(self) -> tuple[list[Mapping[str, Any]], list[Failure]]:
         rows = [row for rows in self._rows.values() for row in rows]
         return rows, sorted(self.failures.values(), key=lambda one: one.run)
 
@@ -289,7 +289,7 @@ def run_batch(
                 first,
                 retries=retries,
                 pause=pause,
-                listener=batch.told,
+                listener=batch.report_outcome,
                 further=tasks.further,
                 meanwhile=batch.write,
             )

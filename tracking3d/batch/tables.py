@@ -8,8 +8,8 @@ import json
 from pathlib import PurePosixPath
 from typing import Any
 
-from tracking3d.batch.places import read
 from tracking3d.batch.rows import VideoRow, read_row
+from tracking3d.batch.storage import read
 from tracking3d.errors import InputError
 
 SUFFIXES = (".csv", ".jsonl", ".ndjson", ".parquet")

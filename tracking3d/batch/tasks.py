@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 from itertools import count
 from typing import Any
 
-from tracking3d.batch.in_parts import begin_in_parts, settle_in_parts, step_in_parts
 from tracking3d.batch.networks import SharedNetwork
 from tracking3d.batch.one_video import log_file, track_video
+from tracking3d.batch.submap_tasks import begin_in_parts, settle_in_parts, step_in_parts
 from tracking3d.batch.video_job import VideoJob
 from tracking3d.engines.protocol import Ended, Task
-from tracking3d.splitting.steps import Step, Steps, steps_of
+from tracking3d.submaps.steps import Step, Steps, steps_of
 
 
 @dataclass

@@ -28,7 +28,7 @@ class VideoJob:
         sequence: Layout, folder and name of a sequence of a dataset, whose images are then the video.
         size: Bytes of the video, where known: large ones are begun first.
         fault: Why it cannot be done, where that is known beforehand.
-        split: Length of the parts that it is cut into, see `tracking3d.splitting.cutting.parse_length`; empty for none.
+        split: Length of the parts that it is cut into, see `tracking3d.submaps.cuts.parse_length`; empty for none.
     """
 
     name: str

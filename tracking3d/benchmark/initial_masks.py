@@ -34,11 +34,11 @@ def masks_for(source: str, truth: Truth, folder: Path) -> Path:
         InputError: If the sequence has no such masks.
     """
     if source == "truth":
-        return _written(truth, _seen(truth), folder)
+        return _write_masks(truth, _read_references(truth), folder)
     if source == "initial":
         if not truth.initial_masks:
             raise InputError(f"{truth.name} comes with no initial masks; choose other --masks.")
-        return _written(truth, truth.initial_masks, folder)
+        return _write_masks(truth, truth.initial_masks, folder)
     if source.startswith((DEGRADED, NOISE)) or source == HAND:
         return _rough(truth, source, folder)
     given = Path(source) / truth.name
@@ -47,7 +47,7 @@ def masks_for(source: str, truth: Truth, folder: Path) -> Path:
     return given
 
 
-def _seen(truth: Truth) -> Mapping[int, MaskReference]:
+def _read_references(truth: Truth) -> Mapping[int, MaskReference]:
     masks = {**truth.masks, **truth.visible_masks}
     if not masks:
         raise InputError(f"{truth.name} has no true masks to start from; choose other --masks.")
@@ -55,7 +55,7 @@ def _seen(truth: Truth) -> Mapping[int, MaskReference]:
 
 
 def _rough(truth: Truth, source: str, folder: Path) -> Path:
-    masks = _seen(truth)
+    masks = _read_references(truth)
     if len(masks) < len(truth.frames):
         raise InputError(
             f"{truth.name} has not a true mask in every frame: there is nothing to degrade there."
@@ -71,7 +71,7 @@ def _rough(truth: Truth, source: str, folder: Path) -> Path:
     return _write(truth, {n: mask for n, mask in enumerate(rough) if mask.any()}, folder)
 
 
-def _written(truth: Truth, masks: Mapping[int, MaskReference], folder: Path) -> Path:
+def _write_masks(truth: Truth, masks: Mapping[int, MaskReference], folder: Path) -> Path:
     return _write(truth, {n: reference.read() for n, reference in masks.items()}, folder)
 
 

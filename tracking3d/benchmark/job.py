@@ -31,9 +31,9 @@ from tracking3d.datasets.run_answers import answers_of_run, is_refined
 from tracking3d.datasets.truth import Truth
 from tracking3d.errors import InputError
 from tracking3d.evaluation.score import score
-from tracking3d.process_memory import resident_memory
-from tracking3d.recording import Listener, record
+from tracking3d.pipeline.record import Listener, record
 from tracking3d.results.files import write_atomic, writing
+from tracking3d.runtime.memory import resident_memory
 from tracking3d.video.image_sequence import ImageSequence
 from tracking3d.video.source import FrameSource
 
@@ -69,7 +69,7 @@ class Job:
     def config(self) -> PipelineConfig:
         """The pipeline, with the camera that the dataset tells a tracker of unless the configuration says one."""
         config = self.variant.config
-        camera = self.truth.told_camera or self.truth.camera
+        camera = self.truth.given_camera or self.truth.camera
         if (
             camera is None
             or not self.truth.camera_told

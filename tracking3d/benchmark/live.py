@@ -14,9 +14,9 @@ from tracking3d.config.models import PipelineConfig
 from tracking3d.datasets.truth import Truth
 from tracking3d.errors import InputError
 from tracking3d.frames import Box, Frame, SkippedFrame
-from tracking3d.pipeline import Session
-from tracking3d.prompts import make_prompt
-from tracking3d.stages import StageTimes
+from tracking3d.pipeline.track import Session
+from tracking3d.prompts.prompt import make_prompt
+from tracking3d.runtime.stage_times import StageTimes
 from tracking3d.video.image_file import read_image
 from tracking3d.video.latest_frames import newest
 

@@ -27,7 +27,7 @@ from tracking3d.evaluation.mask_scores import compare_masks
 from tracking3d.frames import Frame, MaskEstimate, Prompt
 from tracking3d.plugins import TRACKERS, build_plugin, check_options, plugin_label
 from tracking3d.plugins.guard import GuardedTracker
-from tracking3d.prompts import make_prompt
+from tracking3d.prompts.prompt import make_prompt
 from tracking3d.video.image_file import read_image
 
 Start = Literal["box", "mask"]
@@ -205,7 +205,7 @@ def _measure(
     measured = TrackerMeasurement(contestant.label, sequence)
     frames, seconds = [], []
     try:
-        truth = _seen(read_sequence(load_layout(dataset.layout), dataset.root, sequence))
+        truth = _visible_truth(read_sequence(load_layout(dataset.layout), dataset.root, sequence))
         for frame, estimate, took in islice(track_masks(contestant.choice, truth, start), most_frames):
             if frame.index:
                 seconds.append(took)
@@ -217,7 +217,7 @@ def _measure(
     return replace(measured, frames=tuple(frames), seconds=tuple(seconds))
 
 
-def _seen(truth: Truth) -> Truth:
+def _visible_truth(truth: Truth) -> Truth:
     return replace(truth, masks={**truth.masks, **truth.visible_masks})
 
 

@@ -97,7 +97,7 @@ def make_pairs(images: Sequence[Image], seed: int = 0, size: int = 256) -> list[
     """
     pairs = []
     for number, image in enumerate(images):
-        scaled = _scaled(image, size)
+        scaled = _rescale(image, size)
         for strength in STRENGTHS:
             rng = np.random.default_rng([seed, number, round(100 * strength)])
             if pair := _make_pair(scaled, size, strength, rng):
@@ -125,7 +125,7 @@ def matching_scores(
     return MatchingScores(everywhere, nearby, errors.shape[1])
 
 
-def _scaled(image: Image, size: int) -> NDArray[np.float32]:
+def _rescale(image: Image, size: int) -> NDArray[np.float32]:
     """The image in [0, 1], its shorter side from ``size`` to twice that."""
     shorter = min(image.shape[:2])
     scale = min(max(shorter, size), 2 * size) / shorter
@@ -137,7 +137,7 @@ def _scaled(image: Image, size: int) -> NDArray[np.float32]:
 def _make_pair(
     photo: NDArray[np.float32], size: int, strength: float, rng: np.random.Generator
 ) -> MatchingPair | None:
-    textured = _textured(photo)
+    textured = _is_textured(photo)
     corners = rng.integers(0, np.array(photo.shape[:2]) - size + 1, (_CANDIDATES, 2)).tolist()
     top, left = max(corners, key=lambda at: np.count_nonzero(_crop(textured, at[0], at[1], size)))
     crop = _crop(photo, top, left, size)
@@ -177,7 +177,7 @@ def _crop(image: NDArray, top: int, left: int, size: int) -> NDArray:
     return image[top : top + size, left : left + size]
 
 
-def _textured(photo: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _is_textured(photo: NDArray[np.float32]) -> NDArray[np.bool_]:
     """``(H, W)``: pixels around which the image changes in every direction; along an edge no place is known."""
     grey = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY)
     derivatives = [cv2.Sobel(grey, cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1))]

@@ -18,7 +18,7 @@ from tracking3d.errors import InputError
 from tracking3d.evaluation.tapvid import THRESHOLDS, first_queries, tapvid_scores, to_tapvid_raster
 from tracking3d.points.follow import follow_points
 from tracking3d.points.uncertainty import FEATURES
-from tracking3d.results.following import open_scene
+from tracking3d.results.point_tracking import open_scene
 from tracking3d.results.run_reader import RunReader, is_finished
 from tracking3d.video.image_file import read_image
 from tracking3d.video.image_sequence import ImageSequence

@@ -21,7 +21,7 @@ from tracking3d.errors import InputError
 from tracking3d.results.description import now, versions
 from tracking3d.results.files import write_atomic, writing
 from tracking3d.results.records import jsonable
-from tracking3d.stages import STAGES
+from tracking3d.runtime.stage_times import STAGES
 
 FORMAT = "tracking3d-results"
 

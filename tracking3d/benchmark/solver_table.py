@@ -28,9 +28,9 @@ from tracking3d.benchmark.table import file_name
 from tracking3d.benchmark.tables import Plan, deep
 from tracking3d.benchmark.variant import Variant
 from tracking3d.errors import InputError
-from tracking3d.pipeline import SOLVERS
+from tracking3d.pipeline.track import SOLVERS
 from tracking3d.results.files import write_atomic, writing
-from tracking3d.stages import STAGES
+from tracking3d.runtime.stage_times import STAGES
 
 NAME = "online"
 
@@ -116,13 +116,13 @@ def plan(base: Variant) -> Plan:
     for solver in ("paper", NAME):
         settings: dict[str, Any] = own if own["name"] == solver else {"name": solver}
         if solver == "paper":
-            settings = {**settings, "final_refine": False, "correct_tracker": False}
+            settings = {**settings, "final_refine": False, "tracker_feedback": False}
         for features in ("RGB", "S2DNet"):
             label = f"{solver}, {features}"
             if solver not in SOLVERS:
                 variants[label] = f"there is no solver {solver}"
             elif features == "RGB":
-                variants[label] = base.changed(label, features={"name": "rgb"}, solver=settings)
+                variants[label] = base.with_changes(label, features={"name": "rgb"}, solver=settings)
             else:
                 variants[label] = deep(base, label, solver=settings)
     return variants

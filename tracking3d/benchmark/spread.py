@@ -80,7 +80,7 @@ def plan(base: Variant) -> tuple[list[Variant], dict[str, str]]:
 
     Those whose kernels are the ones that the processor takes anyway are left out too: they are one computation.
     """
-    variants, left_out = [base.changed(AS_IT_IS)], {}
+    variants, left_out = [base.with_changes(AS_IT_IS)], {}
     seen = {detect_kernels({}): AS_IT_IS}
     for label, environment in KERNELS.items():
         kernels = detect_kernels(environment)
@@ -90,14 +90,14 @@ def plan(base: Variant) -> tuple[list[Variant], dict[str, str]]:
             left_out[label] = f"they are those of '{seen[kernels]}' ({kernels.openblas}, {kernels.aten})"
         else:
             seen[kernels] = label
-            variants.append(base.changed(label).model_copy(update={"environment": environment}))
+            variants.append(base.with_changes(label).model_copy(update={"environment": environment}))
     usual = base.config.runtime.renderer
     for renderer in RENDERERS:
         if renderer != ("numba" if usual == "auto" else usual):
-            variants.append(base.changed(f"renderer {renderer}", runtime__renderer=renderer))
+            variants.append(base.with_changes(f"renderer {renderer}", runtime__renderer=renderer))
     for seed in NOISE_SEEDS:
         label = f"one grey level of noise, seed {seed}"
-        variants.append(base.changed(label).model_copy(update={"grey_noise": seed}))
+        variants.append(base.with_changes(label).model_copy(update={"grey_noise": seed}))
     return variants, left_out
 
 

@@ -104,7 +104,7 @@ def fill(
         address: Of a Ray cluster that runs them; this machine if None.
     """
     plan = table.plan(base, dataset.synthetic, initial or {})
-    chosen = _chosen(table, dataset)
+    chosen = _choose_sequences(table, dataset)
     used = {row.plan for row in table.rows}
     variants = {
         name: variant for name, variant in plan.items() if isinstance(variant, Variant) and name in used
@@ -122,7 +122,7 @@ def file_name(label: str) -> str:
     return "_".join("".join(sign if sign.isalnum() else " " for sign in label.lower()).split())
 
 
-def _chosen(table: Table, dataset: Dataset) -> Dataset:
+def _choose_sequences(table: Table, dataset: Dataset) -> Dataset:
     if dataset.synthetic:
         return dataset.only(list(table.sequences))
     if not 0 < table.sample < len(dataset.sequences):

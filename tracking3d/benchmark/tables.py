@@ -87,12 +87,12 @@ class Table:
         return replace(self, rows=tuple(chosen))
 
 
-def _started(base: Variant, label: str, iou: float, synthetic: bool, given: Path | None) -> Variant | str:
+def _start_from(base: Variant, label: str, iou: float, synthetic: bool, given: Path | None) -> Variant | str:
     """``base`` from the masks of the tracker ``label``: its own where given, their likeness on synthetic data."""
     if given is not None:
-        return base.changed(label, masks=str(given))
+        return base.with_changes(label, masks=str(given))
     if synthetic:
-        return base.changed(label, masks=f"{DEGRADED}{iou:g}")
+        return base.with_changes(label, masks=f"{DEGRADED}{iou:g}")
     return f"needs the masks of {label}: --initial {label.lower()}=DIR"
 
 
@@ -101,15 +101,15 @@ def deep(base: Variant, label: str, **settings: Any) -> Variant | str:
     known = (info for info in list_plugins() if (info.group, info.name) == (FEATURES, DEEP))
     if not any(info.status == "ok" for info in known):
         return f"needs the feature encoder {DEEP}, which is not installed"
-    return base.changed(label, features={"name": DEEP}, **settings)
+    return base.with_changes(label, features={"name": DEEP}, **settings)
 
 
 def _cdtb(base: Variant, synthetic: bool, initial: Mapping[str, Path]) -> Plan:
     plan: Plan = {
-        name: _started(base, name, paper_numbers.CDTB[name].value, synthetic, initial.get(name.lower()))
+        name: _start_from(base, name, paper_numbers.CDTB[name].value, synthetic, initial.get(name.lower()))
         for name in ("CSR-DCF", "D3S", "OSTrack")
     }
-    tracked = base.changed("csrt of this package", masks="tracker", tracker={"name": "csrt"})
+    tracked = base.with_changes("csrt of this package", masks="tracker", tracker={"name": "csrt"})
     plan["csrt"] = tracked
     if not synthetic and "csr-dcf" not in initial:
         plan["CSR-DCF"] = tracked
@@ -118,17 +118,17 @@ def _cdtb(base: Variant, synthetic: bool, initial: Mapping[str, Path]) -> Plan:
 
 def _in_hand(base: Variant, synthetic: bool, initial: Mapping[str, Path]) -> Plan:
     iou = paper_numbers.IN_HAND["OSTrack"].value
-    return {"OSTrack": _started(base, "OSTrack", iou, synthetic, initial.get("ostrack"))}
+    return {"OSTrack": _start_from(base, "OSTrack", iou, synthetic, initial.get("ostrack"))}
 
 
 def _coin(base: Variant, synthetic: bool, initial: Mapping[str, Path]) -> Plan:
     iou = paper_numbers.COIN["Coin tracking"].value
-    start = _started(base, "Coin tracking", iou, synthetic, initial.get("coin tracking"))
+    start = _start_from(base, "Coin tracking", iou, synthetic, initial.get("coin tracking"))
     if isinstance(start, str):
         return dict.fromkeys(("RGB", "RGB, flat prior", "S2DNet", "S2DNet, flat prior"), start)
     return {
-        "RGB": start.changed("RGB"),
-        "RGB, flat prior": start.changed("RGB, flat prior", object__flat=True),
+        "RGB": start.with_changes("RGB"),
+        "RGB, flat prior": start.with_changes("RGB, flat prior", object__flat=True),
         "S2DNet": deep(start, "S2DNet"),
         "S2DNet, flat prior": deep(start, "S2DNet, flat prior", object__flat=True),
     }
@@ -153,7 +153,7 @@ def _ablation_start(base: Variant, synthetic: bool, initial: Mapping[str, Path])
     if base.config.solver.name != "paper":
         return "changes settings of the solver paper: --preset rerendering"
     iou = paper_numbers.ABLATION["initial masks (OSTrack)"].value
-    return _started(base, "OSTrack", iou, synthetic, initial.get("ostrack"))
+    return _start_from(base, "OSTrack", iou, synthetic, initial.get("ostrack"))
 
 
 def _ablation(base: Variant, synthetic: bool, initial: Mapping[str, Path]) -> Plan:
@@ -161,9 +161,9 @@ def _ablation(base: Variant, synthetic: bool, initial: Mapping[str, Path]) -> Pl
     if isinstance(start, str):
         return dict.fromkeys(("RGB", "S2DNet", *LOSSES), start)
     return {
-        "RGB": start.changed("RGB"),
+        "RGB": start.with_changes("RGB"),
         "S2DNet": deep(start, "S2DNet"),
-        **{label: start.changed(label, **settings) for label, settings in LOSSES.items()},
+        **{label: start.with_changes(label, **settings) for label, settings in LOSSES.items()},
     }
 
 
@@ -172,7 +172,7 @@ def _keyframes(base: Variant, synthetic: bool, initial: Mapping[str, Path]) -> P
     if isinstance(start, str):
         return {str(count): start for count in paper_numbers.KEYFRAMES}
     return {
-        str(count): start.changed(str(count), solver__keyframes__maximum=count)
+        str(count): start.with_changes(str(count), solver__keyframes__maximum=count)
         for count in paper_numbers.KEYFRAMES
     }
 
@@ -180,20 +180,20 @@ def _keyframes(base: Variant, synthetic: bool, initial: Mapping[str, Path]) -> P
 def _bop(base: Variant, synthetic: bool, initial: Mapping[str, Path]) -> Plan:
     iou = paper_numbers.CDTB["OSTrack"].value
     plan: Plan = {
-        "csrt": base.changed("csrt", masks="tracker", tracker={"name": "csrt"}),
-        "OSTrack": _started(base, "OSTrack", iou, synthetic, initial.get("ostrack")),
+        "csrt": base.with_changes("csrt", masks="tracker", tracker={"name": "csrt"}),
+        "OSTrack": _start_from(base, "OSTrack", iou, synthetic, initial.get("ostrack")),
     }
-    plan["truth"] = base.changed("true masks", masks="truth")
+    plan["truth"] = base.with_changes("true masks", masks="truth")
     return plan
 
 
 def _features(base: Variant, synthetic: bool, initial: Mapping[str, Path]) -> Plan:
     iou = paper_numbers.CDTB["OSTrack"].value
     starts: dict[str, Variant | str] = {
-        name: base.changed(name, masks="tracker", tracker={"name": name}) for name in ("csrt", "flow")
+        name: base.with_changes(name, masks="tracker", tracker={"name": name}) for name in ("csrt", "flow")
     }
-    starts["OSTrack"] = _started(base, "OSTrack", iou, synthetic, initial.get("ostrack"))
-    starts["true masks"] = base.changed("true masks", masks="truth")
+    starts["OSTrack"] = _start_from(base, "OSTrack", iou, synthetic, initial.get("ostrack"))
+    starts["true masks"] = base.with_changes("true masks", masks="truth")
     plan: Plan = {}
     for name, start in starts.items():
         for prior, settings in FLAT.items():
@@ -202,7 +202,7 @@ def _features(base: Variant, synthetic: bool, initial: Mapping[str, Path]) -> Pl
                 if isinstance(start, str):
                     plan[label] = start
                 elif features == "RGB":
-                    plan[label] = start.changed(label, features={"name": "rgb"}, **settings)
+                    plan[label] = start.with_changes(label, features={"name": "rgb"}, **settings)
                 else:
                     plan[label] = deep(start, label, **settings)
     return plan

@@ -24,7 +24,7 @@ from tracking3d.errors import InputError
 from tracking3d.results import layout
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader, read_records
-from tracking3d.stages import STAGES, StageTimes
+from tracking3d.runtime.stage_times import STAGES, StageTimes
 
 PERCENTILES = (50, 95, 100)
 _WARM_UP = 2  # frames of a run before the measured ones: it compiles kernels, and reads files once
@@ -125,7 +125,7 @@ def _run(truth: Truth, contender: Contender, folder: Path, frames: int | None) -
         said = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
         raise InputError(f"{contender.name} cannot track {truth.name}: {said}")
     spent = None if before is None or after is None else after - before
-    return _told(contender.name, folder, wall, spent)
+    return _parse_speed(contender.name, folder, wall, spent)
 
 
 def _compile_ahead(contender: Contender) -> None:
@@ -144,7 +144,7 @@ def _python(contender: Contender, module: str, *words: str) -> subprocess.Comple
     return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
 
 
-def _told(name: str, folder: Path, wall: float, processor: float | None) -> TrackSpeed:
+def _parse_speed(name: str, folder: Path, wall: float, processor: float | None) -> TrackSpeed:
     """What a run folder tells of its run."""
     reader = RunReader(folder)
     run = reader.description
@@ -176,7 +176,7 @@ def _told(name: str, folder: Path, wall: float, processor: float | None) -> Trac
     )
 
 
-def checked_out(tag: str, folder: Path) -> Path:
+def check_out(tag: str, folder: Path) -> Path:
     """The package as it was at a tag, unpacked into ``folder``; the folder that holds it.
 
     Raises:

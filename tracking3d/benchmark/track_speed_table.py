@@ -10,7 +10,7 @@ from rich.table import Table
 
 from tracking3d.benchmark.track_speed import PERCENTILES, TrackSpeed
 from tracking3d.errors import OutputError
-from tracking3d.stages import STAGES
+from tracking3d.runtime.stage_times import STAGES
 
 _TALLEST = 5  # times the median frame that a plot shows; of a longer one it says how long it is
 

@@ -45,7 +45,7 @@ class Variant(BaseModel):
         """What a run depends on beside configuration and masks; empty where that is nothing."""
         return (self.environment, self.grey_noise) if self.environment or self.grey_noise is not None else ()
 
-    def changed(self, label: str, *, masks: str | None = None, **settings: Any) -> Variant:
+    def with_changes(self, label: str, *, masks: str | None = None, **settings: Any) -> Variant:
         """A variant with other masks and settings: ``solver__weights__motion=0`` sets that key."""
         document = self.config.model_dump()
         for path, value in settings.items():

@@ -90,7 +90,7 @@ class System:
 
     def step(self, damping: float) -> tuple[FloatArray, FloatArray] | None:
         """Damped step of poses ``(C,)`` and points ``(N, 3)``; None where there is none."""
-        poses, points = _damped(self.poses, damping), _damped(self.points, damping)
+        poses, points = _damp(self.poses, damping), _damp(self.points, damping)
         from tracking3d.bundle_adjustment.kernels import elimination
 
         return elimination.step(poses, points, self.coupling, self.poses_gradient, self.points_gradient)
@@ -116,26 +116,26 @@ class AdjustmentProblem:
         K[1, 1] *= focal_factor
         return K
 
-    def evaluated(self, at: Structure) -> Structure:
+    def evaluate(self, at: Structure) -> Structure:
         """With its cost and its residuals."""
         from tracking3d.bundle_adjustment.kernels import normal_equations
 
         given = self.pixels, self.weight, self.intrinsics(at.focal_factor), at.R, at.t, at.points
-        total, residual = normal_equations.evaluated(*given, self.scale)
+        total, residual = normal_equations.evaluate(*given, self.scale)
         total += float(np.sum(self.prior_weight * np.sum((at.points - self.prior) ** 2, 1)))
         return replace(at, cost=float(total / max(self.weight.sum(), 1e-12)), residual=residual)
 
-    def linearised(self, at: Structure) -> System:
+    def linearize(self, at: Structure) -> System:
         """The quadratic model of the weighted sum of losses."""
         from tracking3d.bundle_adjustment.kernels import normal_equations
 
         given = self.pixels, self.weight, self.intrinsics(at.focal_factor), at.R, at.t, at.points
-        system = System(*normal_equations.linearised(*given, self.scale, self.fixed, self.free_focal))
+        system = System(*normal_equations.linearize(*given, self.scale, self.fixed, self.free_focal))
         points = system.points + 2 * self.prior_weight[:, None, None] * np.eye(3)
         points_gradient = system.points_gradient + 2 * self.prior_weight[:, None] * (at.points - self.prior)
         return replace(system, points=points, points_gradient=points_gradient)
 
-    def stepped(self, at: Structure, d_poses: FloatArray, d_points: FloatArray) -> Structure:
+    def step_by(self, at: Structure, d_poses: FloatArray, d_points: FloatArray) -> Structure:
         """After a step."""
         factor, t = 1.0, at.t
         if self.free_focal:
@@ -203,14 +203,14 @@ def adjust(
         prior_weight=np.where(held, point_prior_weight, 0.0),
     )
     begun = replace(start, points=np.where(known[:, None], start.points, 0.0))
-    best = problem.evaluated(begun)
+    best = problem.evaluate(begun)
     damping, tried, settled = _FIRST_DAMPING, 0, False
     while tried < iterations and not settled:
-        system = problem.linearised(best)
+        system = problem.linearize(best)
         for _ in range(_TRIES):
             tried += 1
             step = system.step(damping)
-            better = None if step is None else problem.evaluated(problem.stepped(best, *step))
+            better = None if step is None else problem.evaluate(problem.step_by(best, *step))
             if better is not None and better.cost < best.cost:
                 settled = best.cost - better.cost < converged * best.cost
                 best, damping = better, max(damping / 10, _LEAST_DAMPING)
@@ -219,7 +219,7 @@ def adjust(
         else:
             settled = True
     if fixed == 1 and not problem.prior_weight.any():
-        best = problem.evaluated(_with_depth_of(begun, best, problem.weight.max(0, initial=0.0) > 0))
+        best = problem.evaluate(_with_depth_of(begun, best, problem.weight.max(0, initial=0.0) > 0))
     points = np.where(known[:, None], best.points, np.nan)
     return replace(best, points=points, iterations=tried)
 
@@ -241,7 +241,7 @@ def _with_depth_of(reference: Structure, structure: Structure, used: NDArray[np.
     return replace(structure, t=t, points=points)
 
 
-def _damped(matrix: FloatArray, damping: float) -> FloatArray:
+def _damp(matrix: FloatArray, damping: float) -> FloatArray:
     """Levenberg-Marquardt's: a share of each diagonal entry more, and a floor that keeps unseen parts still."""
     diagonal = np.einsum("...ii->...i", matrix)
     floor = 1e-9 * diagonal.max(initial=0.0) + 1e-12

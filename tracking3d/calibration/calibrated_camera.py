@@ -72,7 +72,7 @@ def as_coefficients(model: Model, values: tuple[float, ...], what: str) -> tuple
     return (*values, *[0.0] * (count - len(values)))
 
 
-def checked_camera(camera: CalibratedCamera, path: Path) -> CalibratedCamera:
+def validate_camera(camera: CalibratedCamera, path: Path) -> CalibratedCamera:
     """The camera, with as many coefficients as its model has."""
     fx, fy, *_ = camera.intrinsics
     numbers = (*camera.intrinsics, *camera.coefficients)

@@ -19,14 +19,14 @@ def read_camera(name: str | Path) -> CalibratedCamera:
     Raises:
         InputError: If it is not there, none of those formats, or a camera with a lens that is not known.
     """
-    path, chosen = _split(str(name))
+    path, chosen = _split_path(str(name))
     text = _text(path)
     if path.suffix.casefold() == ".txt":
-        return _chosen(colmap_cameras(text, path), chosen, path)
-    return _chosen(yaml_cameras(text, path), chosen, path)
+        return _choose_camera(colmap_cameras(text, path), chosen, path)
+    return _choose_camera(yaml_cameras(text, path), chosen, path)
 
 
-def _split(name: str) -> tuple[Path, str | None]:
+def _split_path(name: str) -> tuple[Path, str | None]:
     path = Path(name).expanduser()
     file, colon, chosen = name.rpartition(":")
     if colon and file and not path.exists() and Path(file).expanduser().is_file():
@@ -50,7 +50,7 @@ def _text(path: Path) -> str:
         raise InputError(f"The camera file {path} cannot be read: {reason}.") from error
 
 
-def _chosen(
+def _choose_camera(
     cameras: Mapping[str, Callable[[], CalibratedCamera]], chosen: str | None, path: Path
 ) -> CalibratedCamera:
     names = ", ".join(cameras)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from tracking3d.calibration.calibrated_camera import CalibratedCamera, checked_camera
+from tracking3d.calibration.calibrated_camera import CalibratedCamera, validate_camera
 from tracking3d.errors import InputError
 from tracking3d.geometry.lens import Model
 
@@ -56,7 +56,7 @@ def colmap_cameras(text: str, path: Path) -> dict[str, Callable[[], CalibratedCa
             raise InputError(
                 f"The camera {line[0]} of {path} has not the numbers that the model {name} has; restore the file."
             ) from None
-        return checked_camera(
+        return validate_camera(
             CalibratedCamera((fx, fy, cx, cy), model, k, (width, height), f"{path.name}"), path
         )
 

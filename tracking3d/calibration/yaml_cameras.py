@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from tracking3d.calibration.calibrated_camera import CalibratedCamera, checked_camera
+from tracking3d.calibration.calibrated_camera import CalibratedCamera, validate_camera
 from tracking3d.errors import InputError
 from tracking3d.geometry.lens import Model
 
@@ -105,7 +105,7 @@ def _opencv(content: Mapping[Any, Any], path: Path) -> CalibratedCamera:
     camera = CalibratedCamera(
         (K[0], K[4], K[2], K[5]), "fisheye" if fisheye else "radtan", k, size, path.name
     )
-    return checked_camera(camera, path)
+    return validate_camera(camera, path)
 
 
 def _kalibr(content: Mapping[str, Any], path: Path) -> CalibratedCamera:
@@ -131,7 +131,7 @@ def _kalibr(content: Mapping[str, Any], path: Path) -> CalibratedCamera:
     if size is not None and (not isinstance(size, list) or len(size) != 2):
         raise InputError(f"The resolution in {path} is not width and height; restore the file.")
     wide = None if size is None else (_whole(size[0], path), _whole(size[1], path))
-    return checked_camera(
+    return validate_camera(
         CalibratedCamera((fx, fy, cx, cy), models[lens], k if lens != "none" else (), wide, path.name), path
     )
 

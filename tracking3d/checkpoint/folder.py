@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.checkpoint.milestones import Milestones, keep_milestones_only
-from tracking3d.checkpoint.progress import JournalEntry, Kept, RunProgress, journal_line, read_journal
-from tracking3d.checkpoint.trees import TreeFolder
+from tracking3d.checkpoint.progress import JournalEntry, RunProgress, SavedState, journal_line, read_journal
+from tracking3d.checkpoint.serialization import TreeFolder
 from tracking3d.errors import InputError
 from tracking3d.frames import SkippedFrame
 from tracking3d.results import layout
@@ -98,7 +98,7 @@ class Checkpoint:
                     self._milestones.keep(self._folder / layout.STATE_FILE, count, self._trees.arrays)
             self._trees.tidy(self._milestones.arrays)
 
-    def read(self) -> Kept:
+    def read(self) -> SavedState:
         """What was kept last.
 
         Raises:
@@ -118,7 +118,9 @@ class Checkpoint:
                 raise ValueError(f"{journal.name} is too short")
             taken, skipped = read_journal(text)
             self._taken = {index: number for number, index in enumerate(taken, 1)}
-            kept = Kept(RunProgress(**state["progress"]), self._trees.read(state["session"]), taken, skipped)
+            kept = SavedState(
+                RunProgress(**state["progress"]), self._trees.read(state["session"]), taken, skipped
+            )
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise InputError(f"{path} is damaged ({error}); start anew with {layout.OVERWRITE}.") from error
         return kept

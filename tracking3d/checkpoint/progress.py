@@ -58,12 +58,12 @@ class JournalEntry:
 
 
 @dataclass(frozen=True)
-class Kept:
+class SavedState:
     """A run that was stopped.
 
     Attributes:
         progress: Where it stands.
-        session: The session's state, see `tracking3d.session.Session.kept`.
+        session: The session's state, see `tracking3d.pipeline.session.Session.kept`.
         taken: The frames that were taken, by index.
         skipped: Those that were not.
     """
@@ -107,7 +107,7 @@ def read_journal(text: bytes) -> tuple[dict[int, JournalEntry], tuple[SkippedFra
     return taken, tuple(skipped)
 
 
-def check_picture(kept: Kept, frame: Frame | SkippedFrame) -> None:
+def check_picture(kept: SavedState, frame: Frame | SkippedFrame) -> None:
     """Make sure that a frame is the one that was answered before the run was stopped.
 
     Raises:

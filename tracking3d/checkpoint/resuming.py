@@ -11,9 +11,9 @@ from pydantic import ValidationError
 
 from tracking3d.checkpoint.progress import checksum
 from tracking3d.config.models import PipelineConfig
-from tracking3d.corrections import Correction
 from tracking3d.errors import InputError, OutputError
 from tracking3d.frames import Frame, Prompt
+from tracking3d.prompts.corrections import Correction
 from tracking3d.results import layout
 from tracking3d.results.lock import is_locked
 from tracking3d.results.records import jsonable
@@ -24,7 +24,7 @@ Earlier = Literal["none", "stopped", "finished", "outdated"]
 frame that is answered is now corrected."""
 
 
-def given_of(
+def prompt_record(
     first: Frame,
     prompt: Prompt | None,
     count: int | None,
@@ -44,7 +44,7 @@ def given_of(
     mask = None if prompt is None or prompt.mask is None else checksum(prompt.mask.astype("uint8"))
     return {
         "start_frame": start_frame,
-        "corrections": [_told(one) for one in sorted(corrections, key=lambda one: one.frame)],
+        "corrections": [_correction_record(one) for one in sorted(corrections, key=lambda one: one.frame)],
         "frames": count,
         "width": width,
         "height": height,
@@ -56,7 +56,7 @@ def given_of(
     }
 
 
-def _told(correction: Correction) -> dict[str, Any]:
+def _correction_record(correction: Correction) -> dict[str, Any]:
     """A correction as ``run.json`` has it."""
     mask, points = correction.mask, correction.points
     return {

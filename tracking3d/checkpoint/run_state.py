@@ -8,8 +8,8 @@ from dataclasses import replace
 from typing import Any
 
 from tracking3d.checkpoint.folder import Checkpoint
-from tracking3d.checkpoint.progress import JournalEntry, Kept, RunProgress
-from tracking3d.checkpoint.trees import UnkeptError
+from tracking3d.checkpoint.progress import JournalEntry, RunProgress, SavedState
+from tracking3d.checkpoint.serialization import NotSerializableError
 
 _log = logging.getLogger(__name__)
 
@@ -28,7 +28,7 @@ class RunState:
         progress: How far the run is now.
     """
 
-    def __init__(self, checkpoint: Checkpoint | None = None, kept: Kept | None = None) -> None:
+    def __init__(self, checkpoint: Checkpoint | None = None, kept: SavedState | None = None) -> None:
         self.checkpoint, self.kept = checkpoint, kept
         self.progress = self.before = kept.progress if kept else RunProgress()
         self._past = {*kept.taken, *(one.index for one in kept.skipped)} if kept else set()
@@ -60,7 +60,7 @@ class RunState:
             return
         try:
             self.checkpoint.save(self.progress, session, taken, revised)
-        except UnkeptError as error:
+        except NotSerializableError as error:
             _log.warning("This run cannot be resumed when it is stopped: %s.", error)
             self.checkpoint.remove()
             self.checkpoint = None

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from tracking3d.checkpoint.resuming import Earlier, changed_frames, earlier_run
-from tracking3d.checkpoint.rolling_back import remove_empty, remove_run, rolled_back
+from tracking3d.checkpoint.rollback import remove_empty, remove_run, roll_back
 from tracking3d.errors import InputError, OutputError
 from tracking3d.results import layout
 from tracking3d.results.files import writing
@@ -23,7 +23,7 @@ from tracking3d.results.run_reader import is_finished
 _log = logging.getLogger(__name__)
 
 
-def corrected_aside(
+def stage_correction(
     folder: Path,
     config: Mapping[str, Any],
     selection: str | None,
@@ -58,7 +58,7 @@ def corrected_aside(
         return stage, "stopped"
     remove_run(stage)
     changed = changed_frames(folder, given)
-    answered = rolled_back(folder, stage, changed)
+    answered = roll_back(folder, stage, changed)
     if answered is None:
         _log.warning(
             "No state of before frame %d was kept in %s, so that all is computed again; frames before the correction "

@@ -31,13 +31,13 @@ class _VideoFirst(TyperGroup):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Insert ``video`` if the first word names no command, also if it is an option."""
-        return list(super().parse_args(ctx, self._named(args)))
+        return list(super().parse_args(ctx, self._name_of(args)))
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """The command and its arguments."""
-        return super().resolve_command(ctx, self._named(args))
+        return super().resolve_command(ctx, self._name_of(args))
 
-    def _named(self, args: list[str]) -> list[str]:
+    def _name_of(self, args: list[str]) -> list[str]:
         return ["video", *args] if args and args[0] not in (*self.commands, "--help") else args
 
 

@@ -62,7 +62,7 @@ def _print(comparison: RunComparison) -> None:
 
     from tracking3d.cli.tables import format_value, print_table
     from tracking3d.report.differences import run_figures
-    from tracking3d.stages import STAGES
+    from tracking3d.runtime.stage_times import STAGES
 
     names = [escape(name) for name in comparison.names]
 

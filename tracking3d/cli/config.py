@@ -27,8 +27,8 @@ def show(
     import yaml
 
     from tracking3d.config.loading import layers_in_words
+    from tracking3d.pipeline.tracker_selection import AUTO
     from tracking3d.plugins import FEATURES, TRACKERS, check_options
-    from tracking3d.tracker_choice import AUTO
 
     settings = configure(config, preset, overrides, quality)
     shown = settings.model_dump(mode="json")

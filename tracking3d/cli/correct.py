@@ -33,9 +33,9 @@ def correct(
     import logging
 
     from tracking3d.cli.progress import print_summary, progress
-    from tracking3d.cli.report import reported
-    from tracking3d.corrected_run import correct_run, object_folders_of
-    from tracking3d.corrections import parse_correction
+    from tracking3d.cli.report import report_progress
+    from tracking3d.pipeline.correct import correct_run, object_folders_of
+    from tracking3d.prompts.corrections import parse_correction
     from tracking3d.results.layout import CORRECTING, RUN, has_state
     from tracking3d.results.run_reader import RunReader
 
@@ -45,7 +45,7 @@ def correct(
     for folder, theirs in by_folder.items():
         count = len(RunReader(folder).frames)
         with ExitStack() as ends:
-            reporting = ends.enter_context(reported([folder] if report else []))
+            reporting = ends.enter_context(report_progress([folder] if report else []))
             listener = reporting(ends.enter_context(progress(count, quiet, 1)))
             try:
                 correct_run(folder, theirs, source=source, listener=listener)

@@ -29,13 +29,13 @@ def demo(
     import json
 
     from tracking3d.cli.progress import print_summary, progress
-    from tracking3d.cli.report import reported
+    from tracking3d.cli.report import report_progress
     from tracking3d.cli.tables import print_figures
     from tracking3d.datasets.clip import read_truth
     from tracking3d.evaluation.score import score_run
-    from tracking3d.open_tracking import request_tracking
-    from tracking3d.prompts import PromptSet
-    from tracking3d.recording import RecordOptions, record_tracking
+    from tracking3d.pipeline.open_tracking import request_tracking
+    from tracking3d.pipeline.record import RecordOptions, record_tracking
+    from tracking3d.prompts.prompt import PromptSet
     from tracking3d.results.files import write_atomic
     from tracking3d.results.layout import REPORT
     from tracking3d.synthesis.convex_clips import make_demo_clip
@@ -47,7 +47,7 @@ def demo(
     box = read_truth(clip).box
     options = RecordOptions(f"tracking3d demo --seed {seed}", overwrite=True)
     request = request_tracking(source, settings, PromptSet.of_one(box))
-    with reported([folder]) as reporting, progress(source.count, quiet) as listener:
+    with report_progress([folder]) as reporting, progress(source.count, quiet) as listener:
         record_tracking(request, folder, options, reporting(listener))
 
     scores = score_run(folder, clip)

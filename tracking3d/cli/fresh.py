@@ -23,7 +23,7 @@ Meshes = Annotated[
 ]
 
 
-def drawn_suite(
+def draw_suite(
     name: str, seed: int | None, count: int | None, meshes: Path | None
 ) -> tuple[str, list[SequenceSpec] | None]:
     """The name of a suite, and its sequences if it is drawn from a seed.

@@ -38,14 +38,14 @@ def model(
 
     `tracking3d run` does this at its end; its option --model chooses how.
     """
-    from tracking3d.reconstruction.of_run import shape_run, texture_run
+    from tracking3d.reconstruction.rebuild import rebuild_shape, retexture_run
 
     if quality is ModelQuality.FINE:
-        shaped = shape_run(run, source, views, largest)
+        shaped = rebuild_shape(run, source, views, largest)
         made, taken = shaped.model, shaped.views
         typer.echo(f"{run}: {len(made.faces)} faces; {shaped.sentence}" if shaped.new else shaped.sentence)
     else:
-        made, taken = texture_run(run, source, views, largest)
+        made, taken = retexture_run(run, source, views, largest)
     size = len(made.texture)
     typer.echo(f"{run}: texture of {size} x {size} texels from {taken} frames")
 
@@ -57,7 +57,7 @@ def check_fine(source: str) -> None:
         InputError: The source is a camera, whose frames cannot be read twice.
         PluginError: A package is missing.
     """
-    from tracking3d.reconstruction.of_run import check_packages
+    from tracking3d.reconstruction.rebuild import check_packages
 
     if source.isdigit() and not Path(source).exists():
         raise InputError(

@@ -14,13 +14,13 @@ if TYPE_CHECKING:
 _ALL = "@all"
 
 
-def given_box(text: str, frame: int) -> Box:
+def parse_given_box(text: str, frame: int) -> Box:
     """Read ``X,Y,WIDTH,HEIGHT``, or the box of frame ``frame`` in a file in VOT's region format.
 
     Raises:
         InputError: The text is neither.
     """
-    from tracking3d.prompts import parse_box
+    from tracking3d.prompts.prompt import parse_box
     from tracking3d.trackers.region_masks import box_in_file
 
     if Path(text).is_file():
@@ -28,7 +28,7 @@ def given_box(text: str, frame: int) -> Box:
     return parse_box(text)
 
 
-def given_masks(file: Path) -> list[Path]:
+def parse_given_masks(file: Path) -> list[Path]:
     """The file itself, or ``FILE@N`` for every object of an indexed image ``FILE@all``.
 
     Raises:
@@ -54,9 +54,9 @@ def check_known(settings: PipelineConfig, objects: int, fine: bool, split: bool)
     Raises:
         InputError: One of them does not.
     """
-    if settings.object.known is None:
+    if settings.object.model is None:
         return
-    from tracking3d.arguments import check_single_known_object as check_one
+    from tracking3d.pipeline.validation import check_single_known_object as check_one
 
     check_one(settings, objects)
     if fine:

@@ -19,7 +19,7 @@ from tracking3d.cli.view import show_address
 if TYPE_CHECKING:
     from tracking3d.config.models import PipelineConfig
     from tracking3d.picker.session import Picked
-    from tracking3d.prompts import PromptSet
+    from tracking3d.prompts.prompt import PromptSet
 
 
 def pick(
@@ -58,7 +58,7 @@ def pick(
     The page shows at once the mask that the tracker makes from it. It also offers the command and a YAML file to copy.
     """
     from tracking3d.cli.tracking import RunDisplay, RunRequest, default_folder, track
-    from tracking3d.recording import RecordOptions
+    from tracking3d.pipeline.record import RecordOptions
     from tracking3d.viewer.opening import check_viser
 
     if view:
@@ -73,7 +73,7 @@ def pick(
 
 def prompts_of(picked: Picked) -> PromptSet:
     """The prompts that were marked in the browser."""
-    from tracking3d.prompts import PromptSet
+    from tracking3d.prompts.prompt import PromptSet
 
     several = len(picked.boxes) + len(picked.masks) > 1
     return PromptSet(picked.boxes, picked.masks, start_frame=picked.frame, as_lists=several)
@@ -106,7 +106,7 @@ def picked_in_browser(
         OutputError: There is a run in the folder.
     """
     from tracking3d.errors import InputError, OutputError
-    from tracking3d.picker.outcome import command_of, save_picked, settings_as_yaml
+    from tracking3d.picker.outcome import command_of, save_outcome, settings_as_yaml
     from tracking3d.picker.server import Picker
     from tracking3d.picker.session import PickingSession
     from tracking3d.results import layout
@@ -124,7 +124,7 @@ def picked_in_browser(
     session = PickingSession(source, images, within(selection, images.count or opened.count or 1), settings)
 
     def save(picked: Picked) -> tuple[str, str]:
-        save_picked(picked, settings, folder, source)
+        save_outcome(picked, settings, folder, source)
         return command_of(picked, folder, source, frames), settings_as_yaml(settings)
 
     picker = Picker(session, save, Access.on(host), port)

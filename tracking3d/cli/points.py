@@ -149,7 +149,7 @@ def _followed(
 ) -> tuple[PointTracks, list[str]]:
     """The tracks that the images correct, if they are read, and what to print about them."""
     from tracking3d.results.correspondences import check_asked, on_mask
-    from tracking3d.results.following import open_scene
+    from tracking3d.results.point_tracking import open_scene
 
     by_images = images is not None and not query.by_mesh
     covered = tracks.on_object | query.any_pixel

@@ -55,7 +55,7 @@ class Program(TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         """Call the command; Ctrl-C or SIGTERM ends it, and its notes are printed."""
         try:
-            with _ended_as_by_ctrl_c():
+            with _end_as_by_ctrl_c():
                 return super().invoke(ctx)
         except KeyboardInterrupt as error:
             _print("interrupted", error)
@@ -67,7 +67,7 @@ _AT_ONCE = 5.0
 
 
 @contextmanager
-def _ended_as_by_ctrl_c() -> Iterator[None]:
+def _end_as_by_ctrl_c() -> Iterator[None]:
     """Let SIGTERM, which containers and batch systems send, end the command as Ctrl-C does.
 
     Some systems send a second one at once; it does not interrupt the writing of results. A later one does, because an
@@ -117,7 +117,7 @@ def _too_little(error: BaseException) -> str:
         return f"the output cannot be written ({error.strerror}); free some disk space, or redirect it elsewhere."
     if isinstance(error, MemoryError) or _NO_MEMORY.search(str(error)):
         return (
-            "there is not enough memory; lower --size (window.size), object.texture_size or solver.most_keyframes, "
+            "there is not enough memory; lower --size (window.size), object.texture_size or solver.max_keyframes, "
             "track fewer objects at once, or close other programs."
         )
     return ""

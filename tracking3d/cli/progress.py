@@ -14,12 +14,12 @@ from rich.table import Table
 
 from tracking3d.cli.tables import format_value, print_table
 from tracking3d.frames import SkippedFrame
-from tracking3d.recording import Listener
+from tracking3d.pipeline.record import Listener
 from tracking3d.results import layout
 from tracking3d.results.description import own_masks, time_per_frame
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
-from tracking3d.stages import STAGES
+from tracking3d.runtime.stage_times import STAGES
 
 _EVERY = 10.0  # seconds between lines of a log
 _COLOURS = {"tracked": "green", "uncertain": "yellow", "lost": "red", "skipped": "red"}
@@ -42,7 +42,7 @@ def progress(count: int | None, quiet: bool, objects: int = 1) -> Iterator[Liste
     """
     console = Console(stderr=True)
     if not console.is_terminal:
-        yield _silent if quiet else _logged(console, count and count * objects)
+        yield _silent if quiet else _log_progress(console, count and count * objects)
         return
     bar = Progress(
         BarColumn(bar_width=24),
@@ -70,7 +70,7 @@ def _silent(frame: FrameRecord | SkippedFrame) -> None:
     pass
 
 
-def _logged(console: Console, count: int | None) -> Listener:
+def _log_progress(console: Console, count: int | None) -> Listener:
     """Print the progress once every `_EVERY` seconds."""
     last, done = time.monotonic(), {False: 0, True: 0}
 

@@ -14,7 +14,7 @@ from tracking3d.errors import Tracking3dError
 
 if TYPE_CHECKING:
     from tracking3d.frames import SkippedFrame
-    from tracking3d.passes import Listener
+    from tracking3d.pipeline.passes import Listener
     from tracking3d.results.records import FrameRecord
 
 
@@ -34,7 +34,7 @@ def report(
 
 
 @contextmanager
-def reported(folders: Sequence[Path]) -> Iterator[Callable[[Listener], Listener]]:
+def report_progress(folders: Sequence[Path]) -> Iterator[Callable[[Listener], Listener]]:
     """Write the reports of runs when the block ends, however it ends, if at least one frame was tracked.
 
     If a report cannot be written, that is printed; it does not change how the run ended.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from tracking3d.cli.model import check_fine
-from tracking3d.cli.objects import check_known, given_box, given_masks
+from tracking3d.cli.objects import check_known, parse_given_box, parse_given_masks
 from tracking3d.cli.options import Debug, Quiet, SettingsOptions, grouped
 from tracking3d.cli.options.camera import CameraOptions
 from tracking3d.cli.options.output import ModelChoice, OutputOptions
@@ -24,8 +24,8 @@ from tracking3d.errors import InputError
 
 if TYPE_CHECKING:
     from tracking3d.config.models import PipelineConfig
-    from tracking3d.corrections import Correction
-    from tracking3d.prompts import PromptSet
+    from tracking3d.prompts.corrections import Correction
+    from tracking3d.prompts.prompt import PromptSet
 
 
 @grouped
@@ -46,8 +46,8 @@ def run(
     Give the object with --box, --mask, --points, --masks or --object. Each box, mask or --points is an object with a
     run folder of its own.
     """
-    from tracking3d.arguments import needs_prompt
-    from tracking3d.recording import RecordOptions
+    from tracking3d.pipeline.record import RecordOptions
+    from tracking3d.pipeline.validation import needs_prompt
 
     prompt = prompt.completed_from(settings.config)
     output.check()
@@ -108,24 +108,24 @@ def _configure(
 
 def _parse_prompts(prompt: PromptOptions, frames: str | None) -> PromptSet:
     """The objects that the options give."""
-    from tracking3d.point_prompts import parse_points
-    from tracking3d.prompts import PromptSet
+    from tracking3d.prompts.points import parse_points
+    from tracking3d.prompts.prompt import PromptSet
     from tracking3d.video.selection import parse_selection
 
     start = prompt.start_frame
     first = start if start is not None else parse_selection(frames).start
-    boxes = [given_box(text, first) for text in prompt.box or ()]
-    masks = [one for file in prompt.mask or () for one in given_masks(file)]
+    boxes = [parse_given_box(text, first) for text in prompt.box or ()]
+    masks = [one for file in prompt.mask or () for one in parse_given_masks(file)]
     points = [parse_points(text) for text in prompt.points or ()]
     several = len(boxes) + len(masks) + len(points) > 1
     return PromptSet(boxes, masks, points, start, as_lists=several)
 
 
 def _parse_corrections(prompt: PromptOptions, objects: int) -> list[Correction]:
-    from tracking3d.corrections import checked_corrections, parse_correction
+    from tracking3d.prompts.corrections import parse_correction, validate_corrections
 
     corrections = [parse_correction(text) for text in prompt.correct or ()]
-    checked_corrections(corrections, max(objects, 1))  # before anything is written
+    validate_corrections(corrections, max(objects, 1))  # before anything is written
     return corrections
 
 

@@ -14,7 +14,7 @@ from tracking3d.errors import InputError
 
 if TYPE_CHECKING:
     from tracking3d.cli.tracking import RunDisplay, RunRequest
-    from tracking3d.splitting.long_video import SplitResult
+    from tracking3d.submaps.job import SplitResult
 
 
 def track_in_parts(request: RunRequest, length: str, workers: int | None, display: RunDisplay) -> None:
@@ -30,8 +30,8 @@ def track_in_parts(request: RunRequest, length: str, workers: int | None, displa
         InputError: Options do not go together.
     """
     from tracking3d.cli.progress import progress
-    from tracking3d.cli.report import reported
-    from tracking3d.splitting.split_run import record_in_parts
+    from tracking3d.cli.report import report_progress
+    from tracking3d.submaps.split_run import record_in_parts
     from tracking3d.video import open_source
 
     _check(request, workers, display)
@@ -40,7 +40,7 @@ def track_in_parts(request: RunRequest, length: str, workers: int | None, displa
     folder, options = request.folder, request.options
     with ExitStack() as ends:
         ends.enter_context(_resumable(folder))
-        reporting = ends.enter_context(reported([folder] if display.report else []))
+        reporting = ends.enter_context(report_progress([folder] if display.report else []))
         count = open_source(request.source, options.selection).count
         listener = reporting(ends.enter_context(progress(count, display.quiet)))
         ended = record_in_parts(
@@ -101,7 +101,7 @@ def _processors() -> int:
 @contextmanager
 def _resumable(folder: Path) -> Iterator[None]:
     """If the run is stopped, say how to continue it."""
-    from tracking3d.splitting.plan import PARTS
+    from tracking3d.submaps.plan import PARTS
 
     try:
         yield

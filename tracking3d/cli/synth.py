@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tracking3d.cli.fresh import Count, Meshes, drawn_suite
+from tracking3d.cli.fresh import Count, Meshes, draw_suite
 from tracking3d.cli.options import Debug, Quiet, grouped, numbers
 from tracking3d.cli.options.panels import OUTPUT, PERFORMANCE
 from tracking3d.errors import InputError
@@ -137,7 +137,7 @@ def synth(
     are kept.
     """
     given = sequence.given()
-    drawn = drawn_suite(suite or "one sequence", sequence.seed if suite else None, count, meshes)
+    drawn = draw_suite(suite or "one sequence", sequence.seed if suite else None, count, meshes)
     others = next((name for name in given if (suite, name) != ("fresh", "seed")), None)
     if suite is not None and others:
         raise InputError(f"--{others} cannot change --suite {suite}, which is fixed; leave out one of them.")

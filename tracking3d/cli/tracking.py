@@ -15,9 +15,9 @@ import typer
 
 if TYPE_CHECKING:
     from tracking3d.config.models import PipelineConfig
-    from tracking3d.corrections import Correction
-    from tracking3d.prompts import PromptSet
-    from tracking3d.recording import RecordOptions
+    from tracking3d.pipeline.record import RecordOptions
+    from tracking3d.prompts.corrections import Correction
+    from tracking3d.prompts.prompt import PromptSet
 
 
 @dataclass(frozen=True)
@@ -65,10 +65,10 @@ class RunDisplay:
 def track(request: RunRequest, display: RunDisplay) -> None:
     """Track, show the progress, and print a summary."""
     from tracking3d.cli.progress import progress
-    from tracking3d.cli.report import reported
-    from tracking3d.cli.view import watched
-    from tracking3d.open_tracking import request_tracking
-    from tracking3d.recording import record_tracking
+    from tracking3d.cli.report import report_progress
+    from tracking3d.cli.view import watch
+    from tracking3d.pipeline.open_tracking import request_tracking
+    from tracking3d.pipeline.record import record_tracking
     from tracking3d.results.layout import object_folders
     from tracking3d.results.run_reader import is_finished
     from tracking3d.video import open_source
@@ -79,14 +79,14 @@ def track(request: RunRequest, display: RunDisplay) -> None:
         logging.getLogger("tracking3d").setLevel(logging.ERROR)
     objects = max(len(prompts), 1)
     folders = object_folders(folder, objects) if objects > 1 else [folder]
-    finished = {one: _written(one) for one in folders if options.resume and is_finished(one)}
+    finished = {one: _time_written(one) for one in folders if options.resume and is_finished(one)}
     with ExitStack() as ends:
         ends.enter_context(resumable(folders))
-        reporting = ends.enter_context(reported(folders if display.report else []))
+        reporting = ends.enter_context(report_progress(folders if display.report else []))
         listener = reporting(ends.enter_context(progress(source.count, display.quiet, objects)))
         if display.view:
             source, listener = ends.enter_context(
-                watched(source, folder, listener, display.host, display.quiet)
+                watch(source, folder, listener, display.host, display.quiet)
             )
         tracking = request_tracking(
             source, request.config, prompts, request.corrections, request.skip_damaged
@@ -106,7 +106,7 @@ def _print_summaries(folders: Sequence[Path], finished: Mapping[Path, int]) -> N
     from tracking3d.cli.progress import print_summary
 
     for folder in folders:
-        if folder in finished and finished[folder] == _written(folder):
+        if folder in finished and finished[folder] == _time_written(folder):
             typer.echo(f"The run {folder} is already finished; there is nothing to resume.")
         else:
             print_summary(folder)
@@ -147,7 +147,7 @@ def default_folder(source: str) -> Path:
     return Path("runs", path.stem if path.is_file() else path.name)
 
 
-def _written(folder: Path) -> int:
+def _time_written(folder: Path) -> int:
     """When the description of a run was last written."""
     from tracking3d.results.layout import RUN
 

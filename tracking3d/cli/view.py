@@ -18,7 +18,7 @@ from tracking3d.cli.options.panels import OUTPUT
 
 if TYPE_CHECKING:
     from tracking3d.frames import SkippedFrame
-    from tracking3d.recording import Listener
+    from tracking3d.pipeline.record import Listener
     from tracking3d.results.records import FrameRecord
     from tracking3d.video.any_frame import FrameImages
     from tracking3d.video.source import FrameSource
@@ -60,7 +60,7 @@ def view(
 
 
 @contextmanager
-def watched(
+def watch(
     source: FrameSource, folder: Path, listener: Listener, host: str | None, quiet: bool
 ) -> Iterator[tuple[FrameSource, Listener]]:
     """Show a run while it is tracked, from its first estimate, and after its end until Ctrl-C.

@@ -43,9 +43,9 @@ def choose_camera(
             are ignored with a warning in the log.
     """
     if config.file is not None:
-        return _measured(read_camera(config.file), width, height)
+        return _measured_camera(read_camera(config.file), width, height)
     camera = _pinhole(config, width, height, known, known_origin)
-    coefficients = given_distortion(config)
+    coefficients = parse_distortion(config)
     if not coefficients:
         return camera
     if camera.assumed:
@@ -60,10 +60,10 @@ def choose_camera(
         None,
         camera.origin,
     )
-    return _measured(taken, width, height)
+    return _measured_camera(taken, width, height)
 
 
-def given_distortion(config: CameraConfig) -> tuple[float, ...]:
+def parse_distortion(config: CameraConfig) -> tuple[float, ...]:
     """The distortion coefficients, as many as their model has; none if there is no distortion.
 
     Raises:
@@ -72,7 +72,7 @@ def given_distortion(config: CameraConfig) -> tuple[float, ...]:
     return as_coefficients(config.distortion_model, config.distortion or (), DISTORTION)
 
 
-def _measured(taken: CalibratedCamera, width: int, height: int) -> Camera:
+def _measured_camera(taken: CalibratedCamera, width: int, height: int) -> Camera:
     """The pinhole camera of the undistorted images of a calibrated camera.
 
     Raises:

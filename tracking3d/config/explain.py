@@ -28,7 +28,7 @@ def hint(name: str, valid: Iterable[str]) -> str:
     return f"valid are {', '.join(names)}." if names else "nothing can be given here."
 
 
-def shown(value: Any) -> str:
+def format_value(value: Any) -> str:
     """``value`` as messages show it, at most one line long."""
     short = reprlib.Repr()
     short.maxstring = short.maxother = 60
@@ -64,7 +64,7 @@ def describe_validation_error(error: ValidationError, model: type[BaseModel], no
         beside = [loc[-1] for loc in unknown if loc[:-1] == unknown[0][:-1]]
         return unknown_key(unknown[0], model, noun, beside)
     problem = problems[0]
-    path, message, given = _reach(model, problem["loc"]).path, problem["msg"], shown(problem["input"])
+    path, message, given = _reach(model, problem["loc"]).path, problem["msg"], format_value(problem["input"])
     match problem["type"]:
         case "missing":
             return f"the {noun} '{path}' is missing; it is required."
@@ -74,7 +74,7 @@ def describe_validation_error(error: ValidationError, model: type[BaseModel], no
             return f"'{path}' must be a mapping of {noun}s, not {given}."
         case "union_tag_invalid":
             allowed = problem["ctx"]["expected_tags"].replace(", ", " or ")
-            return f"'{path}.name' must be {allowed}, not {shown(problem['input'].get('name'))}."
+            return f"'{path}.name' must be {allowed}, not {format_value(problem['input'].get('name'))}."
     if message.startswith("Input should be "):
         allowed = re.sub(r", (unable|got) .*", "", message.removeprefix("Input should be "))
         return f"'{path}' must be {allowed}, not {given}."

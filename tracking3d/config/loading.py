@@ -13,7 +13,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from tracking3d.config.explain import describe_validation_error, hint, shown
+from tracking3d.config.explain import describe_validation_error, format_value, hint
 from tracking3d.config.models import PipelineConfig, PluginChoice
 from tracking3d.config.prompt_section import PromptSection
 from tracking3d.config.yaml_files import parse_yaml, read_mapping
@@ -62,14 +62,14 @@ def load_config(
     """
     settings: dict[str, Any] = PipelineConfig().model_dump()
     layers = _files(file, preset, quality)
-    spoken = [(_called(item), _parse_override(item)) for item in overrides]
+    spoken = [(_name_of(item), _parse_override(item)) for item in overrides]
     spoken.append(("", direct))
     # The names chosen on the command line come first, so that with `--tracker precomputed` the option of
     # `--set tracker.path=...` belongs to that tracker.
     chosen = [(origin, _chosen_names(layer)) for origin, layer in spoken]
 
     for origin, layer in [*layers, *chosen, *spoken]:
-        config = _validated(_merged(settings, _without_shorthand(layer), _CHOICES), origin)
+        config = _validate(_merge(settings, _without_shorthand(layer), _CHOICES), origin)
         settings = config.model_dump()
     return config
 
@@ -80,7 +80,7 @@ def load_prompt(file: Path | None) -> PromptSection:
     Raises:
         InputError: The file or that section cannot be used.
     """
-    return _prompt_of(file, read_mapping(_located(Path(file)), empty={}) if file is not None else {})
+    return _prompt_of(file, read_mapping(_locate(Path(file)), empty={}) if file is not None else {})
 
 
 def layers_in_words(
@@ -148,7 +148,7 @@ def config_schema() -> dict[str, Any]:
     return schema
 
 
-def _located(file: Path) -> Path:
+def _locate(file: Path) -> Path:
     """The file itself; if it does not exist, the ready one of that name, with or without ``configs/``.
 
     Raises:
@@ -170,13 +170,13 @@ def _located(file: Path) -> Path:
 
 def _files(file: Path | None, preset: str | None, quality: str | None) -> list[Layer]:
     """The layers that come from files: preset, quality and configuration file."""
-    from_file = read_mapping(_located(Path(file)), empty={}) if file is not None else {}
+    from_file = read_mapping(_locate(Path(file)), empty={}) if file is not None else {}
     _prompt_of(file, from_file)
     named = {}
     for key, spoken in (("preset", preset), ("quality", quality)):
         name = from_file.pop(key, {})
         if not isinstance(name, str) and name != {}:
-            raise InputError(f"{file}: '{key}' must be the name of a {key}, not {shown(name)}.")
+            raise InputError(f"{file}: '{key}' must be the name of a {key}, not {format_value(name)}.")
         named[key] = spoken if spoken is not None else None if name == {} else name
     chosen = DEFAULT_PRESET if named["preset"] is None else named["preset"]
     layers = [_named_layer("preset", "presets", list_presets(), chosen)]
@@ -216,7 +216,7 @@ def _leaves(settings: Mapping[str, Any], prefix: str = "") -> list[str]:
     return leaves
 
 
-def _called(override: str) -> str:
+def _name_of(override: str) -> str:
     """Name of an override in messages."""
     return argument(f"overrides: {override}", f"--set {override}")
 
@@ -226,8 +226,8 @@ def _parse_override(item: str) -> dict[str, Any]:
     path, equals, text = item.partition("=")
     keys = [key.strip() for key in path.split(".")]
     if not equals or not all(keys):
-        raise InputError(f"{_called(item)} is not section.key=value; write it like runtime.seed=1.")
-    value: Any = parse_yaml(text, _called(item))
+        raise InputError(f"{_name_of(item)} is not section.key=value; write it like runtime.seed=1.")
+    value: Any = parse_yaml(text, _name_of(item))
     for key in reversed(keys[1:]):
         value = {key: value}
     return {keys[0]: value}
@@ -250,9 +250,7 @@ def _chosen_names(layer: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _merged(
-    lower: Mapping[str, Any], upper: Mapping[str, Any], choices: Sequence[str] = ()
-) -> dict[str, Any]:
+def _merge(lower: Mapping[str, Any], upper: Mapping[str, Any], choices: Sequence[str] = ()) -> dict[str, Any]:
     """``lower`` with the values of ``upper``, mapping by mapping.
 
     The sections in ``choices`` have a name: if it changes, nothing of ``lower`` is kept. They are at the top level,
@@ -266,12 +264,12 @@ def _merged(
         if isinstance(below, dict) and isinstance(value, dict):
             if key in choices and value.get("name", below["name"]) != below["name"]:
                 below = {}
-            value = _merged(below, value)
+            value = _merge(below, value)
         result[key] = value
     return result
 
 
-def _validated(settings: Mapping[str, Any], origin: str) -> PipelineConfig:
+def _validate(settings: Mapping[str, Any], origin: str) -> PipelineConfig:
     try:
         return PipelineConfig.model_validate(settings)
     except ValidationError as error:

@@ -93,11 +93,11 @@ class CameraConfig(Section):
 class ObjectConfig(Section):
     """How the object is represented (paper section 3.1)."""
 
-    known: str | None = Field(
+    model: str | None = Field(
         None,
         description=(
             "Known object: the folder of an earlier run, or a mesh file. The object is detected in the video, without "
-            "initialization from motion. Shape and colours are fixed: landmark_views and texture_views are 0, shape is "
+            "initialization from motion. Shape and colours are fixed: adjustment_views and texture_views are 0, shape is "
             "online, and prototype is ignored."
         ),
     )
@@ -115,7 +115,7 @@ class ObjectConfig(Section):
             "mask, and scaled to a common spread; null keeps them unchanged (paper)."
         ),
     )
-    landmark_views: int = Field(
+    adjustment_views: int = Field(
         120,
         ge=0,
         le=2000,
@@ -124,7 +124,7 @@ class ObjectConfig(Section):
             "frames follow the keyframes. 0 switches the adjustment off."
         ),
     )
-    evidence: bool = Field(
+    refine_masks: bool = Field(
         True,
         description=(
             "Segment every frame again at the end of the final refinement, from shape, colour and motion in all frames "
@@ -140,7 +140,7 @@ class ObjectConfig(Section):
             "refinement; 0 keeps the solver's texture, of size texture_size."
         ),
     )
-    largest_texture: int = Field(
+    max_texture_size: int = Field(
         2048, ge=64, le=8192, description="Maximum side of the texture image of the mesh, in texels."
     )
     shape: Literal["online", "fine"] = Field(
@@ -158,11 +158,11 @@ class ObjectConfig(Section):
     @classmethod
     def _is_held_where_known(cls, value: Any) -> Any:
         if isinstance(value, dict) and value.get("known") is not None:
-            return {**value, "landmark_views": 0, "texture_views": 0, "shape": "online"}
+            return {**value, "adjustment_views": 0, "texture_views": 0, "shape": "online"}
         return value
 
 
-class WindowConfig(Section):
+class CropConfig(Section):
     """The crop of the frame that is rendered and compared."""
 
     size: int = Field(
@@ -193,7 +193,7 @@ class RuntimeConfig(Section):
         "auto",
         description="Rendering backend: torch (any device), numba (CPU), or auto, the fastest available.",
     )
-    milestones: int = Field(
+    rollback_points: int = Field(
         8,
         ge=0,
         le=64,
@@ -221,6 +221,6 @@ class PipelineConfig(Section):
     features: PluginChoice = PluginChoice(name="rgb")
     camera: CameraConfig = CameraConfig()
     object: ObjectConfig = ObjectConfig()
-    window: WindowConfig = WindowConfig()
+    crop: CropConfig = CropConfig()
     solver: SolverConfig = OnlineConfig()
     runtime: RuntimeConfig = RuntimeConfig()

@@ -28,7 +28,7 @@ class OnlineConfig(Section):
 
     name: Literal["online"] = Field("online", description="Name of the solver: paper or online.")
     final_refine: FinalRefine = True
-    correct_tracker: CorrectTracker = True
+    tracker_feedback: CorrectTracker = True
     appearance: float = Field(1.0, ge=0, description="Weight of the photometric loss in the pose of a frame.")
     outline: float = Field(
         0.3, ge=0, description="Weight of the distance between the outline and the mask, robust."
@@ -41,13 +41,13 @@ class OnlineConfig(Section):
         gt=0,
         description="A frame becomes a keyframe if it is rotated by more than this many degrees from all keyframes.",
     )
-    window: int = Field(
+    local_window: int = Field(
         12,
         ge=2,
         le=64,
         description="Keyframes in local mapping: half of them recent, half spread over the older ones.",
     )
-    most_keyframes: int = Field(
+    max_keyframes: int = Field(
         64,
         ge=8,
         le=512,
@@ -59,7 +59,7 @@ class OnlineConfig(Section):
     )
 
 
-class Weights(Section):
+class LossWeights(Section):
     """Weights of the loss terms; 0 switches a term off (paper section 3.3)."""
 
     features: float = Field(1.0, ge=0, description="Appearance loss, eq. 1.")
@@ -105,7 +105,7 @@ class PaperConfig(Section):
 
     name: Literal["paper"] = Field("paper", description="Name of the solver: paper or online.")
     final_refine: FinalRefine = False
-    correct_tracker: CorrectTracker = False
+    tracker_feedback: CorrectTracker = False
     iterations: int = Field(500, ge=1, le=100_000, description="Maximum number of iterations per frame.")
     tau: float | None = Field(
         None,
@@ -118,7 +118,7 @@ class PaperConfig(Section):
         0.02, gt=0, lt=1, description="Extent of the soft silhouette beyond the box of a face, in NDC."
     )
     knum: int = Field(30, ge=1, description="Maximum number of faces per pixel of the soft silhouette.")
-    band: Literal["erode", "soften", "none"] = Field(
+    silhouette_bias: Literal["erode", "soften", "none"] = Field(
         "erode",
         description=(
             "How the bias of the soft silhouette is removed: erode the silhouette by 3x3, soften the target with the "
@@ -137,7 +137,7 @@ class PaperConfig(Section):
         "vertices",
         description="Smooth the vertices themselves (SoftRas), or their offsets from the prototype.",
     )
-    agreement: float = Field(
+    min_mask_iou: float = Field(
         0.0,
         ge=0,
         le=1,
@@ -168,18 +168,18 @@ class PaperConfig(Section):
         ge=0,
         description="Iterations on the pose of the new frame alone, before the joint ones; 0 for none (paper).",
     )
-    joint: Literal["always", "new_view"] = Field(
+    joint_when: Literal["always", "new_view"] = Field(
         "always",
         description=(
             "Optimize shape, texture and all poses in every frame (paper), or only in frames that show a new view or "
             "that their pose alone does not explain; needs pose_iterations."
         ),
     )
-    texture_start: Literal["zero", "backprojected"] = Field(
+    texture_init: Literal["zero", "backprojected"] = Field(
         "zero",
         description="Texels not seen before start at zero (paper), or at the features that the new frame shows there.",
     )
-    unseen_charge: float | None = Field(
+    unseen_penalty: float | None = Field(
         None,
         ge=0,
         description=(
@@ -187,7 +187,7 @@ class PaperConfig(Section):
             "any other pixel (paper)."
         ),
     )
-    start_frames: int = Field(
+    init_frames: int = Field(
         1,
         ge=1,
         le=32,
@@ -196,15 +196,15 @@ class PaperConfig(Section):
             "(paper)."
         ),
     )
-    start_iterations: int = Field(
+    init_iterations: int = Field(
         60, ge=1, description="Iterations of each hypothesis in that initialization."
     )
-    weights: Weights = Weights()
+    weights: LossWeights = LossWeights()
     learning_rates: LearningRates = LearningRates()
     keyframes: KeyframeConfig = KeyframeConfig()
 
 
-def _written_out(value: Any) -> Any:
+def _expand(value: Any) -> Any:
     """``paper`` is short for ``{name: paper}``, and settings without a name are those of the default solver.
 
     A section with all lines commented out changes nothing.
@@ -217,7 +217,5 @@ def _written_out(value: Any) -> Any:
     return {"name": OnlineConfig().name, **{key: value[key] for key in value if key not in empty}}
 
 
-SolverConfig = Annotated[
-    OnlineConfig | PaperConfig, Field(discriminator="name"), BeforeValidator(_written_out)
-]
+SolverConfig = Annotated[OnlineConfig | PaperConfig, Field(discriminator="name"), BeforeValidator(_expand)]
 """The solver that ``name`` chooses, with its own settings only."""

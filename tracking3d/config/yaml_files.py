@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 
-from tracking3d.config.explain import shown
+from tracking3d.config.explain import format_value
 from tracking3d.errors import InputError
 
 _LONGEST = 256 << 10
@@ -27,7 +27,7 @@ def _mapping(loader: _StrictLoader, node: yaml.MappingNode) -> dict[Any, Any]:
         key = loader.construct_object(key_node, deep=True)
         if not isinstance(key, str):
             raise yaml.constructor.ConstructorError(
-                None, None, f"the key {shown(key)} is not text", key_node.start_mark
+                None, None, f"the key {format_value(key)} is not text", key_node.start_mark
             )
         if key in seen:
             raise yaml.constructor.ConstructorError(
@@ -51,10 +51,10 @@ def parse_yaml(text: str, origin: str) -> Any:
     Raises:
         InputError: Not YAML, a tag that is not plain data, a key given twice or a key that is not text.
     """
-    return _parsed(text, origin)[0]
+    return _parse(text, origin)[0]
 
 
-def _parsed(text: str, origin: str) -> tuple[Any, list[str]]:
+def _parse(text: str, origin: str) -> tuple[Any, list[str]]:
     """The document, and the keys of its top level that have no value."""
     loader = None
     try:
@@ -135,7 +135,7 @@ def read_mapping(file: Path, empty: Any = None) -> dict[str, Any]:
         raise InputError(f"{file} is not a text file; a configuration is YAML in UTF-8.") from error
     except OSError as error:
         raise InputError(f"The configuration file {file} cannot be read: {error.strerror}.") from error
-    data, left_empty = _parsed(text, str(file))
+    data, left_empty = _parse(text, str(file))
     if data is None:
         return {}
     if not isinstance(data, dict):

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tracking3d.datasets.truth import MaskReference
 from tracking3d.estimation.estimate import MaskSource
-from tracking3d.stages import StageTimes
+from tracking3d.runtime.stage_times import StageTimes
 
 PointTracker = Callable[[int, ArrayLike], tuple[NDArray[np.float64], NDArray[np.bool_]]]
 """Follows the points ``(N, 2)`` of one frame: positions ``(T, N, 2)`` and visibility ``(T, N)`` in the frames of

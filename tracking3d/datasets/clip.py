@@ -77,7 +77,7 @@ def read_truth(folder: Path) -> Truth:
         frames=tuple(frames),
         box=_initial_box(folder, visible_masks.get(0, masks.get(0))),
         camera=true or told,
-        told_camera=told if true else None,
+        given_camera=told if true else None,
         camera_told=_optional(folder / "camera.json").get("told", True) is not False,
         T_cam_obj=poses,
         masks=masks or visible_masks,

@@ -22,7 +22,7 @@ from tracking3d.errors import InputError
 PLACEHOLDERS = frozenset(("sequence", "object", "frame", "instance"))
 
 
-def _checked_path(path: str) -> str:
+def _validate_path(path: str) -> str:
     try:
         named = {name for _, name, _, _ in Formatter().parse(path) if name is not None}
     except ValueError as error:
@@ -35,7 +35,7 @@ def _checked_path(path: str) -> str:
     return path
 
 
-Pattern = Annotated[str, AfterValidator(_checked_path)]
+Pattern = Annotated[str, AfterValidator(_validate_path)]
 Patterns = Annotated[
     tuple[Pattern, ...],
     BeforeValidator(lambda value: (value,) if isinstance(value, str) else value),

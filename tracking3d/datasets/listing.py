@@ -91,7 +91,7 @@ def object_names(layout: DatasetLayout, place: Place) -> list[str]:
     if layout.objects == "masks":
         return _labels(layout, place)
     if layout.objects == "poses":
-        return _posed(layout, place)
+        return _trackable_objects(layout, place)
     return place.objects(layout.objects)
 
 
@@ -107,7 +107,7 @@ def _labels(layout: DatasetLayout, place: Place) -> list[str]:
     return [str(label) for label in objects if label in labels]
 
 
-def _posed(layout: DatasetLayout, place: Place) -> list[str]:
+def _trackable_objects(layout: DatasetLayout, place: Place) -> list[str]:
     """Objects of scene_gt.json that no image shows twice."""
     if layout.poses is None or layout.poses.form != "bop":
         raise InputError(

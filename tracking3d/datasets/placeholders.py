@@ -50,7 +50,7 @@ class Place:
     def files(self, patterns: Iterable[str]) -> list[Path]:
         """The files of the first pattern that any file matches, in natural order."""
         for pattern in patterns:
-            filled = self._filled(pattern)
+            filled = self._fill(pattern)
             found = [path for path in self.root.glob(filled) if path.is_file()] if filled else []
             if found:
                 return sorted(found, key=natural_order)
@@ -68,7 +68,7 @@ class Place:
         """
         file = self.file(patterns)
         if file is None:
-            wanted = " or ".join(self._filled(pattern) or pattern for pattern in patterns)
+            wanted = " or ".join(self._fill(pattern) or pattern for pattern in patterns)
             raise InputError(
                 f"The sequence '{self.sequence}' in {self.root} has no {wanted}, which holds its {what}; restore it."
             )
@@ -77,12 +77,12 @@ class Place:
     def of_frame(self, patterns: Iterable[str], frame: int, instance: int | None) -> Path | None:
         """The existing file of one frame for patterns with ``{frame}`` and ``{instance}``."""
         more = {"frame": str(frame)} | ({} if instance is None else {"instance": str(instance)})
-        filled = (self._filled(pattern, **more) for pattern in patterns)
+        filled = (self._fill(pattern, **more) for pattern in patterns)
         return next((self.root / path for path in filled if path and (self.root / path).is_file()), None)
 
     def objects(self, pattern: str) -> list[str]:
         """What ``{object}`` can be for ``pattern`` to name existing files or folders."""
-        wild = replace(self, object="*")._filled(pattern)
+        wild = replace(self, object="*")._fill(pattern)
         position = next(n for n, part in enumerate(Path(pattern).parts) if "{object}" in part)
         # The sequence's name may have more parts than its placeholder.
         from_end = len(Path(pattern).parts) - position
@@ -91,7 +91,7 @@ class Place:
         names = {part[-from_end].removeprefix(before).removesuffix(after) for part in parts}
         return [path.name for path in sorted(map(Path, names), key=natural_order)]
 
-    def _filled(self, pattern: str, **more: str) -> str | None:
+    def _fill(self, pattern: str, **more: str) -> str | None:
         """The pattern with its placeholders filled; None where one has no value here."""
         values = {"sequence": glob.escape(self.sequence), **more}
         if self.object is not None:

@@ -64,7 +64,7 @@ def read_regions(
         except (ValueError, IndexError, OverflowError) as error:
             reason = "a column is missing" if isinstance(error, IndexError) else error
             raise InputError(f"{file}, line {n + 1 + header_lines}: {reason}; correct that line.") from error
-        regions[number] = _moved(region, -1) if one_based else region
+        regions[number] = _shift(region, -1) if one_based else region
     return regions
 
 
@@ -110,7 +110,7 @@ def _finite(region: Rectangle, *numbers: float) -> Region:
     return Special(0) if np.isnan(numbers).any() else region
 
 
-def _moved(region: Region, by: int) -> Region:
+def _shift(region: Region, by: int) -> Region:
     match region:
         case Rectangle():
             return replace(region, x=region.x + by, y=region.y + by)

@@ -30,7 +30,7 @@ class RegionTracker:
 
     def init(self, frame: Frame, prompt: Prompt) -> MaskEstimate:
         """Start on the first frame: its encoded mask, else the prompt's mask or the object in its box."""
-        if (answer := self._encoded(frame)) is not None:
+        if (answer := self._encode(frame)) is not None:
             self._segmentation = ColourSegmentation(frame.image, prompt.box, answer.binary)
             return answer
         self._segmentation = ColourSegmentation(frame.image, prompt.box, prompt.mask)
@@ -40,7 +40,7 @@ class RegionTracker:
         """The frame's region as a mask."""
         if self._segmentation is None:
             raise PluginError(f"The results of {self._name} were asked for a frame before they were started.")
-        if (answer := self._encoded(frame)) is not None:
+        if (answer := self._encode(frame)) is not None:
             return answer
         region = self._regions.get(frame.index)
         box = None if region is None else bounding_box(region)
@@ -50,7 +50,7 @@ class RegionTracker:
             return MaskEstimate(estimate.mask, estimate.score / 2, reason)
         return estimate
 
-    def _encoded(self, frame: Frame) -> MaskEstimate | None:
+    def _encode(self, frame: Frame) -> MaskEstimate | None:
         """The answer where the frame's region is a mask."""
         region = self._regions.get(frame.index)
         if not isinstance(region, EncodedMask):

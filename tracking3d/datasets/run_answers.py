@@ -18,10 +18,10 @@ from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import Status
 from tracking3d.results import layout
 from tracking3d.results.correspondences import track_points
-from tracking3d.results.following import RunScene, has_landmarks, open_scene
+from tracking3d.results.point_tracking import RunScene, has_landmarks, open_scene
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
-from tracking3d.stages import StageTimes
+from tracking3d.runtime.stage_times import StageTimes
 from tracking3d.video.image_sequence import ImageSequence
 from tracking3d.video.selection import parse_selection, within
 
@@ -47,7 +47,7 @@ def answers_of_run(folder: Path, truth: Truth, *, refined: bool = True, offset: 
             few, or of another size.
     """
     run = RunReader(folder, refined)
-    asked = _shifted(parse_selection(run.description.get("selection")), offset, len(truth.frames))
+    asked = _shift_range(parse_selection(run.description.get("selection")), offset, len(truth.frames))
     records = {record.index + offset: record for record in run.frames if record.index + offset in asked}
     _check_shared(run, records, truth, offset)
     memory = run.description.get("peak_memory_mb")
@@ -77,7 +77,7 @@ def answers_of_run(folder: Path, truth: Truth, *, refined: bool = True, offset: 
     )
 
 
-def _shifted(selection: range, offset: int, count: int) -> range:
+def _shift_range(selection: range, offset: int, count: int) -> range:
     """The frames of a clip of ``count`` frames that a selection of the run's means."""
     start = selection.start + offset
     if start < 0:

@@ -28,7 +28,7 @@ GRACE = 20.0
 """Seconds in which a task that is to stop can keep what is done."""
 
 PRELOADED = [
-    "tracking3d.recording",
+    "tracking3d.pipeline.record",
     "tracking3d.report.several",
     "tracking3d.rendering.kernels.compilation",
     "tracking3d.trackers.csrt",

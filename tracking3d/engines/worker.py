@@ -32,7 +32,7 @@ def call(task: Task, tell: Tell, threads: int = 1) -> tuple[Any, Fault | None]:
     Raises:
         KeyboardInterrupt: If it was to stop.
     """
-    with printed_into(task.log):
+    with redirect_prints(task.log):
         try:
             _give_threads(threads)
             return task.function(tell, *task.arguments), None
@@ -75,7 +75,7 @@ def interruptible() -> None:
 
 
 @contextmanager
-def printed_into(log: Path | None) -> Iterator[None]:
+def redirect_prints(log: Path | None) -> Iterator[None]:
     """What this process prints within is added to a file, by native code too."""
     if log is None:
         yield

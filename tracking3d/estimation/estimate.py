@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.camera import Camera
 from tracking3d.points.answers import PointAnswers
-from tracking3d.stages import StageTimes
+from tracking3d.runtime.stage_times import StageTimes
 
 
 class Status(StrEnum):
@@ -41,7 +41,7 @@ class MaskSource(StrEnum):
     """Nothing: there was no initial mask to hand back."""
 
     @classmethod
-    def handed_back(cls, initial: NDArray[np.bool_] | None) -> MaskSource:
+    def as_initial(cls, initial: NDArray[np.bool_] | None) -> MaskSource:
         """Of an answer that is the initial mask, if there is one."""
         return cls.NONE if initial is None else cls.INITIAL
 
@@ -135,7 +135,7 @@ class ObjectModel:
     seen: NDArray[np.bool_] | None = None
 
 
-def unanswered(frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]) -> FrameEstimate:
+def lost_estimate(frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]) -> FrameEstimate:
     """The answer where the solver could give none: lost, with the initial mask and the pose known before."""
     initial = mask.binary if mask.binary is not None and mask.binary.any() else None
     return FrameEstimate(
@@ -147,5 +147,5 @@ def unanswered(frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64])
         status=Status.LOST,
         reason="",
         confidence=0.0,
-        mask_source=MaskSource.handed_back(initial),
+        mask_source=MaskSource.as_initial(initial),
     )

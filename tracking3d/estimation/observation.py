@@ -9,14 +9,15 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn import functional
 
-from tracking3d.estimation.outline import outline_distance
 from tracking3d.features.protocol import FeatureEncoder
-from tracking3d.frames import Frame
+from tracking3d.frames import Box, Frame
 from tracking3d.geometry.camera import Camera, Window
-from tracking3d.rendering import PoseTarget, channels_last
+from tracking3d.geometry.pose import Pose
+from tracking3d.rendering import PoseTarget, channels_last, signed_distance
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,11 +49,11 @@ class Observation:
     @cached_property
     def half(self) -> Observation:
         """At half the working resolution."""
-        return halved(self)
+        return downsample(self)
 
     @cached_property
     def outline_distance(self) -> Tensor:
-        """``(S, S)`` see `tracking3d.estimation.outline.outline_distance`."""
+        """``(S, S)`` see `tracking3d.estimation.observation.outline_distance`."""
         return outline_distance(self.mask, self.valid)
 
     @cached_property
@@ -108,11 +109,11 @@ def observe(
     rows, columns, border = _within(window, *frame.size)
     pixels = torch.tensor(np.ascontiguousarray(frame.image[rows, columns]), device=device)
     pixels = functional.pad(pixels.permute(2, 0, 1).float() / 255, border)
-    image, detail = _resampled(pixels, window.size), _resampled(pixels, 2 * window.size)
+    image, detail = _resample(pixels, window.size), _resample(pixels, 2 * window.size)
     valid = torch.ones(window.size, window.size, device=device)
     if any(border):
         inside = torch.ones(1, rows.stop - rows.start, columns.stop - columns.start, device=device)
-        valid = _resampled(functional.pad(inside, border), window.size)[0].ge(0.5).float()
+        valid = _resample(functional.pad(inside, border), window.size)[0].ge(0.5).float()
     # Features of a stride above 1 are cut out of the finer image, so as not to be coarser than the rest.
     features = encoder.encode((image if encoder.stride == 1 else detail)[None])
     if features.shape[-1] != window.size:
@@ -123,14 +124,14 @@ def observe(
         soft = distance = torch.zeros_like(valid)
     else:
         there = torch.from_numpy(mask[rows, columns]).to(device).float()
-        soft = _resampled(functional.pad(there[None], border), window.size)[0]
+        soft = _resample(functional.pad(there[None], border), window.size)[0]
         distance = mask_distance(soft)
     K = torch.tensor(window.K(camera), dtype=torch.float32, device=device)
     known = mask is not None and bool(soft.any())
     return Observation(frame.index, window, K, detail, features[0].float(), valid, soft, distance, known)
 
 
-def halved(observation: Observation) -> Observation:
+def downsample(observation: Observation) -> Observation:
     """The same observation at half the working resolution."""
     half = replace(observation.window, size=observation.window.size // 2)
     scale = observation.K.new_tensor([0.5, 0.5, 1.0])
@@ -156,7 +157,7 @@ def halved(observation: Observation) -> Observation:
 def crop(image: Tensor, window: Window) -> Tensor:
     """Resample ``(C, H, W)`` into the window: ``(C, S, S)``, antialiased, zero beyond the border."""
     rows, columns, border = _within(window, *image.shape[-2:])
-    return _resampled(functional.pad(image[:, rows, columns], border), window.size)
+    return _resample(functional.pad(image[:, rows, columns], border), window.size)
 
 
 def _within(window: Window, height: int, width: int) -> tuple[slice, slice, tuple[int, int, int, int]]:
@@ -175,7 +176,7 @@ def _span(first: int, count: int, size: int) -> tuple[slice, int, int]:
     return slice(begin, end), before, count - before - (end - begin)
 
 
-def _resampled(image: Tensor, size: int) -> Tensor:
+def _resample(image: Tensor, size: int) -> Tensor:
     """``(C, side, side)`` at ``size`` x ``size`` pixels, antialiased."""
     return functional.interpolate(image[None], size=(size, size), mode="bilinear", antialias=True)[0]
 
@@ -193,3 +194,42 @@ def mask_distance(mask: Tensor) -> Tensor:
     pixels = cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     exact = np.sqrt(np.rint(np.square(pixels)))
     return torch.from_numpy(exact).to(mask) * (2.0 / mask.shape[-1])
+
+
+def projected_box(vertices: Tensor, camera: Camera, pose: Pose) -> Box | None:
+    """Box ``(x, y, w, h)`` of the projected vertices inside the frame; None where none is or one is behind."""
+    x_cam = vertices @ pose.R.T + pose.translation
+    if not bool((x_cam[:, 2] > 1e-3).all()):
+        return None
+    focal = x_cam.new_tensor([camera.fx, camera.fy])
+    pixel = x_cam[:, :2] / x_cam[:, 2:] * focal + x_cam.new_tensor([camera.cx, camera.cy])
+    # Of an object right before the camera all but a little lies outside, and could be any number of pixels.
+    size = x_cam.new_tensor([camera.width, camera.height])
+    low, high = (bound.clamp_min(0.0).minimum(size) for bound in (pixel.amin(0), pixel.amax(0)))
+    if not bool((low < high).all()):
+        return None
+    return float(low[0]), float(low[1]), float(high[0] - low[0]), float(high[1] - low[1])
+
+
+def mask_box(mask: NDArray[np.bool_]) -> Box:
+    """Box ``(x, y, w, h)`` of a non-empty mask."""
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    left, top = float(columns[0]), float(rows[0])
+    return left, top, float(columns[-1] + 1) - left, float(rows[-1] + 1) - top
+
+
+def outline_distance(mask: Tensor, valid: Tensor) -> Tensor:
+    """``(S, S)`` signed distance in pixels to the mask's outline, negative inside, zero beyond the frame's border.
+
+    A mask that the border cuts off goes on beyond it: the cut is no outline of the object.
+
+    Args:
+        mask: ``(S, S)`` in [0, 1].
+        valid: ``(S, S)`` 1 inside the frame, 0 beyond its border.
+    """
+    inside = valid > 0.5
+    if bool(inside.all()) or not bool(inside.any()):
+        return signed_distance(mask[None])[0]
+    _, nearest = distance_transform_edt(~inside.cpu().numpy(), return_indices=True)
+    row, column = (torch.from_numpy(np.ascontiguousarray(axis)).to(mask.device) for axis in nearest)
+    return torch.where(inside, signed_distance(mask[row.long(), column.long()][None])[0], 0.0)

@@ -19,7 +19,7 @@ from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.camera import Camera, Window
 from tracking3d.geometry.pose import Pose
 from tracking3d.rendering import BackProjection, TexelMap
-from tracking3d.stages import StageTimes
+from tracking3d.runtime.stage_times import StageTimes
 
 State = TypeVar("State")
 
@@ -64,7 +64,7 @@ class RefiningSolver(Protocol, Generic[State]):
         """Solve everything once more over all keyframes; the state is then for ``revisit`` and ``result`` only."""
         ...
 
-    def revisit(
+    def refine_frame(
         self, state: State, frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]
     ) -> tuple[State, FrameEstimate]:
         """The pose of a frame once more, against the final object; frames come in order of time.
@@ -79,10 +79,12 @@ class RefiningSolver(Protocol, Generic[State]):
 
 
 @runtime_checkable
-class SteeredSolver(Protocol, Generic[State]):
+class GuidedSolver(Protocol, Generic[State]):
     """A solver that goes on as the user says: backwards from the first frame, and by a mask that is right."""
 
-    def turned_back(self, state: State, frame: Frame, number: int, T_cam_obj: NDArray[np.float64]) -> State:
+    def restart_backwards(
+        self, state: State, frame: Frame, number: int, T_cam_obj: NDArray[np.float64]
+    ) -> State:
         """Go on from a frame seen before; the frames that follow come from before it, numbered after ``number``.
 
         Args:
@@ -93,6 +95,6 @@ class SteeredSolver(Protocol, Generic[State]):
         """
         ...
 
-    def trusting(self, state: State, frame: Frame, mask: NDArray[np.bool_]) -> State:
+    def trust_mask(self, state: State, frame: Frame, mask: NDArray[np.bool_]) -> State:
         """The state before ``step`` takes a frame whose mask ``(H, W)`` the user has given."""
         ...

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from tracking3d.config.models import PipelineConfig
 from tracking3d.estimation.feature_space import FeatureSpace
-from tracking3d.estimation.framing import mask_box, projected_box
-from tracking3d.estimation.observation import Observation, observe
+from tracking3d.estimation.observation import Observation, mask_box, observe, projected_box
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera, Window
@@ -59,7 +58,7 @@ class SolverBase:
         box = mask_box(mask) if mask is not None else projected_box(vertices, camera, pose)
         if box is None:
             box = (0.0, 0.0, float(camera.width), float(camera.height))
-        window = Window.around(box, self.config.window.margin, self.config.window.size)
+        window = Window.around(box, self.config.crop.margin, self.config.crop.size)
         observation = observe(frame, mask, window, camera, self.encoder, self.device)
         if space is None:
             return observation

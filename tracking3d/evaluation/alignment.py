@@ -60,7 +60,7 @@ class ObjectAlignment:
         Raises:
             ValueError: If they have another shape.
         """
-        R, t = _split("T_cam_obj", T_cam_obj)
+        R, t = _split_similarity("T_cam_obj", T_cam_obj)
         aligned = np.tile(np.eye(4), (len(R), 1, 1))
         aligned[:, :3, :3] = R @ self.A
         aligned[:, :3, 3] = self.scale * (R @ self.offset + t)
@@ -90,8 +90,8 @@ def align_object_frame(
     """
     if diameter is not None and not 0 < diameter < np.inf:
         raise ValueError(f"the diameter needs to be positive, got {diameter}")
-    R_est, t_est = _split("T_est", T_est)
-    R_true, t_true = _split("T_true", T_true)
+    R_est, t_est = _split_similarity("T_est", T_est)
+    R_true, t_true = _split_similarity("T_true", T_true)
     if len(R_est) != len(R_true) or not len(R_est):
         raise ValueError(
             f"poses need equal shapes (N, 4, 4) with N > 0, got {np.shape(T_est)} and {np.shape(T_true)}"
@@ -122,8 +122,8 @@ def align_on_frame(
     Raises:
         ValueError: If a shape is another, a value is not finite, or the scale is not positive.
     """
-    (R_est,), (t_est,) = _split("T_est", np.asarray(T_est)[None])
-    (R_true,), (t_true,) = _split("T_true", np.asarray(T_true)[None])
+    (R_est,), (t_est,) = _split_similarity("T_est", np.asarray(T_est)[None])
+    (R_true,), (t_true,) = _split_similarity("T_true", np.asarray(T_true)[None])
     if scale is None and not t_est[2] * t_true[2] > 0:
         raise ValueError(f"depths {t_est[2]} and {t_true[2]} give no scale")
     scale = float(t_true[2] / t_est[2]) if scale is None else scale
@@ -153,7 +153,7 @@ def translation_errors(
     return residuals / (unit or 1.0)
 
 
-def _split(name: str, T: Poses) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _split_similarity(name: str, T: Poses) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     poses = finite(name, T, None, 4, 4)
     return poses[:, :3, :3], poses[:, :3, 3]
 
@@ -180,10 +180,10 @@ def _fit(
 
     samples = [random.permutation(len(M))[:3] for _ in range(SAMPLES if len(M) > 3 else 0)]
     starts = [_least_squares(M[sample], y[sample]) for sample in samples]
-    starts += [_reweighted(M, y, np.inf, _least_squares(M, y)), np.array([0.0, 0.0, 0.0, 1.0])]
+    starts += [_reweight(M, y, np.inf, _least_squares(M, y)), np.array([0.0, 0.0, 0.0, 1.0])]
     best = sorted(filter(_is_plausible, starts), key=cost)[:_REFINED]
     # A start is kept as it is too: refinement need not end below it.
-    refined = [_reweighted(M, y, limit, start) for start in best]
+    refined = [_reweight(M, y, limit, start) for start in best]
     return min(best + list(filter(_is_plausible, refined)), key=cost)
 
 
@@ -191,7 +191,7 @@ def _is_plausible(x: NDArray[np.float64]) -> bool:
     return bool(x[3] > 0 and np.linalg.norm(x[:3]) <= x[3])
 
 
-def _reweighted(
+def _reweight(
     M: NDArray[np.float64], y: NDArray[np.float64], limit: float, x: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Least squares weighted by the inverse of the last distances (Weiszfeld); those beyond ``limit`` are left out."""

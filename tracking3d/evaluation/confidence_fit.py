@@ -90,7 +90,7 @@ def fit_confidence(
         raise ValueError(f"of {len(was_right)} answers {was_right.sum()} are right; both kinds are needed")
     names = list(evidence)
     values = [floats(name, evidence[name], len(was_right)) for name in names]
-    columns, scales = zip(*(_standardized(value) for value in values), strict=True) if names else ((), ())
+    columns, scales = zip(*(_standardize(value) for value in values), strict=True) if names else ((), ())
     known = [np.isfinite(value) for value in values]
     # What is missing is its mean, and an indicator says that it is.
     design = np.column_stack([np.ones(len(was_right)), *columns, *(~one for one in known)]).astype(float)
@@ -125,7 +125,7 @@ def _contribution(term: Term, values: NDArray[np.float64]) -> NDArray[np.float64
     return np.where(np.isfinite(values), term.weight * np.clip(values, term.low, term.high), term.missing)
 
 
-def _standardized(
+def _standardize(
     values: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], tuple[float, float, float, float]]:
     """Values ``(N,)`` of mean 0 and variance 1 within their bounds, 0 where missing; mean, spread and bounds."""

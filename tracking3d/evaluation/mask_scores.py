@@ -117,7 +117,7 @@ def _share_own(answers: Answers, frames: list[int]) -> float | None:
 
 
 def _compare(answers: Answers, truth: Truth, index: int) -> FrameMasks:
-    masks = [_read(references, index) for references in (answers.masks, answers.initial_masks)]
+    masks = [_read_mask(references, index) for references in (answers.masks, answers.initial_masks)]
     if index in answers.answered:  # no mask is an empty one: it says that the object is nowhere
         masks = [np.zeros(_size(truth, index), bool) if mask is None else mask for mask in masks]
     if index not in truth.masks:
@@ -151,7 +151,7 @@ def _size(truth: Truth, index: int) -> tuple[int, int]:
     return height, width
 
 
-def _read(references: Mapping[int, MaskReference] | None, index: int) -> Mask | None:
+def _read_mask(references: Mapping[int, MaskReference] | None, index: int) -> Mask | None:
     return references[index].read() if references and index in references else None
 
 

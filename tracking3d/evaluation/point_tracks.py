@@ -41,7 +41,7 @@ class PointTrackScores:
 
 def score_points(answers: Answers, truth: Truth) -> PointTrackScores:
     """Ask the method for every true point where it is first seen, and score what it says after that."""
-    by_mesh, corrected = (_scored(one, truth) for one in (answers.points, answers.corrected_points))
+    by_mesh, corrected = (_score_track(one, truth) for one in (answers.points, answers.corrected_points))
     if by_mesh is None:
         return PointTrackScores()
     scores, points = by_mesh
@@ -62,7 +62,7 @@ def score_points(answers: Answers, truth: Truth) -> PointTrackScores:
     )
 
 
-def _scored(tracker: PointTracker | None, truth: Truth) -> tuple[PointScores, int] | None:
+def _score_track(tracker: PointTracker | None, truth: Truth) -> tuple[PointScores, int] | None:
     """Scores of all true points, and how many these are; None where there are none or nobody follows them."""
     if truth.points is None or tracker is None or truth.symmetry_axis is not None:
         return None

@@ -142,10 +142,10 @@ def fit_alignment(pairs: PosePairs | None, diameter: float | None) -> ObjectAlig
 def rotation_errors(pairs: PosePairs) -> dict[int, float]:
     """Aligned error in degrees of each frame whose true rotation is known; 180 where there is no estimate."""
     pairs = pairs.with_rotation
-    return dict(zip(pairs.frames, _aligned(pairs).tolist(), strict=True))
+    return dict(zip(pairs.frames, _align(pairs).tolist(), strict=True))
 
 
-def _aligned(pairs: PosePairs) -> NDArray[np.float64]:
+def _align(pairs: PosePairs) -> NDArray[np.float64]:
     errors = np.full(len(pairs.frames), NO_ESTIMATE)
     if len(pairs.found):
         R_est, R_true = pairs.T_est[:, :3, :3], pairs.T_true[:, :3, :3]
@@ -163,17 +163,17 @@ def return_error(pairs: PosePairs) -> float | None:
     180 if either has no estimate.
     """
     R = pairs.all_true[:, :3, :3]
-    away = _anchored(np.broadcast_to(np.eye(3), R.shape), R, pairs.axis)
+    away = _anchor(np.broadcast_to(np.eye(3), R.shape), R, pairs.axis)
     if not (away.max() > AWAY and away[-1] < BACK):
         return None
     if not {0, len(pairs.frames) - 1} <= set(pairs.found.tolist()):
         return NO_ESTIMATE
     ends = [[0, -1]]
     R_est, R_true = pairs.T_est[ends][0, :, :3, :3], pairs.T_true[ends][0, :, :3, :3]
-    return float(_anchored(R_est, R_true, pairs.axis)[-1])
+    return float(_anchor(R_est, R_true, pairs.axis)[-1])
 
 
-def _anchored(
+def _anchor(
     R_est: NDArray[np.float64], R_true: NDArray[np.float64], axis: NDArray[np.float64] | None
 ) -> NDArray[np.float64]:
     if axis is None:
@@ -201,15 +201,15 @@ def score_poses(answers: Answers, pairs: PosePairs | None, alignment: ObjectAlig
 def _score_rotations(answers: Answers, pairs: PosePairs) -> dict[str, float | None]:
     if not pairs.frames:
         return {}
-    aligned = _aligned(pairs)
+    aligned = _align(pairs)
     anchored = np.full(len(pairs.frames), NO_ESTIMATE)
     consecutive = np.empty(0)
     R_est, R_true = pairs.T_est[:, :3, :3], pairs.T_true[:, :3, :3]
     if len(pairs.found):
-        anchored[pairs.found] = _anchored(R_est, R_true, pairs.axis)
+        anchored[pairs.found] = _anchor(R_est, R_true, pairs.axis)
     if len(pairs.found) > 1:
         consecutive = _consecutive(R_est, R_true, pairs.axis)[np.diff(pairs.found) == 1]
-    tracked = _tracked(answers, pairs)
+    tracked = _is_tracked(answers, pairs)
     return {
         "rotation_error_mean_deg": float(aligned.mean()),
         "rotation_error_median_deg": float(np.median(aligned)),
@@ -240,7 +240,7 @@ def _score_translations(
         "translation_error_mean_percent": float(known.mean()) if len(known) else None,
         "translation_error_median_percent": float(np.median(known)) if len(known) else None,
         "translation_share_under_5_percent": float(
-            np.mean(_tracked(answers, pairs) & (moved < GOOD_TRANSLATION))
+            np.mean(_is_tracked(answers, pairs) & (moved < GOOD_TRANSLATION))
         ),
     }
 
@@ -252,7 +252,7 @@ def _of_positions(pairs: PosePairs) -> ObjectAlignment:
     return align_object_frame(pairs.T_est, T_true)
 
 
-def _tracked(answers: Answers, pairs: PosePairs) -> NDArray[np.bool_]:
+def _is_tracked(answers: Answers, pairs: PosePairs) -> NDArray[np.bool_]:
     """Which frames have an estimate that is not called lost."""
     tracked = np.zeros(len(pairs.frames), bool)
     tracked[pairs.found] = [pairs.frames[place] not in answers.lost for place in pairs.found]

@@ -28,7 +28,7 @@ from tracking3d.evaluation.pose_scores import (
     rotation_errors,
     score_poses,
 )
-from tracking3d.stages import STAGES, StageTimes
+from tracking3d.runtime.stage_times import STAGES, StageTimes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +43,7 @@ class Scores(MaskScores, PoseScores, PointTrackScores, ModelScores, ConfidenceSc
         seconds_per_frame, seconds_per_frame_median: Mean and median wall time of a frame; None where it was not
             recorded.
         seconds_decode, seconds_track, seconds_encode, seconds_solve, seconds_map, seconds_write: Mean wall time of each
-            stage of a frame, see `tracking3d.stages.StageTimes`; None where it was not recorded.
+            stage of a frame, see `tracking3d.runtime.stage_times.StageTimes`; None where it was not recorded.
         peak_memory_mb: Most memory held, in 10^6 bytes; None where it was not recorded.
         memory_growth_mb: How much more was held at most in the second half of the frames than in the first.
     """

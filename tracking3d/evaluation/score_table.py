@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich.table import Table
 
 from tracking3d.evaluation.score import Scores
-from tracking3d.stages import STAGES
+from tracking3d.runtime.stage_times import STAGES
 
 ROWS: tuple[tuple[str, str, str], ...] = (
     ("frames", "frames", ""),

@@ -53,9 +53,9 @@ def vsd(
     estimated = depth_to_distance(floats("depth_est", depth_est, *test.shape), K)
     true = depth_to_distance(floats("depth_true", depth_true, *test.shape), K)
 
-    seen_true = _seen(true, test, delta)
+    seen_true = _visible_pixels(true, test, delta)
     # What is seen at the true pose and covered at the estimated one counts as seen there too.
-    seen_est = _seen(estimated, test, delta) | (seen_true & (estimated > 0))
+    seen_est = _visible_pixels(estimated, test, delta) | (seen_true & (estimated > 0))
     both = seen_true & seen_est
     either = np.count_nonzero(seen_true | seen_est)
     limits = floats("tolerances", tolerances, None)
@@ -112,6 +112,6 @@ def model_depth(
     return np.where(np.isfinite(depth), depth, 0.0)
 
 
-def _seen(model: NDArray[np.float64], test: NDArray[np.float64], delta: float) -> NDArray[np.bool_]:
+def _visible_pixels(model: NDArray[np.float64], test: NDArray[np.float64], delta: float) -> NDArray[np.bool_]:
     """Where a model at distances ``(H, W)`` is not hidden by the scene; without a measurement it is not."""
     return (model > 0) & ((model - test <= delta) | (test == 0))

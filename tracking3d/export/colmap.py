@@ -121,12 +121,13 @@ def _model_of(run: ExportedRun) -> _Model:
 
 def _write_text(folder: Path, model: _Model) -> None:
     cameras = (
-        f"{one.number} PINHOLE {one.width} {one.height} {_joined(one.parameters)}" for one in model.cameras
+        f"{one.number} PINHOLE {one.width} {one.height} {_join_points(one.parameters)}"
+        for one in model.cameras
     )
     _write_lines(folder / "cameras.txt", "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", cameras)
     images = chain.from_iterable(
         (
-            f"{one.number} {_joined(one.quaternion)} {_joined(one.translation)} {one.camera} {one.name}",
+            f"{one.number} {_join_points(one.quaternion)} {_join_points(one.translation)} {one.camera} {one.name}",
             " ".join(f"{x:.3f} {y:.3f} {n}" for (x, y), n in zip(one.pixels, one.points, strict=True)),
         )
         for one in model.images
@@ -134,7 +135,7 @@ def _write_text(folder: Path, model: _Model) -> None:
     titles = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then POINTS2D[] as X Y POINT3D_ID"
     _write_lines(folder / "images.txt", titles, images)
     points = (
-        f"{one.number} {_joined(one.place)} {' '.join(map(str, one.colour))} 0 "
+        f"{one.number} {_join_points(one.place)} {' '.join(map(str, one.colour))} 0 "
         + " ".join(map(str, one.track.ravel()))
         for one in model.points
     )
@@ -147,7 +148,7 @@ def _write_lines(path: Path, titles: str, lines: Iterable[str]) -> None:
     path.write_text("\n".join([f"# {titles}", *lines]) + "\n", encoding="ascii")
 
 
-def _joined(values: Iterable[float]) -> str:
+def _join_points(values: Iterable[float]) -> str:
     return " ".join(f"{value:.12g}" for value in values)
 
 

@@ -114,7 +114,7 @@ class ExportedRun:
             InputError: If there is no such frame.
         """
         posed = [
-            PosedFrame(n, self.seconds(n), self._scaled(one.T_cam_obj), self.reader.camera_of(one), one)
+            PosedFrame(n, self.seconds(n), self._scale(one.T_cam_obj), self.reader.camera_of(one), one)
             for n, one in self.records.items()
             if one.status is not Status.LOST and is_rigid(one.T_cam_obj)
         ]
@@ -162,7 +162,7 @@ class ExportedRun:
         """
         if self.options.object_size is None:
             return 1.0
-        return self.options.object_size / seen_side(load_model(self.reader.mesh_folder))
+        return self.options.object_size / visible_side(load_model(self.reader.mesh_folder))
 
     @property
     def unit(self) -> str:
@@ -206,7 +206,7 @@ class ExportedRun:
     def pinhole_pictures(self) -> Iterator[Frame]:
         """The pictures as the camera of the poses sees them, without the distortion of a lens; see `pictures`."""
         for frame in self._read_pictures():
-            yield replace(frame, image=self.camera.undistorted(frame.image))
+            yield replace(frame, image=self.camera.undistort(frame.image))
 
     def pictures(self) -> Iterator[Frame]:
         """The pictures of all frames that have an answer, read from the source once more.
@@ -221,13 +221,13 @@ class ExportedRun:
 
         return read_selected_images(self.reader, self.options.source, self.records)
 
-    def _scaled(self, T_cam_obj: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _scale(self, T_cam_obj: NDArray[np.float64]) -> NDArray[np.float64]:
         scaled = T_cam_obj.copy()
         scaled[:3, 3] *= self.scale
         return scaled
 
 
-def seen_side(model: ObjectModel) -> float:
+def visible_side(model: ObjectModel) -> float:
     """The longest side of what the video has shown of an object; what it has not is a guess, and often too deep.
 
     Of an object that was hardly seen it is that of the whole mesh.

@@ -111,9 +111,9 @@ def export_run(
     _check_place(path, exporter, overwrite)
     if path in (file.resolve() for file in run_files(reader.folder)):
         raise OutputError(f"{path} is a file of the run itself; choose another {_OUT}.")
-    answered = _answered(exporter, exported)
+    answered = _frames_with_estimates(exporter, exported)
     without = tuple(index for index in exported.span if index not in answered)
-    with _placed(path) as place:
+    with _replace_when_done(path) as place:
         exporter.write(exported, place)
         if place.is_dir():
             label = _label(exporter, exported, without)
@@ -134,7 +134,7 @@ def _check(options: ExportOptions) -> None:
         raise InputError(f"Poses cannot be of '{options.of}'; {_NAMED['of']} is object or camera.")
 
 
-def _answered(exporter: Exporter, run: ExportedRun) -> set[int]:
+def _frames_with_estimates(exporter: Exporter, run: ExportedRun) -> set[int]:
     """The frames that have what the format is about."""
     if exporter.kind in ("masks", "model"):
         return set(run.records)
@@ -180,7 +180,7 @@ def _is_export(folder: Path) -> bool:
 
 
 @contextmanager
-def _placed(path: Path) -> Iterator[Path]:
+def _replace_when_done(path: Path) -> Iterator[Path]:
     """A place of the same name in a folder beside ``path``; what is there at a good end takes the place of ``path``."""
     workshop = partial_path(path)
     made, earlier = workshop / path.name, workshop / "earlier"

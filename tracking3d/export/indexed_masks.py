@@ -37,11 +37,11 @@ def _write_masks(run: ExportedRun, folder: Path) -> list[str]:
     folder.mkdir(parents=True)
     names = [f"{index:05d}" for index in run.span]
     for name, index in zip(names, run.span, strict=True):
-        _indexed(run.mask(index)).save(folder / f"{name}.png")
+        _index_image(run.mask(index)).save(folder / f"{name}.png")
     return names
 
 
-def _indexed(mask: NDArray[np.bool_]) -> Pillow.Image:
+def _index_image(mask: NDArray[np.bool_]) -> Pillow.Image:
     image = Pillow.fromarray(mask.astype(np.uint8))
     image.putpalette(_PALETTE)
     return image

@@ -66,12 +66,12 @@ class Camera:
         """Whether the lens was given, or else solved from what the video shows."""
         return not self.assumed or self.origin.startswith(_SOLVED)
 
-    def solved(self, factor: float) -> Camera:
+    def with_solved_focal(self, factor: float) -> Camera:
         """With ``factor`` times the focal lengths, as the video says."""
-        other = self.zoomed(factor, "")
+        other = self.zoom(factor, "")
         return replace(other, origin=f"{_SOLVED} of {other.fov:.1f} degrees")
 
-    def zoomed(self, factor: float, origin: str) -> Camera:
+    def zoom(self, factor: float, origin: str) -> Camera:
         """With ``factor`` times the focal lengths; ``origin`` says in words where that came from."""
         return replace(self, fx=factor * self.fx, fy=factor * self.fy, origin=origin)
 
@@ -83,9 +83,9 @@ class Camera:
         """Pixels ``(N, 2)`` of the pictures that were taken as those of this camera; NaN where there are none."""
         return xy if self.lens is None else self.lens.to_pinhole(xy)
 
-    def undistorted(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def undistort(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """A picture ``(H, W, 3)`` that was taken, as this camera sees it."""
-        return image if self.lens is None else self.lens.undistorted(image)
+        return image if self.lens is None else self.lens.undistort(image)
 
     def mask_to_pinhole(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """A mask ``(H, W)`` of a picture that was taken, as one of what this camera sees."""

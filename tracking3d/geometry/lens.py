@@ -102,7 +102,7 @@ class Lens:
         rays = (np.asarray(xy, np.float64) - self.pinhole[2:]) / self.pinhole[:2]
         radius = np.linalg.norm(rays, axis=1)
         seen = np.isfinite(radius) & (radius < _reach(self.model, self.coefficients))
-        return np.where(seen[:, None], self._distorted(np.where(seen[:, None], rays, 0.0)), np.nan)
+        return np.where(seen[:, None], self._distort(np.where(seen[:, None], rays, 0.0)), np.nan)
 
     def to_pinhole(self, xy: NDArray) -> NDArray[np.float64]:
         """Pixels ``(N, 2)`` of the picture as those of the pinhole camera; NaN where there are none."""
@@ -114,17 +114,17 @@ class Lens:
         off = np.linalg.norm(self.to_picture(found) - pixels, axis=1)
         return np.where((there & (off < 0.1))[:, None], found, np.nan)
 
-    def undistorted(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def undistort(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The picture ``(H, W, 3)`` as the pinhole camera would have taken it; black where the lens saw nothing."""
         return cast("NDArray[np.uint8]", cv2.remap(image, *_pinhole_to_picture(self), cv2.INTER_LINEAR))
 
     def mask_to_pinhole(self, mask: NDArray) -> NDArray:
         """A mask ``(H, W)`` of the picture, bool or float32 in [0, 1], as one of the pinhole camera's."""
-        return _moved(mask, _pinhole_to_picture(self))
+        return _shift(mask, _pinhole_to_picture(self))
 
     def mask_to_picture(self, mask: NDArray) -> NDArray:
         """A mask ``(H, W)`` of the pinhole camera's picture, as one of the picture that was taken."""
-        return _moved(mask, _picture_to_pinhole(self))
+        return _shift(mask, _picture_to_pinhole(self))
 
     @property
     def K(self) -> NDArray[np.float64]:
@@ -132,7 +132,7 @@ class Lens:
         fx, fy, cx, cy = self.picture
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
-    def _distorted(self, rays: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _distort(self, rays: NDArray[np.float64]) -> NDArray[np.float64]:
         if not len(rays):
             return rays
         k = np.array(self.coefficients)
@@ -205,6 +205,6 @@ def _map(way: Callable[[NDArray], NDArray[np.float64]], lens: Lens) -> Map:
     return np.ascontiguousarray(fine[..., 0]), np.ascontiguousarray(fine[..., 1])
 
 
-def _moved(mask: NDArray, maps: Map) -> NDArray:
+def _shift(mask: NDArray, maps: Map) -> NDArray:
     soft = cv2.remap(mask.astype(np.float32), *maps, cv2.INTER_LINEAR)
     return soft >= 0.5 if mask.dtype == np.bool_ else soft.astype(mask.dtype)

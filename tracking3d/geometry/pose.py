@@ -8,7 +8,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
@@ -114,3 +116,16 @@ def rotation_exponential(axis_angle: Tensor) -> Tensor:
 def rotation_about(axis: Tensor, degrees: float) -> Tensor:
     """``(3, 3)`` rotation about ``axis`` ``(3,)``."""
     return rotation_exponential(functional.normalize(axis, dim=0) * math.radians(degrees))
+
+
+def pose_arrays(pose: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rotation ``(3, 3)`` and translation ``(3,)`` in float64."""
+    T_cam_obj = pose.matrix().numpy()
+    return T_cam_obj[:3, :3], T_cam_obj[:3, 3]
+
+
+def pose_from_arrays(R: NDArray[np.float64], t: NDArray[np.float64], like: Tensor) -> Pose:
+    """A pose from arrays."""
+    return from_matrix(
+        torch.from_numpy(np.ascontiguousarray(R)).to(like), torch.from_numpy(np.ascontiguousarray(t)).to(like)
+    )

@@ -10,7 +10,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from tracking3d.estimation.losses import iou_loss, laplacian_loss
+from tracking3d.estimation.paper.losses import iou_loss, laplacian_loss
 from tracking3d.geometry.mesh import uniform_laplacian
 from tracking3d.modules.renderer import RenderedViews
 from tracking3d.rendering import contour_loss, find_contour, signed_distance, texture_losses
@@ -26,7 +26,7 @@ class _PerFrame(nn.Module):
             raise ValueError(f"reduction is {reduction!r}; give 'mean' or 'none'")
         self.reduction = reduction
 
-    def _reduced(self, loss: Tensor) -> Tensor:
+    def _reduce(self, loss: Tensor) -> Tensor:
         return loss.mean() if self.reduction == "mean" else loss
 
 
@@ -48,7 +48,7 @@ class SilhouetteLoss(_PerFrame):
         check_shapes(
             silhouette=(silhouette, "B 1 H W"), mask=(mask, "B 1 H W"), valid=(valid, "B 1 H W")
         )  # fmt: skip
-        return self._reduced(iou_loss(silhouette[:, 0], mask[:, 0], valid[:, 0]))
+        return self._reduce(iou_loss(silhouette[:, 0], mask[:, 0], valid[:, 0]))
 
 
 class OutlineLoss(_PerFrame):
@@ -75,7 +75,7 @@ class OutlineLoss(_PerFrame):
         """
         check_shapes(mask=(mask, f"{len(views.image)} 1 H W"))
         distance = signed_distance(mask[:, 0])
-        return self._reduced(contour_loss(find_contour(views.drawn), distance, self.scale))
+        return self._reduce(contour_loss(find_contour(views.drawn), distance, self.scale))
 
 
 class TextureLoss(nn.Module):

@@ -38,7 +38,7 @@ class KnownNetwork(Section):
     how: str = Field("", description="How to obtain the file, if there is no address.")
 
     @model_validator(mode="after")
-    def _fetched_or_explained(self) -> KnownNetwork:
+    def _validate_origin(self) -> KnownNetwork:
         if self.address is not None and (self.sha256 is None or self.size is None):
             raise ValueError("an address needs a size and a sha256, because downloads are checked")
         if self.address is None and self.mirrors:

@@ -63,7 +63,7 @@ class Network:
             )
         except Exception as error:  # onnxruntime's exceptions have no common base of their own
             raise InputError(
-                f"{self.file} is not a network that onnxruntime can run ({_told(error)}); give an ONNX file."
+                f"{self.file} is not a network that onnxruntime can run ({_describe_error(error)}); give an ONNX file."
             ) from error
         self.inputs = {node.name: _info(node) for node in self._session.get_inputs()}
         self.outputs = {node.name: _info(node) for node in self._session.get_outputs()}
@@ -84,7 +84,7 @@ class Network:
             results = self._session.run(list(self.outputs), dict(feeds))
         except Exception as error:
             shapes = ", ".join(f"{name} {np.shape(value)}" for name, value in feeds.items())
-            raise InputError(f"{self.file} cannot be run on {shapes}: {_told(error)}.") from error
+            raise InputError(f"{self.file} cannot be run on {shapes}: {_describe_error(error)}.") from error
         return dict(zip(self.outputs, results, strict=True))
 
 
@@ -94,7 +94,7 @@ def _info(node: onnxruntime.NodeArg) -> TensorInfo:
     return TensorInfo(node.name, shape, {"float": "float32", "double": "float64"}.get(kind, kind))
 
 
-def _told(error: Exception) -> str:
+def _describe_error(error: Exception) -> str:
     """The first line of an onnxruntime error, without its error codes."""
     text = " ".join(str(error).split()).rpartition(" : ")[2].rstrip(".")
     return text if len(text) <= 200 else text[:197] + "..."

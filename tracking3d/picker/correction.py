@@ -80,10 +80,10 @@ class CorrectionPage(Picker):
         told = super().told(path)
         return told and {**told, "correcting": self._name}
 
-    def ordered(self, path: str, body: bytes) -> tuple[Any, Callable[[], None]] | None:
+    def order(self, path: str, body: bytes) -> tuple[Any, Callable[[], None]] | None:
         """See `Picker.ordered`: a mask to look at, or the correction; a run is not begun here."""
         if path == "/mask":
-            return super().ordered(path, body)
+            return super().order(path, body)
         if path != "/correct":
             return None
         drawn = parse_object(body)

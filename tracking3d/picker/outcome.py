@@ -18,7 +18,7 @@ FOLDER = "picked"
 DESCRIPTION, SETTINGS = "picked.json", "picked.yaml"
 
 
-def save_picked(picked: Picked, config: PipelineConfig, folder: Path, source: str) -> None:
+def save_outcome(picked: Picked, config: PipelineConfig, folder: Path, source: str) -> None:
     """Write what was picked into the run folder: masks, names and colours, and the settings as YAML.
 
     Args:

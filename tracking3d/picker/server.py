@@ -72,9 +72,9 @@ class Picker:
 
     def told(self, path: str) -> Any | None:
         """What is answered to a question of the page, as JSON has it; None where it is none."""
-        return _told(self.session) if path == "/session.json" else None
+        return _describe(self.session) if path == "/session.json" else None
 
-    def ordered(self, path: str, body: bytes) -> tuple[Any, Callable[[], None]] | None:
+    def order(self, path: str, body: bytes) -> tuple[Any, Callable[[], None]] | None:
         """Do what the page orders.
 
         Args:
@@ -172,7 +172,7 @@ class _Handler(BaseHTTPRequestHandler):
         if not self._may(from_page=True) or (body := self._body()) is None:
             return
         try:
-            done = self.server.picker.ordered(self.path, body)
+            done = self.server.picker.order(self.path, body)
         except Tracking3dError as error:
             return self._refuse(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
         if done is None:
@@ -249,7 +249,7 @@ def _nothing() -> None:
     pass
 
 
-def _told(session: PickingSession) -> dict[str, Any]:
+def _describe(session: PickingSession) -> dict[str, Any]:
     frames = session.frames
     return {
         "source": session.source,

@@ -16,7 +16,7 @@ from tracking3d.frames import Box, Frame
 from tracking3d.picker.drawing import Drawing, DrawnObject
 from tracking3d.picker.drawn_mask import drawn_mask
 from tracking3d.plugins import TRACKERS, build_plugin
-from tracking3d.prompts import make_prompt
+from tracking3d.prompts.prompt import make_prompt
 from tracking3d.trackers.protocol import MaskTracker
 from tracking3d.video.any_frame import FrameImages
 

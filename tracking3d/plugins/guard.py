@@ -19,7 +19,7 @@ from tracking3d.errors import PluginError, Tracking3dError
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame, MaskEstimate, Prompt
 from tracking3d.plugins.registration import describe_exception
-from tracking3d.stages import in_stage
+from tracking3d.runtime.stage_times import in_stage
 from tracking3d.trackers.protocol import CorrectableTracker, ForewarnedTracker, MaskTracker, ResumableTracker
 
 
@@ -66,7 +66,7 @@ class GuardedTracker:
             Tracking3dError: The tracker cannot start from this prompt; the message is its own.
             PluginFailure: It fails otherwise, or its result violates the protocol.
         """
-        with in_stage("track"), _blamed(self._label, but=Tracking3dError):
+        with in_stage("track"), _blame_plugin(self._label, but=Tracking3dError):
             answer = self._tracker.init(frame, prompt)
         return self._checked(answer, frame)
 
@@ -76,7 +76,7 @@ class GuardedTracker:
         Raises:
             PluginFailure: The tracker fails, or its result violates the protocol.
         """
-        with in_stage("track"), _blamed(self._label):
+        with in_stage("track"), _blame_plugin(self._label):
             answer = self._tracker.step(frame)
         return self._checked(answer, frame)
 
@@ -92,7 +92,7 @@ class GuardedTracker:
             PluginFailure: The tracker fails.
         """
         if isinstance(self._tracker, CorrectableTracker):
-            with in_stage("track"), _blamed(self._label):
+            with in_stage("track"), _blame_plugin(self._label):
                 self._tracker.correct(frame, mask.copy())
 
     def announce(self, frame: Frame) -> None:
@@ -102,7 +102,7 @@ class GuardedTracker:
             PluginFailure: The tracker fails.
         """
         if isinstance(self._tracker, ForewarnedTracker):
-            with in_stage("track"), _blamed(self._label):
+            with in_stage("track"), _blame_plugin(self._label):
                 self._tracker.announce(frame)
 
     @property
@@ -118,7 +118,7 @@ class GuardedTracker:
         """
         if not isinstance(self._tracker, ResumableTracker):
             return None
-        with _blamed(self._label):
+        with _blame_plugin(self._label):
             return self._tracker.state()
 
     def restore(self, frame: Frame, prompt: Prompt, state: Any) -> None:
@@ -128,7 +128,7 @@ class GuardedTracker:
             PluginFailure: The tracker fails.
         """
         if isinstance(self._tracker, ResumableTracker):
-            with _blamed(self._label):
+            with _blame_plugin(self._label):
                 self._tracker.restore(frame, prompt, state)
 
     def _checked(self, answer: Any, frame: Frame) -> MaskEstimate:
@@ -171,7 +171,7 @@ class GuardedEncoder:
             return value
 
         def guarded(*given: Any, **named: Any) -> Any:
-            with _blamed(self._label):
+            with _blame_plugin(self._label):
                 return value(*given, **named)
 
         return guarded
@@ -182,7 +182,7 @@ class GuardedEncoder:
         Raises:
             PluginFailure: The encoder fails, or its result violates the protocol.
         """
-        with in_stage("encode"), _blamed(self._label), torch.no_grad():
+        with in_stage("encode"), _blame_plugin(self._label), torch.no_grad():
             features = self._encoder.encode(images)
         if fault := feature_fault(features, images, self._encoder):
             raise PluginFailure(self._label, fault)
@@ -242,7 +242,7 @@ def feature_fault(features: Any, images: Tensor, encoder: FeatureEncoder) -> str
 
 
 @contextmanager
-def _blamed(label: str, but: type[Exception] = PluginFailure) -> Iterator[None]:
+def _blame_plugin(label: str, but: type[Exception] = PluginFailure) -> Iterator[None]:
     """Turn exceptions into failures of the plug-in, except those of the type ``but``."""
     try:
         yield

@@ -49,13 +49,13 @@ class Registered:
         return f"{KIND.get(self.group, 'plug-in')} '{self.name}' ({origin})"
 
 
-def registered_plugins(*groups: str) -> list[Registered]:
+def find_plugins(*groups: str) -> list[Registered]:
     """Registered plug-ins of the given groups, of all groups by default; imports none of them.
 
     Of plug-ins with the same name, the one that is used comes first. A single group takes half the time.
     """
     groups = groups or tuple(KIND)
-    packaged = [plugin for group in groups for plugin in _packaged(group, _search_path())]
+    packaged = [plugin for group in groups for plugin in _packaged_plugins(group, _search_path())]
     packaged.sort(key=lambda plugin: (plugin.package != "tracking3d", plugin.package.lower()))
     return _from_environment() + packaged
 
@@ -92,7 +92,7 @@ def _search_path() -> tuple[tuple[str, int], ...]:
 
 
 @functools.lru_cache(maxsize=8)
-def _packaged(group: str, search_path: tuple[tuple[str, int], ...]) -> tuple[Registered, ...]:
+def _packaged_plugins(group: str, search_path: tuple[tuple[str, int], ...]) -> tuple[Registered, ...]:
     """The plug-ins of installed packages; cached, because reading all metadata is slow."""
     origin = functools.cache(_origin)
     points = metadata.entry_points(group=group)

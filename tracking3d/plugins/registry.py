@@ -16,8 +16,8 @@ from tracking3d.plugins.registration import (
     TRACKERS,
     Registered,
     describe_exception,
+    find_plugins,
     import_plugin,
-    registered_plugins,
 )
 
 _ATTRIBUTES: dict[str, tuple[str, ...]] = {TRACKERS: (), FEATURES: ("channels", "stride", "tau")}
@@ -52,7 +52,7 @@ def list_plugins() -> list[PluginInfo]:
     """Every registered plug-in with its status; imports all of them, and reports those that fail."""
     infos = []
     first: dict[tuple[str, str], Registered] = {}
-    for plugin in registered_plugins():
+    for plugin in find_plugins():
         winner = first.setdefault((plugin.group, plugin.name), plugin)
         status: Literal["ok", "broken", "duplicate"] = "ok"
         reason, options = "", None
@@ -100,10 +100,10 @@ def check_options(group: str, choice: PluginChoice) -> BaseModel:
     Raises:
         PluginError: As `load_plugin`; or an option is unknown, missing or out of range.
     """
-    return _checked(_find(group, choice.name), choice)
+    return _validate_options(_find(group, choice.name), choice)
 
 
-def _checked(plugin: Registered, choice: PluginChoice) -> BaseModel:
+def _validate_options(plugin: Registered, choice: PluginChoice) -> BaseModel:
     model: type[BaseModel] = _load(plugin).Options
     unknown = [key for key in choice.options if key not in model.model_fields]
     if unknown and model.model_config.get("extra", "ignore") == "ignore":  # pydantic would ignore it silently
@@ -124,7 +124,7 @@ def build_plugin(group: str, choice: PluginChoice) -> Any:
         PluginError: As `check_options`; or the plug-in fails while it is built.
     """
     plugin = _find(group, choice.name)
-    options = _checked(plugin, choice)
+    options = _validate_options(plugin, choice)
     try:
         instance = _load(plugin).from_options(options)
     except Tracking3dError:
@@ -137,7 +137,7 @@ def build_plugin(group: str, choice: PluginChoice) -> Any:
 
 
 def _find(group: str, name: str) -> Registered:
-    plugins = [plugin for plugin in registered_plugins(group) if plugin.group == group]
+    plugins = [plugin for plugin in find_plugins(group) if plugin.group == group]
     for plugin in plugins:
         if plugin.name == name:
             return plugin

@@ -9,7 +9,7 @@ from string import Template
 from typing import Literal
 
 from tracking3d.errors import InputError, OutputError
-from tracking3d.plugins.registration import FEATURES, KIND, TRACKERS, registered_plugins
+from tracking3d.plugins.registration import FEATURES, KIND, TRACKERS, find_plugins
 
 Kind = Literal["tracker", "features"]
 _GROUPS: dict[str, str] = {"tracker": TRACKERS, "features": FEATURES}
@@ -37,7 +37,7 @@ def write_plugin(name: str, kind: Kind, folder: Path) -> Path:
             "between words, such as my-tracker."
         )
     group = _GROUPS[kind]
-    for plugin in registered_plugins():
+    for plugin in find_plugins():
         if (plugin.group, plugin.name) == (group, name):
             raise InputError(f"The name is taken by the {plugin.label}; choose another.")
     package = f"tracking3d-{name}"

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.points.bundle import intersect
-from tracking3d.points.chain import Chain, follow_chain
-from tracking3d.points.landmarks import LandmarkScene
+from tracking3d.points.landmark_adjustment import LandmarkScene
+from tracking3d.points.robust_bundle import intersect
+from tracking3d.points.track_chaining import Chain, follow_chain
 from tracking3d.points.uncertainty import FEATURES, Evidence, error_features, expected_error
 from tracking3d.points.view import Array, SurfaceView, sample
 
@@ -50,7 +50,7 @@ def follow_points(scene: LandmarkScene, start: int, xy: Array) -> Followed:
     """Follow pixels of one view through all of them.
 
     Args:
-        scene: The surface in its views; see `tracking3d.points.landmarks.refine_scene`.
+        scene: The surface in its views; see `tracking3d.points.landmark_adjustment.refine_scene`.
         start: Index of the view that the pixels are in.
         xy: ``(N, 2)`` pixels of its frame; those up to a few pixels beside the surface count as on its rim.
     """
@@ -74,7 +74,7 @@ def follow_points(scene: LandmarkScene, start: int, xy: Array) -> Followed:
     chain = follow_chain(scene.warps(), np.full(len(on), start), pixels[on])
     there = [index for index, one in enumerate(scene.views) if one is not None]
     views = [one for one in scene.views if one is not None]
-    seen = agreed(
+    seen = combine_with_images(
         views,
         points[on],
         Chain(chain.measured[there], chain.variance[there], chain.likeness[there]),
@@ -91,7 +91,7 @@ def follow_points(scene: LandmarkScene, start: int, xy: Array) -> Followed:
     return found
 
 
-def agreed(
+def combine_with_images(
     views: list[SurfaceView], points: Array, chain: Chain, slant: Array, gap: NDArray[np.int64], radius: float
 ) -> Followed:
     """Surface points brought together with what the images say of them.

@@ -73,7 +73,7 @@ class _Template:
     xy: Array
     variance: Array
 
-    def replaced(self, chosen: NDArray[np.bool_], row: int, xy: Array, variance: Array) -> _Template:
+    def replace_where(self, chosen: NDArray[np.bool_], row: int, xy: Array, variance: Array) -> _Template:
         return _Template(
             np.where(chosen, row, self.row),
             np.where(chosen[:, None], xy, self.xy),
@@ -132,8 +132,8 @@ class ImageFollower:
         last, position, variance = self._last, self._position, self._variance
         before, seen = self._pictures[last], self._hidden == 0
         self._pictures[index] = now
-        ahead = _predicted(before, now, position, seen, self._on_object)
-        step = _placed(
+        ahead = _predict_position(before, now, position, seen, self._on_object)
+        step = _place_point(
             self._pictures,
             index,
             _Template(np.full(len(ahead), last), position, variance),
@@ -146,7 +146,7 @@ class ImageFollower:
         total, weight, alike = _mean_begun(step)
         same = self._kept.row == self._asked.row
         for template, asked in ((self._kept, ~same), (self._asked, np.ones(len(same), bool))):
-            found = _placed(
+            found = _place_point(
                 self._pictures,
                 index,
                 template,
@@ -163,7 +163,7 @@ class ImageFollower:
         is_found = (weight > 0) & now.holds(at) & ~(elsewhere & (alike < _FOUND))
         # The template that was kept no longer says anything: the frame before is the next one.
         stale = is_found & ~lost & (1 / np.maximum(weight, 1e-12) >= step.variance * 0.999)
-        self._kept = self._kept.replaced(stale, last, position, variance)
+        self._kept = self._kept.replace_where(stale, last, position, variance)
         moved = np.linalg.norm(ahead - position, axis=1)
         self._position = np.where(is_found[:, None], at, ahead)
         self._variance = np.where(
@@ -186,7 +186,7 @@ class ImageFollower:
             set(self._kept.row.tolist()) - {self._first, self._last}, key=lambda row: abs(row - self._last)
         )
         dropped = np.isin(self._kept.row, rows[_MOST_KEPT:])
-        self._kept = self._kept.replaced(dropped, self._first, self.xy, np.zeros(len(self.xy)))
+        self._kept = self._kept.replace_where(dropped, self._first, self.xy, np.zeros(len(self.xy)))
         held = {self._first, self._last, *rows[:_MOST_KEPT]}
         self._pictures = {row: picture for row, picture in self._pictures.items() if row in held}
 
@@ -218,9 +218,9 @@ def follow_in_images(pictures: Sequence[Picture | None], start: int, xy: Array) 
     return tracks
 
 
-def _write(tracks: ImageTracks, row: int, answers: ImageAnswers) -> None:
+def _write(tracks: ImageTracks, row: int, estimates: ImageAnswers) -> None:
     for name in ("positions", "visible", "uncertainty", "likeness", "variance"):
-        getattr(tracks, name)[row] = getattr(answers, name)
+        getattr(tracks, name)[row] = getattr(estimates, name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,7 +233,7 @@ class _Placed:
     likeness: Array
 
 
-def _placed(
+def _place_point(
     pictures: Mapping[int, Picture],
     row: int,
     template: _Template,
@@ -287,7 +287,7 @@ def _add(found: _Placed, counts: NDArray[np.bool_], total: Array, weight: Array,
     np.maximum(alike, np.where(counts, found.likeness, -1.0), out=alike)
 
 
-def _predicted(
+def _predict_position(
     before: Picture, now: Picture, position: Array, seen: NDArray[np.bool_], on_object: NDArray[np.bool_]
 ) -> Array:
     """Where points ``(N, 2)`` of the picture before would be; hidden ones go along with corners of their layer."""

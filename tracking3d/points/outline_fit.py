@@ -81,7 +81,7 @@ def depth_inside(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
     return np.where(inside, inward - 0.5, 0.5 - outward).astype(np.float32)
 
 
-def fitted_to_outlines(
+def fit_to_outlines(
     vertices: NDArray[np.float64], faces: NDArray[np.int64], views: Sequence[OutlineView]
 ) -> NDArray[np.float64]:
     """``(V, 3)`` the vertices, moved.

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tracking3d.points.bundle import bundle
-from tracking3d.points.carrying import Warps
-from tracking3d.points.landmarks import DEVIATION, TOLERANCE, LandmarkScene, seeds
+from tracking3d.points.landmark_adjustment import DEVIATION, TOLERANCE, LandmarkScene, seeds
+from tracking3d.points.robust_bundle import bundle
 from tracking3d.points.view import Array, SurfaceView, redraw_surface
+from tracking3d.points.warping import Warps
 
 TURNS = 2
 _FIXED = 1e-6  # deviation in radii of points that stay where they are
@@ -21,7 +21,7 @@ def resect(scene: LandmarkScene, view: SurfaceView, known: Sequence[int]) -> tup
     The second is in [0, 1]: the share of their points that it shows where surface and pose put them.
 
     Args:
-        scene: Surface and views, put right; see `tracking3d.points.landmarks.refine_scene`.
+        scene: Surface and views, put right; see `tracking3d.points.landmark_adjustment.refine_scene`.
         view: The further one, drawn at about its pose.
         known: Which views of the scene are looked at; those near in time show most of what it shows.
     """
@@ -30,7 +30,7 @@ def resect(scene: LandmarkScene, view: SurfaceView, known: Sequence[int]) -> tup
         others = [scene.views[index] for index in known]
         warps = Warps([*others, view], TOLERANCE * scene.radius)
         found = [
-            _carried(scene, warps, source) for source in range(len(others)) if others[source] is not None
+            _carry_tracks(scene, warps, source) for source in range(len(others)) if others[source] is not None
         ]
         if not found:
             return view, share
@@ -48,7 +48,7 @@ def resect(scene: LandmarkScene, view: SurfaceView, known: Sequence[int]) -> tup
     return view, share
 
 
-def _carried(scene: LandmarkScene, warps: Warps, source: int) -> tuple[Array, Array, Array]:
+def _carry_tracks(scene: LandmarkScene, warps: Warps, source: int) -> tuple[Array, Array, Array]:
     """Points in space under corners of a view, their pixels in the last view, and deviations of these."""
     view = warps.views[source]
     assert view is not None

@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from tracking3d.reconstruction.depth_maps import Guide
+from tracking3d.reconstruction.plane_sweep import Guide
 from tracking3d.reconstruction.shape_views import ShapeView
 
 
@@ -26,7 +26,7 @@ def seen_vertices(
     tolerance = 0.01 * float(np.linalg.norm(np.ptp(vertices, axis=0)))
     seen = np.zeros(len(vertices), np.bool_)
     for view in views:
-        drawn, _ = Guide(vertices, faces).seen_by(view)
+        drawn, _ = Guide(vertices, faces).visible_to(view)
         x, y, z = view.P[:, :3] @ vertices.T + view.P[:, 3:]
         column, row = np.rint(x / z).astype(int), np.rint(y / z).astype(int)
         inside = (z > 0) & (column >= 0) & (column < len(drawn)) & (row >= 0) & (row < len(drawn))

@@ -16,15 +16,21 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from tracking3d.points.outline_fit import fitted_to_outlines
-from tracking3d.reconstruction.depth_maps import Guide, depth_maps
-from tracking3d.reconstruction.fusion import depth_evidence, fused
+from tracking3d.points.outline_fit import fit_to_outlines
 from tracking3d.reconstruction.grid import FloatArray, Grid
-from tracking3d.reconstruction.hull import robust_hull
-from tracking3d.reconstruction.judged import Explained, explained
+from tracking3d.reconstruction.held_out_test import HeldOutScore, score_held_out
 from tracking3d.reconstruction.mesh_distance import mesh_distance
-from tracking3d.reconstruction.shape_views import ShapeView, turned_apart
-from tracking3d.reconstruction.surface import extracted, is_sound, main_pieces, roughly, simplified
+from tracking3d.reconstruction.meshing import (
+    decimate_roughly,
+    extract_surface,
+    is_sound,
+    main_pieces,
+    simplify,
+)
+from tracking3d.reconstruction.plane_sweep import Guide, depth_maps
+from tracking3d.reconstruction.shape_views import ShapeView, spread_by_rotation
+from tracking3d.reconstruction.tsdf_fusion import depth_evidence, fuse_depth
+from tracking3d.reconstruction.visual_hull import carve_hull
 
 FEWEST = 8
 """Frames that a shape is made from."""
@@ -59,11 +65,11 @@ class ReconstructedShape:
     vertices: NDArray[np.float64] | None
     faces: NDArray[np.int64] | None
     sentence: str
-    old: Explained | None = None
-    new: Explained | None = None
+    old: HeldOutScore | None = None
+    new: HeldOutScore | None = None
 
 
-def reconstructed(
+def reconstruct_shape(
     vertices: NDArray[np.float64],
     faces: NDArray[np.int64],
     views: Sequence[ShapeView],
@@ -77,28 +83,28 @@ def reconstructed(
         views: The frames that it is made from, in order.
         left_out: The frames that it is judged by, see `is_left_out`.
     """
-    used = turned_apart(views, _APART, MOST)
+    used = spread_by_rotation(views, _APART, MOST)
     if len(used) < FEWEST or not left_out:
-        return _kept(f"only {len(used)} frames differ enough to tell a shape, and {FEWEST} are needed")
+        return _keep_mesh(f"only {len(used)} frames differ enough to tell a shape, and {FEWEST} are needed")
     if (turn := _turn(used)) < LEAST_TURN:
-        return _kept(f"the object turns by {turn:.0f} degrees only, and {LEAST_TURN:.0f} are needed")
+        return _keep_mesh(f"the object turns by {turn:.0f} degrees only, and {LEAST_TURN:.0f} are needed")
     start = trimesh.Trimesh(vertices, faces, process=False)
     grid, inside = _volume(start, used)
-    mesh = _sound(grid, inside)
+    mesh = _check_shape(grid, inside)
     if mesh is None:
-        return _kept("what is seen contradicts itself: the new surface is full of holes")
+        return _keep_mesh("what is seen contradicts itself: the new surface is full of holes")
     new_faces = np.asarray(mesh.faces, np.int64)
-    new_vertices = fitted_to_outlines(
-        np.asarray(mesh.vertices), new_faces, turned_apart(used, _REFERENCES_APART, _REFERENCES)
+    new_vertices = fit_to_outlines(
+        np.asarray(mesh.vertices), new_faces, spread_by_rotation(used, _REFERENCES_APART, _REFERENCES)
     )
-    old = explained(vertices, faces, used, left_out)
-    new = explained(new_vertices, new_faces, used, left_out)
+    old = score_held_out(vertices, faces, used, left_out)
+    new = score_held_out(new_vertices, new_faces, used, left_out)
     told = (
         f"silhouettes of {len(left_out)} frames that were left out agree by {new.iou:.3f} instead of {old.iou:.3f}, "
         f"colours differ by {new.colour:.3f} instead of {old.colour:.3f}"
     )
     if not new.better_than(old):
-        return _kept(f"the new one is no better ({told})", old, new)
+        return _keep_mesh(f"the new one is no better ({told})", old, new)
     return ReconstructedShape(new_vertices, new_faces, told, old, new)
 
 
@@ -110,33 +116,33 @@ def _volume(start: trimesh.Trimesh, views: Sequence[ShapeView]) -> tuple[Grid, F
     bounds = {}
     for cells in (_COARSE, _CELLS):
         grid = Grid.around(vertices, cells, _MARGIN)
-        hull, _ = robust_hull(grid.points, views, 2 * truncation)
+        hull, _ = carve_hull(grid.points, views, 2 * truncation)
         bounds[cells] = grid, hull, mesh_distance(grid, vertices, faces, 1.2 * truncation)
     maps = depth_maps(
         views,
-        turned_apart(views, _REFERENCES_APART, _REFERENCES),
+        spread_by_rotation(views, _REFERENCES_APART, _REFERENCES),
         _guide(*bounds[_COARSE], start),
         _REACH * diagonal,
         _STEPS,
     )
     grid, hull, prior = bounds[_CELLS]
     total, weight = depth_evidence(grid.points, maps, truncation)
-    return grid, fused(grid.shape, hull, prior, total, weight, truncation)
+    return grid, fuse_depth(grid.shape, hull, prior, total, weight, truncation)
 
 
 def _guide(grid: Grid, hull: FloatArray, prior: FloatArray, start: trimesh.Trimesh) -> Guide:
     """The mesh of the online map as far as it is within the hull: where depths are looked for."""
-    found = extracted(grid, np.minimum(hull, prior))
-    mesh = start if found is None else roughly(main_pieces(found), _GUIDE_FACES)
+    found = extract_surface(grid, np.minimum(hull, prior))
+    mesh = start if found is None else decimate_roughly(main_pieces(found), _GUIDE_FACES)
     return Guide(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64))
 
 
-def _sound(grid: Grid, inside: FloatArray) -> trimesh.Trimesh | None:
+def _check_shape(grid: Grid, inside: FloatArray) -> trimesh.Trimesh | None:
     """The surface of a volume, as little smoothed as it needs to be closed and simple; None if that is not enough."""
     for smooth in _SMOOTH:
-        found = extracted(grid, gaussian_filter(inside.reshape(grid.shape), smooth).ravel())
+        found = extract_surface(grid, gaussian_filter(inside.reshape(grid.shape), smooth).ravel())
         if found is not None:
-            mesh = simplified(main_pieces(found), _FACES)
+            mesh = simplify(main_pieces(found), _FACES)
             if is_sound(mesh) and len(mesh.faces) <= _MOST_FACES:
                 return mesh
     return None
@@ -149,5 +155,7 @@ def _turn(views: Sequence[ShapeView]) -> float:
     return float(np.degrees(np.arccos(np.clip((traces.min() - 1) / 2, -1, 1))))
 
 
-def _kept(why: str, old: Explained | None = None, new: Explained | None = None) -> ReconstructedShape:
+def _keep_mesh(
+    why: str, old: HeldOutScore | None = None, new: HeldOutScore | None = None
+) -> ReconstructedShape:
     return ReconstructedShape(None, None, f"The mesh keeps its shape: {why}.", old, new)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tracking3d.frames import Image
 from tracking3d.geometry.camera import Camera, Window
 from tracking3d.points.outline_fit import depth_inside
-from tracking3d.trackers.crops import box_of, cut, inside_frame
+from tracking3d.trackers.crops import box_of, crop_window, inside_frame
 
 SIDE = 192
 """Pixels of a view's side; a smaller window is seen larger."""
@@ -79,14 +79,14 @@ def shape_view(
     if box is None:
         return None
     window = Window.around(box, _MARGIN, side)
-    inside = (cut(mask.astype(np.float32), window) > 0.5) & inside_frame(mask.shape, window)
+    inside = (crop_window(mask.astype(np.float32), window) > 0.5) & inside_frame(mask.shape, window)
     if not inside.any():
         return None
     height, width = mask.shape
     edges = np.array([-window.left, width - window.left, -window.top, height - window.top]) * window.scale
     return ShapeView(
         index,
-        cut(image, window),
+        crop_window(image, window),
         depth_inside(inside),
         (edges - 0.5).astype(np.float32),
         window.K(camera),
@@ -94,7 +94,7 @@ def shape_view(
     )
 
 
-def turned_apart(views: Sequence[ShapeView], degrees: float, most: int) -> list[ShapeView]:
+def spread_by_rotation(views: Sequence[ShapeView], degrees: float, most: int) -> list[ShapeView]:
     """Those views that differ by at least ``degrees`` from all chosen before; by more, where they are too many."""
     rotations = np.stack([view.T_cam_obj[:3, :3] for view in views]) if views else np.zeros((0, 3, 3))
     while True:

@@ -50,11 +50,11 @@ def bake_texture(model: ObjectModel, views: Sequence[TextureView], largest: int 
         return model
     with threads_kept():
         give_threads({"backend": "numba", "threads": 1})
-        return _textured(model, views, texture_size(views, largest))
+        return _paint_texture(model, views, texture_size(views, largest))
 
 
-def _textured(model: ObjectModel, views: Sequence[TextureView], size: int) -> ObjectModel:
-    gains, coarse = _levelled(model, views, max(size // _COARSE, 64))
+def _paint_texture(model: ObjectModel, views: Sequence[TextureView], size: int) -> ObjectModel:
+    gains, coarse = _level_exposure(model, views, max(size // _COARSE, 64))
     expected = cv2.resize(coarse, (size, size), interpolation=cv2.INTER_LINEAR).reshape(-1, 3)
     texels = TexelMap.of(torch.from_numpy(model.face_uvs).float(), size)
     total, weight = np.zeros((size * size, 3), np.float32), np.zeros(size * size, np.float32)
@@ -63,7 +63,9 @@ def _textured(model: ObjectModel, views: Sequence[TextureView], size: int) -> Ob
         add_view(total, weight, _seen(model, texels, view), gain, expected, view.sharpness / sharpest)
     if not weight.any():
         return model
-    texture = filled(_per(total, weight).reshape(size, size, 3), (weight > 0).reshape(size, size))
+    texture = fill_holes(
+        _divide_safely(total, weight).reshape(size, size, 3), (weight > 0).reshape(size, size)
+    )
     return replace(
         model,
         texture=np.clip(np.round(255 * texture), 0, 255).astype(np.uint8),
@@ -100,7 +102,7 @@ def texture_size(views: Sequence[TextureView], largest: int) -> int:
     return min(max(1 << round(math.log2(wanted)), _SMALLEST), largest)
 
 
-def filled(texture: FloatArray, known: NDArray[np.bool_]) -> FloatArray:
+def fill_holes(texture: FloatArray, known: NDArray[np.bool_]) -> FloatArray:
     """``(T, T, 3)`` where texels that are not known continue those that are, smoothly and around the seam in u."""
     if known.all() or not known.any():
         return texture
@@ -112,7 +114,7 @@ def filled(texture: FloatArray, known: NDArray[np.bool_]) -> FloatArray:
     half = (math.ceil(width / 2), math.ceil(height / 2))
     share = cv2.resize(known.astype(np.float32), half, interpolation=cv2.INTER_AREA)
     mean = cv2.resize(texture * known[..., None].astype(np.float32), half, interpolation=cv2.INTER_AREA)
-    coarse = filled(mean / np.maximum(share, 1e-6)[..., None], share > 0)
+    coarse = fill_holes(mean / np.maximum(share, 1e-6)[..., None], share > 0)
     wrapped = np.concatenate([coarse[:, -1:], coarse, coarse[:, :1]], 1)
     columns = (np.arange(width, dtype=np.float32) + 0.5) * half[0] / width - 0.5 + 1
     rows = (np.arange(height, dtype=np.float32) + 0.5) * half[1] / height - 0.5
@@ -121,7 +123,7 @@ def filled(texture: FloatArray, known: NDArray[np.bool_]) -> FloatArray:
     return np.where(known[..., None], texture, beyond).astype(np.float32)
 
 
-def _levelled(
+def _level_exposure(
     model: ObjectModel, views: Sequence[TextureView], size: int
 ) -> tuple[list[FloatArray], FloatArray]:
     """Factors ``(3,)`` that bring each view's colours to one level, and the texture ``(T, T, 3)`` that they give."""
@@ -136,7 +138,7 @@ def _levelled(
         for (texel, colours, say), gain in zip(seen, gains, strict=True):
             total[texel] += say[:, None] * gain * colours
             weight[texel] += say
-        return _per(total, weight), weight
+        return _divide_safely(total, weight), weight
 
     gains = [np.ones(3, np.float32) for _ in views]
     level, _ = mean(gains)
@@ -146,10 +148,10 @@ def _levelled(
             both = (say[:, None] * colours * level[texel]).sum(0)
             gains[n] = np.clip(both / np.maximum(ours, 1e-12), 1 / _EXPOSURE, _EXPOSURE).astype(np.float32)
     level, weight = mean(gains)
-    return gains, filled(level.reshape(size, size, 3), (weight > 0).reshape(size, size))
+    return gains, fill_holes(level.reshape(size, size, 3), (weight > 0).reshape(size, size))
 
 
-def _per(total: FloatArray, weight: FloatArray) -> FloatArray:
+def _divide_safely(total: FloatArray, weight: FloatArray) -> FloatArray:
     return np.asarray(total / np.maximum(weight, 1e-20)[:, None], np.float32)
 
 

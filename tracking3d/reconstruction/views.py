@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tracking3d.frames import Image
 from tracking3d.geometry.camera import Camera, Window
-from tracking3d.trackers.crops import box_of, cut, inside_frame
+from tracking3d.trackers.crops import box_of, crop_window, inside_frame
 
 BELIEVED = 0.5
 """Confidence of a pose from which on a texture is taken from its frame."""
@@ -70,12 +70,12 @@ def texture_view(
         return None
     window = Window.around(box, _MARGIN, 1)
     window = Window(window.left, window.top, window.side, min(window.side, _LARGEST))
-    inside = (cut(mask.astype(np.float32), window) > 0.5) & inside_frame(mask.shape, window)
+    inside = (crop_window(mask.astype(np.float32), window) > 0.5) & inside_frame(mask.shape, window)
     depth = cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, 5)
     valid = np.clip((depth - _OUTLINE[0]) / (_OUTLINE[1] - _OUTLINE[0]), 0.0, 1.0).astype(np.float32)
     if not valid.any():
         return None
-    seen = cut(image, window)
+    seen = crop_window(image, window)
     return TextureView(
         index,
         seen,
@@ -87,7 +87,7 @@ def texture_view(
     )
 
 
-def kept_views(views: tuple[TextureView, ...], view: TextureView, most: int) -> tuple[TextureView, ...]:
+def keep_best_views(views: tuple[TextureView, ...], view: TextureView, most: int) -> tuple[TextureView, ...]:
     """The views with one more; of more than ``most`` the less sharp of the two that see most alike goes."""
     if most < 1:
         return ()

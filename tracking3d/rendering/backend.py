@@ -116,7 +116,7 @@ def threads_kept() -> Iterator[None]:
 
 
 @contextmanager
-def shared_among(threads: int) -> Iterator[None]:
+def share_threads(threads: int) -> Iterator[None]:
     """Within, kernels share their work among so many threads, and torch has one.
 
     For work that is done once, when no frame waits.

@@ -103,14 +103,14 @@ def contour_loss(contour: Contour, distance: Tensor, scale: float) -> Tensor:
 def contour_distance(contour: Contour, distance: Tensor) -> Tensor:
     """``(N,)`` signed distance ``(B, H, W)`` at the contour's points, between the pixels."""
     check_shapes(distance=(distance, f"{contour.frames} H W"))
-    value, _, _ = _sampled(contour, distance)
+    value, _, _ = _sample_contour(contour, distance)
     return value
 
 
 @torch.no_grad()
 def contour_slopes(contour: Contour, distance: Tensor) -> tuple[Tensor, Tensor]:
     """`contour_distance` and its slopes ``(N, 2)`` by x and y, without gradient."""
-    value, by_x, by_y = _sampled(contour, distance)
+    value, by_x, by_y = _sample_contour(contour, distance)
     return value, torch.stack([by_x, by_y], 1)
 
 
@@ -177,7 +177,7 @@ def _nearest_pixel(position: Tensor, height: int, width: int) -> tuple[Tensor, T
     return row.clamp(0, height - 1) * width + column.clamp(0, width - 1), inside
 
 
-def _sampled(contour: Contour, distance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _sample_contour(contour: Contour, distance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Bilinear samples ``(N,)`` at the contour's positions, and their slopes by x and y; the first has a gradient."""
     _, height, width = distance.shape
     x, y = contour.position.unbind(1)

@@ -45,7 +45,7 @@ def on_faces(values: NDArray[np.float64], texels: TexelMap) -> NDArray[np.float6
     return np.asarray((values[face] * share[..., None]).sum(1))
 
 
-def painted(colours: NDArray[np.float64], texels: TexelMap) -> NDArray[np.uint8]:
+def paint_faces(colours: NDArray[np.float64], texels: TexelMap) -> NDArray[np.uint8]:
     """A texture ``(T, T, 3)``; beside the faces it goes on as at the nearest texel, so that no seam shows.
 
     Args:

@@ -118,7 +118,7 @@ def pose_normal_equations(
     robust = 2 / (scale**2 + residual.square())
     inner = torch.einsum("ipc,pc,jpc,p->pij", slopes, robust, slopes, share)
     pull = torch.einsum("ipc,pc,pc,p->pi", slopes, robust, residual, share)
-    motion = screen_motion(_unprojected(drawn, view, depth), drawn.K[view], pivot[view])  # (P, 2, 6)
+    motion = screen_motion(_unproject(drawn, view, depth), drawn.K[view], pivot[view])  # (P, 2, 6)
     matrix = torch.einsum("pia,pij,pjb->pab", motion, inner, motion)
     gradient = -torch.einsum("pia,pi->pa", motion, pull)
     cost = share * cauchy(value, target, scale).sum(1)
@@ -163,7 +163,7 @@ def _surface_at_pixels(drawn: Rendering, view: Tensor) -> tuple[Tensor, Tensor, 
     return uv_by_x, uv_by_y, depth
 
 
-def _unprojected(drawn: Rendering, view: Tensor, depth: Tensor) -> Tensor:
+def _unproject(drawn: Rendering, view: Tensor, depth: Tensor) -> Tensor:
     """``(P, 3)`` surface points at the covered pixels in camera coordinates."""
     _, height, width = drawn.face_index.shape
     row = torch.div(drawn.pixels, width, rounding_mode="floor")

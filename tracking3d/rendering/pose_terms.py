@@ -50,10 +50,10 @@ def pose_terms(
         from tracking3d.rendering.kernels.pose_terms import pose_terms as by_kernel
 
         return by_kernel(surface, target, R, t, matched, scales, NEAREST_POINT)
-    return _composed(surface, target, R, t, matched, scales)
+    return _compose(surface, target, R, t, matched, scales)
 
 
-def _composed(
+def _compose(
     surface: Surface, target: PoseTarget, R: Tensor, t: Tensor, matched: MatchedPoints | None, scales: Scales
 ) -> PoseTerms:
     """By the renderer and what is known of its derivatives."""

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from tracking3d.errors import InputError
 from tracking3d.evaluation.alignment import align_object_frame
-from tracking3d.report.figures import angles_between, believed_poses, stage_times, status_counts
+from tracking3d.report.figures import angles_between, reliable_poses, stage_times, status_counts
 from tracking3d.report.settings import flat
 from tracking3d.results.files import read_mask
 from tracking3d.results.records import jsonable, mask_iou_or_none
 from tracking3d.results.run_reader import RunReader
-from tracking3d.stages import STAGES
+from tracking3d.runtime.stage_times import STAGES
 
 MOST_FRAMES = 6
 """Frames that differ most, which are shown."""
@@ -113,8 +113,8 @@ class RunComparison:
                 "every_pair": [
                     {
                         "runs": [self.names[row], self.names[column]],
-                        "iou_mean": _known(self.iou_between[row, column]),
-                        "rotation_median_deg": _known(self.rotation_between[row, column]),
+                        "iou_mean": _finite_or_none(self.iou_between[row, column]),
+                        "rotation_median_deg": _finite_or_none(self.rotation_between[row, column]),
                     }
                     for row, column in combinations(range(len(self.runs)), 2)
                 ],
@@ -202,8 +202,8 @@ def _difference(name: str, first: RunReader, other: RunReader) -> Difference:
     records = {record.index: record for record in first.frames}
     shared = [record.index for record in other.frames if record.index in records]
     others = {record.index: record for record in other.frames}
-    T_first = believed_poses([records[index] for index in shared])
-    T_other = believed_poses([others[index] for index in shared])
+    T_first = reliable_poses([records[index] for index in shared])
+    T_other = reliable_poses([others[index] for index in shared])
     rotation, translation, scale = _pose_differences(T_first, T_other)
     return Difference(
         name=name,
@@ -227,7 +227,7 @@ def _between(
     return iou, rotation
 
 
-def _known(value: float) -> float | None:
+def _finite_or_none(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 

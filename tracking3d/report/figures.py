@@ -14,7 +14,7 @@ from tracking3d.estimation.estimate import Status
 from tracking3d.results.description import stages_of
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
-from tracking3d.stages import STAGES, StageTimes
+from tracking3d.runtime.stage_times import STAGES, StageTimes
 
 _MEANINGS = {
     "decode": "reading the frame",
@@ -31,7 +31,7 @@ def status_counts(records: Sequence[FrameRecord]) -> dict[str, int]:
     return {status.value: sum(record.status is status for record in records) for status in Status}
 
 
-def believed_poses(records: Sequence[FrameRecord]) -> NDArray[np.float64]:
+def reliable_poses(records: Sequence[FrameRecord]) -> NDArray[np.float64]:
     """``(N, 4, 4)`` poses; NaN where the object was lost or that is no pose."""
     poses = np.full((len(records), 4, 4), np.nan)
     for number, record in enumerate(records):

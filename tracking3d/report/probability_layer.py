@@ -37,10 +37,10 @@ def probability_layers(
     shown = [_grey(run.probability(run.frames[position].index), width) for position in positions]
     if all(one is None for one in shown):
         return ()
-    layers = list(map(_encoded, shown))
+    layers = list(map(_encode, shown))
     while sum(len(layer) for layer in layers if layer) > budget and width > 16:
         width = width * 3 // 4
-        layers = [_encoded(None if one is None else _shrunk(one, width)) for one in shown]
+        layers = [_encode(None if one is None else _shrunk(one, width)) for one in shown]
     return tuple(layers)
 
 
@@ -57,7 +57,7 @@ def _shrunk(grey: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
     return cv2.resize(grey, shape, interpolation=cv2.INTER_AREA).astype(np.uint8)
 
 
-def _encoded(grey: NDArray[np.uint8] | None) -> bytes | None:
+def _encode(grey: NDArray[np.uint8] | None) -> bytes | None:
     if grey is None:
         return None
     image = Pillow.fromarray(np.rint(grey / 255 * (_STEPS - 1)).astype(np.uint8))

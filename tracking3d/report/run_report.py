@@ -139,8 +139,8 @@ def _data(
     return {
         "indices": [record.index for record in records],
         "statuses": "".join(record.status.value[0] for record in records),
-        "confidences": [_rounded(record.confidence) for record in records],
-        "times": [_rounded(record.time) for record in records] if timed else None,
+        "confidences": [_round(record.confidence) for record in records],
+        "times": [_round(record.time) for record in records] if timed else None,
         "keyframes": [number for number, record in enumerate(records) if record.keyframe],
         "reasons": list(reasons),
         "reason": [reasons[record.reason] for record in records],
@@ -177,7 +177,7 @@ def _front(run: RunReader, model: ObjectModel | None) -> NDArray[np.float64]:
 
 
 def _curves(records: list[FrameRecord], model: ObjectModel | None) -> list[Curve]:
-    poses = figures.believed_poses(records)
+    poses = figures.reliable_poses(records)
     middle = np.zeros(3) if model is None else middle_of(model)
     ious = [_own_overlap(record) for record in records]
     drawn = [
@@ -266,7 +266,7 @@ def _label(record: FrameRecord) -> str:
     return f"frame {record.index}{time}"
 
 
-def _rounded(value: float | None) -> float | None:
+def _round(value: float | None) -> float | None:
     return None if value is None or not math.isfinite(value) else round(value, 2)
 
 

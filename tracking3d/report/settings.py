@@ -15,7 +15,7 @@ class Setting:
     """One setting.
 
     Attributes:
-        name: With its section, such as ``solver.window``.
+        name: With its section, such as ``solver.local_window``.
         value: As text.
         usual: The value of preset ``default``, where that is another one; None where it is the same or unknown.
     """

@@ -15,7 +15,7 @@ from tracking3d.frames import Image
 from tracking3d.results import drawing
 from tracking3d.results.description import own_masks, time_per_frame
 from tracking3d.results.mesh_view import most_different, render_view, side_shown
-from tracking3d.stages import STAGES
+from tracking3d.runtime.stage_times import STAGES
 
 TILE = 240
 COLUMNS = 6
@@ -90,11 +90,11 @@ def draw_contact_sheet(
     Returns:
         ``(H, COLUMNS * TILE, 3)``.
     """
-    tiles = [_labelled(thumbnail, thumbnail.index in replaced) for thumbnail in thumbnails]
+    tiles = [_add_label(thumbnail, thumbnail.index in replaced) for thumbnail in thumbnails]
     tiles += [_blank() for _ in range(-len(tiles) % COLUMNS)]
     if model is not None:
         texture = np.where((model.texture_weight > 0)[..., None], model.texture, model.texture // 3 + 40)
-        tiles.append(_titled(drawing.fit(texture.astype(np.uint8), TILE), "texture (pale: never seen)"))
+        tiles.append(_add_title(drawing.fit(texture.astype(np.uint8), TILE), "texture (pale: never seen)"))
         views = _views(thumbnails, model)
         tiles += views + [_blank() for _ in range(VIEWS - len(views))]
     tiles.append(_legend(run))
@@ -125,25 +125,25 @@ def _views(thumbnails: Sequence[Thumbnail], model: ObjectModel) -> list[Image]:
         and (rotation := side_shown(thumbnail.T_cam_obj, middle)) is not None
     }
     if not sides:
-        return [_titled(render_view(model, np.eye(3), TILE), "model")]
+        return [_add_title(render_view(model, np.eye(3), TILE), "model")]
     indices = list(sides)
     chosen = most_different(np.stack(list(sides.values())), VIEWS)
     return [
-        _titled(render_view(model, sides[index], TILE), f"model as in #{index}")
+        _add_title(render_view(model, sides[index], TILE), f"model as in #{index}")
         for index in sorted(indices[one] for one in chosen)
     ]
 
 
-def _labelled(thumbnail: Thumbnail, replaced: bool) -> Image:
+def _add_label(thumbnail: Thumbnail, replaced: bool) -> Image:
     title = f"#{thumbnail.index} {thumbnail.status.value}" + (", keyframe" if thumbnail.keyframe else "")
     title += ", first answer" if replaced else ""
-    tile = _titled(thumbnail.image, title, drawing.STATUS[thumbnail.status])
+    tile = _add_title(thumbnail.image, title, drawing.STATUS[thumbnail.status])
     if thumbnail.keyframe:
         cv2.rectangle(tile, (1, 1), (TILE - 2, TILE - 2), drawing.KEYFRAME, 3)
     return tile
 
 
-def _titled(tile: Image, title: str, colour: drawing.Colour = drawing.INK) -> Image:
+def _add_title(tile: Image, title: str, colour: drawing.Colour = drawing.INK) -> Image:
     tile = tile.copy()
     tile[: 2 * _LETTERS + 2] = tile[: 2 * _LETTERS + 2] // 4
     drawing.draw_text(tile, title, _LETTERS // 2 + 3, _LETTERS * 3 // 2 + 2, _LETTERS, colour)

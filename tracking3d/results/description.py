@@ -15,11 +15,11 @@ import numpy as np
 
 from tracking3d.estimation.estimate import MaskSource, Status
 from tracking3d.geometry.camera import Camera
-from tracking3d.process_memory import resident_memory
 from tracking3d.results.layout import CONVENTIONS, FORMAT, FORMAT_VERSION
 from tracking3d.results.process import this_process
 from tracking3d.results.records import FrameRecord
-from tracking3d.stages import StageTimes
+from tracking3d.runtime.memory import resident_memory
+from tracking3d.runtime.stage_times import StageTimes
 
 MOST_FAILURES = 20
 """Different reasons of plug-in failures that a summary lists; the commonest come first."""
@@ -39,7 +39,7 @@ class RunHeader:
         source_notes: What the source did to its pictures, in clauses.
         selection: The ``START:STOP:STEP`` that the source was opened with.
         renderer: What renders, and why.
-        given: What tells source and object apart from others, see `tracking3d.checkpoint.resuming.given_of`.
+        given: What tells source and object apart from others, see `tracking3d.checkpoint.resuming.prompt_record`.
         tracker_choice: Why the mask tracker ``auto`` stood for that of ``config``; None if the user named it.
     """
 

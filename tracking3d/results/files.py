@@ -102,10 +102,10 @@ def read_mask(path: Path) -> NDArray[np.bool_] | None:
     """Read a mask written by `write_mask`: ``(H, W)`` bool, or None if there is no such image."""
     if not path.is_file():
         return None
-    return decoded_mask(path.read_bytes())
+    return decode_mask(path.read_bytes())
 
 
-def decoded_mask(data: bytes) -> NDArray[np.bool_] | None:
+def decode_mask(data: bytes) -> NDArray[np.bool_] | None:
     """A mask from the bytes of such a file; None where they are no image."""
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
     return None if image is None else image >= 128

@@ -72,7 +72,7 @@ class FrameLines:
         """
         lines = b"".join(record.to_json().encode() + b"\n" for record in records)
         with writing(self._path):
-            self.cut_back()
+            self.truncate()
             end = self._file.seek(0, 2)
             try:
                 written = 0
@@ -82,7 +82,7 @@ class FrameLines:
                 self._file.truncate(end)
                 raise
 
-    def cut_back(self) -> None:
+    def truncate(self) -> None:
         """Cut off what a stopped run had begun to write after its last finished frame."""
         if self._kept is not None:
             self._file.truncate(self._kept)

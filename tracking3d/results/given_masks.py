@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.corrections import Correction
 from tracking3d.errors import InputError
 from tracking3d.frames import Prompt
+from tracking3d.prompts.corrections import Correction
 from tracking3d.results import layout
 from tracking3d.results.files import read_mask, write_mask, writing
 
@@ -39,7 +39,7 @@ def keep_given_masks(
         write_mask(layout.prompt_path(folder, index), mask)
 
 
-def given_mask(folder: Path, index: int) -> NDArray[np.bool_]:
+def read_given_mask(folder: Path, index: int) -> NDArray[np.bool_]:
     """The mask ``(H, W)`` that was given of a frame.
 
     Raises:

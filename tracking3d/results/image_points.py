@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from tracking3d.frames import Frame
 from tracking3d.points.follow import Followed, follow_points
 from tracking3d.points.image_following import ImageTracks, follow_in_images
-from tracking3d.points.landmarks import LandmarkScene
-from tracking3d.points.meeting import surface_under
+from tracking3d.points.landmark_adjustment import LandmarkScene
 from tracking3d.points.pictures import Picture, open_picture
-from tracking3d.points.tying import meetings, merge_image_points
+from tracking3d.points.ray_intersection import surface_under
+from tracking3d.points.surface_association import meetings, merge_image_points
 from tracking3d.points.uncertainty import FEATURES
 from tracking3d.results.correspondences import PointKind, PointTracks
 from tracking3d.results.run_reader import RunReader

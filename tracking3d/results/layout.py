@@ -61,7 +61,7 @@ LANDMARKS = "landmarks.npz"
 
 OUT = argument("folder", "--out")
 OVERWRITE = argument("overwrite=True", "--overwrite")
-"""What sentences call the arguments of `tracking3d.recording.record`, and of ``tracking3d run``."""
+"""What sentences call the arguments of `tracking3d.pipeline.record.record`, and of ``tracking3d run``."""
 
 CONVENTIONS = {
     "axes": "OpenCV camera axes: x right, y down, z forward.",
@@ -142,7 +142,7 @@ def run_files(folder: Path) -> list[Path]:
         if masks.is_dir():
             names = {path.name.removeprefix(".").removesuffix(".part") for path in masks.iterdir()}
             named += [masks / name for name in sorted(names) if _MASK_NAME.fullmatch(name)]
-    return _with_unfinished(named) + state_files(folder) + correction_files(folder)
+    return _add_unfinished(named) + state_files(folder) + correction_files(folder)
 
 
 def correction_files(folder: Path) -> list[Path]:
@@ -175,8 +175,8 @@ def state_files(folder: Path) -> list[Path]:
     if (inner / MASKS).is_dir():
         names = {path.name.removeprefix(".").removesuffix(".part") for path in (inner / MASKS).iterdir()}
         named += [inner / MASKS / name for name in sorted(names) if _MASK_NAME.fullmatch(name)]
-    return _with_unfinished(named)
+    return _add_unfinished(named)
 
 
-def _with_unfinished(files: list[Path]) -> list[Path]:
+def _add_unfinished(files: list[Path]) -> list[Path]:
     return [path for file in files for path in (file, partial_path(file)) if path.is_file()]

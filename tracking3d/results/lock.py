@@ -27,20 +27,20 @@ def try_lock(descriptor: int, shared: bool = False) -> bool:
 
     A file system without locks counts as free.
     """
-    return _tried(descriptor, shared) is not False
+    return _try_lock(descriptor, shared) is not False
 
 
 def is_locked(path: Path) -> bool | None:
     """Whether somebody holds the lock on ``path``; None on a file system without locks."""
     try:
         with path.open("rb") as file:
-            free = _tried(file.fileno(), shared=True)
+            free = _try_lock(file.fileno(), shared=True)
     except OSError:
         return False
     return None if free is None else not free
 
 
-def _tried(descriptor: int, shared: bool) -> bool | None:
+def _try_lock(descriptor: int, shared: bool) -> bool | None:
     """Whether the lock could be taken; None on a file system without locks."""
     try:
         _lock(descriptor, shared)

@@ -108,16 +108,16 @@ def draw_overlay(
     picture = canvas[: size.picture]
     cv2.resize(frame.image, shape, picture, interpolation=way)
     thin = max(round(size.width / 400), 1)
-    drawing.draw_outline(picture, _scaled(estimate.mask, shape), drawing.REFINED, thin + 1)
+    drawing.draw_outline(picture, _scale(estimate.mask, shape), drawing.REFINED, thin + 1)
     if estimate.initial_mask is not None:
-        drawing.draw_outline(picture, _scaled(estimate.initial_mask, shape), drawing.INITIAL, thin)
+        drawing.draw_outline(picture, _scale(estimate.initial_mask, shape), drawing.INITIAL, thin)
     if axes is not None and estimate.status is Status.TRACKED:
         _draw_axes(picture, estimate, camera, axes, size.scale, thin + 1)
     _draw_bar(canvas[size.picture :], record)
     return canvas
 
 
-def _scaled(mask: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np.bool_]:
+def _scale(mask: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np.bool_]:
     if mask.shape == shape[::-1]:
         return mask
     return cv2.resize(mask.astype(np.uint8), shape, interpolation=cv2.INTER_NEAREST).astype(bool)

@@ -36,12 +36,12 @@ def draw_trails(image: Image, tracks: PointTracks, row: int) -> Image:
         way = [(tracks.positions[at, point] + 0.5) * factor - 0.5 for at in range(max(row - TRAIL, 0), row + 1)
                if tracks.visible[at, point] and np.isfinite(tracks.positions[at, point]).all()]  # fmt: skip
         if len(way) > 1:
-            cv2.polylines(drawn, [_fixed(np.stack(way))], False, colour, 1, cv2.LINE_AA, _SHIFT)
+            cv2.polylines(drawn, [_fixed_points(np.stack(way))], False, colour, 1, cv2.LINE_AA, _SHIFT)
         here = (tracks.positions[row, point] + 0.5) * factor - 0.5
         if not np.isfinite(here).all() or (abs(here) > 2 * max(drawn.shape)).any():
             continue
         thickness = cv2.FILLED if tracks.visible[row, point] else 1
-        x, y = _fixed(here).tolist()
+        x, y = _fixed_points(here).tolist()
         cv2.circle(drawn, (x, y), radius << _SHIFT, colour, thickness, cv2.LINE_AA, _SHIFT)
     return drawn
 
@@ -74,5 +74,5 @@ def _colours(tracks: PointTracks) -> list[Colour]:
     return [(round(255 * r), round(255 * g), round(255 * b)) for r, g, b in colours]
 
 
-def _fixed(xy: np.ndarray) -> np.ndarray:
+def _fixed_points(xy: np.ndarray) -> np.ndarray:
     return np.round(xy * (1 << _SHIFT)).astype(np.int32)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource, Status
 from tracking3d.geometry.camera import Camera
-from tracking3d.stages import StageTimes
+from tracking3d.runtime.stage_times import StageTimes
 
 _KINDS: dict[str, Any] = {
     "index": int,
@@ -173,17 +173,17 @@ def latest(records: Iterable[FrameRecord], refined: bool = True) -> list[FrameRe
         records: In the order in which they were written.
         refined: Take the answers of the final refinement where there are any, else the causal ones everywhere.
     """
-    answers: dict[int, FrameRecord] = {}
+    estimates: dict[int, FrameRecord] = {}
     for record in records:
         if record.refined and not refined:
             continue
-        before = answers.get(record.index)
+        before = estimates.get(record.index)
         # A revision is made long after the frame was seen and no longer knows its name.
         if before and record.revision and not record.refined:
             # What a revision took is counted in the frame that led to it.
             record = replace(record, seconds=before.seconds, stages=before.stages)
-        answers[record.index] = replace(record, name=before.name) if before and not record.name else record
-    return [answers[index] for index in sorted(answers)]
+        estimates[record.index] = replace(record, name=before.name) if before and not record.name else record
+    return [estimates[index] for index in sorted(estimates)]
 
 
 def mask_iou_or_none(a: NDArray[np.bool_], b: NDArray[np.bool_] | None) -> float | None:

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource
 from tracking3d.frames import Frame
 from tracking3d.results import layout
-from tracking3d.results.files import decoded_mask, mask_file, read_mask, write_mask
+from tracking3d.results.files import decode_mask, mask_file, read_mask, write_mask
 from tracking3d.results.probabilities import write_probability
 from tracking3d.results.records import FrameRecord, mask_iou_or_none
 from tracking3d.results.run_reader import RunReader, read_records
-from tracking3d.stages import measured
+from tracking3d.runtime.stage_times import measure
 
 
 class RefinedEstimates:
@@ -58,7 +58,7 @@ class RefinedEstimates:
     def mask(self, record: FrameRecord) -> NDArray[np.bool_]:
         """The mask ``(H, W)`` of an estimate; empty if it cannot be read."""
         if record.refined and (decided := self._decided.get(record.index)) is not None:
-            mask = decoded_mask(decided)
+            mask = decode_mask(decided)
         else:
             mask = read_mask(layout.mask_path(self._aside if record.refined else self._folder, record.index))
         return np.zeros(self._size, bool) if mask is None else mask
@@ -125,7 +125,7 @@ def write_refined(
     estimate = replace(
         estimate, refined=True, initial_mask=initial, keyframe=estimate.keyframe or causal.keyframe
     )
-    with measured("write") as watch:
+    with measure("write") as watch:
         record = FrameRecord.of(estimate, frame.name, initial, revision=True)
         write_mask(layout.mask_path(into, frame.index), estimate.mask)
         if probabilities:

@@ -25,7 +25,7 @@ from tracking3d.results.pictures import Pictures
 from tracking3d.results.probabilities import take_over_probability
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.refined_estimates import RefinedEstimates, write_refined
-from tracking3d.stages import StageTimes, measured
+from tracking3d.runtime.stage_times import StageTimes, measure
 
 
 class RefinementWriter(RefinedEstimates):
@@ -90,7 +90,7 @@ class RefinementWriter(RefinedEstimates):
             OutputError: If the video cannot be written.
         """
         record = self.estimate(frame.index)
-        with measured("write") as watch:
+        with measure("write") as watch:
             self.pictures.add_kept(frame, record, mask, initial)
         if frame.index in self._records:
             self._records[frame.index] = record.and_wrote(watch.times.write)
@@ -167,32 +167,34 @@ class RefinementWriter(RefinedEstimates):
         if not keep:
             clear_refinement(self._folder)
 
-    def described(self, state: str, reason: str = "") -> dict[str, Any]:
+    def describe(self, state: str, reason: str = "") -> dict[str, Any]:
         """What ``run.json`` says of it, see `tracking3d.results.description.refinement`."""
         refined = list(self._records.values()) if self._taken_over else []
         causal = list(self.causal.values())
         return description.refinement(state, reason, causal, refined, self.seconds, self.together)
 
 
-def put_right(
-    answer: FrameRecord,
+def adjusted_record(
+    estimate: FrameRecord,
     T_cam_obj: NDArray[np.float64],
-    judgement: Assessment | None = None,
+    assessment: Assessment | None = None,
     evidence: Mapping[str, float] | None = None,
 ) -> FrameRecord:
     """A second answer with the pose that it has in the end.
 
     Args:
-        answer: As it was.
+        estimate: As it was.
         T_cam_obj: ``(4, 4)``, of the camera of the end.
-        judgement: How far it is believed in the end; as before, if left out.
+        assessment: How far it is believed in the end; as before, if left out.
         evidence: What that comes from, kept among the losses.
     """
-    losses = answer.losses | dict(evidence or {})
-    answer = replace(answer, T_cam_obj=T_cam_obj, camera=None, losses=losses)
-    if judgement is None:
-        return answer
-    return replace(answer, status=judgement.status, reason=judgement.reason, confidence=judgement.confidence)
+    losses = estimate.losses | dict(evidence or {})
+    estimate = replace(estimate, T_cam_obj=T_cam_obj, camera=None, losses=losses)
+    if assessment is None:
+        return estimate
+    return replace(
+        estimate, status=assessment.status, reason=assessment.reason, confidence=assessment.confidence
+    )
 
 
 def clear_refinement(folder: Path) -> None:

@@ -23,7 +23,7 @@ from tracking3d.results.mesh_export import load_mesh
 from tracking3d.results.probabilities import read_probability
 from tracking3d.results.process import is_gone
 from tracking3d.results.records import FrameRecord, latest, read_stages
-from tracking3d.stages import StageTimes
+from tracking3d.runtime.stage_times import StageTimes
 
 LONGEST_LINE = 2**20
 """Bytes of a line of ``frames.jsonl``; no run writes one as long."""

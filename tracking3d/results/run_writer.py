@@ -30,9 +30,9 @@ from tracking3d.results.files import (
     writing,
 )
 from tracking3d.results.frame_lines import FrameLines, WrittenSoFar
-from tracking3d.results.making_room import clear_run_folder
 from tracking3d.results.mesh_export import export_mesh
 from tracking3d.results.notes import notes_of_run
+from tracking3d.results.overwrite import clear_run_folder
 from tracking3d.results.pictures import Pictures
 from tracking3d.results.probabilities import write_probability
 from tracking3d.results.records import FrameRecord, jsonable, latest
@@ -179,10 +179,10 @@ class RunWriter:
             export_mesh(self.folder, model)
         else:
             with writing(self.folder):
-                self._lines.cut_back()
+                self._lines.truncate()
         causal = latest(read_records(self.folder / layout.FRAMES), refined=False)
         self._refinement = RefinementWriter(self.folder, self._camera, self._fps, causal, kept, seconds)
-        self._description["refinement"] = self._refinement.described("running")
+        self._description["refinement"] = self._refinement.describe("running")
         self._write_description()
         return self._refinement
 
@@ -206,7 +206,7 @@ class RunWriter:
         """
         assert self._refinement is not None
         self._refinement.take_over(self._lines.append)
-        self._description["refinement"] = self._refinement.described("finished")
+        self._description["refinement"] = self._refinement.describe("finished")
         self._description["camera"] = asdict(self._camera)
         self._pictures, self._refinement = self._refinement.pictures, None
 
@@ -261,9 +261,9 @@ class RunWriter:
             ended: FinalState = "failed" if isinstance(error, Exception) else "interrupted"
             self.finish(None, ended, str(error) if isinstance(error, Exception) else None)
 
-    def is_initial_mask(self, frame: Frame, answer: MaskEstimate) -> bool:
+    def is_initial_mask(self, frame: Frame, estimate: MaskEstimate) -> bool:
         """Whether a mask tracker's answer for a frame is the one that is kept of it."""
-        kept, given = read_mask(layout.initial_mask_path(self.folder, frame.index)), answer.binary
+        kept, given = read_mask(layout.initial_mask_path(self.folder, frame.index)), estimate.binary
         if kept is None or given is None:
             return all(mask is None or not mask.any() for mask in (kept, given))
         return np.array_equal(kept, given)
@@ -310,7 +310,7 @@ class RunWriter:
         """Where a refinement did not come to its end."""
         if self._refinement is not None:
             self._refinement.give_up(keep=layout.has_state(self.folder))
-            self._description["refinement"] = self._refinement.described(state, error or "")
+            self._description["refinement"] = self._refinement.describe(state, error or "")
 
     def _finish(self, model: ObjectModel | None) -> None:
         records = list(read_records(self.folder / layout.FRAMES))

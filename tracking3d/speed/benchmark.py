@@ -73,7 +73,7 @@ def benchmark(
         figures["ratio_to_torch"] = _ratio(figures, results["torch"])
         figures["speedup_over_dense"] = _ratio(results[DENSE], figures) if dense else None
         apart = name == DENSE or name in (others or {})
-        figures["peak_memory_mb"] = None if apart else _rounded(name, problem, place, threads)
+        figures["peak_memory_mb"] = None if apart else _round(name, problem, place, threads)
     report = {
         **{name: value for name, value in asdict(problem).items() if name != "frequency"},
         "faces": problem.faces,
@@ -125,5 +125,5 @@ def _ratio(one: dict[str, Any], other: dict[str, Any]) -> float:
     return float(f"{one['total_ms'] / other['total_ms']:.3g}")
 
 
-def _rounded(name: str, problem: RenderWorkload, device: torch.device, threads: int) -> float:
+def _round(name: str, problem: RenderWorkload, device: torch.device, threads: int) -> float:
     return round(peak_memory(name, problem, device, threads), 1)

@@ -18,7 +18,7 @@ from dataclasses import asdict
 
 import torch
 
-from tracking3d.process_memory import forget_peak, resident_memory
+from tracking3d.runtime.memory import forget_peak, resident_memory
 from tracking3d.speed.scene import RenderScene, RenderWorkload
 from tracking3d.speed.timing import backends, set_benchmark_threads
 

@@ -10,7 +10,7 @@ import torch
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
-from tracking3d.estimation import losses
+from tracking3d.estimation.paper import losses
 from tracking3d.geometry.prototypes import sphere
 from tracking3d.rendering import Rendering, channels_last, texture_losses
 

@@ -21,7 +21,7 @@ def linear(encoded: ArrayLike) -> NDArray[np.float32]:
     return np.power(np.asarray(encoded, np.float32) / 255, GAMMA, dtype=np.float32)
 
 
-def exposed(
+def expose(
     light: NDArray[np.float32], disturbances: Disturbances, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
     """The image ``(H, W, 3)`` uint8 of linear light ``(H, W, 3)``.
@@ -42,7 +42,7 @@ def jpeg_quality(strength: float) -> int:
     return round(95 - 80 * strength)
 
 
-def compressed(image: NDArray[np.uint8], strength: float) -> bytes:
+def compress(image: NDArray[np.uint8], strength: float) -> bytes:
     """The JPEG file of an image ``(H, W, 3)``."""
     quality = [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality(strength)]
     return bytes(cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), quality)[1])

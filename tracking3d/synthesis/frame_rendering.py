@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.synthesis.camera_effects import exposed, linear
-from tracking3d.synthesis.lighting import Lamp, lamp_at, shaded
+from tracking3d.synthesis.camera_effects import expose, linear
+from tracking3d.synthesis.lighting import Lamp, lamp_at, shade
 from tracking3d.synthesis.pixel_rays import pixels_around, ray_directions
 from tracking3d.synthesis.ray_casting import MeshHits, RayMesh
 from tracking3d.synthesis.room_rendering import room_light
@@ -67,7 +67,7 @@ def render_frame(scene: Scene, frame: int) -> RenderedFrame:
         light += sample
         if k == middle:
             mask, visible, z = np.isfinite(depth), np.isfinite(depth) & (depth < front), depth
-    image = exposed((light / count).astype(np.float32), spec.disturbances, spec.random(f"noise {frame}"))
+    image = expose((light / count).astype(np.float32), spec.disturbances, spec.random(f"noise {frame}"))
     return RenderedFrame(image, mask, visible, np.where(mask, z, 0).astype(np.float32))
 
 
@@ -105,11 +105,11 @@ def _sample(
     lift = _LIFT * scene.solid.radius
 
     seen = _look(scene, scene.surface, T_cam_obj, offset)
-    lit = ~_shadowed(scene.surface, T_cam_obj, seen, source, lift)
+    lit = ~_in_shadow(scene.surface, T_cam_obj, seen, source, lift)
     if hand is not None:
         T_cam_hand = hand.T_cam_hand(time)
-        lit &= ~_shadowed(hand.surface, T_cam_hand, seen, source, lift)
-    light[seen.pixels] = shaded(_albedo(scene, seen.hits), seen.points, seen.normals, lit, lamp, source)
+        lit &= ~_in_shadow(hand.surface, T_cam_hand, seen, source, lift)
+    light[seen.pixels] = shade(_albedo(scene, seen.hits), seen.points, seen.normals, lit, lamp, source)
     depth[seen.pixels] = seen.depth
     if scene.room is not None:
         rows, columns = np.nonzero(np.isinf(depth))
@@ -122,7 +122,7 @@ def _sample(
         nearer = over.depth < depth[over.pixels]
         in_hand = (over.points - T_cam_hand[:3, 3]) @ T_cam_hand[:3, :3]
         lit = np.ones(len(in_hand), bool)
-        skin = shaded(hand.albedo(in_hand), over.points, over.normals, lit, lamp, source)
+        skin = shade(hand.albedo(in_hand), over.points, over.normals, lit, lamp, source)
         rows, columns = (index[nearer] for index in over.pixels)
         light[rows, columns] = skin[nearer]
         front[over.pixels] = over.depth
@@ -145,14 +145,14 @@ def _look(scene: Scene, surface: RayMesh, T: Array, offset: Array) -> _Sight:
     return _Sight((rows[hit], columns[hit]), hits.distance, points, normals, hits, T)
 
 
-def _shadowed(surface: RayMesh, T: Array, seen: _Sight, source: Array, lift: float) -> NDArray[np.bool_]:
+def _in_shadow(surface: RayMesh, T: Array, seen: _Sight, source: Array, lift: float) -> NDArray[np.bool_]:
     """Whether a solid of pose ``T`` is between the points and a point of the lamp."""
     origins = seen.points + lift * seen.normals
     towards = source - origins
     facing = np.flatnonzero(np.einsum("ij,ij->i", seen.normals, towards) > 0)
     R, t = T[:3, :3], T[:3, 3]
     shadowed = np.zeros(len(origins), bool)
-    shadowed[facing] = surface.blocked((origins[facing] - t) @ R, towards[facing] @ R)
+    shadowed[facing] = surface.is_blocked((origins[facing] - t) @ R, towards[facing] @ R)
     return shadowed
 
 

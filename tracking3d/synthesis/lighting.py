@@ -82,7 +82,7 @@ def lamp_at(spec: SequenceSpec, frame: int, centre: Array, radius: float) -> Lam
     return Lamp(position, _SIZE * radius, np.exp(fade + swing * tint), spec.disturbances.highlights)
 
 
-def shaded(
+def shade(
     albedo: Array, points: Array, normals: Array, lit: NDArray[np.bool_], lamp: Lamp, source: Array
 ) -> Array:
     """Light ``(N, 3)`` that surface points send to the camera.

@@ -111,7 +111,7 @@ def degrade_to_iou(
     low, high = 0.0, np.inf
     strength = 1.0
     for _ in range(_STEPS):
-        rough = _degraded(masks, frames, strength)
+        rough = _degrade(masks, frames, strength)
         excess = np.mean([mask_iou(a, b) for a, b in zip(rough[1:], masks[1:], strict=True)]) - mean_iou
         if abs(excess) <= TOLERANCE:
             return rough
@@ -180,7 +180,7 @@ def _frame(
     to_grid = np.array(
         [[1 / step, 0, (columns.start - origin[0]) / step], [0, 1 / step, (rows.start - origin[1]) / step]]
     )
-    shift, growth = (_warped(field.astype(np.float32), to_grid, truth.shape) for field in (wobble, leak))
+    shift, growth = (_warp(field.astype(np.float32), to_grid, truth.shape) for field in (wobble, leak))
     return _Frame(
         (rows, columns),
         size,
@@ -214,7 +214,7 @@ def _signed_and_similarity(
     return signed.astype(np.float32), cv2.GaussianBlur(similarity, (0, 0), max(1.0, 0.02 * size))
 
 
-def _degraded(masks: NDArray[np.bool_], frames: dict[int, _Frame], strength: float) -> NDArray[np.bool_]:
+def _degrade(masks: NDArray[np.bool_], frames: dict[int, _Frame], strength: float) -> NDArray[np.bool_]:
     """All masks at one strength."""
     rough = np.zeros_like(masks)
     rough[0] = masks[0]
@@ -231,7 +231,7 @@ def _rough(frame: _Frame, strength: float) -> NDArray[np.bool_]:
     # Where a pixel of the drifted mask was: (place - shift) / stretch about the object's centre.
     offset = ((origin - (shift_x, shift_y)) / stretch - origin) * frame.size
     back = np.array([[1 / stretch[0], 0, offset[0]], [0, 1 / stretch[1], offset[1]]])
-    signed = _warped(frame.signed, back, frame.signed.shape) + strength * frame.leak
+    signed = _warp(frame.signed, back, frame.signed.shape) + strength * frame.leak
     direction, depth = frame.cut
     if depth > 0:
         least, most = frame.extent
@@ -251,7 +251,7 @@ def _without_specks(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return (areas >= _SMALLEST_PART * areas.max())[labels] & mask
 
 
-def _warped(
+def _warp(
     field: NDArray[np.float32], matrix: NDArray[np.float64], shape: tuple[int, int]
 ) -> NDArray[np.float32]:
     """``field`` at ``matrix`` (2, 3) times each pixel of an image of this ``shape``; constant past its border."""

@@ -62,9 +62,9 @@ def make_path(spec: SequenceSpec, camera: Camera, radius: float) -> Path:
     spin = _SPINS[spec.motion](times, last, math.radians(spec.degrees_per_frame), rng)
     walk = spec.motion == "walk_round"
     if walk:
-        rotations = _walked(times, spin, rng)
+        rotations = _random_walk(times, spin, rng)
     else:
-        turned = _integrated(spin * (times[1] - times[0]))
+        turned = _integrate(spin * (times[1] - times[0]))
         start = Rotation.from_euler("yxz", _views(spec.motion, rng), degrees=True)
         rotations = turned * turned[first].inv() * start
 
@@ -116,7 +116,7 @@ def _walk(times: Array, last: int, speed: float, rng: np.random.Generator) -> Ar
     return speed * rng.choice([-1.0, 1.0]) * pace[:, None] * (0.0, 1.0, 0.0)
 
 
-def _walked(times: Array, spin: Array, rng: np.random.Generator) -> Rotation:
+def _random_walk(times: Array, spin: Array, rng: np.random.Generator) -> Rotation:
     """Rotations of a still object that a camera walks round: upright but for the hand that holds the camera."""
     azimuth = np.degrees(np.cumsum(spin[:, 1]) * (times[1] - times[0]))
     azimuth += rng.uniform(0, 360) - azimuth[_STEPS]
@@ -174,7 +174,7 @@ def _wandering_axis(times: Array, rng: np.random.Generator, period: float) -> Ar
     return axes / np.linalg.norm(axes, axis=1, keepdims=True)
 
 
-def _integrated(steps: Array) -> Rotation:
+def _integrate(steps: Array) -> Rotation:
     """Rotations after none, one, ... of the small rotation vectors ``(M, 3)`` in camera axes."""
     turned = [np.eye(3)]
     for R in Rotation.from_rotvec(steps[:-1]).as_matrix():

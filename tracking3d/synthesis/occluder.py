@@ -107,7 +107,7 @@ def _object_rays(surface: RayMesh, T_cam_obj: Array, camera: Camera) -> Array:
     columns, rows = pixels_around(surface.vertices, T_cam_obj, camera, step)
     directions = ray_directions(camera, columns.astype(np.float64), rows.astype(np.float64))
     R, t = T_cam_obj[:3, :3], T_cam_obj[:3, 3]
-    return directions[surface.blocked(np.tile(-R.T @ t, (len(directions), 1)), directions @ R)]
+    return directions[surface.is_blocked(np.tile(-R.T @ t, (len(directions), 1)), directions @ R)]
 
 
 def _hidden(hand: Hand, time: float, directions: Array) -> float:
@@ -115,7 +115,9 @@ def _hidden(hand: Hand, time: float, directions: Array) -> float:
     origin = -T[:3, :3].T @ T[:3, 3]
     if not len(directions):
         return 0.0
-    return float(hand.surface.blocked(np.tile(origin, (len(directions), 1)), directions @ T[:3, :3]).mean())
+    return float(
+        hand.surface.is_blocked(np.tile(origin, (len(directions), 1)), directions @ T[:3, :3]).mean()
+    )
 
 
 def _hand_mesh() -> trimesh.Trimesh:

@@ -67,7 +67,7 @@ def prism(outline: Array, half_depth: float) -> list[Patch]:
     return [polygon(front), polygon(back[::-1]), *sides]
 
 
-def revolved(profile: Array, sectors: int, steps: int = 96) -> list[Patch]:
+def revolve(profile: Array, sectors: int, steps: int = 96) -> list[Patch]:
     """A surface of revolution about the y axis.
 
     Args:

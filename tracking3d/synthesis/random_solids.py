@@ -16,7 +16,7 @@ from tracking3d.synthesis.patches import (
     cube_sphere,
     prism,
     rectangle,
-    revolved,
+    revolve,
     subdivide_polyline,
     tube,
 )
@@ -76,7 +76,7 @@ def organic(rng: np.random.Generator) -> list[Patch]:
         # Of exponentials, so that no dent reaches the centre.
         shape = np.exp(np.exp(narrowness * (patch.vertices @ centres.T - 1)) @ heights.clip(-0.5, 0.6))
         patches.append(Patch(stretch * patch.vertices * shape[:, None], patch.faces, patch.uvs))
-    return _fitted(patches)
+    return _fit_in_unit_ball(patches)
 
 
 def assembly(rng: np.random.Generator) -> list[Patch]:
@@ -85,7 +85,7 @@ def assembly(rng: np.random.Generator) -> list[Patch]:
     boxes += rng.uniform(-0.02, 0.02, boxes.shape)
     mirrored = rng.choice([-1.0, 1.0], 3) * (1, 0, 1) + (0, 1, 0)
     boxes *= (rng.uniform(0.6, 1, 3) * mirrored)[:, None]
-    return _fitted([patch for box in np.sort(boxes, axis=2) for patch in _block(box)])
+    return _fit_in_unit_ball([patch for box in np.sort(boxes, axis=2) for patch in _block(box)])
 
 
 def stick(rng: np.random.Generator) -> list[Patch]:
@@ -102,7 +102,7 @@ def stick(rng: np.random.Generator) -> list[Patch]:
     ends[[0, -1]] = 0
     curve = np.column_stack([curve, np.zeros(len(curve))])
     upright = curve @ _turn(rng.uniform(0, 2 * math.pi)).T
-    return _fitted(tube(upright, thickness * ends, np.array([0.0, 0.0, 1.0]), steps=28, sections=4))
+    return _fit_in_unit_ball(tube(upright, thickness * ends, np.array([0.0, 0.0, 1.0]), steps=28, sections=4))
 
 
 def knob(rng: np.random.Generator) -> list[Patch]:
@@ -120,7 +120,7 @@ def knob(rng: np.random.Generator) -> list[Patch]:
         girth = 0.5 * (1 + 0.25 * np.sin(waves * math.pi * height / half_height + phase))
         profile = np.column_stack([girth, height])
         ends = (0.0, -half_height), (0.0, half_height)
-        body = revolved(subdivide_polyline(np.vstack([ends[0], profile, ends[1]])), sectors=2)
+        body = revolve(subdivide_polyline(np.vstack([ends[0], profile, ends[1]])), sectors=2)
     size = rng.uniform(0.09, 0.15)
     if rng.random() < 0.5:  # at the side, else on top
         middle = 0.5 * float(rng.uniform(-1, 1)) * half_height
@@ -129,7 +129,7 @@ def knob(rng: np.random.Generator) -> list[Patch]:
     else:
         reach = 0.5 * float(girth[-1])
         spans = (reach - size, reach + size), (half_height - 0.1, half_height + 1.4 * size)
-    return _fitted([*body, *_block(np.array([*spans, (-size, size)]))])
+    return _fit_in_unit_ball([*body, *_block(np.array([*spans, (-size, size)]))])
 
 
 def bowl(rng: np.random.Generator) -> list[Patch]:
@@ -143,7 +143,7 @@ def bowl(rng: np.random.Generator) -> list[Patch]:
         [inner_foot + (inner_rim - inner_foot) * share**power, wall + (depth - wall) * share]
     )
     profile = np.vstack([(0.0, 0.0), outside, inside[::-1], (0.0, wall)])
-    return _fitted(revolved(subdivide_polyline(profile), sectors=2))
+    return _fit_in_unit_ball(revolve(subdivide_polyline(profile), sectors=2))
 
 
 _UPRIGHT = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
@@ -163,7 +163,7 @@ def _block(spans: Array) -> list[Patch]:
     return [Patch(patch.vertices + middle, patch.faces, patch.uvs) for patch in sides]
 
 
-def _fitted(patches: Sequence[Patch]) -> list[Patch]:
+def _fit_in_unit_ball(patches: Sequence[Patch]) -> list[Patch]:
     """The same in the middle, and of the radius of all."""
     vertices = np.concatenate([patch.vertices for patch in patches])
     middle = 0.5 * (vertices.min(0) + vertices.max(0))

@@ -101,7 +101,7 @@ class RayMesh:
         weights[hit] = inside / inside.sum(1, keepdims=True)
         return MeshHits(face, distance, weights)
 
-    def blocked(self, origins: Array, directions: Array) -> NDArray[np.bool_]:
+    def is_blocked(self, origins: Array, directions: Array) -> NDArray[np.bool_]:
         """Whether rays, both ``(N, 3)``, meet the mesh at all: ``(N,)``."""
         if not len(origins):
             return np.zeros(0, bool)

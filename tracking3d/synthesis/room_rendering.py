@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.synthesis.lighting import Lamp, shaded
+from tracking3d.synthesis.lighting import Lamp, shade
 from tracking3d.synthesis.pixel_rays import ray_directions
 from tracking3d.synthesis.room import Room
 from tracking3d.synthesis.scene import Scene
-from tracking3d.synthesis.texture_lookup import filtered
+from tracking3d.synthesis.texture_lookup import filter_texture
 
 Array = NDArray[np.float64]
 
@@ -60,10 +60,10 @@ def room_light(
     albedo = np.zeros((len(x), 3))
     for k in np.unique(look[inside]):
         here = inside & (look == k)
-        albedo[here] = filtered(room.textures[k], uv[here], density[here] * apart[here])
+        albedo[here] = filter_texture(room.textures[k], uv[here], density[here] * apart[here])
 
-    lit = ~_shadowed(scene, room, points + _LIFT * scene.solid.radius * normals, (source - t) @ R)
-    light = shaded(albedo, points @ R.T + t, normals @ R.T, lit, lamp, source)
+    lit = ~_in_shadow(scene, room, points + _LIFT * scene.solid.radius * normals, (source - t) @ R)
+    light = shade(albedo, points @ R.T + t, normals @ R.T, lit, lamp, source)
     return np.where(inside[:, None], light, 0), depth
 
 
@@ -96,14 +96,14 @@ def _on_walls(points: Array, axis: NDArray[np.int64], room: Room) -> tuple[Array
     return np.stack([share[rays, across], share[rays, up]], 1), density
 
 
-def _shadowed(scene: Scene, room: Room, points: Array, source: Array) -> NDArray[np.bool_]:
+def _in_shadow(scene: Scene, room: Room, points: Array, source: Array) -> NDArray[np.bool_]:
     """Whether the object or a thing in the room is between points and ``source``, all in the room's coordinates."""
     towards = source - points
-    shadowed = room.furniture.blocked(points, towards)
+    shadowed = room.furniture.is_blocked(points, towards)
     # Only what passes the object's enclosing sphere can meet it.
     nearest = -np.einsum("ij,ij->i", points, towards) / np.einsum("ij,ij->i", towards, towards)
     passing = points + nearest.clip(0)[:, None] * towards
     near = np.flatnonzero(~shadowed & (np.einsum("ij,ij->i", passing, passing) < scene.solid.radius**2))
     R = room.T_obj_room[:3, :3]
-    shadowed[near] = scene.surface.blocked(points[near] @ R.T, towards[near] @ R.T)
+    shadowed[near] = scene.surface.is_blocked(points[near] @ R.T, towards[near] @ R.T)
     return shadowed

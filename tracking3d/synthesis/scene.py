@@ -21,7 +21,7 @@ from tracking3d.synthesis.occluder import Hand, make_hand
 from tracking3d.synthesis.procedural_solids import PROCEDURAL, make_procedural_solid
 from tracking3d.synthesis.ray_casting import RayMesh
 from tracking3d.synthesis.room import Room, build_room
-from tracking3d.synthesis.solid import Solid, faded
+from tracking3d.synthesis.solid import Solid, fade_texture
 from tracking3d.synthesis.spec import SequenceSpec
 
 Array = NDArray[np.float64]
@@ -36,7 +36,7 @@ class Scene:
     Attributes:
         spec: What was asked for.
         camera: The true camera of all frames.
-        told_camera: The one that a tracker is told; another where `Disturbances.wrong_fov` is on.
+        given_camera: The one that a tracker is told; another where `Disturbances.wrong_fov` is on.
         solid: The object.
         surface: The object for rays.
         path: Its poses over time.
@@ -48,7 +48,7 @@ class Scene:
 
     spec: SequenceSpec
     camera: Camera
-    told_camera: Camera
+    given_camera: Camera
     solid: Solid
     surface: RayMesh
     path: Path
@@ -76,12 +76,12 @@ def make_scene(spec: SequenceSpec) -> Scene:
     hand = make_hand(spec, path, surface, solid.radius, camera)
     background = linear(make_background(spec))
     texture = _resolved_texture(solid, camera, path, spec.supersample)
-    told = _told_camera(spec, camera)
+    told = _given_camera(spec, camera)
     room = build_room(spec, solid, path)
     return Scene(spec, camera, told, solid, surface, path, background, hand, texture, room)
 
 
-def _told_camera(spec: SequenceSpec, camera: Camera) -> Camera:
+def _given_camera(spec: SequenceSpec, camera: Camera) -> Camera:
     if spec.disturbances.wrong_fov == 0:
         return camera
     told = min(spec.fov * (1 + spec.disturbances.wrong_fov), _WIDEST)
@@ -95,14 +95,14 @@ def make_solid(spec: SequenceSpec) -> Solid:
         InputError: If it is neither a procedural object nor a mesh file with faces.
     """
     if spec.object in PROCEDURAL:
-        return faded(make_procedural_solid(spec), spec.print_strength)
+        return fade_texture(make_procedural_solid(spec), spec.print_strength)
     file = FilePath(spec.object)
     if not file.suffix and not file.exists():
         raise InputError(
             f"There is no object '{spec.object}' and no such mesh file "
             f"(objects: {', '.join(PROCEDURAL)}); {hint(spec.object, PROCEDURAL)}"
         )
-    return faded(load_solid(file, spec), spec.print_strength)
+    return fade_texture(load_solid(file, spec), spec.print_strength)
 
 
 def _resolved_texture(

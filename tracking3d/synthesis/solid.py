@@ -47,7 +47,7 @@ class Solid:
         return trimesh.Trimesh(self.vertices, self.faces, process=False)
 
 
-def faded(solid: Solid, strength: float) -> Solid:
+def fade_texture(solid: Solid, strength: float) -> Solid:
     """The same object with what is printed on it shrunk towards its mean colour; at 0 it has that colour alone."""
     if strength == 1:
         return solid

@@ -31,7 +31,7 @@ def pyramid(texture: NDArray[np.float32]) -> list[NDArray[np.float32]]:
     return levels
 
 
-def filtered(levels: list[NDArray[np.float32]], uv: Array, width: Array) -> Array:
+def filter_texture(levels: list[NDArray[np.float32]], uv: Array, width: Array) -> Array:
     """Colours ``(N, 3)`` of a `pyramid` at ``uv`` ``(N, 2)``.
 
     Args:

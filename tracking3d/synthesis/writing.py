@@ -20,7 +20,7 @@ from tracking3d.errors import OutputError
 from tracking3d.geometry.camera import Camera
 from tracking3d.results.files import write_atomic, write_image, write_mask, writing
 from tracking3d.results.layout import partial_path
-from tracking3d.synthesis.camera_effects import compressed
+from tracking3d.synthesis.camera_effects import compress
 from tracking3d.synthesis.frame_rendering import RenderedFrame, render_frame
 from tracking3d.synthesis.point_tracks import GroundTruthTracks, sample_point_tracks
 from tracking3d.synthesis.scene import Scene, make_scene
@@ -108,7 +108,7 @@ def _check_replaceable(folder: Path) -> None:
 
 def _write_frame(folder: Path, name: str, frame: RenderedFrame, spec: SequenceSpec, scale: float) -> None:
     if spec.disturbances.jpeg > 0:
-        write_atomic(folder / "frames" / f"{name}.jpg", compressed(frame.image, spec.disturbances.jpeg))
+        write_atomic(folder / "frames" / f"{name}.jpg", compress(frame.image, spec.disturbances.jpeg))
     else:
         write_image(folder / "frames" / f"{name}.png", frame.image)
     write_mask(folder / "masks" / f"{name}.png", frame.mask)
@@ -143,12 +143,12 @@ def _documents(scene: Scene, box: list[int], scale: float) -> dict[str, dict[str
     units = "metres" if solid.millimetres == 1000 else "object radii, about"
     documents: dict[str, dict[str, Any]] = {
         "poses.json": {"convention": POSE_CONVENTION, "units": units, "frames": poses},
-        "camera.json": {**_intrinsics(scene.told_camera), "depth_scale": scale},
+        "camera.json": {**_intrinsics(scene.given_camera), "depth_scale": scale},
         "init.json": {"frame": 0, "bbox_xywh": box, "mask": "masks/000000.png"},
     }
     if not spec.camera_told:
         documents["camera.json"] |= {"told": False, "note": "true, and no tracker is told of it"}
-    if scene.told_camera != scene.camera:
+    if scene.given_camera != scene.camera:
         documents["camera.json"]["note"] = "wrong on purpose; the true camera is in truth_camera.json"
         documents["truth_camera.json"] = {**_intrinsics(scene.camera), "depth_scale": scale}
     info: dict[str, Any] = {

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.plugins.guard import attribute_fault, feature_fault
-from tracking3d.testing.plugins import factory_of, random_state, refusal_allowed, success_expected
+from tracking3d.testing.plugins import allow_refusal, expect_success, factory_of, random_state
 
 _TOLERANCE = 1e-4
 """Largest difference, relative to the largest feature, between an image encoded alone and in a batch."""
@@ -39,7 +39,7 @@ def check_encoder(
     Raises:
         AssertionError: If it does not; the sentence says what was expected.
     """
-    with success_expected("Building it"):
+    with expect_success("Building it"):
         built = factory_of(encoder, ("encode",), options)()
     fault = attribute_fault(built)
     assert not fault, f"{type(built).__name__}: {fault}."
@@ -54,7 +54,7 @@ def check_encoder(
     for side in (size + 4, size - 1):
         what = f"an image of {side} x {side} pixels"
         odd = torch.rand(1, 3, side, side, generator=random).to(device)
-        with refusal_allowed(what):
+        with allow_refusal(what):
             features = built.encode(odd)
             fault = feature_fault(features, odd, built)
             assert not fault, f"{what}: {fault}."
@@ -64,7 +64,7 @@ def _encode(encoder: FeatureEncoder, images: Tensor, what: str = "") -> Tensor:
     what = what or f"{images.shape[0]} images of {images.shape[3]} x {images.shape[2]} pixels"
     before = images.clone()
     enabled = torch.is_grad_enabled()
-    with success_expected(what):
+    with expect_success(what):
         features = encoder.encode(images)
     assert torch.is_grad_enabled() == enabled, (
         f"{what}: the encoder has switched gradients {'off' if enabled else 'on'} for the whole program; use "

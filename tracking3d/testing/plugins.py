@@ -63,7 +63,7 @@ def random_state(seed: int) -> Iterator[None]:
 
 
 @contextmanager
-def refusal_allowed(what: str) -> Iterator[None]:
+def allow_refusal(what: str) -> Iterator[None]:
     """Let the plug-in refuse what it is given, in one sentence of a `Tracking3dError`.
 
     Raises:
@@ -85,7 +85,7 @@ def refusal_allowed(what: str) -> Iterator[None]:
 
 
 @contextmanager
-def success_expected(what: str) -> Iterator[None]:
+def expect_success(what: str) -> Iterator[None]:
     """Turn whatever is raised in the block, a failed check aside, into a failed check."""
     try:
         yield

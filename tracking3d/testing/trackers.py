@@ -10,7 +10,7 @@ import numpy as np
 from tracking3d.frames import Frame, MaskEstimate, Prompt
 from tracking3d.plugins.guard import mask_fault
 from tracking3d.testing.clips import Clip, Size, moving_disc, plain_frames
-from tracking3d.testing.plugins import factory_of, random_state, refusal_allowed, success_expected
+from tracking3d.testing.plugins import allow_refusal, expect_success, factory_of, random_state
 from tracking3d.trackers.protocol import MaskTracker
 
 SIZES: tuple[Size, ...] = ((90, 120), (131, 97))
@@ -70,18 +70,18 @@ def _run(tracker: MaskTracker, clip: Clip, what: str) -> list[MaskEstimate]:
     answers = []
     for position, frame in enumerate(clip.frames):
         answer = _ask(tracker, frame, None if position else clip.prompt(True), f"{what}, frame {position}")
-        answers.append(_copied(answer))
+        answers.append(_copy_estimate(answer))
     return answers
 
 
 def _ask(tracker: MaskTracker, frame: Frame, prompt: Prompt | None, what: str) -> MaskEstimate:
     """One answer, to be given and valid; with a prompt for the first frame."""
-    with success_expected(what):
+    with expect_success(what):
         answer = tracker.step(frame) if prompt is None else tracker.init(frame, prompt)
-    return _checked(answer, frame, what)
+    return _check_estimate(answer, frame, what)
 
 
-def _checked(answer: Any, frame: Frame, what: str) -> MaskEstimate:
+def _check_estimate(answer: Any, frame: Frame, what: str) -> MaskEstimate:
     fault = mask_fault(answer, frame.size)
     assert not fault, f"{what}: {fault}."
     assert isinstance(answer.reason, str), f"{what}: the reason is {answer.reason!r} instead of text."
@@ -95,7 +95,7 @@ def _checked(answer: Any, frame: Frame, what: str) -> MaskEstimate:
     return checked
 
 
-def _copied(answer: MaskEstimate) -> MaskEstimate:
+def _copy_estimate(answer: MaskEstimate) -> MaskEstimate:
     mask = None if answer.mask is None else answer.mask.copy()
     return MaskEstimate(mask, answer.score, answer.reason)
 
@@ -111,7 +111,7 @@ def _check_answers(build: Callable[[], MaskTracker], clip: Clip, with_mask: bool
     for position, frame in enumerate(clip.frames):
         step = f"{what}, frame {position}"
         given.append(_ask(tracker, frame, None if position else prompt, step))
-        copies.append(_copied(given[-1]))
+        copies.append(_copy_estimate(given[-1]))
         assert np.array_equal(frame.image, images[position]), (
             f"{step}: the tracker has changed the frame's image; draw on a copy."
         )
@@ -151,7 +151,7 @@ def _check_independent(build: Callable[[], MaskTracker], clip: Clip, other: Clip
         beside = []
         for position, (frame, distraction) in enumerate(zip(clip.frames, other.frames, strict=True)):
             what = f"two trackers side by side, frame {position}"
-            beside.append(_copied(_ask(first, frame, None if position else clip.prompt(True), what)))
+            beside.append(_copy_estimate(_ask(first, frame, None if position else clip.prompt(True), what)))
             _ask(second, distraction, None if position else other.prompt(True), what)
     for position, (once, again) in enumerate(zip(alone, beside, strict=True)):
         assert _same(once, again), (
@@ -166,8 +166,8 @@ def _check_hostile(
     """It may refuse to start, in one sentence; once started it answers."""
     tracker = build()
     started = False
-    with refusal_allowed(what):
-        _checked(tracker.init(frames[0], prompt), frames[0], f"{what}, frame 0")
+    with allow_refusal(what):
+        _check_estimate(tracker.init(frames[0], prompt), frames[0], f"{what}, frame 0")
         started = True
     for position, frame in enumerate(frames[1:] if started else (), start=1):
         _ask(tracker, frame, None, f"{what}, frame {position}")

@@ -91,7 +91,7 @@ class BackgroundMemory:
         cue[within] = known * np.where(changed < 0, _UNCHANGED_WEIGHT * changed, changed)
         return cv2.resize(cue, (window.size, window.size), interpolation=_interpolation(window))
 
-    def unchanged(self, image: Image) -> NDArray[np.float32]:
+    def unchanged_score(self, image: Image) -> NDArray[np.float32]:
         """``(H, W)`` in [0, 1]: how surely a pixel of the frame is what was seen of the background there."""
         everywhere = (slice(None), slice(None))
         alike = np.clip(1 - self._difference(image, everywhere) / _CHANGED, 0, 1)

@@ -34,7 +34,7 @@ class BoxOffset:
         x, y, width, height = followed
         return cls(((told[0] - x) / width, (told[1] - y) / height), (told[2] / width, told[3] / height))
 
-    def applied(self, box: Box) -> Box:
+    def apply(self, box: Box) -> Box:
         """The object's box where the one that is followed is ``box``."""
         x, y, width, height = box
         across, down = self.factor
@@ -70,7 +70,7 @@ class OpenCvBoxes:
 
     def announce(self, image: Image) -> None:
         """Look for the box in another thread already; ``update`` is called with this very image next, if at all."""
-        self._announced = image, _looking().submit(self._found, image)
+        self._announced = image, _looking().submit(self._find, image)
 
     def update(self, image: Image) -> Box | None:
         """The box in the next image, or None where the tracker has lost the object."""
@@ -79,9 +79,9 @@ class OpenCvBoxes:
             box = announced[1].result()
             if announced[0] is image:
                 return box
-        return self._found(image)
+        return self._find(image)
 
-    def _found(self, image: Image) -> Box | None:
+    def _find(self, image: Image) -> Box | None:
         if self._tracker is None:
             return None
         cv2.setRNGSeed(0)

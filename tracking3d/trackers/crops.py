@@ -10,7 +10,7 @@ from tracking3d.frames import Box
 from tracking3d.geometry.camera import Window
 
 
-def cut(image: NDArray, window: Window) -> NDArray:
+def crop_window(image: NDArray, window: Window) -> NDArray:
     """What ``window`` sees of ``image`` ``(H, W)`` or ``(H, W, C)``, resampled to ``(size, size[, C])``.
 
     The part of the window beyond the frame repeats the frame's border.

@@ -121,7 +121,7 @@ class CsrtTracker:
     @property
     def _witness(self) -> Box | None:
         """The box as the last correction had it; None where the box tracker has lost the object."""
-        return None if self._followed is None else self._offset.applied(self._followed)
+        return None if self._followed is None else self._offset.apply(self._followed)
 
     def _begin(self, image: Image, box: Box) -> None:
         self._boxes, self._followed = BoxTracker(self._options, image, box), box

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from tracking3d.frames import Box, Image
 from tracking3d.geometry.camera import Window
 from tracking3d.trackers.colour_models import GlobalColours, Palette, lab
-from tracking3d.trackers.crops import cut, inside_frame
+from tracking3d.trackers.crops import crop_window, inside_frame
 from tracking3d.trackers.mask_motion import MaskMotion
-from tracking3d.trackers.outline import prior, shifted_to
+from tracking3d.trackers.outline import prior, shift_to
 
 _NEIGHBOURHOOD = 0.22  # radius within which local colours count, relative to the square root of the area
 _SMOOTHNESS, _EDGES = 100.0, 12.0  # lambda and sigma of the fast global smoother
@@ -69,7 +69,7 @@ class FrameCrop:
     @classmethod
     def of(cls, frame: Image, window: Window) -> Self:
         """See ``frame`` ``(H, W, 3)`` RGB through ``window``."""
-        image = cut(frame, window)
+        image = crop_window(frame, window)
         return cls(window, image, lab(image), inside_frame(frame.shape, window))
 
     @property
@@ -131,7 +131,7 @@ def decide(
     """
     opinions = [(1.0, motion.by_flow)] + [(1.0, motion.by_similarity)] * cues.similarity
     if cues.outline or cues.novelty:
-        outline = shifted_to(last_mask, np.tanh(evidence / 3))
+        outline = shift_to(last_mask, np.tanh(evidence / 3))
         opinions += [(cues.outline, outline)] * (cues.outline > 0)
         evidence = evidence + cues.novelty * (outline > 0.5) * (1 - np.tanh(np.abs(evidence)))
     log_odds = evidence + cues.prior * prior(opinions, int(np.count_nonzero(motion.moved)))

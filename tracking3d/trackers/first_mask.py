@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from tracking3d.frames import Box, Image
 from tracking3d.geometry.camera import Window
 from tracking3d.trackers.colour_models import lab
-from tracking3d.trackers.crops import clip_box, cut, inside_frame, paste_mask
+from tracking3d.trackers.crops import clip_box, crop_window, inside_frame, paste_mask
 
 _SIZE = 288
 _MARGIN = 0.35
@@ -35,7 +35,7 @@ def mask_in_box(image: Image, box: Box, iterations: int = 5) -> NDArray[np.float
     candidate = np.zeros((_SIZE, _SIZE), bool)
     candidate[rows, columns] = True
     candidate &= inside_frame(image.shape, window)
-    mask = _grab_cut(lab(cut(image, window)), candidate, iterations)
+    mask = _grab_cut(lab(crop_window(image, window)), candidate, iterations)
     if np.count_nonzero(mask) < _LEAST_SHARE * np.count_nonzero(candidate):
         mask = _ellipse(rows, columns)
     return paste_mask(mask, window, image.shape)

@@ -25,7 +25,7 @@ def why_no_contrib(*names: str) -> str:
     absent = [name for name in names if not _has(name)]
     if not absent:
         return ""
-    installed = [wheel for wheel in _WHEELS if _installed(wheel)]
+    installed = [wheel for wheel in _WHEELS if _is_installed(wheel)]
     remove = f"`pip uninstall -y {' '.join(installed)}`, then " if installed else ""
     return f"the OpenCV in use has no {', '.join(absent)}: {remove}`pip install {CONTRIB}`"
 
@@ -38,7 +38,7 @@ def _has(name: str) -> bool:
     return True
 
 
-def _installed(wheel: str) -> bool:
+def _is_installed(wheel: str) -> bool:
     try:
         metadata.distribution(wheel)
     except metadata.PackageNotFoundError:

@@ -34,7 +34,7 @@ def prior(moved: list[tuple[float, NDArray[np.float32]]], area: int) -> NDArray[
     return np.clip(distance / (0.12 * math.sqrt(area)), -4.0, 4.0).astype(np.float32)
 
 
-def shifted_to(mask: NDArray[np.float32], evidence: NDArray[np.float32]) -> NDArray[np.float32]:
+def shift_to(mask: NDArray[np.float32], evidence: NDArray[np.float32]) -> NDArray[np.float32]:
     """``mask``, shifted without a turn to where ``evidence`` ``(S, S)`` supports it most.
 
     A side that turns away takes its texture along, and flow with it, while the outline stays where it is.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tracking3d.frames import Image
 from tracking3d.geometry.camera import Window
 from tracking3d.trackers.colour_models import GlobalColours, lab
-from tracking3d.trackers.crops import cut, inside_frame
+from tracking3d.trackers.crops import crop_window, inside_frame
 from tracking3d.trackers.outline import both_sides, remove_specks
 
 _OVERVIEW = 160  # longer side in pixels of the image that is searched
@@ -53,10 +53,10 @@ def find_by_colours(
     left, top = ((at + 0.5) / scale - side / 2 for at in (column, row))
     window = Window.around((left, top, side, side), margin, size)
 
-    crop, in_frame = cut(image, window), inside_frame(image.shape, window)
+    crop, in_frame = crop_window(image, window), inside_frame(image.shape, window)
     rows, columns = np.mgrid[:size, :size] + 0.5 - size / 2
     evidence = 2 * colours.rarity(lab(crop), overview) + 1 - np.hypot(rows, columns) / (0.3 * size)
-    evidence -= _UNCHANGED * cut(known, window)
+    evidence -= _UNCHANGED * crop_window(known, window)
     support = np.tanh(evidence / 3).astype(np.float32)
     smooth = cv2.ximgproc.fastGlobalSmootherFilter(crop, support, 100.0, 12.0)
     found = (smooth > 0) & in_frame

@@ -20,7 +20,7 @@ from tracking3d.geometry.camera import Window
 from tracking3d.trackers.background import BackgroundMemory
 from tracking3d.trackers.colour_models import GlobalColours, Palette
 from tracking3d.trackers.confidence import Judgement, outline_margin
-from tracking3d.trackers.crops import box_iou, box_of, clip_box, cut, outside, paste_mask
+from tracking3d.trackers.crops import box_iou, box_of, clip_box, crop_window, outside, paste_mask
 from tracking3d.trackers.cues import Cues, FrameCrop, colour_and_motion, decide, distance_beyond
 from tracking3d.trackers.first_mask import mask_in_box
 from tracking3d.trackers.mask_motion import follow_mask
@@ -75,7 +75,7 @@ class ColourSegmentation:
         self._doubtful_frames = 0
         self._usual_area = float(np.count_nonzero(self._mask > 0.5))
         view = FrameCrop.of(image, Window.around(box_of(self._mask) or box, _MARGIN, size))
-        inside, around = both_sides(cut(self._mask, view.window))
+        inside, around = both_sides(crop_window(self._mask, view.window))
         self._colours = GlobalColours(view.colours, inside, around)
         self._palette = Palette(view.colours)
         beside = both_sides(mask)[1] if mask is not None else outside(box, image.shape, _SLACK)
@@ -101,7 +101,7 @@ class ColourSegmentation:
         self._image, self._mask, self._doubtful_frames = image, mask.astype(np.float32), 0
         if box is not None:
             view = FrameCrop.of(image, Window.around(box, _MARGIN, self._size))
-            self._colours.update(view.colours, *both_sides(cut(self._mask, view.window)))
+            self._colours.update(view.colours, *both_sides(crop_window(self._mask, view.window)))
             self._background.forget(mask)
 
     def step(self, image: Image, witness: Box | None = None) -> MaskEstimate:
@@ -116,7 +116,7 @@ class ColourSegmentation:
         mask, judgement = self._search(image) if box is None else self._follow(image, box, witness)
         self._doubtful_frames = self._doubtful_frames + 1 if judgement.doubt else 0
         if witness is not None and self._doubtful_frames >= _PATIENCE:
-            mask, judgement = self._begin_anew(image, witness, mask, judgement)
+            mask, judgement = self._restart(image, witness, mask, judgement)
             self._doubtful_frames = 0
         self._velocity = _shift(box, box_of(mask))
         self._image, self._mask, self._judgement = image, mask, judgement
@@ -127,7 +127,7 @@ class ColourSegmentation:
         right, down = self._velocity
         last = FrameCrop.of(self._image, before)
         present = FrameCrop.of(image, Window(before.left + right, before.top + down, before.side, self._size))
-        last_mask = cut(self._mask, before)
+        last_mask = crop_window(self._mask, before)
         shift = (before.scale * right, before.scale * down)
         seen = present.in_frame
         motion = follow_mask(last.grey, present.grey, last_mask, self._cues.similarity, shift, seen)
@@ -169,20 +169,20 @@ class ColourSegmentation:
     def _search(self, image: Image) -> _Answer:
         """Where the object was out of sight: the mask of what has its colours, if anything has."""
         self._background.lose()
-        unchanged = self._background.unchanged(image) if self._cues.background else None
+        unchanged = self._background.unchanged_score(image) if self._cues.background else None
         found = find_by_colours(image, self._colours, self._usual_area, _MARGIN, self._size, unchanged)
         if found is None or found[2] < _FOUND_AGAIN * self._first_separation:
             return _out_of_sight(image)
         mask, window, separation = found
         return paste_mask(mask, window, image.shape), Judgement(separation, margin=separation)
 
-    def _begin_anew(
+    def _restart(
         self, image: Image, witness: Box, mask: NDArray[np.float32], judgement: Judgement
     ) -> _Answer:
         """Segment from the witness's box; keep the old mask unless the new one looks more like the object."""
         fresh = mask_in_box(image, witness)
         view = FrameCrop.of(image, Window.around(witness, _MARGIN, self._size))
-        separation = self._separation(view, cut(fresh, view.window))
+        separation = self._separation(view, crop_window(fresh, view.window))
         in_sight = box_of(mask) is not None
         if separation <= (judgement.separation if in_sight else _FOUND_AGAIN * self._first_separation):
             return mask, judgement

@@ -159,13 +159,13 @@ class VideoPictures:
                 continue
             self._next = at + 1
             if at == index:
-                return self._converted(picture)
+                return self._convert_frame(picture)
             if at > index:
                 break
         self._running = None
         return None
 
-    def _converted(self, picture: av.VideoFrame) -> Image | None:
+    def _convert_frame(self, picture: av.VideoFrame) -> Image | None:
         try:
             return self._convert(picture)
         except ValueError:

@@ -12,7 +12,7 @@ import numpy as np
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, Image, SkippedFrame
 from tracking3d.video.selection import EVERY_FRAME, within
-from tracking3d.video.source import Intrinsics, checked
+from tracking3d.video.source import Intrinsics, check_frames
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class ArraySource:
     def __iter__(self) -> Iterator[Frame | SkippedFrame]:
         """Give the selected frames; an `InputError` ends it at the first item that is no image."""
         frames = self._frames()
-        return checked(frames, self.name) if self.convert is None else frames
+        return check_frames(frames, self.name) if self.convert is None else frames
 
     def _frames(self) -> Iterator[Frame | SkippedFrame]:
         wanted = self.selection

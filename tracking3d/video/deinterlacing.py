@@ -15,7 +15,7 @@ FILTER = "bwdif"
 """FFmpeg's filter of Bob Weaver and yadif, https://ffmpeg.org/ffmpeg-filters.html#bwdif"""
 
 
-def deinterlaced(pictures: Iterable[av.VideoFrame | str]) -> Iterator[av.VideoFrame | str]:
+def deinterlace(pictures: Iterable[av.VideoFrame | str]) -> Iterator[av.VideoFrame | str]:
     """The same pictures in the same number and order, interlaced ones deinterlaced; progressive ones pass as they are.
 
     The lines of a picture that are missing at its moment come from the pictures before and after it, so that each

@@ -10,7 +10,7 @@ from tracking3d.errors import InputError
 from tracking3d.frames import Frame, SkippedFrame
 from tracking3d.video.image_file import SUFFIXES, read_exif_intrinsics, read_image
 from tracking3d.video.selection import EVERY_FRAME, natural_order, within
-from tracking3d.video.source import Intrinsics, checked
+from tracking3d.video.source import Intrinsics, check_frames
 
 
 def images_among(paths: Iterable[Path]) -> list[Path]:
@@ -82,7 +82,7 @@ class ImageSequence:
 
     def __iter__(self) -> Iterator[Frame | SkippedFrame]:
         """Read the selected images; those that cannot be read are given as skipped."""
-        return checked(self._frames(), self.name)
+        return check_frames(self._frames(), self.name)
 
     def _frames(self) -> Iterator[Frame | SkippedFrame]:
         for index in self.selection:

@@ -94,7 +94,9 @@ def newest(
 ) -> Iterator[Frame | SkippedFrame]:
     """The frames that are the newest whenever one is asked for; see `LatestFrames`."""
     slot = _Slot()
-    reader = threading.Thread(target=_read, args=(frames, rate, slot), name="latest frames", daemon=True)
+    reader = threading.Thread(
+        target=_read_frames, args=(frames, rate, slot), name="latest frames", daemon=True
+    )
     reader.start()
     try:
         while items := slot.take():
@@ -163,7 +165,7 @@ class _Slot:
         return sorted(found, key=lambda item: item.index)
 
 
-def _read(frames: Iterable[Frame | SkippedFrame], rate: float | None, slot: _Slot) -> None:
+def _read_frames(frames: Iterable[Frame | SkippedFrame], rate: float | None, slot: _Slot) -> None:
     """What the thread does: leave item after item, until there is none or nobody takes them."""
     error: BaseException | None = None
     iterator: Iterator[Frame | SkippedFrame] = iter(())

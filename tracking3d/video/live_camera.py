@@ -15,7 +15,7 @@ from tracking3d.frames import Frame, Image, SkippedFrame
 from tracking3d.video.latest_frames import newest
 from tracking3d.video.opencv_log import silent_opencv
 from tracking3d.video.selection import EVERY_FRAME
-from tracking3d.video.source import Intrinsics, checked
+from tracking3d.video.source import Intrinsics, check_frames
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class LiveCamera:
 
     def __iter__(self) -> Iterator[Frame | SkippedFrame]:
         """Open the camera and give the newest frame whenever one is asked for, those dropped as `SkippedFrame`."""
-        return checked(newest(self._frames()), self.name)
+        return check_frames(newest(self._frames()), self.name)
 
     def _frames(self) -> Iterator[Frame]:
         camera = _open(self.number)

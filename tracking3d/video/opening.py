@@ -40,7 +40,7 @@ def open_source(
         InputError: If there is nothing that can be read as frames, the selection is bad or empty, or ``fps`` is given
             for a source that has times of its own.
     """
-    selection, fps = parse_selection(frames), _checked_fps(fps)
+    selection, fps = parse_selection(frames), _validate_fps(fps)
     if isinstance(source, str | Path):
         opened = _open_path(str(source), selection)
         if fps is None:
@@ -55,7 +55,7 @@ def open_source(
     )
 
 
-def _checked_fps(fps: float | None) -> float | None:
+def _validate_fps(fps: float | None) -> float | None:
     if fps is None:
         return None
     number = isinstance(fps, Real) and not isinstance(fps, bool)

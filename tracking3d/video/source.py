@@ -60,7 +60,7 @@ def source_notes(source: FrameSource) -> tuple[str, ...]:
     return tuple(getattr(source, "notes", ()))
 
 
-def checked(frames: Iterable[Frame | SkippedFrame], name: str) -> Iterator[Frame | SkippedFrame]:
+def check_frames(frames: Iterable[Frame | SkippedFrame], name: str) -> Iterator[Frame | SkippedFrame]:
     """Pass ``frames`` on; skip those of another size than the first, and insist on at least one.
 
     Args:

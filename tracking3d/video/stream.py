@@ -24,13 +24,13 @@ from av.error import FFmpegError
 
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, SkippedFrame
-from tracking3d.video.deinterlacing import deinterlaced
+from tracking3d.video.deinterlacing import deinterlace
 from tracking3d.video.latest_frames import newest
 from tracking3d.video.picture_conversion import PictureConverter
 from tracking3d.video.selection import EVERY_FRAME
-from tracking3d.video.source import Intrinsics, checked
+from tracking3d.video.source import Intrinsics, check_frames
 from tracking3d.video.video_decoding import decode_pictures
-from tracking3d.video.video_file import VideoFile, described, frame_of, video_stream
+from tracking3d.video.video_file import VideoFile, describe_video, frame_of, video_stream
 
 SCHEMES = ("http", "https", "rtsp", "rtsps")
 """Of the addresses that are opened."""
@@ -89,7 +89,7 @@ def open_stream(address: str, selection: range = EVERY_FRAME) -> NetworkFile | L
     if not host:
         raise InputError(f"{name} names no server; write it as {scheme}://server/path.")
     with _open(name, address) as container:
-        found = described(container, name, Path(address), selection)
+        found = describe_video(container, name, Path(address), selection)
         if scheme in ("http", "https") and found.count is not None:
             return NetworkFile(**vars(found), address=address)
     return LiveStream(name, address, selection, found.fps, notes=found.notes)
@@ -129,7 +129,7 @@ class LiveStream:
 
     def __iter__(self) -> Iterator[Frame | SkippedFrame]:
         """Open the stream and give the newest frame whenever one is asked for, those dropped as `SkippedFrame`."""
-        return checked(newest(self._frames()), self.name)
+        return check_frames(newest(self._frames()), self.name)
 
     def _frames(self) -> Iterator[Frame | SkippedFrame]:
         indices, start, failed = counting(), None, 0
@@ -168,7 +168,7 @@ class LiveStream:
             stream, convert = video_stream(container), PictureConverter()
             if stream is None:
                 raise InputError(f"{self.name} has no video in it any more.")
-            for picture in deinterlaced(decode_pictures(container, stream)):
+            for picture in deinterlace(decode_pictures(container, stream)):
                 yield picture if isinstance(picture, str) else (picture, convert)
 
 

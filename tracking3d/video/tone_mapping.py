@@ -62,12 +62,12 @@ class ToneMapping:
         codes = signal >> 6
         light = _light(self.transfer)[codes]
         if self.transfer == "PQ":
-            light *= _rolled_off_codes()[codes.max(2)][..., None]
+            light *= _roll_off_codes()[codes.max(2)][..., None]
         if self.transfer == "HLG":
             # The display's gamma, which follows the brightness of the scene.
             gain = SOURCE_PEAK * cv2.pow(cv2.transform(light, _LUMA_2020[None]), 0.2)
             peak = np.sqrt(gain * light.max(2) / SOURCE_PEAK) * _FINE
-            light *= (gain * _rolled_off_roots()[np.minimum(peak + 0.5, _FINE).astype(np.uint16)])[..., None]
+            light *= (gain * _roll_off_roots()[np.minimum(peak + 0.5, _FINE).astype(np.uint16)])[..., None]
         if self.wide:
             light = cv2.transform(light, _TO_709)
         steps = (np.clip(light, 0.0, 1.0) * _FINE + 0.5).astype(np.uint16)
@@ -118,18 +118,18 @@ def _light(transfer: str) -> NDArray[np.float32]:
 
 
 @lru_cache(maxsize=1)
-def _rolled_off_codes() -> NDArray[np.float32]:
+def _roll_off_codes() -> NDArray[np.float32]:
     """Factors for the brightest channel's PQ signal of 10 bits; light is then 1 at `WHITE`."""
-    return _rolled_off(pq_to_light(np.arange(1024) / 1023))
+    return _roll_off(pq_to_light(np.arange(1024) / 1023))
 
 
 @lru_cache(maxsize=1)
-def _rolled_off_roots() -> NDArray[np.float32]:
+def _roll_off_roots() -> NDArray[np.float32]:
     """The same for the root of the brightest channel's light, in steps of `_FINE` up to `SOURCE_PEAK`."""
-    return _rolled_off((np.arange(_FINE + 1) / _FINE) ** 2 * SOURCE_PEAK)
+    return _roll_off((np.arange(_FINE + 1) / _FINE) ** 2 * SOURCE_PEAK)
 
 
-def _rolled_off(light: NDArray[np.float64]) -> NDArray[np.float32]:
+def _roll_off(light: NDArray[np.float64]) -> NDArray[np.float32]:
     """The factors that bring light in cd/m2 below 1, which is `WHITE`: BT.2390's Hermite spline over PQ."""
     most = float(light_to_pq(np.array(SOURCE_PEAK)))
     signal = np.minimum(light_to_pq(light) / most, 1.0)

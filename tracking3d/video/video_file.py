@@ -15,10 +15,10 @@ from av.video.stream import VideoStream
 
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, SkippedFrame
-from tracking3d.video.deinterlacing import deinterlaced
+from tracking3d.video.deinterlacing import deinterlace
 from tracking3d.video.picture_conversion import PictureConverter, said_of
 from tracking3d.video.selection import EVERY_FRAME, within
-from tracking3d.video.source import Intrinsics, checked
+from tracking3d.video.source import Intrinsics, check_frames
 from tracking3d.video.video_decoding import decode_pictures
 
 
@@ -59,7 +59,7 @@ class VideoFile:
             InputError: If it is no video, or truncated beyond use.
         """
         with open_container(name, path) as container:
-            return described(container, name, path, selection)
+            return describe_video(container, name, path, selection)
 
     def container(self) -> InputContainer:
         """The file, open at its beginning.
@@ -71,14 +71,14 @@ class VideoFile:
 
     def __iter__(self) -> Iterator[Frame | SkippedFrame]:
         """Decode the selected frames; those that cannot be decoded are given as skipped."""
-        return checked(self._frames(), self.name)
+        return check_frames(self._frames(), self.name)
 
     def _frames(self) -> Iterator[Frame | SkippedFrame]:
         with self.container() as container:
             stream = video_stream(container)
             assert stream is not None
             start, convert = stream.start_time, PictureConverter()
-            for index, picture in enumerate(deinterlaced(decode_pictures(container, stream))):
+            for index, picture in enumerate(deinterlace(decode_pictures(container, stream))):
                 seconds = None
                 if isinstance(picture, av.VideoFrame) and picture.pts is not None and stream.time_base:
                     start = picture.pts if start is None else min(start, picture.pts)
@@ -93,7 +93,7 @@ class VideoFile:
                     return
 
 
-def described(container: InputContainer, name: str, path: Path, selection: range) -> VideoFile:
+def describe_video(container: InputContainer, name: str, path: Path, selection: range) -> VideoFile:
     """What an open file's header and first picture tell; see `VideoFile.open`."""
     if container.format.name in ("tty", "image2") or container.format.name.endswith("_pipe"):
         raise InputError(f"{name} is not a video; give a video file or a folder of images.")

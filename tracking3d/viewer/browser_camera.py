@@ -31,12 +31,12 @@ def look_from_aside(server: viser.ViserServer, scenes: Sequence[ObjectScene], na
     aside = aside_of(scenes[0].path)
     places = np.concatenate([scene.place + np.vstack([scene.path, np.zeros(3)]) for scene in scenes])
     camera = server.initial_camera
-    camera.look_at, distance = framed(places, aside, _NARROW if narrow else _ASPECT)
+    camera.look_at, distance = frame_object(places, aside, _NARROW if narrow else _ASPECT)
     camera.position = camera.look_at + distance * aside
     camera.fov = _FOV
 
 
-def framed(
+def frame_object(
     places: NDArray[np.float64], aside: NDArray[np.float64], aspect: float = _ASPECT
 ) -> tuple[NDArray[np.float64], float]:
     """Where to look, and from how far, so that all ``places`` are in view.

@@ -199,7 +199,7 @@ class Corrections:
     def __init__(self, each: Sequence[RunCorrection], access: Access) -> None:
         self._each, self._access = each, access
 
-    def offered(self, index: int) -> str:
+    def offer(self, index: int) -> str:
         """Links to correct a frame of each run, and how far corrections are, as HTML."""
         return (
             '<div style="font-size:12px;line-height:1.5;margin:4px 12px"><p>Where the answer is on something else, say '

@@ -127,16 +127,16 @@ class _Guard:
             from_page=socket,
         )
         if refusal is not None:
-            return _refused(connection, refusal)
+            return _refuse(connection, refusal)
         if self.access.gives_token(request.path) and not socket:
-            answer = connection.respond(303, "")
-            answer.headers["Location"] = urlsplit(request.path).path or "/"
-            answer.headers["Set-Cookie"] = self.access.cookie(self.port)
+            estimate = connection.respond(303, "")
+            estimate.headers["Location"] = urlsplit(request.path).path or "/"
+            estimate.headers["Set-Cookie"] = self.access.cookie(self.port)
         elif (found := usual(connection, request)) is None:
             return None
         else:
-            answer = found
-        return _with_safe_headers(answer)
+            estimate = found
+        return _with_safe_headers(estimate)
 
 
 def _one(request: Request, name: str) -> str | None:
@@ -145,7 +145,7 @@ def _one(request: Request, name: str) -> str | None:
     return values[0] if len(values) == 1 else ("" if values else None)
 
 
-def _refused(connection: ServerConnection, refusal: Refusal) -> Response:
+def _refuse(connection: ServerConnection, refusal: Refusal) -> Response:
     return _with_safe_headers(connection.respond(refusal.status, refusal.reason + "\n"))
 
 

@@ -94,7 +94,7 @@ def beside(pictures: Sequence[Image], names: Sequence[str]) -> Image:
     if len(pictures) == 1:
         return pictures[0]
     width = WIDEST // 2
-    tiles = [_named(picture, name, width) for picture, name in zip(pictures, names, strict=True)]
+    tiles = [_add_name(picture, name, width) for picture, name in zip(pictures, names, strict=True)]
     height = max(len(tile) for tile in tiles)
     canvas = np.full((height * -(-len(tiles) // 2), 2 * width, 3), drawing.PAPER, np.uint8)
     for number, tile in enumerate(tiles):
@@ -116,7 +116,7 @@ def axes_of(run: FollowedRun) -> ObjectAxes | None:
     return None
 
 
-def _named(picture: Image, name: str, width: int) -> Image:
+def _add_name(picture: Image, name: str, width: int) -> Image:
     height = max(round(picture.shape[0] * width / picture.shape[1]), 1)
     tile = np.full((height + 22, width, 3), drawing.PAPER, np.uint8)
     tile[22:] = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)

@@ -140,7 +140,7 @@ class ObjectScene:
 
     def _draw_mesh(self) -> None:
         path = self._run.folder / layout.GLB
-        written, data = _changed(path, self._mesh_written)
+        written, data = _read_if_changed(path, self._mesh_written)
         if data is None:
             return
         self._mesh_written = written
@@ -162,10 +162,10 @@ class ObjectScene:
                 thickness=2.0,
                 thickness_units="screen",
             )
-        for slot, number in enumerate(_spread(records)):
+        for slot, number in enumerate(_spread_frames(records)):
             self._draw_frustum(slot, records[number], T_obj_cam[number])
 
-    def _clicked(self, index: int, event: object) -> None:
+    def _on_click(self, index: int, event: object) -> None:
         self._jump(index)
 
     def _draw_frustum(self, slot: int, record: FrameRecord, T_obj_cam: NDArray[np.float64]) -> None:
@@ -181,15 +181,15 @@ class ObjectScene:
             wxyz=_wxyz(T_obj_cam),
             position=T_obj_cam[:3, 3],
         )
-        handle.on_click(partial(self._clicked, record.index))
+        handle.on_click(partial(self._on_click, record.index))
 
 
 def _as_seen(camera: Camera, image: Image) -> Image:
     """The picture ``(H, W, 3)`` without the distortion of a lens; one that was made smaller is left as it is."""
-    return camera.undistorted(image) if image.shape[:2] == (camera.height, camera.width) else image
+    return camera.undistort(image) if image.shape[:2] == (camera.height, camera.width) else image
 
 
-def _spread(records: list[FrameRecord]) -> list[int]:
+def _spread_frames(records: list[FrameRecord]) -> list[int]:
     """Places of those records that get a frustum: the keyframes, the doubtful, and others between, spread evenly."""
     keyframes = [place for place, record in enumerate(records) if record.keyframe]
     doubtful = [
@@ -213,7 +213,7 @@ def _wxyz(T: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.array([w, x, y, z])
 
 
-def _changed(path: Path, before: float) -> tuple[float, bytes | None]:
+def _read_if_changed(path: Path, before: float) -> tuple[float, bytes | None]:
     """When a file was written, and what it holds if that is not as ``before``; None if it is, or there is none."""
     try:
         told = path.stat()

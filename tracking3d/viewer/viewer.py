@@ -23,14 +23,14 @@ from tracking3d.results.overlay import ObjectAxes
 from tracking3d.video.any_frame import FrameImages
 from tracking3d.viewer import timeline
 from tracking3d.viewer.browser_camera import look_from_aside, look_through
+from tracking3d.viewer.checkpoint_landmarks import landmarks_of_checkpoint
 from tracking3d.viewer.correcting import Corrections
+from tracking3d.viewer.descriptions import about, describe_frame, list_streaks
 from tracking3d.viewer.followed_run import FollowedRun
 from tracking3d.viewer.guarded_server import start_server
-from tracking3d.viewer.kept_landmarks import kept_landmarks
 from tracking3d.viewer.panel import SPEEDS, Panel
 from tracking3d.viewer.picture import axes_of, beside, draw_picture
 from tracking3d.viewer.scene import ObjectScene, set_up_space
-from tracking3d.viewer.told import about, describe_frame, list_streaks
 from tracking3d.web.access import Access
 
 POLL = 0.5
@@ -270,7 +270,7 @@ class Viewer:
         return [colours[self._runs.index(run) % len(colours)] for run in video.runs]
 
     def _offer_correction(self, index: int) -> None:
-        offered = self._corrections.offered(max(index, 0))
+        offered = self._corrections.offer(max(index, 0))
         if offered != self._panel.correct.content:
             self._panel.correct.content = offered
 
@@ -304,7 +304,7 @@ class Viewer:
                 place += max(1.6 * scene.distance, 1.1 * (above + scene.reach))
             scene.place, above = np.array([0.0, place, 0.0]), scene.reach
             # Of the state of a run that goes on: the final refinement may scale and turn the object.
-            points = None if run.refined else kept_landmarks(run.folder)
+            points = None if run.refined else landmarks_of_checkpoint(run.folder)
             scene.draw_landmarks(points)
             any_landmarks = any_landmarks or points is not None
         look_from_aside(

@@ -9,7 +9,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, Prompt
-from tracking3d.prompts import make_prompt
+from tracking3d.prompts.prompt import make_prompt
 from tracking3d.trackers.crops import box_of
 from tracking3d.trackers.vot_regions import Polygon, rasterise
 

@@ -10,7 +10,7 @@ from tracking3d.config.loading import load_config
 from tracking3d.config.models import PipelineConfig
 from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.frames import Frame, Image, Prompt
-from tracking3d.pipeline import Session, checked_image
+from tracking3d.pipeline.track import Session, validate_image
 
 PRESET_VARIABLE = "TRACKING3D_PRESET"
 """Environment variable with the name of the preset where none is given."""
@@ -41,7 +41,7 @@ class ObjectSessions:
         Raises:
             Tracking3dError: If the image or a prompt cannot be used.
         """
-        frame = Frame(self._frames, checked_image(image, self._frames))
+        frame = Frame(self._frames, validate_image(image, self._frames))
         self._frames += 1
         self._sessions += [Session(self._config, prompt(frame)) for prompt in new]
         return [session.step(frame) for session in self._sessions]

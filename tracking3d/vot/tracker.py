@@ -51,7 +51,7 @@ class VotTracker:
         overrides: str = "",
         region: str = "mask",
     ) -> None:
-        with _told_to_the_toolkit():
+        with _report_to_toolkit():
             if region not in _REGIONS:
                 raise InputError(f"There are no regions '{region}'; choose one of {', '.join(_REGIONS)}.")
             self._config = configuration(config, preset, overrides)
@@ -81,7 +81,7 @@ class VotTracker:
         self, frame: Any, new: Sequence[Status] | Status = (), properties: Mapping[str, Any] | None = None
     ) -> list[Status]:
         """Go on to the next frame, in which objects may be new; see `init`."""
-        with _told_to_the_toolkit():
+        with _report_to_toolkit():
             objects = [new] if isinstance(new, tuple) and new else new
             prompts = [partial(prompt_of, region) for region, _ in objects]
             return [self._status(estimate) for estimate in self._sessions.step(_image(frame), prompts)]
@@ -92,7 +92,7 @@ class VotTracker:
 
 
 @contextmanager
-def _told_to_the_toolkit() -> Iterator[None]:
+def _report_to_toolkit() -> Iterator[None]:
     try:
         yield
     except Tracking3dError as error:

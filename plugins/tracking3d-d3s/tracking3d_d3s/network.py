@@ -19,7 +19,7 @@ from tracking3d.errors import InputError, PluginError
 from tracking3d.frames import Box, Frame, Image, MaskEstimate, Prompt
 from tracking3d.geometry.camera import Window
 from tracking3d.networks.session import Network
-from tracking3d.trackers.crops import box_iou, box_of, clip_box, cut, inside_frame, paste_mask
+from tracking3d.trackers.crops import box_iou, box_of, clip_box, crop_window, inside_frame, paste_mask
 from tracking3d.trackers.csrt import BoxTracker, CsrtTracker
 
 _INPUTS = {"train_imgs": 3, "test_imgs": 3, "train_masks": 1, "test_dist": 1}
@@ -79,9 +79,9 @@ class D3sNetwork:
             )
         self._box = box
         window = self._window(box)
-        pixels = _normalised(cut(image, window))
+        pixels = _normalised(crop_window(image, window))
         if prompt.mask is not None:
-            given = cut(prompt.mask.astype(np.float32), window) * inside_frame(image.shape, window)
+            given = crop_window(prompt.mask.astype(np.float32), window) * inside_frame(image.shape, window)
             self._template = _Template(pixels, _plane(given > _GIVEN_MASK))
             answer = MaskEstimate(prompt.mask.astype(np.float32))
         else:
@@ -104,7 +104,7 @@ class D3sNetwork:
         if found is not None:
             self._box = _moved(self._box, _centre(found), frame.image.shape)
         window = self._window(self._box)
-        probability = self._run(self._template, _normalised(cut(frame.image, window)))
+        probability = self._run(self._template, _normalised(crop_window(frame.image, window)))
         mask = _largest((probability > self._threshold) & inside_frame(frame.image.shape, window))
         if mask is None:
             return MaskEstimate(None, 0.0, "D3S finds no object")

@@ -118,7 +118,7 @@ def test_a_box_stays_in_the_frame(tmp_path):
 
 def test_crops_are_those_of_the_projects():
     assert Patch.square((100, 80, 40, 90), 2.0, 128) == Patch(60, 65, 120, 120, 128)
-    assert Patch.stretched((100, 80, 40, 90), 2.0, 256) == Patch(80, 35, 80, 180, 256)
+    assert Patch.stretch_to((100, 80, 40, 90), 2.0, 256) == Patch(80, 35, 80, 180, 256)
 
 
 def test_a_patch_is_normalised_and_black_beyond_the_frame():

@@ -39,7 +39,7 @@ class Patch:
         return cls._around(box, side, side, size)
 
     @classmethod
-    def stretched(cls, box: Box, factor: float, size: int) -> Self:
+    def stretch_to(cls, box: Box, factor: float, size: int) -> Self:
         """``factor`` times the box each way, whatever its proportions (AlphaRefine)."""
         width, height = (max(math.ceil(factor * side), 1) for side in box[2:])
         return cls._around(box, width, height, size)

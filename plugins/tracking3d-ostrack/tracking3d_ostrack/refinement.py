@@ -46,14 +46,14 @@ class AlphaRefine:
 
     def start(self, image: Image, box: Box) -> None:
         """Take ``box`` ``(x, y, w, h)`` in ``image`` ``(H, W, 3)`` for the object."""
-        patch = Patch.stretched(box, _SEARCH, self._size)
+        patch = Patch.stretch_to(box, _SEARCH, self._size)
         inside = np.array([patch.box_in(box)], np.float32)
         inside[0, :2] -= 0.5  # the project counts from the middle of the first pixel
         self._reference = {"train_imgs": patch.cut(image), "train_bb": inside}
 
     def mask(self, image: Image, box: Box) -> NDArray[np.float32]:
         """``(H, W)``: the probability of the object; 0 where the crop around ``box`` does not reach."""
-        patch = Patch.stretched(box, _SEARCH, self._size)
+        patch = Patch.stretch_to(box, _SEARCH, self._size)
         answers = self._network.run({**self._reference, "test_imgs": patch.cut(image)})
         mask = np.squeeze(answers["mask"])
         if mask.shape != (self._size, self._size):

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from tracking3d import Frame, FrameEstimate, ObjectModel, Session, Status, load_config
 from tracking3d.errors import InputError, Tracking3dError
-from tracking3d.export.exported_run import seen_side
-from tracking3d.prompts import make_prompt
+from tracking3d.export.exported_run import visible_side
+from tracking3d.prompts.prompt import make_prompt
 
 CHANNELS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0), "mono8": (0, 0, 0)}
 """Encodings of pictures: which of a pixel's bytes are red, green and blue."""
@@ -152,7 +152,7 @@ class ObjectTracking:
         if self._metres == 0 or due:
             model = tracking.result()
             if self._object_size:
-                self._metres = self._object_size / seen_side(model)
+                self._metres = self._object_size / visible_side(model)
             if due:
                 mesh, self._last_mesh = triangles(model, self._metres), estimate.index
         quaternion = Rotation.from_matrix(estimate.T_cam_obj[:3, :3]).as_quat()

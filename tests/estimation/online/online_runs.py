@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from tracking3d.config.loading import load_config
 from tracking3d.estimation.estimate import FrameEstimate
-from tracking3d.estimation.online.belief import Belief
 from tracking3d.estimation.online.solver import OnlineSolver
+from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.evaluation.metrics import Angles, aligned_rotation_errors
 from tracking3d.features.rgb import RgbEncoder
 from tracking3d.frames import Frame, MaskEstimate
@@ -19,7 +19,7 @@ from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synt
 
 FRAMES = 14
 Mask = NDArray[np.bool_] | None
-Run = tuple[Belief, list[FrameEstimate]]
+Run = tuple[SolverState, list[FrameEstimate]]
 
 
 @cache
@@ -59,13 +59,13 @@ def true_mask(index: int) -> NDArray[np.bool_]:
 
 def run(frames: Iterable[tuple[Frame, Mask]], after: Run | None = None) -> Run:
     """The state at the end, and every answer as it came; ``after`` is a run that goes on with ``frames``."""
-    state, answers = (after[0], list(after[1])) if after else (None, [])
+    state, estimates = (after[0], list(after[1])) if after else (None, [])
     for shown, mask in frames:
         given = estimate_of(mask)
-        state, answer = solver().init(shown, given) if state is None else solver().step(state, shown, given)
-        answers.append(answer)
+        state, estimate = solver().init(shown, given) if state is None else solver().step(state, shown, given)
+        estimates.append(estimate)
     assert state is not None
-    return state, answers
+    return state, estimates
 
 
 def with_true_masks(indices: Iterable[int] = range(FRAMES)) -> list[tuple[Frame, Mask]]:
@@ -84,21 +84,21 @@ def whole_run() -> Run:
     return known_run(FRAMES)
 
 
-def final(answers: Iterable[FrameEstimate]) -> list[FrameEstimate]:
+def final(estimates: Iterable[FrameEstimate]) -> list[FrameEstimate]:
     """The last causal answer for every frame, in order of time."""
     found: dict[int, FrameEstimate] = {}
-    for answer in answers:
-        found |= {better.index: better for better in answer.revised}
-        found[answer.index] = answer
+    for estimate in estimates:
+        found |= {better.index: better for better in estimate.revised}
+        found[estimate.index] = estimate
     return [found[index] for index in sorted(found)]
 
 
-def revisited(state: Belief, answers: Iterable[FrameEstimate]) -> Run:
-    """The refined state, and every frame once more; ``answers`` are the final causal ones."""
+def revisited(state: SolverState, estimates: Iterable[FrameEstimate]) -> Run:
+    """The refined state, and every frame once more; ``estimates`` are the final causal ones."""
     state, refined = solver().refine(state), []
-    for answer in answers:
-        given = estimate_of(answer.initial_mask)
-        state, better = solver().revisit(state, frame(answer.index), given, answer.T_cam_obj)
+    for estimate in estimates:
+        given = estimate_of(estimate.initial_mask)
+        state, better = solver().refine_frame(state, frame(estimate.index), given, estimate.T_cam_obj)
         refined.append(better)
     return state, refined
 
@@ -106,12 +106,12 @@ def revisited(state: Belief, answers: Iterable[FrameEstimate]) -> Run:
 @cache
 def refined_run() -> Run:
     """The whole run, looked at once more."""
-    state, answers = whole_run()
-    return revisited(state, final(answers))
+    state, estimates = whole_run()
+    return revisited(state, final(estimates))
 
 
-def rotation_errors(answers: list[FrameEstimate]) -> Angles:
+def rotation_errors(estimates: list[FrameEstimate]) -> Angles:
     """Against the clip's truth, in degrees."""
-    found = np.stack([answer.T_cam_obj[:3, :3] for answer in answers])
-    true = turning_clip().T_cam_obj[[answer.index for answer in answers], :3, :3]
+    found = np.stack([estimate.T_cam_obj[:3, :3] for estimate in estimates])
+    true = turning_clip().T_cam_obj[[estimate.index for estimate in estimates], :3, :3]
     return aligned_rotation_errors(found, true)

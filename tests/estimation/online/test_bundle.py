@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tracked_solids import degrees_between, disturbed, scene
 
-from tracking3d.bundle_adjustment.adjustment import AdjustmentProblem, Structure, Tracks, _damped, adjust
+from tracking3d.bundle_adjustment.adjustment import AdjustmentProblem, Structure, Tracks, _damp, adjust
 from tracking3d.bundle_adjustment.reprojection import transform_to_camera
 
 
@@ -63,12 +63,12 @@ def test_the_gradient_is_the_finite_difference_of_the_cost():
     given = scene(frames=3, count=6, noise=1.0)
     for fixed, free_focal in ((1, False), (0, False), (1, True)):
         posed = problem(given, fixed, free_focal, prior_weight=0.3)
-        at = replace(posed.evaluated(disturbed(given.truth)), focal_factor=1.1)
-        system = posed.linearised(at)
+        at = replace(posed.evaluate(disturbed(given.truth)), focal_factor=1.1)
+        system = posed.linearize(at)
         total = posed.weight.sum()
 
         def cost(d_poses, d_points, posed=posed, at=at, total=total):
-            return total * posed.evaluated(posed.stepped(at, d_poses, d_points)).cost
+            return total * posed.evaluate(posed.step_by(at, d_poses, d_points)).cost
 
         none, still = np.zeros(len(system.poses)), np.zeros_like(at.points)
         for k in range(len(none)):
@@ -86,12 +86,12 @@ def test_the_matrix_is_gauss_newtons_at_small_residuals():
     """With hardly any residual the Hessian is J^T J, which finite differences of the gradient show."""
     given = scene(frames=3, count=5)
     posed = problem(given, free_focal=True)
-    at = posed.evaluated(given.truth)
-    system = posed.linearised(at)
+    at = posed.evaluate(given.truth)
+    system = posed.linearize(at)
     size = len(system.poses)
     for k in range(size):
         d = 1e-6 * np.eye(size)[k]
-        ahead, back = (posed.linearised(posed.stepped(at, s * d, np.zeros_like(at.points))) for s in (1, -1))
+        ahead, back = (posed.linearize(posed.step_by(at, s * d, np.zeros_like(at.points))) for s in (1, -1))
         finite = (ahead.poses_gradient - back.poses_gradient) / 2e-6
         assert np.allclose(system.poses[k], finite, rtol=1e-3, atol=1e-3 * np.abs(system.poses).max())
         finite = (ahead.points_gradient - back.points_gradient) / 2e-6
@@ -100,11 +100,11 @@ def test_the_matrix_is_gauss_newtons_at_small_residuals():
 
 def test_eliminating_the_points_gives_the_step_of_the_whole_system():
     given = scene(frames=3, count=7, noise=0.5)
-    system = problem(given).linearised(given.truth)
+    system = problem(given).linearize(given.truth)
     size, count = len(system.poses), len(system.points)
     whole = np.zeros((size + 3 * count, size + 3 * count))
-    whole[:size, :size] = _damped(system.poses, 0.01)
-    for n, block in enumerate(_damped(system.points, 0.01)):
+    whole[:size, :size] = _damp(system.poses, 0.01)
+    for n, block in enumerate(_damp(system.points, 0.01)):
         rows = slice(size + 3 * n, size + 3 * n + 3)
         whole[rows, rows] = block
         whole[:size, rows] = system.coupling[n].T

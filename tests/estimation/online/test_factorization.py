@@ -10,12 +10,12 @@ from tracked_solids import degrees_between, intrinsics, scene
 
 from tracking3d.bundle_adjustment.adjustment import Structure
 from tracking3d.bundle_adjustment.reprojection import project_camera_points, transform_to_camera
-from tracking3d.estimation.online.factorization import (
+from tracking3d.estimation.online.initialization.factorization import (
     affine_motion,
+    align_with_axis,
     assumed_relief,
     measured_relief,
     metric_structure,
-    onto_axis,
 )
 
 
@@ -136,7 +136,7 @@ def test_degenerate_points_give_no_traceback(kind):
 
 def test_the_least_rotation_takes_a_direction_to_the_axis():
     direction = np.array([0.3, -0.2, 0.9])
-    R = onto_axis(direction)
+    R = align_with_axis(direction)
     assert np.allclose(R @ direction, [0, 0, np.linalg.norm(direction)])
     assert np.allclose(R @ R.T, np.eye(3))
     angle = np.degrees(np.arccos(direction[2] / np.linalg.norm(direction)))

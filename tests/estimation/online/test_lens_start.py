@@ -13,7 +13,7 @@ from turned_solid import turned_map
 
 from tracking3d.config.loading import load_config
 from tracking3d.estimation.estimate import FrameEstimate, Status
-from tracking3d.estimation.online.lens import lens_hypotheses, through
+from tracking3d.estimation.online.mapping.focal_length import lens_hypotheses, with_focal_length
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.evaluation.metrics import aligned_rotation_errors
 from tracking3d.features.rgb import RgbEncoder
@@ -46,13 +46,13 @@ def answers(assumed: bool, frames: int = FRAMES) -> list[FrameEstimate]:
     state = None
     for index in range(frames):
         frame, mask = Frame(index, clip().images[index]), estimate_of(clip().masks[index])
-        state, answer = solver.init(frame, mask) if state is None else solver.step(state, frame, mask)
-        found |= {one.index: one for one in (*answer.revised, answer)}
+        state, estimate = solver.init(frame, mask) if state is None else solver.step(state, frame, mask)
+        found |= {one.index: one for one in (*estimate.revised, estimate)}
     return [found[index] for index in range(frames)]
 
 
 def error(assumed: bool) -> float:
-    found = np.array([answer.T_cam_obj[:3, :3] for answer in answers(assumed)])
+    found = np.array([estimate.T_cam_obj[:3, :3] for estimate in answers(assumed)])
     truth = np.array([pose[:3, :3] for pose in clip().T_cam_obj])
     return float(np.mean(aligned_rotation_errors(found, truth)))
 
@@ -67,7 +67,7 @@ def test_a_longer_lens_is_chosen_and_the_poses_are_better_with_it():
 
 
 def test_a_given_lens_stays():
-    assert {answer.camera.origin for answer in answers(False, SOON) if answer.camera} == {
+    assert {estimate.camera.origin for estimate in answers(False, SOON) if estimate.camera} == {
         "default field of view"
     }
     assert len(lens_hypotheses(Camera.from_fov(160, 120, 30.0))) == 1
@@ -75,7 +75,7 @@ def test_a_given_lens_stays():
 
 def test_answers_from_before_the_start_are_given_anew_with_its_camera():
     assert answers(True, SOON)[-1].status is Status.TRACKED
-    assert len({answer.camera for answer in answers(True, SOON)}) == 1
+    assert len({estimate.camera for estimate in answers(True, SOON)}) == 1
 
 
 def test_hypotheses_begin_with_the_assumed_lens_and_keep_the_shape_of_pixels():
@@ -92,8 +92,8 @@ def test_hypotheses_begin_with_the_assumed_lens_and_keep_the_shape_of_pixels():
 def test_through_another_lens_the_origin_stays_where_it_is_seen():
     view = turned_map([0.0]).keyframes[0]
     before = Camera.from_fov(64, 64, 45.0)
-    after = before.zoomed(3.0, "")
-    other = through(view, before, after)
+    after = before.zoom(3.0, "")
+    other = with_focal_length(view, before, after)
     seen = [
         project(torch.zeros(1, 3), one.pose.R[None], one.pose.translation[None], one.observation.K[None])[0]
         for one in (view, other)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from rendered_solids import pose_of
 
-from tracking3d.estimation.online.motion import led_to, predicted
+from tracking3d.estimation.online.tracking.motion_model import is_consistent_with_motion, pose_predictions
 from tracking3d.geometry.camera import Camera
 
 
@@ -18,30 +18,30 @@ def lost(frames: int, step: float = 5.0):
     trail = tuple((pose_of(step * n, (0, 1, 0)), n) for n in range(10))
     camera = Camera.from_fov(80, 60)
     return SimpleNamespace(
-        trail=trail, lost_for=frames, last=trail[-1], before=None, camera=camera, tried=None
+        trajectory=trail, lost_frames=frames, last=trail[-1], before=None, camera=camera, last_candidate=None
     )
 
 
 @pytest.mark.parametrize("off", [-25.0, 0.0, 25.0])
 def test_a_pose_near_where_the_motion_goes_is_led_to(off):
-    assert led_to(lost(3), pose_of(5.0 * 12 + off, (0, 1, 0)), 12)
+    assert is_consistent_with_motion(lost(3), pose_of(5.0 * 12 + off, (0, 1, 0)), 12)
 
 
 def test_a_pose_elsewhere_is_not():
-    assert not led_to(lost(3), pose_of(5.0 * 12 + 40, (0, 1, 0)), 12)
-    assert not led_to(lost(3), pose_of(180.0, (0, 1, 0)), 12)
+    assert not is_consistent_with_motion(lost(3), pose_of(5.0 * 12 + 40, (0, 1, 0)), 12)
+    assert not is_consistent_with_motion(lost(3), pose_of(180.0, (0, 1, 0)), 12)
 
 
 def test_a_long_loss_leads_nowhere():
-    assert not led_to(lost(20), pose_of(5.0 * 12, (0, 1, 0)), 29)
+    assert not is_consistent_with_motion(lost(20), pose_of(5.0 * 12, (0, 1, 0)), 29)
 
 
 def test_without_any_motion_nothing_is_led_to():
-    assert not led_to(SimpleNamespace(trail=(), lost_for=1), pose_of(0), 1)
+    assert not is_consistent_with_motion(SimpleNamespace(trajectory=(), lost_frames=1), pose_of(0), 1)
 
 
 def test_a_lost_object_is_looked_for_where_it_goes_first():
-    starts = predicted(lost(3), 12, None)
+    starts = pose_predictions(lost(3), 12, None)
     assert list(starts) == ["coasting", "last"]
     turned = np.degrees(2 * np.arccos(abs(float(starts["coasting"].quaternion[0]))))
     assert turned == pytest.approx(60, abs=1)
@@ -51,11 +51,11 @@ def test_a_mask_tells_where_a_lost_object_is_again():
     mask = np.zeros((60, 80), bool)
     mask[10:20, 60:70] = True
     state = lost(3)
-    state.tried = pose_of(200.0, (0, 1, 0))
-    starts = predicted(state, 12, mask)
+    state.last_candidate = pose_of(200.0, (0, 1, 0))
+    starts = pose_predictions(state, 12, mask)
     assert list(starts) == ["coasting", "last", "coasting in the mask", "last in the mask", "tried"]
     for name in ("coasting in the mask", "last in the mask", "tried"):
         x, y, z = starts[name].translation.tolist()
         K = state.camera.K
         assert (K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]) == pytest.approx((64.5, 14.5), abs=1e-3)
-    assert torch.equal(starts["tried"].quaternion, state.tried.quaternion)
+    assert torch.equal(starts["tried"].quaternion, state.last_candidate.quaternion)

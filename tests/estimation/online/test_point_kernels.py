@@ -11,7 +11,7 @@ from tracked_solids import disturbed, scene
 from twins import bundle_adjustment, pose_from_points
 
 from tracking3d.bundle_adjustment.adjustment import AdjustmentProblem, System, adjust
-from tracking3d.estimation.online.pose_from_points import pose_of_tracks
+from tracking3d.estimation.online.optimization.pnp import pose_of_tracks
 from tracking3d.rendering.kernels.threads import get_num_threads, set_num_threads
 
 SCENES = {
@@ -29,8 +29,8 @@ def by_twins(monkeypatch):
 
     def call(function):
         with monkeypatch.context() as patch:
-            patch.setattr(AdjustmentProblem, "evaluated", bundle_adjustment.evaluated)
-            patch.setattr(AdjustmentProblem, "linearised", bundle_adjustment.linearised)
+            patch.setattr(AdjustmentProblem, "evaluated", bundle_adjustment.evaluate)
+            patch.setattr(AdjustmentProblem, "linearised", bundle_adjustment.linearize)
             patch.setattr(System, "step", bundle_adjustment.step)
             return function()
 
@@ -55,10 +55,10 @@ def posed(given, fixed, free_focal):
 @pytest.mark.parametrize(("fixed", "free_focal"), [(0, False), (1, False), (1, True), (2, True)])
 def test_cost_residuals_equations_and_step_of_a_bundle(settings, fixed, free_focal):
     problem, at = posed(scene(**settings), fixed, free_focal)
-    mine, expected = problem.evaluated(at), bundle_adjustment.evaluated(problem, at)
+    mine, expected = problem.evaluate(at), bundle_adjustment.evaluate(problem, at)
     assert mine.cost == pytest.approx(expected.cost, rel=1e-12)
     np.testing.assert_allclose(mine.residual, expected.residual, rtol=1e-9, atol=1e-9)
-    mine, expected = problem.linearised(at), bundle_adjustment.linearised(problem, at)
+    mine, expected = problem.linearize(at), bundle_adjustment.linearize(problem, at)
     for field in fields(mine):
         values = getattr(expected, field.name)
         np.testing.assert_allclose(
@@ -81,7 +81,7 @@ def test_an_adjustment_ends_in_the_same_place(by_twins, settings):
 
 def test_threads_change_no_digit_of_a_step():
     problem, at = posed(scene(frames=41, count=70), 1, True)
-    system = problem.linearised(at)
+    system = problem.linearize(at)
     before, steps = get_num_threads(), []
     for threads in (1, 2, 5):
         set_num_threads(threads)
@@ -96,7 +96,7 @@ def test_threads_change_no_digit_of_a_step():
 
 def test_equations_that_are_not_finite_give_no_step():
     problem, at = posed(scene(), 1, False)
-    system = problem.linearised(at)
+    system = problem.linearize(at)
     for broken in (
         replace(system, poses=np.full_like(system.poses, np.nan)),
         replace(system, points_gradient=np.full_like(system.points_gradient, np.inf)),

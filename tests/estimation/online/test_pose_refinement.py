@@ -12,8 +12,8 @@ from torch import Tensor
 
 from tracking3d.bundle_adjustment.reprojection import apply_pose_steps
 from tracking3d.estimation.observation import Observation
-from tracking3d.estimation.online.pose_refinement import _Evidence, refine_pose, refine_poses
-from tracking3d.estimation.online.pose_refinement_types import PoseWeights
+from tracking3d.estimation.online.optimization.pose_refinement import _Evidence, refine_pose, refine_poses
+from tracking3d.estimation.online.optimization.types import PoseWeights
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_angle
 from tracking3d.rendering import MatchedPoints, Surface
 

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from tracking3d.estimation.observation import Observation
-from tracking3d.estimation.online.belief import ObjectMap, View
-from tracking3d.estimation.online.points import FollowedPoints
+from tracking3d.estimation.online.features.klt import FollowedPoints
+from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.shape import Shape
 from tracking3d.geometry.camera import Camera, Window
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
@@ -53,7 +53,7 @@ def turned_map(angles: list[float], *, textured: bool = True, lit: bool = True, 
             number * step, window, torch.tensor(window.K(CAMERA)).float(), features, features,
             torch.ones(SIZE, SIZE), mask, torch.zeros(SIZE, SIZE), True,
         )  # fmt: skip
-        views.append(View(observation, mask.numpy() > 0.5, pose, FollowedPoints.none()))
+        views.append(Keyframe(observation, mask.numpy() > 0.5, pose, FollowedPoints.none()))
     texels = TexelMap.of(shape.face_uvs, 48)
     return ObjectMap(shape, texels, vertices, np.zeros((0, 3)), tuple(views), np.zeros(0, dtype=np.bool_))
 

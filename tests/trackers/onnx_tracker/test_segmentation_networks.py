@@ -10,7 +10,7 @@ from small_networks import SIDE, decoder, encoder, saliency_network
 
 from tracking3d.errors import InputError
 from tracking3d.trackers.onnx.description import Decoder, ImageInput, PromptableNetwork, SaliencyNetwork
-from tracking3d.trackers.onnx.images import enlarged, fit_image, network_input, on_image, sigmoid
+from tracking3d.trackers.onnx.images import enlarge, fit_image, network_input, on_image, sigmoid
 from tracking3d.trackers.onnx.judging import ColourJudge, background_points
 from tracking3d.trackers.onnx.promptable import PromptableSegmenter
 from tracking3d.trackers.onnx.proposals import Proposal, sharpness
@@ -94,10 +94,10 @@ def test_a_grid_comes_back_to_the_pixels_it_covers(padded):
 
 
 def test_a_box_is_enlarged_about_its_centre_within_the_frame():
-    assert enlarged((10, 20, 20, 10), 1.5, (100, 100)) == (slice(18, 32), slice(5, 35))
-    assert enlarged((-10, -10, 30, 30), 1.0, (100, 100)) == (slice(0, 20), slice(0, 20))
+    assert enlarge((10, 20, 20, 10), 1.5, (100, 100)) == (slice(18, 32), slice(5, 35))
+    assert enlarge((-10, -10, 30, 30), 1.0, (100, 100)) == (slice(0, 20), slice(0, 20))
     for box in ((500.0, 500.0, 10.0, 10.0), (-50.0, 5.0, 10.0, 0.0)):
-        rows, columns = enlarged(box, 1.2, (100, 50))
+        rows, columns = enlarge(box, 1.2, (100, 50))
         assert rows.stop - rows.start >= 2 and columns.stop - columns.start >= 2
         assert rows.start >= 0 and columns.stop <= 50
 

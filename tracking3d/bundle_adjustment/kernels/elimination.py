@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from tracking3d.bundle_adjustment.kernels.reprojection import factorised, shared, solve_factorised
+from tracking3d.bundle_adjustment.kernels.reprojection import factorize, shared, solve_factorised
 from tracking3d.bundle_adjustment.reprojection import FloatArray
 from tracking3d.rendering.kernels.compilation import kernel
 from tracking3d.rendering.kernels.threads import share
@@ -50,7 +50,7 @@ def _divide(points, coupling, points_gradient, by_points, gradient):
     """Factorise points' blocks, divide by them what couples them, and take the points out of the poses' gradient."""
     along, tile = np.empty(3), np.zeros(3 * _COLUMNS)
     for n in range(len(points)):
-        if not factorised(points[n]):
+        if not factorize(points[n]):
             return False
         for row in range(3):
             along[row] = points_gradient[n, row]

@@ -62,7 +62,7 @@ _EQUATIONS = record(
 )  # fmt: skip
 
 
-def evaluated(
+def evaluate(
     pixels: FloatArray,
     weight: FloatArray,
     K: FloatArray,
@@ -73,10 +73,10 @@ def evaluated(
 ) -> tuple[float, FloatArray]:
     """The sum of weighted losses, and ``(F, N)`` residuals; nan where nothing is seen."""
     residual = np.empty(weight.shape)
-    return float(_evaluate(_packed(pixels, weight, K, R, t, points), float(scale), residual)), residual
+    return float(_evaluate(_pack(pixels, weight, K, R, t, points), float(scale), residual)), residual
 
 
-def linearised(
+def linearize(
     pixels: FloatArray,
     weight: FloatArray,
     K: FloatArray,
@@ -96,12 +96,12 @@ def linearised(
         np.zeros(size),
         np.zeros((many, 3)),
     )
-    bundle = _packed(pixels, weight, K, R, t, points)
+    bundle = _pack(pixels, weight, K, R, t, points)
     _linearise(bundle, float(scale), fixed, free_focal, equations)
     return equations
 
 
-def _packed(*arrays: FloatArray) -> BundleArrays:
+def _pack(*arrays: FloatArray) -> BundleArrays:
     return BundleArrays(*(np.ascontiguousarray(array, np.float64) for array in arrays))
 
 

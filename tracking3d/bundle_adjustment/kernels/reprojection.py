@@ -34,7 +34,7 @@ def pixel_motion(x_cam, t, focal, root, by_point, by_pose):
 
 
 @shared
-def turned_by(x, y, z, R, turned):
+def rotate_by(x, y, z, R, turned):
     """Write ``exp((x, y, z)) R``, by Rodrigues' formula."""
     squared = x * x + y * y + z * z
     angle = math.sqrt(squared)
@@ -52,7 +52,7 @@ def turned_by(x, y, z, R, turned):
 
 
 @shared
-def factorised(matrix):
+def factorize(matrix):
     """Replace the lower triangle of a symmetric matrix by its Cholesky factor; False where there is none."""
     size = len(matrix)
     for i in range(size):

@@ -47,14 +47,14 @@ def show_batch_progress(quiet: bool, as_json: bool) -> Iterator[Listener]:
     def listener(happening: Happening) -> None:
         how_far = happening.progress
         done = how_far.finished + how_far.failed
-        bars.update(every, total=how_far.total, completed=done, said=in_words(how_far))
+        bars.update(every, total=how_far.total, complete=done, said=in_words(how_far))
         for worker, about in list(how_far.running.items())[:_MOST_WORKERS]:
             if worker not in lines:
                 lines[worker] = bars.add_task(escape(worker), total=None, said="")
             bars.update(
                 lines[worker],
                 total=about.get("of"),
-                completed=about.get("frames", 0),
+                complete=about.get("frames", 0),
                 said=escape(", ".join(str(about[key]) for key in ("video", "step") if key in about)),
                 visible=True,
             )

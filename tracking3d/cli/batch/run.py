@@ -138,8 +138,8 @@ def run(
     grow as videos finish. The exit code is 1 if a video failed.
     """
     from tracking3d.batch.listing import dataset_jobs, list_jobs
-    from tracking3d.batch.places import absolute
     from tracking3d.batch.running import run_batch
+    from tracking3d.batch.storage import absolute
     from tracking3d.benchmark.sequences import open_dataset
     from tracking3d.cli.batch.progress import show_batch_progress
     from tracking3d.engines.choosing import open_engine
@@ -153,7 +153,7 @@ def run(
     if data is not None:
         videos = dataset_jobs(open_dataset(jobs, data, data, 1).only(sequences or []), config)
     else:
-        videos = list_jobs(jobs, lambda row: _configured(row, settings, engine.threads), split or "")
+        videos = list_jobs(jobs, lambda row: _build_config(row, settings, engine.threads), split or "")
     needs = _needs(videos, engine)
     with (
         open_engine(engine.address, engine.workers, needs) as workers,
@@ -188,10 +188,10 @@ def _needs(videos: Sequence[VideoJob], engine: EngineOptions) -> Needs:
 def _check_split(
     split: str, settings: PipelineConfig, out: str, data: Path | None, address: str | None
 ) -> None:
-    from tracking3d.batch.places import local
+    from tracking3d.batch.storage import local
     from tracking3d.errors import InputError
-    from tracking3d.splitting.cutting import parse_length
-    from tracking3d.splitting.long_video import refuse_what_cannot_be_joined
+    from tracking3d.submaps.cuts import parse_length
+    from tracking3d.submaps.job import refuse_what_cannot_be_joined
 
     refuse_what_cannot_be_joined(settings)
     parse_length(split, 1e9)  # refuses what is no length at any frame rate
@@ -204,7 +204,7 @@ def _check_split(
         )
 
 
-def _configured(row: VideoRow, settings: SettingsOptions, threads: int) -> PipelineConfig:
+def _build_config(row: VideoRow, settings: SettingsOptions, threads: int) -> PipelineConfig:
     """The configuration of a row: its own settings override those of the command line."""
     tracker: dict[str, str | None] = {"name": row.tracker}
     if row.masks is not None:

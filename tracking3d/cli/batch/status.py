@@ -22,7 +22,7 @@ def status(
     from rich.table import Table
 
     from tracking3d.batch.folder import read_failures, read_progress
-    from tracking3d.batch.places import absolute
+    from tracking3d.batch.storage import absolute
     from tracking3d.cli.batch.progress import in_words
     from tracking3d.cli.tables import print_table
 

@@ -39,7 +39,7 @@ def track(
     import json
     import tempfile
 
-    from tracking3d.benchmark.track_speed import Contender, as_figures, checked_out, measure
+    from tracking3d.benchmark.track_speed import Contender, as_figures, check_out, measure
     from tracking3d.benchmark.track_speed_table import plot_stages, speed_table, stage_table
     from tracking3d.cli.options import configure
     from tracking3d.cli.tables import print_table
@@ -64,7 +64,7 @@ def track(
         if paper_frames:
             contenders.append(Contender("preset paper", ("--preset", "paper", *chosen), paper_frames))
         if against is not None:
-            earlier = checked_out(against, Path(folder) / "earlier")
+            earlier = check_out(against, Path(folder) / "earlier")
             contenders.append(Contender(against, tuple(given), frames, earlier))
         speeds = measure(
             truth, contenders, Path(folder), repeats, lambda words: typer.echo(f"{words} ...", err=True)

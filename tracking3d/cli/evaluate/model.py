@@ -81,9 +81,9 @@ def score_models(
 def _scores(run: Path, clip: Path | None, source: str | None, largest: int) -> dict[str, Any]:
     from dataclasses import asdict
 
-    from tracking3d.reconstruction.of_run import explained_run
+    from tracking3d.reconstruction.rebuild import score_run
 
-    found = asdict(explained_run(run, source, largest))
+    found = asdict(score_run(run, source, largest))
     if clip is not None:
         found |= asdict(_against_truth(run, clip))
     return found

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from tracking3d.cli.evaluate.options import Address, Data, Jobs, Masks, Out, Sequences, name_of_settings
-from tracking3d.cli.fresh import Count, Meshes, drawn_suite
+from tracking3d.cli.fresh import Count, Meshes, draw_suite
 from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quality, Quiet, configure
 
 
@@ -52,7 +52,7 @@ def suite(
     from tracking3d.cli.tables import print_table
 
     check_masks(masks)
-    name, specs = drawn_suite(name, seed, count, meshes)
+    name, specs = draw_suite(name, seed, count, meshes)
     settings = configure(config, preset, overrides, quality)
     called = label or name_of_settings(config, quality or preset, overrides, masks)
     variant = Variant(label=called, config=settings, masks=masks)

@@ -83,8 +83,8 @@ def configure(
         InputError: A setting is unknown or invalid.
     """
     from tracking3d.config.loading import load_config
+    from tracking3d.pipeline.tracker_selection import check_tracker_options
     from tracking3d.plugins import FEATURES, check_options
-    from tracking3d.tracker_choice import check_tracker_options
 
     config = load_config(file, preset, overrides or (), quality=quality, **_without_none(direct))
     check_tracker_options(config)

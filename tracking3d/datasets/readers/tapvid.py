@@ -85,7 +85,7 @@ def answers_from_tapvid(
     scale = np.array([width, height]) / _raster(arrays, tracks, raster, file)
     positions = (tracks * scale - 0.5).transpose(1, 0, 2)
     visible = ~occluded.T & np.isfinite(positions).all(2)
-    asked = _asked(queries, truth, scale, positions.shape, file)
+    asked = _query_frames(queries, truth, scale, positions.shape, file)
     # A query may be rounded to whole pixels of its raster.
     tracker = PointTable(
         asked, positions, visible, max(1.0, float(scale.max())) if queries is not None else 0.01
@@ -164,7 +164,7 @@ def _raster(
     return np.array(RASTER, dtype=np.float64)
 
 
-def _asked(
+def _query_frames(
     queries: NDArray[np.float64] | None,
     truth: Truth,
     scale: NDArray[np.float64],

@@ -44,7 +44,7 @@ def answers_from_tum(
     for number, line in enumerate(read_text(file).splitlines(), 1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
-        time, T = _parsed(file, number, line)
+        time, T = _parse(file, number, line)
         frame = time * (fps or 1.0)
         if not abs(frame) < 2**53 or abs(frame - round(frame)) > _TIMING:
             raise InputError(
@@ -67,7 +67,7 @@ def answers_from_tum(
     )
 
 
-def _parsed(file: Path, number: int, line: str) -> tuple[float, NDArray[np.float64]]:
+def _parse(file: Path, number: int, line: str) -> tuple[float, NDArray[np.float64]]:
     try:
         values = np.array([float(value) for value in line.split()])
     except ValueError as error:

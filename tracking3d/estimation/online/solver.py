@@ -16,52 +16,59 @@ from numpy.typing import NDArray
 
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.estimation.feature_space import FeatureSpace, feature_channels
-from tracking3d.estimation.online.anew import (
-    adopted,
-    believable,
-    doubted,
-    guess,
-    in_place,
-    is_whole,
-    joined,
-    largest_of,
-    looks_alike,
-    of_frame,
-    of_one_thing,
-    refined_aside,
-    turned_to,
+from tracking3d.estimation.online.atlas.atlas import (
+    activate_largest_map,
+    activate_map,
+    guess_alignment,
+    map_of_frame,
+    mark_unaligned,
+    refine_inactive_map,
+    switch_map,
+    transform_estimates,
 )
-from tracking3d.estimation.online.answers import solved, unsolved, with_colours
-from tracking3d.estimation.online.attempt import Attempt
-from tracking3d.estimation.online.belief import ONLINE_CLASSES, Belief, ObjectMap, View
-from tracking3d.estimation.online.final_refinement import refined_once_more
-from tracking3d.estimation.online.finding import PoseFinder
-from tracking3d.estimation.online.growing import refined, with_keyframe, with_points
-from tracking3d.estimation.online.judgement import ENOUGH_POINTS, judge, unexplained
-from tracking3d.estimation.online.lens import through
-from tracking3d.estimation.online.mapping import pose_of
-from tracking3d.estimation.online.motion import carried, moved_on, predicted
-from tracking3d.estimation.online.moving import moving_beside, with_past
-from tracking3d.estimation.online.object_model import object_model
-from tracking3d.estimation.online.points import FollowedPoints, follow, grey
-from tracking3d.estimation.online.reversal import turned_round
-from tracking3d.estimation.online.start import InitialMap
-from tracking3d.estimation.online.steering import trusting, turned_back
-from tracking3d.estimation.online.tracking import (
-    agreeing,
-    coast,
-    supported,
-    worth_trying,
+from tracking3d.estimation.online.atlas.map_alignment import merge_maps
+from tracking3d.estimation.online.atlas.reinitialization import (
+    colours_match,
+    is_fully_visible,
+    is_reliable,
+    masks_overlap,
 )
-from tracking3d.estimation.online.waiting import solved_start, waiting_view
+from tracking3d.estimation.online.features.klt import FollowedPoints, follow, grey
+from tracking3d.estimation.online.frame_tracker import FrameTracker
+from tracking3d.estimation.online.initialization.initial_map import InitialMap
+from tracking3d.estimation.online.initialization.initializer import add_pending_frame, try_initialize
+from tracking3d.estimation.online.mapping.depth_reversal import fix_depth_reversal
+from tracking3d.estimation.online.mapping.focal_length import with_focal_length
+from tracking3d.estimation.online.mapping.global_refinement import refine_globally
+from tracking3d.estimation.online.mapping.keyframe_insertion import (
+    insert_keyframe,
+    insert_points,
+    refine_local_map,
+)
+from tracking3d.estimation.online.mapping.object_model import object_model
+from tracking3d.estimation.online.masks.frame_estimates import initial_estimate, learn_colours, make_estimate
+from tracking3d.estimation.online.masks.motion_cue import motion_cue_in_window, remember_motion
+from tracking3d.estimation.online.relocalization.pose_search import should_retry
+from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS, assess_pose, is_high_loss
+from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
+from tracking3d.estimation.online.state.pose_candidate import PoseCandidate
+from tracking3d.estimation.online.state.solver_state import ONLINE_CLASSES, SolverState
+from tracking3d.estimation.online.tracking.motion_model import (
+    advance,
+    extrapolate_motion,
+    pose_predictions,
+    predict_points,
+)
+from tracking3d.estimation.online.tracking.pose_tracking import find_inliers, pose_evidence
+from tracking3d.estimation.online.user_guidance import restart_backwards, trust_mask
+from tracking3d.estimation.prototype_start import first_mask, first_translation, mask_ellipse, prototype_mesh
 from tracking3d.estimation.shape import Shape
 from tracking3d.estimation.solver import STATE_CLASSES
-from tracking3d.estimation.start import first_mask, first_translation, mask_ellipse, prototype_mesh
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.camera import Camera
-from tracking3d.geometry.pose import Pose, rotation_angle
+from tracking3d.geometry.pose import Pose, pose_from_arrays, rotation_angle
 from tracking3d.rendering import TexelMap
-from tracking3d.stages import in_stage
+from tracking3d.runtime.stage_times import in_stage
 
 _SPARSE = 40  # witnesses below which the map takes a frame for the sake of new points
 _PAUSE = 3  # frames from one keyframe to the next for that sake
@@ -73,13 +80,13 @@ _TRAIL = 5  # believed frames that give the motion where nothing is seen
 
 
 @dataclass(frozen=True)
-class OnlineSolver(PoseFinder):
+class OnlineSolver(FrameTracker):
     """See the module; implements `tracking3d.estimation.solver.Solver`, `RefiningSolver` and `SteeredSolver`."""
 
     state_classes: ClassVar[tuple[type, ...]] = (*STATE_CLASSES, *ONLINE_CLASSES)
     """What a `Belief` is made of, for keeping it."""
 
-    def init(self, frame: Frame, mask: MaskEstimate) -> tuple[Belief, FrameEstimate]:
+    def init(self, frame: Frame, mask: MaskEstimate) -> tuple[SolverState, FrameEstimate]:
         """Take the first frame, with the prototype as the shape.
 
         Raises:
@@ -89,14 +96,14 @@ class OnlineSolver(PoseFinder):
 
     def _first(
         self, frame: Frame, binary: NDArray[np.bool_], camera: Camera, space: FeatureSpace | None = None
-    ) -> tuple[Belief, FrameEstimate]:
+    ) -> tuple[SolverState, FrameEstimate]:
         """Take a first frame; ``space`` is that of the features, where there is one."""
         ellipse = mask_ellipse(binary)
         translation = torch.tensor(first_translation(ellipse, camera), dtype=torch.float32)
         pose = Pose.identity(translation.to(self.device))
         shape = Shape.of(prototype_mesh(self.config.object, ellipse), self.config.object.flat, self.device)
         texels = TexelMap.of(shape.face_uvs, self.config.object.texture_size)
-        known = ObjectMap(
+        object_map = ObjectMap(
             shape,
             texels,
             shape.rest,
@@ -106,217 +113,245 @@ class OnlineSolver(PoseFinder):
             renderer=self.config.runtime.renderer,
         )
         image = grey(frame.image)
-        belief = Belief(camera, known, None, (pose, frame.index), None, image, FollowedPoints.none())
-        observation = self._observe(belief, frame, binary, pose)
+        state = SolverState(camera, object_map, None, (pose, frame.index), None, image, FollowedPoints.none())
+        observation = self._observe(state, frame, binary, pose)
         if space is None:
             channels = feature_channels(self.encoder, self.config.object.texture_channels)
             space = FeatureSpace.of(observation.features, observation.mask, channels)
         observation = replace(observation, features=space.project(observation.features))
-        view = View(observation, binary, pose, FollowedPoints.none())
-        known, view = with_points(known, camera, view, image)
-        answer = unsolved(frame, binary, pose, camera)
-        belief = replace(belief, known=known, space=space, followed=view.points, waiting=((view, answer),))
-        return belief, answer
+        view = Keyframe(observation, binary, pose, FollowedPoints.none())
+        object_map, view = insert_points(object_map, camera, view, image)
+        estimate = initial_estimate(frame, binary, pose, camera)
+        state = replace(
+            state,
+            object_map=object_map,
+            feature_space=space,
+            tracked_points=view.points,
+            pending=((view, estimate),),
+        )
+        return state, estimate
 
-    def step(self, state: Belief, frame: Frame, mask: MaskEstimate) -> tuple[Belief, FrameEstimate]:
+    def step(self, state: SolverState, frame: Frame, mask: MaskEstimate) -> tuple[SolverState, FrameEstimate]:
         """Take one more frame."""
         binary = mask.found
-        if state.waiting is not None:
+        if state.pending is not None:
             return self._wait(state, frame, grey(frame.image), binary)
-        state, answer = self._track(state, frame, grey(frame.image), binary)
-        may_begin_anew = not state.known.held and not state.known.pointless
-        if answer.status is Status.LOST and binary is not None and may_begin_anew:
-            state, answer = self._otherwise(state, answer, frame, binary)
-        return state, doubted(answer) if state.guessed else answer
+        state, estimate = self._track(state, frame, grey(frame.image), binary)
+        may_begin_anew = not state.object_map.fixed_keyframes and not state.object_map.pointless
+        if estimate.status is Status.LOST and binary is not None and may_begin_anew:
+            state, estimate = self._otherwise(state, estimate, frame, binary)
+        return state, mark_unaligned(estimate) if state.unaligned else estimate
 
-    turned_back = staticmethod(turned_back)
-    trusting = staticmethod(trusting)
+    restart_backwards = staticmethod(restart_backwards)
+    trust_mask = staticmethod(trust_mask)
 
-    def refine(self, state: Belief) -> Belief:
+    def refine(self, state: SolverState) -> SolverState:
         """All keyframes together once more; where the start still waits, it is what the frames say so far."""
-        if state.waiting is not None:
-            state, start = solved_start(state, self.online, ended=True)
+        if state.pending is not None:
+            state, start = try_initialize(state, self.online, ended=True)
             if start is None:
                 return state
             state, _ = self._begun(state, start)
-        state = joined(state, self.online, state.known.keyframes)
-        state = largest_of(replace(state, spans=(*state.spans, (state.since, state.last[1]))))
-        known, camera = refined_once_more(state.known, state.camera, self.online)
+        state = merge_maps(state, self.online, state.object_map.keyframes)
+        state = activate_largest_map(
+            replace(state, spans=(*state.spans, (state.active_since, state.last_pose[1])))
+        )
+        object_map, camera = refine_globally(state.object_map, state.camera, self.online)
         return replace(
             state,
-            aside=tuple(refined_aside(other, state.camera, camera, self.online) for other in state.aside),
-            guessed=False,
+            inactive_maps=tuple(
+                refine_inactive_map(other, state.camera, camera, self.online) for other in state.inactive_maps
+            ),
+            unaligned=False,
             camera=camera,
-            known=known,
-            surface=known.surface(),
-            before=None,
-            lost_for=0,
-            doubted_for=0,
-            trail=state.trail and ((known.keyframes[0].pose, known.keyframes[0].index),),
-            followed=FollowedPoints.none(),
+            object_map=object_map,
+            surface=object_map.surface(),
+            previous_pose=None,
+            lost_frames=0,
+            doubtful_frames=0,
+            trajectory=state.trajectory and ((object_map.keyframes[0].pose, object_map.keyframes[0].index),),
+            tracked_points=FollowedPoints.none(),
         )
 
-    def revisit(
-        self, state: Belief, frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]
-    ) -> tuple[Belief, FrameEstimate]:
+    def refine_frame(
+        self, state: SolverState, frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]
+    ) -> tuple[SolverState, FrameEstimate]:
         """A frame's pose once more, against the final map."""
-        state = of_frame(state, frame.index)
-        binary, image, known = mask.found, grey(frame.image), state.known
-        causal = pose_of(T_cam_obj[:3, :3], T_cam_obj[:3, 3], known.vertices)
+        state = map_of_frame(state, frame.index)
+        binary, image, object_map = mask.found, grey(frame.image), state.object_map
+        causal = pose_from_arrays(T_cam_obj[:3, :3], T_cam_obj[:3, 3], object_map.vertices)
         if state.surface is None:
-            return state, replace(unsolved(frame, binary, causal, state.camera), refined=True)
+            return state, replace(initial_estimate(frame, binary, causal, state.camera), refined=True)
         starts = {"causal": causal}
-        followed = follow(state.grey, image, state.followed)
-        own = next((view for view in known.keyframes if view.index == frame.index), None)
+        followed = follow(state.grey, image, state.tracked_points)
+        own = next((view for view in object_map.keyframes if view.index == frame.index), None)
         if own is not None:
             starts["keyframe"] = own.pose
-            followed = own.points.joined(followed)
-        if state.before is not None:
-            starts |= predicted(state, frame.index, binary)
-        found = self._found(state, self._view(state, frame, binary, causal, followed), frame, image, starts)
-        before = state.last if state.last[1] == frame.index - 1 else None
-        belief = replace(moved_on(state, found, found.fit.pose, image), before=before)
+            followed = own.points.concatenate(followed)
+        if state.previous_pose is not None:
+            starts |= pose_predictions(state, frame.index, binary)
+        found = self._find(state, self._view(state, frame, binary, causal, followed), frame, image, starts)
+        before = state.last_pose if state.last_pose[1] == frame.index - 1 else None
+        updated = replace(advance(state, found, found.fit.pose, image), previous_pose=before)
         if not found.lost:
-            belief = replace(belief, trail=(*state.trail, (found.fit.pose, frame.index))[-_TRAIL:])
+            updated = replace(
+                updated, trajectory=(*state.trajectory, (found.fit.pose, frame.index))[-_TRAIL:]
+            )
         if found.lost:  # no pose was found that would be better than where it was taken to be
             found = replace(found, fit=replace(found.fit, pose=causal))
-        answer = solved(belief, unsolved(frame, binary, found.fit.pose, state.camera), found)
-        return belief, replace(doubted(answer) if state.guessed else answer, refined=True)
+        estimate = make_estimate(
+            updated, initial_estimate(frame, binary, found.fit.pose, state.camera), found
+        )
+        return updated, replace(mark_unaligned(estimate) if state.unaligned else estimate, refined=True)
 
-    def result(self, state: Belief) -> ObjectModel:
+    def result(self, state: SolverState) -> ObjectModel:
         """The object with its visible texture back-projected from the keyframes."""
-        if state.aside:
-            state = largest_of(state)
-        known = state.known
-        if not known.keyframes:
-            known = replace(known, keyframes=tuple(view for view, _ in state.waiting or ()))
-        return object_model(known, state.surface or known.surface())
+        if state.inactive_maps:
+            state = activate_largest_map(state)
+        object_map = state.object_map
+        if not object_map.keyframes:
+            object_map = replace(object_map, keyframes=tuple(view for view, _ in state.pending or ()))
+        return object_model(object_map, state.surface or object_map.surface())
 
     def _wait(
-        self, state: Belief, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
-    ) -> tuple[Belief, FrameEstimate]:
+        self, state: SolverState, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
+    ) -> tuple[SolverState, FrameEstimate]:
         """Keep a first frame, and solve all of them once they can be."""
-        assert state.waiting is not None
-        pose = state.last[0]
-        view = self._view(state, frame, mask, pose, follow(state.grey, image, state.followed))
-        known, view = waiting_view(state.known, tuple(v for v, _ in state.waiting), view, image)
-        answer = unsolved(frame, mask, pose, state.camera)
-        belief = replace(state, known=known, waiting=(*state.waiting, (view, answer)))
+        assert state.pending is not None
+        pose = state.last_pose[0]
+        view = self._view(state, frame, mask, pose, follow(state.grey, image, state.tracked_points))
+        object_map, view = add_pending_frame(
+            state.object_map, tuple(v for v, _ in state.pending), view, image
+        )
+        estimate = initial_estimate(frame, mask, pose, state.camera)
+        updated = replace(state, object_map=object_map, pending=(*state.pending, (view, estimate)))
         with in_stage("map"):
-            belief, start = solved_start(belief.moved(pose, frame.index, image, view.points), self.online)
+            updated, start = try_initialize(
+                updated.advanced(pose, frame.index, image, view.points), self.online
+            )
         if start is None:
-            reason = belief.waits_for or answer.reason
-            return belief, replace(answer, reason=reason)
-        return self._begun(belief, start)
+            reason = updated.waiting_reason or estimate.reason
+            return updated, replace(estimate, reason=reason)
+        return self._begun(updated, start)
 
-    def _begun(self, state: Belief, start: InitialMap) -> tuple[Belief, FrameEstimate]:
+    def _begun(self, state: SolverState, start: InitialMap) -> tuple[SolverState, FrameEstimate]:
         """Answer all waiting frames anew."""
-        assert state.waiting is not None
-        everything = list(range(len(start.known.keyframes)))
-        waiting, before, camera = state.waiting, state.camera, start.camera
+        assert state.pending is not None
+        everything = list(range(len(start.object_map.keyframes)))
+        waiting, before, camera = state.pending, state.camera, start.camera
         with in_stage("map"):
-            known = refined(start.known, camera, everything, self.online, bundle_iterations=20, rounds=3)
-            belief = replace(state, camera=camera, known=known, surface=known.surface(), waiting=None)
-        poses = {view.index: view.pose for view in known.keyframes}
-        pose, usual, revised, trail = known.keyframes[0].pose, belief.usual, [], []
+            object_map = refine_local_map(
+                start.object_map, camera, everything, self.online, bundle_iterations=20, rounds=3
+            )
+            updated = replace(
+                state, camera=camera, object_map=object_map, surface=object_map.surface(), pending=None
+            )
+        poses = {view.index: view.pose for view in object_map.keyframes}
+        pose, usual, revised, trail = object_map.keyframes[0].pose, updated.baseline, [], []
         for seen, earlier in waiting:
-            view = through(seen, before, camera)
+            view = with_focal_length(seen, before, camera)
             start_pose = poses.get(view.index, pose)
-            if known.pointless:
+            if object_map.pointless:
                 view = replace(view, points=FollowedPoints.none(), mask_weight=1.0)
-            fit = self._fit(belief, view, {start.origin: start_pose}, view.points)[1]
-            if view.index == known.keyframes[0].index:
+            fit = self._fit(updated, view, {start.origin: start_pose}, view.points)[1]
+            if view.index == object_map.keyframes[0].index:
                 fit = replace(fit, pose=start_pose)
-            pose, usual = fit.pose, usual.updated(fit)
+            pose, usual = fit.pose, usual.update(fit)
             trail.append((pose, view.index))
-            kept = agreeing(known, camera, pose, view.points, view)
-            support = supported(known, camera, pose, kept, view)
-            found = Attempt(view, fit, start.origin, kept, support, judge(fit, usual, support))
-            revised.append(solved(belief, earlier, found))
-            belief = with_colours(belief, revised[-1], found)
-        belief = replace(
-            belief, last=trail[-1], before=trail[-2], trail=tuple(trail[-_TRAIL:]), usual=usual,
-            followed=view.points,
+            kept = find_inliers(object_map, camera, pose, view.points, view)
+            support = pose_evidence(object_map, camera, pose, kept, view)
+            found = PoseCandidate(view, fit, start.origin, kept, support, assess_pose(fit, usual, support))
+            revised.append(make_estimate(updated, earlier, found))
+            updated = learn_colours(updated, revised[-1], found)
+        updated = replace(
+            updated, last_pose=trail[-1], previous_pose=trail[-2], trajectory=tuple(trail[-_TRAIL:]), baseline=usual,
+            tracked_points=view.points,
         )  # fmt: skip
-        answer = replace(revised[-1], revised=tuple(revised[:-1]))
-        if start.origin == "flat" and not self.config.object.flat and not answer.reason:
-            answer = replace(answer, reason=_LOOKS_FLAT)
-        return belief, answer
+        estimate = replace(revised[-1], revised=tuple(revised[:-1]))
+        if start.origin == "flat" and not self.config.object.flat and not estimate.reason:
+            estimate = replace(estimate, reason=_LOOKS_FLAT)
+        return updated, estimate
 
     def _track(
-        self, state: Belief, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
-    ) -> tuple[Belief, FrameEstimate]:
+        self, state: SolverState, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
+    ) -> tuple[SolverState, FrameEstimate]:
         """Find the frame's pose, and take it into the map where it shows something new."""
-        starts = predicted(state, frame.index, mask)
+        starts = pose_predictions(state, frame.index, mask)
         likeliest = next(iter(starts.values()))
-        followed = follow(state.grey, image, state.followed, carried(state, likeliest))
-        found = self._found(state, self._view(state, frame, mask, likeliest, followed), frame, image, starts)
-        usual = not unexplained(found.fit, state.usual, found.view.mask_weight)
-        key = not found.lost and (usual or found.support.settles) and self._is_keyframe(state, found)
-        pose = coast(state.trail, frame.index) if found.lost else found.fit.pose
-        belief = moved_on(state, found, pose, image)
+        followed = follow(state.grey, image, state.tracked_points, predict_points(state, likeliest))
+        found = self._find(state, self._view(state, frame, mask, likeliest, followed), frame, image, starts)
+        usual = not is_high_loss(found.fit, state.baseline, found.view.mask_weight)
+        key = not found.lost and (usual or found.evidence.is_decisive) and self._is_keyframe(state, found)
+        pose = extrapolate_motion(state.trajectory, frame.index) if found.lost else found.fit.pose
+        updated = advance(state, found, pose, image)
         if usual and not found.lost:
-            belief = replace(belief, usual=state.usual.updated(found.fit))
+            updated = replace(updated, baseline=state.baseline.update(found.fit))
         if key:
             view = replace(found.view, pose=pose, points=found.points)
             with in_stage("map"):
-                known, followed = with_keyframe(state.known, state.camera, view, image, self.online)
-                surface = known.surface()
-                last = known.keyframes[-1].pose, frame.index
-                belief = replace(belief, known=known, surface=surface, last=last, followed=followed)
-                belief = turned_round(belief, self.online)
-                belief = joined(belief, self.online, belief.known.keyframes[-1:])
-            pose = belief.last[0]
+                object_map, followed = insert_keyframe(
+                    state.object_map, state.camera, view, image, self.online
+                )
+                surface = object_map.surface()
+                last = object_map.keyframes[-1].pose, frame.index
+                updated = replace(
+                    updated, object_map=object_map, surface=surface, last_pose=last, tracked_points=followed
+                )
+                updated = fix_depth_reversal(updated, self.online)
+                updated = merge_maps(updated, self.online, updated.object_map.keyframes[-1:])
+            pose = updated.last_pose[0]
         if found.lost:
-            belief = replace(belief, before=None)
+            updated = replace(updated, previous_pose=None)
         elif usual:
-            belief = replace(belief, trail=(*belief.trail, (pose, frame.index))[-_TRAIL:])
+            updated = replace(updated, trajectory=(*updated.trajectory, (pose, frame.index))[-_TRAIL:])
         found = replace(found, fit=replace(found.fit, pose=pose))
-        plain, now = unsolved(frame, mask, pose, state.camera), belief
-        answer = solved(now, plain, found, lambda: moving_beside(now, found, image))
-        belief = with_past(with_colours(belief, answer, found), answer, found, image)
+        plain, now = initial_estimate(frame, mask, pose, state.camera), updated
+        estimate = make_estimate(now, plain, found, lambda: motion_cue_in_window(now, found, image))
+        updated = remember_motion(learn_colours(updated, estimate, found), estimate, found, image)
         if not found.lost:
-            belief = replace(belief, anew=None)
-        return belief, replace(answer, keyframe=key)
+            updated = replace(updated, reinitialization=None)
+        return updated, replace(estimate, keyframe=key)
 
     def _otherwise(
-        self, state: Belief, answer: FrameEstimate, frame: Frame, mask: NDArray[np.bool_]
-    ) -> tuple[Belief, FrameEstimate]:
+        self, state: SolverState, estimate: FrameEstimate, frame: Frame, mask: NDArray[np.bool_]
+    ) -> tuple[SolverState, FrameEstimate]:
         """A lost object by another map that knows this side of it, or by a second start; see `anew`.
 
         Args:
             state: After the frame, in which the object is lost.
-            answer: To it.
+            estimate: To it.
             frame: The frame.
             mask: ``(H, W)`` its initial mask.
         """
         image = grey(frame.image)
-        for other in state.aside if worth_trying(state.lost_for) else ():
-            belief, found = self._track(turned_to(state, other, frame.index), frame, image, mask)
+        for other in state.inactive_maps if should_retry(state.lost_frames) else ():
+            updated, found = self._track(activate_map(state, other, frame.index), frame, image, mask)
             if found.losses["witnesses"] >= ENOUGH_POINTS and found.status is not Status.LOST:
-                return belief, found
-        begun, last = state.anew, None
-        if begun is not None and begun.waiting:
-            last = begun.waiting[-1][0].mask
-        if begun is None or not of_one_thing(last, mask):
-            if not is_whole(mask) or not looks_alike(state, frame, mask):
-                return replace(state, anew=None), answer
+                return updated, found
+        begun, last = state.reinitialization, None
+        if begun is not None and begun.pending:
+            last = begun.pending[-1][0].mask
+        if begun is None or not masks_overlap(last, mask):
+            if not is_fully_visible(mask) or not colours_match(state, frame, mask):
+                return replace(state, reinitialization=None), estimate
             camera = replace(state.camera, assumed=False)
-            return replace(state, anew=self._first(frame, mask, camera, state.space)[0]), answer
+            return replace(
+                state, reinitialization=self._first(frame, mask, camera, state.feature_space)[0]
+            ), estimate
         begun, again = self._wait(begun, frame, image, mask)
-        if begun.waiting is not None:
-            return replace(state, anew=begun), answer
-        if not believable(begun, again):
-            return replace(state, anew=None), answer
-        similarity = guess(state, begun)
-        return adopted(state, begun, similarity), in_place(again, similarity, state.camera)
+        if begun.pending is not None:
+            return replace(state, reinitialization=begun), estimate
+        if not is_reliable(begun, again):
+            return replace(state, reinitialization=None), estimate
+        similarity = guess_alignment(state, begun)
+        return switch_map(state, begun, similarity), transform_estimates(again, similarity, state.camera)
 
-    def _is_keyframe(self, state: Belief, found: Attempt) -> bool:
+    def _is_keyframe(self, state: SolverState, found: PoseCandidate) -> bool:
         """Whether the map has something to learn from a frame, and the frame can be relied on."""
-        view, fit, agreed = found.view, found.fit, found.support.witnesses
+        view, fit, agreed = found.view, found.fit, found.evidence.inliers
         if view.mask is None or (agreed < ENOUGH_POINTS and fit.overlap < _FITS):
             return False
-        keyframes = state.known.keyframes
+        keyframes = state.object_map.keyframes
         if agreed < _SPARSE and view.index >= keyframes[-1].index + _PAUSE:
             return True
         angles = [float(rotation_angle(other.pose.quaternion, fit.pose.quaternion)) for other in keyframes]

@@ -7,9 +7,9 @@ from dataclasses import dataclass, fields
 from torch import Tensor
 from torch.nn import functional
 
-from tracking3d.config.solvers import PaperConfig, Weights
-from tracking3d.estimation import losses
+from tracking3d.config.solvers import LossWeights, PaperConfig
 from tracking3d.estimation.observation import ObservationBatch
+from tracking3d.estimation.paper import losses
 from tracking3d.estimation.shape import Shape
 from tracking3d.geometry.pose import Pose
 from tracking3d.rendering import Rendering, SoftBand, render, sample_texture, texture_losses
@@ -57,7 +57,7 @@ class Losses:
     laplacian: Tensor
     total_variation: Tensor
 
-    def total(self, weights: Weights) -> Tensor:
+    def total(self, weights: LossWeights) -> Tensor:
         """The weighted sum, frames averaged (``mu_n`` of eq. 1 and 2)."""
         return (
             weights.features * self.features.mean()
@@ -120,7 +120,7 @@ class Problem:
         drawn = self.rendering(parameters)
         zero = drawn.silhouette.new_zeros(())
         seen = None
-        if self.seen is not None and config.unseen_charge is not None:
+        if self.seen is not None and config.unseen_penalty is not None:
             seen = sample_texture(self.seen, drawn.uv.detach())[:, 0]
         pixel_loss, total_variation = texture_losses(
             parameters.texture,
@@ -132,12 +132,12 @@ class Problem:
             backend=self.backend,
         )
         appearance = losses.appearance_loss(
-            pixel_loss, drawn.pixels, batch.valid, config.cauchy_scale, seen, config.unseen_charge or 0.0
+            pixel_loss, drawn.pixels, batch.valid, config.cauchy_scale, seen, config.unseen_penalty or 0.0
         )
         silhouette, target = drawn.silhouette, batch.mask
-        if config.band == "erode":
+        if config.silhouette_bias == "erode":
             silhouette = losses.erode(silhouette)
-        elif config.band == "soften":
+        elif config.silhouette_bias == "soften":
             target = losses.soften(batch.mask, batch.distance, config.sigma)
         smoothed = parameters.offsets
         if config.laplacian_of == "vertices":

@@ -19,21 +19,21 @@ from tracking3d.estimation.appearance import visible_texture
 from tracking3d.estimation.assessment import Assessment, assess
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource, ObjectModel, Status
 from tracking3d.estimation.feature_space import TAU, FeatureSpace, feature_channels
-from tracking3d.estimation.keyframes import KeyframeCandidate, is_new_view, select_keyframes
 from tracking3d.estimation.observation import Observation, ObservationBatch
-from tracking3d.estimation.paper.belief import PaperState, PosedObservation
-from tracking3d.estimation.paper.joint_start import joint_start
+from tracking3d.estimation.paper.initialization import initialize_jointly
+from tracking3d.estimation.paper.keyframes import KeyframeCandidate, is_new_view, select_keyframes
+from tracking3d.estimation.paper.motion_model import candidate_poses
 from tracking3d.estimation.paper.optimize import Optimum, optimize
-from tracking3d.estimation.paper.prediction import candidate_poses
 from tracking3d.estimation.paper.problem import Problem
+from tracking3d.estimation.paper.state import PaperState, PosedObservation
+from tracking3d.estimation.prototype_start import first_mask, first_translation, mask_ellipse, prototype_mesh
 from tracking3d.estimation.shape import Shape
 from tracking3d.estimation.solver import STATE_CLASSES
 from tracking3d.estimation.solver_base import SolverBase
-from tracking3d.estimation.start import first_mask, first_translation, mask_ellipse, prototype_mesh
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.pose import Pose
 from tracking3d.rendering import BackProjection, TexelMap
-from tracking3d.stages import in_stage
+from tracking3d.runtime.stage_times import in_stage
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class PaperSolver(SolverBase):
         if shape.flat:
             # Facing the camera: any plane fits a ball, and the one that fits an ellipsoid best is seen edge-on.
             offsets[:, 2] = -shape.rest[:, 2]
-        belief = PaperState(
+        state = PaperState(
             self.camera,
             shape,
             TexelMap.of(shape.face_uvs, size),
@@ -87,15 +87,15 @@ class PaperSolver(SolverBase):
                 torch.zeros(3, size, size, device=self.device), torch.zeros(size, size, device=self.device)
             ),
             (pose, frame.index),
-            waiting=() if self.settings.start_frames > 1 else None,
+            waiting=() if self.settings.init_frames > 1 else None,
             renderer=self.config.runtime.renderer,
         )
-        observation = self._observe(belief, frame, binary, pose)
+        observation = self._observe(state, frame, binary, pose)
         if self._channels < self.encoder.channels:
             space = FeatureSpace.of(observation.features, observation.mask, self._channels)
-            belief = replace(belief, space=space)
+            state = replace(state, space=space)
             observation = replace(observation, features=space.project(observation.features))
-        return self._solve(belief, frame, binary, PosedObservation(observation, pose))
+        return self._solve(state, frame, binary, PosedObservation(observation, pose))
 
     def step(self, state: PaperState, frame: Frame, mask: MaskEstimate) -> tuple[PaperState, FrameEstimate]:
         """Track one more frame."""
@@ -111,7 +111,7 @@ class PaperSolver(SolverBase):
 
     def result(self, state: PaperState) -> ObjectModel:
         """The object with its visible texture back-projected from the keyframes (section 3.4)."""
-        texture, weight = visible_texture(state.seen_with_keyframes())
+        texture, weight = visible_texture(state.visible_texture_of_keyframes())
         return ObjectModel(
             state.vertices.double().cpu().numpy(),
             state.shape.faces.cpu().numpy(),
@@ -122,52 +122,52 @@ class PaperSolver(SolverBase):
         )
 
     def _observe(
-        self, belief: PaperState, frame: Frame, mask: NDArray[np.bool_] | None, pose: Pose
+        self, state: PaperState, frame: Frame, mask: NDArray[np.bool_] | None, pose: Pose
     ) -> Observation:
-        return self.observe(frame, mask, pose, belief.vertices, belief.camera, belief.space)
+        return self.observe(frame, mask, pose, state.vertices, state.camera, state.space)
 
-    def _best_candidate(self, belief: PaperState, observation: Observation, candidates: list[Pose]) -> Pose:
+    def _best_candidate(self, state: PaperState, observation: Observation, candidates: list[Pose]) -> Pose:
         """The pose with the least loss as it stands."""
         if len(candidates) == 1:
             return candidates[0]
-        problem = self._problem_of_pose(belief, observation)
+        problem = self._problem_of_pose(state, observation)
         totals = []
         for pose in candidates:
             with torch.no_grad():
-                losses = problem.losses(belief.parameters([PosedObservation(observation, pose)]))
+                losses = problem.losses(state.parameters([PosedObservation(observation, pose)]))
             totals.append(float(losses.total(self.settings.weights)))
         return candidates[int(np.argmin(np.nan_to_num(totals, nan=np.inf)))]
 
-    def _problem_of_pose(self, belief: PaperState, observation: Observation) -> Problem:
+    def _problem_of_pose(self, state: PaperState, observation: Observation) -> Problem:
         """One frame against the shape and texture known so far."""
         seen = previous = None
-        if self.settings.unseen_charge is not None:
-            seen = (belief.seen_with_keyframes().weight > 0).float()[None]
-        if belief.keyframes:
-            keyframe = belief.keyframes[-1]
+        if self.settings.unseen_penalty is not None:
+            seen = (state.visible_texture_of_keyframes().weight > 0).float()[None]
+        if state.keyframes:
+            keyframe = state.keyframes[-1]
             previous = keyframe.pose, keyframe.observation.index
         return Problem(
-            belief.shape, ObservationBatch.of([observation]), self.settings, seen, previous, belief.renderer
+            state.shape, ObservationBatch.of([observation]), self.settings, seen, previous, state.renderer
         )
 
     def _solve(
-        self, belief: PaperState, frame: Frame, mask: NDArray[np.bool_] | None, current: PosedObservation
+        self, state: PaperState, frame: Frame, mask: NDArray[np.bool_] | None, current: PosedObservation
     ) -> tuple[PaperState, FrameEstimate]:
         """Optimize, judge, choose keyframes, answer."""
-        first, iterations = not belief.started, 0
+        first, iterations = not state.started, 0
         optimum = None
         if self.settings.pose_iterations and not first:
-            optimum = self._refine_pose(belief, current)
+            optimum = self._refine_pose(state, current)
             iterations = optimum.iterations
             if not optimum.reason:
                 current = PosedObservation(current.observation, optimum.parameters.poses[0])
         frames = [current]
-        if optimum is None or self._needs_joint(belief, current, optimum):
+        if optimum is None or self._needs_joint(state, current, optimum):
             with in_stage("map"):
-                frames, optimum = self._optimize(self._with_new_texture(belief, current), current)
+                frames, optimum = self._optimize(self._with_new_texture(state, current), current)
             iterations += optimum.iterations
         losses = optimum.losses.of_frame(-1)
-        answer = FrameEstimate(
+        estimate = FrameEstimate(
             index=frame.index,
             time=frame.time,
             T_cam_obj=optimum.parameters.poses[-1].matrix().numpy(),
@@ -178,80 +178,84 @@ class PaperSolver(SolverBase):
             confidence=0.0,
             losses=losses,
             iterations=iterations,
-            mask_source=MaskSource.handed_back(mask),
+            mask_source=MaskSource.as_initial(mask),
         )
-        judgement = self._judge(optimum, -1, mask is not None)
-        if judgement.status is Status.LOST and (optimum.reason or not first):
+        assessment = self._judge(optimum, -1, mask is not None)
+        if assessment.status is Status.LOST and (optimum.reason or not first):
             # What was known before stays; only the pose goes on from where the optimization left it.
             if not optimum.reason:
-                belief = replace(belief, last=(optimum.parameters.poses[-1], frame.index), before=None)
-            return replace(belief, started=True), self._answered(answer, judgement)
-        joint = len(frames) > 1 or first or not belief.keyframes
+                state = replace(state, last=(optimum.parameters.poses[-1], frame.index), before=None)
+            return replace(state, started=True), self._answered(estimate, assessment)
+        joint = len(frames) > 1 or first or not state.keyframes
         if joint:
             with in_stage("map"):
-                known = self._updated(belief, frames, optimum)
+                known = self._update(state, frames, optimum)
         else:
-            known = belief.moved(frames[-1].pose, frame.index)
-        if judgement.status is not Status.LOST:
-            rendered, source, judgement = self._supported(known.silhouette(known.last[0]), mask, judgement)
-            answer = replace(answer, mask=rendered, mask_source=source)
-        answer = replace(answer, keyframe=any(k.observation.index == frame.index for k in known.keyframes))
-        return self._with_waiting(belief, known, frames, optimum, self._answered(answer, judgement))
+            known = state.moved(frames[-1].pose, frame.index)
+        if assessment.status is not Status.LOST:
+            rendered, source, assessment = self._assess_support(
+                known.silhouette(known.last[0]), mask, assessment
+            )
+            estimate = replace(estimate, mask=rendered, mask_source=source)
+        estimate = replace(
+            estimate, keyframe=any(k.observation.index == frame.index for k in known.keyframes)
+        )
+        return self._with_waiting(state, known, frames, optimum, self._answered(estimate, assessment))
 
-    def _supported(
-        self, rendered: NDArray[np.bool_], initial: NDArray[np.bool_] | None, judgement: Assessment
+    def _assess_support(
+        self, rendered: NDArray[np.bool_], initial: NDArray[np.bool_] | None, assessment: Assessment
     ) -> tuple[NDArray[np.bool_], MaskSource, Assessment]:
-        """The rendered mask, or the initial one where the two differ too much (`solver.agreement`)."""
+        """The rendered mask, or the initial one where the two differ too much (`solver.min_mask_iou`)."""
         if initial is None:
-            return rendered, MaskSource.RENDERED, judgement
+            return rendered, MaskSource.RENDERED, assessment
         iou = float(np.sum(rendered & initial)) / max(float(np.sum(rendered | initial)), 1.0)
-        if iou >= self.settings.agreement:
-            return rendered, MaskSource.RENDERED, judgement
+        if iou >= self.settings.min_mask_iou:
+            return rendered, MaskSource.RENDERED, assessment
         reason = f"the rendered mask overlaps the initial one by an IoU of {iou:.2f} only, so that one is the answer"
-        return initial, MaskSource.INITIAL, replace(judgement, status=Status.UNCERTAIN, reason=reason)
+        return initial, MaskSource.INITIAL, replace(assessment, status=Status.UNCERTAIN, reason=reason)
 
-    def _refine_pose(self, belief: PaperState, current: PosedObservation) -> Optimum:
+    def _refine_pose(self, state: PaperState, current: PosedObservation) -> Optimum:
         """The new frame's pose alone, against what is known."""
         return optimize(
-            self._problem_of_pose(belief, current.observation),
-            belief.parameters([current]),
+            self._problem_of_pose(state, current.observation),
+            state.parameters([current]),
             iterations=self.settings.pose_iterations,
             tau=self.tau,
             free="pose",
         )
 
-    def _needs_joint(self, belief: PaperState, current: PosedObservation, optimum: Optimum) -> bool:
+    def _needs_joint(self, state: PaperState, current: PosedObservation, optimum: Optimum) -> bool:
         """Whether shape and texture have something to learn from this frame."""
-        if self.settings.joint == "always" or belief.waiting is not None or not belief.keyframes:
+        if self.settings.joint_when == "always" or state.waiting is not None or not state.keyframes:
             return True
         if self._judge(optimum, -1, current.observation.has_mask).status is Status.LOST:
             return True
-        latest = belief.keyframes[-1].pose
-        return is_new_view(latest, current.pose, belief.object_size, self.settings.keyframes)
+        latest = state.keyframes[-1].pose
+        return is_new_view(latest, current.pose, state.object_size, self.settings.keyframes)
 
-    def _with_new_texture(self, belief: PaperState, current: PosedObservation) -> PaperState:
+    def _with_new_texture(self, state: PaperState, current: PosedObservation) -> PaperState:
         """Start texels that no keyframe has seen at what the new frame shows."""
-        if self.settings.texture_start == "zero":
-            return belief
-        shown = belief.back_project(current.observation.features, current)
-        new = (belief.seen_with_keyframes().weight <= 0) & (shown.weight > 0)
-        return replace(belief, texture=torch.where(new, shown.mean(), belief.texture))
+        if self.settings.texture_init == "zero":
+            return state
+        shown = state.back_project(current.observation.features, current)
+        new = (state.visible_texture_of_keyframes().weight <= 0) & (shown.weight > 0)
+        return replace(state, texture=torch.where(new, shown.mean(), state.texture))
 
     def _optimize(
-        self, belief: PaperState, current: PosedObservation
+        self, state: PaperState, current: PosedObservation
     ) -> tuple[list[PosedObservation], Optimum]:
         """Everything over the keyframes and the new frame; over all first frames when the joint start is due."""
         config = self.settings
-        waiting = belief.waiting or ()
-        if waiting and len(waiting) + 1 == config.start_frames:
+        waiting = state.waiting or ()
+        if waiting and len(waiting) + 1 == config.init_frames:
             frames = [keyframe for keyframe, _ in waiting] + [current]
-            return frames, joint_start(belief, frames, config, self.tau)
-        frames = [*belief.keyframes, current]
+            return frames, initialize_jointly(state, frames, config, self.tau)
+        frames = [*state.keyframes, current]
         # The gauge: the oldest frame does not move, so that poses stored at different times compare.
-        fixed = 1 if belief.keyframes or not belief.started else 0
+        fixed = 1 if state.keyframes or not state.started else 0
         batch = ObservationBatch.of([frame.observation for frame in frames])
-        problem = Problem(belief.shape, batch, config, backend=belief.renderer)
-        start = belief.parameters(frames)
+        problem = Problem(state.shape, batch, config, backend=state.renderer)
+        start = state.parameters(frames)
         return frames, optimize(problem, start, iterations=config.iterations, tau=self.tau, fixed=fixed)
 
     def _judge(self, optimum: Optimum, position: int, has_mask: bool) -> Assessment:
@@ -263,11 +267,11 @@ class PaperSolver(SolverBase):
             losses["features"] = float(optimum.losses.features.mean())
         return assess(losses["features"], silhouette, has_mask, self.tau, limit, optimum.reason)
 
-    def _updated(self, belief: PaperState, frames: list[PosedObservation], optimum: Optimum) -> PaperState:
+    def _update(self, state: PaperState, frames: list[PosedObservation], optimum: Optimum) -> PaperState:
         """Take over what was found, and choose the keyframes anew."""
         parameters = optimum.parameters
         moved = [PosedObservation(frame.observation, parameters.poses[i]) for i, frame in enumerate(frames)]
-        found = replace(belief, offsets=parameters.offsets, texture=parameters.texture)
+        found = replace(state, offsets=parameters.offsets, texture=parameters.texture)
         silhouette = (optimum.losses.silhouette + optimum.losses.distance).tolist()
         appearance = optimum.losses.features.tolist()
         candidates = [
@@ -275,7 +279,7 @@ class PaperSolver(SolverBase):
         ]
         criteria = self.settings.keyframes
         kept = select_keyframes(candidates, found.object_size, self.tau, criteria)
-        seen = belief.seen
+        seen = state.seen
         for i, keyframe in enumerate(moved[:-1]):
             if i not in kept and appearance[i] < self.tau:
                 seen = seen + found.back_project(keyframe.observation.image, keyframe)
@@ -284,53 +288,55 @@ class PaperSolver(SolverBase):
 
     def _with_waiting(
         self,
-        belief: PaperState,
+        state: PaperState,
         known: PaperState,
         frames: list[PosedObservation],
         optimum: Optimum,
-        answer: FrameEstimate,
+        estimate: FrameEstimate,
     ) -> tuple[PaperState, FrameEstimate]:
         """Keep the first frames until they are solved together, then answer them anew."""
-        if belief.waiting is None:
-            return known, answer
-        count = len(belief.waiting) + 1
-        if count < self.settings.start_frames:
-            waiting = (*belief.waiting, (PosedObservation(frames[-1].observation, known.last[0]), answer))
-            if answer.status is Status.TRACKED and len(waiting) > 1:
+        if state.waiting is None:
+            return known, estimate
+        count = len(state.waiting) + 1
+        if count < self.settings.init_frames:
+            waiting = (*state.waiting, (PosedObservation(frames[-1].observation, known.last[0]), estimate))
+            if estimate.status is Status.TRACKED and len(waiting) > 1:
                 reason = "the first frames are not yet solved together"
-                answer = replace(
-                    answer, status=Status.UNCERTAIN, reason=reason, confidence=answer.confidence / 2
+                estimate = replace(
+                    estimate, status=Status.UNCERTAIN, reason=reason, confidence=estimate.confidence / 2
                 )
-            return replace(known, waiting=waiting), answer
+            return replace(known, waiting=waiting), estimate
         revised = []
-        for position, (keyframe, earlier) in enumerate(belief.waiting):
-            judgement = self._judge(optimum, position, keyframe.observation.has_mask)
+        for position, (keyframe, earlier) in enumerate(state.waiting):
+            assessment = self._judge(optimum, position, keyframe.observation.has_mask)
             pose = optimum.parameters.poses[position]
             answered, source = earlier.mask, earlier.mask_source
-            if judgement.status is not Status.LOST:
+            if assessment.status is not Status.LOST:
                 rendered = known.silhouette(pose)
-                answered, source, judgement = self._supported(rendered, earlier.initial_mask, judgement)
+                answered, source, assessment = self._assess_support(
+                    rendered, earlier.initial_mask, assessment
+                )
             revised.append(
                 replace(
                     earlier,
                     T_cam_obj=pose.matrix().numpy(),
                     mask=answered,
                     mask_source=source,
-                    status=judgement.status,
-                    reason=judgement.reason,
-                    confidence=judgement.confidence,
+                    status=assessment.status,
+                    reason=assessment.reason,
+                    confidence=assessment.confidence,
                     losses=optimum.losses.of_frame(position),
                 )
             )
         # The motion so far was found before; that of the joint solution is what goes on.
         before = optimum.parameters.poses[-2], frames[-2].observation.index
-        return replace(known, before=before, waiting=None), replace(answer, revised=tuple(revised))
+        return replace(known, before=before, waiting=None), replace(estimate, revised=tuple(revised))
 
     @staticmethod
-    def _answered(answer: FrameEstimate, judgement: Assessment) -> FrameEstimate:
+    def _answered(estimate: FrameEstimate, assessment: Assessment) -> FrameEstimate:
         return replace(
-            answer,
-            status=judgement.status,
-            reason=judgement.reason,
-            confidence=judgement.confidence,
+            estimate,
+            status=assessment.status,
+            reason=assessment.reason,
+            confidence=assessment.confidence,
         )

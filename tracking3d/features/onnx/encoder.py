@@ -62,7 +62,7 @@ class OnnxEncoder:
         self._outputs = _outputs(network, self._description, answers)
         maps = [answers[name] for name in self._outputs]
         self.stride = self._description.stride or max(round(height / maps[0].shape[-2]), 1)
-        self.channels = int(self._combined(maps, (1, 1)).shape[1])
+        self.channels = int(self._combine(maps, (1, 1)).shape[1])
 
     @classmethod
     def from_options(cls, options: BaseModel) -> Self:
@@ -86,19 +86,19 @@ class OnnxEncoder:
 
     def _encode(self, images: Tensor) -> Tensor:
         images = images.detach().cpu().float()
-        fitted = self._fitted(images)
+        fitted = self._fit_size(images)
         answers = self._answers(fitted)
         height, width = (max(side // self.stride, 1) for side in images.shape[-2:])
         if self._resizes:
-            return self._combined([answers[name] for name in self._outputs], (height, width))
+            return self._combine([answers[name] for name in self._outputs], (height, width))
         whole = tuple(max(side // self.stride, 1) for side in fitted.shape[-2:])
-        return self._combined([answers[name] for name in self._outputs], whole)[..., :height, :width]
+        return self._combine([answers[name] for name in self._outputs], whole)[..., :height, :width]
 
     @property
     def _resizes(self) -> bool:
         return self._description.input.fit == "resize" or any(self._sides)
 
-    def _fitted(self, images: Tensor) -> Tensor:
+    def _fit_size(self, images: Tensor) -> Tensor:
         """The images at a size that the network takes."""
         multiple = self._description.input.multiple
         height, width = (
@@ -123,7 +123,7 @@ class OnnxEncoder:
         answers = self._network.run({self._input.name: array})
         return {name: torch.from_numpy(value) for name, value in answers.items() if value.dtype.kind == "f"}
 
-    def _combined(self, maps: list[Tensor], size: tuple[int, ...]) -> Tensor:
+    def _combine(self, maps: list[Tensor], size: tuple[int, ...]) -> Tensor:
         """The features ``(B, C, *size)`` of one or several maps."""
         how = self._description
         resized = [

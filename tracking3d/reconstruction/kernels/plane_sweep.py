@@ -1,4 +1,4 @@
-"""Depth from patches along the known motion; `tracking3d.reconstruction.depth_maps` says what is computed."""
+"""Depth from patches along the known motion; `tracking3d.reconstruction.plane_sweep` says what is computed."""
 # mypy: disable-error-code="no-untyped-def"
 
 from __future__ import annotations

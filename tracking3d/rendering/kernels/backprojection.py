@@ -96,7 +96,7 @@ def seen_texels(
 
 
 @numba.njit(inline="always", **OPTIONS)
-def _sampled(plane, column, row, right, down):
+def _sample(plane, column, row, right, down):
     """Bilinear, with nothing beyond the border."""
     height, width = plane.shape
     one, total = np.float32(1), np.float32(0)
@@ -138,11 +138,11 @@ def _seen_texels(frame, faces, texels, grazing, tolerance, seen):
             continue
         column, row = math.floor(u), math.floor(v)
         right, down = u - np.float32(column), v - np.float32(row)
-        believed = cosine * cosine * _sampled(valid, column, row, right, down)
+        believed = cosine * cosine * _sample(valid, column, row, right, down)
         if not believed > 0:
             continue
         index[found], weight[found] = texel[one], believed
         for channel in range(len(values)):
-            shown[channel, found] = _sampled(values[channel], column, row, right, down)
+            shown[channel, found] = _sample(values[channel], column, row, right, down)
         found += 1
     return found

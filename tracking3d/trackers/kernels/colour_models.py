@@ -25,7 +25,7 @@ def local_shares(
 
 
 @numba.njit(**OPTIONS)
-def _mirrored(index, size):
+def _mirror(index, size):
     """The index that stands for one outside, as OpenCV's ``BORDER_REFLECT_101``."""
     while index < 0 or index >= size:
         index = -index if index < 0 else 2 * (size - 1) - index
@@ -40,9 +40,9 @@ def _local_shares(labels, last_labels, last_mask, radius, size, shares):
     # What lies in each column within reach of the present row, mirrored at the borders as `cv2.blur` does.
     columns = np.zeros((2, size, width + 2 * radius), np.float64)
     for row in range(-radius, height + radius):
-        added, removed = _mirrored(row, height), _mirrored(row - 2 * radius - 1, height)
+        added, removed = _mirror(row, height), _mirror(row - 2 * radius - 1, height)
         for place in range(width + 2 * radius):
-            column = _mirrored(place - radius, width)
+            column = _mirror(place - radius, width)
             value = last_mask[added, column]
             columns[0, last_labels[added, column], place] += value
             columns[1, last_labels[added, column], place] += 1 - value

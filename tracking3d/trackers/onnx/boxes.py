@@ -102,10 +102,10 @@ def vit_boxes(model: Path) -> NetworkBoxes:
 
 def _create(kind: Any, *files: Path) -> Any:
     # Networks are read first: given by name in Params, OpenCV would print warnings about its own defaults.
-    return kind.create(*(_read(file) for file in files))
+    return kind.create(*(_read_output(file) for file in files))
 
 
-def _read(file: Path) -> Any:
+def _read_output(file: Path) -> Any:
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:

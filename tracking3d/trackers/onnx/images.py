@@ -32,7 +32,7 @@ class Letterbox:
         return np.array([self.content[1] / self.image[1], self.content[0] / self.image[0]], np.float32)
 
 
-def enlarged(box: Box, factor: float, shape: tuple[int, ...]) -> tuple[slice, slice]:
+def enlarge(box: Box, factor: float, shape: tuple[int, ...]) -> tuple[slice, slice]:
     """Rows and columns of ``box`` ``(x, y, w, h)`` enlarged about its centre, within a frame ``(H, W, ...)``.
 
     At least two pixels are left, also of a box beyond the frame.

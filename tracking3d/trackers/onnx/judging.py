@@ -13,8 +13,8 @@ from tracking3d.frames import Box, Image
 from tracking3d.geometry.camera import Window
 from tracking3d.trackers.colour_models import GlobalColours, lab
 from tracking3d.trackers.confidence import Judgement, inside_distance, outline_margin
-from tracking3d.trackers.crops import box_iou, box_of, cut, inside_frame
-from tracking3d.trackers.onnx.images import enlarged
+from tracking3d.trackers.crops import box_iou, box_of, crop_window, inside_frame
+from tracking3d.trackers.onnx.images import enlarge
 from tracking3d.trackers.onnx.proposals import Proposal
 
 _MARGIN, _SIZE = 0.45, 160  # of the crops that colours are taken from
@@ -68,7 +68,7 @@ class ColourJudge:
 
     def __init__(self, image: Image, mask: NDArray[np.float32]) -> None:
         window = _window(box_of(mask) or (0.0, 0.0, float(mask.shape[1]), float(mask.shape[0])))
-        self._colours = GlobalColours(lab(cut(image, window)), *_sides(mask, window))
+        self._colours = GlobalColours(lab(crop_window(image, window)), *_sides(mask, window))
 
     def verdict(self, image: Image, proposal: Proposal, witness: Box | None) -> Verdict:
         """Sharpen a proposal by the colours and judge it.
@@ -78,14 +78,14 @@ class ColourJudge:
             proposal: What a network proposes.
             witness: ``(x, y, w, h)``, a box tracker's opinion, or None where it has none.
         """
-        mask = self._sharpened(image, proposal.mask)
+        mask = self._sharpen(image, proposal.mask)
         return Verdict(replace(proposal, mask=mask), self._judge(image, mask, witness))
 
     def learn(self, image: Image, mask: NDArray[np.float32]) -> None:
         """Let the colours follow a mask that is trusted."""
         if (box := box_of(mask)) is not None:
             window = _window(box)
-            self._colours.update(lab(cut(image, window)), *_sides(mask, window))
+            self._colours.update(lab(crop_window(image, window)), *_sides(mask, window))
 
     def corrected(self, image: Image, mask: NDArray[np.float32]) -> ColourJudge:
         """This judge after a correction; a new one where the mask shows that it knew the wrong colours."""
@@ -99,17 +99,17 @@ class ColourJudge:
         if box is None:
             return Judgement(0.0, 0.0, 0.0, believed=False)
         window = _window(box)
-        colours = lab(cut(image, window))
+        colours = lab(crop_window(image, window))
         separation = self._colours.separation(colours, *_sides(mask, window))
-        margin = outline_margin(self._colours.log_ratio(colours), cut(mask, window) > 0.5)
+        margin = outline_margin(self._colours.log_ratio(colours), crop_window(mask, window) > 0.5)
         return Judgement(separation, margin, None if witness is None else box_iou(box, witness))
 
-    def _sharpened(self, image: Image, mask: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _sharpen(self, image: Image, mask: NDArray[np.float32]) -> NDArray[np.float32]:
         """The network's shares and the colours as one; nothing is added where the network saw nothing."""
         box = box_of(mask)
         if box is None:
             return mask
-        place = enlarged(box, 1.5, image.shape)
+        place = enlarge(box, 1.5, image.shape)
         shares = np.clip(mask[place], 0.02, 0.98)
         colours = _smooth(self._colours.log_ratio(lab(image[place])), _RADIUS, mask)
         odds = (shares / (1.0 - shares)) * np.exp(_COLOUR * colours)
@@ -135,8 +135,8 @@ def background_points(image: Image, mask: NDArray[np.float32], most: int = 3) ->
     if box is None:
         return np.zeros((0, 2), np.float32)
     window = _window(box)
-    colours = GlobalColours(lab(cut(image, window)), *_sides(mask, window))
-    rows, columns = enlarged(box, 1.0, image.shape)
+    colours = GlobalColours(lab(crop_window(image, window)), *_sides(mask, window))
+    rows, columns = enlarge(box, 1.0, image.shape)
     inside = mask[rows, columns] > 0.5
     log_odds = _smooth(colours.log_ratio(lab(image[rows, columns])), 0.67 * _RADIUS, mask)
     count, labels, parts, _ = cv2.connectedComponentsWithStats(
@@ -165,7 +165,7 @@ def _smooth(values: NDArray[np.float32], radius: float, mask: NDArray[np.float32
 
 def _sides(mask: NDArray[np.float32], window: Window) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """The object's pixels in a window, and those of the frame surely beyond its outline."""
-    inside = cut(mask, window) > 0.5
+    inside = crop_window(mask, window) > 0.5
     in_frame = inside_frame(mask.shape, window)
     if not inside.any():
         return inside, in_frame

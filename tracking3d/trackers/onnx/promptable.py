@@ -16,7 +16,7 @@ from tracking3d.trackers.onnx.description import Decoder, PromptableNetwork
 from tracking3d.trackers.onnx.images import Letterbox, fit_image, network_input, on_image, sigmoid
 from tracking3d.trackers.onnx.judging import background_points
 from tracking3d.trackers.onnx.proposals import Proposal, sharpness
-from tracking3d.trackers.onnx.saliency import known
+from tracking3d.trackers.onnx.saliency import validate_name
 
 Points = NDArray[np.float32]
 """``(N, 3)``: x, y in pixels of the image, and 1 on the object or 0 beside it."""
@@ -41,13 +41,15 @@ class PromptableSegmenter:
         self._description = description
         self._encoder, self._decoder = Network(encoder, threads), Network(decoder, threads)
         names = description.decoder
-        self._input = known(description.input.name, self._encoder.inputs, encoder, "input")
-        self._output = known(names.masks, self._decoder.outputs, decoder, "output")
+        self._input = validate_name(description.input.name, self._encoder.inputs, encoder, "input")
+        self._output = validate_name(names.masks, self._decoder.outputs, decoder, "output")
         given = [names.points, names.labels, names.mask, names.has_mask, names.frame_size]
         for name in filter(None, given):
-            known(name, self._decoder.inputs, decoder, "input")
+            validate_name(name, self._decoder.inputs, decoder, "input")
         self._embeddings = {
-            name: known(description.embeddings.get(name, name), self._encoder.outputs, encoder, "output")
+            name: validate_name(
+                description.embeddings.get(name, name), self._encoder.outputs, encoder, "output"
+            )
             for name in self._decoder.inputs
             if name not in given
         }
@@ -130,14 +132,18 @@ class Look:
             rows.append((0.0, 0.0, -1.0))
         prompt = np.array(rows, np.float32).reshape(-1, 3)
         feeds = dict(self._embeddings)
-        feeds[names.points] = self._shaped(names.points, self._coordinates(prompt[:, :2]))
-        feeds[names.labels] = self._shaped(names.labels, prompt[:, 2])
+        feeds[names.points] = self._shape_prompt(names.points, self._coordinates(prompt[:, :2]))
+        feeds[names.labels] = self._shape_prompt(names.labels, prompt[:, 2])
         if names.mask is not None:
-            feeds[names.mask] = self._shaped(names.mask, self._logits(mask))
+            feeds[names.mask] = self._shape_prompt(names.mask, self._logits(mask))
         if names.has_mask is not None:
-            feeds[names.has_mask] = self._shaped(names.has_mask, np.array([mask is not None], np.float32))
+            feeds[names.has_mask] = self._shape_prompt(
+                names.has_mask, np.array([mask is not None], np.float32)
+            )
         if names.frame_size is not None:
-            feeds[names.frame_size] = self._shaped(names.frame_size, np.array(self._fit.image, np.float32))
+            feeds[names.frame_size] = self._shape_prompt(
+                names.frame_size, np.array(self._fit.image, np.float32)
+            )
         output = self._network.run(feeds)[self._output]
         if output.ndim < 2 or not output.size:
             raise InputError(
@@ -177,7 +183,7 @@ class Look:
             logits[:rows, :columns] = (2.0 * small - 1.0) * _LOGIT
         return logits
 
-    def _shaped(self, name: str, values: NDArray[np.float32]) -> NDArray:
+    def _shape_prompt(self, name: str, values: NDArray[np.float32]) -> NDArray:
         """``values`` with as many axes, and of the type, that the input wants."""
         info = self._network.inputs[name]
         missing = max(len(info.shape) - values.ndim, 0)

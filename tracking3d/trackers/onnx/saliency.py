@@ -12,7 +12,7 @@ from tracking3d.errors import InputError
 from tracking3d.frames import Box, Image
 from tracking3d.networks.session import Network
 from tracking3d.trackers.onnx.description import SaliencyNetwork
-from tracking3d.trackers.onnx.images import enlarged, fit_image, network_input, on_image, sigmoid
+from tracking3d.trackers.onnx.images import enlarge, fit_image, network_input, on_image, sigmoid
 from tracking3d.trackers.onnx.proposals import Proposal, sharpness
 
 # Nothing beyond the box, enlarged by this, is the object; the user's first box is nearer to it than a tracker's.
@@ -37,8 +37,8 @@ class SaliencySegmenter:
     ) -> None:
         self._description, self._crops = description, crops
         self._network = Network(file, threads)
-        self._input = known(description.input.name, self._network.inputs, file, "input")
-        self._output = known(description.output, self._network.outputs, file, "output")
+        self._input = validate_name(description.input.name, self._network.inputs, file, "input")
+        self._output = validate_name(description.output, self._network.outputs, file, "output")
 
     def propose(self, image: Image, box: Box, last: NDArray[np.float32] | None) -> list[Proposal]:
         """See `Segmenter.propose`: what stands out in each crop, as far as it lies about the box.
@@ -46,11 +46,11 @@ class SaliencySegmenter:
         The box is not moved towards the last mask: a hand that was once taken for a part of the object would
         bring more of itself into the crop.
         """
-        limits = enlarged(box, _FIRST_SLACK if last is None else _SLACK, image.shape)
+        limits = enlarge(box, _FIRST_SLACK if last is None else _SLACK, image.shape)
         return [self._proposal(image, box, factor, limits) for factor in self._crops]
 
     def _proposal(self, image: Image, box: Box, factor: float, limits: tuple[slice, slice]) -> Proposal:
-        rows, columns = enlarged(box, factor, image.shape)
+        rows, columns = enlarge(box, factor, image.shape)
         crop = image[rows, columns]
         fit = fit_image(crop.shape[:2], self._description.input)
         feeds = {self._input: network_input(crop, fit, self._description.input)}
@@ -85,7 +85,7 @@ class SaliencySegmenter:
         return np.clip(np.nan_to_num(shares, nan=0.0), 0.0, 1.0)
 
 
-def known(name: str | None, names: Mapping[str, object], file: Path, what: str) -> str:
+def validate_name(name: str | None, names: Mapping[str, object], file: Path, what: str) -> str:
     """``name``, or the first of the network's ``names`` where it is None; an error if there is none such."""
     if name is None:
         return next(iter(names))

@@ -83,7 +83,7 @@ class OnnxTracker:
         if self._frames_since < self._options.every and not carried.reason:
             return carried
         self._frames_since = 0
-        return self._segmented(image, box, carried)
+        return self._segment(image, box, carried)
 
     def correct(self, frame: Frame, mask: NDArray[np.bool_]) -> None:
         """Re-anchor the box tracker and the carried mask on ``mask`` ``(H, W)`` in ``frame``."""
@@ -119,12 +119,14 @@ class OnnxTracker:
         verdicts = [
             judge.verdict(image, one, None) for one in self._segmenter.propose_by_points(image, points)
         ]
-        best = max(verdicts, key=lambda one: (_kept(one.proposal.mask, points), one.preference))
-        if _unusable(best) or _kept(best.proposal.mask, points) < _kept(soft, points):
+        best = max(verdicts, key=lambda one: (_count_kept_points(one.proposal.mask, points), one.preference))
+        if _unusable(best) or _count_kept_points(best.proposal.mask, points) < _count_kept_points(
+            soft, points
+        ):
             return given
         return MaskEstimate(best.proposal.mask, best.score)
 
-    def _segmented(self, image: Image, witness: Box | None, carried: MaskEstimate) -> MaskEstimate:
+    def _segment(self, image: Image, witness: Box | None, carried: MaskEstimate) -> MaskEstimate:
         """The network's answer, or the carried one where the network has none that can be used."""
         assert self._carried is not None
         box = witness if witness is not None else self._place(carried)
@@ -175,7 +177,7 @@ class OnnxTracker:
         return self._last_box if found is None else found
 
 
-def _kept(mask: NDArray[np.float32], points: NDArray[np.float32]) -> int:
+def _count_kept_points(mask: NDArray[np.float32], points: NDArray[np.float32]) -> int:
     """How many of the points a mask keeps to."""
     x, y = np.rint(points[:, :2]).astype(int).T
     inside = mask[y.clip(0, mask.shape[0] - 1), x.clip(0, mask.shape[1] - 1)] > 0.5

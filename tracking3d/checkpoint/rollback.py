@@ -1,0 +1,122 @@
+"""A run as it was before a frame, as a run folder of its own that goes on from there."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+from tracking3d.checkpoint.milestones import Milestone, link_or_copy, milestones_in
+from tracking3d.checkpoint.progress import read_journal
+from tracking3d.errors import InputError
+from tracking3d.results import layout
+from tracking3d.results.files import write_atomic, writing
+from tracking3d.results.records import jsonable, latest
+from tracking3d.results.run_reader import RunReader, read_records
+
+
+def roll_back(folder: Path, stage: Path, changed: Collection[int]) -> int | None:
+    """Make of an empty folder the run as it was, stopped, before the first of some frames was taken.
+
+    Args:
+        folder: The run; nothing of it is changed.
+        stage: Gets the earlier run: its last milestone of before then, and the answers that there were.
+        changed: Indices of those frames.
+
+    Returns:
+        How many frames are answered in it; None where no state of before then was kept, and nothing was made.
+
+    Raises:
+        OutputError: If it cannot be written.
+        InputError: If the run is damaged.
+    """
+    inner = folder / layout.STATE
+    milestones = milestones_in(inner)
+    while milestones:
+        try:
+            state = json.loads(milestones[-1].path.read_bytes())
+            journal = (inner / layout.JOURNAL).read_bytes()[: state["journal"]]
+            taken, _ = read_journal(journal)
+            lines = int(state["progress"]["lines"])
+        except (OSError, ValueError, KeyError, TypeError):  # damaged: an earlier one does it too
+            taken, journal, lines = {}, b"", -1
+        if lines >= 0 and not taken.keys() & set(changed):
+            _copy_run(folder, stage, milestones, journal, lines)
+            return len(taken)
+        milestones.pop()
+    return None
+
+
+def _copy_run(folder: Path, stage: Path, milestones: list[Milestone], journal: bytes, lines: int) -> None:
+    run = RunReader(folder)
+    records = latest(read_records(folder / layout.FRAMES, lines), refined=False)
+    causal = folder / layout.CAUSAL
+    with writing(stage):
+        for inner in (layout.MASKS, layout.INITIAL_MASKS, layout.STATE):
+            (stage / inner).mkdir(parents=True, exist_ok=True)
+        (stage / layout.STATE / layout.MASKS).mkdir(exist_ok=True)
+        if (folder / layout.PROBABILITIES).is_dir():
+            (stage / layout.PROBABILITIES).mkdir(exist_ok=True)
+        (stage / layout.FRAMES).write_bytes((folder / layout.FRAMES).read_bytes()[:lines])
+        for record in records:
+            estimates = [layout.mask_path(causal, record.index), layout.mask_path(folder, record.index)]
+            initial = layout.initial_mask_path(folder, record.index)
+            corrected = layout.mask_path(folder / layout.STATE, record.index)
+            likely = layout.probability_path(folder, record.index)
+            for file in ([one for one in estimates if one.is_file()][:1], [initial], [corrected], [likely]):
+                if file and file[0].is_file():
+                    place = file[0].relative_to(causal if file[0].is_relative_to(causal) else folder)
+                    link_or_copy(file[0], stage / place)
+        for name in sorted({name for one in milestones for name in one.arrays}):
+            link_or_copy(folder / layout.STATE / name, stage / layout.STATE / name)
+        for one in milestones:
+            link_or_copy(one.path, stage / layout.STATE / one.path.name)
+        (stage / layout.STATE / layout.JOURNAL).write_bytes(journal)
+        link_or_copy(milestones[-1].path, stage / layout.STATE / layout.STATE_FILE)
+    told = {**run.description, "state": "interrupted", "refinement": None}
+    corrections = (run.description.get("given") or {}).get("corrections") or []
+    answered = {record.index for record in records}
+    told["given"] = {
+        **(run.description.get("given") or {}),
+        "corrections": [one for one in corrections if one["frame"] in answered],
+    }
+    write_atomic(stage / layout.RUN, json.dumps(jsonable(told)).encode() + b"\n")
+
+
+def remove_run(folder: Path) -> None:
+    """Remove the files of a run, and what of its folders is empty then; others stay.
+
+    Raises:
+        OutputError: If one cannot be removed.
+    """
+    with writing(folder):
+        for path in layout.run_files(folder):
+            path.unlink(missing_ok=True)
+    remove_empty(folder)
+
+
+def remove_empty(folder: Path) -> None:
+    """Remove the folders within a folder that are empty, and itself."""
+    inner = (
+        sorted((path for path in folder.rglob("*") if path.is_dir()), reverse=True) if folder.is_dir() else []
+    )
+    for path in (*inner, folder):
+        try:
+            path.rmdir()
+        except OSError:
+            continue
+
+
+def prompt_record_in(run: RunReader) -> dict[str, Any]:
+    """What ``run.json`` tells of source and object, see `tracking3d.checkpoint.resuming.prompt_record`.
+
+    Raises:
+        InputError: If it does not, as one of an earlier version.
+    """
+    given = run.description.get("given")
+    if not isinstance(given, dict):
+        raise InputError(
+            f"The run {run.folder} does not say what it was begun with; make it anew, with the correction."
+        )
+    return given

@@ -1,0 +1,1 @@
+"""Several maps: switching between them, aligning and merging them."""

@@ -1,0 +1,1 @@
+"""From pixels to points: optical flow, keypoints, texture. No map and no pose."""

@@ -1,0 +1,154 @@
+"""Points that are followed from frame to frame by optical flow, and new corners to follow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+MOST_POINTS = 250
+"""Points that a frame gets at least, where it has so many corners."""
+MOST_FOLLOWED = 350
+"""Points that are followed at once."""
+_SMALLEST = 16  # pixels on either side of a mask in which corners are looked for
+_QUALITY = 0.01  # of the strongest corner, see cv2.goodFeaturesToTrack
+_SUBPIXEL_WINDOW = (3, 3)  # pixels on every side
+_SUBPIXEL_REACH = 2.0  # pixels that a corner may be moved by and still be in the mask
+_SUBPIXEL_STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.03)
+_FLOW_WINDOW = (15, 15)
+_FLOW_LEVELS = 3
+_ROUND_TRIP = 0.7  # pixels that a point followed there and back may miss itself by
+
+
+@dataclass(frozen=True, eq=False)
+class FollowedPoints:
+    """Points of the surface as one frame shows them.
+
+    Attributes:
+        landmark: ``(N,)`` int64, which landmark each is.
+        pixel: ``(N, 2)`` float32 in the full frame.
+    """
+
+    landmark: NDArray[np.int64]
+    pixel: NDArray[np.float32]
+
+    @classmethod
+    def none(cls) -> FollowedPoints:
+        """No points."""
+        return cls(np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
+
+    def __len__(self) -> int:
+        return len(self.landmark)
+
+    def spread_out(self, most: int, size: float) -> FollowedPoints:
+        """At most ``most``: the oldest in every square of ``size`` / 20 pixels, then others by age.
+
+        Points stand in the order of their age, the oldest first.
+        """
+        if len(self) <= most:
+            return self
+        cell = np.floor(self.pixel / max(size / 20, 1.0)).astype(np.int64)
+        first = np.sort(np.unique(cell, axis=0, return_index=True)[1])
+        rest = np.setdiff1d(np.arange(len(self)), first)
+        kept = np.sort(np.concatenate([first, rest])[:most])
+        return FollowedPoints(self.landmark[kept], self.pixel[kept])
+
+    def concatenate(self, other: FollowedPoints) -> FollowedPoints:
+        """These, and those of another that are not among them."""
+        new = ~np.isin(other.landmark, self.landmark)
+        return FollowedPoints(
+            np.concatenate([self.landmark, other.landmark[new]]),
+            np.concatenate([self.pixel, other.pixel[new]]),
+        )
+
+    def only(self, kept: NDArray[np.bool_]) -> FollowedPoints:
+        """Those that ``kept`` ``(N,)`` says."""
+        return FollowedPoints(self.landmark[kept], self.pixel[kept])
+
+
+def grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """``(H, W)`` brightness of ``(H, W, 3)`` RGB."""
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+
+
+def follow(
+    before: NDArray[np.uint8],
+    now: NDArray[np.uint8],
+    points: FollowedPoints,
+    guess: NDArray[np.float32] | None = None,
+) -> FollowedPoints:
+    """Where points have gone, by pyramidal Lucas-Kanade flow there and back.
+
+    Args:
+        before: ``(H, W)`` grey image of the earlier frame.
+        now: ``(H, W)`` grey image of the later one.
+        points: In the earlier frame.
+        guess: ``(N, 2)`` where they are expected; where they were if None.
+
+    Returns:
+        Those that came back to where they had been.
+    """
+    if not len(points):
+        return points
+    there, found = _flow(before, now, points.pixel, points.pixel if guess is None else guess)
+    back, found_back = _flow(now, before, there, points.pixel)
+    returned = np.linalg.norm(back - points.pixel, axis=1) < _ROUND_TRIP
+    height, width = now.shape
+    inside = ((there >= 0) & (there <= [width - 1, height - 1])).all(1)
+    kept = found & found_back & returned & inside
+    return FollowedPoints(points.landmark[kept], there[kept])
+
+
+def new_corners(
+    image: NDArray[np.uint8], mask: NDArray[np.bool_], taken: NDArray[np.float32], most: int
+) -> NDArray[np.float32]:
+    """``(N, 2)`` corners inside a mask, away from its outline and from points that are there already.
+
+    Distances grow with the mask: points keep a 25th of the root of its area from each other, and a 50th from the
+    outline, which slides over the surface as the object turns.
+
+    Args:
+        image: ``(H, W)`` grey.
+        mask: ``(H, W)``.
+        taken: ``(M, 2)`` pixels of points that are there.
+        most: How many at most.
+    """
+    none = np.zeros((0, 2), np.float32)
+    if most <= 0 or not mask.any():
+        return none
+    x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    if min(width, height) < _SMALLEST:
+        return none
+    size = float(np.sqrt(mask.sum()))
+    distance, margin = max(size / 25, 3.0), max(round(size / 50), 2)
+    box = slice(y, y + height), slice(x, x + width)
+    free = _erode(mask[box], margin)
+    corner = np.array([x, y], np.float32)
+    for place in np.rint(taken - corner).astype(int).tolist():
+        cv2.circle(free, place, round(distance), 0, cv2.FILLED)
+    crop = np.ascontiguousarray(image[box])
+    coarse = cv2.goodFeaturesToTrack(crop, most, _QUALITY, distance, mask=free)
+    if coarse is None:
+        return none
+    fine = cv2.cornerSubPix(crop, coarse.copy(), _SUBPIXEL_WINDOW, (-1, -1), _SUBPIXEL_STOP)
+    close = (np.abs(fine - coarse) < _SUBPIXEL_REACH).all(2, keepdims=True)
+    return np.asarray(np.where(close, fine, coarse)[:, 0] + corner, dtype=np.float32)
+
+
+def _flow(
+    before: NDArray[np.uint8], now: NDArray[np.uint8], start: NDArray[np.float32], guess: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Where points ``(N, 2)`` have gone, searched from a guess, and which of them were found."""
+    there, found, _ = cv2.calcOpticalFlowPyrLK(
+        before, now, np.ascontiguousarray(start, np.float32), np.array(guess, np.float32),
+        winSize=_FLOW_WINDOW, maxLevel=_FLOW_LEVELS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )  # fmt: skip
+    return there, found[:, 0] > 0
+
+
+def _erode(mask: NDArray[np.bool_], margin: int) -> NDArray[np.uint8]:
+    """``mask`` without what is within ``margin`` of its outline or of the array's border."""
+    padded = np.pad(mask, 1).astype(np.uint8)
+    return np.ascontiguousarray(cv2.erode(padded, np.ones((3, 3), np.uint8), iterations=margin)[1:-1, 1:-1])

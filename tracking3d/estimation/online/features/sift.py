@@ -1,0 +1,93 @@
+"""Keypoints with descriptors, for finding surface points again after large motions: SIFT inside the mask."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+_MOST = 250  # keypoints of a frame
+_CONTRAST = 0.02  # half of OpenCV's: the faint texture of small objects counts
+_SIZE = 200  # pixels that the longer side of the object is scaled to, by 0.5 at least and 2 at most
+_BORDER = 8  # pixels around the object that descriptors may look at
+_RATIO = 0.8  # of the distances to the best and the second best, Lowe 2004, section 7.1
+_SAME_PLACE = 2.0  # pixels within which keypoints are one corner, seen at several scales and orientations
+
+
+@dataclass(frozen=True, eq=False)
+class Keypoints:
+    """Keypoints of one frame. A corner with two orientations is there twice, as either descriptor may match.
+
+    Attributes:
+        pixel: ``(M, 2)`` float32 in the full frame.
+        descriptor: ``(M, 128)`` float32.
+    """
+
+    pixel: NDArray[np.float32]
+    descriptor: NDArray[np.float32]
+
+    @classmethod
+    def none(cls) -> Keypoints:
+        """No keypoints."""
+        return cls(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32))
+
+    def __len__(self) -> int:
+        return len(self.pixel)
+
+
+def detect(
+    image: NDArray[np.uint8], mask: NDArray[np.bool_], length: float | None = None, most: int = _MOST
+) -> Keypoints:
+    """The strongest keypoints inside a mask, of the object at one size whatever its size in the frame.
+
+    Args:
+        image: ``(H, W)`` grey.
+        mask: ``(H, W)``.
+        length: Longer side of the object in pixels, where the mask is not that of the object.
+        most: How many keypoints.
+    """
+    if not mask.any():
+        return Keypoints.none()
+    x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    corner = np.array([max(x - _BORDER, 0), max(y - _BORDER, 0)])
+    box = slice(corner[1], y + height + _BORDER), slice(corner[0], x + width + _BORDER)
+    original = np.array(image[box].shape[::-1])
+    scale = float(np.clip(_SIZE / (length or max(width, height)), 0.5, 2.0))
+    # Given the size and not the factor, OpenCV scales by exactly the ratio of the sizes.
+    size = np.rint(scale * original).astype(int).tolist()
+    crop = cv2.resize(image[box], size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
+    inside = cv2.resize(mask[box].astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    # Without the precise upscale all places are a quarter of a pixel too far right and down.
+    sift = cv2.SIFT.create(most, contrastThreshold=_CONTRAST, enable_precise_upscale=True)
+    found, descriptor = sift.detectAndCompute(crop, inside)
+    if not len(found):
+        return Keypoints.none()
+    place = np.array([point.pt for point in found])
+    pixel = (place + 0.5) * original / size - 0.5 + corner
+    return Keypoints(pixel.astype(np.float32), np.asarray(descriptor, dtype=np.float32))
+
+
+def match(a: Keypoints, b: Keypoints) -> NDArray[np.int64]:
+    """Keypoints that are each other's nearest, and clearly so: nearer than to anything elsewhere in ``b``.
+
+    Returns:
+        ``(K, 2)`` indices into ``a`` and ``b``, each at most once.
+    """
+    if not (len(a) and len(b)):
+        return np.zeros((0, 2), np.int64)
+    similarity = _root_sift(a.descriptor) @ _root_sift(b.descriptor).T
+    distance = np.sqrt(np.maximum(2 - 2 * similarity, 0.0))
+    best = distance.argmin(1)
+    mutual = np.flatnonzero(distance.argmin(0)[best] == np.arange(len(a)))
+    distance, best = distance[mutual], best[mutual]
+    gap = np.abs(b.pixel[best][:, None] - b.pixel).max(2)
+    elsewhere = np.where(gap < _SAME_PLACE, np.inf, distance).min(1)
+    clear = np.isfinite(elsewhere) & (distance[np.arange(len(best)), best] < _RATIO * elsewhere)
+    return np.stack([mutual[clear], best[clear]], 1)
+
+
+def _root_sift(descriptor: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Unit vectors whose products are Hellinger's kernel (RootSIFT, Arandjelovic and Zisserman 2012)."""
+    return np.asarray(np.sqrt(descriptor / descriptor.sum(1, keepdims=True).clip(1e-9)), dtype=np.float32)

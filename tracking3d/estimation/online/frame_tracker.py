@@ -1,0 +1,131 @@
+"""The pose of one frame, by all that can be tried: cheap starts, costly ones, and elsewhere than the mask says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.config.solvers import OnlineConfig
+from tracking3d.estimation.observation import Observation
+from tracking3d.estimation.online.features.klt import FollowedPoints
+from tracking3d.estimation.online.mapping.local_mapping import mask_weight
+from tracking3d.estimation.online.optimization.types import PoseFit, PoseWeights
+from tracking3d.estimation.online.relocalization.pose_search import relocalize, should_retry
+from tracking3d.estimation.online.relocalization.whole_frame import overlaps_mask, relocalize_in_frame
+from tracking3d.estimation.online.state.confidence import assess_pose, needs_relocalization
+from tracking3d.estimation.online.state.object_map import Keyframe
+from tracking3d.estimation.online.state.pose_candidate import PoseCandidate
+from tracking3d.estimation.online.state.solver_state import SolverState
+from tracking3d.estimation.online.tracking.motion_model import is_consistent_with_motion
+from tracking3d.estimation.online.tracking.pose_tracking import (
+    find_inliers,
+    fit_pose,
+    pixel_scale,
+    pose_evidence,
+    pose_of_points,
+)
+from tracking3d.estimation.solver_base import SolverBase
+from tracking3d.estimation.tracker_feedback import SIGHTED
+from tracking3d.frames import Frame
+from tracking3d.geometry.pose import Pose
+
+
+@dataclass(frozen=True)
+class FrameTracker(SolverBase):
+    """Finds an object that is known in a frame."""
+
+    @property
+    def online(self) -> OnlineConfig:
+        """The solver's own part of the configuration."""
+        assert isinstance(self.config.solver, OnlineConfig)
+        return self.config.solver
+
+    @property
+    def weights(self) -> PoseWeights:
+        """Weights of a pose's terms."""
+        online = self.online
+        return PoseWeights(appearance=online.appearance, outline=online.outline, points=online.points)
+
+    def _find(
+        self,
+        state: SolverState,
+        view: Keyframe,
+        frame: Frame,
+        image: NDArray[np.uint8],
+        starts: dict[str, Pose],
+    ) -> PoseCandidate:
+        """The pose by cheap starts, by costly ones where it looks wrong, and elsewhere where none is believed."""
+        assert state.surface is not None
+        object_map, camera = state.object_map, state.camera
+        on_object = view.points.only(~object_map.candidate[view.points.landmark])
+        points = pose_of_points(object_map, camera, on_object, pixel_scale(view))
+        if points is not None:
+            starts = {**starts, "points": points[0]}
+        won, fit = self._fit(state, view, starts, view.points)
+        kept = find_inliers(object_map, camera, fit.pose, view.points, view)
+        support = pose_evidence(object_map, camera, fit.pose, kept, view)
+        if state.lost_frames or needs_relocalization(fit, state.baseline, support):
+            won, fit, kept = relocalize(
+                object_map,
+                state.surface,
+                camera,
+                view,
+                image,
+                (won, fit, kept),
+                self.weights,
+                state.lost_frames,
+            )
+            support = pose_evidence(object_map, camera, fit.pose, kept, view)
+        astray = state.lost_frames > 0 and not is_consistent_with_motion(state, fit.pose, frame.index)
+        assessment = assess_pose(fit, state.baseline, support, won == "grid", astray)
+        best = PoseCandidate(view, fit, won, kept, support, assessment)
+        if best.lost or (best.doubtful and should_retry(state.doubtful_frames)):
+            other = self._elsewhere(state, frame, image, view.mask)
+            return other if other is not None and other.better_than(best) else best
+        return best
+
+    def _elsewhere(
+        self, state: SolverState, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
+    ) -> PoseCandidate | None:
+        """The object somewhere else in the frame than the mask; None where it is not seen there either."""
+        where = relocalize_in_frame(
+            state.object_map, state.camera, image, (state.trajectory or (state.last_pose,))[-1][0]
+        )
+        if where is None:
+            return None
+        pose, points = where
+        elsewhere = mask is None or not overlaps_mask(state.object_map.silhouette(pose, state.camera), mask)
+        view = self._view(state, frame, None if elsewhere else mask, pose, points)
+        _, fit = self._fit(state, view, {SIGHTED: pose}, points)
+        kept = find_inliers(state.object_map, state.camera, fit.pose, points, view)
+        support = pose_evidence(state.object_map, state.camera, fit.pose, kept, view)
+        found = PoseCandidate(
+            view, fit, SIGHTED, kept, support, assess_pose(fit, state.baseline, support, guessed=True)
+        )
+        return None if found.lost else found
+
+    def _fit(
+        self, state: SolverState, view: Keyframe, starts: dict[str, Pose], points: FollowedPoints
+    ) -> tuple[str, PoseFit]:
+        assert state.surface is not None
+        return fit_pose(state.object_map, state.surface, view, starts, points, self.weights)
+
+    def _view(
+        self,
+        state: SolverState,
+        frame: Frame,
+        mask: NDArray[np.bool_] | None,
+        pose: Pose,
+        followed: FollowedPoints,
+    ) -> Keyframe:
+        """A frame as it is seen from a pose, with its mask judged by the points."""
+        on_object = followed.only(~state.object_map.candidate[followed.landmark])
+        observation = self._observe(state, frame, mask, pose)
+        return Keyframe(observation, mask, pose, followed, mask_weight=mask_weight(mask, on_object))
+
+    def _observe(
+        self, state: SolverState, frame: Frame, mask: NDArray[np.bool_] | None, pose: Pose
+    ) -> Observation:
+        return self.observe(frame, mask, pose, state.object_map.vertices, state.camera, state.feature_space)

@@ -1,0 +1,1 @@
+"""From pending frames to a first map."""

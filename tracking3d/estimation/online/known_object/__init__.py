@@ -1,0 +1,1 @@
+"""A solver whose map is given before the video."""

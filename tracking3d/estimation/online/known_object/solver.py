@@ -1,0 +1,222 @@
+"""The online solver for an object that is known: it is looked for instead of got to know, and then tracked as any."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.errors import InputError, argument
+from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
+from tracking3d.estimation.feature_space import FeatureSpace, feature_channels
+from tracking3d.estimation.known_object import KnownObject
+from tracking3d.estimation.online.features.klt import FollowedPoints, grey
+from tracking3d.estimation.online.known_object.detection import by_keypoints, by_outline
+from tracking3d.estimation.online.known_object.rendered_keyframes import map_of_known_object
+from tracking3d.estimation.online.mapping.keyframe_insertion import insert_keyframe
+from tracking3d.estimation.online.masks.frame_estimates import initial_estimate, learn_colours, make_estimate
+from tracking3d.estimation.online.relocalization.pose_search import should_retry
+from tracking3d.estimation.online.relocalization.whole_frame import overlaps_mask
+from tracking3d.estimation.online.solver import OnlineSolver
+from tracking3d.estimation.online.state.confidence import assess_pose
+from tracking3d.estimation.online.state.pose_candidate import PoseCandidate
+from tracking3d.estimation.online.state.solver_state import SolverState
+from tracking3d.estimation.online.tracking.pose_tracking import candidate_cost, find_inliers, pose_evidence
+from tracking3d.estimation.online.user_guidance import restart_backwards
+from tracking3d.estimation.tracker_feedback import SIGHTED
+from tracking3d.frames import Frame, MaskEstimate
+from tracking3d.geometry.pose import Pose
+from tracking3d.runtime.stage_times import in_stage
+
+NOT_SEEN = "the known object has not been seen yet"
+_OUTLINED = "outline"
+_ENOUGH_ALONE, _MOSTLY_SEEN = 30, 0.5
+"""Points that tell a first pose without a mask, and the share of unseen texture below which they do."""
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class KnownObjectSolver(OnlineSolver):
+    """Tracks what is known; answers are in the object's own coordinates and unit.
+
+    Until the object is found in a frame, frames are answered as lost, and each is searched. From then on it is the
+    online solver, on a map whose shape is held.
+
+    Attributes:
+        known_object: The object.
+    """
+
+    known_object: KnownObject
+
+    def init(self, frame: Frame, mask: MaskEstimate) -> tuple[SolverState, FrameEstimate]:
+        """Take the first frame.
+
+        Raises:
+            InputError: If nothing could ever tell where the object is.
+        """
+        known_object, binary = self.known_object, mask.found
+        if binary is None and not known_object.has_colours:
+            raise InputError(
+                f"{known_object.name} has no colours that it could be found by; say where it is in the first frame: "
+                f"{argument('box=', '--box X,Y,W,H')} or {argument('mask=', '--mask FILE')}."
+            )
+        self._warn_of_lens()
+        with in_stage("map"):
+            object_map, space = map_of_known_object(known_object, self.config, self.encoder, self.device)
+        pose = Pose.identity(
+            object_map.vertices.new_tensor([0.0, 0.0, 4 * self.camera.fy / self.camera.height])
+        )
+        state = SolverState(
+            self.camera, object_map, object_map.surface(), (pose, frame.index), None, grey(frame.image),
+            FollowedPoints.none(), None, space,
+        )  # fmt: skip
+        state, estimate = self._sought(state, frame, binary)
+        return state, known_object.answered(estimate)
+
+    def step(self, state: SolverState, frame: Frame, mask: MaskEstimate) -> tuple[SolverState, FrameEstimate]:
+        """Take one more frame."""
+        if state.trajectory:
+            state, estimate = super().step(state, frame, mask)
+        else:
+            state, estimate = self._sought(state, frame, mask.found)
+        return state, self.known_object.answered(estimate)
+
+    def refine_frame(
+        self, state: SolverState, frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]
+    ) -> tuple[SolverState, FrameEstimate]:
+        """A frame's pose once more, with all that the video has shown."""
+        if not state.trajectory:
+            estimate = _unseen(initial_estimate(frame, mask.found, state.last_pose[0], state.camera))
+            return state, self.known_object.answered(replace(estimate, refined=True))
+        causal = self.known_object.to_solver(T_cam_obj)
+        state, estimate = super().refine_frame(state, frame, mask, causal)
+        return state, self.known_object.answered(estimate)
+
+    def restart_backwards(
+        self, state: SolverState, frame: Frame, number: int, T_cam_obj: NDArray[np.float64]
+    ) -> SolverState:
+        """The belief that goes on from a frame seen long ago; see `steering.turned_back`."""
+        turned = restart_backwards(state, frame, number, self.known_object.to_solver(T_cam_obj))
+        return turned if state.trajectory else replace(turned, trajectory=())
+
+    def result(self, state: SolverState) -> ObjectModel:
+        """The object as it is known."""
+        assert state.surface is not None
+        features = state.surface.texture.permute(1, 2, 0).cpu().numpy()
+        return replace(self.known_object.model, features=features)
+
+    def _sought(
+        self, state: SolverState, frame: Frame, mask: NDArray[np.bool_] | None
+    ) -> tuple[SolverState, FrameEstimate]:
+        """Look for the object in a frame, and begin with it where it is found."""
+        image = grey(frame.image)
+        state = self._with_space(state, frame, mask)
+        found = self._match_views(state, frame, image, mask)
+        if found is None or found.lost or _too_little(found):
+            estimate = _unseen(initial_estimate(frame, mask, state.last_pose[0], state.camera), found)
+            pose = state.last_pose[0]
+            missing = replace(
+                state, last_pose=(pose, frame.index), grey=image, lost_frames=state.lost_frames + 1
+            )
+            return missing, estimate
+        pose = found.fit.pose
+        begun = replace(
+            state, last_pose=(pose, frame.index), previous_pose=None, grey=image, tracked_points=found.points,
+            lost_frames=0, doubtful_frames=int(found.doubtful), trajectory=((pose, frame.index),),
+            baseline=state.baseline.update(found.fit),
+        )  # fmt: skip
+        estimate = make_estimate(begun, initial_estimate(frame, mask, pose, state.camera), found)
+        # What is not sure must not become what later frames are held against, where there is something better.
+        if not found.doubtful or not self.known_object.has_colours:
+            view = replace(found.view, pose=pose, points=found.points)
+            with in_stage("map"):
+                object_map, followed = insert_keyframe(
+                    state.object_map, state.camera, view, image, self.online
+                )
+                begun = replace(
+                    begun, object_map=object_map, surface=object_map.surface(), tracked_points=followed
+                )
+            estimate = replace(estimate, keyframe=True)
+        return learn_colours(begun, estimate, found), estimate
+
+    def _match_views(
+        self, state: SolverState, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
+    ) -> PoseCandidate | None:
+        """The object in a frame of which nothing else is known; None where nothing looks like it."""
+        attempts: list[PoseCandidate] = []
+        for region in (mask, None) if mask is not None else (None,):
+            if self.known_object.has_colours and not _is_sure(attempts):
+                attempts += [
+                    self._attempt(state, frame, mask, SIGHTED, pose, points)
+                    for pose, points in by_keypoints(state.object_map, state.camera, image, region)
+                ]
+        if mask is not None and not _is_sure(attempts) and should_retry(state.lost_frames):
+            assert state.surface is not None
+            view = self._view(state, frame, mask, state.last_pose[0], FollowedPoints.none())
+            attempts += [
+                self._attempt(state, frame, mask, _OUTLINED, pose, FollowedPoints.none())
+                for pose in by_outline(state.surface, state.camera, view, self.weights)
+            ]
+        believed = [one for one in attempts if not one.lost] or attempts
+        return min(
+            believed,
+            key=lambda one: candidate_cost(one.fit, self.weights, one.view.mask_weight, one.evidence.inliers),
+            default=None,
+        )
+
+    def _attempt(
+        self,
+        state: SolverState,
+        frame: Frame,
+        mask: NDArray[np.bool_] | None,
+        origin: str,
+        pose: Pose,
+        points: FollowedPoints,
+    ) -> PoseCandidate:
+        """What comes of a pose that was found in some way."""
+        object_map, camera = state.object_map, state.camera
+        if mask is not None and not overlaps_mask(object_map.silhouette(pose, camera), mask):
+            mask = None
+        view = self._view(state, frame, mask, pose, points)
+        _, fit = self._fit(state, view, {origin: pose}, points)
+        kept = find_inliers(object_map, camera, fit.pose, points, view)
+        support = pose_evidence(object_map, camera, fit.pose, kept, view)
+        assessment = assess_pose(fit, state.baseline, support, guessed=origin == _OUTLINED)
+        return PoseCandidate(view, fit, origin, kept, support, assessment)
+
+    def _with_space(self, state: SolverState, frame: Frame, mask: NDArray[np.bool_] | None) -> SolverState:
+        """The belief with the features of an object whose colours the first frame with a mask tells first."""
+        if state.feature_space is not None or mask is None or not mask.any():
+            return state
+        seen = self._observe(state, frame, mask, state.last_pose[0])
+        channels = feature_channels(self.encoder, self.config.object.texture_channels)
+        return replace(state, feature_space=FeatureSpace.of(seen.features, seen.mask, channels))
+
+    def _warn_of_lens(self) -> None:
+        """Tell the log where the lens is assumed though the object was learnt with another."""
+        earlier = self.known_object.camera
+        if self.camera.assumed and earlier is not None and earlier.known:
+            _log.warning(
+                "%s was learnt with a lens of %.1f degrees in pictures of %d x %d pixels, not %d x %d; its lens is "
+                "not taken over, and 45 degrees are assumed. Give the lens of this video.",
+                self.known_object.name.capitalize(), earlier.fov, earlier.width, earlier.height,
+                self.camera.width, self.camera.height,
+            )  # fmt: skip
+
+
+def _is_sure(attempts: list[PoseCandidate]) -> bool:
+    return any(not one.doubtful for one in attempts)
+
+
+def _too_little(found: PoseCandidate) -> bool:
+    """Whether a few points alone say where it is: no mask bears them out, and they may lie in one spot."""
+    enough = found.evidence.inliers >= _ENOUGH_ALONE and found.fit.unseen < _MOSTLY_SEEN
+    return found.view.mask is None and found.doubtful and not enough
+
+
+def _unseen(estimate: FrameEstimate, found: PoseCandidate | None = None) -> FrameEstimate:
+    """The answer while the object has not been seen, and what spoke most against what was found."""
+    why = "" if found is None or not found.view.observation.has_mask else f": {found.assessment.reason}"
+    return replace(estimate, status=Status.LOST, reason=NOT_SEEN + why, confidence=0.05)

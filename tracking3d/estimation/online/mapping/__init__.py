@@ -1,0 +1,1 @@
+"""All that changes the map: keyframes, landmarks, focal length, depth."""

@@ -1,0 +1,107 @@
+"""The focal length, where nobody gave it: hypotheses for the start, and solved with poses and points later on.
+
+A wrong lens makes the object turn too little or too much. Several lenses are tried, since the cost has a valley at
+each, and the one at hand stays unless another explains the points clearly better.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from tracking3d.bundle_adjustment.adjustment import Structure, adjust
+from tracking3d.config.camera import USUAL_ANGLES
+from tracking3d.estimation.online.mapping.local_mapping import shared_landmarks, structure_of, tracks_of
+from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
+from tracking3d.geometry.camera import Camera
+from tracking3d.geometry.pose import Pose, pose_from_arrays
+
+CANDIDATES = (10.0, 25.0, 45.0, 65.0)
+"""Vertical fields of view in degrees."""
+_AT_THE_START = (9.0, 16.0, 27.0, 65.0)  # beside the assumed one
+_CLEARLY = 0.08  # share of the cost that a lens twice as long or short has to take off; nearer ones less
+_SAME = math.log(1.05)  # focal lengths so near are one
+_ITERATIONS = 25
+_FEWEST = 30  # landmarks
+
+
+def lens_hypotheses(camera: Camera) -> tuple[Camera, ...]:
+    """The cameras that a start is solved with, the assumed one first: only it where somebody gave the lens."""
+    if not camera.assumed:
+        return (camera,)
+    others = [
+        camera.zoom(
+            Camera.from_fov(camera.width, camera.height, degrees).fy / camera.fy,
+            f"field of view of {degrees:g} degrees, the likeliest of those tried",
+        )
+        for degrees in _AT_THE_START
+    ]
+    return (camera, *others)
+
+
+def with_focal_length(view: Keyframe, before: Camera, after: Camera) -> Keyframe:
+    """A view as another lens would have taken it: the image stays, the object's depth goes with the focal length."""
+    factor = after.fy / before.fy
+    K = view.observation.K.clone()
+    K[0, 0], K[1, 1] = factor * K[0, 0], factor * K[1, 1]
+    x, y, z = view.pose.translation.unbind(-1)
+    pose = Pose(torch.stack([x, y, factor * z], -1), view.pose.quaternion)
+    return replace(view, pose=pose, observation=replace(view.observation, K=K), texture=None)
+
+
+def lens_change(factor: float) -> float:
+    """How far another focal length is, in [0, 1]: 1 is twice as long or short, or more."""
+    return min(abs(math.log2(factor)), 1.0)
+
+
+def solve_lens(object_map: ObjectMap, camera: Camera) -> tuple[ObjectMap, Camera]:
+    """The map and the camera with the focal length that explains the landmarks best.
+
+    Args:
+        object_map: The map.
+        camera: Of the full frame, assumed.
+    """
+    views = list(object_map.keyframes)
+    names = shared_landmarks(object_map, views)
+    if len(names) < _FEWEST:
+        return object_map, camera
+    tracks, start = tracks_of(views, names), structure_of(object_map, views, names)
+    kept = adjust(tracks, camera.K, start, iterations=_ITERATIONS)
+    tried = []
+    candidates = [Camera.from_fov(camera.width, camera.height, angle).fy for angle in CANDIDATES]
+    for lens in (1.0, *(focal / camera.fy for focal in candidates)):
+        stretched = replace(start, t=start.t * [1.0, 1.0, lens], focal_factor=lens)
+        tried.append(adjust(tracks, camera.K, stretched, iterations=_ITERATIONS, free_focal=True))
+    tried = [one for one in tried if _is_a_lens(one.focal_factor, camera)]
+    best = min(tried, key=lambda one: one.cost, default=kept)
+    change = lens_change(best.focal_factor)
+    if abs(math.log(best.focal_factor)) < _SAME or best.cost > (1 - _CLEARLY * change) * kept.cost:
+        return object_map, camera
+    return _with_lens(object_map, camera, names, best)
+
+
+def _is_a_lens(factor: float, camera: Camera) -> bool:
+    least, most = USUAL_ANGLES
+    degrees = camera.zoom(factor, "").fov
+    return least <= degrees <= most
+
+
+def _with_lens(
+    object_map: ObjectMap, camera: Camera, names: np.ndarray, found: Structure
+) -> tuple[ObjectMap, Camera]:
+    factor = found.focal_factor
+    landmarks = object_map.landmarks.copy()
+    sound = np.isfinite(found.points).all(1)
+    landmarks[names[sound]] = found.points[sound]
+    solved = camera.with_solved_focal(factor)
+    keyframes = [
+        replace(
+            with_focal_length(view, camera, solved),
+            pose=pose_from_arrays(found.R[n], found.t[n], object_map.vertices),
+        )
+        for n, view in enumerate(object_map.keyframes)
+    ]
+    return replace(object_map, landmarks=landmarks, keyframes=tuple(keyframes)), solved

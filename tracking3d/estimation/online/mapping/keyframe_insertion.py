@@ -1,0 +1,92 @@
+"""A frame's way into the map: its points become landmarks, and the map is refined with it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.config.solvers import OnlineConfig
+from tracking3d.estimation.online.features.klt import MOST_FOLLOWED, MOST_POINTS, FollowedPoints, new_corners
+from tracking3d.estimation.online.features.sift import detect
+from tracking3d.estimation.online.mapping.candidate_landmarks import promote_candidates, with_candidates
+from tracking3d.estimation.online.mapping.keyframe_culling import cull_keyframes, prune_landmarks
+from tracking3d.estimation.online.mapping.local_mapping import refine_map, window_of, with_landmarks
+from tracking3d.estimation.online.mapping.photometric_adjustment import refine_without_points
+from tracking3d.estimation.online.optimization.shape_fit import FitWeights
+from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
+from tracking3d.geometry.camera import Camera
+
+_MOST_WITHOUT_POINTS = 15
+
+
+def insert_points(
+    object_map: ObjectMap, camera: Camera, view: Keyframe, image: NDArray[np.uint8]
+) -> tuple[ObjectMap, Keyframe]:
+    """With landmarks at a view's keypoints and corners, and candidates beside its mask.
+
+    Args:
+        object_map: The map.
+        camera: Of the full frame.
+        view: With its pose and the points that were followed into it.
+        image: ``(H, W)`` grey.
+    """
+    if object_map.pointless:
+        return object_map, view
+    inside = view.mask if view.mask is not None else object_map.silhouette(view.pose, camera)
+    keypoints = detect(image, inside)
+    taken = np.concatenate([view.points.pixel, keypoints.pixel])
+    corners = new_corners(image, inside, taken, MOST_POINTS)
+    object_map, view = with_landmarks(object_map, camera, view, keypoints, corners)
+    return (object_map, view) if object_map.fixed_keyframes else with_candidates(object_map, view, image)
+
+
+def insert_keyframe(
+    object_map: ObjectMap, camera: Camera, view: Keyframe, image: NDArray[np.uint8], config: OnlineConfig
+) -> tuple[ObjectMap, FollowedPoints]:
+    """The map with a view as a new keyframe, refined over a window; and the points to follow from it."""
+    object_map, view = insert_points(object_map, camera, view, image)
+    drawn, filmed = (
+        object_map.keyframes[: object_map.fixed_keyframes],
+        (*object_map.keyframes[object_map.fixed_keyframes :], view),
+    )
+    object_map = replace(object_map, keyframes=(*drawn, *cull_keyframes(filmed, config.max_keyframes)))
+    window = window_of(len(object_map.keyframes), config.local_window)
+    object_map = refine_local_map(object_map, camera, window, config, bundle_iterations=10, rounds=1)
+    followed = object_map.keyframes[-1].points.spread_out(MOST_FOLLOWED, float(view.observation.window.side))
+    return prune_landmarks(object_map, followed)
+
+
+def refine_local_map(
+    object_map: ObjectMap,
+    camera: Camera,
+    positions: list[int],
+    config: OnlineConfig,
+    *,
+    bundle_iterations: int,
+    rounds: int,
+) -> ObjectMap:
+    """Candidates taken over or dropped, then poses, landmarks and shape refined; see `refine_map`.
+
+    Of an object whose shape is held nothing is, but what the newest view shows of its texture is taken.
+    """
+    if object_map.fixed_keyframes:
+        newest = object_map.keyframes[-1]
+        newest = replace(newest, texture=object_map.back_project(newest.observation.features, newest))
+        return replace(object_map, keyframes=(*object_map.keyframes[:-1], newest))
+    if object_map.pointless:
+        recent = list(range(len(object_map.keyframes)))[-_MOST_WITHOUT_POINTS:]
+        return refine_without_points(
+            object_map, sorted({0, *recent}), FitWeights(smoothness=config.smoothness)
+        )
+    object_map = promote_candidates(object_map, camera, positions)
+    return refine_map(
+        object_map,
+        camera,
+        positions,
+        weights=FitWeights(smoothness=config.smoothness),
+        prior=config.surface_prior,
+        bundle_iterations=bundle_iterations,
+        rounds=rounds,
+    )

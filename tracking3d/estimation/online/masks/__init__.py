@@ -1,0 +1,1 @@
+"""From a pose to the frame's mask and estimate."""

@@ -1,0 +1,100 @@
+"""What the solver answers for a frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.estimation.estimate import FrameEstimate, MaskSource, Status
+from tracking3d.estimation.online.masks.mask_fusion import FusedMask, fuse_mask, update_colours
+from tracking3d.estimation.online.optimization.observability import least_constrained_axis
+from tracking3d.estimation.online.state.pose_candidate import PoseCandidate
+from tracking3d.estimation.online.state.solver_state import SolverState
+from tracking3d.estimation.tracker_feedback import MOVING
+from tracking3d.frames import Frame
+from tracking3d.geometry.camera import Camera
+from tracking3d.geometry.pose import Pose
+
+WAITING = "the object has not moved enough yet to tell its shape"
+
+
+def initial_estimate(
+    frame: Frame, mask: NDArray[np.bool_] | None, pose: Pose, camera: Camera
+) -> FrameEstimate:
+    """The answer while nothing is known: the initial mask."""
+    return FrameEstimate(
+        index=frame.index,
+        time=frame.time,
+        T_cam_obj=pose.matrix().numpy(),
+        mask=mask if mask is not None else np.zeros(frame.size, dtype=np.bool_),
+        initial_mask=mask,
+        status=Status.UNCERTAIN,
+        reason=WAITING,
+        confidence=0.3,
+        mask_source=MaskSource.as_initial(mask),
+        camera=camera,
+    )
+
+
+def learn_colours(state: SolverState, estimate: FrameEstimate, found: PoseCandidate) -> SolverState:
+    """The belief with what a frame that is believed shows of the colours."""
+    if found.doubtful or found.view.mask is None:
+        return state
+    return replace(state, colours=update_colours(state.colours, found.view.observation, estimate.mask))
+
+
+def make_estimate(
+    state: SolverState,
+    estimate: FrameEstimate,
+    found: PoseCandidate,
+    moving: Callable[[], NDArray[np.float32] | None] | None = None,
+) -> FrameEstimate:
+    """The answer with a pose, its judgement and the mask that the image shows; of a lost frame, the initial mask.
+
+    Args:
+        state: Map, camera and colours.
+        estimate: What does not depend on the pose.
+        found: What was found in the frame.
+        moving: See `answer_mask`.
+    """
+    view, fit, assessment = found.view, found.fit, found.assessment
+    if found.lost:
+        mask = view.mask if view.mask is not None else np.zeros_like(estimate.mask)
+        weighed = FusedMask(mask, MaskSource.as_initial(view.mask))
+    else:
+        weighed = fuse_mask(
+            state.object_map.silhouette(fit.pose, state.camera),
+            view.mask,
+            view.observation,
+            assessment.confidence,
+            state.colours,
+            moving,
+        )
+    return replace(
+        estimate,
+        T_cam_obj=fit.pose.matrix().numpy(),
+        camera=state.camera,
+        mask=weighed.mask,
+        mask_source=weighed.source,
+        probability=weighed.probability,
+        status=assessment.status,
+        reason=assessment.reason,
+        confidence=assessment.confidence,
+        hypothesis=found.hypothesis,
+        iterations=fit.iterations,
+        losses={
+            "features": fit.appearance,
+            "outline": fit.outline,
+            "points": fit.points,
+            "overlap": fit.overlap,
+            "unseen": fit.unseen,
+            "witnesses": float(found.evidence.inliers),
+            "strays": found.evidence.outlier_ratio,
+            "stiffness": least_constrained_axis(fit)[0],
+            "mask_weight": view.mask_weight,
+            MOVING: weighed.moving,
+        },
+    )

@@ -1,0 +1,1 @@
+"""Least squares: poses, points, shape and shading. No state."""

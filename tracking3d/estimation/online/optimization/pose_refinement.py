@@ -1,0 +1,176 @@
+"""Poses of one frame against a known object: Levenberg-Marquardt on pixels, outline and matched points together.
+
+The cost is a weighted sum of three means of Cauchy losses. Covered pixels whose texture no keyframe has seen pull
+nowhere; each is charged, so that the object does not turn to where nothing contradicts it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tracking3d.bundle_adjustment.reprojection import FloatArray, apply_pose_steps
+from tracking3d.estimation.observation import Observation
+from tracking3d.estimation.online.optimization.types import (
+    ENOUGH,
+    FIRST_DAMPING,
+    LEAST_DAMPING,
+    MOST_DAMPING,
+    NOTHING_SEEN,
+    EvaluatedPoses,
+    PoseFit,
+    PoseWeights,
+)
+from tracking3d.geometry.pose import Pose, from_matrix
+from tracking3d.rendering import MatchedPoints, Scales, Surface, pose_terms
+from tracking3d.rendering.backend import use_numba
+
+_DEFAULT_WEIGHTS = PoseWeights()
+
+
+@dataclass(frozen=True, eq=False)
+class _Evidence:
+    """What poses are fitted to at one resolution.
+
+    Attributes:
+        observation: The frame at this resolution.
+        matched: With pixels of this resolution; None without any.
+        weights: With scales in pixels of this resolution.
+    """
+
+    observation: Observation
+    matched: MatchedPoints | None
+    weights: PoseWeights
+
+    def half(self) -> _Evidence:
+        """At half the resolution."""
+        matched, weights = self.matched, self.weights
+        if matched is not None:
+            matched = replace(matched, pixels=(matched.pixels + 0.5) / 2 - 0.5)
+        outline, points = weights.outline_scale / 2, weights.points_scale / 2
+        weights = replace(weights, outline_scale=outline, points_scale=points)
+        return _Evidence(self.observation.half, matched, weights)
+
+
+def refine_pose(
+    surface: Surface,
+    observation: Observation,
+    start: Pose,
+    matched: MatchedPoints | None = None,
+    weights: PoseWeights = _DEFAULT_WEIGHTS,
+    iterations: tuple[int, ...] = (4, 5),
+) -> PoseFit:
+    """Fit one pose; see `refine_poses`."""
+    return refine_poses(surface, observation, [start], matched, weights, iterations)[0]
+
+
+def refine_poses(
+    surface: Surface,
+    observation: Observation,
+    starts: Sequence[Pose],
+    matched: MatchedPoints | None = None,
+    weights: PoseWeights = _DEFAULT_WEIGHTS,
+    iterations: tuple[int, ...] = (4, 5),
+) -> list[PoseFit]:
+    """Fit one frame's pose from several starts, coarse to fine, each as if it were alone.
+
+    Args:
+        surface: The object.
+        observation: The frame.
+        starts: Where to start.
+        matched: Points with known places in the frame's window at full working resolution.
+        weights: Of the kinds of evidence.
+        iterations: Most steps at each resolution, each twice the one before, the last one the full working
+            resolution. Zeros only evaluate the starts.
+    """
+    if not starts:
+        return []
+    levels = [_Evidence(observation, matched if matched is not None and len(matched) else None, weights)]
+    for _ in iterations[1:]:
+        levels.append(levels[-1].half())
+    R = torch.stack([pose.R for pose in starts]).cpu().double().numpy()
+    t = torch.stack([pose.translation for pose in starts]).cpu().double().numpy()
+    spent, moving = np.zeros(len(starts), np.int64), np.zeros(len(starts), bool)
+    for level, steps in zip(levels[::-1], iterations, strict=True):
+        if steps or level is levels[0]:
+            found = _minimize(surface, level, R, t, steps)
+            R, t, spent, moving = found.R, found.t, spent + found.spent, moving | found.moved
+    return [
+        found.fit(n, _pose(surface, R[n], t[n]) if moving[n] else start, int(spent[n]))
+        for n, start in enumerate(starts)
+    ]
+
+
+def _minimize(
+    surface: Surface, evidence: _Evidence, R: FloatArray, t: FloatArray, steps: int
+) -> EvaluatedPoses:
+    """Levenberg-Marquardt at one resolution, in which no cost ever rises."""
+    target, weights = evidence.observation.target, evidence.weights
+    if use_numba(surface.renderer, surface.vertices, surface.texture, target.features):
+        from tracking3d.estimation.online.optimization.kernels import pose_refinement
+
+        return pose_refinement.minimize(surface, target, evidence.matched, weights, R, t, steps)
+    best = _evaluate(surface, evidence, R, t)
+    going, damping = np.arange(len(R)), np.full(len(R), FIRST_DAMPING)
+    for _ in range(steps):
+        present = best[going]
+        trial = _evaluate(
+            surface, evidence, *apply_pose_steps(present.R, present.t, present.steps(damping[going]))
+        )
+        trial.moved[:] = True
+        gain = present.cost - trial.cost
+        better = gain > 0
+        spent = best.spent[going] + 1
+        best[going[better]] = trial[better]
+        best.spent[going] = spent
+        damping[going] = np.where(better, np.maximum(damping[going] / 4, LEAST_DAMPING), damping[going] * 8)
+        ends = np.where(better, gain < ENOUGH * present.cost, damping[going] > MOST_DAMPING)
+        going = going[~ends]
+        if not len(going):
+            break
+    return best
+
+
+def _evaluate(surface: Surface, evidence: _Evidence, R: FloatArray, t: FloatArray) -> EvaluatedPoses:
+    """Poses with their costs and normal equations."""
+    weights = evidence.weights
+    scales = Scales(weights.appearance_scale, weights.outline_scale, weights.points_scale)
+    terms = pose_terms(
+        surface, evidence.observation.target, *_on_device(surface, R, t), evidence.matched, scales
+    )
+    comparable = terms.comparable.numpy()
+    nothing = comparable == 0
+    unseen = np.where(nothing, 1.0, 1 - terms.known.numpy() / np.where(nothing, 1.0, comparable))
+    outline, points = terms.outline.cost.numpy(), terms.points.cost.numpy()
+    appearance = (
+        terms.appearance.cost.numpy() * (1 - unseen) + weights.unseen * unseen + NOTHING_SEEN * nothing
+    )
+    # The equations are of the mean over what is known, the cost is of all that can be compared.
+    model = (
+        terms.appearance * torch.from_numpy(weights.appearance * (1 - unseen))
+        + terms.outline * weights.outline
+        + terms.points * weights.points
+    )
+    cost = weights.appearance * appearance + weights.outline * outline + weights.points * points
+    return EvaluatedPoses(
+        R, t, cost, appearance, outline, points, terms.overlap.numpy(), unseen, model.matrix.numpy(),
+        model.gradient.numpy(), np.ones(len(R), np.int64), np.zeros(len(R), bool),
+    )  # fmt: skip
+
+
+def _pose(surface: Surface, R: FloatArray, t: FloatArray) -> Pose:
+    return from_matrix(*_on_device(surface, R, t))
+
+
+def _on_device(surface: Surface, R: FloatArray, t: FloatArray) -> tuple[Tensor, Tensor]:
+    return torch.from_numpy(R).to(surface.vertices), torch.from_numpy(t).to(surface.vertices)
+
+
+def render_cost(fit: PoseFit, weights: PoseWeights, mask_weight: float) -> float:
+    """What poses from different points are compared by: the cost without them."""
+    missed = mask_weight * (1 - fit.overlap)
+    return weights.appearance * fit.appearance + weights.outline * mask_weight * fit.outline + missed

@@ -1,0 +1,1 @@
+"""A pose without a prediction."""

@@ -1,0 +1,132 @@
+"""The map of the object: its shape, texture, landmarks and keyframes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from tracking3d.estimation.observation import Observation
+from tracking3d.estimation.online.features.klt import FollowedPoints
+from tracking3d.estimation.online.features.sift import Keypoints
+from tracking3d.estimation.shape import Shape
+from tracking3d.geometry.camera import Camera
+from tracking3d.geometry.pose import Pose
+from tracking3d.rendering import BackProjection, Surface, TexelMap, back_project, project, rasterize
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframe:
+    """A frame with its pose and what it shows of the landmarks.
+
+    Attributes:
+        observation: Its window.
+        mask: ``(H, W)`` initial mask in the full frame, or None.
+        pose: As it stands.
+        points: Landmarks and where the frame shows them.
+        keypoints: For matching; ``keypoint_landmark`` ``(M,)`` says which landmark each is.
+        texture: What the frame shows of the feature texture, as last computed; None before.
+        mask_weight: How far the mask is believed, in [0, 1].
+        strength: Of the texture inside the mask, as far as it was asked for; see `texture_strength`.
+    """
+
+    observation: Observation
+    mask: NDArray[np.bool_] | None
+    pose: Pose
+    points: FollowedPoints
+    keypoints: Keypoints = field(default_factory=Keypoints.none)
+    keypoint_landmark: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    texture: BackProjection | None = None
+    mask_weight: float = 1.0
+    strength: float = math.inf
+
+    @property
+    def index(self) -> int:
+        """The frame's index in the source."""
+        return self.observation.index
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectMap:
+    """What is known of the object.
+
+    Attributes:
+        shape: The fixed part.
+        texels: Where each texel lies on the surface.
+        vertices: ``(V, 3)``.
+        landmarks: ``(N, 3)`` float64 surface points in object coordinates.
+        keyframes: In order of time; the first one's pose never moves.
+        candidate: ``(N,)`` found beside the mask, and not yet known to be on the object.
+        pointless: Whether the object has no points that can be followed: it is known by pixels and outlines alone.
+        renderer: Which renderer, see `tracking3d.rendering.backend`.
+        beside: ``(8, 2)`` candidates in each direction from the object that could be told, and that move as it does.
+        held: How many of the first keyframes are drawn ones of an object that was known before, whose shape is held and
+            of whose surface every point counts as often seen; 0 where the object is got to know in the video.
+    """
+
+    shape: Shape
+    texels: TexelMap
+    vertices: Tensor
+    landmarks: NDArray[np.float64]
+    keyframes: tuple[Keyframe, ...]
+    candidate: NDArray[np.bool_]
+    pointless: bool = False
+    renderer: str = "auto"
+    candidates_around: NDArray[np.int64] = field(default_factory=lambda: np.zeros((8, 2), np.int64))
+    fixed_keyframes: int = 0
+
+    @cached_property
+    def sightings(self) -> NDArray[np.int64]:
+        """``(N,)`` how many keyframes show each landmark."""
+        count = np.full(len(self.landmarks), int(self.fixed_keyframes > 0), np.int64)
+        for view in self.keyframes:
+            count[view.points.landmark] += 1
+        return count
+
+    @property
+    def radius(self) -> float:
+        """Largest distance of a vertex from the middle."""
+        return float((self.vertices - self.vertices.mean(0)).norm(dim=1).max())
+
+    def back_project(self, values: Tensor, view: Keyframe) -> BackProjection:
+        """What a view shows of the texture; ``values`` is ``(C, H, W)`` over its window."""
+        observation = view.observation
+        scale = values.shape[-1] / observation.window.size
+        K = observation.K.clone()
+        K[:2] *= scale
+        K[:2, 2] += (scale - 1) / 2  # pixel centres stay at integers
+        valid = observation.valid * (observation.mask if observation.has_mask else 1.0)
+        if scale != 1:
+            valid = torch.nn.functional.interpolate(
+                valid[None, None], size=values.shape[-2:], mode="bilinear"
+            )[0, 0]
+        return back_project(
+            values, valid, self.vertices, self.shape.faces, self.texels, view.pose.R, view.pose.translation, K,
+            self.renderer,
+        )  # fmt: skip
+
+    def surface(self) -> Surface:
+        """Shape and texture for fitting poses; the texture is the mean of what the keyframes show."""
+        size = self.texels.size
+        channels = self.keyframes[0].observation.features.shape[0]
+        total = BackProjection(
+            self.vertices.new_zeros(channels, size, size), self.vertices.new_zeros(size, size)
+        )
+        for view in self.keyframes:
+            total = total + (view.texture or self.back_project(view.observation.features, view))
+        texture = total.mean().permute(1, 2, 0).contiguous().permute(2, 0, 1)
+        seen = (total.weight > 0).float()[None]
+        return Surface(self.vertices, self.shape.faces, self.shape.face_uvs, texture, seen, self.renderer)
+
+    def silhouette(self, pose: Pose, camera: Camera) -> NDArray[np.bool_]:
+        """Hard silhouette ``(H, W)`` in the full frame."""
+        size = (camera.height, camera.width)
+        K = torch.tensor(camera.K, dtype=torch.float32, device=self.vertices.device)
+        screen, depth = project(self.vertices, pose.R[None], pose.translation[None], K[None])
+        covered = rasterize(screen, depth, self.shape.faces, size, self.renderer).face_index[0] >= 0
+        return np.asarray(covered.cpu().numpy(), dtype=np.bool_)

@@ -1,0 +1,1 @@
+"""A pose near the predicted one."""

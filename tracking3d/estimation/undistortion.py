@@ -1,0 +1,104 @@
+"""A solver behind a lens: it sees what a pinhole camera would have taken, and answers for the pictures as they were.
+
+Everything around the solver, the mask tracker, prompts and answers, is in pixels of the pictures that were taken. Poses
+and the solver's own state are of the pinhole camera.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, Generic
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.estimation.estimate import FrameEstimate, MaskSource, ObjectModel
+from tracking3d.estimation.solver import GuidedSolver, RefiningSolver, Solver, State
+from tracking3d.frames import Frame, MaskEstimate
+from tracking3d.geometry.lens import Lens
+
+
+def undistort_solver(lens: Lens | None, solver: Solver[Any]) -> Solver[Any]:
+    """The solver behind a lens; as it is where there is none."""
+    if lens is None:
+        return solver
+    complete = isinstance(solver, RefiningSolver) and isinstance(solver, GuidedSolver)
+    return (CompleteUndistortingSolver if complete else UndistortingSolver)(lens, solver)
+
+
+class UndistortingSolver(Generic[State]):
+    """See `behind`, and `tracking3d.estimation.solver.Solver` for the methods."""
+
+    def __init__(self, lens: Lens, solver: Any) -> None:
+        self._lens, self._solver = lens, solver
+
+    def init(self, frame: Frame, mask: MaskEstimate) -> tuple[State, FrameEstimate]:
+        """See `Solver.init`."""
+        state, estimate = self._solver.init(self._frame(frame), self._mask(mask))
+        return state, self._answer(estimate, mask)
+
+    def step(self, state: State, frame: Frame, mask: MaskEstimate) -> tuple[State, FrameEstimate]:
+        """See `Solver.step`."""
+        state, estimate = self._solver.step(state, self._frame(frame), self._mask(mask))
+        return state, self._answer(estimate, mask)
+
+    def result(self, state: State) -> ObjectModel:
+        """See `Solver.result`."""
+        model: ObjectModel = self._solver.result(state)
+        return model
+
+    def _frame(self, frame: Frame) -> Frame:
+        return replace(frame, image=self._lens.undistort(frame.image))
+
+    def _mask(self, mask: MaskEstimate) -> MaskEstimate:
+        if mask.mask is None:
+            return mask
+        return replace(mask, mask=self._lens.mask_to_pinhole(mask.mask.astype(np.float32)))
+
+    def _answer(self, estimate: FrameEstimate, mask: MaskEstimate | None = None) -> FrameEstimate:
+        """An answer for the pictures as they were; what was handed in comes back as it was."""
+        initial = mask.found if mask is not None else self._seen(estimate.initial_mask)
+        handed_back = estimate.mask_source is MaskSource.INITIAL and initial is not None
+        answered = initial if handed_back else self._seen(estimate.mask)
+        assert answered is not None
+        return replace(
+            estimate,
+            mask=answered,
+            initial_mask=initial,
+            probability=None
+            if estimate.probability is None
+            else self._lens.mask_to_picture(estimate.probability),
+            revised=tuple(self._answer(earlier) for earlier in estimate.revised),
+        )
+
+    def _seen(self, mask: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+        return None if mask is None else self._lens.mask_to_picture(mask)
+
+
+class CompleteUndistortingSolver(UndistortingSolver[State]):
+    """Of a solver that refines and can be steered, too; see `RefiningSolver` and `SteeredSolver`."""
+
+    def refine(self, state: State) -> State:
+        """See `RefiningSolver.refine`."""
+        refined: State = self._solver.refine(state)
+        return refined
+
+    def refine_frame(
+        self, state: State, frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]
+    ) -> tuple[State, FrameEstimate]:
+        """See `RefiningSolver.revisit`."""
+        state, estimate = self._solver.refine_frame(state, self._frame(frame), self._mask(mask), T_cam_obj)
+        return state, self._answer(estimate, mask)
+
+    def restart_backwards(
+        self, state: State, frame: Frame, number: int, T_cam_obj: NDArray[np.float64]
+    ) -> State:
+        """See `SteeredSolver.turned_back`."""
+        turned: State = self._solver.restart_backwards(state, self._frame(frame), number, T_cam_obj)
+        return turned
+
+    def trust_mask(self, state: State, frame: Frame, mask: NDArray[np.bool_]) -> State:
+        """See `SteeredSolver.trusting`."""
+        seen = self._lens.mask_to_pinhole(mask)
+        trusted: State = self._solver.trust_mask(state, self._frame(frame), seen)
+        return trusted

@@ -1,0 +1,1 @@
+"""One video from its frames to estimates and a run folder."""

@@ -1,0 +1,180 @@
+"""The passes over a video: every frame is estimated, again with the final model if that is asked for, and drawn.
+
+In short::
+
+    for frame in frames:                             # first pass: causal estimates
+        for recording in active:
+            recording.take(frame)                    # TrackedObject.step, Session.step, Solver.step
+    for recording in active:
+        recording.begin_refinement(source)           # everything is refined
+    for frame in frames:                             # second pass: estimates with the final model
+        recording.take_again(frame)
+    recording.refinement.adjust_all()                # poses, surface and lens by all frames together
+    for frame in frames:                             # third pass: what masks have in common
+        recording.refinement.collect_mask(frame)
+    for frame in frames:                             # last pass: masks and pictures
+        recording.refinement.draw(frame)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+
+from tracking3d.frames import Frame, SkippedFrame
+from tracking3d.pipeline.final_refinement import FinalRefinement
+from tracking3d.pipeline.frame_reading import read_again, read_with_next, with_share
+from tracking3d.pipeline.recorder import ObjectRecorder
+from tracking3d.rendering.backend import share_threads
+from tracking3d.results.records import FrameRecord
+from tracking3d.video.source import FrameSource
+
+Listener = Callable[[FrameRecord | SkippedFrame], None]
+"""Is called with every frame that is done or skipped, and with each once more in a final refinement."""
+
+
+class ActiveRecordings:
+    """The recordings of one tracking that have not failed; iterating gives them.
+
+    Args:
+        recordings: One for each object.
+        listener: Is called with every frame of every object.
+
+    Attributes:
+        errors: What ended the others, in the order in which they failed.
+    """
+
+    def __init__(self, recordings: Sequence[ObjectRecorder], listener: Listener = lambda frame: None) -> None:
+        self._active, self._listener = list(recordings), listener
+        self.errors: list[Exception] = []
+
+    def __len__(self) -> int:
+        return len(self._active)
+
+    def __iter__(self) -> Iterator[ObjectRecorder]:
+        """Give each active recording; after the last one, raise the first error if all have failed."""
+        yield from tuple(self._active)
+        if not self._active:
+            raise self.errors[0]
+
+    def refining(self) -> Iterator[tuple[ObjectRecorder, FinalRefinement]]:
+        """Give each active recording that has a final refinement, with it; see `__iter__`."""
+        for recording in self:
+            if recording.refinement is not None:
+                yield recording, recording.refinement
+
+    @contextmanager
+    def guard(self, recording: ObjectRecorder) -> Iterator[None]:
+        """If something fails within, this recording ends and the others go on."""
+        try:
+            yield
+        except Exception as error:
+            self._active.remove(recording)
+            with suppress(Exception):  # the first error is the one to tell
+                self.tell(recording.written())
+            recording.give_up(error)
+            self.errors.append(error)
+
+    def give_up(self, error: BaseException) -> None:
+        """End all active recordings because of ``error``."""
+        for recording in self._active:
+            recording.give_up(error)
+
+    def tell(self, done: FrameRecord | SkippedFrame | None) -> None:
+        """Call the listener, if there is something to tell."""
+        if done:
+            self._listener(done)
+
+
+def run_passes(
+    source: FrameSource,
+    frames: Iterable[Frame | SkippedFrame],
+    recordings: Sequence[ObjectRecorder],
+    listener: Listener,
+    first_pass_only: bool = False,
+) -> None:
+    """Run all passes. A recording that fails is ended; the others go on.
+
+    Args:
+        source: Where the frames come from.
+        frames: Its frames, begun already.
+        recordings: One for each object.
+        listener: Is called with every frame of every object.
+        first_pass_only: Stop when every frame has its causal estimate.
+
+    Raises:
+        Tracking3dError: The first failure, at the end or as soon as no recording is left.
+    """
+    active = ActiveRecordings(recordings, listener)
+    with ExitStack() as threads:
+        # The listener hears of a live source's frames at once.
+        for recording in recordings if source.repeatable else ():
+            threads.enter_context(recording.writing_beside())
+        try:
+            waits = any(one.takes for one in active)
+            for frame, coming in read_with_next(source, frames) if waits else ():
+                shared = with_share(frame, len(recordings)) if isinstance(frame, Frame) else frame
+                for recording in active:
+                    with active.guard(recording):
+                        active.tell(recording.take(shared, coming))
+            _finish_writing(active)
+            if first_pass_only:
+                for recording in active:
+                    with active.guard(recording):
+                        recording.pause()
+                return
+            run_refinement(source, active)
+        except BaseException as error:
+            active.give_up(error)
+            raise
+    if active.errors:
+        raise active.errors[0]
+
+
+def run_refinement(source: FrameSource, active: ActiveRecordings) -> None:
+    """All frames have causal estimates: run the final refinement, if it is asked for and possible, and draw.
+
+    Args:
+        source: Where the frames come from.
+        active: The recordings.
+    """
+    objects = len(active)
+    with share_threads(1):
+        for recording in active:
+            with active.guard(recording):
+                recording.begin_refinement(source)
+        for frame in read_again(source) if any(one.looks_again for one in active) else ():
+            for recording in active:
+                with active.guard(recording):
+                    active.tell(recording.take_again(with_share(frame, objects)))
+        _finish_writing(active)
+        _run_last_passes(source, active)
+        for recording in active:
+            with active.guard(recording):
+                recording.finish()
+
+
+def _run_last_passes(source: FrameSource, active: ActiveRecordings) -> None:
+    """Adjust poses, surface and lens by all frames together, then masks; and draw."""
+    for recording, refinement in active.refining():
+        with active.guard(recording):
+            refinement.adjust_all()
+    for frame in read_again(source) if any(each.decides_masks for _, each in active.refining()) else ():
+        for recording, refinement in active.refining():
+            with active.guard(recording):
+                refinement.collect_mask(frame)
+    for recording, refinement in active.refining():
+        with active.guard(recording):
+            refinement.settle_masks()
+    for frame in read_again(source) if any(active.refining()) else ():
+        for recording, refinement in active.refining():
+            with active.guard(recording):
+                refinement.draw(frame)
+    _finish_writing(active)
+
+
+def _finish_writing(active: ActiveRecordings) -> None:
+    """Wait until everything is written that is written in other threads."""
+    for recording in active:
+        with active.guard(recording):
+            active.tell(recording.written())

@@ -1,0 +1,284 @@
+"""One object on its way from the frames to its run folder: estimated, written, and refined at the end."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
+from typing import Any
+
+from tracking3d.checkpoint.progress import JournalEntry, SavedState, check_picture, checksum
+from tracking3d.checkpoint.run_state import RunState
+from tracking3d.errors import OutputError
+from tracking3d.estimation.estimate import FrameEstimate, ObjectModel
+from tracking3d.frames import Frame, SkippedFrame
+from tracking3d.pipeline.final_refinement import FinalRefinement
+from tracking3d.pipeline.open_tracking import TrackedObject
+from tracking3d.pipeline.refinement_steps import PrecomputedRefinement
+from tracking3d.pipeline.session import Session
+from tracking3d.prompts.corrections import prompts_in
+from tracking3d.reconstruction import bake_texture
+from tracking3d.results.mesh_export import load_model
+from tracking3d.results.records import FrameRecord
+from tracking3d.results.refinement_writer import RefinementWriter
+from tracking3d.results.run_writer import RunWriter
+from tracking3d.runtime.concurrency import BackgroundWriter
+from tracking3d.video.source import FrameSource
+
+_log = logging.getLogger(__name__)
+
+
+class ObjectRecorder:
+    """One object on its way from the frames to its run folder.
+
+    Args:
+        tracked: The object.
+        writer: Writes the run folder.
+        state: How far the run is; the session was given the state of the stopped run, if there is one.
+        redraw: Whether frames come in another order than that of time, and are drawn once more in that order.
+        temporary: Whether the run folder is removed in the end, so that errors do not name it.
+
+    Attributes:
+        latest: The estimate for the frame that was taken last.
+        refinement: The second passes; None before `begin_refinement`, and if there are none.
+        precomputed: What the last steps come to, if other processes have computed it.
+    """
+
+    def __init__(
+        self,
+        tracked: TrackedObject,
+        writer: RunWriter,
+        state: RunState,
+        redraw: bool = False,
+        temporary: bool = False,
+    ) -> None:
+        self._tracked, self._session = tracked, tracked.session
+        self._writer, self._state = writer, state
+        self._redraw, self._temporary = redraw, temporary
+        self._work = BackgroundWriter()  # all that touches writer and state while frames come
+        self._unmet = set(tracked.corrections)
+        self._answered = state.kept is not None
+        self._warned = False
+        self._initial: dict[int, tuple[float, str]] = {}
+        if state.kept and self._refines:
+            self._initial = {one.index: (one.score, one.reason) for one in state.kept.taken.values()}
+        self._causal_model: ObjectModel | None = None
+        self.latest: FrameEstimate | None = None
+        self.refinement: FinalRefinement | None = None
+        self.precomputed: PrecomputedRefinement | None = None
+
+    @contextmanager
+    def writing_beside(self) -> Iterator[None]:
+        """Within, estimates are written by another thread while the next frame is solved, one at a time."""
+        self._work.threaded = True
+        try:
+            yield
+        finally:
+            self._work.end()
+
+    def written(self) -> Any:
+        """Wait until all estimates are written; what is to be told of the last one."""
+        return self._work.wait()
+
+    @property
+    def takes(self) -> bool:
+        """Whether the frames are to come for the first time, or for the mask tracker to see them again."""
+        return not self._state.before.refining
+
+    def take(
+        self, frame: Frame | SkippedFrame, coming: Frame | SkippedFrame | None = None
+    ) -> FrameRecord | SkippedFrame | None:
+        """Estimate the object in the next frame and write the estimate; what a stopped run has estimated stands.
+
+        Args:
+            frame: The frame.
+            coming: The one that will be taken next, if it is known.
+
+        Returns:
+            What is to be told: of this frame, or of the one before while `writing_beside`.
+        """
+        if isinstance(frame, Frame):
+            self._unmet.discard(frame.index)
+        if self._state.kept and self._state.has(frame.index):
+            return self._take_kept(self._state.kept, frame)
+        if isinstance(frame, SkippedFrame):
+            return self._work.do(partial(self._skip, frame))
+        if not isinstance(coming, Frame) or self._state.has(coming.index):
+            coming = None
+        estimate = self._tracked.step(frame, coming)
+        self._answered, self.latest = True, estimate
+        initial = self._session.initial_mask
+        if self._refines:
+            self._initial[frame.index] = initial.score, initial.reason
+        taken = kept = None
+        if self._state.checkpoint:
+            taken = JournalEntry(
+                frame.index,
+                checksum(frame.image),
+                initial.score,
+                initial.reason,
+                self._session.corrected,
+                self._session.failure_at(frame.index),
+            )
+            kept = self._session.kept()
+        return self._work.do(partial(self._write, estimate, frame, taken, kept))
+
+    def _skip(self, frame: SkippedFrame) -> SkippedFrame:
+        self._writer.skip(frame)
+        if self._state.checkpoint:
+            self._state.checkpoint.note(frame)
+        return frame
+
+    def _write(
+        self,
+        estimate: FrameEstimate,
+        frame: Frame,
+        taken: JournalEntry | None,
+        session: dict[str, Any] | None,
+    ) -> FrameRecord:
+        record, checkpoint = self._writer.write(estimate, frame), self._state.checkpoint
+        if checkpoint and taken is not None and session is not None:
+            if taken.corrected:
+                checkpoint.keep_correction(frame.index, estimate.mask)
+            revised = [one.index for one in estimate.revised]
+            so_far = {"lines": self._writer.lines, "seconds": self._writer.seconds}
+            self._state.save(session, taken, revised, last=frame.index, **so_far)
+        return record
+
+    def _take_kept(self, kept: SavedState, frame: Frame | SkippedFrame) -> FrameRecord | SkippedFrame | None:
+        """Draw a frame that has its estimate, and show it to a mask tracker that cannot be resumed otherwise."""
+        if isinstance(frame, SkippedFrame) and frame.index not in kept.taken:
+            return frame
+        if frame.index not in kept.taken or not self.takes:
+            return None
+        check_picture(kept, frame)
+        assert isinstance(frame, Frame)
+        if self._session.replays:
+            self._replay(kept, frame)
+        return self._writer.draw_again(frame)
+
+    def _replay(self, kept: SavedState, frame: Frame) -> None:
+        """Show a frame to the mask tracker again; warn once if the tracker gives another mask than before."""
+        taken, first = kept.taken[frame.index], frame.index == next(iter(kept.taken))
+        correction = None
+        if taken.corrected and self._state.checkpoint:
+            correction = self._state.checkpoint.correction(frame.index)
+        prompts = prompts_in(frame, self._tracked.corrections)
+        mask = self._session.replay(frame, first, correction, *prompts)
+        if self._warned or taken.failure or not mask or self._writer.is_initial_mask(frame, mask):
+            return
+        self._warned = True
+        _log.warning(
+            "The mask tracker gives another mask of %s than before the run was stopped; what follows may differ from a "
+            "run that was not.",
+            frame.name or f"frame {frame.index}",
+        )
+
+    @property
+    def _refines(self) -> bool:
+        """Whether a final refinement is asked for."""
+        return self._session.config.solver.final_refine
+
+    def begin_refinement(self, source: FrameSource) -> None:
+        """All frames were taken: refine everything, or record why not though it was asked for."""
+        for index in sorted(self._unmet):
+            _log.warning(
+                "Frame %d, which was to be corrected, is not among the frames that could be read.", index
+            )
+        estimates = self._refined(source)
+        if estimates is not None:
+            estimates.together = self._session.refining
+            self._writer.refine_camera(self._session.camera)
+            self.refinement = FinalRefinement(
+                self._tracked,
+                self._writer,
+                estimates,
+                self._state,
+                self._work,
+                self._initial,
+                self.precomputed,
+            )
+        elif self._redraw:
+            self._writer.begin_drawing_anew()
+
+    def _refined(self, source: FrameSource) -> RefinementWriter | None:
+        """Refine everything, unless the stopped run has done so; None if there is no refinement."""
+        before = self._state.before
+        if before.refining:
+            estimates = self._writer.begin_refinement(None, before.refined_lines, before.refinement_seconds)
+            self._causal_model = load_model(
+                self._writer.folder
+            )  # in its place again, if it was being replaced
+            return estimates
+        if not self._refines:
+            return None
+        if not self._session.can_refine or not source.repeatable:
+            self._writer.leave_out_refinement(
+                f"{source.name} cannot be read a second time"
+                if self._session.can_refine
+                else f"the solver {self._session.config.solver.name} gives causal answers only"
+            )
+            return None
+        self._causal_model = self._session.result()
+        estimates = self._writer.begin_refinement(self._causal_model)
+        self._session.refine()
+        self._state.save(
+            self._session.kept(),
+            refining=True,
+            seconds=self._writer.seconds,
+            refinement_seconds=estimates.seconds,
+        )
+        return estimates
+
+    @property
+    def looks_again(self) -> bool:
+        """Whether the frames are to come once more, in order of time."""
+        return self.refinement is not None or self._redraw
+
+    def take_again(self, frame: Frame) -> FrameRecord | None:
+        """Estimate the object in a frame again; without a refinement, only draw the frame, and give None."""
+        if self.refinement is not None:
+            return self.refinement.take_again(frame)
+        self._writer.draw_again(frame)
+        return None
+
+    def finish(self) -> None:
+        """Write what is made at the end."""
+        model, largest = self._session.result(), self._session.config.object.max_texture_size
+        if self.refinement is not None:
+            self.refinement.draw_rest()
+            self._work.wait()
+            model = bake_texture(*self.refinement.final_model(), largest)
+            self._writer.end_refinement()
+            self._causal_model = None
+        self._writer.finish(model, "finished")
+        if self._state.checkpoint:
+            self._state.checkpoint.finish()
+
+    def pause(self) -> None:
+        """Stop here; the folder is that of a stopped run, which can be resumed."""
+        self._writer.finish(_model_so_far(self._session), "interrupted")
+
+    def give_up(self, error: BaseException) -> None:
+        """Keep what is finished when ``error`` ends the run, and let ``error`` say so."""
+        self._work.end()
+        failed = isinstance(error, Exception)
+        folder = self._writer.folder
+        if self._causal_model is not None and not self._temporary:
+            error.add_note(
+                f"The final refinement was not finished; the causal answers are whole in {folder}."
+            )
+        elif self._answered and not self._temporary:
+            error.add_note(f"What was finished until then is kept in {folder}.")
+        model = self._causal_model or _model_so_far(self._session)
+        with suppress(OutputError):  # the first error is the one to tell
+            self._writer.finish(model, "failed" if failed else "interrupted", str(error) or None)
+
+
+def _model_so_far(session: Session) -> ObjectModel | None:
+    """The object as far as it is known; None if the session stopped in a state that gives none."""
+    try:
+        return session.result()
+    except Exception:
+        return None

@@ -1,0 +1,134 @@
+"""The pipeline as functions: frames go in, answers come out.
+
+>>> for estimate in track(frames, box=(x, y, w, h)):  # doctest: +SKIP
+...     print(estimate.index, estimate.status, estimate.T_cam_obj)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.config.camera import choose_camera
+from tracking3d.config.models import PipelineConfig
+from tracking3d.estimation.estimate import FrameEstimate
+from tracking3d.frames import Box
+from tracking3d.pipeline.components import SOLVERS
+from tracking3d.pipeline.open_tracking import TrackRequest, request_tracking
+from tracking3d.pipeline.point_queries import validate_queries
+from tracking3d.pipeline.result_options import ModelChoice, config_of_result
+from tracking3d.pipeline.session import Session
+from tracking3d.pipeline.tracking import Tracking, track_frames
+from tracking3d.pipeline.validation import set_known_object, validate_config
+from tracking3d.prompts.corrections import Correction
+from tracking3d.prompts.prompt import PromptSet
+from tracking3d.video.image_input import validate_image
+from tracking3d.video.in_memory import open_frames
+
+__all__ = ["SOLVERS", "Session", "Tracking", "choose_camera", "track", "track_objects", "validate_image"]
+
+
+def track(
+    frames: Any,
+    *,
+    box: Box | None = None,
+    mask: NDArray[np.bool_] | None = None,
+    points: Any = None,
+    start_frame: int | None = None,
+    corrections: Iterable[Correction] = (),
+    config: PipelineConfig | Path | str | None = None,
+    skip_damaged: bool = False,
+    follow: Any = None,
+    refine: bool | None = None,
+    model: ModelChoice | None = None,
+    object: str | Path | None = None,
+) -> Tracking:
+    """Track an object through frames; answers come as the frames do, memory is bounded by the keyframes.
+
+    Args:
+        frames: What `open_source` opens by a path; ``(N, H, W, 3)`` uint8 RGB; a tensor ``(N, 3, H, W)`` or ``(N, H, W,
+            3)`` of uint8 or of floats in [0, 1]; a ``cv2.VideoCapture``; a `FrameSource`; or any iterable of such
+            images, pictures of Pillow, paths of images and `Frame` objects. Frames that could not be read are passed
+            over, but not the first.
+        box: The object in the first frame, ``(x, y, width, height)`` in pixels.
+        mask: The object in the first frame, ``(H, W)`` bool.
+        points: The object in the first frame by ``(N, 3)`` points: x, y in pixels, and 1 on it or 0 beside it. One of
+            box, mask and points is given, or none where the tracker knows its masks (``precomputed``).
+        start_frame: Index of the frame in which the object is given, instead of the first. Answers then come from there
+            to the end, and after them backwards to the beginning. Only where frames can be gone through again.
+        corrections: What the object is in later frames: there the mask tracker is set on it, and the mask is trusted.
+        config: The pipeline, or a YAML file of one; the default preset if None.
+        skip_damaged: Where the first frame could not be read, take the box or mask for the first one that could.
+        follow: Surface points to follow: ``(N, 2)`` pixels of the frame in which the object is given, or ``(N, 3)`` of
+            frame, x, y. Each answer says in ``points`` where they are, by the frames until then; the result in
+            ``tracks``, by the whole video.
+        refine: Whether the `Tracking.result` looks at the whole video once more; None leaves that to the configuration,
+            as the command line does.
+        model: What is made of the object for the result: ``none`` leaves what was learnt on the way, ``fast`` takes the
+            texture from the video at its resolution, ``fine`` then makes the shape anew too from all frames, and keeps
+            it if it explains them better; None leaves that to the configuration.
+        object: The folder of an earlier run, or a mesh file: the object is that one. It is then found without a box,
+            or with one, answers are in its coordinates and unit, and its shape and colours are held.
+
+    Returns:
+        An iterator of one estimate a frame, whose `Tracking.result` is all of it.
+
+    Raises:
+        Tracking3dError: If an argument cannot be used; on the way, if a frame cannot, or the first one does not fit
+            the box or mask.
+    """
+    source, config = open_frames(frames), set_known_object(validate_config(config), object)
+    config = config_of_result(config, source, refine, model)
+    prompts = PromptSet.of_one(box, mask, points, start_frame)
+    request = request_tracking(source, config, prompts, corrections, skip_damaged)
+    return Tracking(request, refine is not None or model is not None, validate_queries(follow))
+
+
+def track_objects(
+    frames: Any,
+    *,
+    boxes: Sequence[Box] = (),
+    masks: Sequence[NDArray[np.bool_]] = (),
+    points: Sequence[Any] = (),
+    start_frame: int | None = None,
+    corrections: Iterable[Correction] = (),
+    config: PipelineConfig | Path | str | None = None,
+    skip_damaged: bool = False,
+) -> Iterator[tuple[FrameEstimate, ...]]:
+    """Track several objects through frames that are gone through once; see `track`.
+
+    An object whose plug-in has failed for good, see ``runtime.on_plugin_failure``, is answered as lost from then on;
+    the others go on.
+
+    Args:
+        frames: See `track`.
+        boxes: The objects in the first frame, each ``(x, y, width, height)`` in pixels.
+        masks: More objects, after those of the boxes, each ``(H, W)`` bool.
+        points: More objects, after those of the masks, each by points.
+        start_frame: The frame in which the objects are given.
+        corrections: What an object is in later frames; `Correction.object` says which, in the order of the objects.
+        config: The pipeline of every object, or a YAML file of one; the default preset if None.
+        skip_damaged: See `track`.
+
+    Returns:
+        An iterator of one estimate an object, in the order in which they were given, for each frame.
+
+    Raises:
+        Tracking3dError: If an argument cannot be used; on the way, if a frame cannot, the first one does not fit a box
+            or mask, or the last object has failed.
+    """
+    prompts = PromptSet(boxes, masks, points, start_frame, as_lists=True)
+    request = request_tracking(open_frames(frames), config, prompts, corrections, skip_damaged)
+    return _estimates_of(request)
+
+
+def _estimates_of(request: TrackRequest) -> Iterator[tuple[FrameEstimate, ...]]:
+    """What `track_objects` gives; the source is closed when it ends."""
+    with closing(track_frames(request)) as tracked:
+        for _, _, estimates in tracked:
+            yield estimates

@@ -1,0 +1,160 @@
+"""The mask tracker ``auto``: the best of those that can be used here and that this machine and video can afford."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+from tracking3d.config.models import PipelineConfig, PluginChoice
+from tracking3d.errors import InputError, Tracking3dError
+from tracking3d.frames import Frame, Prompt
+from tracking3d.networks.catalogue import known_networks
+from tracking3d.networks.store import State, state_of
+from tracking3d.plugins import TRACKERS, build_plugin, check_options
+
+AUTO = "auto"
+"""Name of the tracker that stands for the best one."""
+AFFORDABLE = 900.0
+"""Seconds that the masks of a whole video may take."""
+UNHURRIED, LIVE = 1.0, 0.1
+"""Seconds that one frame's mask may take where the number of frames is unknown, and of a camera."""
+_CARRIED = 0.05
+"""Seconds in which a mask is carried on to a frame that the network is not asked about."""
+
+
+@dataclass(frozen=True)
+class TrackerCandidate:
+    """A mask tracker that was measured.
+
+    Attributes:
+        name: Name of the plug-in.
+        what: What sentences call it.
+        iou: Mean IoU with true masks over the four real clips, see docs/masks.md and docs/segmenters.md.
+        seconds: A frame on one core of the machine on which that was measured.
+        networks: Known networks that it needs.
+        options: Its options.
+    """
+
+    name: str
+    what: str
+    iou: float
+    seconds: float
+    networks: tuple[str, ...] = ()
+    options: dict[str, Any] = field(default_factory=dict)
+
+
+_SAM = {"segmenter": "mobile-sam", "encoder": "mobile-sam-encoder", "decoder": "mobile-sam-decoder"}
+_U2 = {"segmenter": "u2netp", "model": "u2netp"}
+_NANO = {"box": "nano", "nano_backbone": "nanotrack-backbone", "nano_head": "nanotrack-head"}
+_SAM_FILES, _U2_FILES = ("mobile-sam-encoder", "mobile-sam-decoder"), ("u2netp",)
+_NANO_FILES = ("nanotrack-backbone", "nanotrack-head")
+
+CANDIDATES = (
+    TrackerCandidate("onnx", "MobileSAM in NanoTrack's box", 0.940, 1.57, _SAM_FILES + _NANO_FILES, _SAM | _NANO),
+    TrackerCandidate("onnx", "MobileSAM in CSR-DCF's box", 0.919, 1.60, _SAM_FILES, _SAM),
+    TrackerCandidate("onnx", "U2Netp in NanoTrack's box", 0.918, 0.97, _U2_FILES + _NANO_FILES, _U2 | _NANO),
+    TrackerCandidate(
+        "onnx", "MobileSAM in NanoTrack's box, every 5th frame", 0.912, 0.36, _SAM_FILES + _NANO_FILES,
+        _SAM | _NANO | {"every": 5},
+    ),
+    TrackerCandidate(
+        "onnx", "U2Netp in NanoTrack's box, every 5th frame", 0.894, 0.25, _U2_FILES + _NANO_FILES,
+        _U2 | _NANO | {"every": 5},
+    ),
+    TrackerCandidate("onnx", "U2Netp in CSR-DCF's box", 0.888, 1.00, _U2_FILES, _U2),
+    # Answers to the masks of both, which correct them, have a mean IoU of .880 with csrt and .883 with flow on 24 fresh
+    # clips, and of .891 and .874 on five real ones; flow takes half of the time.
+    TrackerCandidate("csrt", "csrt, which needs no network", 0.857, 0.06),
+    TrackerCandidate("flow", "flow, which needs neither network nor correlation filter", 0.789, 0.05),
+)  # fmt: skip
+"""The best first."""
+
+
+def check_tracker_options(config: PipelineConfig) -> None:
+    """Make sure of the options of the mask tracker; ``auto`` has none.
+
+    Raises:
+        PluginError: If the tracker is unknown or broken.
+        InputError: If an option is wrong.
+    """
+    if config.tracker.name != AUTO:
+        check_options(TRACKERS, config.tracker)
+    elif config.tracker.options:
+        raise InputError(
+            f"tracker.{next(iter(config.tracker.options))} is an option of one tracker, and '{AUTO}' stands for "
+            "whichever is best; name the tracker."
+        )
+
+
+def choose_tracker(
+    config: PipelineConfig, frames: int | None, live: bool, first: Frame, prompt: Prompt | None
+) -> tuple[PipelineConfig, str]:
+    """The configuration with a tracker in place of ``auto``, and why it is that one; nothing is fetched.
+
+    Args:
+        config: The pipeline; with another tracker than ``auto`` it is given back with an empty text.
+        frames: How many there are, where that is known.
+        live: Whether they do not wait.
+        first: The first frame, on which trackers with networks are timed.
+        prompt: The object in it; None where nobody has said where it is.
+    """
+    if config.tracker.name != AUTO:
+        return config, ""
+    height, width = first.size
+    prompt = prompt or Prompt((0.0, 0.0, float(width), float(height)))
+    budget = LIVE if live else UNHURRIED if not frames else AFFORDABLE / frames
+    passed: list[str] = []
+    for candidate in _is_usable():
+        seconds = _time_per_frame(candidate, first, prompt) if candidate.networks else candidate.seconds
+        if seconds is not None and (seconds <= budget or not candidate.networks):
+            choice = PluginChoice(name=candidate.name, **candidate.options)
+            why = f"{candidate.what}: mean IoU {candidate.iou:.2f} where it was measured, {seconds:.2f} s a frame"
+            why += " here" if candidate.networks else ""
+            if passed:
+                why += f"; within {budget:.2g} s a frame, which rules out {passed[0]}"
+            elif not candidate.networks:
+                why += "; no network of a better one is in your cache (`tracking3d models list`)"
+            return config.model_copy(update={"tracker": choice}), f"{choice.name} ({why})"
+        passed.append(candidate.what)
+    raise AssertionError("the last candidate needs nothing and is always taken")
+
+
+def _is_usable() -> Iterator[TrackerCandidate]:
+    """The candidates whose networks are in the cache, whole; ``csrt`` where this OpenCV has its correlation filter."""
+    from tracking3d.trackers.csrt import CsrtTracker
+
+    known = known_networks()
+    whole: dict[str, bool] = {}
+    for candidate in CANDIDATES:
+        if candidate.name == "csrt" and CsrtTracker.why_unavailable():
+            continue
+        for name in candidate.networks:
+            if name not in whole:
+                whole[name] = state_of(known[name]) in (State.OK, State.UNCHECKED)
+        if all(whole[name] for name in candidate.networks):
+            yield candidate
+
+
+def _time_per_frame(candidate: TrackerCandidate, first: Frame, prompt: Prompt) -> float | None:
+    """Seconds that a frame takes here; None where the tracker cannot be used.
+
+    The same frame is shown twice. Where a network sees every k-th frame only, it is the share of one in k.
+    """
+    every = candidate.options.get("every", 1)
+    choice = PluginChoice(name=candidate.name, **{**candidate.options, "every": 1})
+    try:
+        import torch
+
+        from tracking3d.runtime.isolation import preserve_process
+
+        with preserve_process(torch.device("cpu")):
+            tracker = build_plugin(TRACKERS, choice)
+            tracker.init(first, prompt)
+            started = time.perf_counter()
+            tracker.step(first)
+            spent = time.perf_counter() - started
+    except (Tracking3dError, RuntimeError, ValueError):
+        return None
+    return spent / every + (_CARRIED if every > 1 else 0.0)

@@ -1,0 +1,325 @@
+"""Surface and poses put right by landmarks: points that the images follow consistently over many views.
+
+Points are followed from several views through all others, bundled with the poses, and the surface is moved under
+those that are consistent. With better surface and poses the images are warped better into one another, so that
+points are followed better: it is done several times.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from tracking3d.bundle_adjustment.reversal import Reversal
+from tracking3d.points.outline_fit import fit_to_outlines, outline_of
+from tracking3d.points.ray_intersection import surface_under
+from tracking3d.points.robust_bundle import bundle, other_way_round
+from tracking3d.points.surface import move_surface
+from tracking3d.points.track_chaining import follow_chain
+from tracking3d.points.view import Array, SurfaceView, redraw_surface
+from tracking3d.points.warping import Warps
+
+ROUNDS = 6
+START_VIEWS = 8
+MOST_SEEDS = 120
+"""Landmarks that begin in one view."""
+TOLERANCE = 0.03
+"""How far behind a drawn surface a point may lie and be seen, in radii of the object."""
+DEVIATION = 0.1
+"""Pixels that a measurement is off at best."""
+_BETWEEN = 7.0  # pixels between seeds
+_LEAST_VIEWS = 6  # of a landmark that moves the surface
+_LEAST_SUPPORT = 60  # points in half of the views; with fewer, poses were wrong more often than put right
+_SETTLED = np.deg2rad(0.01)
+"""Turn of a round that ends them. Of an object with faint texture a round leaves .8 to .9 of an error, so that five to
+ten times as much is still to come."""
+_HELD = 0.1  # deviation of landmarks from the surface, in radii
+
+_Corners = tuple[NDArray[np.int64], Array, Array]
+
+
+@dataclass(frozen=True)
+class Support:
+    """What landmarks say of a view's pose.
+
+    Attributes:
+        followed: How many of them were found in the view.
+        agreeing: How many of those where surface and pose put them; 0 where they were too few to be asked.
+        telling: Whether they are points of the object's texture; on a plain one they are shades and edges, which slide
+            over it as it turns, and agree with wrong poses.
+    """
+
+    followed: int
+    agreeing: int
+    telling: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkScene:
+    """A rigid surface in T views.
+
+    Attributes:
+        views: None where the object was not found.
+        vertices: ``(V, 3)`` in object coordinates.
+        faces: ``(F, 3)``.
+        focal_factor: By which the views' focal lengths are those that they were opened with.
+        support: What landmarks say of each view's pose; empty before they were looked for.
+        may_reverse: Whether depth may be the other way round than the run has it; no longer once that is clear.
+        reversal: What was done to surface and poses, where landmarks said that it was.
+    """
+
+    views: list[SurfaceView | None]
+    vertices: Array
+    faces: NDArray[np.int64]
+    focal_factor: float = 1.0
+    support: Mapping[int, Support] = field(default_factory=dict)
+    may_reverse: bool = False
+    reversal: Reversal | None = None
+
+    @property
+    def radius(self) -> float:
+        """Half the diagonal of the object's box."""
+        return float(np.linalg.norm(np.ptp(self.vertices, axis=0))) / 2
+
+    def warps(self) -> Warps:
+        """The views for carrying points between them."""
+        return Warps(self.views, TOLERANCE * self.radius)
+
+    def redrawn(
+        self, vertices: Array, poses: Mapping[int, Array], focal_factor: float = 1.0
+    ) -> LandmarkScene:
+        """The same views with another surface in other poses, by index of the view, through another lens."""
+        lens = np.array([focal_factor, focal_factor, 1.0, 1.0])
+        views = [
+            None
+            if view is None
+            else redraw_surface(
+                replace(view, intrinsics=view.intrinsics * lens), vertices, self.faces, poses[index]
+            )
+            for index, view in enumerate(self.views)
+        ]
+        return replace(
+            self, views=views, vertices=vertices, focal_factor=self.focal_factor * focal_factor, support={}
+        )
+
+
+def refine_scene(
+    scene: LandmarkScene,
+    rounds: int = ROUNDS,
+    after_round: Callable[[int], None] = lambda done: None,
+    free_focal: bool = False,
+) -> LandmarkScene:
+    """Put surface and poses right, as far as the images say how, until the poses hardly turn any more.
+
+    Where the images say little, as of a plain object, or where poses are so wrong that views do not show each other's
+    points, everything stays as it is.
+
+    Args:
+        scene: As a run left it.
+        rounds: How many times at most.
+        after_round: Is told how many are done.
+        free_focal: Whether the lens is to be put right too, since nobody knows it.
+    """
+    done, last = 0, rounds
+    while done < last:
+        done += 1
+        before, scene = scene, _refine_once(scene, free_focal)
+        after_round(done)
+        if scene.reversal is not before.reversal:
+            last = done + rounds  # all of it is new
+        elif _rotation_between(before, scene) < _SETTLED:
+            break
+    return scene
+
+
+def fit_outlines(scene: LandmarkScene) -> LandmarkScene:
+    """The scene with a surface whose silhouettes lie on the masks: landmarks leave the rim where they found it.
+
+    Outlines have no say while `refine_scene` goes on: where the texture is faint, they would hold the surface where
+    poses that are wrong want it.
+
+    Args:
+        scene: As `refine_scene` left it; as it is where the images said little.
+    """
+    if not any(support.agreeing for support in scene.support.values()):
+        return scene
+    return _fit_surface(_refine_once(replace(_fit_surface(scene), may_reverse=False), free_focal=False))
+
+
+def _fit_surface(scene: LandmarkScene) -> LandmarkScene:
+    views = {index: view for index, view in enumerate(scene.views) if view is not None}
+    vertices = fit_to_outlines(scene.vertices, scene.faces, [outline_of(view) for view in views.values()])
+    redrawn = scene.redrawn(vertices, {index: view.T_cam_obj for index, view in views.items()})
+    return replace(redrawn, support=scene.support)
+
+
+def _rotation_between(before: LandmarkScene, after: LandmarkScene) -> float:
+    """Median angle in radians by which the poses turned, that of the object frame itself left out."""
+    pairs = [
+        (a.T_cam_obj, b.T_cam_obj)
+        for a, b in zip(before.views, after.views, strict=True)
+        if a is not None and b is not None
+    ]
+    if not pairs:
+        return 0.0
+    first, second = (np.stack(part)[:, :3, :3] for part in zip(*pairs, strict=True))
+    turned = Rotation.from_matrix(first.transpose(0, 2, 1) @ second)
+    return float(np.median((turned.mean().inv() * turned).magnitude()))
+
+
+def _refine_once(scene: LandmarkScene, free_focal: bool) -> LandmarkScene:
+    there = [index for index, view in enumerate(scene.views) if view is not None]
+    if not there:
+        return scene
+    views = [view for view in scene.views if view is not None]
+    T = np.stack([view.T_cam_obj for view in views])
+    corners = [seeds(view, scene.vertices, scene.faces) for view in views]
+    spread = np.unique(np.linspace(0, len(there) - 1, START_VIEWS).round().astype(int))
+    begun = _begin(scene, there, corners, spread)
+    # Spread evenly, the views may all show one side of an object that goes to and fro or round.
+    unreached = np.flatnonzero(begun.followed < [len(xy) for _, _, xy in corners])
+    if len(unreached):
+        further = unreached[_unlike(T[unreached, :3, :3], START_VIEWS)]
+        begun = begun.and_of(_begin(scene, there, corners, further))
+    if not len(begun.face):
+        return scene
+    face, barycentric, followed = begun.face, begun.barycentric, begun.followed.tolist()
+    points = np.einsum("nk,nkd->nd", barycentric, scene.vertices[scene.faces[face]])
+    if np.median(followed) < _LEAST_SUPPORT:
+        return replace(
+            scene, support={at: Support(count, 0) for at, count in zip(there, followed, strict=True)}
+        )
+    solved = partial(
+        bundle,
+        intrinsics=np.stack([view.intrinsics for view in views]),
+        measured=begun.measured,
+        deviation=np.sqrt(begun.variance + DEVIATION**2),
+        held=_HELD * scene.radius,
+    )
+    found, vertices = solved(points, T_cam_obj=T), scene.vertices
+    other = other_way_round(points, T, solved, found) if scene.may_reverse else None
+    if other is not None and other.is_better:
+        found = other.found
+        vertices = other.reversal.surface(vertices, points, found.points)
+        scene = replace(scene, reversal=other.reversal, may_reverse=False)
+    elif free_focal:
+        found = solved(points, T_cam_obj=T, begun=found)
+    if other is not None and other.is_hopeless:
+        scene = replace(scene, may_reverse=False)
+    kept = (found.weight > 0).sum(0) >= min(_LEAST_VIEWS, len(there))
+    vertices = move_surface(vertices, scene.faces, face[kept], barycentric[kept], found.points[kept])
+    counts = zip(there, followed, found.agreeing.sum(1).tolist(), strict=True)
+    support = {at: Support(count, agreeing) for at, count, agreeing in counts}
+    redrawn = scene.redrawn(vertices, dict(zip(there, found.T_cam_obj, strict=True)), found.focal_factor)
+    return replace(redrawn, support=support)
+
+
+@dataclass(frozen=True, eq=False)
+class _Begun:
+    """N landmarks that began in some of T views, and where the images say that they are in each.
+
+    Attributes:
+        face: ``(N,)`` on which each lies.
+        barycentric: ``(N, 3)`` where on it.
+        measured: ``(T, N, 2)`` pixels, see `Chain`.
+        variance: ``(T, N)`` squared pixels.
+    """
+
+    face: NDArray[np.int64]
+    barycentric: Array
+    measured: Array
+    variance: Array
+
+    @property
+    def followed(self) -> NDArray[np.int64]:
+        """``(T,)`` how many were found in each view."""
+        return np.isfinite(self.variance).sum(1)
+
+    def and_of(self, other: _Begun) -> _Begun:
+        """These and others."""
+        return _Begun(
+            np.concatenate([self.face, other.face]),
+            np.concatenate([self.barycentric, other.barycentric]),
+            np.concatenate([self.measured, other.measured], axis=1),
+            np.concatenate([self.variance, other.variance], axis=1),
+        )
+
+
+def _begin(
+    scene: LandmarkScene, there: Sequence[int], corners: Sequence[_Corners], starts: NDArray[np.integer]
+) -> _Begun:
+    """Landmarks that begin in some views, followed through all.
+
+    Args:
+        scene: Surface and views.
+        there: Places in the scene of the views that there are.
+        corners: What `seeds` says of each.
+        starts: Which of them landmarks begin in.
+    """
+    face, barycentric, xy = (
+        np.concatenate(part) for part in zip(*(corners[at] for at in starts), strict=True)
+    )
+    start = np.repeat(np.array(there)[starts], [len(corners[at][2]) for at in starts])
+    chain = follow_chain(scene.warps(), start, xy)
+    begins = np.repeat(starts, [len(corners[at][2]) for at in starts])
+    T = np.stack([view.T_cam_obj for view in scene.views if view is not None])
+    one_side = of_one_side(T, scene.vertices, scene.faces[face], begins)
+    variance = np.where(one_side, chain.variance[there], np.inf)
+    return _Begun(face, barycentric, chain.measured[there], variance)
+
+
+def of_one_side(
+    T_cam_obj: Array, vertices: Array, triangles: NDArray[np.int64], begins: NDArray[np.integer]
+) -> NDArray[np.bool_]:
+    """Which views look at a landmark's face from the side from which it was first seen.
+
+    The two sides of a card lie closer together than surface and poses are known, so that depth alone does not tell
+    that the one hides the other. Landmarks that are followed round the edge by mistake would turn one side against the
+    other, further with every round.
+
+    Args:
+        T_cam_obj: ``(T, 4, 4)``.
+        vertices: ``(V, 3)``.
+        triangles: ``(N, 3)`` vertices of the face that each landmark lies on.
+        begins: ``(N,)`` the view in which it was first seen.
+
+    Returns:
+        ``(T, N)`` bool.
+    """
+    corner, right, left = vertices[triangles].transpose(1, 0, 2)
+    normal = np.cross(right - corner, left - corner)
+    eye = -np.einsum("tji,tj->ti", T_cam_obj[:, :3, :3], T_cam_obj[:, :3, 3])
+    facing = eye @ normal.T - (corner * normal).sum(1)
+    seen: NDArray[np.bool_] = facing * facing[begins, np.arange(len(begins))] > 0
+    return seen
+
+
+def _unlike(R_cam_obj: Array, count: int) -> NDArray[np.int64]:
+    """Indices of views ``(N, 3, 3)`` that are turned as far from one another as can be, ascending."""
+    chosen, nearest = [0], np.full(len(R_cam_obj), np.inf)
+    while len(chosen) < min(count, len(R_cam_obj)):
+        trace = np.einsum("nij,ij->n", R_cam_obj, R_cam_obj[chosen[-1]])
+        nearest = np.minimum(nearest, np.arccos(np.clip((trace - 1) / 2, -1, 1)))
+        nearest[chosen] = -1
+        chosen.append(int(nearest.argmax()))
+    return np.sort(np.array(chosen))
+
+
+def seeds(view: SurfaceView, vertices: Array, faces: NDArray[np.int64]) -> _Corners:
+    """Where landmarks begin in a view of a surface: face ``(N,)``, weights of its corners ``(N, 3)``, and pixel
+    ``(N, 2)`` of each.
+    """
+    inside = cv2.erode(((view.beyond == 0) & (view.mask > 0.5)).astype(np.uint8), np.ones((5, 5), np.uint8))
+    corners = cv2.goodFeaturesToTrack(
+        view.image.clip(0, 255).astype(np.uint8), MOST_SEEDS, 0.005, _BETWEEN, mask=inside
+    )
+    xy = np.zeros((0, 2)) if corners is None else corners[:, 0].astype(np.float64)
+    face, barycentric = surface_under(*view.project(vertices), faces, xy)
+    on = face >= 0
+    return face[on], barycentric[on], xy[on]

@@ -1,0 +1,184 @@
+"""Corrections: prompts in later frames, from which the mask tracker restarts."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.config.explain import a_kind, format_value
+from tracking3d.errors import InputError, argument
+from tracking3d.frames import Box, Frame, Prompt, pixels
+from tracking3d.prompts.points import check_points_inside, looks_like_points, parse_points, validate_points
+from tracking3d.prompts.prompt import make_prompt, parse_box, read_mask_file, validate_box, validate_mask
+from tracking3d.trackers.crops import clip_box
+
+CORRECT = argument("corrections=", "--correct ")
+"""Their name in messages, before their values."""
+_FORM = (
+    "FRAME:X,Y,W,H, FRAME:MASK.png or 'FRAME:X,Y+ X,Y-'; with several objects FRAME@OBJECT, counted from 0"
+)
+_HEAD = re.compile(r"(\d{1,12})(?:@(\d{1,6}))?:(.+)", re.DOTALL)
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """A prompt in one later frame; exactly one of box, mask and points is given.
+
+    Attributes:
+        frame: Index of the frame.
+        box: ``(x, y, width, height)`` in pixels.
+        mask: ``(H, W)``, or its image file.
+        points: ``(N, 3)``: x, y in pixels, and 1 on the object or 0 on the background.
+        object: Index of the object, counted from 0, if there are several.
+    """
+
+    frame: int
+    box: Box | None = None
+    mask: NDArray[np.bool_] | Path | None = None
+    points: Any = None
+    object: int = 0
+
+    @property
+    def name(self) -> str:
+        """Its name in messages, before its value."""
+        return f"{CORRECT}{self.frame}:"
+
+    def prompt(self, frame: Frame) -> Prompt:
+        """The prompt for its frame.
+
+        Raises:
+            InputError: It cannot be used there.
+        """
+        names = {"box_name": self.name, "mask_name": self.name, "points_name": self.name}
+        return make_prompt(frame, self.box, self.mask, points=self.points, **names)
+
+    def check_fits(self, size: tuple[int, int]) -> None:
+        """Make sure that it fits a frame of ``size`` ``(height, width)``.
+
+        Raises:
+            InputError: It does not.
+        """
+        label = f"frame {self.frame}"
+        if self.box is not None and clip_box(self.box, size) is None:
+            raise InputError(
+                f"{self.name}{format_value(self.box)} lies outside {label}, which is {pixels(size)} pixels."
+            )
+        if isinstance(self.mask, np.ndarray) and self.mask.shape != size:
+            raise InputError(
+                f"{self.name} the mask is {pixels(self.mask.shape)} pixels, but {label} is {pixels(size)}; the sizes "
+                "must be equal."
+            )
+        if self.points is not None:
+            check_points_inside(self.points, size, label, self.name)
+
+
+def prompts_in(frame: Frame, corrections: Mapping[int, Correction]) -> list[Prompt]:
+    """The prompts that `tracking3d.Session.step` takes with a frame: its correction, if there is one."""
+    correction = corrections.get(frame.index)
+    return [] if correction is None else [correction.prompt(frame)]
+
+
+def parse_correction(text: str) -> Correction:
+    """Read ``FRAME:X,Y,W,H``, ``FRAME:MASK.png`` or ``FRAME:X,Y+ X,Y-``, with or without ``@OBJECT`` after FRAME.
+
+    Raises:
+        InputError: The text is none of them.
+    """
+    head = _HEAD.fullmatch(text.strip())
+    if head is None:
+        raise InputError(f"{CORRECT}'{text}' is not of the form {_FORM}.")
+    frame, number, what = int(head[1]), int(head[2] or 0), head[3].strip()
+    name = f"{CORRECT}{frame}:"
+    if looks_like_points(what):
+        return Correction(frame, points=parse_points(what, name), object=number)
+    if re.fullmatch(r"[-+.\deE,\s]+", what):
+        return Correction(frame, box=parse_box(what, name), object=number)
+    return Correction(frame, mask=Path(what), object=number)
+
+
+def validate_corrections(corrections: Any, objects: int = 1) -> list[dict[int, Correction]]:
+    """Check corrections, and sort them by object and frame; mask files are read.
+
+    Args:
+        corrections: Any number of them.
+        objects: Number of objects.
+
+    Raises:
+        InputError: One is not a correction, two are for the same frame, or one is for an object that does not exist.
+    """
+    if not isinstance(corrections, Iterable) or isinstance(corrections, str | bytes | Mapping):
+        raise InputError(
+            f"{CORRECT}{format_value(corrections)} is {a_kind(corrections)}; give a list of Correction."
+        )
+    by_object: list[dict[int, Correction]] = [{} for _ in range(objects)]
+    for one in corrections:
+        correction = _validate_correction(one)
+        if correction.object >= objects:
+            count = "is 1 object" if objects == 1 else f"are {objects} objects"
+            raise InputError(
+                f"{correction.name} is for object {correction.object}, but there {count}, counted from 0."
+            )
+        theirs = by_object[correction.object]
+        if correction.frame in theirs:
+            raise InputError(
+                f"{correction.name} frame {correction.frame} is corrected twice; give one correction per frame."
+            )
+        theirs[correction.frame] = correction
+    return by_object
+
+
+def check_corrections_fit(
+    corrections: Iterable[Correction], first: Frame, tracker: str, selection: Sequence[int] | None = None
+) -> None:
+    """Check corrections against the first frame, so that a bad one does not stop a long run later.
+
+    Args:
+        corrections: Those of one object.
+        first: The frame of the prompt.
+        tracker: Name of the mask tracker.
+        selection: Indices of the tracked frames, if they are known.
+
+    Raises:
+        InputError: One cannot be used.
+    """
+    for one in corrections:
+        if tracker == "precomputed":
+            raise InputError(
+                f"{one.name} the tracker 'precomputed' cannot be corrected; replace the mask file of that frame."
+            )
+        if one.frame == first.index:
+            raise InputError(
+                f"{one.name} frame {one.frame} is the frame of the prompt; change the prompt instead."
+            )
+        if selection is not None and one.frame not in selection:
+            raise InputError(f"{one.name} frame {one.frame} is not among the tracked frames.")
+        one.check_fits(first.size)
+
+
+def _validate_correction(correction: Any) -> Correction:
+    if not isinstance(correction, Correction):
+        raise InputError(
+            f"{CORRECT}{format_value(correction)} is {a_kind(correction)}; give a list of Correction."
+        )
+    for value in (correction.frame, correction.object):
+        if not isinstance(value, int) or isinstance(value, bool) or value < 0:
+            raise InputError(
+                f"{CORRECT}{format_value(value)} is not an index; frames and objects are counted from 0."
+            )
+    given = (correction.box, correction.mask, correction.points)
+    if sum(one is not None for one in given) != 1:
+        raise InputError(f"{correction.name} give either a box, a mask or points.")
+    if correction.box is not None:
+        return replace(correction, box=validate_box(correction.box, correction.name))
+    if correction.points is not None:
+        return replace(correction, points=validate_points(correction.points, correction.name))
+    if isinstance(correction.mask, Path):
+        mask = read_mask_file(correction.mask, f"{correction.name}{correction.mask}")
+        return replace(correction, mask=validate_mask(mask, correction.name))
+    return replace(correction, mask=validate_mask(correction.mask, correction.name))

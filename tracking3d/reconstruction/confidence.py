@@ -1,0 +1,85 @@
+"""How far a refined answer is believed, once landmarks were looked for.
+
+What is rendered at a pose can look right though the pose is wrong, because shape and texture were made with such poses.
+Landmarks are independent of that: in wrong poses fewer of those that are found agree.
+"""
+
+from __future__ import annotations
+
+import math
+
+from tracking3d.estimation.assessment import Assessment
+from tracking3d.estimation.estimate import Status
+from tracking3d.points.landmark_adjustment import Support
+from tracking3d.results.records import FrameRecord
+
+BELIEVED = 0.5
+"""Confidence from which on a frame is tracked."""
+_EVEN, _NEARLY_ALL = 0.5, 0.95
+"""Shares of the followed landmarks that agree, between which belief grows: where poses are wrong, what is followed is
+often something else, such as the background, and much of it fits no pose."""
+_INTERCEPT = -0.8803
+_TERMS = {  # weight, and the range that was seen
+    "rendering": (1.012, -3.861, 2.624),
+    "share": (0.8517, 0.0, math.log(_NEARLY_ALL / (1 - _NEARLY_ALL))),
+}
+
+
+def assess_estimate(estimate: FrameRecord, support: Support) -> tuple[Assessment, dict[str, float]]:
+    """The judgement of a refined answer, and what it comes from, as the answer's ``losses`` keep it."""
+    assessment = judge_with_landmarks(
+        Assessment(estimate.status, estimate.reason, estimate.confidence), support
+    )
+    return assessment, {
+        "rendering": estimate.confidence,
+        "landmarks": float(support.agreeing),
+        "followed": float(support.followed),
+        "telling": float(support.telling),
+    }
+
+
+def judge_with_landmarks(rendering: Assessment, support: Support) -> Assessment:
+    """The judgement of a frame by what is rendered and by landmarks; what is lost stays lost.
+
+    A logistic regression of whether the answer is right, that is, within 10 degrees and above an IoU of 0.7. Fitted by
+    ``training/confidence.py --refined`` on the suites ``fresh`` of seeds 605, 606, 607, 609 and 610, with true masks
+    and those of `csrt` and `flow`; docs/benchmark.md has what it is worth on another. How many landmarks agree, and
+    whether the object is plain, adds nothing to the share that does.
+
+    Args:
+        rendering: The judgement by what is rendered, and by points that were followed from frame to frame.
+        support: What landmarks say.
+    """
+    if rendering.status is Status.LOST:
+        return rendering
+    evidence = refined_confidence_features(rendering.confidence, support)
+    odds = sum(weight * min(max(evidence[name], low), high) for name, (weight, low, high) in _TERMS.items())
+    confidence = 1 / (1 + math.exp(-_INTERCEPT - odds))
+    if confidence >= BELIEVED:
+        return Assessment(Status.TRACKED, "", confidence)
+    reason = rendering.reason
+    if rendering.status is Status.TRACKED or not reason:
+        reason = (
+            f"few landmarks speak for the pose ({support.agreeing} agree of {support.followed} in the image)"
+            if support.telling
+            else "the object is plain: hardly anything tells how it is turned"
+        )
+    return Assessment(Status.UNCERTAIN, reason, confidence)
+
+
+def refined_confidence_features(rendering: float, support: Support) -> dict[str, float]:
+    """The evidence that a confidence is made of, by name.
+
+    Args:
+        rendering: The confidence by what is rendered.
+        support: What landmarks say.
+    """
+    share = (1 + support.agreeing) / (2 + support.followed)
+    return {
+        "rendering": _log_odds(min(max(rendering, 0.02), 0.98)),
+        "share": _log_odds(min(max(share, _EVEN), _NEARLY_ALL)),
+    }
+
+
+def _log_odds(probability: float) -> float:
+    return math.log(probability / (1 - probability))

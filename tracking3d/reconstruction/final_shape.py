@@ -1,0 +1,42 @@
+"""The shape of a run's mesh, made anew where its configuration asks for it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tracking3d.config.models import PipelineConfig
+from tracking3d.errors import InputError
+from tracking3d.reconstruction.rebuild import rebuild_shape
+from tracking3d.results.run_notes import note_in_run
+from tracking3d.video.source import FrameSource
+
+
+def make_final_shape(folder: Path, config: PipelineConfig, source: FrameSource) -> str:
+    """Make the shape of a finished run anew, if ``object.shape`` is ``fine``; where that cannot be, the mesh stays.
+
+    What came of it stands in ``run.json`` under ``shape`` too.
+
+    Args:
+        folder: The run folder.
+        config: Of the run.
+        source: Its video.
+
+    Returns:
+        What came of it, in a sentence; empty where nothing was asked.
+
+    Raises:
+        OutputError: If something cannot be written.
+    """
+    if config.object.shape != "fine":
+        return ""
+    if source.repeatable:
+        try:
+            sentence = rebuild_shape(folder, source).sentence
+        except InputError as error:
+            sentence = str(error)
+    else:
+        sentence = (
+            f"The shape stays, for {source.name} comes once only and all frames are needed a second time."
+        )
+    note_in_run(folder, {"shape": sentence})
+    return sentence

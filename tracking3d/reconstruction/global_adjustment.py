@@ -1,0 +1,169 @@
+"""Poses, lens and surface put right by points, once all frames of a video have been looked at again.
+
+The final refinement gives a pose to every frame by what is rendered there, through a surface that is a few percent off.
+Points that the images follow over many views have no such bias (`tracking3d.points`). Some of the frames, spread over
+the video, are bundled; every other one is resected from its neighbours among them, so that memory is bounded.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from tracking3d.estimation.estimate import GUESSED, ObjectModel, Status
+from tracking3d.estimation.online.features.klt import grey
+from tracking3d.estimation.online.features.texture_strength import PLAIN, texture_strength
+from tracking3d.frames import Image
+from tracking3d.geometry.camera import Camera
+from tracking3d.points.landmark_adjustment import LandmarkScene, Support, fit_outlines, refine_scene
+from tracking3d.points.resection import resect
+from tracking3d.points.view import SurfaceView, open_view
+from tracking3d.reconstruction.views import TextureView
+from tracking3d.results.records import FrameRecord
+
+ROUNDS = (4, 12)
+"""Least and most of them. Each brings what is left of an error down by some tenths, not to nothing."""
+_DRAWN = 480
+"""Views that all rounds draw together, where that allows for more than the least of them."""
+LONGEST_SIDE = 240
+"""Pixels of the windows in which points are followed."""
+_LEAST_VIEWS = 4
+_Pose = NDArray[np.float64]
+
+
+class GlobalAdjustment:
+    """The frames of the final refinement as they come by, and what they say together.
+
+    Args:
+        model: The final object; its surface is what points are on.
+        camera: Of the full frame.
+        answered: Indices of the frames that will come, ascending.
+        most: How many of them are kept.
+
+    Attributes:
+        camera: The same, through another lens where nobody gave it and `settle` found it.
+        vertices: ``(V, 3)`` of the object; others after `settle`.
+        vertices_of_landmarks: The same as landmarks alone have it, which know nothing of what masks are wrong by.
+        faces: ``(F, 3)``.
+    """
+
+    def __init__(self, model: ObjectModel, camera: Camera, answered: Sequence[int], most: int) -> None:
+        self.camera, self.vertices = camera, np.asarray(model.vertices, np.float64)
+        self.vertices_of_landmarks = self.vertices
+        self._lens, self.faces = camera.fx, np.asarray(model.faces, np.int64)
+        count = min(most, len(answered))
+        at = np.linspace(0, len(answered) - 1, count).round().astype(int) if count else ()
+        self._wanted = {answered[index] for index in at}
+        self._views: dict[int, SurfaceView] = {}
+        self._strengths: list[float] = []
+        self._scene: LandmarkScene | None = None
+        self._bundled: list[int] = []
+        self._before: dict[int, _Pose] = {}
+
+    def wants(self, index: int) -> bool:
+        """Whether a frame is one of those that `see` may keep."""
+        return index in self._wanted
+
+    def see(self, record: FrameRecord, image: Image, mask: NDArray[np.bool_]) -> None:
+        """Keep a frame, if it is one of those to be bundled and its object was found."""
+        if self.wants(record.index) and record.status is not Status.LOST:
+            view = self._view(record.T_cam_obj, image, mask)
+            if view is not None:
+                self._views[record.index] = view
+                self._strengths.append(texture_strength(grey(image), mask))
+
+    def settle(self) -> None:
+        """Put poses, lens and surface right, as far as the frames say how."""
+        if len(self._views) < _LEAST_VIEWS:
+            return
+        self._bundled = sorted(self._views)
+        views: list[SurfaceView | None] = [self._views[index] for index in self._bundled]
+        self._before = {index: self._views[index].T_cam_obj for index in self._bundled}
+        self._views = {}
+        scene = refine_scene(
+            LandmarkScene(views, self.vertices, self.faces, may_reverse=True),
+            int(np.clip(_DRAWN // len(views), *ROUNDS)),
+            free_focal=self.camera.assumed,
+        )
+        self.vertices_of_landmarks = scene.vertices
+        self._scene = fit_outlines(scene)
+        self.vertices = self._scene.vertices
+        if scene.focal_factor != 1:
+            self.camera = self.camera.with_solved_focal(scene.focal_factor)
+
+    def pose(
+        self, record: FrameRecord, image: Image, mask: NDArray[np.bool_]
+    ) -> tuple[_Pose, Support | None]:
+        """The pose ``(4, 4)`` of any frame after `settle`, and what landmarks say of it; None where nothing does.
+
+        Args:
+            record: Its answer.
+            image: ``(H, W, 3)`` RGB.
+            mask: ``(H, W)`` the answer's.
+        """
+        scene = self._scene
+        if scene is None or not np.isfinite(record.T_cam_obj).all():
+            return record.T_cam_obj, None
+        after = bisect(self._bundled, record.index)
+        around = [at for at in (after - 1, after) if 0 <= at < len(self._bundled)]
+        lost = record.status is Status.LOST
+        if lost and GUESSED not in record.losses and len(around) == 2:
+            return self._between(record.index, *around), None
+        nearest = min(around, key=lambda at: abs(self._bundled[at] - record.index))
+        kept = scene.views[nearest]
+        assert kept is not None
+        if self._bundled[nearest] == record.index:
+            return kept.T_cam_obj, self._told(scene.support.get(nearest))
+        # What the nearest frame's pose was moved by in object coordinates: mostly, the object frame itself moved.
+        T_before_now = np.linalg.inv(self._as_settled(self._before[self._bundled[nearest]])) @ kept.T_cam_obj
+        predicted = self._as_settled(record.T_cam_obj) @ T_before_now
+        view = None if lost else self._view(predicted, image, mask)
+        if view is None:
+            return predicted, None
+        resected, share = resect(scene, view, around)
+        there = [scene.support[at] for at in around if at in scene.support]
+        followed = max((one.followed for one in there), default=0)
+        return resected.T_cam_obj, self._told(Support(followed, round(share * followed)))
+
+    def moved(self, model: ObjectModel) -> ObjectModel:
+        """The model with the surface that was found."""
+        return replace(model, vertices=self.vertices)
+
+    def seen_by(self, view: TextureView, record: FrameRecord) -> TextureView:
+        """What the texture is taken from, with the pose that its frame has in the end."""
+        factor = self.camera.fx / self._lens
+        return replace(view, K=view.K @ np.diag([factor, factor, 1.0]), T_cam_obj=record.T_cam_obj)
+
+    def _told(self, support: Support | None) -> Support | None:
+        """What landmarks say, with whether they can tell anything on this object."""
+        return support and replace(support, telling=float(np.median(self._strengths)) >= PLAIN)
+
+    def _between(self, index: int, before: int, after: int) -> _Pose:
+        """The pose of a frame in which the object was not found: it goes on steadily from one view to the next."""
+        kept = [self._scene.views[at] for at in (before, after)] if self._scene else []
+        poses = np.stack([view.T_cam_obj for view in kept if view is not None])
+        times = self._bundled[before], self._bundled[after]
+        T = np.eye(4)
+        T[:3, :3] = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(index).as_matrix()
+        share = (index - times[0]) / (times[1] - times[0])
+        T[:3, 3] = (1 - share) * poses[0, :3, 3] + share * poses[1, :3, 3]
+        return T
+
+    def _view(self, T_cam_obj: _Pose, image: Image, mask: NDArray[np.bool_]) -> SurfaceView | None:
+        image, mask = self.camera.undistort(image), self.camera.mask_to_pinhole(mask)
+        return open_view(image, mask, self.camera, T_cam_obj, self.vertices, self.faces, LONGEST_SIDE)
+
+    def _as_settled(self, T_cam_obj: _Pose) -> _Pose:
+        """A pose of before as it is after what was done to all: the way round of depth, and the lens.
+
+        Through another lens the object has the same size.
+        """
+        assert self._scene is not None
+        T = T_cam_obj.copy() if self._scene.reversal is None else self._scene.reversal.poses(T_cam_obj)
+        T[2, 3] *= self._scene.focal_factor
+        return T

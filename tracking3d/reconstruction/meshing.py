@@ -1,0 +1,105 @@
+"""The surface of a signed distance volume as a mesh: closed, in one piece, simple, and with an atlas."""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from tracking3d.reconstruction.grid import FloatArray, Grid
+
+SMALLEST_PIECE = 0.1
+"""Share of the largest piece's volume below which a piece is a crumb."""
+
+
+CELL = 8
+"""Texels along the side of a cell of the `cell_atlas`."""
+
+
+def extract_surface(grid: Grid, inside: FloatArray) -> trimesh.Trimesh | None:
+    """The surface where the volume is zero; None where it is nowhere, or leaves the grid.
+
+    Args:
+        grid: Of the volume.
+        inside: ``(X * Y * Z,)`` signed distance, positive inside.
+    """
+    from skimage.measure import marching_cubes
+
+    volume = np.full(np.add(grid.shape, 2), -abs(float(inside.min())) - grid.spacing, np.float32)
+    volume[1:-1, 1:-1, 1:-1] = inside.reshape(grid.shape)
+    if not (volume > 0).any():
+        return None
+    vertices, faces, _, _ = marching_cubes(volume, 0.0, allow_degenerate=False)
+    mesh = trimesh.Trimesh(grid.origin + grid.spacing * (vertices - 1.0), faces, process=True)
+    return mesh if mesh.volume > 0 else trimesh.Trimesh(mesh.vertices, mesh.faces[:, ::-1], process=False)
+
+
+def main_pieces(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The largest piece, and others that are no crumbs; cavities within it are filled."""
+    pieces = mesh.split(only_watertight=True)
+    solid = [piece for piece in pieces if piece.volume > 0]
+    if not solid:
+        return mesh
+    largest = max(piece.volume for piece in solid)
+    kept = [piece for piece in solid if piece.volume >= SMALLEST_PIECE * largest]
+    whole = trimesh.util.concatenate(kept)
+    assert isinstance(whole, trimesh.Trimesh)
+    return whole
+
+
+def is_sound(mesh: trimesh.Trimesh) -> bool:
+    """Whether a mesh is closed, oriented alike everywhere, with its outside outside."""
+    return bool(mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0)
+
+
+def simplify(mesh: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
+    """With about so many faces at most; with more where fewer would tear it."""
+    while faces < len(mesh.faces):
+        simple = decimate_roughly(mesh, faces)
+        if is_sound(simple):
+            return simple
+        faces *= 2
+    return mesh
+
+
+def decimate_roughly(mesh: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
+    """With about so many faces at most, sound or not."""
+    import fast_simplification
+
+    if faces >= len(mesh.faces):
+        return mesh
+    vertices, triangles = fast_simplification.simplify(
+        np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32), target_count=faces
+    )
+    simple = trimesh.Trimesh(vertices.astype(np.float64), triangles, process=True)
+    simple.update_faces(simple.nondegenerate_faces())
+    return simple
+
+
+def cell_atlas(faces: int) -> tuple[NDArray[np.float64], int]:
+    """Texture coordinates ``(F, 3, 2)`` with a cell for every two faces, and the texels that they need along a side.
+
+    Quickly made, for colours that are compared and not looked at.
+    """
+    across = max(int(np.ceil(np.sqrt((faces + 1) // 2))), 1)
+    number = np.arange(faces)
+    cell = np.stack([number // 2 % across, number // 2 // across], 1)[:, None]
+    low, high = 0.75 / CELL, 1 - 0.75 / CELL
+    first = np.array([[low, low], [low, high - 1 / CELL], [high - 1 / CELL, low]])
+    corners = np.where((number % 2 == 0)[:, None, None], first, 1 - first)
+    return (cell + corners) / across, across * CELL
+
+
+def unwrap(vertices: NDArray[np.float64], faces: NDArray[np.int64], size: int = 1024) -> NDArray[np.float64]:
+    """``(F, 3, 2)`` texture coordinates of the face corners, v downwards, in charts apart from each other."""
+    import xatlas
+
+    atlas = xatlas.Atlas()
+    atlas.add_mesh(vertices.astype(np.float32), faces.astype(np.uint32))
+    pack = xatlas.PackOptions()
+    pack.padding, pack.resolution, pack.bilinear = 2, size, True
+    atlas.generate(pack_options=pack)
+    vertex, corner, uv = atlas[0]
+    if not np.array_equal(vertex[corner], faces):
+        raise ValueError("the atlas has other faces than the mesh")
+    return np.asarray(uv, np.float64)[corner]

@@ -1,0 +1,126 @@
+"""Poses fitted once more, to the surface at hand at the views' resolution.
+
+Each view is compared with what all of them together show of the surface: a few Levenberg-Marquardt steps on colours
+within the mask and on the outline.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial.transform import Rotation
+
+from tracking3d.reconstruction.meshing import cell_atlas
+from tracking3d.reconstruction.shape_views import ShapeView
+from tracking3d.rendering import (
+    BackProjection,
+    PoseTarget,
+    Scales,
+    Surface,
+    TexelMap,
+    back_project,
+    pose_terms,
+)
+
+COLOUR, OUTLINE = 0.1, 2.0
+"""Difference of colours in [0, 1], and pixels, from which on a disagreement counts less."""
+OUTLINE_WEIGHT = 0.3
+_STEPS = 6
+_ENOUGH = 1e-4
+_FARTHEST = 5.0  # degrees a pose may turn; a view that wants more is not to be believed
+
+
+def coloured_surface(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], views: Sequence[ShapeView]
+) -> Surface:
+    """The surface with the mean of what the views show of it.
+
+    Args:
+        vertices: ``(V, 3)``.
+        faces: ``(F, 3)``.
+        views: The frames.
+    """
+    face_uvs, size = cell_atlas(len(faces))
+    uvs = torch.from_numpy(face_uvs).float()
+    points, corners = torch.from_numpy(vertices).float(), torch.from_numpy(faces)
+    texels = TexelMap.of(uvs, size)
+    seen = BackProjection(torch.zeros(3, size, size), torch.zeros(size, size))
+    for view in views:
+        R, t, K = _place_surface(view)
+        # A pixel or two within the outline colours are mixed with the background's.
+        valid = torch.from_numpy(np.clip((view.depth_inside - 1) / 2, 0, 1))
+        seen = seen + back_project(_picture(view), valid, points, corners, texels, R, t, K)
+    # Between the cells texels continue the nearest one on a face: samples at a face's edge mix with them.
+    beside = np.ones((size, size), np.bool_)
+    beside.flat[texels.texel.numpy()] = False
+    row, column = distance_transform_edt(beside, return_distances=False, return_indices=True)
+    texture = seen.mean()[:, row, column].contiguous()
+    known = (seen.weight > 0)[row, column][None].float()
+    return Surface(points, corners, uvs, texture, known)
+
+
+def refine_views(surface: Surface, views: Sequence[ShapeView]) -> list[ShapeView]:
+    """The views with poses that fit the surface better.
+
+    Args:
+        surface: From `coloured_surface`.
+        views: The frames.
+    """
+    return [replace(view, T_cam_obj=_fit_pose(surface, view)) for view in views]
+
+
+def _fit_pose(surface: Surface, view: ShapeView) -> NDArray[np.float64]:
+    """``(4, 4)`` the pose that fits best, the one at hand where none fits better or it runs away."""
+    mask = torch.from_numpy(view.mask)
+    target = PoseTarget(
+        torch.from_numpy(view.K).float(),
+        _picture(view),
+        mask.float(),
+        torch.from_numpy(view.in_frame),
+        mask,
+        torch.from_numpy(-view.depth_inside),
+    )
+    first = view.T_cam_obj
+    pose, (cost, matrix, gradient) = first, _cost(surface, target, first)
+    damping = 1e-3
+    for _ in range(_STEPS):
+        diagonal = np.diag(matrix)
+        step = np.linalg.solve(
+            matrix + np.diag(damping * diagonal + 1e-9 * diagonal.max() + 1e-300), -gradient
+        )
+        trial = pose.copy()
+        trial[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ pose[:3, :3]
+        trial[:3, 3] += step[:3]
+        result = _cost(surface, target, trial)
+        if result[0] < cost:
+            gain, damping = cost - result[0], max(damping / 4, 1e-6)
+            pose, (cost, matrix, gradient) = trial, result
+            if gain < _ENOUGH * cost:
+                break
+        else:
+            damping *= 8
+    turned = Rotation.from_matrix(pose[:3, :3] @ first[:3, :3].T).magnitude()
+    return pose if np.degrees(turned) < _FARTHEST else first
+
+
+def _cost(
+    surface: Surface, target: PoseTarget, pose: NDArray[np.float64]
+) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+    R, t = torch.from_numpy(pose[None, :3, :3]).float(), torch.from_numpy(pose[None, :3, 3]).float()
+    terms = pose_terms(surface, target, R, t, None, Scales(COLOUR, OUTLINE, 1.0))
+    model = terms.appearance + terms.outline * OUTLINE_WEIGHT
+    return float(model.cost[0]), model.matrix[0].numpy(), model.gradient[0].numpy()
+
+
+def _place_surface(view: ShapeView) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    T = torch.from_numpy(view.T_cam_obj).float()
+    return T[:3, :3], T[:3, 3], torch.from_numpy(view.K).float()
+
+
+def _picture(view: ShapeView) -> torch.Tensor:
+    return torch.from_numpy(view.image).permute(2, 0, 1).float() / 255

@@ -1,0 +1,201 @@
+"""The texture, and the shape, of a run that exists, from its answers and the video that it was made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+
+from tracking3d.errors import InputError
+from tracking3d.estimation.estimate import ObjectModel
+from tracking3d.frames import Frame
+from tracking3d.reconstruction.held_out_scores import HeldOutScores, held_out_scores
+from tracking3d.reconstruction.held_out_test import MOST_LEFT_OUT, is_held_out
+from tracking3d.reconstruction.reliable_frames import no_reliable_frame_error, reliable_frames
+from tracking3d.reconstruction.shape import MOST, reconstruct_shape
+from tracking3d.reconstruction.shape_views import ShapeView, shape_view, spread_by_rotation
+from tracking3d.reconstruction.texturing import bake_texture
+from tracking3d.reconstruction.uv_atlas import replace_shape
+from tracking3d.reconstruction.views import TextureView, keep_best_views, texture_view
+from tracking3d.results import layout
+from tracking3d.results.mesh_export import export_mesh, load_model
+from tracking3d.results.records import FrameRecord
+from tracking3d.results.run_reader import RunReader
+from tracking3d.video.source import FrameSource
+
+_TEXTURE_VIEWS = 24
+_NEEDED = ("skimage", "xatlas", "fast_simplification")
+
+
+@dataclass(frozen=True, eq=False)
+class ShapedRun:
+    """What came of a reconstruction.
+
+    Attributes:
+        model: The run's mesh as it is now.
+        views: Frames that its texture was taken from.
+        new: Whether it has a new shape.
+        sentence: How much better that is, or why the old one stays.
+    """
+
+    model: ObjectModel
+    views: int
+    new: bool
+    sentence: str
+
+
+def retexture_run(
+    folder: Path, source: str | None = None, most: int = 24, largest: int = 2048
+) -> tuple[ObjectModel, int]:
+    """Write the mesh of the online map of a run anew, with a texture at the resolution of its video.
+
+    Args:
+        folder: The run folder.
+        source: The video; None for the one that the run names.
+        most: Frames that the texture is taken from.
+        largest: Most texels along a side.
+
+    Returns:
+        The model, and how many frames its texture was taken from.
+
+    Raises:
+        InputError: If the run goes on, has no mesh or no frame that is believed, or the video is another one.
+        OutputError: If the mesh cannot be written.
+    """
+    run = RunReader(folder)
+    model = _online_model(run)
+    views: tuple[TextureView, ...] = ()
+    for frame, record in reliable_frames(run, source):
+        mask, camera = run.pinhole_mask(frame.index), run.camera_of(record)
+        view = texture_view(frame.index, frame.image, mask, camera, np.asarray(record.T_cam_obj))
+        views = views if view is None else keep_best_views(views, view, most)
+    if not views:
+        raise no_reliable_frame_error(run)
+    model = bake_texture(model, views, largest)
+    export_mesh(run.mesh_folder, model)
+    return model, len(views)
+
+
+def rebuild_shape(
+    folder: Path, source: str | FrameSource | None = None, most: int = 24, largest: int = 2048
+) -> ShapedRun:
+    """Make the shape of a run's object anew from all its frames, and write the mesh if that explains them better.
+
+    The mesh of the online map is kept in `layout.ONLINE`.
+
+    Args:
+        folder: The run folder.
+        source: The video, or where that is; None for the one that the run names.
+        most: Frames that the texture is taken from.
+        largest: Most texels along a side.
+
+    Raises:
+        InputError: If a package is missing, the run goes on, has no mesh or no frame that is believed, or the video
+            is another one.
+        OutputError: If the mesh cannot be written.
+    """
+    check_packages()
+    run = RunReader(folder)
+    online = _online_model(run)
+    shapes: list[ShapeView] = []
+    left_out: list[ShapeView] = []
+    believed = 0
+    views: tuple[TextureView, ...] = ()
+    for frame, record in reliable_frames(run, source):
+        seen = _views_of_frame(run, frame, record)
+        if seen is None:
+            continue
+        views = keep_best_views(views, seen[1], most)
+        (left_out if is_held_out(believed) else shapes).append(seen[0])
+        believed += 1
+        if len(shapes) > 4 * MOST:  # memory does not grow with the video
+            shapes = spread_by_rotation(shapes, 0.5, 2 * MOST)
+        if len(left_out) > 2 * MOST_LEFT_OUT:
+            left_out = spread_by_rotation(left_out, 0.5, MOST_LEFT_OUT)
+    if not views:
+        raise no_reliable_frame_error(run)
+    judges = spread_by_rotation(left_out, 0.5, MOST_LEFT_OUT)
+    made = reconstruct_shape(online.vertices, online.faces, shapes, judges)
+    if made.vertices is None or made.faces is None:
+        model = bake_texture(online, views, largest)
+        export_mesh(run.mesh_folder, model)
+        return ShapedRun(model, len(views), False, made.sentence)
+    model = bake_texture(replace_shape(online, made.vertices, made.faces, shapes), views, largest)
+    kept = run.mesh_folder / layout.ONLINE
+    if not (kept / layout.FEATURES).is_file():
+        kept.mkdir(exist_ok=True)
+        export_mesh(kept, online)
+    export_mesh(run.mesh_folder, model)
+    return ShapedRun(model, len(views), True, made.sentence)
+
+
+def score_run(folder: Path, source: str | None = None, largest: int = 2048) -> HeldOutScores:
+    """How well the mesh of a run predicts frames that it was not made from.
+
+    The frames that `shape_run` keeps out are; the others give the mesh its texture anew, and the poses alone of those
+    kept out are fitted to it. Nothing is written. Of a mesh of the online map all frames have shaped the surface.
+
+    Args:
+        folder: The run folder.
+        source: The video; None for the one that the run names.
+        largest: Most texels along a side.
+
+    Raises:
+        InputError: If a package is missing, the run goes on, has no mesh, too few frames that are believed, or the
+            video is another one.
+    """
+    check_packages()
+    run = RunReader(folder)
+    model = load_model(run.mesh_folder)
+    used: list[ShapeView] = []
+    left_out: list[tuple[ShapeView, TextureView]] = []
+    views: tuple[TextureView, ...] = ()
+    believed = 0
+    for frame, record in reliable_frames(run, source):
+        if (seen := _views_of_frame(run, frame, record)) is None:
+            continue
+        if is_held_out(believed):
+            left_out.append(seen)
+        else:
+            used.append(seen[0])
+            views = keep_best_views(views, seen[1], _TEXTURE_VIEWS)
+        believed += 1
+        if len(used) > 2 * MOST:
+            used = spread_by_rotation(used, 0.5, MOST)
+        if len(left_out) > MOST_LEFT_OUT:
+            left_out = left_out[::2]
+    if not left_out:
+        raise InputError(
+            f"Only {believed} frames of the run {folder} are believed; none can be left out to judge its model by."
+        )
+    return held_out_scores(bake_texture(model, views, largest), used, left_out)
+
+
+def _views_of_frame(
+    run: RunReader, frame: Frame, record: FrameRecord
+) -> tuple[ShapeView, TextureView] | None:
+    """A frame as shapes and textures are made from it; None where its mask is empty or too small."""
+    given = run.pinhole_mask(frame.index), run.camera_of(record), np.asarray(record.T_cam_obj)
+    shape = shape_view(frame.index, frame.image, *given)
+    view = texture_view(frame.index, frame.image, *given)
+    return None if shape is None or view is None else (shape, view)
+
+
+def check_packages() -> None:
+    """Make sure that what a shape is made with is installed.
+
+    Raises:
+        InputError: If something is missing; says what to install.
+    """
+    if any(find_spec(name) is None for name in _NEEDED):
+        raise InputError(
+            "A shape is made anew with scikit-image, fast-simplification and xatlas: pip install 'tracking3d[model]', "
+            "or leave the mesh as it is."
+        )
+
+
+def _online_model(run: RunReader) -> ObjectModel:
+    kept = run.mesh_folder / layout.ONLINE
+    return load_model(kept if (kept / layout.FEATURES).is_file() else run.mesh_folder)

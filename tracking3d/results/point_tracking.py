@@ -1,0 +1,228 @@
+"""Points of a run followed with the help of its video; see `tracking3d.points`.
+
+Surface and poses that the video has put right are kept in the run folder, so that they are found once.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tracking3d.errors import InputError, OutputError
+from tracking3d.estimation.estimate import Status
+from tracking3d.frames import Frame, Image
+from tracking3d.points.follow import follow_points
+from tracking3d.points.landmark_adjustment import ROUNDS, LandmarkScene, fit_outlines, refine_scene
+from tracking3d.points.pictures import Picture
+from tracking3d.points.ray_intersection import surface_under
+from tracking3d.points.view import SurfaceView, open_view
+from tracking3d.results import layout
+from tracking3d.results.correspondences import (
+    PointTracks,
+    as_points,
+    in_frame,
+    kinds,
+    on_mask,
+    tracked_record,
+)
+from tracking3d.results.files import write_atomic
+from tracking3d.results.image_points import follow_beside_mesh, read_run_images, with_image_points
+from tracking3d.results.records import FrameRecord
+from tracking3d.results.run_reader import RunReader
+from tracking3d.results.run_source import open_run_source
+from tracking3d.video import FrameSource
+
+_DAMAGED = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
+_VERSION = 1  # of what is kept; another one is found anew
+
+
+@dataclass(frozen=True, eq=False)
+class RunScene:
+    """A run with the views of its frames.
+
+    Attributes:
+        run: The run.
+        scene: Its surface in the frames, in their order.
+        pictures: Reads the whole frames, in the same order, for points that the surface does not cover; None where
+            such points are not followed.
+    """
+
+    run: RunReader
+    scene: LandmarkScene
+    pictures: Callable[[], list[Picture | None]] | None = None
+
+    def track(self, frame: int, xy: ArrayLike, beside_object: bool = False) -> PointTracks:
+        """Follow pixels of one frame through the whole run: predicted by surface and poses, corrected by the images.
+
+        Pixels on the object's mask that the surface does not cover are followed in the images, until they meet it.
+
+        Args:
+            frame: Index of the frame that ``xy`` is in.
+            xy: ``(N, 2)`` pixels; (0, 0) is the centre of the top-left pixel. Those that lie a few pixels beside the
+                surface count as on its rim; their ``face`` is -1.
+            beside_object: Follow pixels beside the object too, in the images alone; else they have no answer.
+
+        Raises:
+            InputError: If the run has no such frame, the object was lost there, or ``xy`` are no points.
+        """
+        query = as_points(xy)
+        asked = tracked_record(self.run, frame)
+        records = self.run.frames
+        start = next(row for row, one in enumerate(records) if one is asked)
+        inside = in_frame(self.run.camera, query)
+        camera = self.run.camera_of(asked)
+        seen = camera.to_pinhole(query)
+        found = follow_points(self.scene, start, np.where(inside[:, None], seen, np.nan))
+        on_object = np.asarray(np.isfinite(found.points).all(1))
+        face, barycentric = np.full(len(query), -1), np.full((len(query), 3), np.nan)
+        if (view := self.scene.views[start]) is not None and on_object.any():
+            face[on_object], barycentric[on_object] = surface_under(
+                *view.project(self.scene.vertices), self.scene.faces, view.to_window(seen[on_object])
+            )
+        lost = np.array([one.status == Status.LOST or one.area == 0 for one in records])
+        tracks = PointTracks(
+            frame,
+            query,
+            np.array([one.index for one in records], dtype=np.int64),
+            camera.to_picture(found.positions.reshape(-1, 2)).reshape(found.positions.shape),
+            found.visible & ~lost[:, None],
+            on_object,
+            face,
+            barycentric,
+            found.points,
+            found.uncertainty,
+            found.measured,
+            kinds(on_object),
+        )
+        on_it = on_mask(self.run, frame, query)
+        rest = np.flatnonzero(~on_object & inside & (on_it | beside_object))
+        if self.pictures is None or not len(rest):
+            return tracks
+        points = follow_beside_mesh(self.run, self.scene, self.pictures(), start, query[rest], on_it[rest])
+        return with_image_points(tracks, rest, points, on_it[rest])
+
+
+def open_scene(
+    run: RunReader | Path,
+    source: FrameSource | None = None,
+    rounds: int = ROUNDS,
+    after_round: Callable[[int], None] = lambda done: None,
+) -> RunScene:
+    """Read the frames of a run and put its surface and poses right by them.
+
+    What is found is written to ``landmarks.npz`` beside the mesh, and taken from there the next time. Where the folder
+    cannot be written it is found anew each time.
+
+    Args:
+        run: A run with a mesh.
+        source: Its frames; those that the run names if left out.
+        rounds: See `refine_scene`; 0 leaves surface and poses as the run has them, and nothing is kept.
+        after_round: See `refine_scene`.
+
+    Raises:
+        InputError: If the run has no mesh, or its frames cannot be read or are of another size.
+    """
+    run = run if isinstance(run, RunReader) else RunReader(run)
+    vertices, faces = _surface(run)
+    images: dict[int, SurfaceView | None] = {}
+    records = {one.index: one for one in run.frames}
+    source = source if source is not None else open_run_source(run)
+    for frame in source:
+        if isinstance(frame, Frame) and (record := records.get(frame.index)) is not None:
+            images[frame.index] = _view(run, record, frame.image, vertices, faces)
+    if not images:
+        raise InputError(
+            f"The video has no frame of the run {run.folder}; say by --source which one it was made on."
+        )
+    scene = LandmarkScene([images.get(one.index) for one in run.frames], vertices, faces)
+    pictures = cache(partial(read_run_images, run, source)) if getattr(source, "repeatable", True) else None
+    if not rounds:
+        return RunScene(run, scene, pictures)
+    file = run.mesh_folder / layout.LANDMARKS
+    key = _key(run, vertices, rounds)
+    if (kept := _read_scene(file, key, scene)) is not None:
+        return RunScene(run, kept, pictures)
+    scene = fit_outlines(refine_scene(scene, rounds, after_round))
+    _write(file, key, scene)
+    return RunScene(run, scene, pictures)
+
+
+def _view(
+    run: RunReader,
+    record: FrameRecord,
+    image: Image,
+    vertices: NDArray[np.float64],
+    faces: NDArray[np.int64],
+) -> SurfaceView | None:
+    camera = run.camera_of(record)
+    if image.shape[:2] != (camera.height, camera.width):
+        raise InputError(
+            f"Frame {record.index} of the video has {image.shape[1]} x {image.shape[0]} pixels, the run {run.folder} "
+            f"{camera.width} x {camera.height}; say by --source which video it was made on."
+        )
+    if record.status == Status.LOST:
+        return None
+    image = camera.undistort(image)
+    return open_view(image, run.pinhole_mask(record.index), camera, record.T_cam_obj, vertices, faces)
+
+
+def has_landmarks(run: RunReader) -> bool:
+    """Whether landmarks were found before that are of the poses and the mesh that the run has now.
+
+    Raises:
+        InputError: If the run has no mesh.
+    """
+    file = run.mesh_folder / layout.LANDMARKS
+    try:
+        with np.load(file, allow_pickle=False) as kept:
+            key = str(kept["key"])
+    except _DAMAGED:
+        return False
+    return key == _key(run, _surface(run)[0], ROUNDS)
+
+
+def _surface(run: RunReader) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Vertices ``(V, 3)`` and faces ``(F, 3)`` of the mesh of a run."""
+    mesh = run.mesh()
+    # An OBJ may hold a vertex once for each texture coordinate; to move, a surface must hang together.
+    vertices, merged = np.unique(np.asarray(mesh.vertices).round(9), axis=0, return_inverse=True)
+    return vertices, merged.reshape(-1)[np.asarray(mesh.faces)]
+
+
+def _key(run: RunReader, vertices: NDArray[np.float64], rounds: int) -> str:
+    """What the refined scene depends on."""
+    parts = [vertices.tobytes(), *(one.T_cam_obj.tobytes() for one in run.frames)]
+    return f"{_VERSION} {rounds} {hashlib.sha256(b''.join(parts)).hexdigest()}"
+
+
+def _read_scene(file: Path, key: str, scene: LandmarkScene) -> LandmarkScene | None:
+    """The scene with surface and poses as they were kept, if they are of the same run."""
+    try:
+        with np.load(file, allow_pickle=False) as kept:
+            if str(kept["key"]) != key:
+                return None
+            vertices, T = kept["vertices"], kept["T_cam_obj"]
+    except _DAMAGED:
+        return None
+    if vertices.shape != scene.vertices.shape or T.shape != (len(scene.views), 4, 4):
+        return None
+    return scene.redrawn(vertices, dict(enumerate(T)))
+
+
+def _write(file: Path, key: str, scene: LandmarkScene) -> None:
+    nowhere = np.full((4, 4), np.nan)
+    T = np.stack([nowhere if view is None else view.T_cam_obj for view in scene.views])
+    data = io.BytesIO()
+    np.savez_compressed(data, key=np.array(key), vertices=scene.vertices, T_cam_obj=T)
+    try:
+        write_atomic(file, data.getvalue())
+    except OutputError:
+        return  # a folder that is only read

@@ -1,0 +1,1 @@
+"""Time, threads, memory and random state of the process."""

@@ -1,0 +1,136 @@
+"""What is done beside the frames, in threads of its own: reading those that come, and keeping what is answered.
+
+One thread reads a few frames ahead; every recording has one that writes, one answer behind at most. Reading and
+writing change no answer, so that these are the same on every run, however busy the machine is. Frames that do not
+depend on each other are done several at a time, their results in order. What goes wrong in such a thread is raised
+where its result is asked for.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from typing import Any, TypeVar, cast
+
+T = TypeVar("T")
+
+READ_AHEAD = 3
+"""Items that are read before they are asked for, at most."""
+_END = object()
+
+
+def read_ahead(items: Iterable[T], most: int = READ_AHEAD) -> Generator[T]:
+    """The same items in the same order, taken from ``items`` in another thread.
+
+    Closing it waits for the item in work; ``items`` itself is left to whoever opened it.
+
+    Args:
+        items: Nobody else takes from it meanwhile.
+        most: How many are taken before they are asked for.
+    """
+    source = iter(items)
+    with ThreadPoolExecutor(1, "tracking3d-reading") as thread:
+        waiting = deque[Future[T | object]]()
+        try:
+            waiting.extend(thread.submit(next, source, _END) for _ in range(most))
+            while (item := waiting.popleft().result()) is not _END:
+                waiting.append(thread.submit(next, source, _END))
+                yield cast(T, item)
+        finally:
+            thread.shutdown(wait=False, cancel_futures=True)
+
+
+def with_next(items: Iterable[T]) -> Generator[tuple[T, T | None]]:
+    """Every item with the one that follows it; None follows the last."""
+    following = iter(items)
+    item = next(following, _END)
+    while item is not _END:
+        after = next(following, _END)
+        yield cast(T, item), None if after is _END else cast(T, after)
+        item = after
+
+
+class OrderedExecutor:
+    """Jobs that do not depend on each other, done several at a time; what they give comes in their order.
+
+    Args:
+        most: How many at a time; one is done where it is given.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._threads: ThreadPoolExecutor | None = None
+        self._waiting = deque[Future[Any]]()
+
+    def do(self, job: Callable[[], T]) -> Iterator[T]:
+        """Begin a job; gives what earlier ones gave, when as many wait as are done at a time.
+
+        Raises:
+            Exception: What an earlier one ended with.
+        """
+        if self._most <= 1:
+            yield job()
+            return
+        if self._threads is None:
+            self._threads = ThreadPoolExecutor(self._most, "tracking3d-in-turn")
+        self._waiting.append(self._threads.submit(job))
+        while len(self._waiting) > self._most:
+            yield self._waiting.popleft().result()
+
+    def rest(self) -> Iterator[Any]:
+        """What the last jobs give, and an end of the threads."""
+        while self._waiting:
+            yield self._waiting.popleft().result()
+        if self._threads is not None:
+            self._threads.shutdown()
+            self._threads = None
+
+
+class BackgroundWriter:
+    """Jobs that are done one after the other, each while the caller prepares the next; or where they are given.
+
+    Attributes:
+        threaded: Whether jobs are done in another thread from here on.
+    """
+
+    def __init__(self) -> None:
+        self.threaded = False
+        self._thread: ThreadPoolExecutor | None = None
+        self._running: Future[object] | None = None
+
+    def do(self, job: Callable[[], T]) -> T | None:
+        """Begin a job when the one before is done.
+
+        Returns:
+            What the job before gave, or this one where there is no other thread; None where there is nothing yet.
+
+        Raises:
+            Exception: What the job before, or this one, ended with; the job is then not begun.
+        """
+        if not self.threaded:
+            return job()
+        before = self.wait()
+        if self._thread is None:
+            self._thread = ThreadPoolExecutor(1, "tracking3d-writing")
+        self._running = self._thread.submit(job)
+        return cast("T | None", before)
+
+    def wait(self) -> object:
+        """Wait for the job in work; what it gave, or None where there is none.
+
+        Raises:
+            Exception: What it ended with.
+        """
+        running, self._running = self._running, None
+        return None if running is None else running.result()
+
+    def end(self) -> None:
+        """Wait for the job in work, whatever becomes of it, and let go of the thread."""
+        self.threaded = False
+        with suppress(Exception):
+            self.wait()
+        if self._thread is not None:
+            self._thread.shutdown()
+            self._thread = None

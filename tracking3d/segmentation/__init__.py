@@ -1,0 +1,21 @@
+"""How likely each pixel is the object's, from sources that see different things, for any solver.
+
+Of one frame, `pixel_features` says what the sources see, `log_odds` weighs it, `along_edges` and `tidied` decide. When
+all frames are known, `tracking3d.segmentation.whole_video` does the same with more sources.
+"""
+
+from tracking3d.segmentation.colour_models import ColourModels, as_lab
+from tracking3d.segmentation.mask_extraction import clean_mask, paste_window, snap_to_edges
+from tracking3d.segmentation.online_features import SOURCES, in_question, log_odds, pixel_features
+
+__all__ = [
+    "SOURCES",
+    "ColourModels",
+    "as_lab",
+    "clean_mask",
+    "in_question",
+    "log_odds",
+    "paste_window",
+    "pixel_features",
+    "snap_to_edges",
+]

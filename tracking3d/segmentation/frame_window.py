@@ -1,0 +1,144 @@
+"""One frame as the evidence is asked in it: a window at the frame's own resolution, and the surface drawn into it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from tracking3d.frames import Image
+from tracking3d.geometry.camera import Camera, Window
+from tracking3d.rendering.visibility import NEAR, rasterize
+from tracking3d.trackers.crops import box_of, crop_window, inside_frame
+
+LARGEST = 320
+"""Pixels of a window's side; a larger one is seen smaller."""
+_MARGIN = 0.2  # beside the masks, relative to their longer side
+
+Plane = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Answered:
+    """A frame and what is known of it, through a pinhole camera.
+
+    Attributes:
+        index: Of the frame.
+        image: ``(H, W, 3)`` RGB.
+        initial: ``(H, W)`` the mask tracker's mask.
+        answer: ``(H, W)`` the mask that was answered.
+        T_cam_obj: ``(4, 4)``; NaN where there is no pose that is believed.
+        confidence: Of the pose, in [0, 1].
+    """
+
+    index: int
+    image: Image
+    initial: Mask
+    answer: Mask
+    T_cam_obj: NDArray[np.float64]
+    confidence: float
+
+
+@dataclass(frozen=True, eq=False)
+class FrameWindow:
+    """A frame, the object's surface at its pose, and where masks say that the object is.
+
+    Attributes:
+        window: Of the frame; all planes are ``(S, S)`` of it.
+        image: ``(S, S, 3)`` RGB.
+        K: ``(3, 3)`` intrinsics of the window.
+        T_cam_obj: ``(4, 4)``; NaN where there is no pose.
+        initial: The mask tracker's mask.
+        answer: The mask that was answered.
+        drawn: The silhouette; empty without a pose.
+        inverse_depth: Of the surface, carried on beyond the silhouette; 0 without a pose.
+        confidence: Of the pose, in [0, 1].
+        valid: What lies in the frame.
+    """
+
+    window: Window
+    image: NDArray[np.uint8]
+    K: NDArray[np.float64]
+    T_cam_obj: NDArray[np.float64]
+    initial: Mask
+    answer: Mask
+    drawn: Mask
+    inverse_depth: Plane
+    confidence: float
+    valid: Mask
+
+    @classmethod
+    def of(
+        cls, frame: Answered, camera: Camera, vertices: NDArray[np.float64], faces: NDArray[np.int64]
+    ) -> Self | None:
+        """A frame seen through the window around its masks; None where both are empty.
+
+        Args:
+            frame: The frame.
+            camera: Of the full frame.
+            vertices: ``(V, 3)`` of the object.
+            faces: ``(F, 3)``.
+        """
+        box = box_of(frame.initial | frame.answer)
+        if box is None:
+            return None
+        window = Window.around(box, _MARGIN, 1)
+        window = Window(window.left, window.top, window.side, min(window.side, LARGEST))
+        valid = inside_frame(frame.initial.shape, window)
+        initial, answer = (
+            (crop_window(mask.astype(np.float32), window) > 0.5) & valid
+            for mask in (frame.initial, frame.answer)
+        )
+        K, T_cam_obj = window.K(camera), frame.T_cam_obj
+        drawn, inverse_depth = surface_in(K, T_cam_obj, vertices, faces, window.size)
+        image = crop_window(frame.image, window)
+        return cls(
+            window,
+            image,
+            K,
+            T_cam_obj,
+            initial,
+            answer,
+            drawn & valid,
+            inverse_depth,
+            frame.confidence,
+            valid,
+        )
+
+
+def surface_in(
+    K: NDArray[np.float64],
+    T_cam_obj: NDArray[np.float64],
+    vertices: NDArray[np.float64],
+    faces: NDArray[np.int64],
+    size: int,
+) -> tuple[Mask, Plane]:
+    """The silhouette ``(S, S)`` and one over its depth, beyond it the nearest pixel's; empty and 0 without a pose."""
+    nothing = np.zeros((size, size), bool), np.zeros((size, size), np.float32)
+    if not np.isfinite(T_cam_obj).all() or not np.isfinite(vertices).all():
+        return nothing
+    seen = vertices @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3]
+    if (seen[:, 2] <= NEAR).any():
+        return nothing
+    screen = seen @ K.T
+    screen = screen[:, :2] / screen[:, 2:]
+    drawn = rasterize(
+        torch.tensor(screen, dtype=torch.float32)[None],
+        torch.tensor(seen[:, 2], dtype=torch.float32)[None],
+        torch.tensor(faces),
+        (size, size),
+    ).depth[0].numpy()  # fmt: skip
+    covered = np.isfinite(drawn)
+    if not covered.any():
+        return nothing
+    _, nearest = cv2.distanceTransformWithLabels(
+        (~covered).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    by_label = np.zeros(int(nearest.max()) + 1, np.float32)
+    by_label[nearest[covered]] = 1 / drawn[covered]
+    return covered, by_label[nearest]

@@ -1,0 +1,242 @@
+"""The last steps of a long video: its parts become one object and one run, which ends as any run does."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tracking3d.checkpoint.resuming import prompt_record
+from tracking3d.pipeline.open_tracking import OpenTracking, TrackRequest, open_tracking, request_tracking
+from tracking3d.pipeline.passes import run_passes
+from tracking3d.pipeline.record import RecordOptions, begin_recording
+from tracking3d.pipeline.refinement_steps import PrecomputedRefinement
+from tracking3d.prompts.prompt import PromptSet
+from tracking3d.reconstruction.final_shape import make_final_shape
+from tracking3d.results.description import RunHeader
+from tracking3d.results.run_notes import note_in_run
+from tracking3d.results.run_reader import RunReader
+from tracking3d.results.run_writer import RunWriter
+from tracking3d.submaps.alignment import DisagreementError
+from tracking3d.submaps.job import Tell
+from tracking3d.submaps.merged_run import write_causal_mesh, write_merged_run
+from tracking3d.submaps.merging import MergedMap, merge_submaps
+from tracking3d.submaps.plan import PARTS, part_folder, put_cut_mask, remove_parts
+from tracking3d.submaps.plan_step import Begun
+from tracking3d.submaps.submap_runs import PartJob, Revisit
+from tracking3d.video import open_source
+
+_log = logging.getLogger(__name__)
+_SAME_OBJECT = 0.5
+"""Share of the smaller one of two masks that lies within the other, below which a part began on something else than the
+part before ends with. One of them may well have lost a side of the object."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """A video whose parts have their causal answers.
+
+    Attributes:
+        begun: The video.
+        jobs: Its parts, as they were tracked last.
+        again: Numbers of those that were tracked a second time.
+        seconds: What tracking the parts took.
+    """
+
+    begun: Begun
+    jobs: tuple[PartJob, ...]
+    again: tuple[int, ...] = ()
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Again:
+    """A part that began on something else and is to be tracked once more."""
+
+    number: int
+    job: PartJob
+
+
+@dataclass(frozen=True)
+class Refused:
+    """Why parts cannot be joined."""
+
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Joined:
+    """A video whose parts are one run, but for its second answers.
+
+    Attributes:
+        begun: The video.
+        looks: Frames to be looked at again, by parts.
+        about: What ``run.json`` says of the parts.
+        seconds: What each step took, by name.
+    """
+
+    begun: Begun
+    looks: tuple[Revisit, ...]
+    about: Mapping[str, Any]
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+
+def join(tell: Tell, tracked: Tracked) -> Again | Refused | Joined:
+    """Make one run of the parts, up to where all frames are looked at again.
+
+    Raises:
+        Tracking3dError: If something cannot be read or written; what was finished until then is kept.
+    """
+    begun, clock = tracked.begun, time.monotonic()
+    video = begun.video
+    if (again := _find_running(tracked)) is not None:
+        return again
+    with open_tracking(_request(begun)) as opened:
+        session = opened.objects[0].session
+    try:
+        whole = merge_submaps(session, begun.config, begun.plan, video.folder)
+    except DisagreementError as error:
+        _log.warning("The parts could not be joined: %s.", error)
+        return Refused(str(error))
+    seconds = {"look_ahead": begun.plan.seconds, "parts": tracked.seconds}
+    seconds["join"], clock = time.monotonic() - clock, time.monotonic()
+    about = {
+        "workers": video.workers,
+        "parts": [[run.part.start, run.part.stop] for run in whole.runs],
+        "looked_at": begun.plan.looked_at,
+        "tracked_again": list(tracked.again),
+        "joints": whole.joints,
+        "dearer": whole.dearer,
+    }
+    writer = _begin_writing(begun, opened, whole)
+    owned = _owned_ranges(begun)
+    session.resume(opened.first, whole.session, {})
+    write_causal_mesh(video.folder, session)
+    session.refine()
+    write_merged_run(writer, session, whole.runs, owned, sum(seconds.values()) + time.monotonic() - clock)
+    seconds["refine"] = time.monotonic() - clock
+    note_in_run(video.folder, {"split": {**about, "seconds": seconds}})
+    return Joined(begun, _revisits(begun, owned), about, seconds)
+
+
+@dataclass(frozen=True, eq=False)
+class Ending:
+    """A video whose frames are all answered, to be drawn.
+
+    Attributes:
+        joined: The run; its ``seconds`` tell what all steps took.
+        precomputed: What the last steps of its final refinement come to.
+    """
+
+    joined: Joined
+    precomputed: PrecomputedRefinement
+
+
+def end(tell: Tell, ending: Ending) -> None:
+    """Draw what is answered, and write what is made at the end; the parts are removed.
+
+    Args:
+        tell: Is given the answers that are drawn.
+        ending: All that is known.
+
+    Raises:
+        Tracking3dError: If something cannot be read or written; what was finished until then is kept.
+    """
+    begun = ending.joined.begun
+    video, config = begun.video, begun.config
+    about = {**ending.joined.about, "seconds": dict(ending.joined.seconds)}
+    note_in_run(video.folder, {"split": about})
+    options = RecordOptions(video.command, video.selection, resume=True)
+    with open_tracking(_request(begun)) as opened, ExitStack() as writers:
+        opened = replace(opened, tracker_choice=begun.choice)
+        recording = begin_recording(opened, 0, video.folder, options, writers)
+        if recording is not None:
+            recording.precomputed = ending.precomputed
+            run_passes(opened.source, opened.frames, [recording], tell)
+    if recording is not None:
+        make_final_shape(video.folder, config, opened.source)
+    remove_parts(video.folder)
+
+
+def _request(begun: Begun) -> TrackRequest:
+    """The whole video, with the mask tracker that was chosen."""
+    video = begun.video
+    source = open_source(video.source, video.selection)
+    return request_tracking(source, begun.config, video.prompts, skip_damaged=True)
+
+
+def _find_running(tracked: Tracked) -> Again | None:
+    """The first part that began on something else than the part before ends with, and was not tracked again yet."""
+    begun = tracked.begun
+    folder, whole = begun.video.folder, begun.video.frames(begun.count)
+    checked = max(tracked.again, default=0)
+    for before, part in zip(begun.plan.parts, begun.plan.parts[1:], strict=False):
+        if part.number <= checked:
+            continue
+        cut = whole[part.start]
+        earlier = RunReader(part_folder(folder, before), refined=False)
+        estimates = {one.index: one for one in earlier.frames}
+        prompts = tracked.jobs[part.number].prompts
+        began = prompts.masks[0] if prompts.masks else None
+        if (
+            cut not in estimates
+            or estimates[cut].status != "tracked"
+            or began is None
+            or isinstance(began, Path)
+        ):
+            continue
+        estimate = earlier.mask(cut)
+        smaller = min(estimate.sum(), began.sum())
+        if smaller and np.count_nonzero(estimate & began) < _SAME_OBJECT * smaller:
+            _log.warning("Part %d began on something else and is tracked again.", part.number + 1)
+            put_cut_mask(folder, part, estimate)
+            job = replace(tracked.jobs[part.number], prompts=PromptSet.of_one(mask=estimate), resume=False)
+            return Again(part.number, job)
+    return None
+
+
+def _owned_ranges(begun: Begun) -> list[range]:
+    """Indices of the frames that each part answers for."""
+    whole = begun.video.frames(begun.count)
+    starts = [part.owns_from for part in begun.plan.parts]
+    return [whole[start:stop] for start, stop in zip(starts, [*starts[1:], len(whole)], strict=True)]
+
+
+def _begin_writing(begun: Begun, opened: OpenTracking, whole: MergedMap) -> RunWriter:
+    """The writer of the joined run, with all that a run knows of itself before its first frame."""
+    video, source, [one] = begun.video, opened.source, opened.objects
+    header = RunHeader(
+        config=begun.config.model_dump(mode="json"),
+        camera=whole.camera,
+        source=source.name,
+        seed=begun.config.runtime.seed,
+        renderer=one.session.renderer,
+        fps=source.fps,
+        command=video.command,
+        selection=video.selection,
+        given=prompt_record(opened.first, one.prompt, source.count),
+        tracker_choice=begun.choice,
+    )
+    return RunWriter(video.folder, header, overwrite=True)
+
+
+def _revisits(begun: Begun, owned: Sequence[range]) -> tuple[Revisit, ...]:
+    video = begun.video
+    return tuple(
+        Revisit(
+            video.source,
+            video.selection,
+            f"{mine.start}:{mine[-1] + 1}:{mine.step}",
+            begun.config,
+            video.folder,
+            video.prompts,
+            video.folder / PARTS / f"second_{part.number}",
+        )
+        for part, mine in zip(begun.plan.parts, owned, strict=True)
+    )

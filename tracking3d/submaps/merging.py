@@ -1,0 +1,241 @@
+"""The parts of a video as one object: how each lies in the first, and what they know together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tracking3d.checkpoint.folder import Checkpoint
+from tracking3d.config.models import PipelineConfig
+from tracking3d.config.solvers import OnlineConfig
+from tracking3d.estimation.online.atlas.map_merging import transform_map
+from tracking3d.estimation.online.mapping.global_refinement import keyframe_cost
+from tracking3d.estimation.online.state.object_map import ObjectMap
+from tracking3d.estimation.online.state.solver_state import SolverState
+from tracking3d.features.protocol import FeatureEncoder
+from tracking3d.geometry.camera import Camera
+from tracking3d.geometry.pose import pose_arrays
+from tracking3d.geometry.similarity import Similarity
+from tracking3d.pipeline.components import build_encoder
+from tracking3d.pipeline.frame_order import FrameOrder
+from tracking3d.pipeline.session import Session
+from tracking3d.results.run_reader import RunReader
+from tracking3d.submaps.alignment import DisagreementError, SubmapAlignment, align_submaps, by_lens
+from tracking3d.submaps.merged_run import PartRun
+from tracking3d.submaps.plan import Plan, part_folder
+from tracking3d.submaps.similarity import fit_similarity
+from tracking3d.submaps.state_merging import merge_states
+
+MOST_DEARER = 1.75
+"""How many times what the parts' keyframes cost by themselves they may cost together; see `keyframe_cost`."""
+_FEWEST_KEYFRAMES = 3
+_SAME_LENS = math.log(1.05)
+
+
+@dataclass(frozen=True, eq=False)
+class MergedMap:
+    """All parts as one.
+
+    Attributes:
+        runs: The parts, with how each lies in the joined object.
+        session: The state of a session that has seen all of them.
+        camera: Of the causal answers.
+        joints: What is known of each joint, for the record.
+        dearer: How many times what they cost by themselves the keyframes cost together.
+    """
+
+    runs: Sequence[PartRun]
+    session: Mapping[str, Any]
+    camera: Camera
+    joints: Sequence[Mapping[str, Any]]
+    dearer: float
+
+
+def merge_submaps(session: Session, config: PipelineConfig, plan: Plan, folder: Path) -> MergedMap:
+    """Join the parts that are tracked.
+
+    Args:
+        session: For the whole video, which has seen nothing yet.
+        config: The pipeline.
+        plan: The parts.
+        folder: The run folder.
+
+    Raises:
+        DisagreementError: If they cannot be joined.
+        InputError: If a part's folder is damaged.
+    """
+    assert isinstance(config.solver, OnlineConfig)
+    tracked, object_map = _read_submaps(session, config, plan, folder)
+    encoder = build_encoder(config)
+    tried: list[_Try] = []
+    refused: list[DisagreementError] = []
+    lenses = _lenses(object_map)
+    for camera in lenses:
+        try:
+            tried.append(_try_alignment(camera, tracked, object_map, config.solver, encoder))
+        except DisagreementError as error:
+            refused.append(error)
+    if not tried:
+        raise DisagreementError(f"{refused[0]}{_of_lenses(lenses)}") from refused[0]
+    best = min(tried, key=lambda one: one.dearer)
+    runs, updated = best.runs, best.belief
+    settled = [
+        replace(run, similarity=_refine_alignment(updated.object_map, own.object_map, similarity))
+        for run, own, similarity in zip(runs, best.beliefs, best.similarities, strict=True)
+    ]
+    first, last = runs[0].kept.session, max(record.index for run in runs for record in run.records)
+    first_pose, presented, _, anew = first["steering"]
+    state = {
+        **first,
+        "solver": updated,
+        "camera": updated.camera,
+        "steering": (first_pose, FrameOrder(presented.first), last, anew),
+    }
+    return MergedMap(settled, state, updated.camera, [_describe(joint) for joint in best.joints], best.dearer)
+
+
+@dataclass(frozen=True, eq=False)
+class _Try:
+    """The parts joined by one lens; runs and beliefs are those that it makes of them."""
+
+    runs: Sequence[PartRun]
+    beliefs: Sequence[SolverState]
+    joints: Sequence[SubmapAlignment]
+    similarities: Sequence[Similarity]
+    belief: SolverState
+    dearer: float
+
+
+def _lenses(states: Sequence[SolverState]) -> list[Camera]:
+    """The cameras of the parts, those that are about the same once: where nobody gave the lens, each solved its own."""
+    lenses: list[Camera] = []
+    for state in states:
+        if all(abs(math.log(state.camera.fy / other.fy)) > _SAME_LENS for other in lenses):
+            lenses.append(state.camera)
+    return lenses
+
+
+def _of_lenses(lenses: Sequence[Camera]) -> str:
+    """What is to be said of lenses that differ: parts that are told one have the better chance to agree."""
+    if len(lenses) < 2:
+        return ""
+    degrees = sorted(one.fov for one in lenses)
+    return (
+        f"; each part solved the lens anew (vertical fields of view of {degrees[0]:.0f} to {degrees[-1]:.0f} degrees), "
+        "so that saying what it is (--fov or --intrinsics) may mend that"
+    )
+
+
+def _try_alignment(
+    camera: Camera,
+    runs: Sequence[PartRun],
+    states: Sequence[SolverState],
+    config: OnlineConfig,
+    encoder: FeatureEncoder,
+) -> _Try:
+    seen = [by_lens(state, run.records, camera) for state, run in zip(states, runs, strict=True)]
+    by_it = [state for state, _ in seen]
+    own = [replace(run, records=records) for run, (_, records) in zip(runs, seen, strict=True)]
+    joints = [
+        _joint(number, by_it[number - 1 : number + 1], own[number - 1 : number + 1])
+        for number in range(1, len(own))
+    ]
+    similarities = [Similarity.identity()]
+    for joint in joints:
+        similarities.append(similarities[-1].after(joint.fit.similarity))
+    state, dearer = merge_submap_states(by_it, similarities, config, encoder, states)
+    return _Try(own, by_it, joints, similarities, state, dearer)
+
+
+def merge_submap_states(
+    states: Sequence[SolverState],
+    similarities: Sequence[Similarity],
+    config: OnlineConfig,
+    encoder: FeatureEncoder,
+    before: Sequence[SolverState] | None = None,
+) -> tuple[SolverState, float]:
+    """What the parts know as one, and how many times as much their keyframes cost so; see `map_joining.joined`.
+
+    Args:
+        states: Of the parts, all by one lens.
+        similarities: From each part's object to the first one's.
+        config: Of the solver.
+        encoder: Of the features.
+        before: The parts as they were solved, each by its own lens, which tell what they cost by themselves.
+
+    Raises:
+        DisagreementError: If together they explain what was seen far worse than each by itself.
+    """
+    own = float(np.mean([keyframe_cost(state.object_map) for state in before or states]))
+    state = merge_states(states, similarities, config, encoder)
+    together = keyframe_cost(state.object_map)
+    if together > MOST_DEARER * own:
+        raise DisagreementError(
+            f"one object explains what they show {together / own:.1f} times as badly as one each does"
+        )
+    return state, together / own
+
+
+def _read_submaps(
+    session: Session, config: PipelineConfig, plan: Plan, folder: Path
+) -> tuple[list[PartRun], list[SolverState]]:
+    """The parts with what each knows, by its own lens."""
+    runs: list[PartRun] = []
+    states: list[SolverState] = []
+    for part in plan.parts:
+        own = part_folder(folder, part)
+        kept = Checkpoint(own, session.state_classes, config.runtime.device).read()
+        state = kept.session["solver"]
+        if state.pending is not None:
+            why = state.waiting_reason or "the object did not move enough in it"
+            raise DisagreementError(f"the shape was never told in part {part.number + 1} ({why})")
+        records = RunReader(own, refined=False).frames
+        states.append(state)
+        runs.append(PartRun(part, own, kept, records, Similarity.identity()))
+    return runs, states
+
+
+def _joint(number: int, states: Sequence[SolverState], runs: Sequence[PartRun]) -> SubmapAlignment:
+    try:
+        return align_submaps(states[0], states[1], runs[0].records, runs[1].records)
+    except DisagreementError as error:
+        raise DisagreementError(f"parts {number} and {number + 1}: {error}") from error
+
+
+def _refine_alignment(object_map: ObjectMap, own: ObjectMap, similarity: Similarity) -> Similarity:
+    """How a part lies in the joined object after the refinement moved its keyframes."""
+    after = {view.index: view.pose for view in object_map.keyframes}
+    before = {view.index: view.pose for view in transform_map(own, similarity).keyframes}
+    common = sorted(before.keys() & after.keys())
+    if len(common) < _FEWEST_KEYFRAMES:
+        return similarity
+    poses = []
+    for side in (after, before):
+        T = np.tile(np.eye(4), (len(common), 1, 1))
+        for n, index in enumerate(common):
+            T[n, :3, :3], T[n, :3, 3] = pose_arrays(side[index])
+        poses.append(T)
+    fit = fit_similarity(poses[0], poses[1], own_points(object_map), own_points(object_map))
+    return fit.similarity.after(similarity)
+
+
+def own_points(object_map: ObjectMap) -> np.ndarray:
+    """``(V, 3)`` vertices of a map: what holds a small change of coordinates to where the object is."""
+    return np.asarray(object_map.vertices.double().cpu().numpy())
+
+
+def _describe(joint: SubmapAlignment) -> dict[str, Any]:
+    fit = joint.fit
+    return {
+        "frames": joint.frames,
+        "landmarks": joint.landmarks,
+        "degrees": float(np.median(fit.angles)),
+        "distance": float(np.median(fit.distances)),
+        "scale": fit.similarity.scale,
+        "scale_error": fit.scale_error,
+    }

@@ -1,0 +1,161 @@
+"""The parts of a video as runs: tracked to the end of their first pass, and looked at again against the whole object.
+
+What is here runs in processes of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tracking3d.checkpoint.folder import Checkpoint
+from tracking3d.checkpoint.progress import SavedState
+from tracking3d.config.models import PipelineConfig
+from tracking3d.frames import Frame, MaskEstimate
+from tracking3d.pipeline.frame_reading import read_timed
+from tracking3d.pipeline.open_tracking import open_tracking, request_tracking
+from tracking3d.pipeline.record import RecordOptions, record_tracking
+from tracking3d.pipeline.refinement_steps import estimate_again
+from tracking3d.pipeline.session import Session
+from tracking3d.prompts.prompt import PromptSet
+from tracking3d.results import layout
+from tracking3d.results.files import read_mask, writing
+from tracking3d.results.records import FrameRecord
+from tracking3d.results.refined_estimates import write_refined
+from tracking3d.results.run_reader import RunReader
+from tracking3d.video import open_source
+from tracking3d.video.source import FrameSource
+
+Tell = Callable[[Any], None]
+
+
+@dataclass(frozen=True, eq=False)
+class PartJob:
+    """One part of a video, to be tracked.
+
+    Attributes:
+        source: The video, as `open_source` takes it.
+        selection: Frames of the part, ``START:STOP:STEP``.
+        config: The pipeline.
+        folder: The part's run folder.
+        prompts: What the object is in its first frame.
+        command: For the record.
+        resume: Go on with what is there.
+        first_pass_only: Stop when every frame has its causal answer.
+    """
+
+    source: str
+    selection: str
+    config: PipelineConfig
+    folder: Path
+    prompts: PromptSet
+    command: str | None = None
+    resume: bool = False
+    first_pass_only: bool = True
+
+
+def track_part(tell: Tell, job: PartJob) -> None:
+    """Track one part; ``tell`` is given each frame's record.
+
+    Raises:
+        Tracking3dError: See `record_tracking`.
+    """
+    source = open_source(job.source, job.selection)
+    if job.resume and job.first_pass_only and is_tracked(job.folder, source):
+        return
+    request = request_tracking(source, job.config, job.prompts, skip_damaged=True)
+    options = RecordOptions(
+        job.command, job.selection, not job.resume, job.resume, first_pass_only=job.first_pass_only
+    )
+    record_tracking(request, job.folder, options, tell)
+
+
+def is_tracked(folder: Path, source: FrameSource) -> bool:
+    """Whether a part has all its causal answers, and the state to go on from."""
+    if not ((folder / layout.RUN).is_file() and layout.has_state(folder)):
+        return False
+    run = RunReader(folder, refined=False)
+    return len(run.frames) + len(run.description["skipped"]) == source.count
+
+
+@dataclass(frozen=True, eq=False)
+class Revisit:
+    """Frames of the joined run, to be answered against the whole object.
+
+    Attributes:
+        source: The video.
+        whole: All selected frames of it, ``START:STOP:STEP``, or None.
+        selection: The frames that are looked at.
+        config: The pipeline.
+        folder: The joined run's.
+        prompts: What the object is in the video's first frame.
+        out: Folder that gets ``masks/`` and ``frames.jsonl`` of the second answers.
+    """
+
+    source: str
+    whole: str | None
+    selection: str
+    config: PipelineConfig
+    folder: Path
+    prompts: PromptSet
+    out: Path
+
+
+def refine_submap(tell: Tell, job: Revisit) -> int:
+    """Answer for some frames once more, in order of time; ``tell`` is given each answer's record.
+
+    Returns:
+        How many have a second answer.
+
+    Raises:
+        Tracking3dError: If a plug-in fails that may not, or something cannot be read or written.
+    """
+    kept, session = resume_submap(job)
+    causal = {one.index: one for one in RunReader(job.folder, refined=False).frames}
+    with writing(job.out):
+        (job.out / layout.MASKS).mkdir(parents=True, exist_ok=True)
+    answered = 0
+    with (job.out / layout.FRAMES).open("wb") as lines:
+        for frame in read_timed(open_source(job.source, job.selection)):
+            if not isinstance(frame, Frame) or frame.index not in causal:
+                continue
+            record_ = _second_answer(session, job, kept, frame, causal[frame.index])
+            if record_ is not None:
+                with writing(job.out):
+                    lines.write(record_.to_json().encode() + b"\n")
+                answered += 1
+            tell(record_ or causal[frame.index])
+    return answered
+
+
+def resume_submap(job: Revisit) -> tuple[SavedState, Session]:
+    """The state of the joined run, and a session that has its object.
+
+    Raises:
+        Tracking3dError: If it cannot be read.
+    """
+    request = request_tracking(open_source(job.source, job.whole), job.config, job.prompts, skip_damaged=True)
+    with open_tracking(request) as opened:
+        first, session = opened.first, opened.objects[0].session
+    kept = Checkpoint(job.folder, session.state_classes, job.config.runtime.device).read()
+    failures = {index: frame.failure for index, frame in kept.taken.items() if frame.failure}
+    session.resume(first, kept.session, failures)
+    return kept, session
+
+
+def _second_answer(
+    session: Session, job: Revisit, kept: SavedState, frame: Frame, causal: FrameRecord
+) -> FrameRecord | None:
+    """The record of a frame's second answer, its mask written; None lets the first stand."""
+    mask = read_mask(layout.initial_mask_path(job.folder, frame.index))
+    taken = kept.taken[frame.index]
+    initial = MaskEstimate(None if mask is None else mask.astype(np.float32), taken.score, taken.reason)
+    estimate = estimate_again(session, frame, causal, initial)
+    if estimate is None:
+        return None
+    probabilities = (job.folder / layout.PROBABILITIES).is_dir()
+    return write_refined(job.out, estimate, frame, causal, mask, probabilities)

@@ -1,0 +1,129 @@
+"""The frames that a caller of the library has, in whatever form, as a source."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from torch import Tensor
+
+from tracking3d.config.explain import a_kind
+from tracking3d.errors import InputError
+from tracking3d.frames import Frame, Image, SkippedFrame
+from tracking3d.video.array_source import ArraySource
+from tracking3d.video.image_input import WANTED, validate_image
+from tracking3d.video.opening import open_source
+from tracking3d.video.source import FrameSource, Intrinsics
+
+_KINDS = f"{WANTED}, tensors, Pillow's pictures or paths of images; or the path of a video or folder"
+
+
+def open_frames(frames: Any) -> FrameSource:
+    """A source of what `tracking3d.track` was given; what can be seen without taking a frame is seen now.
+
+    Args:
+        frames: A source already; what `tracking3d.video.open_source` opens by a path; a ``cv2.VideoCapture``; an array
+            ``(N, H, W, 3)`` of uint8; a tensor ``(N, 3, H, W)`` or ``(N, H, W, 3)`` of uint8 or of floats in [0, 1]; or
+            any iterable of what `tracking3d.video.image_input.validate_image` takes, and of `Frame` and `SkippedFrame`.
+
+    Raises:
+        InputError: If it is nothing of that.
+    """
+    if isinstance(frames, str | Path):
+        return open_source(frames)
+    if isinstance(frames, cv2.VideoCapture):
+        return CapturedFrames.of(frames)
+    shape = tuple(getattr(frames, "shape", None) or ())
+    if isinstance(frames, Tensor):
+        if len(shape) != 4 or 3 not in (shape[1], shape[3]):
+            raise InputError(
+                f"frames= is a Tensor of shape {shape}; give (N, 3, H, W) or (N, H, W, 3), as uint8 or as floats in "
+                "[0, 1]."
+            )
+    elif getattr(frames, "shape", None) is not None and (
+        len(shape) != 4 or shape[3] != 3 or str(getattr(frames, "dtype", "")).rpartition(".")[2] != "uint8"
+    ):
+        raise InputError(
+            f"frames= is {a_kind(frames)} of shape {shape} and type {getattr(frames, 'dtype', '?')}; "
+            f"give {WANTED}, one after the other or as one array (N, H, W, 3)."
+        )
+    if not isinstance(frames, Iterable) or isinstance(frames, Mapping | type | bytes):
+        raise InputError(f"frames= is {a_kind(frames)}; give {_KINDS}.")
+    if isinstance(frames, FrameSource):
+        return frames
+    if isinstance(frames, Sequence | Tensor) and len(frames):
+        next(
+            iter(ArraySource(frames[:1], convert=validate_image))
+        )  # what is wrong with all of them is said at once
+    return ArraySource(frames, convert=validate_image)
+
+
+@dataclass(eq=False)
+class CapturedFrames:
+    """The frames that a ``cv2.VideoCapture`` of the caller's still has; it is left open.
+
+    One of a file is taken back to where it stood when it was given, to be read again; that the first frame is then the
+    same is made sure of. See `tracking3d.video.source.FrameSource` for the attributes.
+    """
+
+    capture: cv2.VideoCapture
+    start: int
+    count: int | None
+    fps: float | None
+    name: str = "the VideoCapture"
+    intrinsics: Intrinsics | None = None
+    intrinsics_origin: str = ""
+    _first: Image | None = field(default=None, repr=False)
+
+    @classmethod
+    def of(cls, capture: cv2.VideoCapture) -> CapturedFrames:
+        """A source of what is left of a capture.
+
+        Raises:
+            InputError: If it is not open.
+        """
+        if not capture.isOpened():
+            raise InputError("frames= is a VideoCapture that is not open; open it on a file or camera.")
+        length, start = (
+            int(capture.get(what)) for what in (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_POS_FRAMES)
+        )
+        rate = capture.get(cv2.CAP_PROP_FPS)
+        return cls(
+            capture, max(start, 0), length - start if length > start else None, rate if rate > 0 else None
+        )
+
+    @property
+    def repeatable(self) -> bool:
+        """Whether it is one of a file."""
+        return self.count is not None
+
+    def __iter__(self) -> Iterator[Frame | SkippedFrame]:
+        """Read to the end; indices count from the frame at which the capture stood.
+
+        Raises:
+            InputError: If there is none, or going back did not lead to the same frame.
+        """
+        if self._first is not None and self.repeatable:
+            self.capture.set(cv2.CAP_PROP_POS_FRAMES, self.start)
+        index = 0
+        while True:
+            there, image = self.capture.read()
+            if not there:
+                break
+            rgb: Image = cv2.cvtColor(image, cv2.COLOR_GRAY2RGB if image.ndim == 2 else cv2.COLOR_BGR2RGB)
+            if index == 0:
+                if self._first is None:
+                    self._first = rgb
+                elif self.repeatable and not np.array_equal(self._first, rgb):
+                    raise InputError(
+                        f"{self.name} shows another picture when it is taken back to frame {self.start}; give the path "
+                        "of the video."
+                    )
+            yield Frame(index, rgb, time=index / self.fps if self.fps else None, name=f"frame {index}")
+            index += 1
+        if not index:
+            raise InputError(f"{self.name} has no frame left that can be read.")
