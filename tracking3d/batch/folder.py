@@ -68,13 +68,13 @@ class Progress:
     engine: str = ""
     workers: int = 0
     began: float = 0.0
-    update: float = 0.0
+    updated: float = 0.0
     seconds_to_go: float | None = None
 
     @property
     def state_in_words(self) -> str:
         """The state; of a batch that has not said anything for long, that too."""
-        silent = time.time() - self.update
+        silent = time.time() - self.updated
         if self.state == "running" and silent > _SILENT:
             return f"running, but nothing was heard of it for {silent / 60:.0f} minutes"
         return self.state
@@ -86,7 +86,7 @@ def write_progress(out: str, progress: Progress) -> Progress:
     Raises:
         OutputError: If it cannot be written.
     """
-    progress = replace(progress, update=time.time())
+    progress = replace(progress, updated=time.time())
     write(
         join_path(out, PROGRESS),
         json.dumps({"format": FORMAT, **asdict(progress)}, indent=1).encode() + b"\n",

@@ -92,9 +92,9 @@ class ObjectConfig(Section):
     model: str | None = Field(
         None,
         description=(
-            "The folder of an earlier run or a mesh file: the object is that one, and is found in the video without a "
-            "start by motion. Shape and colours are held: adjustment_views and texture_views are 0, shape is online, and "
-            "prototype is not asked."
+            "The folder of an earlier run or a mesh file: the object is that one, and is found in the video without an "
+            "initialization by motion. Shape and colours are kept: adjustment_views and texture_views are 0, shape is "
+            "fast, and prototype is ignored."
         ),
     )
     prototype: str = Field(

@@ -128,7 +128,7 @@ class Truth:
         frames: The images in order.
         box: The object in frame 0 as ``(x, y, width, height)``, where a tracker starts from one.
         camera: Of all frames, where known.
-        told_camera: What a tracker is told that the camera is, where that is not the true one.
+        given_camera: What a tracker is told that the camera is, where that is not the true one.
         camera_told: Whether a tracker is told any camera.
         T_cam_obj: ``(4, 4)`` pose by frame index; only those that are known and trusted. The rotation or the
             translation is NaN where only the other is known.

@@ -40,7 +40,7 @@ from tracking3d.video.image_input import validate_image
 from tracking3d.video.in_memory import open_frames
 from tracking3d.video.source import FrameSource
 
-__all__ = ["SOLVERS", "Session", "Tracking", "validate_image", "choose_camera", "track", "track_objects"]
+__all__ = ["SOLVERS", "Session", "Tracking", "choose_camera", "track", "track_objects", "validate_image"]
 
 
 def track(

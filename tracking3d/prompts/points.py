@@ -130,7 +130,7 @@ def points_prompt(frame: Frame, points: Any, name: str = POINTS) -> Prompt:
     around = box_of(mask)
     if around is None or mask.all():
         raise InputError(
-            f"{name}{format_value(points)}: by these points nothing in {frame.label} tells the object from the rest; give "
-            "more of them, some beside the object, or a box."
+            f"{name}{format_value(points)}: by these points nothing in {frame.label} tells the object from the rest; "
+            "give more of them, some on the background, or a box."
         )
     return Prompt(around, mask, checked)

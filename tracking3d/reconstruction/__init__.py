@@ -3,4 +3,4 @@
 from tracking3d.reconstruction.texturing import make_texture
 from tracking3d.reconstruction.views import BELIEVED, TextureView, keep_best_views, texture_view
 
-__all__ = ["BELIEVED", "TextureView", "keep_best_views", "texture_view", "make_texture"]
+__all__ = ["BELIEVED", "TextureView", "keep_best_views", "make_texture", "texture_view"]

@@ -49,7 +49,7 @@ class MaskRefinement:
         camera: Of the full frame, as it is in the end.
         vertices: ``(V, 3)`` of the final object.
         faces: ``(F, 3)``.
-        answers: Of all frames.
+        estimates: Of all frames.
     """
 
     def __init__(

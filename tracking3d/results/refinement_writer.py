@@ -120,7 +120,7 @@ class RefinementWriter:
             record,
             area=int(np.count_nonzero(mask)),
             iou_initial=mask_iou(mask, initial),
-            mask_source=MaskSource.WEIGHED,
+            mask_source=MaskSource.FUSED,
         )
         self._decided[index] = mask_file(mask)
         if probability is not None and (self._folder / layout.PROBABILITIES).is_dir():
@@ -257,10 +257,10 @@ def adjusted_record(
         estimate: As it was.
         T_cam_obj: ``(4, 4)``, of the camera of the end.
         assessment: How far it is believed in the end; as before, if left out.
-        evidence: What that comes from, kept among the losses.
+        evidence: What that comes from, added to the diagnostics.
     """
-    losses = estimate.losses | dict(evidence or {})
-    estimate = replace(estimate, T_cam_obj=T_cam_obj, camera=None, losses=losses)
+    diagnostics = estimate.diagnostics | dict(evidence or {})
+    estimate = replace(estimate, T_cam_obj=T_cam_obj, camera=None, diagnostics=diagnostics)
     if assessment is None:
         return estimate
     return replace(

@@ -11,11 +11,11 @@ from tracking3d.segmentation.online_features import SOURCES, features, in_questi
 __all__ = [
     "SOURCES",
     "ColourModels",
-    "snap_to_edges",
     "as_lab",
+    "clean_mask",
     "features",
     "in_question",
     "log_odds",
     "paste_window",
-    "clean_mask",
+    "snap_to_edges",
 ]

@@ -37,7 +37,7 @@ Tell = Callable[[Any], None]
 
 @dataclass(frozen=True, eq=False)
 class PromptSet:
-    """What the object is in a first frame; nothing where the mask tracker knows. See `tracking3d.pipeline.record.record`."""
+    """What the object is in a first frame; nothing if the mask tracker knows. See `tracking3d.pipeline.record`."""
 
     box: Box | None = None
     mask: NDArray[np.bool_] | Path | None = None

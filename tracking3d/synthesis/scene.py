@@ -36,7 +36,7 @@ class Scene:
     Attributes:
         spec: What was asked for.
         camera: The true camera of all frames.
-        told_camera: The one that a tracker is told; another where `Disturbances.wrong_fov` is on.
+        given_camera: The one that a tracker is told; another where `Disturbances.wrong_fov` is on.
         solid: The object.
         surface: The object for rays.
         path: Its poses over time.

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tracking3d.rendering.kernels.compilation import OPTIONS, kernel
 
 _HULLS = 2
-"""As many as `tracking3d.segmentation.soft_visual_hull` has ranks; loops over so many known beforehand are a third faster."""
+"""As many as `tracking3d.segmentation.soft_visual_hull` has ranks; loops of a known length are a third faster."""
 
 
 def carry_sign(
@@ -25,7 +25,7 @@ def carry_sign(
     cells: int,
     mark: int,
 ) -> NDArray[np.int8] | None:
-    """``(C * C * C,)``: see `tracking3d.segmentation.soft_visual_hull.carry_sign`; ``mark`` stands where nothing is known."""
+    """``(C * C * C,)``: see `tracking3d.segmentation.soft_visual_hull.carry_sign`; ``mark`` stands for unknown."""
     values = np.empty((cells, cells, cells), np.int8)
     in_front = _carry_sign(
         np.ascontiguousarray(distance, np.float32),

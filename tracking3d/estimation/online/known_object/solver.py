@@ -25,7 +25,7 @@ from tracking3d.estimation.online.state.pose_candidate import PoseCandidate
 from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.estimation.online.tracking.pose_tracking import candidate_cost, find_inliers, pose_evidence
 from tracking3d.estimation.online.user_guidance import restart_backwards
-from tracking3d.estimation.tracker_feedback import SIGHTED
+from tracking3d.estimation.tracker_feedback import RELOCALIZED
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.pose import Pose
 from tracking3d.runtime.stage_times import in_stage
@@ -149,7 +149,7 @@ class KnownObjectSolver(OnlineSolver):
         for region in (mask, None) if mask is not None else (None,):
             if self.known_object.has_colours and not _is_sure(attempts):
                 attempts += [
-                    self._attempt(state, frame, mask, SIGHTED, pose, points)
+                    self._attempt(state, frame, mask, RELOCALIZED, pose, points)
                     for pose, points in by_keypoints(state.object_map, state.camera, image, region)
                 ]
         if mask is not None and not _is_sure(attempts) and should_retry(state.lost_frames):

@@ -84,7 +84,7 @@ def fuse_mask(
     mask = full > 0
     if not mask.any():  # a mask of nothing says that the evidence is for neither
         return FusedMask(initial, MaskSource.INITIAL)
-    return FusedMask(mask, MaskSource.WEIGHED, 0.5 + 0.5 * full, share)
+    return FusedMask(mask, MaskSource.FUSED, 0.5 + 0.5 * full, share)
 
 
 def update_colours(
