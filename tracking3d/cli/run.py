@@ -288,7 +288,7 @@ def run(
             "flat": flat or None,
             "prototype": prototype,
             "texture_views": 0 if model is ModelChoice.NONE else None,
-            "shape": None if model is None else "fine" if fine else "online",
+            "shape": None if model is None else "fine" if fine else "fast",
         },
         window={"size": size},
         solver={"final_refine": final_refine},

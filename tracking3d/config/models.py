@@ -139,8 +139,8 @@ class ObjectConfig(Section):
     max_texture_size: int = Field(
         2048, ge=64, le=8192, description="Most texels along a side of the mesh's texture."
     )
-    shape: Literal["online", "fine"] = Field(
-        "online",
+    shape: Literal["fast", "fine"] = Field(
+        "fast",
         description=(
             "The shape of the mesh at the end: the online map's, or fine, made anew from all frames after the final "
             "refinement and kept where it explains frames that were left out better (extra model)."
@@ -154,7 +154,7 @@ class ObjectConfig(Section):
     @classmethod
     def _is_held_where_known(cls, value: Any) -> Any:
         if isinstance(value, dict) and value.get("known") is not None:
-            return {**value, "adjustment_views": 0, "texture_views": 0, "shape": "online"}
+            return {**value, "adjustment_views": 0, "texture_views": 0, "shape": "fast"}
         return value
 
 

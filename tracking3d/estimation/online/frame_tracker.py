@@ -58,8 +58,8 @@ class FrameTracker:
     @property
     def weights(self) -> PoseWeights:
         """Weights of a pose's terms."""
-        online = self.online
-        return PoseWeights(appearance=online.appearance, outline=online.outline, points=online.points)
+        weights = self.online.weights
+        return PoseWeights(weights.appearance, outline=weights.outline, points=weights.points)
 
     @property
     def device(self) -> torch.device:
