@@ -58,7 +58,7 @@ class PointFollowing:
     """Follows points through the frames of a session as they are answered.
 
     Args:
-        queries: See `checked_queries`.
+        queries: See `validate_queries`.
     """
 
     def __init__(self, queries: Array) -> None:

@@ -232,7 +232,7 @@ def open_frames_in_order(
 
 
 def check_order(source: FrameSource, config: PipelineConfig, start_frame: int | None) -> None:
-    """Make sure that source and solver can go both ways, where that is asked for; see `opened`.
+    """Make sure that source and solver can go both ways, where that is asked for; see `open_frames_in_order`.
 
     Raises:
         InputError: If not.

@@ -118,7 +118,7 @@ def points_prompt(frame: Frame, points: Any, name: str = POINTS) -> Prompt:
 
     Args:
         frame: The frame.
-        points: See `checked_points`.
+        points: See `validate_points`.
         name: What sentences call them.
 
     Raises:

@@ -87,7 +87,7 @@ class RefinementWriter:
         return self._records.get(index) or self.causal[index]
 
     def put(self, estimate: FrameRecord) -> None:
-        """Let a second answer be what it is in the end, see `put_right`; causal ones stand.
+        """Let a second answer be what it is in the end, see `adjusted_record`; causal ones stand.
 
         It is not kept for a run that is stopped here and goes on later: that finds it anew.
         """

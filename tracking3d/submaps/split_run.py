@@ -18,7 +18,7 @@ from tracking3d.submaps.steps import Step, steps_of
 from tracking3d.submaps.submap_runs import PromptSet
 
 SideBySide = Callable[..., list[Any]]
-"""See `side_by_side`."""
+"""See `run_in_processes`."""
 
 
 def record_in_parts(
@@ -53,7 +53,7 @@ def record_in_parts(
         overwrite: Replace a run that is in the folder.
         resume: Go on with what is there.
         listener: Is told of every answer, the first ones and those of the refinement.
-        map_jobs: What takes the place of `side_by_side` with so many workers.
+        map_jobs: What takes the place of `run_in_processes` with so many workers.
 
     Raises:
         InputError: If the video cannot be split, or what is there is of something else.

@@ -93,7 +93,7 @@ _TRAJECTORY_LENGTH = 5  # tracked frames that the motion model extrapolates from
 
 @dataclass(frozen=True)
 class OnlineSolver(FrameTracker):
-    """See the module; implements `tracking3d.estimation.solver.Solver`, `RefiningSolver` and `SteeredSolver`."""
+    """The solver `online`; implements `tracking3d.estimation.solver.Solver`, `RefiningSolver` and `GuidedSolver`."""
 
     state_classes: ClassVar[tuple[type, ...]] = (*STATE_CLASSES, *ONLINE_CLASSES)
     """The classes that a `SolverState` consists of, for checkpoints."""
@@ -276,8 +276,8 @@ class OnlineSolver(FrameTracker):
             revised.append(make_estimate(updated, earlier, found))
             updated = learn_colours(updated, revised[-1], found)
         updated = replace(
-            updated, last_pose=trail[-1], previous_pose=trail[-2], trajectory=tuple(trail[-_TRAJECTORY_LENGTH:]), baseline=usual,
-            tracked_points=view.points,
+            updated, last_pose=trail[-1], previous_pose=trail[-2], trajectory=tuple(trail[-_TRAJECTORY_LENGTH:]),
+            baseline=usual, tracked_points=view.points,
         )  # fmt: skip
         estimate = replace(revised[-1], revised=tuple(revised[:-1]))
         if start.origin == "flat" and not self.config.object.flat and not estimate.reason:

@@ -53,7 +53,7 @@ class PaperSolver:
     encoder: FeatureEncoder
 
     state_classes: ClassVar[tuple[type, ...]] = (*STATE_CLASSES, PaperState, Keyframe)
-    """What a `Belief` is made of, for keeping it."""
+    """What a `PaperState` is made of, for keeping it."""
 
     @property
     def settings(self) -> PaperConfig:

@@ -83,7 +83,7 @@ PACKED = (
     " float32[:,:,::1], float32[:,::1], boolean[:,::1], boolean[:,::1], float32[:,::1], float32[:,::1],"
     " float32[:,::1], float32[:,::1]"
 )
-"""Numba's types of what `packed` returns."""
+"""Numba's types of what `pack` returns."""
 
 
 @kernel(

@@ -97,7 +97,7 @@ class KnownObjectSolver(OnlineSolver):
     def restart_backwards(
         self, state: SolverState, frame: Frame, number: int, T_cam_obj: NDArray[np.float64]
     ) -> SolverState:
-        """The belief that goes on from a frame seen long ago; see `steering.turned_back`."""
+        """The belief that goes on from a frame seen long ago; see `user_guidance.restart_backwards`."""
         turned = restart_backwards(state, frame, number, self.known_object.to_solver(T_cam_obj))
         return turned if state.trajectory else replace(turned, trajectory=())
 

@@ -58,7 +58,7 @@ def make_estimate(
         state: Map, camera and colours.
         estimate: What does not depend on the pose.
         found: What was found in the frame.
-        moving: See `answer_mask`.
+        moving: See `fuse_mask`.
     """
     view, fit, assessment = found.view, found.fit, found.assessment
     if found.lost:
