@@ -18,7 +18,7 @@ from tracking3d.estimation.online.mapping.candidate_landmarks import (
     surroundings,
     with_candidates,
 )
-from tracking3d.estimation.online.mapping.local_mapping import candidate_landmarks, shared_landmarks
+from tracking3d.estimation.online.mapping import candidate_landmarks, shared_landmarks
 
 ANGLES = [-15.0, -5.0, 5.0, 15.0]
 POINT = np.array([0.1, 0.1, -0.75])

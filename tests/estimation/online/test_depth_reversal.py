@@ -18,7 +18,7 @@ from tracking3d.bundle_adjustment.reversal import reversal_of
 from tracking3d.config.solvers import OnlineConfig
 from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.mapping.depth_reversal import fix_depth_reversal
-from tracking3d.estimation.online.mapping.local_mapping import depth_reversal as online_reversal
+from tracking3d.estimation.online.mapping import depth_reversal as online_reversal
 from tracking3d.estimation.online.state.object_map import ObjectMap
 from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.geometry.pose import pose_from_arrays

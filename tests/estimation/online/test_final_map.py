@@ -9,7 +9,7 @@ from turned_solid import CAMERA, turned_map
 
 from tracking3d.config.solvers import OnlineConfig
 from tracking3d.estimation.online.mapping.global_refinement import keyframe_cost, refine_globally
-from tracking3d.estimation.online.mapping.local_mapping import global_refinement
+from tracking3d.estimation.online.mapping import global_refinement
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
 
 ANGLES = [0.0, 12.0, 24.0, 36.0]

@@ -13,7 +13,7 @@ from turned_solid import turned_map
 from tracking3d.bundle_adjustment.adjustment import Structure, adjust
 from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.mapping.focal_length import solve_lens
-from tracking3d.estimation.online.mapping.local_mapping import focal_length
+from tracking3d.estimation.online.mapping import focal_length
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import pose_arrays, pose_from_arrays
 
