@@ -45,9 +45,9 @@ EXACT = {
 AT_LEAST = {
     "tracking3d.config.loading": "config_schema layers_in_words list_presets list_qualities load_config load_prompt",
     "tracking3d.config.models": """CameraConfig ObjectConfig PipelineConfig PluginChoice RuntimeConfig
-        SolverConfig WindowConfig""",
+        SolverConfig CropConfig""",
     "tracking3d.config.solvers": """KeyframeConfig LearningRates OnlineConfig PaperConfig SolverConfig
-        Weights""",
+        TrackingWeights LossWeights""",
     "tracking3d.errors": "InputError OutputError PluginError Tracking3dError",
     "tracking3d.estimation.estimate": "FrameEstimate ObjectModel Status",
     "tracking3d.estimation.solver": "Solver",
@@ -135,7 +135,7 @@ FIELDS = {
     Scores: """iou_initial_mean iou_mean rotation_error_mean_deg rotation_error_median_deg
         rotation_error_anchored_median_deg share_under_5_deg share_worse_than_initial frames""",
 }
-SETTINGS = "tracker features camera object window solver runtime"
+SETTINGS = "tracker features camera object crop solver runtime"
 
 
 @pytest.mark.parametrize(("module", "names"), EXACT.items())

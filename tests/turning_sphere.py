@@ -87,7 +87,7 @@ def turning_sphere_of(count: int, width: int = 160, height: int = 120, step: flo
                 status=Status.TRACKED,
                 reason="appearance loss below tau",
                 confidence=0.9,
-                losses={"features": 0.01, "silhouette": 0.02},
+                losses={"appearance": 0.01, "silhouette": 0.02},
                 iterations=12,
                 keyframe=index % 5 == 0,
                 seconds=0.25,

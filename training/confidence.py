@@ -75,7 +75,8 @@ def judged_frames(benchmark: Path, solver: str | None, refined: bool) -> Iterato
                 known = record.iou_initial is not None
                 evidence = {
                     **record.losses,
-                    **(confidence_features(record.losses) if "witnesses" in record.losses else {}),
+                    **record.diagnostics,
+                    **_of_tracking(record),
                     "has_mask": float(known),
                     "iou_initial": record.iou_initial if record.iou_initial is not None else np.nan,
                     "recorded": record.confidence,
@@ -84,13 +85,22 @@ def judged_frames(benchmark: Path, solver: str | None, refined: bool) -> Iterato
                 yield Judged(truth.name, evidence, right[record.index])
 
 
+def _of_tracking(record: FrameRecord) -> dict[str, float]:
+    """The features of the causal confidence, if the solver records them."""
+    known = "inliers" in record.diagnostics
+    return confidence_features(record.losses, record.diagnostics) if known else {}
+
+
 def _of_landmarks(record: FrameRecord) -> dict[str, float]:
     """What landmarks say of a refined answer, beside what was believed before they were asked."""
-    if "followed" not in record.losses or record.status is Status.LOST:
+    if "landmark_matches" not in record.diagnostics or record.status is Status.LOST:
         return {}
-    followed, agreeing = int(record.losses["followed"]), int(record.losses["landmarks"])
-    support = Support(followed, agreeing, bool(record.losses.get("telling", 1.0)))
-    return supported_by(record.losses.get("rendering", record.confidence), support)
+    followed, agreeing = (
+        int(record.diagnostics["landmark_matches"]),
+        int(record.diagnostics["landmark_inliers"]),
+    )
+    support = Support(followed, agreeing, bool(record.diagnostics.get("textured", 1.0)))
+    return supported_by(record.diagnostics.get("confidence_before", record.confidence), support)
 
 
 def table(frames: list[Judged], names: list[str]) -> tuple[dict[str, np.ndarray], np.ndarray]:

@@ -148,14 +148,14 @@ def test_config_show_says_what_each_layer_sets(call):
     preset, quality = result.stderr.splitlines()
     assert preset == "# preset default: changes nothing"
     assert quality == "# quality draft: tracker.name=flow, crop.size=96, solver.final_refine=False"
-    assert yaml.safe_load(result.stdout)["window"]["size"] == 96
+    assert yaml.safe_load(result.stdout)["crop"]["size"] == 96
     assert yaml.safe_load(call("config", "show", "--quality", "best").stdout)["tracker"] == {"name": "auto"}
 
 
 def test_config_show_is_a_configuration_file_with_every_default(call, tmp_path):
     result = call("config", "show", "--preset", "paper", "--set", "crop.size=64")
     shown = yaml.safe_load(result.stdout)
-    assert shown["window"]["size"] == 64
+    assert shown["crop"]["size"] == 64
     assert shown["tracker"]["padding"] > 0
     (tmp_path / "shown.yaml").write_text(result.stdout)
     assert load_config(tmp_path / "shown.yaml").crop.size == 64

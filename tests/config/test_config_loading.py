@@ -48,7 +48,7 @@ def test_presets_choose_the_solver_and_only_the_default_one_looks_twice_and_corr
 
 
 def test_later_layers_win_key_by_key(yaml_file):
-    file = yaml_file("preset: paper\nsolver: {iterations: 7, sigma: 10, knum: 5}\nwindow: {size: 64}")
+    file = yaml_file("preset: paper\nsolver: {iterations: 7, sigma: 10, knum: 5}\ncrop: {size: 64}")
     config = load_config(
         file,
         overrides=["solver.sigma=20", "solver.weights.motion=2"],
@@ -63,7 +63,7 @@ def test_later_layers_win_key_by_key(yaml_file):
 
 
 def test_named_preset_wins_over_the_files(yaml_file):
-    file = yaml_file("preset: does_not_exist\nwindow: {size: 64}")
+    file = yaml_file("preset: does_not_exist\ncrop: {size: 64}")
     assert load_config(file, preset="paper").crop.size == 64
     with pytest.raises(InputError, match="no preset 'does_not_exist'"):
         load_config(file)
@@ -87,15 +87,16 @@ def test_a_solver_is_chosen_by_its_name_and_has_its_own_defaults(yaml_file, text
     assert PipelineConfig(solver="paper") == config
 
 
-@pytest.mark.parametrize("section", [{"points": 0.5}, OnlineConfig(points=0.5)])
+@pytest.mark.parametrize("section", [{"local_window": 8}, OnlineConfig(local_window=8)])
 def test_settings_without_a_name_are_those_of_the_default_solver(section):
-    assert PipelineConfig(solver=section) == load_config(overrides=["solver.weights.points=0.5"])
+    assert PipelineConfig(solver=section) == load_config(overrides=["solver.local_window=8"])
 
 
 def test_a_configuration_holds_only_what_its_solver_reads():
     online, paper = (load_config(preset=name).model_dump()["solver"] for name in ("default", "paper"))
-    assert online.keys() & paper.keys() == {"name", "final_refine", "tracker_feedback"}
-    assert {"points", "window"} <= online.keys() and {"iterations", "weights"} <= paper.keys()
+    assert online.keys() & paper.keys() == {"name", "final_refine", "tracker_feedback", "weights"}
+    assert "local_window" in online and "iterations" in paper
+    assert not online["weights"].keys() & paper["weights"].keys()
 
 
 def test_another_solver_drops_the_settings_of_the_one_below(yaml_file):
@@ -118,10 +119,10 @@ def test_another_solver_drops_the_settings_of_the_one_below(yaml_file):
             r"choose 'paper' by 'solver.name'\.$",
         ),
         (
-            "preset: paper\nsolver: {points: 1}",
-            "'solver.points' is a setting of the solver 'online', and the solver is",
+            "preset: paper\nsolver: {local_window: 4}",
+            "'solver.local_window' is a setting of the solver 'online', and the solver is",
         ),
-        ("solver: {weights: {motion: 1}}", "'solver.weights' is a setting of the solver 'paper'"),
+        ("solver: {weights: {motion: 1}}", "there is no setting 'solver.weights.motion'"),
         (
             "solver: {sigma: 1, tau: 1, knum: 1, silhouette_bias: none, stop: plateau}",
             "'solver.sigma', 'solver.tau', 'solver.knum' and 2 more are settings of the solver 'paper'.*leave them out",
@@ -198,7 +199,7 @@ def test_yaml_merge_keys_are_plain_data():
         ("solver: !!python/object/apply:os.system ['touch {marker}']", "never run code"),
         ("solver: !!python/name:os.system", "never run code"),
         ("solver: !mine {sigma: 3}", "'!mine' is refused"),
-        ("crop: {size: 64}\nwindow: {margin: 1}", r"'window' is given twice \(line 2"),
+        ("crop: {size: 64}\ncrop: {margin: 1}", r"'crop' is given twice \(line 2"),
         ("solver: {sigma: 1, sigma: 2}", "'sigma' is given twice"),
         ("1: 2", "key 1 is not text"),
         ("? [a, b]\n: 1", "is not text"),
@@ -206,14 +207,14 @@ def test_yaml_merge_keys_are_plain_data():
         ("solvr: {sigma: 3}", r"no setting 'solvr'; did you mean 'solver'\?"),
         ("fov: 30", r"no setting 'fov'; did you mean 'camera.fov'\?"),
         ("solver: {name: paper, weights: {featurs: 3}}", r"did you mean 'solver.weights.features'\?"),
-        ("zzz: 30", "no setting 'zzz'; valid are camera, features"),
+        ("zzz: 30", "no setting 'zzz'; valid are camera, crop, features"),
         ("solver: {name: paper, sigma: lots}", "'solver.sigma' must be a valid number, not 'lots'"),
         ("crop: {size: 4}", "'crop.size' must be greater than or equal to 32, not 4"),
         (
             "solver: {name: paper, silhouette_bias: erod}",
             "'solver.silhouette_bias' must be 'erode', 'soften' or 'none', not 'erod'",
         ),
-        ("solver: {points: .nan}", "must be a finite number, not nan"),
+        ("solver: {weights: {points: .nan}}", "must be a finite number, not nan"),
         ("solver: papre", "'solver.name' must be 'online' or 'paper', not 'papre'"),
         ("solver: {name: 5}", "'solver.name' must be 'online' or 'paper', not 5"),
         ("solver: 3", "'solver' must be a mapping of settings, not 3"),
@@ -346,7 +347,7 @@ def test_schema_covers_presets_and_the_short_form_of_plugins():
     solvers = schema["properties"]["solver"]["anyOf"]
     assert solvers[0]["enum"] == ["online", "paper"]
     assert [one["$ref"].rpartition("/")[2] for one in solvers[1:]] == ["OnlineConfig", "PaperConfig"]
-    assert schema["$defs"]["WindowConfig"]["properties"]["size"]["minimum"] == 32
+    assert schema["$defs"]["CropConfig"]["properties"]["size"]["minimum"] == 32
 
 
 def test_configuration_is_frozen():

@@ -30,7 +30,7 @@ def test_each_quality_looks_closer_than_the_one_before():
 
 def test_what_lies_above_wins(tmp_path: Path):
     file = tmp_path / "mine.yaml"
-    file.write_text("quality: draft\nwindow: {size: 64}\n")
+    file.write_text("quality: draft\ncrop: {size: 64}\n")
     config = load_config(file, overrides=["solver.final_refine=true"])
     assert (config.tracker.name, config.crop.size, config.solver.final_refine) == ("flow", 64, True)
     config = load_config(file, quality="best", tracker="csrt")

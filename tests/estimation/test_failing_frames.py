@@ -104,7 +104,7 @@ def test_a_frame_whose_loss_is_no_number_is_lost_and_the_run_goes_on(preset):
     assert np.isfinite(estimates[4].T_cam_obj).all()
     for estimate in estimates[5:]:
         assert estimate.status is not Status.LOST, estimate.reason
-        assert math.isfinite(estimate.losses["features"])
+        assert math.isfinite(estimate.losses["appearance"])
     assert state.texture.isfinite().all()
     assert all(keyframe.observation.index != 4 for keyframe in state.keyframes)
 

@@ -43,4 +43,4 @@ def test_the_texture_has_the_channels_that_are_kept(limit, channels, tau):
     assert state.texture.shape == (channels, 32, 32)
     assert (state.space is None) == (channels == 21)
     assert torch.isfinite(state.texture).all()
-    assert np.isfinite(estimate.losses["features"])
+    assert np.isfinite(estimate.losses["appearance"])

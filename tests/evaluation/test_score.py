@@ -624,7 +624,7 @@ def test_an_interrupted_run_is_scored_though_it_has_few_frames_of_the_clip(write
 
 def test_the_share_of_answers_of_its_own_is_told_beside_the_iou(write_run, clip):
     sources = {
-        n: {"mask_source": "initial" if n < 7 else "mean" if n < 9 else "rendered"} for n in range(FRAMES)
+        n: {"mask_source": "initial" if n < 7 else "fused" if n < 9 else "rendered"} for n in range(FRAMES)
     }
     scores = score_run(write_run(changes=sources), clip)
     assert scores.share_own_masks == pytest.approx(3 / 9)  # the given frame does not count

@@ -19,11 +19,11 @@ DOCUMENTS = (
     "crop: {size: true}", "object: {prototype: 5}", "object: {frequency: -1}", "object: {texture_size: 1e3}",
     "a: &a [*a]", "a: &a {b: *a}", "tracker: &t {name: csrt}\nfeatures: *t", "<<: {crop: {size: 64}}",
     "crop: {<<: {size: 64}, margin: 0.2}", "? [a, b]\n: c", "? {a: b}\n: c", "1: 2", "null: 3", "true: 1",
-    "window: !!python/object/apply:os.system [echo]", "window: !!set {size}", "window: !!binary aGk=",
-    "!!omap [a: b]", "crop: {size: 2020-01-01}", "window:\n\tsize: 64", "crop: {size: 64", "window: 'open",
-    "&a a: *b", "%YAML 9.9\n---\na: b", "crop: {size: 64}\nwindow: {size: 32}", "%TAG ! tag:x:\n---\n!a b",
+    "crop: !!python/object/apply:os.system [echo]", "crop: !!set {size}", "crop: !!binary aGk=",
+    "!!omap [a: b]", "crop: {size: 2020-01-01}", "crop:\n\tsize: 64", "crop: {size: 64", "crop: 'open",
+    "&a a: *b", "%YAML 9.9\n---\na: b", "crop: {size: 64}\ncrop: {size: 32}", "%TAG ! tag:x:\n---\n!a b",
     "crop: {size: 0o100}", "crop: {size: 0x40}", "crop: {size: 1_0_0}", "crop: {size: 1:30}",
-    "[" * 500, "{a: " * 2000, "- " * 2000, "a: " + "x" * 100_000, "\ufeffwindow: {size: 64}", "a: \x07", "# only",
+    "[" * 500, "{a: " * 2000, "- " * 2000, "a: " + "x" * 100_000, "\ufeffcrop: {size: 64}", "a: \x07", "# only",
     "a: &x [l, l, l, l, l, l, l, l, l]\nb: &y [*x, *x, *x, *x, *x, *x, *x, *x]\nc: &z [*y, *y, *y, *y, *y, *y, *y]\n"
     "d: &u [*z, *z, *z, *z, *z, *z, *z]\ne: &v [*u, *u, *u, *u, *u, *u, *u]\nf: [*v, *v, *v, *v, *v, *v, *v, *v]",
 )  # fmt: skip

@@ -12,7 +12,7 @@ from tracking3d.config.models import PluginChoice
 from tracking3d.errors import InputError
 from tracking3d.estimation.online.known_object import rendered_keyframes
 from tracking3d.estimation.online.known_object.solver import NOT_SEEN
-from tracking3d.estimation.tracker_feedback import SIGHTED
+from tracking3d.estimation.tracker_feedback import RELOCALIZED
 from tracking3d.evaluation.metrics import mask_iou
 from tracking3d.pipeline.known_object import read_known_object
 from tracking3d.pipeline.prompted_tracker import PromptedTracker
@@ -38,7 +38,7 @@ def test_it_is_found_in_the_first_frame_without_a_box_in_the_mesh_s_own_coordina
     mesh.export(tmp_path / "thing.glb")
     found = list(track(list(clip.images), object=tmp_path / "thing.glb", config=config()))
     assert [one.status for one in found] == [Status.TRACKED] * len(clip.images)
-    assert found[0].hypothesis == SIGHTED and found[0].initial_mask is None
+    assert found[0].hypothesis == RELOCALIZED and found[0].initial_mask is None
     assert found[1].initial_mask is not None  # the mask tracker was set on what was found
     for one, truth, mask in zip(found, clip.scene.T_cam_obj, clip.masks, strict=True):
         assert degrees_between(one.T_cam_obj, truth) < 2

@@ -164,9 +164,9 @@ def test_masks_are_weighed_once_more_and_the_causal_ones_stand(clip, source, tmp
     for frame, before in zip(final.frames, causal.frames, strict=True):
         mask = final.mask(frame.index)
         assert frame.area == np.count_nonzero(mask)
-        assert before.mask_source is not MaskSource.WEIGHED
+        assert before.mask_source is not MaskSource.FUSED
         assert before.area == np.count_nonzero(causal.mask(frame.index))
-    assert any(frame.mask_source is MaskSource.WEIGHED for frame in final.frames)
+    assert any(frame.mask_source is MaskSource.FUSED for frame in final.frames)
     assert final.config["object"]["evidence"]
 
 

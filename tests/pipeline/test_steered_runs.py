@@ -255,7 +255,7 @@ def test_a_correction_puts_mask_and_pose_where_the_object_is(clip, online):
     for index in range(10, 14):
         assert iou(alone[index].mask, long.masks[index]) < 0.3
         assert iou(corrected[index].mask, long.masks[index]) > 0.9
-        assert corrected[index].losses["overlap"] > 0.8  # of the silhouette with the mask
+        assert corrected[index].diagnostics["mask_iou"] > 0.8  # of the silhouette with the mask
 
 
 def test_a_run_goes_on_from_the_frame_that_it_started_from_only(clip, images, tmp_path, monkeypatch):

@@ -12,7 +12,14 @@ from refining_solver import CausalSolver
 
 from tracking3d import Frame, FrameEstimate, Status, load_config, track
 from tracking3d.errors import PluginError
-from tracking3d.estimation.tracker_feedback import MOVES, MOVING, SIGHTED, SURE, WORTH_CORRECTING, corrects
+from tracking3d.estimation.tracker_feedback import (
+    MOTION_RATIO,
+    MOVES,
+    RELOCALIZED,
+    SURE,
+    WORTH_CORRECTING,
+    corrects,
+)
 from tracking3d.frames import MaskEstimate, Prompt
 from tracking3d.pipeline.session import SOLVERS
 from tracking3d.plugins import VARIABLE
@@ -122,19 +129,19 @@ def test_the_bounds_themselves_are_worth_correcting():
 
 def test_what_moves_along_corrects_however_unsure_the_pose_is():
     unsure = {"confidence": 0.3, "status": Status.UNCERTAIN}
-    assert corrects(estimate(losses={MOVING: MOVES}, **unsure))
-    assert corrects(estimate(losses={MOVING: 0.05}, mask=square(10, 19), **unsure))  # 19 of 20
-    assert not corrects(estimate(losses={MOVING: MOVES / 2}, **unsure))
-    assert not corrects(estimate(losses={MOVING: 0.5}, mask=square(10, 9), **unsure))
-    assert not corrects(estimate(losses={MOVING: 0.5}, mask=np.zeros(SIZE, bool), **unsure))
+    assert corrects(estimate(diagnostics={MOTION_RATIO: MOVES}, **unsure))
+    assert corrects(estimate(diagnostics={MOTION_RATIO: 0.05}, mask=square(10, 19), **unsure))  # 19 of 20
+    assert not corrects(estimate(diagnostics={MOTION_RATIO: MOVES / 2}, **unsure))
+    assert not corrects(estimate(diagnostics={MOTION_RATIO: 0.5}, mask=square(10, 9), **unsure))
+    assert not corrects(estimate(diagnostics={MOTION_RATIO: 0.5}, mask=np.zeros(SIZE, bool), **unsure))
 
 
 def test_what_was_found_elsewhere_by_its_points_corrects_a_mask_of_something_else():
     for initial in (None, square(0, 5), square(35, 10)):
-        assert corrects(estimate(hypothesis=SIGHTED, initial_mask=initial, confidence=0.4))
+        assert corrects(estimate(hypothesis=RELOCALIZED, initial_mask=initial, confidence=0.4))
     for initial in (square(10), square(12)):  # the mask is there, too: then the usual bounds hold
-        assert not corrects(estimate(hypothesis=SIGHTED, initial_mask=initial, confidence=0.4))
-    assert not corrects(estimate(hypothesis=SIGHTED, status=Status.UNCERTAIN))
+        assert not corrects(estimate(hypothesis=RELOCALIZED, initial_mask=initial, confidence=0.4))
+    assert not corrects(estimate(hypothesis=RELOCALIZED, status=Status.UNCERTAIN))
 
 
 def answers(tracker: dict | str, correct: bool = True, policy: str = "continue", **changes) -> list:

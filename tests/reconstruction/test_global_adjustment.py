@@ -11,7 +11,7 @@ from rendered_views import CAMERA, ball, pattern, pose, seen
 from scipy.spatial.transform import Rotation
 
 from tracking3d.bundle_adjustment.reversal import reversal_of
-from tracking3d.estimation.estimate import GUESSED, ObjectModel, Status
+from tracking3d.estimation.estimate import UNALIGNED_MAP, ObjectModel, Status
 from tracking3d.evaluation.alignment import align_object_frame
 from tracking3d.points import landmark_adjustment
 from tracking3d.points.track_chaining import Chain
@@ -137,7 +137,7 @@ def test_a_pose_that_lies_to_the_others_by_a_guess_keeps_its_motion():
         record = answer(index, off[index])
         if index in (3, 4):
             lost = answer(index, off[7] @ turned_by(index), Status.LOST)
-            record = replace(lost, losses={GUESSED: 1.0})
+            record = replace(lost, diagnostics={UNALIGNED_MAP: 1.0})
             guessed.append(record)
         look.see(record, image, mask)
     look.settle()

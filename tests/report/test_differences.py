@@ -116,7 +116,7 @@ def test_only_settings_that_differ_are_named(run_of):
     settings = {"solver": {"name": "online", "local_window": 12}, "camera": {"fov": None}}
     other = {"solver": {"name": "online", "local_window": 8}, "camera": {"fov": None}, "crop": {"size": 64}}
     comparison = compare_runs([run_of("a", config=settings), run_of("b", config=other)])
-    assert comparison.settings == {"solver.local_window": ["12", "8"], "window.size": [None, "64"]}
+    assert comparison.settings == {"solver.local_window": ["12", "8"], "crop.size": [None, "64"]}
 
 
 def test_runs_of_different_lengths_are_compared_where_both_have_answers(run_of):

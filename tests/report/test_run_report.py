@@ -162,7 +162,7 @@ def test_doubts_tell_guessed_poses_from_those_of_frames_in_which_nothing_is_know
     lines = [json.loads(line) for line in path.read_text().splitlines()]
     guessed = [line for line in lines if line["status"] == "lost"][1:]
     for line in guessed:
-        line["losses"], line["mask_source"] = {"guessed": 1.0}, "weighed"
+        line["diagnostics"], line["mask_source"] = {"unaligned_map": 1.0}, "fused"
     path.write_text("".join(json.dumps(line) + "\n" for line in lines))
     told = " ".join(doubts_of(RunReader(run_folder)))
     assert "The object was lost in 1 of 12 frames: their poses mean nothing" in told

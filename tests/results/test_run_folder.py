@@ -60,8 +60,7 @@ def test_run_json_says_how_the_run_was_made_and_what_came_of_it(tmp_path, turnin
         "failed": 0,
         "masks": {
             "rendered": 0,
-            "weighed": 0,
-            "mean": 0,
+            "fused": 0,
             "initial": 0,
             "none": 0,
         },  # these estimates do not say
@@ -150,7 +149,7 @@ def test_what_is_not_a_number_is_null(tmp_path, turning_sphere, start_run):
         turning_sphere.estimates[0],
         T_cam_obj=np.full((4, 4), np.nan),
         confidence=math.nan,
-        losses={"features": math.inf, "silhouette": math.nan},
+        losses={"appearance": math.inf, "silhouette": math.nan},
         mask=np.zeros((120, 160), dtype=bool),
         initial_mask=np.zeros((120, 160), dtype=bool),
         status=Status.LOST,
@@ -164,7 +163,7 @@ def test_what_is_not_a_number_is_null(tmp_path, turning_sphere, start_run):
     record = run.frames[0]
     assert np.isnan(record.T_cam_obj).all()
     assert math.isnan(record.confidence)
-    assert math.isnan(record.losses["features"])
+    assert math.isnan(record.losses["appearance"])
     assert record.iou_initial is None
 
 

@@ -53,12 +53,12 @@ def test_answers_that_are_the_initial_masks_get_no_iou_with_them(summary):
     assert not any("IoU" in name for name, _ in rows)
     document = json.loads((run / "run.json").read_text())
     assert document["iou_initial_mean"] == 1 and document["iou_initial_mean_own"] is None
-    assert document["counts"]["masks"] == {"rendered": 0, "weighed": 0, "mean": 0, "initial": 8, "none": 0}
+    assert document["counts"]["masks"] == {"rendered": 0, "fused": 0, "initial": 8, "none": 0}
 
 
 def test_of_answers_that_are_its_own_the_iou_is_told_of_these(summary):
     rows, _, run = summary(
-        [MaskSource.INITIAL] * 5 + [MaskSource.RENDERED, MaskSource.WEIGHED, MaskSource.RENDERED]
+        [MaskSource.INITIAL] * 5 + [MaskSource.RENDERED, MaskSource.FUSED, MaskSource.RENDERED]
     )
     assert dict(rows)["frames with an estimated mask"] == "3 of 8; the others keep the initial mask"
     document = json.loads((run / "run.json").read_text())

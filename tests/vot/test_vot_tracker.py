@@ -167,9 +167,9 @@ def test_the_preset_may_be_in_the_environment_and_an_argument_wins(monkeypatch):
 
 
 def test_a_file_and_overrides_are_heard(tmp_path):
-    (tmp_path / "fast.yaml").write_text("solver: {points: 3}\n")
+    (tmp_path / "fast.yaml").write_text("solver: {weights: {points: 3}}\n")
     config = configuration(str(tmp_path / "fast.yaml"), overrides="crop.size=48 object.texture_size=32")
-    assert (config.solver.points, config.crop.size, config.object.texture_size) == (3, 48, 32)
+    assert (config.solver.weights.points, config.crop.size, config.object.texture_size) == (3, 48, 32)
 
 
 # Regions

@@ -90,7 +90,7 @@ def earlier_run(
         folder: The run folder.
         config: The configuration, as JSON has it.
         selection: The ``START:STOP:STEP`` that the source was opened with.
-        given: See `given_of`.
+        given: See `prompt_record`.
 
     Raises:
         InputError: If the run there is of other settings or another source, or its state was not kept.

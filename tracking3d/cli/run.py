@@ -90,13 +90,13 @@ def _configure(
         features=tracking.features,
         camera=camera.settings(),
         object={
-            "known": prompt.known,
+            "model": prompt.known,
             "flat": tracking.flat or None,
             "prototype": tracking.prototype,
             "texture_views": 0 if model is ModelChoice.NONE else None,
-            "shape": None if model is None else "fine" if model is ModelChoice.FINE else "online",
+            "shape": None if model is None else "fine" if model is ModelChoice.FINE else "fast",
         },
-        window={"size": performance.size},
+        crop={"size": performance.size},
         solver={"final_refine": tracking.final_refine},
         runtime={
             "device": performance.device,

@@ -96,9 +96,9 @@ class ObjectConfig(Section):
     model: str | None = Field(
         None,
         description=(
-            "Known object: the folder of an earlier run, or a mesh file. The object is detected in the video, without "
-            "initialization from motion. Shape and colours are fixed: adjustment_views and texture_views are 0, shape is "
-            "online, and prototype is ignored."
+            "The folder of an earlier run or a mesh file: the object is that one, and is found in the video without an "
+            "initialization by motion. Shape and colours are kept: adjustment_views and texture_views are 0, shape is "
+            "fast, and prototype is ignored."
         ),
     )
     prototype: str = Field(
@@ -143,10 +143,10 @@ class ObjectConfig(Section):
     max_texture_size: int = Field(
         2048, ge=64, le=8192, description="Maximum side of the texture image of the mesh, in texels."
     )
-    shape: Literal["online", "fine"] = Field(
-        "online",
+    shape: Literal["fast", "fine"] = Field(
+        "fast",
         description=(
-            "Shape of the final mesh: online takes that of the online map; fine reconstructs it from all frames after "
+            "Shape of the final mesh: fast takes that of the online map; fine reconstructs it from all frames after "
             "the final refinement, and keeps the result if it explains held-out frames better (extra model)."
         ),
     )
@@ -158,7 +158,7 @@ class ObjectConfig(Section):
     @classmethod
     def _is_held_where_known(cls, value: Any) -> Any:
         if isinstance(value, dict) and value.get("known") is not None:
-            return {**value, "adjustment_views": 0, "texture_views": 0, "shape": "online"}
+            return {**value, "adjustment_views": 0, "texture_views": 0, "shape": "fast"}
         return value
 
 

@@ -23,19 +23,21 @@ CorrectTracker = Annotated[
 ]
 
 
+class TrackingWeights(Section):
+    """Weights of the robust losses of a frame's pose in the solver ``online``."""
+
+    appearance: float = Field(1.0, ge=0, description="Appearance: differences of features, pixel by pixel.")
+    outline: float = Field(0.3, ge=0, description="Outline: distances from the mask's outline.")
+    points: float = Field(1.0, ge=0, description="Points: reprojection errors of the tracked points.")
+
+
 class OnlineConfig(Section):
     """The solver ``online``: tracked points combined with re-rendering."""
 
     name: Literal["online"] = Field("online", description="Name of the solver: paper or online.")
     final_refine: FinalRefine = True
     tracker_feedback: CorrectTracker = True
-    appearance: float = Field(1.0, ge=0, description="Weight of the photometric loss in the pose of a frame.")
-    outline: float = Field(
-        0.3, ge=0, description="Weight of the distance between the outline and the mask, robust."
-    )
-    points: float = Field(
-        1.0, ge=0, description="Weight of the reprojection errors of tracked points, robust."
-    )
+    weights: TrackingWeights = TrackingWeights()
     keyframe_rotation: float = Field(
         8.0,
         gt=0,

@@ -31,10 +31,8 @@ class MaskSource(StrEnum):
 
     RENDERED = "rendered"
     """The silhouette of the object at the frame's pose."""
-    WEIGHED = "weighed"
+    FUSED = "fused"
     """What the image shows between that silhouette and the initial mask."""
-    MEAN = "mean"
-    """The mean of their outlines, as versions before 0.2 answered."""
     INITIAL = "initial"
     """The initial mask, handed back as it was."""
     NONE = "none"
@@ -48,12 +46,12 @@ class MaskSource(StrEnum):
     @property
     def is_own(self) -> bool:
         """Whether the answer is more than the input handed back."""
-        return self in (MaskSource.RENDERED, MaskSource.WEIGHED, MaskSource.MEAN)
+        return self in (MaskSource.RENDERED, MaskSource.FUSED)
 
 
-GUESSED = "guessed"
-"""In `FrameEstimate.losses` where the object was lost before and started anew, and how its poses lie to those of before
-is a guess."""
+UNALIGNED_MAP = "unaligned_map"
+"""In `FrameEstimate.diagnostics` if the object was re-initialized after a loss and the transform from the new map to
+the earlier one is only a guess."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +68,8 @@ class FrameEstimate:
         status: See `Status`.
         reason: Why the frame has that status, in words.
         confidence: In [0, 1].
-        losses: Each loss term at the answer, unweighted, by name.
+        losses: Each loss term at the estimate, unweighted, by name.
+        diagnostics: What else tells how far the pose is to be trusted, by name: see docs/run-folder.md.
         iterations: Optimizer iterations spent.
         keyframe: Whether the frame became a keyframe.
         seconds: Wall time spent on the frame, all stages together.
@@ -109,6 +108,7 @@ class FrameEstimate:
     camera: Camera | None = None
     points: PointAnswers | None = None
     probability: NDArray[np.float32] | None = None
+    diagnostics: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ WORTH_CORRECTING = (0.5, 0.9)
 width of an outline; below, one of them is of something else, and nobody knows which."""
 
 
-SIGHTED = "sighted"
+RELOCALIZED = "relocalized"
 """What `FrameEstimate.hypothesis` says where the object was found by its points alone, anywhere in the frame; where the
 mask tracker was elsewhere or had nothing, it is set on what was found, however sure that is."""
 
@@ -24,9 +24,9 @@ ELSEWHERE = 0.2
 """IoU of the object's silhouette, or mask, with the initial mask up to which that is of something else."""
 
 
-MOVING = "moving"
-"""What `FrameEstimate.losses` calls the share of the answer's mask by which it differs from the initial mask because of
-what moves as the object does."""
+MOTION_RATIO = "motion_ratio"
+"""In `FrameEstimate.diagnostics`: the share of the mask by which it differs from the initial mask because of parts that
+move as the object does."""
 
 MOVES = 0.02
 """Such a share from which on the answer is handed back, however sure it is: a side that turns into view lies beside the
@@ -35,14 +35,14 @@ mask for a few frames only, and a pose that is judged by a mask without it canno
 
 def corrects(estimate: FrameEstimate) -> bool:
     """Whether an answer is sure enough, and unlike the initial mask enough, to be handed back to the mask tracker."""
-    moving = estimate.losses.get(MOVING, 0.0) >= MOVES
+    moving = estimate.diagnostics.get(MOTION_RATIO, 0.0) >= MOVES
     if estimate.status is not Status.TRACKED and not moving:
         return False
     if estimate.initial_mask is None:
-        return estimate.hypothesis == SIGHTED
+        return estimate.hypothesis == RELOCALIZED
     both = int(np.count_nonzero(estimate.mask & estimate.initial_mask))
     either = int(np.count_nonzero(estimate.mask | estimate.initial_mask))
-    if estimate.hypothesis == SIGHTED and both <= ELSEWHERE * either:
+    if estimate.hypothesis == RELOCALIZED and both <= ELSEWHERE * either:
         return True
     least, most = WORTH_CORRECTING
     if not both or both < least * either:

@@ -27,7 +27,7 @@ def undistort_solver(lens: Lens | None, solver: Solver[Any]) -> Solver[Any]:
 
 
 class UndistortingSolver(Generic[State]):
-    """See `behind`, and `tracking3d.estimation.solver.Solver` for the methods."""
+    """See `undistort_solver`, and `tracking3d.estimation.solver.Solver` for the methods."""
 
     def __init__(self, lens: Lens, solver: Any) -> None:
         self._lens, self._solver = lens, solver
@@ -76,7 +76,7 @@ class UndistortingSolver(Generic[State]):
 
 
 class CompleteUndistortingSolver(UndistortingSolver[State]):
-    """Of a solver that refines and can be steered, too; see `RefiningSolver` and `SteeredSolver`."""
+    """Of a solver that refines and can be steered, too; see `RefiningSolver` and `GuidedSolver`."""
 
     def refine(self, state: State) -> State:
         """See `RefiningSolver.refine`."""
@@ -93,12 +93,12 @@ class CompleteUndistortingSolver(UndistortingSolver[State]):
     def restart_backwards(
         self, state: State, frame: Frame, number: int, T_cam_obj: NDArray[np.float64]
     ) -> State:
-        """See `SteeredSolver.turned_back`."""
+        """See `GuidedSolver.restart_backwards`."""
         turned: State = self._solver.restart_backwards(state, self._frame(frame), number, T_cam_obj)
         return turned
 
     def trust_mask(self, state: State, frame: Frame, mask: NDArray[np.bool_]) -> State:
-        """See `SteeredSolver.trusting`."""
+        """See `GuidedSolver.trust_mask`."""
         seen = self._lens.mask_to_pinhole(mask)
         trusted: State = self._solver.trust_mask(state, self._frame(frame), seen)
         return trusted

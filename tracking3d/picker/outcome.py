@@ -44,7 +44,7 @@ def save_outcome(picked: Picked, config: PipelineConfig, folder: Path, source: s
 
 
 def mask_files(picked: Picked, folder: Path) -> list[Path]:
-    """Where the masks of `save_picked` lie."""
+    """Where the masks of `save_outcome` lie."""
     return [folder / FOLDER / f"object_{number}.png" for number in range(len(picked.masks))]
 
 
@@ -54,7 +54,7 @@ def settings_as_yaml(config: PipelineConfig) -> str:
 
 
 def command_of(picked: Picked, folder: Path, source: str, frames: str | None) -> str:
-    """The command line of the run; its files are those of `save_picked`.
+    """The command line of the run; its files are those of `save_outcome`.
 
     Args:
         picked: What was picked.

@@ -39,8 +39,8 @@ def validate_queries(follow: Any) -> Array | None:
         queries = np.zeros(0)
     if queries.ndim != 2 or queries.shape[1] not in (2, 3) or not len(queries):
         raise InputError(
-            f"follow={format_value(follow)} is {a_kind(follow)} that does not hold points; give (x, y) of each in pixels, "
-            "or (frame, x, y)."
+            f"follow={format_value(follow)} is {a_kind(follow)} that does not hold points; give (x, y) of each in "
+            "pixels, or (frame, x, y)."
         )
     if not np.isfinite(queries).all():
         raise InputError(
@@ -58,7 +58,7 @@ class PointFollowing:
     """Follows points through the frames of a session as they are answered.
 
     Args:
-        queries: See `checked_queries`.
+        queries: See `validate_queries`.
     """
 
     def __init__(self, queries: Array) -> None:

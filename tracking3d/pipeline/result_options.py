@@ -68,5 +68,5 @@ def config_of_result(
     elif model == "none":
         shape = shape.model_copy(update={"texture_views": 0})
     if model is not None:
-        shape = shape.model_copy(update={"shape": "fine" if model == "fine" else "online"})
+        shape = shape.model_copy(update={"shape": "fine" if model == "fine" else "fast"})
     return config.model_copy(update={"solver": solver, "object": shape})

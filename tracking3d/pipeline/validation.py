@@ -61,7 +61,7 @@ def check_session(config: Any, prompt: Any, intrinsics: Any) -> None:
     if prompt is not None:
         if not isinstance(prompt, Prompt):
             raise InputError(
-                f"prompt= is {a_kind(prompt)}; make one from the first frame with tracking3d.prompts.prompt.make_prompt."
+                f"prompt= is {a_kind(prompt)}; make one with tracking3d.prompts.prompt.make_prompt."
             )
         validate_box(prompt.box, "prompt.box=")
         if prompt.mask is not None:

@@ -120,7 +120,7 @@ def points_prompt(frame: Frame, points: Any, name: str = POINTS) -> Prompt:
 
     Args:
         frame: The frame.
-        points: See `checked_points`.
+        points: See `validate_points`.
         name: Their name in messages.
 
     Raises:
@@ -132,7 +132,7 @@ def points_prompt(frame: Frame, points: Any, name: str = POINTS) -> Prompt:
     around = box_of(mask)
     if around is None or mask.all():
         raise InputError(
-            f"{name}{format_value(points)}: these points do not separate an object from the background in {frame.label}; give "
-            "more points, some of them on the background, or a box."
+            f"{name}{format_value(points)}: these points do not separate an object from the background in "
+            f"{frame.label}; give more points, some of them on the background, or a box."
         )
     return Prompt(around, mask, checked)

@@ -1,7 +1,7 @@
-"""How far a refined answer is believed, once landmarks were looked for.
+"""How far a refined estimate can be trusted, given its landmarks.
 
-What is rendered at a pose can look right though the pose is wrong, because shape and texture were made with such poses.
-Landmarks are independent of that: in wrong poses fewer of those that are found agree.
+The rendering at a pose can look right though the pose is wrong, because shape and texture were made with such poses.
+Landmarks are independent of that: at a wrong pose fewer of the matched ones are inliers.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from tracking3d.points.landmark_adjustment import Support
 from tracking3d.results.records import FrameRecord
 
 BELIEVED = 0.5
-"""Confidence from which on a frame is tracked."""
+"""Confidence from which a frame is `tracked`."""
 _EVEN, _NEARLY_ALL = 0.5, 0.95
 """Shares of the followed landmarks that agree, between which belief grows: where poses are wrong, what is followed is
 often something else, such as the background, and much of it fits no pose."""
@@ -26,20 +26,20 @@ _TERMS = {  # weight, and the range that was seen
 
 
 def assess_estimate(estimate: FrameRecord, support: Support) -> tuple[Assessment, dict[str, float]]:
-    """The judgement of a refined answer, and what it comes from, as the answer's ``losses`` keep it."""
+    """The assessment of a refined estimate, and what it comes from, for the estimate's ``diagnostics``."""
     assessment = judge_with_landmarks(
         Assessment(estimate.status, estimate.reason, estimate.confidence), support
     )
     return assessment, {
-        "rendering": estimate.confidence,
-        "landmarks": float(support.agreeing),
-        "followed": float(support.followed),
-        "telling": float(support.telling),
+        "confidence_before": estimate.confidence,
+        "landmark_inliers": float(support.agreeing),
+        "landmark_matches": float(support.followed),
+        "textured": float(support.telling),
     }
 
 
 def judge_with_landmarks(rendering: Assessment, support: Support) -> Assessment:
-    """The judgement of a frame by what is rendered and by landmarks; what is lost stays lost.
+    """The assessment of a frame by its rendering and its landmarks; a lost frame stays lost.
 
     A logistic regression of whether the answer is right, that is, within 10 degrees and above an IoU of 0.7. Fitted by
     ``training/confidence.py --refined`` on the suites ``fresh`` of seeds 605, 606, 607, 609 and 610, with true masks
@@ -60,9 +60,9 @@ def judge_with_landmarks(rendering: Assessment, support: Support) -> Assessment:
     reason = rendering.reason
     if rendering.status is Status.TRACKED or not reason:
         reason = (
-            f"few landmarks speak for the pose ({support.agreeing} agree of {support.followed} in the image)"
+            f"too few landmark inliers ({support.agreeing} of {support.followed} matched landmarks)"
             if support.telling
-            else "the object is plain: hardly anything tells how it is turned"
+            else "the object has hardly any texture: its rotation is poorly constrained"
         )
     return Assessment(Status.UNCERTAIN, reason, confidence)
 

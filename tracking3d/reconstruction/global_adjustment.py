@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from tracking3d.estimation.estimate import GUESSED, ObjectModel, Status
+from tracking3d.estimation.estimate import UNALIGNED_MAP, ObjectModel, Status
 from tracking3d.estimation.online.features.klt import grey
 from tracking3d.estimation.online.features.texture_strength import PLAIN, texture_strength
 from tracking3d.frames import Image
@@ -112,7 +112,7 @@ class GlobalAdjustment:
         after = bisect(self._bundled, record.index)
         around = [at for at in (after - 1, after) if 0 <= at < len(self._bundled)]
         lost = record.status is Status.LOST
-        if lost and GUESSED not in record.losses and len(around) == 2:
+        if lost and UNALIGNED_MAP not in record.diagnostics and len(around) == 2:
             return self._between(record.index, *around), None
         nearest = min(around, key=lambda at: abs(self._bundled[at] - record.index))
         kept = scene.views[nearest]

@@ -134,8 +134,8 @@ def rebuild_shape(
 def score_run(folder: Path, source: str | None = None, largest: int = 2048) -> HeldOutScores:
     """How well the mesh of a run predicts frames that it was not made from.
 
-    The frames that `shape_run` keeps out are; the others give the mesh its texture anew, and the poses alone of those
-    kept out are fitted to it. Nothing is written. Of a mesh of the online map all frames have shaped the surface.
+    The frames that `rebuild_shape` keeps out are; the others give the mesh its texture anew, and the poses alone of
+    those kept out are fitted to it. Nothing is written. Of a mesh of the online map all frames have shaped the surface.
 
     Args:
         folder: The run folder.

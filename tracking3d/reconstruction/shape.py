@@ -81,7 +81,7 @@ def reconstruct_shape(
         vertices: ``(V, 3)`` of the shape at hand, closed.
         faces: ``(F, 3)``.
         views: The frames that it is made from, in order.
-        left_out: The frames that it is judged by, see `is_left_out`.
+        left_out: The frames that it is judged by, see `is_held_out`.
     """
     used = spread_by_rotation(views, _APART, MOST)
     if len(used) < FEWEST or not left_out:

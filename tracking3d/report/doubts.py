@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tracking3d.estimation.estimate import GUESSED, MaskSource, Status
+from tracking3d.estimation.estimate import UNALIGNED_MAP, MaskSource, Status
 from tracking3d.results.run_reader import RunReader
 
 
@@ -41,9 +41,9 @@ def _about_its_end(run: RunReader) -> list[str]:
 
 def _about_frames(run: RunReader) -> list[str]:
     told, count = [], len(run.frames)
-    losses = [record.losses for record in run.frames if record.status is Status.LOST]
-    guessed = sum(GUESSED in terms for terms in losses)
-    lost = len(losses) - guessed
+    diagnostics = [record.diagnostics for record in run.frames if record.status is Status.LOST]
+    guessed = sum(UNALIGNED_MAP in terms for terms in diagnostics)
+    lost = len(diagnostics) - guessed
     uncertain = sum(record.status is Status.UNCERTAIN for record in run.frames)
     failed = sum(bool(record.failure) for record in run.frames)
     skipped = len(run.description.get("skipped") or [])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -25,6 +25,7 @@ _KINDS: dict[str, Any] = {
     "reason": str,
     "confidence": int | float | None,
     "losses": dict,
+    "diagnostics": dict,
     "iterations": int,
     "keyframe": bool,
     "seconds": int | float | None,
@@ -53,7 +54,7 @@ class FrameRecord:
         status: The estimator's judgement.
         reason: Why, in words.
         confidence: In [0, 1].
-        losses: Each loss term at the answer, unweighted, by name; NaN where it was not a number.
+        losses: Each loss term at the estimate, unweighted, by name; NaN if it was not a number.
         iterations: Optimizer iterations spent.
         keyframe: Whether the frame became a keyframe.
         seconds: Wall time spent on the frame, all stages together; of a revision 0, see `latest`.
@@ -65,7 +66,8 @@ class FrameRecord:
         refined: Whether this is the answer of the final refinement, not the causal one.
         stages: The same time stage by stage; None where it is not known, as in runs of older versions.
         mask_source: Where the answer's mask comes from; None where it is not known.
-        camera: fx, fy, cx, cy of the camera that the pose is of; None where it is the run's.
+        camera: fx, fy, cx, cy of the camera that the pose is of; None if it is the run's.
+        diagnostics: What else tells how far the pose is to be trusted, by name; NaN if it was not a number.
     """
 
     index: int
@@ -88,6 +90,7 @@ class FrameRecord:
     stages: StageTimes | None = None
     mask_source: MaskSource | None = None
     camera: tuple[float, float, float, float] | None = None
+    diagnostics: dict[str, float] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -119,6 +122,7 @@ class FrameRecord:
             stages=estimate.stages,
             mask_source=estimate.mask_source,
             camera=None if (c := estimate.camera) is None else (c.fx, c.fy, c.cx, c.cy),
+            diagnostics={name: float(value) for name, value in estimate.diagnostics.items()},
         )
 
     def through(self, camera: Camera) -> Camera:
@@ -148,6 +152,8 @@ class FrameRecord:
             fields["confidence"] = _number(fields["confidence"])
             fields["seconds"] = _number(fields["seconds"])
             fields["losses"] = {term: _number(value) for term, value in fields["losses"].items()}
+            diagnostics = fields.get("diagnostics", {})
+            fields["diagnostics"] = {name: _number(value) for name, value in diagnostics.items()}
             if (stages := fields.get("stages")) is not None:
                 fields["stages"] = read_stages(stages)
             if (source := fields.get("mask_source")) is not None:

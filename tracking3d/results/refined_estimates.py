@@ -94,7 +94,7 @@ class RefinedEstimates:
             record,
             area=int(np.count_nonzero(mask)),
             iou_initial=mask_iou_or_none(mask, self.initial_mask(index)),
-            mask_source=MaskSource.WEIGHED,
+            mask_source=MaskSource.FUSED,
         )
         self._decided[index] = mask_file(mask)
         if probability is not None and self.writes_probabilities:

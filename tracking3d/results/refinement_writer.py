@@ -186,10 +186,10 @@ def adjusted_record(
         estimate: As it was.
         T_cam_obj: ``(4, 4)``, of the camera of the end.
         assessment: How far it is believed in the end; as before, if left out.
-        evidence: What that comes from, kept among the losses.
+        evidence: What that comes from, added to the diagnostics.
     """
-    losses = estimate.losses | dict(evidence or {})
-    estimate = replace(estimate, T_cam_obj=T_cam_obj, camera=None, losses=losses)
+    diagnostics = estimate.diagnostics | dict(evidence or {})
+    estimate = replace(estimate, T_cam_obj=T_cam_obj, camera=None, diagnostics=diagnostics)
     if assessment is None:
         return estimate
     return replace(

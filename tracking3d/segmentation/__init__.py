@@ -1,7 +1,7 @@
 """How likely each pixel is the object's, from sources that see different things, for any solver.
 
-Of one frame, `pixel_features` says what the sources see, `log_odds` weighs it, `along_edges` and `tidied` decide. When
-all frames are known, `tracking3d.segmentation.whole_video` does the same with more sources.
+Of one frame, `pixel_features` says what the sources see, `log_odds` weighs it, `snap_to_edges` and `clean_mask` decide.
+When all frames are known, `tracking3d.segmentation.whole_video` does the same with more sources.
 """
 
 from tracking3d.segmentation.colour_models import ColourModels, as_lab

@@ -150,7 +150,7 @@ def motion_parallax(
         apart: Pixels of distance from which on, and in full, the motions can be told.
 
     Returns:
-        See `_parted_ways`.
+        See `_motion_parallax`.
     """
     from tracking3d.segmentation.kernels import motion_cue
 

@@ -181,7 +181,7 @@ def _ways_apart(
 def _cue_from_flows(
     here: MotionReference, window: Window, ways: _Ways, inverse_depth: Plane, radius: float
 ) -> Plane:
-    """``(S, S)`` see `moves_along`."""
+    """``(S, S)`` see `online_motion_log_odds`."""
     grey, past = _warp_to_window(here.grey, here.to_small @ window.to_frame, window), ways.past
     ours = np.full(grey.shape, np.inf, np.float32)
     told = np.zeros(grey.shape, np.float32)

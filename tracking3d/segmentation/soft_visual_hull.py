@@ -143,7 +143,7 @@ def march_rays(
     """``(R, S, S)`` pixels within or from hulls, where each ray comes nearest to being within.
 
     Args:
-        hulls: ``(C, C, C, 2 R)`` from `with_peaks`.
+        hulls: ``(C, C, C, 2 R)`` from `sharpen_peaks`.
         origin: ``(3,)`` of the camera in cells; the middle of the first cell is at 0.
         rays: ``(S, S, 3)`` in cells, for a depth of 1.
         depths: ``(D,)`` at which each ray is asked.

@@ -31,7 +31,7 @@ MOST_VIEWS = 60
 """Frames that are put together, spread over those that are believed."""
 _BELIEVED = 0.5
 _ASKED = 0.4
-"""How far the image smooths what is said, see `along_edges`: in an even one outlines would creep."""
+"""How far the image smooths what is said, see `snap_to_edges`: in an even one outlines would creep."""
 _AT_A_TIME = 2
 """Frames that are decided at a time, in as many threads as OpenCV may take at most."""
 _MOST_CHANGE = 0.35  # of the union of both masks; a mask that changes more is another object's

@@ -159,7 +159,8 @@ def merge_submap_states(
     encoder: FeatureEncoder,
     before: Sequence[SolverState] | None = None,
 ) -> tuple[SolverState, float]:
-    """What the parts know as one, and how many times as much their keyframes cost so; see `map_joining.joined`.
+    """What the parts know as one, and how many times as much their keyframes cost so; see
+    `tracking3d.submaps.state_merging.merge_states`.
 
     Args:
         states: Of the parts, all by one lens.

@@ -31,7 +31,9 @@ _PRESENT = "--present-frame"
 
 def quantities(runs: Sequence[FollowedRun]) -> list[str]:
     """What can be plotted of these runs."""
-    terms = {term for run in runs for record in run.frames.values() for term in record.losses}
+    terms = {
+        term for run in runs for record in run.frames.values() for term in record.losses | record.diagnostics
+    }
     return [*PLAIN_QUANTITIES, *sorted(terms)]
 
 
@@ -136,7 +138,11 @@ def _values(run: FollowedRun, quantity: str) -> list[tuple[int, float]]:
             return record.confidence
         if quantity == PLAIN_QUANTITIES[1]:
             return record.iou_initial
-        return record.seconds if quantity == PLAIN_QUANTITIES[2] else record.losses.get(quantity)
+        return (
+            record.seconds
+            if quantity == PLAIN_QUANTITIES[2]
+            else (record.losses | record.diagnostics).get(quantity)
+        )
 
     values = [(index, of(record)) for index, record in run.frames.items()]
     return [(index, value) for index, value in values if value is not None and math.isfinite(value)]

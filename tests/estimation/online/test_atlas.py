@@ -12,7 +12,7 @@ from online_runs import estimate_of, final
 
 from tracking3d.checkpoint.serialization import TreeFolder
 from tracking3d.config.loading import load_config
-from tracking3d.estimation.estimate import GUESSED, MaskSource, Status
+from tracking3d.estimation.estimate import UNALIGNED_MAP, MaskSource, Status
 from tracking3d.estimation.online.atlas.atlas import (
     activate_largest_map,
     guess_alignment,
@@ -88,7 +88,9 @@ def refined(count: int):
 def rotation_errors(estimates) -> np.ndarray:
     """In degrees, of those that have a pose, be it a guess how that lies to others."""
     seen = [
-        estimate for estimate in estimates if estimate.status is not Status.LOST or GUESSED in estimate.losses
+        estimate
+        for estimate in estimates
+        if estimate.status is not Status.LOST or UNALIGNED_MAP in estimate.diagnostics
     ]
     found = np.stack([estimate.T_cam_obj[:3, :3] for estimate in seen])
     true = clip().T_cam_obj[[SHOWN[estimate.index] for estimate in seen], :3, :3]
@@ -99,13 +101,15 @@ def test_a_side_that_nobody_knows_is_tracked_anew_and_said_to_lie_there_by_a_gue
     state, estimates = run(ALONE)
     second = final(estimates)[BACK:]
     assert state.unaligned and len(state.inactive_maps) == 1
-    assert all(estimate.status is Status.LOST and GUESSED in estimate.losses for estimate in second[1:])
+    assert all(
+        estimate.status is Status.LOST and UNALIGNED_MAP in estimate.diagnostics for estimate in second[1:]
+    )
     assert all("re-initialized" in estimate.reason and estimate.confidence <= 0.05 for estimate in second[1:])
     # Its masks are its own.
     assert all(estimate.mask_source is not MaskSource.INITIAL for estimate in second[-5:])
     assert rotation_errors(second).mean() < 4
     # Until the second start is solved nothing is known, and it is as large as it was.
-    assert GUESSED not in estimates[BACK].losses
+    assert UNALIGNED_MAP not in estimates[BACK].diagnostics
     before, after = (np.linalg.norm(estimate.T_cam_obj[:3, 3]) for estimate in (estimates[5], estimates[-1]))
     assert after == pytest.approx(before, rel=0.3)
 
@@ -117,14 +121,14 @@ def test_when_a_known_side_is_met_again_both_maps_are_one():
     assert any(view.index < FIRST for view in state.object_map.keyframes)
     assert any(BACK <= view.index < ALONE for view in state.object_map.keyframes)
     last = estimates[-1]
-    assert last.status is Status.TRACKED and GUESSED not in last.losses
+    assert last.status is Status.TRACKED and UNALIGNED_MAP not in last.diagnostics
     assert rotation_errors([*estimates[3:FIRST], last])[-1] < 6
 
 
 def test_the_final_refinement_puts_all_frames_of_joined_maps_right():
     _, estimates = refined(len(SHOWN))
     seen = [estimate for estimate in estimates if SHOWN[estimate.index] is not None]
-    assert not any(GUESSED in estimate.losses for estimate in seen)
+    assert not any(UNALIGNED_MAP in estimate.diagnostics for estimate in seen)
     assert np.median(rotation_errors(seen)) < 3
 
 
@@ -139,8 +143,8 @@ def test_maps_that_were_never_joined_are_refined_each_by_itself():
     }
     assert len(activate_largest_map(state).object_map.keyframes) == max(sizes)
     guessed = (
-        {GUESSED in estimate.losses for estimate in first},
-        {GUESSED in estimate.losses for estimate in second},
+        {UNALIGNED_MAP in estimate.diagnostics for estimate in first},
+        {UNALIGNED_MAP in estimate.diagnostics for estimate in second},
     )
     assert sorted(guessed, key=sorted) == [{False}, {True}]
     mesh = solver().result(state)
@@ -151,7 +155,7 @@ def test_a_frame_that_stays_lost_stays_where_it_was_taken_to_be():
     _, causal = run(ALONE)
     _, estimates = refined(ALONE)
     for before, after in list(zip(final(causal), estimates, strict=True))[FIRST:BACK]:
-        assert before.status is after.status is Status.LOST and GUESSED not in after.losses
+        assert before.status is after.status is Status.LOST and UNALIGNED_MAP not in after.diagnostics
         assert np.allclose(after.T_cam_obj, before.T_cam_obj, atol=1e-5)
 
 

@@ -56,7 +56,7 @@ def test_the_mask_is_where_the_probability_is_above_a_half():
 def test_two_masks_that_are_right_are_kept():
     mask, source = answer(TRUTH, TRUTH, TRUTH)
     assert iou(mask, TRUTH) > 0.97
-    assert source is MaskSource.WEIGHED
+    assert source is MaskSource.FUSED
 
 
 @pytest.mark.parametrize("shift", [-8, 8])
@@ -106,4 +106,4 @@ def test_colours_of_a_frame_are_learnt():
 
 def test_the_answer_says_whether_it_is_more_than_the_input_handed_back():
     own = [source for source in MaskSource if source.is_own]
-    assert own == [MaskSource.RENDERED, MaskSource.WEIGHED, MaskSource.MEAN]
+    assert own == [MaskSource.RENDERED, MaskSource.FUSED]

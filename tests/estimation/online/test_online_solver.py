@@ -26,7 +26,7 @@ from tracking3d.config.loading import load_config
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.solver import RefiningSolver
-from tracking3d.estimation.tracker_feedback import MOVES, MOVING
+from tracking3d.estimation.tracker_feedback import MOTION_RATIO, MOVES
 from tracking3d.evaluation.metrics import mask_iou
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.pipeline.track import track
@@ -87,7 +87,7 @@ def test_rotations_are_found_and_the_silhouette_overlaps_the_object():
     object_map = whole_run()[0].object_map
     for estimate in estimates:
         assert not estimate.refined
-        assert estimate.losses["overlap"] > 0.85
+        assert estimate.diagnostics["mask_iou"] > 0.85
         assert np.linalg.det(estimate.T_cam_obj[:3, :3]) == pytest.approx(1, abs=1e-5)
     last = whole_run()[0].last[0]
     assert mask_iou(object_map.silhouette(last, turning_clip().camera), true_mask(FRAMES - 1)) > 0.9
@@ -187,9 +187,9 @@ def test_a_side_that_the_masks_leave_out_is_taken_in_since_it_moves_along():
     _, estimates = run([(frame(index), cut[index]) for index in cut], after=known_run(9))
     estimate = estimates[-1]
     assert mask_iou(estimate.mask, true_mask(last)) > mask_iou(cut[last], true_mask(last)) + 0.03
-    assert max(one.losses[MOVING] for one in estimates[9:]) > MOVES
+    assert max(one.diagnostics[MOTION_RATIO] for one in estimates[9:]) > MOVES
     assert all(
-        one.losses[MOVING] < MOVES for one in whole_run()[1][started() + 1 :]
+        one.diagnostics[MOTION_RATIO] < MOVES for one in whole_run()[1][started() + 1 :]
     )  # true masks lack nothing
 
 

@@ -12,7 +12,7 @@ from tracking3d.estimation.online.initialization.initial_map import initialize_w
 from tracking3d.estimation.online.initialization.rotation_hypotheses import (
     DIRECTIONS,
     TURNS,
-    turning_hypotheses,
+    rotation_hypotheses,
 )
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
 
@@ -25,7 +25,7 @@ def box_mask(left: int, top: int, side: int) -> np.ndarray:
 
 def test_hypotheses_turn_steadily_in_every_direction_and_one_does_not() -> None:
     views = list(turned_map([0.0, 0.0, 0.0]).keyframes)
-    found = turning_hypotheses(views, CAMERA)
+    found = rotation_hypotheses(views, CAMERA)
     assert len(found) == 1 + DIRECTIONS * len(TURNS)
     assert len({name for name, _ in found}) == 1 + DIRECTIONS
     angles = []
@@ -42,14 +42,14 @@ def test_translations_follow_the_masks() -> None:
     first, second = turned_map([0.0, 0.0]).keyframes
     depth = float(first.pose.translation[2])
     views = [replace(first, mask=box_mask(20, 20, 16)), replace(second, mask=box_mask(26, 17, 16))]
-    beside = turning_hypotheses(views, CAMERA)[0][1][1].translation
+    beside = rotation_hypotheses(views, CAMERA)[0][1][1].translation
     expected = torch.tensor([6 / CAMERA.fx * depth, -3 / CAMERA.fy * depth, depth])
     assert torch.allclose(beside, expected, atol=1e-5)
     # Half as wide is twice as far away.
     views[1] = replace(second, mask=box_mask(24, 24, 8))
-    assert float(turning_hypotheses(views, CAMERA)[0][1][1].translation[2]) == pytest.approx(2 * depth)
+    assert float(rotation_hypotheses(views, CAMERA)[0][1][1].translation[2]) == pytest.approx(2 * depth)
     views[1] = replace(second, mask=None)
-    assert torch.equal(turning_hypotheses(views, CAMERA)[0][1][1].translation, first.pose.translation)
+    assert torch.equal(rotation_hypotheses(views, CAMERA)[0][1][1].translation, first.pose.translation)
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from online_runs import FRAMES, empty_frame, estimate_of, frame, solver, true_ma
 from tracking3d.estimation.estimate import MaskSource, Status
 from tracking3d.estimation.online.features.klt import grey
 from tracking3d.estimation.online.relocalization.whole_frame import overlaps_mask, relocalize_in_frame
-from tracking3d.estimation.tracker_feedback import SIGHTED, corrects
+from tracking3d.estimation.tracker_feedback import RELOCALIZED, corrects
 from tracking3d.evaluation.metrics import mask_iou
 from tracking3d.frames import Frame
 
@@ -47,7 +47,7 @@ def test_what_comes_back_elsewhere_is_found_while_the_mask_clings_to_the_wall(fr
     index = FRAMES + frames
     image, mask = moved(frame(SHOWN).image, aside), moved(true_mask(SHOWN), aside)
     state, back = solver().step(lost_for(frames), Frame(index, image), estimate_of(wrong_mask()))
-    assert (back.status, back.hypothesis) == (Status.TRACKED, SIGHTED)
+    assert (back.status, back.hypothesis) == (Status.TRACKED, RELOCALIZED)
     assert back.mask_source is MaskSource.RENDERED
     assert mask_iou(back.mask, mask) > 0.85
     assert (back.initial_mask == wrong_mask()).all()

@@ -65,7 +65,7 @@ def _divide(points, coupling, points_gradient, by_points, gradient):
 
 @shared
 def _solve_columns(factor, right, solved, tile):
-    """Write the solutions ``(3, C)`` of a system whose matrix was `factorised`."""
+    """Write the solutions ``(3, C)`` of a system whose matrix was factorized."""
     a, b, c = 1 / factor[0, 0], 1 / factor[1, 1], 1 / factor[2, 2]
     ba, ca, cb = factor[1, 0], factor[2, 0], factor[2, 1]
     for first in range(0, right.shape[1], _COLUMNS):

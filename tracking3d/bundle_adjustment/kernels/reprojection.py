@@ -72,7 +72,7 @@ def factorize(matrix):
 
 @shared
 def solve_factorised(factor, right):
-    """Replace ``right`` by the solution of a system whose matrix was `factorised`."""
+    """Replace ``right`` by the solution of a system whose matrix was factorized."""
     size = len(factor)
     for i in range(size):
         for k in range(i):

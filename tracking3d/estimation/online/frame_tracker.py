@@ -12,12 +12,12 @@ from tracking3d.estimation.observation import Observation
 from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.mapping.local_mapping import mask_weight
 from tracking3d.estimation.online.optimization.types import PoseFit, PoseWeights
-from tracking3d.estimation.online.relocalization.pose_search import relocalize, should_retry
+from tracking3d.estimation.online.relocalization.pose_search import ROTATION_SEARCH, relocalize, should_retry
 from tracking3d.estimation.online.relocalization.whole_frame import overlaps_mask, relocalize_in_frame
 from tracking3d.estimation.online.state.confidence import assess_pose, needs_relocalization
 from tracking3d.estimation.online.state.object_map import Keyframe
 from tracking3d.estimation.online.state.pose_candidate import PoseCandidate
-from tracking3d.estimation.online.state.solver_state import SolverState
+from tracking3d.estimation.online.state.solver_state import SolverPhase, SolverState
 from tracking3d.estimation.online.tracking.motion_model import is_consistent_with_motion
 from tracking3d.estimation.online.tracking.pose_tracking import (
     find_inliers,
@@ -27,7 +27,7 @@ from tracking3d.estimation.online.tracking.pose_tracking import (
     pose_of_points,
 )
 from tracking3d.estimation.solver_base import SolverBase
-from tracking3d.estimation.tracker_feedback import SIGHTED
+from tracking3d.estimation.tracker_feedback import RELOCALIZED
 from tracking3d.frames import Frame
 from tracking3d.geometry.pose import Pose
 
@@ -45,8 +45,8 @@ class FrameTracker(SolverBase):
     @property
     def weights(self) -> PoseWeights:
         """Weights of a pose's terms."""
-        online = self.online
-        return PoseWeights(appearance=online.appearance, outline=online.outline, points=online.points)
+        weights = self.online.weights
+        return PoseWeights(weights.appearance, outline=weights.outline, points=weights.points)
 
     def _find(
         self,
@@ -56,7 +56,7 @@ class FrameTracker(SolverBase):
         image: NDArray[np.uint8],
         starts: dict[str, Pose],
     ) -> PoseCandidate:
-        """The pose by cheap starts, by costly ones where it looks wrong, and elsewhere where none is believed."""
+        """The pose near the predicted ones; relocalized if its losses are unusual, anywhere in the frame if doubtful."""
         assert state.surface is not None
         object_map, camera = state.object_map, state.camera
         on_object = view.points.only(~object_map.candidate[view.points.landmark])
@@ -66,7 +66,7 @@ class FrameTracker(SolverBase):
         won, fit = self._fit(state, view, starts, view.points)
         kept = find_inliers(object_map, camera, fit.pose, view.points, view)
         support = pose_evidence(object_map, camera, fit.pose, kept, view)
-        if state.lost_frames or needs_relocalization(fit, state.baseline, support):
+        if state.phase is SolverPhase.LOST or needs_relocalization(fit, state.baseline, support):
             won, fit, kept = relocalize(
                 object_map,
                 state.surface,
@@ -78,8 +78,10 @@ class FrameTracker(SolverBase):
                 state.lost_frames,
             )
             support = pose_evidence(object_map, camera, fit.pose, kept, view)
-        astray = state.lost_frames > 0 and not is_consistent_with_motion(state, fit.pose, frame.index)
-        assessment = assess_pose(fit, state.baseline, support, won == "grid", astray)
+        astray = state.phase is SolverPhase.LOST and not is_consistent_with_motion(
+            state, fit.pose, frame.index
+        )
+        assessment = assess_pose(fit, state.baseline, support, won == ROTATION_SEARCH, astray)
         best = PoseCandidate(view, fit, won, kept, support, assessment)
         if best.lost or (best.doubtful and should_retry(state.doubtful_frames)):
             other = self._elsewhere(state, frame, image, view.mask)
@@ -89,7 +91,7 @@ class FrameTracker(SolverBase):
     def _elsewhere(
         self, state: SolverState, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
     ) -> PoseCandidate | None:
-        """The object somewhere else in the frame than the mask; None where it is not seen there either."""
+        """The object relocalized anywhere in the frame, away from the mask too; None if it is not found."""
         where = relocalize_in_frame(
             state.object_map, state.camera, image, (state.trajectory or (state.last_pose,))[-1][0]
         )
@@ -98,11 +100,11 @@ class FrameTracker(SolverBase):
         pose, points = where
         elsewhere = mask is None or not overlaps_mask(state.object_map.silhouette(pose, state.camera), mask)
         view = self._view(state, frame, None if elsewhere else mask, pose, points)
-        _, fit = self._fit(state, view, {SIGHTED: pose}, points)
+        _, fit = self._fit(state, view, {RELOCALIZED: pose}, points)
         kept = find_inliers(state.object_map, state.camera, fit.pose, points, view)
         support = pose_evidence(state.object_map, state.camera, fit.pose, kept, view)
         found = PoseCandidate(
-            view, fit, SIGHTED, kept, support, assess_pose(fit, state.baseline, support, guessed=True)
+            view, fit, RELOCALIZED, kept, support, assess_pose(fit, state.baseline, support, guessed=True)
         )
         return None if found.lost else found
 
@@ -120,7 +122,7 @@ class FrameTracker(SolverBase):
         pose: Pose,
         followed: FollowedPoints,
     ) -> Keyframe:
-        """A frame as it is seen from a pose, with its mask judged by the points."""
+        """A frame seen from a pose, with the confidence in its mask that the points give."""
         on_object = followed.only(~state.object_map.candidate[followed.landmark])
         observation = self._observe(state, frame, mask, pose)
         return Keyframe(observation, mask, pose, followed, mask_weight=mask_weight(mask, on_object))

@@ -1,8 +1,20 @@
 """The online solver: track fast, map when it pays, and join matched points with re-rendering.
 
-The first frames wait until the object has moved enough to be solved together (`waiting`, `start`); every further one
-is tracked against the map (`tracking`) and judged (`judgement`), and enters the map where it shows a new view
-(`growing`, `mapping`). When the video has ended, everything can be solved once more.
+The loop, frame by frame; the rooms beside this module hold its steps::
+
+    if phase is INITIALIZING:                  # initialization/
+        add the frame to the pending ones
+        if they show enough motion: make the first map, and estimate all pending frames again
+    else:                                      # frame_tracker
+        predict the pose by the motion model   # tracking/
+        refine it by appearance, outline and tracked points
+        if the losses are unusual: relocalize  # relocalization/
+        assess the pose, fuse the mask         # state/confidence, masks/
+        if the frame is a keyframe:            # mapping/
+            insert it, refine the local map, check for a depth reversal
+            merge the maps that show the same side  # atlas/
+    if phase is LOST:                          # atlas/
+        try the inactive maps, else collect frames for a second map
 """
 
 from __future__ import annotations
@@ -52,7 +64,7 @@ from tracking3d.estimation.online.relocalization.pose_search import should_retry
 from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS, assess_pose, is_high_loss
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.pose_candidate import PoseCandidate
-from tracking3d.estimation.online.state.solver_state import ONLINE_CLASSES, SolverState
+from tracking3d.estimation.online.state.solver_state import ONLINE_CLASSES, SolverPhase, SolverState
 from tracking3d.estimation.online.tracking.motion_model import (
     advance,
     extrapolate_motion,
@@ -70,21 +82,21 @@ from tracking3d.geometry.pose import Pose, pose_from_arrays, rotation_angle
 from tracking3d.rendering import TexelMap
 from tracking3d.runtime.stage_times import in_stage
 
-_SPARSE = 40  # witnesses below which the map takes a frame for the sake of new points
-_PAUSE = 3  # frames from one keyframe to the next for that sake
-_FITS = 0.8  # overlap with the mask that lets a frame without witnesses into the map
+_FEW_INLIERS = 40  # inliers below which a frame becomes a keyframe for the sake of new points
+_MIN_INTERVAL = 3  # frames between two such keyframes
+_MIN_OVERLAP = 0.8  # IoU with the mask from which a frame without inliers can be a keyframe
 _LOOKS_FLAT = (
-    "all points seen so far lie in one plane; if the whole object is flat, --flat tells its back side better"
+    "all points seen so far lie in one plane; if the whole object is flat, --flat estimates its back better"
 )
-_TRAIL = 5  # believed frames that give the motion where nothing is seen
+_TRAJECTORY_LENGTH = 5  # tracked frames that the motion model extrapolates from
 
 
 @dataclass(frozen=True)
 class OnlineSolver(FrameTracker):
-    """See the module; implements `tracking3d.estimation.solver.Solver`, `RefiningSolver` and `SteeredSolver`."""
+    """The solver `online`; implements `tracking3d.estimation.solver.Solver`, `RefiningSolver` and `GuidedSolver`."""
 
     state_classes: ClassVar[tuple[type, ...]] = (*STATE_CLASSES, *ONLINE_CLASSES)
-    """What a `Belief` is made of, for keeping it."""
+    """The classes that a `SolverState` consists of, for checkpoints."""
 
     def init(self, frame: Frame, mask: MaskEstimate) -> tuple[SolverState, FrameEstimate]:
         """Take the first frame, with the prototype as the shape.
@@ -92,12 +104,12 @@ class OnlineSolver(FrameTracker):
         Raises:
             InputError: If the first frame's mask is missing or empty, or the prototype cannot be used.
         """
-        return self._first(frame, first_mask(frame, mask), self.camera)
+        return self._first_state(frame, first_mask(frame, mask), self.camera)
 
-    def _first(
+    def _first_state(
         self, frame: Frame, binary: NDArray[np.bool_], camera: Camera, space: FeatureSpace | None = None
     ) -> tuple[SolverState, FrameEstimate]:
-        """Take a first frame; ``space`` is that of the features, where there is one."""
+        """The state after a first frame; ``space`` is the feature space, if there is one already."""
         ellipse = mask_ellipse(binary)
         translation = torch.tensor(first_translation(ellipse, camera), dtype=torch.float32)
         pose = Pose.identity(translation.to(self.device))
@@ -133,25 +145,25 @@ class OnlineSolver(FrameTracker):
 
     def step(self, state: SolverState, frame: Frame, mask: MaskEstimate) -> tuple[SolverState, FrameEstimate]:
         """Take one more frame."""
-        binary = mask.found
-        if state.pending is not None:
-            return self._wait(state, frame, grey(frame.image), binary)
-        state, estimate = self._track(state, frame, grey(frame.image), binary)
-        may_begin_anew = not state.object_map.fixed_keyframes and not state.object_map.pointless
-        if estimate.status is Status.LOST and binary is not None and may_begin_anew:
-            state, estimate = self._otherwise(state, estimate, frame, binary)
+        binary, image = mask.found, grey(frame.image)
+        if state.phase is SolverPhase.INITIALIZING:
+            return self._add_pending(state, frame, image, binary)
+        state, estimate = self._track(state, frame, image, binary)
+        can_reinitialize = not state.object_map.fixed_keyframes and not state.object_map.pointless
+        if state.phase is SolverPhase.LOST and binary is not None and can_reinitialize:
+            state, estimate = self._recover(state, estimate, frame, binary)
         return state, mark_unaligned(estimate) if state.unaligned else estimate
 
     restart_backwards = staticmethod(restart_backwards)
     trust_mask = staticmethod(trust_mask)
 
     def refine(self, state: SolverState) -> SolverState:
-        """All keyframes together once more; where the start still waits, it is what the frames say so far."""
-        if state.pending is not None:
+        """Refine all keyframes together; if the map is not initialized yet, initialize it from the pending frames."""
+        if state.phase is SolverPhase.INITIALIZING:
             state, start = try_initialize(state, self.online, ended=True)
             if start is None:
                 return state
-            state, _ = self._begun(state, start)
+            state, _ = self._initialize(state, start)
         state = merge_maps(state, self.online, state.object_map.keyframes)
         state = activate_largest_map(
             replace(state, spans=(*state.spans, (state.active_since, state.last_pose[1])))
@@ -176,7 +188,7 @@ class OnlineSolver(FrameTracker):
     def refine_frame(
         self, state: SolverState, frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]
     ) -> tuple[SolverState, FrameEstimate]:
-        """A frame's pose once more, against the final map."""
+        """Estimate a frame's pose again, with the final map."""
         state = map_of_frame(state, frame.index)
         binary, image, object_map = mask.found, grey(frame.image), state.object_map
         causal = pose_from_arrays(T_cam_obj[:3, :3], T_cam_obj[:3, 3], object_map.vertices)
@@ -195,9 +207,9 @@ class OnlineSolver(FrameTracker):
         updated = replace(advance(state, found, found.fit.pose, image), previous_pose=before)
         if not found.lost:
             updated = replace(
-                updated, trajectory=(*state.trajectory, (found.fit.pose, frame.index))[-_TRAIL:]
+                updated, trajectory=(*state.trajectory, (found.fit.pose, frame.index))[-_TRAJECTORY_LENGTH:]
             )
-        if found.lost:  # no pose was found that would be better than where it was taken to be
+        if found.lost:  # no better pose than the causal one was found
             found = replace(found, fit=replace(found.fit, pose=causal))
         estimate = make_estimate(
             updated, initial_estimate(frame, binary, found.fit.pose, state.camera), found
@@ -213,10 +225,10 @@ class OnlineSolver(FrameTracker):
             object_map = replace(object_map, keyframes=tuple(view for view, _ in state.pending or ()))
         return object_model(object_map, state.surface or object_map.surface())
 
-    def _wait(
+    def _add_pending(
         self, state: SolverState, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
     ) -> tuple[SolverState, FrameEstimate]:
-        """Keep a first frame, and solve all of them once they can be."""
+        """Add a frame to the pending ones, and initialize the map if they show enough motion."""
         assert state.pending is not None
         pose = state.last_pose[0]
         view = self._view(state, frame, mask, pose, follow(state.grey, image, state.tracked_points))
@@ -232,10 +244,10 @@ class OnlineSolver(FrameTracker):
         if start is None:
             reason = updated.waiting_reason or estimate.reason
             return updated, replace(estimate, reason=reason)
-        return self._begun(updated, start)
+        return self._initialize(updated, start)
 
-    def _begun(self, state: SolverState, start: InitialMap) -> tuple[SolverState, FrameEstimate]:
-        """Answer all waiting frames anew."""
+    def _initialize(self, state: SolverState, start: InitialMap) -> tuple[SolverState, FrameEstimate]:
+        """Make the first map, and estimate all pending frames with it."""
         assert state.pending is not None
         everything = list(range(len(start.object_map.keyframes)))
         waiting, before, camera = state.pending, state.camera, start.camera
@@ -264,8 +276,8 @@ class OnlineSolver(FrameTracker):
             revised.append(make_estimate(updated, earlier, found))
             updated = learn_colours(updated, revised[-1], found)
         updated = replace(
-            updated, last_pose=trail[-1], previous_pose=trail[-2], trajectory=tuple(trail[-_TRAIL:]), baseline=usual,
-            tracked_points=view.points,
+            updated, last_pose=trail[-1], previous_pose=trail[-2], trajectory=tuple(trail[-_TRAJECTORY_LENGTH:]),
+            baseline=usual, tracked_points=view.points,
         )  # fmt: skip
         estimate = replace(revised[-1], revised=tuple(revised[:-1]))
         if start.origin == "flat" and not self.config.object.flat and not estimate.reason:
@@ -275,18 +287,19 @@ class OnlineSolver(FrameTracker):
     def _track(
         self, state: SolverState, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
     ) -> tuple[SolverState, FrameEstimate]:
-        """Find the frame's pose, and take it into the map where it shows something new."""
+        """Estimate the frame's pose, and insert the frame into the map if it shows something new."""
         starts = pose_predictions(state, frame.index, mask)
         likeliest = next(iter(starts.values()))
         followed = follow(state.grey, image, state.tracked_points, predict_points(state, likeliest))
         found = self._find(state, self._view(state, frame, mask, likeliest, followed), frame, image, starts)
         usual = not is_high_loss(found.fit, state.baseline, found.view.mask_weight)
-        key = not found.lost and (usual or found.evidence.is_decisive) and self._is_keyframe(state, found)
+        reliable = usual or found.evidence.is_decisive
+        is_keyframe = not found.lost and reliable and self._is_keyframe(state, found)
         pose = extrapolate_motion(state.trajectory, frame.index) if found.lost else found.fit.pose
         updated = advance(state, found, pose, image)
         if usual and not found.lost:
             updated = replace(updated, baseline=state.baseline.update(found.fit))
-        if key:
+        if is_keyframe:
             view = replace(found.view, pose=pose, points=found.points)
             with in_stage("map"):
                 object_map, followed = insert_keyframe(
@@ -303,30 +316,32 @@ class OnlineSolver(FrameTracker):
         if found.lost:
             updated = replace(updated, previous_pose=None)
         elif usual:
-            updated = replace(updated, trajectory=(*updated.trajectory, (pose, frame.index))[-_TRAIL:])
+            updated = replace(
+                updated, trajectory=(*updated.trajectory, (pose, frame.index))[-_TRAJECTORY_LENGTH:]
+            )
         found = replace(found, fit=replace(found.fit, pose=pose))
         plain, now = initial_estimate(frame, mask, pose, state.camera), updated
         estimate = make_estimate(now, plain, found, lambda: motion_cue_in_window(now, found, image))
         updated = remember_motion(learn_colours(updated, estimate, found), estimate, found, image)
         if not found.lost:
             updated = replace(updated, reinitialization=None)
-        return updated, replace(estimate, keyframe=key)
+        return updated, replace(estimate, keyframe=is_keyframe)
 
-    def _otherwise(
+    def _recover(
         self, state: SolverState, estimate: FrameEstimate, frame: Frame, mask: NDArray[np.bool_]
     ) -> tuple[SolverState, FrameEstimate]:
-        """A lost object by another map that knows this side of it, or by a second start; see `anew`.
+        """Relocalize a lost object in an inactive map that knows this side, or collect frames for a second map.
 
         Args:
             state: After the frame, in which the object is lost.
-            estimate: To it.
+            estimate: Of the frame.
             frame: The frame.
             mask: ``(H, W)`` its initial mask.
         """
         image = grey(frame.image)
         for other in state.inactive_maps if should_retry(state.lost_frames) else ():
             updated, found = self._track(activate_map(state, other, frame.index), frame, image, mask)
-            if found.losses["witnesses"] >= ENOUGH_POINTS and found.status is not Status.LOST:
+            if found.diagnostics["inliers"] >= ENOUGH_POINTS and found.status is not Status.LOST:
                 return updated, found
         begun, last = state.reinitialization, None
         if begun is not None and begun.pending:
@@ -336,10 +351,10 @@ class OnlineSolver(FrameTracker):
                 return replace(state, reinitialization=None), estimate
             camera = replace(state.camera, assumed=False)
             return replace(
-                state, reinitialization=self._first(frame, mask, camera, state.feature_space)[0]
+                state, reinitialization=self._first_state(frame, mask, camera, state.feature_space)[0]
             ), estimate
-        begun, again = self._wait(begun, frame, image, mask)
-        if begun.pending is not None:
+        begun, again = self._add_pending(begun, frame, image, mask)
+        if begun.phase is SolverPhase.INITIALIZING:
             return replace(state, reinitialization=begun), estimate
         if not is_reliable(begun, again):
             return replace(state, reinitialization=None), estimate
@@ -347,12 +362,12 @@ class OnlineSolver(FrameTracker):
         return switch_map(state, begun, similarity), transform_estimates(again, similarity, state.camera)
 
     def _is_keyframe(self, state: SolverState, found: PoseCandidate) -> bool:
-        """Whether the map has something to learn from a frame, and the frame can be relied on."""
+        """Whether a frame shows the map something new, and its pose is reliable."""
         view, fit, agreed = found.view, found.fit, found.evidence.inliers
-        if view.mask is None or (agreed < ENOUGH_POINTS and fit.overlap < _FITS):
+        if view.mask is None or (agreed < ENOUGH_POINTS and fit.overlap < _MIN_OVERLAP):
             return False
         keyframes = state.object_map.keyframes
-        if agreed < _SPARSE and view.index >= keyframes[-1].index + _PAUSE:
+        if agreed < _FEW_INLIERS and view.index >= keyframes[-1].index + _MIN_INTERVAL:
             return True
         angles = [float(rotation_angle(other.pose.quaternion, fit.pose.quaternion)) for other in keyframes]
         return bool(np.degrees(min(angles)) > self.online.keyframe_rotation)

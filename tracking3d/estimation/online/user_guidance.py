@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.estimation.online.features.klt import FollowedPoints, follow, grey
-from tracking3d.estimation.online.state.solver_state import SolverState
+from tracking3d.estimation.online.state.solver_state import SolverPhase, SolverState
 from tracking3d.frames import Frame
 from tracking3d.geometry.pose import pose_from_arrays
 
@@ -54,7 +54,7 @@ def trust_mask(state: SolverState, frame: Frame, mask: NDArray[np.bool_]) -> Sol
     Without witnesses against it the mask counts in full. Where the last pose is elsewhere the object was lost, though
     nobody noticed: all sides of it are looked at, where the mask is.
     """
-    if state.pending is None:
+    if state.phase is not SolverPhase.INITIALIZING:
         rendered = state.object_map.silhouette(state.last_pose[0], state.camera)
         if np.count_nonzero(rendered & mask) < _ELSEWHERE * np.count_nonzero(rendered | mask):
             state = replace(state, lost_frames=max(state.lost_frames, 1))

@@ -74,7 +74,8 @@ class Losses:
     def of_frame(self, position: int) -> dict[str, float]:
         """All terms by name, those with frames for one frame."""
         values = ((field.name, getattr(self, field.name)) for field in fields(self))
-        return {name: float(value[position] if value.dim() else value) for name, value in values}
+        named = {name: float(value[position] if value.dim() else value) for name, value in values}
+        return {"appearance": named.pop("features"), **named}
 
 
 @dataclass(frozen=True, eq=False)

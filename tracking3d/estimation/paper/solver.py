@@ -264,8 +264,8 @@ class PaperSolver(SolverBase):
         limit = self.settings.keyframes.silhouette
         if self.settings.stop == "threshold":
             # The paper's failure is that its stopping rule was not reached, by all frames together.
-            losses["features"] = float(optimum.losses.features.mean())
-        return assess(losses["features"], silhouette, has_mask, self.tau, limit, optimum.reason)
+            losses["appearance"] = float(optimum.losses.features.mean())
+        return assess(losses["appearance"], silhouette, has_mask, self.tau, limit, optimum.reason)
 
     def _update(self, state: PaperState, frames: list[PosedObservation], optimum: Optimum) -> PaperState:
         """Take over what was found, and choose the keyframes anew."""

@@ -1,4 +1,4 @@
-"""Points moved to where views see them, one by one; `tracking3d.points.robust_bundle.intersect` says what is computed."""
+"""Points moved to where views see them, one by one; see `tracking3d.points.robust_bundle.intersect`."""
 
 from __future__ import annotations
 

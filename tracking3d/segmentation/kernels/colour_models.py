@@ -1,4 +1,4 @@
-"""Kernel of `tracking3d.segmentation.colour_models`: how often each pixel's own colour lies around it, on both sides."""
+"""How often each pixel's own colour lies around it, on both sides; for `tracking3d.segmentation.colour_models`."""
 # mypy: disable-error-code="no-untyped-def"
 
 from __future__ import annotations

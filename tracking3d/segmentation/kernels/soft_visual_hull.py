@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tracking3d.rendering.kernels.compilation import OPTIONS, kernel
 
 _HULLS = 2
-"""As many as `tracking3d.segmentation.soft_visual_hull` has ranks; loops over so many known beforehand are a third faster."""
+"""As many as `tracking3d.segmentation.soft_visual_hull` has ranks; loops of a known length are a third faster."""
 
 
 def sample_grid_distances(
@@ -25,7 +25,7 @@ def sample_grid_distances(
     cells: int,
     mark: int,
 ) -> NDArray[np.int8] | None:
-    """``(C * C * C,)``: see `tracking3d.segmentation.soft_visual_hull.sample_grid_distances`; ``mark`` is for unknown cells."""
+    """``(C * C * C,)``: see `sample_grid_distances` of the caller; ``mark`` is for unknown cells."""
     values = np.empty((cells, cells, cells), np.int8)
     in_front = _carry_sign(
         np.ascontiguousarray(distance, np.float32),

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from tracking3d.config.solvers import OnlineConfig
-from tracking3d.estimation.estimate import GUESSED, FrameEstimate, Status
+from tracking3d.estimation.estimate import UNALIGNED_MAP, FrameEstimate, Status
 from tracking3d.estimation.online.atlas.map_merging import transform_map, transform_pose
 from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.mapping.focal_length import with_focal_length
@@ -127,7 +127,7 @@ def mark_unaligned(estimate: FrameEstimate) -> FrameEstimate:
         status=Status.LOST,
         reason=_REASON,
         confidence=min(estimate.confidence, _UNPROVEN),
-        losses=dict(estimate.losses) | {GUESSED: 1.0},
+        diagnostics=dict(estimate.diagnostics) | {UNALIGNED_MAP: 1.0},
     )
 
 

@@ -85,7 +85,7 @@ def merge(first: ObjectMap, second: ObjectMap, pairs: Pairs, most: int) -> Objec
     Args:
         first: A map.
         second: Another, in the coordinates of the first, with features of the same kind.
-        pairs: See `same_landmarks`.
+        pairs: See `match_landmarks`.
         most: Keyframes that are kept.
     """
     names = len(first.landmarks) + np.arange(len(second.landmarks))

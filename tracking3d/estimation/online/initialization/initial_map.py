@@ -12,7 +12,7 @@ from tracking3d.bundle_adjustment.adjustment import Structure
 from tracking3d.estimation.observation import downsample
 from tracking3d.estimation.online.features.klt import FollowedPoints
 from tracking3d.estimation.online.features.sift import Keypoints
-from tracking3d.estimation.online.initialization.rotation_hypotheses import turning_hypotheses
+from tracking3d.estimation.online.initialization.rotation_hypotheses import rotation_hypotheses
 from tracking3d.estimation.online.initialization.structure_from_motion import structure_hypotheses
 from tracking3d.estimation.online.mapping.focal_length import with_focal_length
 from tracking3d.estimation.online.mapping.local_mapping import fit_shape, tracks_of
@@ -130,7 +130,7 @@ def initialize_without_points(
 ) -> list[InitialMap]:
     """The best start that needs no points, from the first of the views.
 
-    Shape and poses are fitted together from every hypothesis of `turning_hypotheses`; the better ones go on.
+    Shape and poses are fitted together from every hypothesis of `rotation_hypotheses`; the better ones go on.
 
     Args:
         object_map: Prototype and landmarks; its keyframes are not looked at.
@@ -143,7 +143,7 @@ def initialize_without_points(
     modes = ShapeBasis.of(object_map.shape)
     tried = [
         (math.inf, name, replace(object_map, keyframes=_with_poses(chosen, poses)))
-        for name, poses in turning_hypotheses(chosen, camera)
+        for name, poses in rotation_hypotheses(chosen, camera)
     ]
     for survivors, iterations, coarse in _STAGES:
         better = []

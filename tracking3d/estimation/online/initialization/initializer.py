@@ -29,7 +29,7 @@ from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import SolverState
 
 MOTION = 0.03
-"""Change of form at which a start is tried first, see `motion_enough`."""
+"""Change of form at which a start is tried first, see `image_deformation`."""
 _MORE_MOTION = 1.3  # times as much before it is tried again
 _DOUBTFUL = 0.5  # bundle cost above which the points do not tell: they are 0.8 pixels off
 _MOST = 40  # frames that wait for a better one
@@ -176,7 +176,7 @@ def _is_undecided(starts: list[InitialMap], motion: float, leaning: NDArray[np.f
 
     Args:
         starts: By rising cost.
-        motion: See `motion_enough`.
+        motion: See `image_deformation`.
         leaning: How the object turned in the best start when it was tried last: what wins twice needs to win by less.
     """
     if len(starts) < 2 or starts[0].bundle > _WELL_FOLLOWED:

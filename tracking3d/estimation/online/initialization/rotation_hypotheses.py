@@ -16,14 +16,14 @@ TURNS = (20.0, 50.0)
 DIRECTIONS = 8
 
 
-def turning_hypotheses(views: list[Keyframe], camera: Camera) -> list[tuple[str, list[Pose]]]:
+def rotation_hypotheses(views: list[Keyframe], camera: Camera) -> list[tuple[str, list[Pose]]]:
     """Poses of the views for no rotation, and for turning steadily in eight directions, by two angles; with names.
 
     Translations follow the masks' centres and sizes.
     """
     first = views[0].pose
     placed = [_place_views(views[0], view, camera) for view in views]
-    found = [("still", [Pose(translation, first.quaternion) for translation in placed])]
+    found = [("no rotation", [Pose(translation, first.quaternion) for translation in placed])]
     frames = max(views[-1].index - views[0].index, 1)
     for direction in range(DIRECTIONS):
         angle = 2 * math.pi * direction / DIRECTIONS
@@ -34,7 +34,7 @@ def turning_hypotheses(views: list[Keyframe], camera: Camera) -> list[tuple[str,
                 from_matrix(rotation_about(axis, part) @ first.R, translation)
                 for part, translation in zip(degrees, placed, strict=True)
             ]
-            found.append((f"turning {round(math.degrees(angle))}", poses))
+            found.append((f"rotation {round(math.degrees(angle))}", poses))
     return found
 
 

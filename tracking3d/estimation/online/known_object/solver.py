@@ -25,7 +25,7 @@ from tracking3d.estimation.online.state.pose_candidate import PoseCandidate
 from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.estimation.online.tracking.pose_tracking import candidate_cost, find_inliers, pose_evidence
 from tracking3d.estimation.online.user_guidance import restart_backwards
-from tracking3d.estimation.tracker_feedback import SIGHTED
+from tracking3d.estimation.tracker_feedback import RELOCALIZED
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.pose import Pose
 from tracking3d.runtime.stage_times import in_stage
@@ -97,7 +97,7 @@ class KnownObjectSolver(OnlineSolver):
     def restart_backwards(
         self, state: SolverState, frame: Frame, number: int, T_cam_obj: NDArray[np.float64]
     ) -> SolverState:
-        """The belief that goes on from a frame seen long ago; see `steering.turned_back`."""
+        """The belief that goes on from a frame seen long ago; see `user_guidance.restart_backwards`."""
         turned = restart_backwards(state, frame, number, self.known_object.to_solver(T_cam_obj))
         return turned if state.trajectory else replace(turned, trajectory=())
 
@@ -149,7 +149,7 @@ class KnownObjectSolver(OnlineSolver):
         for region in (mask, None) if mask is not None else (None,):
             if self.known_object.has_colours and not _is_sure(attempts):
                 attempts += [
-                    self._attempt(state, frame, mask, SIGHTED, pose, points)
+                    self._attempt(state, frame, mask, RELOCALIZED, pose, points)
                     for pose, points in by_keypoints(state.object_map, state.camera, image, region)
                 ]
         if mask is not None and not _is_sure(attempts) and should_retry(state.lost_frames):

@@ -212,7 +212,8 @@ def refine_map(
         camera: Of the full frame.
         positions: Which keyframes take part, rising; the first one does not move.
         weights: Of the shape's terms.
-        prior: What a landmark at distance 1 from the surface costs, see `bundle.adjust`.
+        prior: What a landmark at distance 1 from the surface costs, see
+            `tracking3d.bundle_adjustment.adjustment.adjust`.
         scale: Pixels, of the robust loss.
         bundle_iterations: Of the bundle adjustment.
         rounds: Of the shape.

@@ -13,7 +13,7 @@ from tracking3d.estimation.online.masks.mask_fusion import FusedMask, fuse_mask,
 from tracking3d.estimation.online.optimization.observability import least_constrained_axis
 from tracking3d.estimation.online.state.pose_candidate import PoseCandidate
 from tracking3d.estimation.online.state.solver_state import SolverState
-from tracking3d.estimation.tracker_feedback import MOVING
+from tracking3d.estimation.tracker_feedback import MOTION_RATIO
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose
@@ -58,7 +58,7 @@ def make_estimate(
         state: Map, camera and colours.
         estimate: What does not depend on the pose.
         found: What was found in the frame.
-        moving: See `answer_mask`.
+        moving: See `fuse_mask`.
     """
     view, fit, assessment = found.view, found.fit, found.assessment
     if found.lost:
@@ -85,16 +85,14 @@ def make_estimate(
         confidence=assessment.confidence,
         hypothesis=found.hypothesis,
         iterations=fit.iterations,
-        losses={
-            "features": fit.appearance,
-            "outline": fit.outline,
-            "points": fit.points,
-            "overlap": fit.overlap,
-            "unseen": fit.unseen,
-            "witnesses": float(found.evidence.inliers),
-            "strays": found.evidence.outlier_ratio,
-            "stiffness": least_constrained_axis(fit)[0],
-            "mask_weight": view.mask_weight,
-            MOVING: weighed.moving,
+        losses={"appearance": fit.appearance, "outline": fit.outline, "points": fit.points},
+        diagnostics={
+            "inliers": float(found.evidence.inliers),
+            "outlier_ratio": found.evidence.outlier_ratio,
+            "min_curvature": least_constrained_axis(fit)[0],
+            "unseen_ratio": fit.unseen,
+            "mask_iou": fit.overlap,
+            "mask_confidence": view.mask_weight,
+            MOTION_RATIO: weighed.moving,
         },
     )

@@ -64,8 +64,8 @@ def fuse_mask(
         observation: The frame.
         confidence: Of the pose.
         colours: What earlier frames showed, or None.
-        moving: Gives what moves as the object does in the window of `finer`, ``(S, S)``, or None where that is not
-            known; asked where the image has to be.
+        moving: Gives what moves as the object does in the window of `upsampled_window`, ``(S, S)``, or None where that
+            is not known; asked where the image has to be.
     """
     if initial is None:
         return FusedMask(rendered, MaskSource.RENDERED)
@@ -84,7 +84,7 @@ def fuse_mask(
     mask = full > 0
     if not mask.any():  # a mask of nothing says that the evidence is for neither
         return FusedMask(initial, MaskSource.INITIAL)
-    return FusedMask(mask, MaskSource.WEIGHED, 0.5 + 0.5 * full, share)
+    return FusedMask(mask, MaskSource.FUSED, 0.5 + 0.5 * full, share)
 
 
 def update_colours(
@@ -104,6 +104,6 @@ def upsampled_window(observation: Observation) -> tuple[Window, NDArray[np.uint8
 
 def mask_in_window(mask: NDArray[np.bool_], window: Window) -> NDArray[np.bool_]:
     """``(S, S)`` what a window shows of a mask ``(H, W)``."""
-    # What is beyond the frame is not the object, although `cut` repeats the border.
+    # What is beyond the frame is not the object, although `crop_window` repeats the border.
     seen = crop_window(mask.astype(np.float32), window) > 0.5
     return np.asarray(seen & inside_frame(mask.shape, window))

@@ -25,7 +25,7 @@ _WITNESSES = 20  # points that agree, with which a pose can tell a motion
 def motion_cue_in_window(
     state: SolverState, found: PoseCandidate, image: NDArray[np.uint8]
 ) -> NDArray[np.float32] | None:
-    """``(S, S)`` what moves along in the window of `finer`; None where that cannot be told.
+    """``(S, S)`` what moves along in the window of `upsampled_window`; None where that cannot be told.
 
     Args:
         state: Before the frame.

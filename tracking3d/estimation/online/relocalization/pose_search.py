@@ -26,6 +26,8 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
 from tracking3d.rendering import Surface
 
+ROTATION_SEARCH = "rotation_search"
+"""The hypothesis of a pose that is the best of many rotations around the predicted one."""
 _GRID_ANGLES = (20.0, 40.0)
 _GRID_FINALISTS = 5
 _OFTEN = 5  # frames after a loss in which turns are tried in every one, and later in one of so many
@@ -107,7 +109,7 @@ def relocalize(
             placed = {str(n): pose for n, pose in enumerate(aligned_keyframes(object_map, camera, view))}
             centre = fit_pose(object_map, surface, view, placed, FollowedPoints.none(), weights)[1].pose
         for pose in search_rotations(surface, view, centre, weights):
-            tried.append(fitted("grid", pose, FollowedPoints.none(), view.points))
+            tried.append(fitted(ROTATION_SEARCH, pose, FollowedPoints.none(), view.points))
     return min(
         tried,
         key=lambda one: candidate_cost(one[1], weights, view.mask_weight, count_inliers(object_map, one[2])),

@@ -1,4 +1,4 @@
-"""How far the pose of a frame is believed: by what is usual for this object, and by what witnesses there are."""
+"""How far the pose of a frame can be trusted: by the losses that are usual for this object, and by its inliers."""
 
 from __future__ import annotations
 
@@ -12,49 +12,49 @@ from tracking3d.estimation.online.optimization.observability import least_constr
 from tracking3d.estimation.online.optimization.types import PoseFit, PoseWeights
 
 ENOUGH_POINTS = 15
-"""Points that agree with a pose and settle it, whatever the pixels say."""
+"""Inliers that settle a pose, whatever the appearance says."""
 _UNSEEN_CHARGE = PoseWeights().unseen
-_ENOUGH_KNOWN = 0.8  # share of known texture from which on it counts in full
-_MOSTLY = 0.7  # share of unseen texture
+_FULL_WEIGHT_TEXTURE = 0.8  # share of known texture from which the appearance counts in full
+_MOSTLY_UNSEEN = 0.7  # share of unseen texture
 _INTERCEPT = -0.429
 _TERMS = {  # weight, and the range that was seen
     "missed": (-6.219, 0.0, 0.5394),
-    "unseen": (-3.339, 0.00157, 0.5698),
-    "witnesses": (0.4149, 0.0, 5.663),
-    "strays": (-0.6459, 0.0, 0.3333),
+    "unseen_ratio": (-3.339, 0.00157, 0.5698),
+    "inliers": (0.4149, 0.0, 5.663),
+    "outlier_ratio": (-0.6459, 0.0, 0.3333),
     "points": (-1.686, 0.0, 0.9385),
-    "stiffness": (0.4711, -2.815, 2.374),
+    "min_curvature": (0.4711, -2.815, 2.374),
 }
 _REASONS = {
-    "missed": "the silhouette overlaps the mask too little (IoU {fit.overlap:.2f})",
-    "unseen": "much of the visible surface was never seen before (share {fit.unseen:.2f})",
-    "witnesses": "too few point inliers ({evidence.inliers})",
-    "strays": "too many point outliers (share {evidence.outlier_ratio:.2f})",
-    "points": "the reprojection error of the points is high (loss {fit.points:.2f})",
-    "stiffness": "rotation about camera axis ({axis}) is poorly constrained",
+    "missed": "the silhouette and the mask overlap too little (IoU {fit.overlap:.2f})",
+    "unseen_ratio": "much of what is visible has not been seen before (ratio {fit.unseen:.2f})",
+    "inliers": "too few inliers ({evidence.inliers})",
+    "outlier_ratio": "too many outliers (ratio {evidence.outlier_ratio:.2f})",
+    "points": "the reprojection errors of the inliers are too large (loss {fit.points:.2f})",
+    "min_curvature": "rotation about camera axis ({axis}) is poorly constrained",
 }
-_DOUBTED = 0.4  # confidence at most where points agree and pixels do not
-_BY_OUTLINE = 0.2  # confidence at most where only the outline agrees
-_AS_USUAL = 0.97  # of the overlap
-_UNWITNESSED = 0.5  # confidence at most where there is no mask to compare with
+_POINTS_ONLY = 0.4  # highest confidence if the points fit and the appearance does not
+_OUTLINE_ONLY = 0.2  # highest confidence if only the outline fits
+_USUAL_OVERLAP = 0.97  # share of the usual overlap
+_WITHOUT_MASK = 0.5  # highest confidence if there is no mask to compare with
 _MEMORY = 0.9  # of the running means
 SETTLED = 15
-"""Tracked frames whose means are what later ones are held against."""
-_WORSE, _OUTLINE_ROOM, _OVERLAP_ROOM = 1.5, 0.1, 0.05  # how far the means may go from there
+"""Tracked frames whose means bound those of later ones."""
+_WORST_RATIO, _OUTLINE_ROOM, _OVERLAP_ROOM = 1.5, 0.1, 0.05  # how far the means may move from there
 BELIEVED = 0.5
-"""Confidence from which on a frame is tracked; one of less is looked at twice."""
+"""Confidence from which a frame is `tracked`; below it, the frame is relocalized too."""
 
 
 @dataclass(frozen=True)
 class PoseEvidence:
-    """What speaks for a pose beside what it costs.
+    """The evidence for a pose apart from its losses.
 
     Attributes:
-        witnesses: How many landmarks that two keyframes have seen agree with it.
-        strays: Share of such landmarks in the frame that are elsewhere, in [0, 1].
-        mask_weight: How far the mask is believed, in [0, 1].
+        inliers: Inliers among the landmarks that at least two keyframes have seen.
+        outlier_ratio: Share of such landmarks in the frame that are outliers, in [0, 1].
+        mask_weight: How far the mask is trusted, in [0, 1].
         has_mask: Whether there is one.
-        plain: Whether the object has no points that could agree.
+        untextured: Whether the object has no points that could be tracked.
     """
 
     inliers: int
@@ -65,15 +65,15 @@ class PoseEvidence:
 
     @property
     def is_decisive(self) -> bool:
-        """Whether so many points agree that pixels alone do not contradict them."""
+        """Whether there are so many inliers that the appearance alone does not contradict them."""
         return self.inliers >= ENOUGH_POINTS
 
 
 @dataclass(frozen=True)
 class LossBaseline:
-    """Running mean losses of tracked frames, clamped near those of the first 15.
+    """Running mean losses of tracked frames, clamped near those of the first `SETTLED` frames.
 
-    So a slow drift cannot raise the baseline.
+    Without the clamp a slow drift would raise the baseline and hide itself.
 
     Attributes:
         appearance: Appearance loss.
@@ -90,7 +90,7 @@ class LossBaseline:
     sound: tuple[float, float, float] | None = None
 
     def update(self, fit: PoseFit) -> LossBaseline:
-        """With one more frame."""
+        """The baseline after one more tracked frame."""
         appearance = _MEMORY * self.appearance + (1 - _MEMORY) * fit.appearance
         outline = _MEMORY * self.outline + (1 - _MEMORY) * fit.outline
         overlap = _MEMORY * self.overlap + (1 - _MEMORY) * fit.overlap
@@ -98,83 +98,81 @@ class LossBaseline:
         if frames == SETTLED:
             sound = appearance, outline, overlap
         if sound is not None:
-            appearance = min(appearance, _WORSE * sound[0])
-            outline = min(outline, _WORSE * sound[1] + _OUTLINE_ROOM)
+            appearance = min(appearance, _WORST_RATIO * sound[0])
+            outline = min(outline, _WORST_RATIO * sound[1] + _OUTLINE_ROOM)
             overlap = max(overlap, sound[2] - _OVERLAP_ROOM)
         return LossBaseline(appearance, outline, overlap, frames, sound)
 
 
-def confidence_features(losses: Mapping[str, float]) -> dict[str, float]:
-    """The evidence that a confidence is made of, by name, from what answers record as ``losses``.
+def confidence_features(losses: Mapping[str, float], diagnostics: Mapping[str, float]) -> dict[str, float]:
+    """The features of the confidence, by name, from what an estimate records as ``losses`` and ``diagnostics``.
 
-    What contradicts the mask is no evidence against a pose where points tell that the mask is wrong.
+    If the points tell that the mask is wrong, a contradiction with it is no evidence against a pose.
     """
-    known = 1 - losses["unseen"]
-    compared = (losses["features"] - _UNSEEN_CHARGE * losses["unseen"]) / max(known, 0.05)
+    known = 1 - diagnostics["unseen_ratio"]
+    compared = (losses["appearance"] - _UNSEEN_CHARGE * diagnostics["unseen_ratio"]) / max(known, 0.05)
     return {
         "appearance": min(max(compared, 0.0), 2.0),
-        "outline": losses["mask_weight"] * losses["outline"],
-        "missed": losses["mask_weight"] * (1 - losses["overlap"]),
-        "unseen": losses["unseen"],
-        "witnesses": math.log1p(losses["witnesses"]),
-        "stiffness": math.log(losses.get("stiffness", 0.0) + 1e-3),
-        "strays": losses.get("strays", 0.0),
+        "outline": diagnostics["mask_confidence"] * losses["outline"],
+        "missed": diagnostics["mask_confidence"] * (1 - diagnostics["mask_iou"]),
+        "unseen_ratio": diagnostics["unseen_ratio"],
+        "inliers": math.log1p(diagnostics["inliers"]),
+        "min_curvature": math.log(diagnostics.get("min_curvature", 0.0) + 1e-3),
+        "outlier_ratio": diagnostics.get("outlier_ratio", 0.0),
         "points": losses["points"],
     }
 
 
 def needs_relocalization(fit: PoseFit, baseline: LossBaseline, evidence: PoseEvidence) -> bool:
-    """Whether costly hypotheses should be tried."""
+    """Whether the costly hypotheses of `relocalization` should be tried."""
     if not evidence.is_decisive:
         return loss_excess(fit, baseline, evidence.mask_weight) > 0
     return is_high_loss(fit, baseline, evidence.mask_weight) or fit.points > 1.0
 
 
 def fits_outline(fit: PoseFit, baseline: LossBaseline) -> bool:
-    """Whether a pose fits the outline of its frame as well as is usual, whatever the pixels inside say.
+    """Whether a pose fits the outline of its frame as well as is usual, whatever the appearance says.
 
-    On a plain object that turns under a lamp they change, and there is little else to go by.
+    An object without texture changes its colours as it turns under a lamp, and there is little else to go by.
     """
-    return fit.overlap > _AS_USUAL * baseline.overlap and fit.outline < baseline.outline + _OUTLINE_ROOM
+    return fit.overlap > _USUAL_OVERLAP * baseline.overlap and fit.outline < baseline.outline + _OUTLINE_ROOM
 
 
 def loss_excess(fit: PoseFit, baseline: LossBaseline, mask_weight: float) -> float:
-    """By how much the losses exceed what is usual: above 0 they are higher, above 1 far higher.
+    """By how much the losses exceed the baseline: above 0 they are higher, above 1 far higher.
 
     Texture that was never seen is no evidence against a pose.
     """
     known = 1 - fit.unseen
     compared = (fit.appearance - _UNSEEN_CHARGE * fit.unseen) / max(known, 1e-3)
     appearance = (compared - 1.3 * baseline.appearance - 0.05) / (0.5 * baseline.appearance + 0.1)
-    appearance *= min(known / _ENOUGH_KNOWN, 1.0)
+    appearance *= min(known / _FULL_WEIGHT_TEXTURE, 1.0)
     outline = mask_weight * (fit.outline - 1.5 * baseline.outline - 0.3) / (baseline.outline + 0.5)
     overlap = mask_weight * (0.85 * baseline.overlap - fit.overlap) / 0.25
     return max(appearance, outline, overlap)
 
 
 def likelihood(fit: PoseFit, evidence: PoseEvidence) -> float:
-    """How likely a frame like this is right: a logistic regression, see `weighed`.
+    """The likelihood that a frame is right: a logistic regression on `confidence_features`.
 
-    Right means within 10 degrees and above an IoU of 0.7. Fitted by ``training/confidence.py`` on the causal answers of
-    the suite ``fresh`` of seed 9101; docs/method/confidence.md has what it is worth on others.
+    Right means within 10 degrees and above an IoU of 0.7. ``training/confidence.py`` fitted it to the causal estimates
+    of the suite ``fresh`` of seed 9101; docs/method/confidence.md has its calibration on other seeds.
     """
     return 1 / (1 + math.exp(-_INTERCEPT - sum(_log_odds(fit, evidence).values())))
 
 
 def _log_odds(fit: PoseFit, evidence: PoseEvidence) -> dict[str, float]:
-    """What each kind of evidence adds to the log odds of being right."""
+    """What each feature adds to the log-odds of being right."""
     features = confidence_features(
+        {"appearance": fit.appearance, "outline": fit.outline, "points": fit.points},
         {
-            "features": fit.appearance,
-            "outline": fit.outline,
-            "points": fit.points,
-            "overlap": fit.overlap,
-            "unseen": fit.unseen,
-            "witnesses": evidence.inliers,
-            "strays": evidence.outlier_ratio,
-            "stiffness": least_constrained_axis(fit)[0],
-            "mask_weight": evidence.mask_weight,
-        }
+            "inliers": evidence.inliers,
+            "outlier_ratio": evidence.outlier_ratio,
+            "min_curvature": least_constrained_axis(fit)[0],
+            "unseen_ratio": fit.unseen,
+            "mask_iou": fit.overlap,
+            "mask_confidence": evidence.mask_weight,
+        },
     )
     return {
         name: weight * min(max(features[name], low), high) for name, (weight, low, high) in _TERMS.items()
@@ -182,7 +180,7 @@ def _log_odds(fit: PoseFit, evidence: PoseEvidence) -> dict[str, float]:
 
 
 def is_high_loss(fit: PoseFit, baseline: LossBaseline, mask_weight: float) -> bool:
-    """Whether a pose leaves far more of its frame unexplained than is usual."""
+    """Whether the losses of a pose far exceed the baseline."""
     return loss_excess(fit, baseline, mask_weight) > 1
 
 
@@ -193,57 +191,54 @@ def assess_pose(
 
     Args:
         fit: The pose and its losses.
-        usual: What is usual.
-        support: What speaks for the pose beside its losses.
-        guessed: Whether the pose is the best of many turns that were tried. Where none of them explains the frame,
-            which is the least bad is up to chance, and points that happen to agree with it are, too.
-        astray: Whether the object was lost in the frame before, and no motion leads to the pose. Then it is no side
-            that was never seen, and the mask may be of anything.
+        baseline: The losses of tracked frames.
+        evidence: The evidence for the pose apart from its losses.
+        guessed: Whether the pose is the best of many rotations that were tried. If none of them explains the frame, the
+            least bad one is chance, and so are the points that happen to fit it.
+        astray: Whether the object was lost in the frame before and the pose is not consistent with the motion model.
+            Then the frame shows no new side, and the mask may be of another object.
     """
     odd = loss_excess(fit, baseline, evidence.mask_weight)
     far, few = odd > 1, not evidence.is_decisive
     if few and not evidence.has_mask:
-        return Assessment(Status.LOST, "the object is out of sight: no mask and no points", 0.05)
+        return Assessment(Status.LOST, "the object is out of sight: no mask and too few inliers", 0.05)
     if far and guessed and not few:
         return Assessment(Status.LOST, "no pose hypothesis explains the frame", 0.05)
     confidence = likelihood(fit, evidence)
     by_outline = evidence.untextured and evidence.has_mask and fits_outline(fit, baseline)
+    loss = f"appearance loss {fit.appearance:.2f}, usually {baseline.appearance:.2f}"
     if few and far and by_outline:
-        reason = f"the outline agrees, the pixels do not (loss {fit.appearance:.2f}, usually {baseline.appearance:.2f})"
-        return Assessment(Status.UNCERTAIN, reason, min(confidence, _BY_OUTLINE))
+        reason = f"the outline fits, the appearance does not ({loss})"
+        return Assessment(Status.UNCERTAIN, reason, min(confidence, _OUTLINE_ONLY))
     if few and far:
-        pixels = f"neither pixels (loss {fit.appearance:.2f}, usually {baseline.appearance:.2f})"
-        mask, points = f"the mask (overlap {fit.overlap:.2f})", f"points ({evidence.inliers})"
+        found = f"{loss}; mask IoU {fit.overlap:.2f}; {evidence.inliers} inliers"
+        reason = f"no pose fits the frame ({found})"
         if fits_outline(fit, baseline):
-            reason = f"{pixels} nor {points} agree with any pose, although one fits {mask}"
-        else:
-            reason = f"{pixels}, nor {mask}, nor {points} agree with any pose"
+            reason = f"no pose fits the frame, though one fits the mask ({found})"
         return Assessment(Status.LOST, reason, 0.05)
     if not evidence.has_mask:
-        confidence = min(confidence, _UNWITNESSED)
-    if few and fit.unseen > _MOSTLY:
+        confidence = min(confidence, _WITHOUT_MASK)
+    if few and fit.unseen > _MOSTLY_UNSEEN:
         confidence *= 0.5
     if astray and few and confidence < BELIEVED:
         status = Status.UNCERTAIN if by_outline and odd <= 0 else Status.LOST
         return Assessment(
-            status,
-            "the object found after tracking was lost may be a different one",
-            min(confidence, _BY_OUTLINE),
+            status, "after the loss, what was found may be another object", min(confidence, _OUTLINE_ONLY)
         )
     if far:
-        reason = f"the points agree, the pixels do not (loss {fit.appearance:.2f})"
-        return Assessment(Status.UNCERTAIN, reason, min(confidence, _DOUBTED))
+        reason = f"the points fit, the appearance does not (loss {fit.appearance:.2f})"
+        return Assessment(Status.UNCERTAIN, reason, min(confidence, _POINTS_ONLY))
     if confidence >= BELIEVED:
         return Assessment(Status.TRACKED, "", confidence)
     return Assessment(Status.UNCERTAIN, _doubt(fit, evidence), confidence)
 
 
 def _doubt(fit: PoseFit, evidence: PoseEvidence) -> str:
-    """What speaks most against a pose, in words."""
-    if not evidence.is_decisive and fit.unseen > _MOSTLY:
-        return "a side never seen before: only outline and motion constrain the pose"
+    """The feature that speaks most against a pose, in words."""
+    if not evidence.is_decisive and fit.unseen > _MOSTLY_UNSEEN:
+        return "a new side: only the outline and the motion model constrain the pose"
     odds = _log_odds(fit, evidence)
     best = {name: weight * (high if weight > 0 else low) for name, (weight, low, high) in _TERMS.items()}
     worst = max(odds, key=lambda name: best[name] - odds[name])
     axis = ", ".join(f"{part:.1f}" for part in least_constrained_axis(fit)[1])
-    return _REASONS[worst].format(fit=fit, support=evidence, axis=axis)
+    return _REASONS[worst].format(fit=fit, evidence=evidence, axis=axis)

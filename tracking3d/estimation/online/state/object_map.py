@@ -64,9 +64,11 @@ class ObjectMap:
         candidate: ``(N,)`` found beside the mask, and not yet known to be on the object.
         pointless: Whether the object has no points that can be followed: it is known by pixels and outlines alone.
         renderer: Which renderer, see `tracking3d.rendering.backend`.
-        beside: ``(8, 2)`` candidates in each direction from the object that could be told, and that move as it does.
-        held: How many of the first keyframes are drawn ones of an object that was known before, whose shape is held and
-            of whose surface every point counts as often seen; 0 where the object is got to know in the video.
+        candidates_around: ``(8, 2)`` candidates in each direction from the object that could be told, and that move as
+            it does.
+        fixed_keyframes: How many of the first keyframes are drawn ones of an object that was known before, whose shape
+            is held and of whose surface every point counts as often seen; 0 where the object is got to know in the
+            video.
     """
 
     shape: Shape

@@ -19,10 +19,10 @@ class PoseCandidate:
     Attributes:
         view: The frame.
         fit: Its pose.
-        won: Which start of the pose won.
+        hypothesis: Which start of the pose won.
         points: Those that agree with it.
-        support: What speaks for the pose beside its losses.
-        judgement: Of the pose.
+        evidence: What speaks for the pose beside its losses.
+        assessment: Of the pose.
     """
 
     view: Keyframe

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from enum import Enum, auto
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,16 +21,27 @@ from tracking3d.segmentation import ColourModels
 from tracking3d.segmentation.online_motion_cue import MotionReference
 
 
+class SolverPhase(Enum):
+    """What the solver does with the next frame."""
+
+    INITIALIZING = auto()
+    """It collects pending frames until they show enough motion for a first map."""
+    TRACKING = auto()
+    """It tracks the object against the map."""
+    LOST = auto()
+    """It relocalizes the object, or initializes a second map."""
+
+
 @dataclass(frozen=True, eq=False)
 class InactiveMap:
-    """An inactive map; its transform to the active map is unknown.
+    """A map that the object is not tracked against now; its transform to the active map is unknown.
 
     Attributes:
         object_map: The map.
-        surface: The map's surface.
-        usual: What frames that were tracked against it have cost.
-        spans: First and last index of the frames that it answered.
-        guessed: Whether how it lies to the first map is a guess.
+        surface: Its surface.
+        baseline: The losses of the frames that were tracked against it.
+        spans: First and last index of the frames that were estimated with it.
+        unaligned: Whether its transform to the first map is only a guess.
     """
 
     object_map: ObjectMap
@@ -47,30 +59,31 @@ class SolverState:
         camera: The camera of the video.
         object_map: The object's map.
         surface: The map's surface, as poses are fitted to it.
-        last: Pose and index of the last frame, a lost one's included.
-        before: The same of the frame before; None where there is no motion to go on with.
+        last_pose: Pose and index of the last frame, also if the object was lost in it.
+        previous_pose: The same of the frame before it; None if no motion is known.
         grey: ``(H, W)`` the last frame.
-        followed: Points in the last frame.
-        waiting: First frames that wait for the start, with their answers so far; None once it is done.
-        space: What is made of the encoder's features; None leaves them as they are.
-        due: Motion at which the next start is tried.
-        undecided: How many frames the last start had that could not be told from another; 0 if there was none.
-        leaning: ``(3,)`` how the object turns in that start, as a rotation vector; None if there was none.
-        waits_for: Why the start waits, where that is not lack of motion.
-        usual: What tracked frames have cost.
-        lost_for: How many frames in a row the object has been lost; those without a mask, where nothing can be tried,
-            count as one.
-        doubted_for: How many frames in a row have been lost or hardly believed.
-        tried: The best pose of the last frame, where that had a mask and was not believed.
-        trail: Poses and indices of the last frames that were believed.
-        colours: Of object and surroundings in frames that were believed.
-        past: The last frames that were believed, for what moves along.
-        anew: A second start, under way while the object is lost and there is a mask; see `anew`.
-        aside: Other maps of the object.
-        spans: First and last index of earlier frames that the present map answered; since: from which index it does.
-        guessed: Whether how it lies to the first map is a guess.
-        reversal_tried: How many keyframes there were, and how many degrees they had turned, when depth was last tried
-            the other way round.
+        tracked_points: Points in the last frame.
+        pending: The frames that wait for the first map, with their estimates so far; None once there is a map.
+        feature_space: The projection of the encoder's features; None leaves them as they are.
+        next_attempt: The motion at which the next initialization is tried.
+        ambiguous_frames: How many frames the last initialization had if it was ambiguous; 0 if there was none.
+        ambiguous_rotation: ``(3,)`` the object's rotation in that initialization as a rotation vector, or None.
+        waiting_reason: Why the initialization waits, if not for motion.
+        baseline: The losses of tracked frames.
+        lost_frames: How many frames in a row the object has been lost; those without a mask, in which no hypothesis can
+            be tried, count as one.
+        doubtful_frames: How many frames in a row have been lost or of low confidence.
+        last_candidate: The best pose of the last frame, if that had a mask and the pose was rejected.
+        trajectory: Poses and indices of the last tracked frames, for the motion model.
+        colours: Colours of object and background in tracked frames.
+        motion_references: The last tracked frames, for the motion cue.
+        reinitialization: The state of a second initialization, which goes on while the object is lost and has a mask.
+        inactive_maps: The other maps of the object.
+        spans: First and last index of the earlier frames that were estimated with the active map.
+        active_since: Index of the frame from which the active map has been active.
+        unaligned: Whether the transform from the active map to the first one is only a guess.
+        reversal_attempt: How many keyframes there were, and how many degrees they spanned, when a depth reversal was
+            last tried.
     """
 
     camera: Camera
@@ -100,10 +113,17 @@ class SolverState:
     unaligned: bool = False
     reversal_attempt: tuple[int, float] = (0, 0.0)
 
+    @property
+    def phase(self) -> SolverPhase:
+        """Which phase the solver is in."""
+        if self.pending is not None:
+            return SolverPhase.INITIALIZING
+        return SolverPhase.LOST if self.lost_frames else SolverPhase.TRACKING
+
     def advanced(
         self, pose: Pose, index: int, grey: NDArray[np.uint8], followed: FollowedPoints
     ) -> SolverState:
-        """One frame later."""
+        """The state one frame later."""
         return replace(
             self, last_pose=(pose, index), previous_pose=self.last_pose, grey=grey, tracked_points=followed
         )
@@ -121,4 +141,4 @@ ONLINE_CLASSES = (
     Keypoints,
     LossBaseline,
 )
-"""What a `Belief` is made of beside `tracking3d.estimation.solver.STATE_CLASSES`."""
+"""The classes that a `SolverState` consists of, besides `tracking3d.estimation.solver.STATE_CLASSES`."""

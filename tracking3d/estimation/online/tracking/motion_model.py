@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tracking3d.estimation.online.mapping.local_mapping import project_points
 from tracking3d.estimation.online.state.pose_candidate import PoseCandidate
-from tracking3d.estimation.online.state.solver_state import SolverState
+from tracking3d.estimation.online.state.solver_state import SolverPhase, SolverState
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, extrapolate, rotation_angle
 
@@ -27,15 +27,18 @@ def pose_predictions(state: SolverState, index: int, mask: NDArray[np.bool_] | N
         mask: ``(H, W)`` its initial mask, or None: of an object that was lost it says where it is again.
     """
     last, last_index = state.last_pose
-    if state.lost_frames and state.trajectory:
-        starts = {"coasting": extrapolate_motion(state.trajectory, index), "last": state.trajectory[-1][0]}
+    if state.phase is SolverPhase.LOST and state.trajectory:
+        starts = {
+            "motion_model": extrapolate_motion(state.trajectory, index),
+            "last": state.trajectory[-1][0],
+        }
         if mask is not None:
             starts |= {
                 f"{name} in the mask": align_to_mask(pose, state.camera, mask)
                 for name, pose in starts.items()
             }
             if state.last_candidate is not None:
-                starts["tried"] = align_to_mask(state.last_candidate, state.camera, mask)
+                starts["last_candidate"] = align_to_mask(state.last_candidate, state.camera, mask)
         return starts
     if state.previous_pose is None:
         return {"last": last}

@@ -1,4 +1,4 @@
-"""Kernel of `tracking3d.estimation.online.optimization.pose_refinement`: Levenberg-Marquardt over a frame's poses in one call."""
+"""Kernel of the module of the same name in `optimization`: Levenberg-Marquardt over a frame's poses in one call."""
 # mypy: disable-error-code="no-untyped-def"
 
 from __future__ import annotations
