@@ -17,11 +17,12 @@ from rich.table import Table
 from tracking3d.config.models import PipelineConfig, PluginChoice
 from tracking3d.errors import InputError
 from tracking3d.evaluation.metrics import aligned_rotation_errors
+from tracking3d.frames import Box
+from tracking3d.prompts import PromptSet
 from tracking3d.recording import record
 from tracking3d.results import layout
 from tracking3d.results.files import write_image, write_mask, writing
 from tracking3d.results.run_reader import RunReader, is_finished
-from tracking3d.splitting.part_runs import InitialPrompt
 from tracking3d.splitting.split_run import record_in_parts
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, degrade_masks, synthesize
 from tracking3d.video import open_source
@@ -114,10 +115,10 @@ def measure_split(
     spec = SyntheticSpec(frames=min(frames, 90), size=size, degrees_per_frame=2.0, fill=0.55)
     source, clip, order = write_looped(folder / "video", spec, frames)
     update: dict[str, Any] = {"camera": config.camera.model_copy(update={"fov": spec.fov})}
-    given = InitialPrompt(box=clip.box)
+    box: Box | None = clip.box
     if masks == "truth":
         update["tracker"] = PluginChoice(name="precomputed", path=str(folder / "video" / "masks"))
-        given = InitialPrompt()
+        box = None
     config = config.model_copy(update=update)
     measured = {}
     for name in ("whole", "split"):
@@ -126,10 +127,16 @@ def measure_split(
             told(f"{name}: {frames} frames")
             began, reason, parts = time.monotonic(), "", 1
             if name == "whole":
-                record(open_source(str(source)), config, out, box=given.box, overwrite=True)
+                record(open_source(str(source)), config, out, box=box, overwrite=True)
             else:
                 ended = record_in_parts(
-                    source, config, out, given, length=f"{length}f", workers=workers, overwrite=True
+                    source,
+                    config,
+                    out,
+                    PromptSet.of_one(box),
+                    length=f"{length}f",
+                    workers=workers,
+                    overwrite=True,
                 )
                 reason, parts = (ended.reason if len(ended.folders) > 1 else ""), ended.parts
             taken = {"seconds": time.monotonic() - began, "reason": reason, "parts": parts}

@@ -1,4 +1,4 @@
-"""What callers of the library give: checked when they give it, in sentences that name the argument."""
+"""Validation of what a caller of the library or the command line gives; messages name the argument."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from tracking3d.video.source import FrameSource
 
 
 def checked_config(config: Any) -> PipelineConfig:
-    """The configuration itself, that of a YAML file, or the default preset.
+    """The configuration: as given, read from a YAML file, or the default preset.
 
     Raises:
-        InputError: If it is anything else, or the file cannot be used.
+        InputError: It is anything else, or the file cannot be used.
     """
     if isinstance(config, PipelineConfig):
         return config
@@ -33,10 +33,10 @@ def checked_config(config: Any) -> PipelineConfig:
 
 
 def check_frame(frame: Any) -> None:
-    """Make sure of what `tracking3d.Session.step` was given.
+    """Check the argument of `tracking3d.Session.step`.
 
     Raises:
-        InputError: If it is no `tracking3d.Frame`, or its image is not ``(H, W, 3)`` uint8.
+        InputError: It is not a `tracking3d.Frame`, or its image is not ``(H, W, 3)`` uint8.
     """
     if not isinstance(frame, Frame):
         raise InputError(f"frame= is {a_kind(frame)}; wrap the image: Frame(index, image).")
@@ -44,24 +44,24 @@ def check_frame(frame: Any) -> None:
 
 
 def check_session(config: Any, prompt: Any, intrinsics: Any) -> None:
-    """Make sure of what a `tracking3d.Session` was given.
+    """Check the arguments of `tracking3d.Session`.
 
     Raises:
-        InputError: If something cannot be used.
+        InputError: One of them cannot be used.
     """
     if not isinstance(config, PipelineConfig):
         raise InputError(f"config= is {a_kind(config)}; give a PipelineConfig, see load_config.")
     if config.tracker.name == AUTO:
         raise InputError(
-            f"The tracker '{AUTO}' is chosen by the first frame, in track and record; for a session name one, or take "
-            "what tracking3d.tracker_choice.choose_tracker gives."
+            f"The tracker '{AUTO}' is chosen from the first frame, by track and record; for a session give the name of "
+            "a tracker, or the result of tracking3d.tracker_choice.choose_tracker."
         )
     if prompt is None and needs_prompt(config):
-        raise InputError("Say what the object is by either a box or a mask of the first frame.")
+        raise InputError("Give the object with either a box or a mask in the first frame.")
     if prompt is not None:
         if not isinstance(prompt, Prompt):
             raise InputError(
-                f"prompt= is {a_kind(prompt)}; make one of the first frame with tracking3d.prompts.make_prompt."
+                f"prompt= is {a_kind(prompt)}; make one from the first frame with tracking3d.prompts.make_prompt."
             )
         checked_box(prompt.box, "prompt.box=")
         if prompt.mask is not None:
@@ -74,57 +74,57 @@ def check_session(config: Any, prompt: Any, intrinsics: Any) -> None:
             fits = False
         if not fits:
             raise InputError(
-                f"intrinsics={shown(intrinsics)} is not fx, fy, cx, cy in pixels with positive fx and fy."
+                f"intrinsics={shown(intrinsics)} must be fx, fy, cx, cy in pixels, with positive fx and fy."
             )
 
 
 def needs_prompt(config: PipelineConfig) -> bool:
-    """Whether somebody has to say what the object is: neither the mask tracker nor an earlier run knows it."""
+    """Whether the user must prompt the object: neither masks of all frames nor a known object replace the prompt."""
     return config.tracker.name != "precomputed" and config.object.known is None
 
 
 def check_single_known_object(config: PipelineConfig, objects: int) -> None:
-    """Make sure that several objects are not all said to be one that is known.
+    """Make sure that a known object is not given together with several prompts.
 
     Raises:
-        InputError: If they are.
+        InputError: It is.
     """
     if config.object.known is not None and objects > 1:
         raise InputError(
-            f"{argument('object=', '--object ')}{config.object.known} is one object, but {objects} are given; track "
-            "each in a run of its own."
+            f"{argument('object=', '--object ')}{config.object.known} is one known object, but {objects} objects are "
+            "given; track each in a run of its own."
         )
 
 
 def with_known(config: PipelineConfig, known: Any) -> PipelineConfig:
-    """The configuration for an object that is known; as it is where ``known`` is None.
+    """The configuration for a known object; unchanged if ``known`` is None.
 
     Raises:
-        InputError: If that is no path.
+        InputError: It is not a path.
     """
     if known is None:
         return config
     if not isinstance(known, str | Path):
         raise InputError(f"object= is {a_kind(known)}; give the folder of an earlier run, or a mesh file.")
-    told = ObjectConfig.model_validate({**config.object.model_dump(), "known": str(known)})
-    return config.model_copy(update={"object": told})
+    section = ObjectConfig.model_validate({**config.object.model_dump(), "known": str(known)})
+    return config.model_copy(update={"object": section})
 
 
 def check_source(source: Any) -> None:
-    """Make sure of what `tracking3d.recording.record` was given to read.
+    """Check the source that `tracking3d.recording.record` reads.
 
     Raises:
-        InputError: If it is no source of frames.
+        InputError: It is not a source of frames.
     """
     if not isinstance(source, FrameSource):
         raise InputError(f"source= is {a_kind(source)}; open it with tracking3d.video.open_source.")
 
 
 def checked_folder(folder: Any) -> Path:
-    """The run folder.
+    """The run folder as a path.
 
     Raises:
-        InputError: If it is no path.
+        InputError: It is not a path.
     """
     if not isinstance(folder, str | Path):
         raise InputError(f"folder= is {a_kind(folder)}; give the path of the run folder.")

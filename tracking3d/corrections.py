@@ -1,4 +1,4 @@
-"""What the user says of the object in later frames: a box, a mask or points, from which tracking goes on there."""
+"""Corrections: prompts in later frames, from which the mask tracker restarts."""
 
 from __future__ import annotations
 
@@ -19,21 +19,23 @@ from tracking3d.prompts import checked_box, checked_mask, make_prompt, parse_box
 from tracking3d.trackers.crops import clip_box
 
 CORRECT = argument("corrections=", "--correct ")
-"""What sentences call them, before their values."""
-_FORM = "FRAME:X,Y,W,H, FRAME:MASK.png or 'FRAME:X,Y+ X,Y-'; of several objects FRAME@OBJECT, counted from 0"
+"""Their name in messages, before their values."""
+_FORM = (
+    "FRAME:X,Y,W,H, FRAME:MASK.png or 'FRAME:X,Y+ X,Y-'; with several objects FRAME@OBJECT, counted from 0"
+)
 _HEAD = re.compile(r"(\d{1,12})(?:@(\d{1,6}))?:(.+)", re.DOTALL)
 
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """The object in one later frame; one of box, mask and points is given.
+    """A prompt in one later frame; exactly one of box, mask and points is given.
 
     Attributes:
         frame: Index of the frame.
         box: ``(x, y, width, height)`` in pixels.
-        mask: ``(H, W)``, or the image file of one.
-        points: ``(N, 3)``: x, y in pixels, and 1 on the object or 0 beside it.
-        object: Of which object, where there are several, counted from 0.
+        mask: ``(H, W)``, or its image file.
+        points: ``(N, 3)``: x, y in pixels, and 1 on the object or 0 on the background.
+        object: Index of the object, counted from 0, if there are several.
     """
 
     frame: int
@@ -44,23 +46,23 @@ class Correction:
 
     @property
     def name(self) -> str:
-        """What sentences call it, before its value."""
+        """Its name in messages, before its value."""
         return f"{CORRECT}{self.frame}:"
 
     def prompt(self, frame: Frame) -> Prompt:
-        """The prompt that it is in its frame.
+        """The prompt for its frame.
 
         Raises:
-            InputError: If it cannot be one there.
+            InputError: It cannot be used there.
         """
         names = {"box_name": self.name, "mask_name": self.name, "points_name": self.name}
         return make_prompt(frame, self.box, self.mask, points=self.points, **names)
 
     def check_fits(self, size: tuple[int, int]) -> None:
-        """Make sure that it can be one of a frame of ``size`` ``(height, width)``.
+        """Make sure that it fits a frame of ``size`` ``(height, width)``.
 
         Raises:
-            InputError: If it cannot.
+            InputError: It does not.
         """
         label = f"frame {self.frame}"
         if self.box is not None and clip_box(self.box, size) is None:
@@ -69,28 +71,28 @@ class Correction:
             )
         if isinstance(self.mask, np.ndarray) and self.mask.shape != size:
             raise InputError(
-                f"{self.name} the mask is {pixels(self.mask.shape)} pixels but {label} {pixels(size)}; they must be "
-                "alike."
+                f"{self.name} the mask is {pixels(self.mask.shape)} pixels, but {label} is {pixels(size)}; the sizes "
+                "must be equal."
             )
         if self.points is not None:
             check_points_inside(self.points, size, label, self.name)
 
 
 def prompts_in(frame: Frame, corrections: Mapping[int, Correction]) -> list[Prompt]:
-    """What `tracking3d.Session.step` is given with a frame: the correction of it, where there is one."""
+    """The prompts that `tracking3d.Session.step` takes with a frame: its correction, if there is one."""
     correction = corrections.get(frame.index)
     return [] if correction is None else [correction.prompt(frame)]
 
 
 def parse_correction(text: str) -> Correction:
-    """Read ``FRAME:X,Y,W,H``, ``FRAME:MASK.png`` or ``FRAME:X,Y+ X,Y-``, FRAME with ``@OBJECT`` behind it or without.
+    """Read ``FRAME:X,Y,W,H``, ``FRAME:MASK.png`` or ``FRAME:X,Y+ X,Y-``, with or without ``@OBJECT`` after FRAME.
 
     Raises:
-        InputError: If it is none of them.
+        InputError: The text is none of them.
     """
     head = _HEAD.fullmatch(text.strip())
     if head is None:
-        raise InputError(f"{CORRECT}'{text}' is not {_FORM}.")
+        raise InputError(f"{CORRECT}'{text}' is not of the form {_FORM}.")
     frame, number, what = int(head[1]), int(head[2] or 0), head[3].strip()
     name = f"{CORRECT}{frame}:"
     if looks_like_points(what):
@@ -101,14 +103,14 @@ def parse_correction(text: str) -> Correction:
 
 
 def checked_corrections(corrections: Any, objects: int = 1) -> list[dict[int, Correction]]:
-    """Corrections by frame, for each of several objects; what can be read without the frames is read.
+    """Check corrections, and sort them by object and frame; mask files are read.
 
     Args:
         corrections: Any number of them.
-        objects: How many objects there are.
+        objects: Number of objects.
 
     Raises:
-        InputError: If one is no correction, two are of the same frame, or one is of an object that there is not.
+        InputError: One is not a correction, two are for the same frame, or one is for an object that does not exist.
     """
     if not isinstance(corrections, Iterable) or isinstance(corrections, str | bytes | Mapping):
         raise InputError(
@@ -118,13 +120,14 @@ def checked_corrections(corrections: Any, objects: int = 1) -> list[dict[int, Co
     for one in corrections:
         correction = _checked(one)
         if correction.object >= objects:
+            count = "is 1 object" if objects == 1 else f"are {objects} objects"
             raise InputError(
-                f"{correction.name} is of object {correction.object}, but there are {objects}, counted from 0."
+                f"{correction.name} is for object {correction.object}, but there {count}, counted from 0."
             )
         theirs = by_object[correction.object]
         if correction.frame in theirs:
             raise InputError(
-                f"{correction.name} frame {correction.frame} is corrected twice; say one thing of it."
+                f"{correction.name} frame {correction.frame} is corrected twice; give one correction per frame."
             )
         theirs[correction.frame] = correction
     return by_object
@@ -133,28 +136,28 @@ def checked_corrections(corrections: Any, objects: int = 1) -> list[dict[int, Co
 def check_corrections_fit(
     corrections: Iterable[Correction], first: Frame, tracker: str, selection: Sequence[int] | None = None
 ) -> None:
-    """Make sure of corrections by the first frame, so that a long run does not end at a wrong one.
+    """Check corrections against the first frame, so that a bad one does not stop a long run later.
 
     Args:
-        corrections: Of one object.
-        first: The frame in which it was given.
+        corrections: Those of one object.
+        first: The frame of the prompt.
         tracker: Name of the mask tracker.
-        selection: Indices of the frames, where they are known.
+        selection: Indices of the tracked frames, if they are known.
 
     Raises:
-        InputError: If one cannot be used.
+        InputError: One cannot be used.
     """
     for one in corrections:
         if tracker == "precomputed":
             raise InputError(
-                f"{one.name} masks that were made elsewhere are what they are; put the better mask among them."
+                f"{one.name} the tracker 'precomputed' cannot be corrected; replace the mask file of that frame."
             )
         if one.frame == first.index:
             raise InputError(
-                f"{one.name} frame {one.frame} is the one in which the object is given; say it there, and not twice."
+                f"{one.name} frame {one.frame} is the frame of the prompt; change the prompt instead."
             )
         if selection is not None and one.frame not in selection:
-            raise InputError(f"{one.name} there is no frame {one.frame} among those that are tracked.")
+            raise InputError(f"{one.name} frame {one.frame} is not among the tracked frames.")
         one.check_fits(first.size)
 
 
@@ -163,7 +166,9 @@ def _checked(correction: Any) -> Correction:
         raise InputError(f"{CORRECT}{shown(correction)} is {a_kind(correction)}; give a list of Correction.")
     for value in (correction.frame, correction.object):
         if not isinstance(value, int) or isinstance(value, bool) or value < 0:
-            raise InputError(f"{CORRECT}{shown(value)} is no index; frames and objects count from 0.")
+            raise InputError(
+                f"{CORRECT}{shown(value)} is not an index; frames and objects are counted from 0."
+            )
     given = (correction.box, correction.mask, correction.points)
     if sum(one is not None for one in given) != 1:
         raise InputError(f"{correction.name} give either a box, a mask or points.")

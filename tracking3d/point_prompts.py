@@ -1,4 +1,4 @@
-"""Points that say what the object is: some on it, some beside it, read and checked."""
+"""Point prompts: points on the object and on the background, read and checked."""
 
 from __future__ import annotations
 
@@ -16,11 +16,13 @@ from tracking3d.trackers.crops import box_of
 from tracking3d.trackers.mask_from_points import mask_from_points
 
 POINTS = argument("points=", "--points ")
-"""What sentences call them, before their values."""
+"""Their name in messages, before their values."""
 MOST = 1000
-"""Points of one object in one frame."""
+"""Maximum number of points of one object in one frame."""
 
-_FORM = "'X,Y+ X,Y-' in pixels, + on the object and - beside it, for example '320,210+ 300,190+ 40,60-'"
+_FORM = (
+    "'X,Y+ X,Y-' in pixels, + on the object and - on the background, for example '320,210+ 300,190+ 40,60-'"
+)
 _TOKEN = re.compile(r"([^,\s]+),([^,\s]+)([+-])")
 
 
@@ -31,17 +33,17 @@ def looks_like_points(text: str) -> bool:
 
 
 def parse_points(text: str, name: str = POINTS) -> NDArray[np.float32]:
-    """Read ``X,Y+ X,Y-``: x and y in pixels, + on the object and - beside it.
+    """Read ``X,Y+ X,Y-``: x and y in pixels, + on the object and - on the background.
 
     Args:
-        text: The points with spaces between them.
-        name: What sentences call them.
+        text: The points, separated by spaces.
+        name: Their name in messages.
 
     Returns:
-        ``(N, 3)``: x, y, and 1 on the object or 0 beside it.
+        ``(N, 3)``: x, y, and 1 on the object or 0 on the background.
 
     Raises:
-        InputError: If it is not of that form, or no such points can be.
+        InputError: The text is not of that form, or the points cannot be used.
     """
     rows = []
     for word in text.split():
@@ -51,42 +53,42 @@ def parse_points(text: str, name: str = POINTS) -> NDArray[np.float32]:
                 raise ValueError
             rows.append((float(found[1]), float(found[2]), 1.0 if found[3] == "+" else 0.0))
         except ValueError as error:
-            raise InputError(f"{name}'{text}': '{word}' is no point; write them as {_FORM}.") from error
+            raise InputError(f"{name}'{text}': '{word}' is not a point; write points as {_FORM}.") from error
     if not rows:
-        raise InputError(f"{name}'{text}' names no point; write them as {_FORM}.")
+        raise InputError(f"{name}'{text}' has no point; write points as {_FORM}.")
     return _checked(rows, f"{name}'{text}'")
 
 
 def checked_points(points: Any, name: str = POINTS) -> NDArray[np.float32]:
-    """Points with at least one on the object, that do not contradict each other.
+    """Check points: at least one is on the object, and they do not contradict each other.
 
     Args:
-        points: ``(N, 3)`` of any kind of sequence: x, y in pixels, and 1 (or true) on the object, 0 beside it.
-        name: What sentences call them.
+        points: ``(N, 3)`` of any kind of sequence: x, y in pixels, and 1 (or true) on the object, 0 on the background.
+        name: Their name in messages.
 
     Raises:
-        InputError: If they are anything else.
+        InputError: They are anything else.
     """
     return _checked(points, f"{name}{shown(points)}")
 
 
 def _checked(points: Any, said: str) -> NDArray[np.float32]:
-    """The same; ``said`` is what sentences say was given."""
-    wanted = "give (x, y, 1) for each point on the object and (x, y, 0) for each beside it"
+    """The same; ``said`` is how messages name the given value."""
+    wanted = "give (x, y, 1) for each point on the object and (x, y, 0) for each on the background"
     try:
         if isinstance(points, str | bytes | Mapping):
             raise TypeError
         values = np.asarray([[float(value) for value in point] for point in points], dtype=np.float64)
-    except Exception as error:  # iterating over what somebody gave can end in any way
+    except Exception as error:  # iterating over a foreign object can raise anything
         raise InputError(f"{said} is {a_kind(points)}; {wanted}.") from error
     if values.ndim != 2 or values.shape[1] != 3 or not len(values):
-        raise InputError(f"{said} is no list of points; {wanted}.")
+        raise InputError(f"{said} is not a list of points; {wanted}.")
     if len(values) > MOST:
-        raise InputError(f"{said} holds {len(values)} points; {MOST} are the most that are taken.")
+        raise InputError(f"{said} has {len(values)} points; give at most {MOST}.")
     if not np.isfinite(values).all() or np.abs(values).max() > 1e6:
-        raise InputError(f"{said} has a coordinate that is no number of pixels; {wanted}.")
+        raise InputError(f"{said} has a coordinate that is not a number of pixels; {wanted}.")
     if not np.isin(values[:, 2], (0, 1)).all():
-        raise InputError(f"{said} has a point that is neither 1 nor 0; {wanted}.")
+        raise InputError(f"{said} has a point whose label is neither 1 nor 0; {wanted}.")
     on = values[:, 2] == 1
     if not on.any():
         raise InputError(f"{said} has no point on the object; give at least one, X,Y+ on the command line.")
@@ -94,7 +96,7 @@ def _checked(points: Any, said: str) -> NDArray[np.float32]:
     if gaps.size and gaps.min() < 1:
         x, y = values[on][np.unravel_index(gaps.argmin(), gaps.shape)[0], :2]
         raise InputError(
-            f"{said} says of {x:g},{y:g} both that it is on the object and that it is beside it."
+            f"{said} has the point {x:g},{y:g} both on the object and on the background; leave out one of the two."
         )
     return values.astype(np.float32)
 
@@ -102,10 +104,10 @@ def _checked(points: Any, said: str) -> NDArray[np.float32]:
 def check_points_inside(
     points: NDArray[np.float32], size: tuple[int, int], label: str, name: str = POINTS
 ) -> None:
-    """Make sure that points are inside a frame of ``size`` ``(height, width)``, which sentences call ``label``.
+    """Make sure that points are inside a frame of ``size`` ``(height, width)``, which messages call ``label``.
 
     Raises:
-        InputError: If one is not; it is named.
+        InputError: One is not; it is named.
     """
     height, width = size
     for x, y, _ in points:
@@ -114,15 +116,15 @@ def check_points_inside(
 
 
 def points_prompt(frame: Frame, points: Any, name: str = POINTS) -> Prompt:
-    """The prompt that points in a frame make, with the mask that an image method finds by them.
+    """Make a prompt from points in a frame, with a mask that is segmented from them.
 
     Args:
         frame: The frame.
         points: See `checked_points`.
-        name: What sentences call them.
+        name: Their name in messages.
 
     Raises:
-        InputError: If they cannot be used, or tell nothing from the rest.
+        InputError: They cannot be used, or do not separate the object from the background.
     """
     checked = checked_points(points, name)
     check_points_inside(checked, frame.size, frame.label, name)
@@ -130,7 +132,7 @@ def points_prompt(frame: Frame, points: Any, name: str = POINTS) -> Prompt:
     around = box_of(mask)
     if around is None or mask.all():
         raise InputError(
-            f"{name}{shown(points)}: by these points nothing in {frame.label} tells the object from the rest; give "
-            "more of them, some beside the object, or a box."
+            f"{name}{shown(points)}: these points do not separate an object from the background in {frame.label}; give "
+            "more points, some of them on the background, or a box."
         )
     return Prompt(around, mask, checked)

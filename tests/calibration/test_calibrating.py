@@ -124,5 +124,5 @@ def test_the_command_writes_what_run_reads(views, tmp_path, monkeypatch):
         Image.fromarray(one.image).save(f"{one.index:02d}.png")
     result = CliRunner().invoke(app, ["calibrate", "*.png", "--squares", "7x5", "--square-mm", "30"])
     assert result.exit_code == 0, result.output
-    assert "8 views, reprojection error 0." in result.output and "% of the picture covered" in result.output
+    assert "8 views, reprojection error 0." in result.output and "% of the image covered" in result.output
     assert read_camera("camera.yaml").intrinsics[0] == pytest.approx(420, abs=4)

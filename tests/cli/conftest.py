@@ -86,7 +86,7 @@ def script(monkeypatch) -> Script:
                 sphere.vertices, sphere.faces, uvs, texture.astype(np.uint8), texture[..., 0], texture
             )
 
-    monkeypatch.setattr("tracking3d.recording.Session", FakeSession)
+    monkeypatch.setattr("tracking3d.open_tracking.Session", FakeSession)
     return script
 
 

@@ -62,7 +62,7 @@ def test_a_table_is_tracked_with_the_settings_of_its_rows(call, table, script, o
     status = call("batch", "status", "out")
     assert status.exit_code == 0 and "finished" in status.stdout and "2 of 2 videos" in status.stdout
     again = call("batch", table, "--out", "out", "--no-report", "--set", "window.size=64", "--threads", 2)
-    assert again.exit_code == 0 and len(script.built) == 3 and "2 of them before" in again.stderr
+    assert again.exit_code == 0 and len(script.built) == 3 and "2 of them earlier" in again.stderr
 
 
 def test_events_are_lines_of_json_and_a_failure_is_the_exit_code(call, shots, script, opened):
@@ -83,7 +83,7 @@ def test_events_are_lines_of_json_and_a_failure_is_the_exit_code(call, shots, sc
 def test_ctrl_c_says_that_the_same_command_goes_on(call, shots, script, opened):
     script.faults[2] = KeyboardInterrupt()
     result = call("batch", shots, "--out", "out", "--quiet", "--no-report")
-    assert result.exit_code == 130 and "The same command goes on" in result.stderr
+    assert result.exit_code == 130 and "To continue the batch, repeat the command." in result.stderr
     assert "interrupted" in call("batch", "status", "out").stdout
     script.faults.clear()
     assert call("batch", shots, "--out", "out", "--quiet", "--no-report").exit_code == 0

@@ -25,7 +25,7 @@ def test_a_full_device_is_told():
         done = subprocess.run([*PYTHON, "config", "schema"], stdout=full, stderr=-1, text=True, check=False)
     assert done.returncode == 2
     [line] = done.stderr.splitlines()
-    assert line.startswith("error: what is printed cannot be written (No space left on device)")
+    assert line.startswith("error: the output cannot be written (No space left on device)")
 
 
 def test_a_closed_pipe_ends_in_silence():
@@ -72,7 +72,7 @@ def test_little_memory_is_told_with_what_to_lower(call, clip, script, error):
     first, kept, advice = result.stderr.splitlines()[-3:]
     assert first.startswith("error: there is not enough memory; lower --size (window.size)")
     assert kept == "What was finished until then is kept in run."
-    assert advice == "The same command with --resume goes on from there."
+    assert advice == "To continue from there, repeat the command with --resume."
     assert len(Path("run/frames.jsonl").read_text().splitlines()) == 2
 
 

@@ -27,11 +27,11 @@ def test_the_formats_are_listed(call):
 
 def test_an_export_says_where_it_is(call, finished):
     result = call("export", finished, "--to", "tum", "--out", "poses.txt")
-    said = "poses.txt is written, 5 frames, lengths in the run's own unit.\n"
+    said = "Wrote poses.txt: 5 frames, lengths in the run's own unit.\n"
     assert (result.exit_code, result.stdout, result.stderr) == (0, said, "")
     metric = call("export", finished, "--to", "tum", "--out", "metric.txt", "--object-size", "0.2")
-    assert metric.stdout == "metric.txt is written, 5 frames.\n"
-    assert call("export", finished, "--to", "vot", "--out", "m.txt").stdout == "m.txt is written, 5 frames.\n"
+    assert metric.stdout == "Wrote metric.txt: 5 frames.\n"
+    assert call("export", finished, "--to", "vot", "--out", "m.txt").stdout == "Wrote m.txt: 5 frames.\n"
     lines = Path("poses.txt").read_text().splitlines()
     assert lines[3].split()[:4] == ["0", "0.000000000", "0.000000000", "3.000000000"]
     told = json.loads(call("export", finished, "--to", "kitti", "--out", "kitti", "--json").stdout)

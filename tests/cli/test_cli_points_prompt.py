@@ -34,17 +34,17 @@ def test_points_are_numbers_with_a_sign_behind():
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("", "names no point"),
-        ("10,20", "'10,20' is no point; write them as"),
-        ("10,20+ x,y-", "'x,y-' is no point"),
-        ("10+", "'10\\+' is no point"),
-        ("1,2,3+", "'1,2,3\\+' is no point"),
-        ("nan,2+", "no number of pixels"),
-        ("1e99,2+", "no number of pixels"),
+        ("", "has no point"),
+        ("10,20", "'10,20' is not a point; write points as"),
+        ("10,20+ x,y-", "'x,y-' is not a point"),
+        ("10+", "'10\\+' is not a point"),
+        ("1,2,3+", "'1,2,3\\+' is not a point"),
+        ("nan,2+", "not a number of pixels"),
+        ("1e99,2+", "not a number of pixels"),
         ("10,20-", "no point on the object"),
-        ("10,20+ 10,20-", "says of 10,20 both"),
-        ("10,20+ 10.4,20.4-", "says of 10,20 both"),
-        ("1,1+ " * 1001, "1000 are the most"),
+        ("10,20+ 10,20-", "has the point 10,20 both"),
+        ("10,20+ 10.4,20.4-", "has the point 10,20 both"),
+        ("1,1+ " * 1001, "at most 1000"),
     ],
 )
 def test_bad_points_are_refused(text, sentence):
@@ -73,12 +73,12 @@ def test_points_outside_the_frame_are_refused_with_its_size():
 
 
 def test_points_that_tell_nothing_are_refused():
-    with pytest.raises(InputError, match="nothing in frame 0 tells the object from the rest"):
+    with pytest.raises(InputError, match="do not separate an object from the background in frame 0"):
         make_prompt(Frame(0, np.zeros((2, 2, 3), np.uint8)), points=[(0, 0, 1)])
 
 
 def test_one_kind_of_prompt_is_wanted():
-    with pytest.raises(InputError, match="either a box or a mask"):
+    with pytest.raises(InputError, match="one of a box, a mask or points"):
         make_prompt(FRAME, (1, 1, 5, 5), points=[(1, 1, 1)])
 
 
@@ -92,10 +92,10 @@ def test_a_correction_is_a_box_a_mask_or_points():
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("1,2,3,4", "is not FRAME:X,Y,W,H"),
-        ("x:1,2,3,4", "is not FRAME"),
-        ("-1:1,2,3,4", "is not FRAME"),
-        ("5:", "is not FRAME"),
+        ("1,2,3,4", "is not of the form FRAME:X,Y,W,H"),
+        ("x:1,2,3,4", "is not of the form FRAME"),
+        ("-1:1,2,3,4", "is not of the form FRAME"),
+        ("5:", "is not of the form FRAME"),
         ("5:1,2,3", "5:.* is not four numbers"),
         ("5:1,2,0,4", "has no size"),
         ("5:1,2-", "no point on the object"),
@@ -113,11 +113,11 @@ def test_bad_corrections_are_refused(text, sentence):
         ([(5, (1, 2, 3, 4))], "is a tuple"),
         ([Correction(5)], "give either a box, a mask or points"),
         ([Correction(5, box=(1, 1, 5, 5), points=[(1, 1, 1)])], "give either a box, a mask or points"),
-        ([Correction(-5, box=(1, 1, 5, 5))], "is no index"),
+        ([Correction(-5, box=(1, 1, 5, 5))], "is not an index"),
         ([Correction(5, mask=Path("absent.png"))], r"absent\.png does not exist"),
         ([Correction(5, mask=np.zeros((4, 4)))], "is empty"),
         ([Correction(5, box=(1, 1, 5, 5)), Correction(5, box=(1, 1, 6, 6))], "corrected twice"),
-        ([Correction(5, box=(1, 1, 5, 5), object=1)], "of object 1, but there are 1"),
+        ([Correction(5, box=(1, 1, 5, 5), object=1)], "for object 1, but there is 1"),
     ],
 )
 def test_corrections_that_cannot_be_are_refused(given, sentence):
@@ -128,7 +128,10 @@ def test_corrections_that_cannot_be_are_refused(given, sentence):
 BAD = {
     "points outside": (["--points", "70,20+"], "--points 70,20 lies outside 000.png"),
     "nothing on the object": (["--points", "7,20-"], "no point on the object"),
-    "box and points": (["--box", "20,10,20,20", "--points", "7,20+"], "either --box, --mask or --points"),
+    "box and points": (
+        ["--box", "20,10,20,20", "--points", "7,20+"],
+        "only one of --box, --mask and --points",
+    ),
     "no such frame": (
         ["--box", "20,10,20,20", "--start-frame", "9"],
         "--start-frame 9 is not among the frames",
@@ -140,13 +143,13 @@ BAD = {
     ),
     "a solver that goes forwards": (
         ["--box", "20,10,20,20", "--start-frame", "2", "--preset", "paper"],
-        "The solver paper goes forwards only",
+        "Solver 'paper' cannot track backwards. Use solver.name=online, or start at the prompt frame",
     ),
     "a box outside": (["--box", "20,10,20,20", "--correct", "3:70,2,5,5"], "--correct 3:"),
-    "the first frame": (["--box", "20,10,20,20", "--correct", "0:1,2,5,5"], "in which the object is given"),
-    "beyond the end": (["--box", "20,10,20,20", "--correct", "7:1,2,5,5"], "there is no frame 7"),
+    "the first frame": (["--box", "20,10,20,20", "--correct", "0:1,2,5,5"], "is the frame of the prompt"),
+    "beyond the end": (["--box", "20,10,20,20", "--correct", "7:1,2,5,5"], "frame 7 is not among"),
     "an absent mask": (["--box", "20,10,20,20", "--correct", "3:absent.png"], "absent.png does not exist"),
-    "another object": (["--box", "20,10,20,20", "--correct", "3@1:1,2,5,5"], "of object 1, but there are 1"),
+    "another object": (["--box", "20,10,20,20", "--correct", "3@1:1,2,5,5"], "for object 1, but there is 1"),
 }
 
 
@@ -163,7 +166,7 @@ def test_masks_that_were_made_elsewhere_are_not_corrected(refused, clip, script,
     for number in range(5):
         Path(f"masks/{number:03d}.png").write_bytes(Path("mask.png").read_bytes())
     line = refused("run", clip, "--masks", "masks", "--correct", "3:1,2,5,5")
-    assert "put the better mask among them" in line
+    assert "replace the mask file of that frame" in line
 
 
 def test_a_file_says_what_is_tracked_and_the_command_line_wins(call, clip, script):

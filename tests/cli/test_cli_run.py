@@ -167,7 +167,7 @@ def test_a_damaged_first_frame_is_skipped_where_that_is_asked_for(call, clip, sc
 def test_box_partly_outside_is_clipped_and_the_run_goes_on(call, clip, script, caplog):
     assert call("run", clip, "--box", "-5,10,20,20").exit_code == 0
     assert script.built[0][1].box == (0, 10, 15, 20)
-    assert "reaches beyond the frame" in caplog.text
+    assert "extends beyond the frame" in caplog.text
 
 
 def test_interrupted_run_keeps_what_was_finished(call, clip, script):
@@ -177,7 +177,7 @@ def test_interrupted_run_keeps_what_was_finished(call, clip, script):
     assert result.stderr.splitlines() == [
         "interrupted",
         "What was finished until then is kept in run.",
-        "The same command with --resume goes on from there.",
+        "To continue from there, repeat the command with --resume.",
     ]
     run = RunReader(Path("run"))
     assert run.state == "interrupted"
@@ -205,7 +205,7 @@ def test_a_stopped_run_is_resumed_by_the_same_command(call, clip, script):
     again = call("run", clip, *BOX, "--out", "run", "--resume")
     assert (again.exit_code, again.stdout) == (
         0,
-        "The run run is finished already; there is nothing to resume.\n",
+        "The run run is already finished; there is nothing to resume.\n",
     )
 
 
@@ -217,7 +217,7 @@ def test_a_run_of_other_settings_is_not_resumed(call, clip, script):
     assert "runtime.seed was 0 and is 5" in result.stderr
     both = call("run", clip, *BOX, "--out", "run", "--resume", "--overwrite")
     assert both.exit_code == 2
-    assert "either --resume or --overwrite" in both.stderr
+    assert "either --resume, which continues" in both.stderr
 
 
 def test_a_run_is_corrected_with_its_own_settings(call, clip, script):
@@ -234,10 +234,10 @@ def test_a_run_is_corrected_with_its_own_settings(call, clip, script):
     ("words", "told"),
     [
         (["nowhere", "3:1,1,9,9"], "nowhere is not a run folder"),
-        (["run", "3;1,1,9,9"], "is not FRAME:X,Y,W,H"),
-        (["run", "77:1,1,9,9"], "there is no frame 77"),
-        (["run", "3@2:1,1,9,9"], "is of object 2, but there are 1"),
-        (["run", "0:1,1,9,9"], "is the one in which the object is given"),
+        (["run", "3;1,1,9,9"], "is not of the form FRAME:X,Y,W,H"),
+        (["run", "77:1,1,9,9"], "frame 77 is not among"),
+        (["run", "3@2:1,1,9,9"], "is for object 2, but there is 1 object"),
+        (["run", "0:1,1,9,9"], "is the frame of the prompt"),
         (["run", "3:mask.png"], "mask.png"),
         (["run", "3:1,1,9,9", "--source", "gone.mp4"], "gone.mp4"),
     ],
@@ -257,7 +257,7 @@ def test_a_correction_that_fails_says_how_to_go_on(call, clip, script):
     script.faults[3] = PluginError("The tracker gave up.")
     result = call("correct", "run", "3:21,11,20,20")
     assert result.exit_code == 2
-    assert "The run run is as it was; the same command " in result.stderr
+    assert "The run run is unchanged; the same command " in result.stderr
     assert Path("run/run.json").read_bytes() == before
 
 
@@ -268,7 +268,7 @@ def test_failing_plugin_ends_the_run_with_a_sentence_and_keeps_what_was_finished
     assert result.stderr.splitlines() == [
         "error: The tracker gave up.",
         "What was finished until then is kept in run.",
-        "The same command with --resume goes on from there.",
+        "To continue from there, repeat the command with --resume.",
     ]
     description = json.loads(Path("run/run.json").read_text())
     assert (description["state"], description["error"]) == ("failed", "The tracker gave up.")
@@ -308,12 +308,12 @@ def test_folder_that_cannot_be_written_is_named(refused, clip, script, tmp_path)
         ("--box 1,2,3", "error: --box '1,2,3' is not four numbers"),
         ("--box here", "'here' is not four numbers"),
         ("--box a,b,c,d", "'a,b,c,d' is not four numbers"),
-        ("--box 1,2,nan,4", "no finite number"),
+        ("--box 1,2,nan,4", "not a finite number"),
         ("--box 1,2,0,4", "has no size"),
         ("--box 1,2,3,-4", "has no size"),
         ("--box 100,100,9,9", "error: --box 100,100,9,9 lies outside 000.png, which is 64 x 48"),
         ("--mask absent.png", "error: --mask absent.png does not exist"),
-        ("--box 1,1,9,9 --mask m.png", "either --box, --mask or --points"),
+        ("--box 1,1,9,9 --mask m.png", "only one of --box, --mask and --points"),
         ("--box 1,1,9,9 --box 1,2", "'1,2' is not four numbers"),
         ("--box 1,1,9,9 --box 100,100,9,9", "outside 000.png, which is 64 x 48"),
         ("--masks absent", "absent"),
@@ -359,8 +359,8 @@ def test_bad_sources_are_refused_in_one_sentence(refused, script, tmp_path):
     ("mask", "words"),
     [
         (np.zeros((48, 64)), "is empty"),
-        (np.ones((48, 64)), "covers the whole"),
-        (np.eye(20), "is 20 x 20 pixels but 000.png is 64 x 48"),
+        (np.ones((48, 64)), "covers all"),
+        (np.eye(20), "is 20 x 20 pixels, but 000.png is 64 x 48"),
     ],
 )
 def test_bad_mask_is_refused_in_one_sentence(refused, clip, script, mask_file, mask, words):

@@ -93,9 +93,9 @@ REFUSED = {
     "--distortion=1,2,3,4,5,6,7,8,9,10,11,12,13,14,15": "has 15 numbers",
     "--distortion=a,b": "K1,K2,P1,P2",
     "--distortion=0.1,nan,0,0 --fov 40": "K1,K2,P1,P2",
-    "--distortion=wide:1,2,3,4": "known are radtan and fisheye",
+    "--distortion=wide:1,2,3,4": "use radtan or fisheye",
     "--distortion=fisheye:1,2,3,4,5 --fov 40": "has 5 numbers",
-    "--distortion=-0.1,0,0,0": "means nothing without the focal lengths",
+    "--distortion=-0.1,0,0,0": "needs the focal lengths",
     "--distortion=-9,0,0,0 --fov 60": "folds pictures",
     "--camera none.yaml": "does not exist",
     "--camera camera.yaml --fov 40": "leave out --fov",
@@ -115,7 +115,7 @@ def test_what_cannot_be_is_refused_in_a_sentence(call, images, script, options):
     given = () if options.startswith("--mask") else BOX
     result = call("run", images, *given, *options.split(), "--out", "run")
     if REFUSED[options] is None:  # two coefficients are filled up, and nobody gave the focal length
-        assert "means nothing without" in result.output
+        assert "needs the focal lengths" in result.output
     else:
         assert any(one in " ".join(result.output.split()) for one in REFUSED[options].split("|")), (
             result.output
@@ -157,8 +157,8 @@ def test_a_board_is_printed_at_its_true_size(call):
         (("shots", "--board", "dots"), "charuco or chessboard"),
         (("shots", "--model", "omni"), "radtan or fisheye"),
         (("shots", "--square-mm", "-1"), "above 0"),
-        (("shots", "--out", "no/where.yaml"), "no folder"),
-        (("shots", "--out", "there.yaml"), "is there already"),
+        (("shots", "--out", "no/where.yaml"), "does not exist; make it first"),
+        (("shots", "--out", "there.yaml"), "already exists"),
         (("shots",), "in 0 of 4 frames"),
         (("nowhere.mp4",), "does not exist"),
         (("board", "--out", "board.doc"), "neither a .png nor a .pdf"),

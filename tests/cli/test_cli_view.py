@@ -91,7 +91,7 @@ def test_run_view_opens_with_the_first_answer_and_closes_at_the_end(call, clip, 
     [viewer] = viewers
     assert viewer.folders == [Path("run")] and viewer.seen == [True] and viewer.closed
     assert np.asarray(viewer.images.image(3)).shape == (48, 64, 3)
-    assert "The viewer stays open; Ctrl-C ends it." in result.stderr
+    assert "The viewer stays open; Ctrl-C stops it." in result.stderr
     assert RunReader(Path("run")).state == "finished"
 
 
@@ -109,7 +109,7 @@ def test_a_source_that_gives_each_frame_once_is_shown_as_it_passes(viewers):
 
 
 def test_host_without_view_is_refused(refused, clip):
-    assert "--host is where --view serves" in refused("run", clip, *BOX, "--host", "0.0.0.0")
+    assert "--host is the address that --view serves" in refused("run", clip, *BOX, "--host", "0.0.0.0")
 
 
 def test_run_without_an_object_hints_at_pick(refused, clip):
@@ -141,7 +141,7 @@ def test_run_without_an_object_picks_where_a_person_is_there(call, clip, script,
 
 @pytest.mark.parametrize("options", [["--quiet"], ["--resume"]])
 def test_who_wants_no_conversation_gets_the_sentence(refused, clip, terminal, options):
-    assert "Say what the object is" in refused("run", clip, *options)
+    assert "Give the object" in refused("run", clip, *options)
 
 
 def test_pick_starts_the_run_both_ways_from_the_frame_that_was_picked_in(call, clip, script, monkeypatch):
@@ -161,7 +161,7 @@ def test_pick_starts_the_run_both_ways_from_the_frame_that_was_picked_in(call, c
 
 def test_pick_refuses_a_folder_with_a_run_before_anything_is_drawn(call, refused, clip, script):
     call("run", clip, *BOX, "--out", "run")
-    assert "run holds a run already" in refused("pick", clip, "--out", "run")
+    assert "run already holds a run" in refused("pick", clip, "--out", "run")
     assert script.built[1:] == []
 
 
@@ -170,7 +170,7 @@ def test_pick_refuses_what_does_not_wait(refused, monkeypatch):
         name, repeatable, count = "camera 0", False, None
 
     monkeypatch.setattr("tracking3d.video.open_source", lambda source, frames: Camera())
-    assert "camera 0 does not wait while one draws" in refused("pick", "0")
+    assert "camera 0 cannot be paused to draw in" in refused("pick", "0")
 
 
 def test_the_page_of_pick_is_served_until_the_run_is_started(clip, tmp_path, monkeypatch, capfd):

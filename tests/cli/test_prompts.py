@@ -37,8 +37,8 @@ def test_box_is_four_numbers(text):
         ("1,2,3", "is not four numbers"),
         ("1,2,3,4,5", "is not four numbers"),
         ("1 2 3 4", "is not four numbers"),
-        ("1,2,nan,4", "no finite number"),
-        ("inf,2,3,4", "no finite number"),
+        ("1,2,nan,4", "not a finite number"),
+        ("inf,2,3,4", "not a finite number"),
         ("1,2,0,4", "has no size"),
         ("1,2,3,-4", "has no size"),
     ],
@@ -58,7 +58,7 @@ def test_box_inside_the_frame_is_kept(caplog):
 def test_box_partly_outside_is_clipped_with_a_note(caplog):
     with caplog.at_level(logging.WARNING):
         assert make_prompt(FRAME, box=(-5, 40, 20, 30)).box == (0, 40, 15, 8)
-    assert "The box -5,40,20,30 reaches beyond the frame" in caplog.text
+    assert "The box -5,40,20,30 extends beyond the frame" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -72,7 +72,7 @@ def test_box_outside_the_frame_is_refused_with_the_frames_size(box):
 def test_box_of_no_size_is_refused_however_it_came():
     with pytest.raises(InputError, match="has no size"):
         make_prompt(FRAME, box=(5, 5, 0, 5))
-    with pytest.raises(InputError, match="no finite number"):
+    with pytest.raises(InputError, match="not a finite number"):
         make_prompt(FRAME, box=(5, 5, float("nan"), 5))
 
 
@@ -105,8 +105,8 @@ def test_mask_file_is_any_image(tmp_path: Path, image):
     ("mask", "sentence"),
     [
         (np.zeros((48, 64), dtype=bool), "mask=.* ?is empty"),
-        (np.ones((48, 64), dtype=bool), r"covers the whole of 000\.png"),
-        (np.ones((24, 32), dtype=bool), r"is 32 x 24 pixels but 000\.png is 64 x 48"),
+        (np.ones((48, 64), dtype=bool), r"covers all of 000\.png"),
+        (np.ones((24, 32), dtype=bool), r"is 32 x 24 pixels, but 000\.png is 64 x 48"),
         (np.ones((64, 48), dtype=bool), "is 48 x 64 pixels"),
     ],
 )
@@ -128,7 +128,7 @@ def test_mask_file_that_cannot_be_read_is_named(tmp_path: Path):
 
 
 def test_exactly_one_of_box_and_mask_is_wanted():
-    with pytest.raises(InputError, match="either a box or a mask"):
+    with pytest.raises(InputError, match="one of a box, a mask or points"):
         make_prompt(FRAME)
-    with pytest.raises(InputError, match="either a box or a mask"):
+    with pytest.raises(InputError, match="one of a box, a mask or points"):
         make_prompt(FRAME, (1, 1, 5, 5), some_mask())

@@ -128,9 +128,9 @@ def test_another_solver_drops_the_settings_of_the_one_below(yaml_file):
         ),
         (
             "solver: {online: {points: 1}}",
-            "'solver.online' is no section any more; the settings of the solver 'online' stand directly under 'solver'",
+            "'solver.online' is not a section; write the settings of the solver 'online' directly under 'solver'",
         ),
-        ("preset: paper\nsolver: {online: {points: 1}}", "beside 'name: online'"),
+        ("preset: paper\nsolver: {online: {points: 1}}", "next to 'name: online'"),
         ("iterations: 3", "did you mean 'solver.iterations'?"),
     ],
 )
@@ -186,9 +186,9 @@ def test_yaml_merge_keys_are_plain_data():
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("- tracker: csrt", "holds a list at its top level"),
-        ("just words", "holds a single value at its top level"),
-        ("42", "holds a single value"),
+        ("- tracker: csrt", "has a list at its top level"),
+        ("just words", "has a single value at its top level"),
+        ("42", "has a single value"),
         ("tracker: [1", "not valid YAML"),
         ("a: b: c", "not valid YAML"),
         ("\tsolver: 1", "not valid YAML"),
@@ -242,7 +242,7 @@ def test_bad_yaml_is_one_sentence_with_the_file_and_the_place(yaml_file, tmp_pat
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("solver: null", "'solver' must be a mapping of settings, not null; leave it out"),
+        ("solver: null", "'solver' must be a mapping of settings, not null; to change nothing, leave it out"),
         ("features: ~", "'features' must be a mapping of settings, not null"),
         ("camera: null", "'camera' must be a mapping of settings, not null"),
         ("preset: null", "'preset' must be the name of a preset"),
@@ -251,13 +251,13 @@ def test_bad_yaml_is_one_sentence_with_the_file_and_the_place(yaml_file, tmp_pat
         (
             "a: &a [x, x, x, x, x, x, x, x, x, x]\n"
             + "".join(f"{b}: &{b} [{', '.join([f'*{a}'] * 10)}]\n" for a, b in pairwise("abcdefgh")),
-            "its aliases stand for more than 100,000 values",
+            "its aliases expand to more than 100,000 values",
         ),
         ("# " + "x" * 300_000, "is longer than 256 KiB"),
         ("runtime: {seed: 18446744073709551616}", "'runtime.seed' must be less than 18446744073709551616"),
-        ("camera: {intrinsics: [1.0e+308, 1, 1, 1]}", "in pixels, which are from 1 to a million"),
-        ("camera: {intrinsics: [1.0e-300, 1, 1, 1]}", "in pixels, which are from 1 to a million"),
-        ("camera: {intrinsics: [90, 90, 1.0e+300, 1]}", "in pixels, which are from 1 to a million"),
+        ("camera: {intrinsics: [1.0e+308, 1, 1, 1]}", "in pixels, from 1 to a million"),
+        ("camera: {intrinsics: [1.0e-300, 1, 1, 1]}", "in pixels, from 1 to a million"),
+        ("camera: {intrinsics: [90, 90, 1.0e+300, 1]}", "in pixels, from 1 to a million"),
         ("camera: {fov: .nan}", "'camera.fov' must be a finite number"),
     ],
     ids=lambda value: value[:25],

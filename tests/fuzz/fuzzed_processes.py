@@ -38,7 +38,7 @@ def _ended(case: Case, process: subprocess.Popen, codes: tuple[int, ...]) -> Non
     output, errors = process.communicate(timeout=SECONDS)
     said = (output or b"").decode("utf-8", "replace") + (errors or b"").decode("utf-8", "replace")
     assert "Traceback" not in said, said
-    assert "fault of tracking3d" not in said, said
+    assert "bug in tracking3d" not in said, said
     assert process.returncode in codes, (process.returncode, said)
 
 

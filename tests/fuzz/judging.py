@@ -54,7 +54,7 @@ class Case:
         result = CliRunner().invoke(app, words)
         output = result.stdout + result.stderr
         assert "Traceback" not in output or "--debug" in words, output
-        assert "fault of tracking3d" not in output, output
+        assert "bug in tracking3d" not in output, output
         assert result.exit_code in (0, 2), (result.exit_code, output, result.exception)
         if result.exit_code == 2:
             errors = [line for line in result.stderr.splitlines() if line.startswith("error: ")]

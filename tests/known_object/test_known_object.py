@@ -173,9 +173,9 @@ def refused(*arguments: object) -> str:
 @pytest.mark.parametrize(
     ("more", "sentence"),
     [
-        (("--model", "fine"), "is held"),
-        (("--split", "4f"), "leave it out with --object"),
-        (("--box", "1,2,30,40", "--box", "50,60,30,40"), "2 are given"),
+        (("--model", "fine"), "is fixed"),
+        (("--split", "4f"), "leave out --split, or --object"),
+        (("--box", "1,2,30,40", "--box", "50,60,30,40"), "2 objects are given"),
         (("--flat",), "flat or not"),
         (("--preset", "paper"), "the solver paper"),
         ((), "does not exist"),
@@ -199,5 +199,5 @@ def test_the_library_says_what_it_cannot_take(clip):
     with pytest.raises(InputError, match="is held"):
         track(frames, object="nowhere", model="fine")
     known = config(object={"known": "nowhere"})
-    with pytest.raises(InputError, match="2 are given"):
+    with pytest.raises(InputError, match="2 objects are given"):
         list(track_objects(frames, boxes=[(0, 0, 9, 9), (9, 9, 9, 9)], config=known))

@@ -67,7 +67,7 @@ def test_a_page_that_is_not_there_is_told_with_its_number(cache, network, serve)
 
 def test_a_body_that_breaks_off_is_refused_and_what_came_is_kept_beside_the_place(cache, network, serve):
     net = network(address=serve(BYTES[:1000], claimed=len(BYTES)))
-    with pytest.raises(InputError, match=f"broke off after 1000 of {len(BYTES)} bytes"):
+    with pytest.raises(InputError, match=f"broke after 1000 of {len(BYTES)} bytes"):
         fetch(net)
     assert not network_path(net).exists()
     [kept] = files_in(cache)
@@ -86,14 +86,14 @@ def test_without_a_network_one_sentence_says_what_to_download_and_where_to_put_i
     with socket.socket() as closed:  # a port on which nobody listens
         closed.bind(("127.0.0.1", 0))
         address = f"http://127.0.0.1:{closed.getsockname()[1]}/tiny-net.onnx"
-    told = refused(cache, InputError, "could not be fetched", fetch, network(address=address))
+    told = refused(cache, InputError, "could not be downloaded", fetch, network(address=address))
     for part in (address, "tracking3d models get tiny-net --from FILE", str(cache / "models/tiny-net.onnx")):
         assert part in told
 
 
 def test_a_host_that_does_not_exist_is_told(cache, network):
     refused(
-        cache, InputError, "could not be fetched", fetch, network(address="http://nowhere.invalid/n.onnx")
+        cache, InputError, "could not be downloaded", fetch, network(address="http://nowhere.invalid/n.onnx")
     )
 
 
@@ -154,7 +154,7 @@ def test_a_server_whose_file_is_shorter_than_what_was_kept_is_asked_anew(cache, 
     part = cache / f"models/.tiny-net.onnx.{net.sha256[:12]}.part"
     part.parent.mkdir(parents=True)
     part.write_bytes(BYTES[:2000])
-    with pytest.raises(InputError, match="broke off after 1000"):
+    with pytest.raises(InputError, match="broke after 1000"):
         fetch(net)
 
 
@@ -194,9 +194,9 @@ def test_a_mirror_of_ones_own_is_checked_like_any_other(cache, network, serve):
     unknown = network(address=None, sha256=None, size=None, how="export net.pth")
     exported = network(address=None, how="export net.pth")
     refused(cache, InputError, "SHA-256 is", fetch, exported, mirror=folder)
-    refused(cache, InputError, "SHA-256 is not known", fetch, unknown, mirror=folder)
+    refused(cache, InputError, "SHA-256 is unknown", fetch, unknown, mirror=folder)
     for wrong in ("ftp://mirror", "/etc", "file:///etc"):
-        refused(cache, InputError, "is no address", fetch, network(), mirror=wrong)
+        refused(cache, InputError, "is not an address", fetch, network(), mirror=wrong)
 
 
 def test_a_proxy_of_the_environment_is_asked_instead(cache, network, serve_and_note, monkeypatch):
@@ -266,7 +266,7 @@ def test_a_network_without_an_address_says_how_to_come_by_it(cache, network):
     told = refused(cache, InputError, r"export net\.pth \(https://example.org/tiny\), then", fetch, exported)
     assert "models get tiny-net --from FILE" in told
     measured = network(address=None, how="export net.pth")
-    refused(cache, InputError, "use your file by its path; if you have the one with SHA-256", fetch, measured)
+    refused(cache, InputError, "give the path of your file; if its SHA-256 is", fetch, measured)
 
 
 def test_a_file_fetched_elsewhere_is_taken_if_it_is_the_known_one(cache, network, tmp_path):

@@ -58,7 +58,7 @@ WRONG_BOXES = {
     "a dictionary": (dict(zip("xywh", BOX, strict=True)), r"^box=.* is not four numbers"),
     "complex": ((1j, 2, 3, 4), r"^box=.* is not four numbers"),
     "beyond floats": ((10**400, 0, 5, 5), r"^box=.* is not four numbers"),
-    "nan": ((math.nan, 0, 5, 5), r"^box=nan,0,5,5 has a value that is no finite number"),
+    "nan": ((math.nan, 0, 5, 5), r"^box=nan,0,5,5 has a value that is not a finite number"),
     "no size": ((5, 5, 0, 5), r"^box=5,5,0,5 has no size"),
 }
 
@@ -68,8 +68,8 @@ WRONG_MASKS = {
     "three axes": (IMAGE, r"^mask= is an array of shape \(48, 64, 3\) and type uint8; give an \(H, W\)"),
     "objects": (np.full((48, 64), None), r"^mask= is .*type object"),
     "a number": (7, r"^mask= is an int of shape \(\)"),
-    "ragged lists": ([[1], [1, 2]], r"^mask= is a list that numpy cannot read"),
-    "nan": (np.full((48, 64), np.nan), r"^mask= has values that are no finite numbers"),
+    "ragged lists": ([[1], [1, 2]], r"^mask= is a list that NumPy cannot convert"),
+    "nan": (np.full((48, 64), np.nan), r"^mask= has values that are not finite"),
     "empty": (np.zeros((48, 64), bool), r"^mask= is empty; mark the object in it"),
 }
 
@@ -129,15 +129,15 @@ def test_a_wrong_configuration_is_refused_when_track_is_called(wrong, sentence):
 
 @pytest.mark.parametrize("prompt", [{}, {"box": BOX, "mask": MASK}], ids=["neither", "both"])
 def test_either_a_box_or_a_mask_is_asked_for_by_their_names(config, prompt):
-    with pytest.raises(InputError, match=r"either a box or a mask .*: box=, mask= or points=\.$"):
+    with pytest.raises(InputError, match=r"one of a box, a mask or points .*: box=, mask= or points=\.$"):
         track([IMAGE], config=config, **prompt)
 
 
 def test_objects_are_asked_for_by_lists(config):
     for boxes in (None, "box", 5):
-        with pytest.raises(InputError, match=r"^boxes=.*; give a list with one for each object"):
+        with pytest.raises(InputError, match=r"^boxes=.*; give a list with one item per object"):
             track_objects([IMAGE], boxes=boxes, config=config)
-    with pytest.raises(InputError, match=r"boxes or masks .*: boxes=, masks= or points=\.$"):
+    with pytest.raises(InputError, match=r"boxes, masks or points .*: boxes=, masks= or points=\.$"):
         track_objects([IMAGE], config=config)
 
 
@@ -145,7 +145,7 @@ def test_what_only_the_first_frame_can_tell_is_told_by_its_argument(config):
     outside = track([IMAGE], box=(500, 500, 5, 5), config=config)
     with pytest.raises(InputError, match=r"^box=500,500,5,5 lies outside frame 0, which is 64 x 48 pixels"):
         next(outside)
-    with pytest.raises(InputError, match=r"^mask= is 64 x 20 pixels but frame 0 is 64 x 48"):
+    with pytest.raises(InputError, match=r"^mask= is 64 x 20 pixels, but frame 0 is 64 x 48"):
         next(track([IMAGE], mask=MASK[:20], config=config))
 
 
@@ -197,9 +197,9 @@ def test_record_names_its_own_arguments_where_a_folder_is_taken(config, tmp_path
         ({"prompt": Prompt((1, 2))}, r"^prompt\.box=\(1, 2\) is not four numbers"),
         ({"prompt": Prompt(BOX, "mask.png")}, r"^prompt\.mask='mask.png' is text"),
         ({"prompt": None}, r"either a box or a mask"),
-        ({"intrinsics": (1, 2)}, r"^intrinsics=\(1, 2\) is not fx, fy, cx, cy"),
+        ({"intrinsics": (1, 2)}, r"^intrinsics=\(1, 2\) must be fx, fy, cx, cy"),
         ({"intrinsics": (0, 50, 32, 24)}, r"^intrinsics=.* positive fx and fy"),
-        ({"intrinsics": (math.nan, 50, 32, 24)}, r"^intrinsics=.* is not fx"),
+        ({"intrinsics": (math.nan, 50, 32, 24)}, r"^intrinsics=.* must be fx"),
     ],
 )
 def test_a_session_refuses_wrong_arguments(config, changed, sentence):
@@ -215,7 +215,7 @@ def test_a_session_refuses_wrong_arguments(config, changed, sentence):
         (None, r"^frame= is None; "),
         (Frame(3, IMAGE / 255), r"^Frame 3 has shape \(48, 64, 3\) and type float64; "),
         (Frame(3, None), r"^Frame 3 is None; "),
-        (Frame(0, IMAGE[:10]), r"^prompt\.mask= has shape \(48, 64\) but frame 0 \(10, 64\)"),
+        (Frame(0, IMAGE[:10]), r"^prompt\.mask= has shape \(48, 64\), but frame 0 has \(10, 64\)"),
     ],
 )
 def test_a_session_takes_frames_only(config, frame, sentence):

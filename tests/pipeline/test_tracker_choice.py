@@ -124,7 +124,7 @@ def test_another_tracker_is_left_as_it_is():
 def test_auto_has_no_options_and_is_nothing_for_a_session():
     with pytest.raises(InputError, match=r"tracker\.every is an option of one tracker"):
         check_tracker_options(load_config(tracker={"name": "auto", "every": 5}))
-    with pytest.raises(InputError, match="chosen by the first frame"):
+    with pytest.raises(InputError, match="chosen from the first frame"):
         Session(AUTO, PROMPT)
 
 
@@ -140,7 +140,7 @@ def test_a_run_says_which_it_was_and_goes_on_with_it(monkeypatch, tmp_path):
     def refuse(*given):
         raise AssertionError("it is known already")
 
-    monkeypatch.setattr("tracking3d.recording.choose_tracker", refuse)
+    monkeypatch.setattr("tracking3d.open_tracking.choose_tracker", refuse)
     record(open_source(images), AUTO, tmp_path / "run", box=PROMPT.box, resume=True)
     assert json.loads((tmp_path / "run/run.json").read_text())["config"]["tracker"]["name"] == "csrt"
 

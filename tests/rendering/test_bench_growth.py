@@ -43,7 +43,7 @@ needs_matplotlib = pytest.mark.skipif(
 @pytest.fixture
 def few_points(monkeypatch) -> None:
     monkeypatch.setattr(bench_growth, "RANGES", FEW)
-    monkeypatch.setattr(bench_render, "peak_memory", lambda name, problem, device, threads: None)
+    monkeypatch.setattr(bench_render, "peak_memory", lambda name, problem, device, threads: 0.0)
 
 
 def bench(*arguments: object):

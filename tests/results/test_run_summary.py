@@ -49,7 +49,7 @@ def summary(tmp_path, turning_sphere, write_run, capsys):
 
 def test_answers_that_are_the_initial_masks_get_no_iou_with_them(summary):
     rows, _, run = summary([MaskSource.INITIAL] * 8)
-    assert dict(rows)["masks of its own"] == "0 of 8: all are the initial masks"
+    assert dict(rows)["frames with an estimated mask"] == "0 of 8"
     assert not any("IoU" in name for name, _ in rows)
     document = json.loads((run / "run.json").read_text())
     assert document["iou_initial_mean"] == 1 and document["iou_initial_mean_own"] is None
@@ -60,7 +60,7 @@ def test_of_answers_that_are_its_own_the_iou_is_told_of_these(summary):
     rows, _, run = summary(
         [MaskSource.INITIAL] * 5 + [MaskSource.RENDERED, MaskSource.WEIGHED, MaskSource.RENDERED]
     )
-    assert dict(rows)["masks of its own"] == "3 of 8; the others are the initial masks"
+    assert dict(rows)["frames with an estimated mask"] == "3 of 8; the others keep the initial mask"
     document = json.loads((run / "run.json").read_text())
     assert document["iou_initial_mean_own"] < document["iou_initial_mean"]
     assert dict(rows)["mean IoU of these with the initial masks"] == f"{document['iou_initial_mean_own']:.3f}"

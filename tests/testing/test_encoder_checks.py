@@ -169,7 +169,7 @@ BROKEN = {
     FirstOnly: r"3 images of 64 x 64 pixels: its features have shape \(1, 3, 16, 16\) instead of \(3,",
     SquareOnly: r"1 images of 128 x 64 pixels: its features have shape \(1, 3, 16, 16\) instead of \(1, 3, 16, 32\)",
     Doubles: "float64 instead of float32",
-    Arrays: "answered with a ndarray of float32 instead of a tensor",
+    Arrays: "returned a ndarray of float32 instead of a tensor",
     Elsewhere: "its features are on meta, but the images on cpu",
     InPlace: "the encoder has changed the images; work on a copy",
     UnitLength: "a black image: its features are not all finite",

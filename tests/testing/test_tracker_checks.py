@@ -226,9 +226,9 @@ class WideOnly(ColourTracker):
 
 
 BROKEN = {
-    NoEstimate: "answered with a ndarray of float32 instead of a MaskEstimate",
-    Transposed: r"its mask has shape \(120, 90\), but the frame \(90, 120\)",
-    Cropped: r"its mask has shape \(90, 96\), but the frame \(90, 120\)",
+    NoEstimate: "returned a ndarray of float32 instead of a MaskEstimate",
+    Transposed: r"its mask has shape \(120, 90\), but the frame has \(90, 120\)",
+    Cropped: r"its mask has shape \(90, 96\), but the frame has \(90, 120\)",
     Doubles: "float64 instead of float32",
     Bytes: "values from 0 to 255 instead of from 0 to 1",
     Logits: "values from -1 to 1 instead of from 0 to 1",

@@ -10,10 +10,9 @@ from tracking3d.batch.one_video import RUN, begun_before, counted, counting, fet
 from tracking3d.batch.video_job import VideoJob
 from tracking3d.engines.protocol import Tell
 from tracking3d.point_prompts import parse_points
-from tracking3d.prompts import parse_box
+from tracking3d.prompts import PromptSet, parse_box
 from tracking3d.splitting.beginning import Begun, begin
 from tracking3d.splitting.long_video import LongVideo, SplitResult
-from tracking3d.splitting.part_runs import InitialPrompt
 from tracking3d.splitting.steps import Step
 
 
@@ -94,7 +93,7 @@ def settle_in_parts(
 
 
 def _video(job: VideoJob, work: Path, command: str, workers: int) -> LongVideo:
-    given = InitialPrompt(
+    prompts = PromptSet.of_one(
         next(map(parse_box, job.box), None),
         next(map(Path, job.mask), None),
         next(map(parse_points, job.points), None),
@@ -103,7 +102,7 @@ def _video(job: VideoJob, work: Path, command: str, workers: int) -> LongVideo:
         job.video,
         job.config,
         work / RUN,
-        given,
+        prompts,
         job.split,
         workers,
         job.frames,

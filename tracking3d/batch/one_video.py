@@ -24,9 +24,10 @@ from tracking3d.datasets.reading import read_sequence
 from tracking3d.engines.protocol import Tell
 from tracking3d.errors import InputError, OutputError
 from tracking3d.frames import SkippedFrame
+from tracking3d.open_tracking import request_tracking
 from tracking3d.point_prompts import parse_points
-from tracking3d.prompts import parse_box
-from tracking3d.recording import record, record_objects
+from tracking3d.prompts import PromptSet, parse_box
+from tracking3d.recording import RecordOptions, record_tracking
 from tracking3d.report.several import write_reports
 from tracking3d.results import layout
 from tracking3d.results.files import write_atomic, writing
@@ -155,19 +156,10 @@ def _track(tell: Tell, job: VideoJob, run: Path, command: str) -> None:
     boxes: list[Any] = [parse_box(text) for text in job.box]
     masks: list[Any] = [Path(file) for file in job.mask]
     points: list[Any] = [parse_points(text) for text in job.points]
-    about: dict[str, Any] = {
-        "start_frame": job.start_frame,
-        "corrections": [parse_correction(text) for text in job.correct],
-        "command": command,
-        "selection": job.frames,
-        "resume": True,
-        "listener": listener,
-    }
-    if job.objects > 1:
-        record_objects(source, job.config, run, boxes=boxes, masks=masks, points=points, **about)
-    else:
-        box, mask, point = (next(iter(given), None) for given in (boxes, masks, points))
-        record(source, job.config, run, box=box, mask=mask, points=point, **about)
+    prompts = PromptSet(boxes, masks, points, job.start_frame, as_lists=job.objects > 1)
+    corrections = [parse_correction(text) for text in job.correct]
+    request = request_tracking(source, job.config, prompts, corrections)
+    record_tracking(request, run, RecordOptions(command, job.frames, resume=True), listener)
 
 
 def counting(tell: Tell, of: int | None, **about: Any) -> Callable[[FrameRecord | SkippedFrame], None]:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.checkpoint.milestones import Milestones, keep_milestones_only
-from tracking3d.checkpoint.progress import Kept, RunProgress, TakenFrame, journal_line, read_journal
+from tracking3d.checkpoint.progress import JournalEntry, Kept, RunProgress, journal_line, read_journal
 from tracking3d.checkpoint.trees import TreeFolder
 from tracking3d.errors import InputError
 from tracking3d.frames import SkippedFrame
@@ -54,7 +54,7 @@ class Checkpoint:
         self._journal = 0
         self._waiting = b""
 
-    def note(self, frame: SkippedFrame | TakenFrame) -> None:
+    def note(self, frame: SkippedFrame | JournalEntry) -> None:
         """Remember a frame that was not taken, or whose state is of no use; it is kept with the next state."""
         self._waiting += journal_line(frame)
 
@@ -62,7 +62,7 @@ class Checkpoint:
         self,
         progress: RunProgress,
         session: dict[str, Any],
-        taken: TakenFrame | None = None,
+        taken: JournalEntry | None = None,
         revised: Iterable[int] = (),
     ) -> None:
         """Keep the state after a frame.

@@ -1,6 +1,6 @@
 """The command line: parse, call, print.
 
-Each command has a file and imports what it needs when it is called, so that ``--help`` is quick.
+Each command has a file, and imports what it needs when it is called. So ``--help`` is quick.
 """
 
 from __future__ import annotations
@@ -79,6 +79,6 @@ def _root(
 
 def main() -> None:
     """Entry point of the console script."""
-    # Matrices are small here: OpenBLAS's threads, one a core by default, wait for one another longer than they work.
+    # Matrices are small here: the threads of OpenBLAS, by default one per core, would wait longer than they work.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     app()

@@ -1,4 +1,4 @@
-"""``tracking3d calibrate``: a camera with its lens, from views of a printed board."""
+"""``tracking3d calibrate``: intrinsics and lens distortion from views of a printed board."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import typer
 from typer.core import TyperGroup
 
 from tracking3d.cli.options import Debug, Quiet
+from tracking3d.cli.options.panels import VIDEO
 from tracking3d.errors import InputError, OutputError
 
 if TYPE_CHECKING:
@@ -17,11 +18,11 @@ if TYPE_CHECKING:
     from tracking3d.calibration.calibrate import Calibration
 
 MOST_FRAMES = 150
-"""Of a video that the board is looked for in, spread over it."""
+"""Frames of a video in which the board is detected, spread evenly over it."""
 _PIXELS = 320
-"""Of a printed square."""
+"""Pixels along the side of a printed square."""
 _MARGIN = 0.2
-"""Squares of white around a printed board, which its border has to be told from."""
+"""White margin around a printed board, in squares; detection needs it."""
 _MILLIMETRES_AN_INCH = 25.4
 
 
@@ -29,11 +30,11 @@ class _VideoFirst(TyperGroup):
     """A group whose command ``video`` need not be named."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Put ``video`` before what names no command, options too."""
+        """Insert ``video`` if the first word names no command, also if it is an option."""
         return list(super().parse_args(ctx, self._named(args)))
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """The command that is meant, and its arguments."""
+        """The command and its arguments."""
         return super().resolve_command(ctx, self._named(args))
 
     def _named(self, args: list[str]) -> list[str]:
@@ -42,26 +43,26 @@ class _VideoFirst(TyperGroup):
 
 app = typer.Typer(
     cls=_VideoFirst,
-    help="Measure a camera and its lens: `calibrate board` prints a board, `calibrate VIDEO` reads views of it.",
+    help="Calibrate a camera and its lens from views of a printed board.",
     no_args_is_help=True,
 )
 
-Kind = Annotated[str, typer.Option("--board", metavar="charuco|chessboard", help="Which board it is.")]
+Kind = Annotated[str, typer.Option("--board", metavar="charuco|chessboard", help="Kind of board.")]
 Squares = Annotated[
-    str, typer.Option(metavar="COLUMNSxROWS", help="Squares of the board, black and white ones.")
+    str, typer.Option(metavar="COLUMNSxROWS", help="Columns and rows of squares; black and white ones count.")
 ]
 Millimetres = Annotated[float, typer.Option("--square-mm", help="Side of a square in millimetres.")]
 
 
 @app.command(name="board")
 def print_board(
-    out: Annotated[Path, typer.Option(metavar="FILE.png|FILE.pdf", help="Where it is written.")],
+    out: Annotated[Path, typer.Option(metavar="FILE.png|FILE.pdf", help="File to write.")],
     kind: Kind = "charuco",
     squares: Squares = "7x10",
     square: Millimetres = 25.0,
     debug: Debug = False,
 ) -> None:
-    """Draw a board to be printed at its true size; the default fits on A4 and Letter."""
+    """Draw a board to print at its true size; the default fits on A4 and Letter paper."""
     import numpy as np
     from PIL import Image as Pillow
 
@@ -69,7 +70,7 @@ def print_board(
         raise InputError(f"--out {out} is neither a .png nor a .pdf file.")
     board = _board(kind, squares, square)
     drawn = np.pad(board.picture(_PIXELS), round(_MARGIN * _PIXELS), constant_values=255)
-    # So that a square is as long as it was asked for, whatever that is in whole pixels of usual resolutions.
+    # The resolution makes a square exactly as long as given.
     resolution = _PIXELS / board.square * _MILLIMETRES_AN_INCH
     page = Pillow.fromarray(drawn)
     try:
@@ -81,55 +82,63 @@ def print_board(
         raise OutputError(f"{out} cannot be written: {error.strerror or error}.") from error
     height, width = (side / _PIXELS * board.square for side in drawn.shape)
     typer.echo(
-        f"{out}: {board.columns} x {board.rows} squares of {board.square:g} mm, {width:.0f} x {height:.0f} mm in all"
+        f"{out}: {board.columns} x {board.rows} squares of {board.square:g} mm, {width:.0f} x {height:.0f} mm in total"
     )
     typer.echo(
-        "Print it at 100 %, fix it on something flat, and film it from near and far, tilted, up to the corners."
+        "Print it at 100 %, mount it on something flat, and film it near and far, tilted, and in the image corners."
     )
 
 
 @app.command(name="video")
 def video(
     source: Annotated[
-        str, typer.Argument(metavar="SOURCE", help="Video or folder of pictures of the board.")
+        str, typer.Argument(metavar="SOURCE", help="Video or image folder that shows the board.")
     ],
-    out: Annotated[Path, typer.Option(metavar="FILE.yaml", help="Camera file that is written.")] = Path(
+    out: Annotated[Path, typer.Option(metavar="FILE.yaml", help="Camera file to write.")] = Path(
         "camera.yaml"
     ),
     kind: Kind = "charuco",
     squares: Squares = "7x10",
     square: Millimetres = 25.0,
     model: Annotated[
-        str, typer.Option(metavar="radtan|fisheye", help="Kind of lens; fisheye beyond about 120 degrees.")
+        str,
+        typer.Option(
+            metavar="radtan|fisheye",
+            help="Distortion model; use fisheye for fields of view above about 120 degrees.",
+        ),
     ] = "radtan",
     frames: Annotated[
         str | None,
-        typer.Option(metavar="START:STOP:STEP", help="Which frames; 150 spread over the video if left out."),
+        typer.Option(
+            metavar="START:STOP:STEP",
+            help="Frames to use; default 150, spread over the video.",
+            rich_help_panel=VIDEO,
+        ),
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Measure the camera that filmed SOURCE, and write it for `tracking3d run --camera`.
+    """Calibrate the camera that filmed SOURCE, and write a file for `tracking3d run --camera`.
 
-    OpenCV's YAML is written: intrinsics, distortion, size, reprojection error and coverage.
+    The file is OpenCV's YAML, with intrinsics, distortion, image size, reprojection error and coverage.
     """
     from tracking3d.calibration.calibrate import calibrate
     from tracking3d.calibration.camera_files import write_camera
     from tracking3d.video import open_source
 
     if model not in ("radtan", "fisheye"):
-        raise InputError(f"--model {model} is not known; give radtan or fisheye.")
+        raise InputError(f"--model {model} is unknown; give radtan or fisheye.")
     board = _board(kind, squares, square)
     if out.exists() and not overwrite:
-        raise OutputError(f"{out} is there already; give another --out, or --overwrite.")
+        raise OutputError(f"{out} already exists; give another --out, or --overwrite.")
     if not out.absolute().parent.is_dir():
-        raise OutputError(f"{out} cannot be written: there is no folder {out.parent}; make it first.")
+        raise OutputError(f"{out} cannot be written: the folder {out.parent} does not exist; make it first.")
     opened = open_source(source, frames)
     if frames is None and opened.count is not None and opened.count > MOST_FRAMES:
         opened = open_source(source, f"::{-(-opened.count // MOST_FRAMES)}")
     elif opened.count is None and frames is None and not opened.repeatable:
-        raise InputError(f"{opened.name} goes on without an end; say by --frames how much of it is taken.")
+        raise InputError(f"{opened.name} has no end; give the frames to use with --frames.")
     found = calibrate(opened, board, "fisheye" if model == "fisheye" else "radtan", opened.name)
     notes = {
         "avg_reprojection_error": round(found.error, 4),
@@ -148,7 +157,7 @@ def _board(kind: str, squares: str, square: float) -> Board:
     from tracking3d.calibration.boards import Board, parse_squares
 
     if kind not in ("charuco", "chessboard"):
-        raise InputError(f"--board {kind} is not known; give charuco or chessboard.")
+        raise InputError(f"--board {kind} is unknown; give charuco or chessboard.")
     columns, rows = parse_squares(squares)
     return Board(columns, rows, "chessboard" if kind == "chessboard" else "charuco", square)
 
@@ -163,9 +172,9 @@ def _print(found: Calibration, out: Path) -> None:
     worst = max(found.errors, key=lambda index: found.errors[index])
     typer.echo(
         f"{len(found.errors)} views, reprojection error {found.error:.3f} pixels (worst frame {worst}: "
-        f"{found.errors[worst]:.3f}), {100 * found.coverage:.0f} % of the picture covered"
+        f"{found.errors[worst]:.3f}), {100 * found.coverage:.0f} % of the image covered"
     )
     for reason, count in Counter(found.left_out.values()).most_common():
         which = [str(index) for index, why in found.left_out.items() if why == reason]
         shown = ", ".join(which[:8]) + (" and more" if len(which) > 8 else "")
-        typer.echo(f"left out, {reason}: {count} frames ({shown})")
+        typer.echo(f"not used, {reason}: {count} frames ({shown})")

@@ -1,4 +1,4 @@
-"""``tracking3d compare``: what differs between runs over one video."""
+"""``tracking3d compare``: what differs between runs on the same video."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tracking3d.cli.options import Debug
+from tracking3d.cli.options import AsJson, Debug
+from tracking3d.cli.options.panels import OUTPUT
 
 if TYPE_CHECKING:
     from tracking3d.report.differences import RunComparison
@@ -16,20 +17,26 @@ if TYPE_CHECKING:
 def compare(
     runs: Annotated[
         list[Path],
-        typer.Argument(metavar="RUN RUN...", help="Run folders over one video."),
+        typer.Argument(metavar="RUN RUN...", help="Run folders of the same video."),
     ],
     against: Annotated[
         Path | None,
-        typer.Option(metavar="RUN", help="The run that the others are held against; the first if left out."),
+        typer.Option(
+            metavar="RUN", help="Reference run that the others are compared with; default the first."
+        ),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.html", help="Write a page too, with the frames that differ most."),
+        typer.Option(
+            metavar="FILE.html",
+            help="Write an HTML page too, which shows the frames that differ most.",
+            rich_help_panel=OUTPUT,
+        ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON only.")] = False,
+    as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:
-    """Print what differs between runs over one video: settings, masks, poses, statuses, time."""
+    """Print what differs between runs on the same video: settings, masks, poses, statuses and time."""
     import json
 
     from tracking3d.report.differences import compare_runs
@@ -74,9 +81,9 @@ def _print(comparison: RunComparison) -> None:
         table("settings that differ", dict(comparison.settings), names)
     summaries = [one.summary for one in comparison.differences]
     apart = {_LABELS[key]: [one[key] for one in summaries] for key in summaries[0]}
-    table(f"against {names[0]}", apart, names[1:])
+    table(f"compared with {names[0]}", apart, names[1:])
     if len(names) > 2:
-        table("every two: IoU of masks, mean; rotation, median", _every_two(comparison), names)
+        table("every pair: mean mask IoU, median rotation", _every_two(comparison), names)
     worst = {
         f"frame {index}": [_at(one, index) for one in comparison.differences] for index in comparison.worst
     }
@@ -106,12 +113,12 @@ def _at(one: Any, index: int) -> str | None:
 
 
 _LABELS = {
-    "frames": "frames that both have",
-    "iou_mean": "IoU of masks, mean",
-    "iou_least": "IoU of masks, least",
+    "frames": "common frames",
+    "iou_mean": "mask IoU, mean",
+    "iou_least": "mask IoU, minimum",
     "rotation_median_deg": "rotation, median (degrees)",
-    "rotation_greatest_deg": "rotation, greatest",
+    "rotation_greatest_deg": "rotation, maximum",
     "translation_median_percent": "translation, median (% of distance)",
-    "translation_greatest_percent": "translation, greatest",
-    "scale": "unit of length, over the first's",
+    "translation_greatest_percent": "translation, maximum",
+    "scale": "scale, relative to the first",
 }

@@ -20,9 +20,9 @@ def show(
     overrides: Overrides = None,
     debug: Debug = False,
 ) -> None:
-    """Print the whole configuration as YAML, with every default, as `run` would use it.
+    """Print the complete configuration as YAML, with every default, as `run` would use it.
 
-    What preset, quality and file set is told on the standard error.
+    The standard error lists what preset, quality and file change.
     """
     import yaml
 
@@ -35,7 +35,7 @@ def show(
     for section, group in (("tracker", TRACKERS), ("features", FEATURES)):
         choice = getattr(settings, section)
         if section == "tracker" and choice.name == AUTO:
-            continue  # which one that is depends on the video
+            continue  # the video decides which one
         shown[section] = {"name": choice.name, **check_options(group, choice).model_dump(mode="json")}
     for words in layers_in_words(config, preset, quality):
         typer.echo(f"# {words}", err=True)
@@ -54,7 +54,7 @@ def schema(debug: Debug = False) -> None:
 
 @app.command("list")
 def list_files(debug: Debug = False) -> None:
-    """List the configuration files that come with the program; `--config` takes their names."""
+    """List the configuration files that come with tracking3d; --config takes their names."""
     from tracking3d.config.loading import ready_files
 
     for name, file in ready_files().items():
@@ -63,17 +63,17 @@ def list_files(debug: Debug = False) -> None:
 
 @app.command()
 def path(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of one, as `config list` prints it.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of a file, as `config list` prints it.")],
     debug: Debug = False,
 ) -> None:
-    """Print where such a file lies, to copy or to read it."""
+    """Print the path of a configuration file that comes with tracking3d."""
     from tracking3d.config.explain import hint
     from tracking3d.config.loading import ready_files
     from tracking3d.errors import InputError
 
     files = ready_files()
     if name not in files:
-        raise InputError(f"There is no ready configuration '{name}'; {hint(name, files)}")
+        raise InputError(f"There is no configuration file named '{name}'; {hint(name, files)}")
     typer.echo(files[name])
 
 
@@ -81,6 +81,6 @@ def path(
 def validate(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Configuration file.")], debug: Debug = False
 ) -> None:
-    """Check a configuration file, the options of its plug-ins included."""
+    """Check a configuration file, including the options of its plug-ins."""
     configure(file, None, None)
     typer.echo(f"{file} is valid")

@@ -1,44 +1,34 @@
-"""``tracking3d correct``: say what the object is in a frame of a run that is there."""
+"""``tracking3d correct``: prompt the object again in a frame of an existing run."""
 
 from __future__ import annotations
 
 from contextlib import ExitStack
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from tracking3d.cli.options import Debug, Quiet
+from tracking3d.cli.options import Debug, Quiet, RunOrParent, Video
+from tracking3d.cli.options.output import Report
 
 
 def correct(
-    run: Annotated[
-        Path, typer.Argument(metavar="RUN", help="Run folder, or the folder with those of several objects.")
-    ],
+    run: RunOrParent,
     corrections: Annotated[
         list[str],
         typer.Argument(
             metavar="FRAME:BOX|MASK|POINTS...",
-            help="What the object is in a frame: X,Y,W,H, a mask file or 'X,Y+ X,Y-'; FRAME@OBJECT of several.",
+            help="Prompt in a frame: X,Y,W,H, a mask file or 'X,Y+ X,Y-'. FRAME@OBJECT if there are several objects.",
         ),
     ],
-    source: Annotated[
-        str | None,
-        typer.Option(metavar="VIDEO", help="The video, where it is not where the run found it."),
-    ] = None,
-    report: Annotated[
-        bool,
-        typer.Option(
-            "--report/--no-report", help="Write report.html and turntable.mp4 again.", show_default=False
-        ),
-    ] = True,
+    source: Video = None,
+    report: Report = True,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Correct a run: what depends on the corrected frame is computed again, with the run's own settings.
+    """Correct a run: re-compute all that depends on the corrected frames, with the run's own settings.
 
-    It is done in a copy; the run stays as it is until that is finished. A correction that was stopped goes on when the
-    same command is given again.
+    The work is done in a copy, which replaces the run when it is finished. If the correction is stopped, the same
+    command continues it.
     """
     import logging
 
@@ -62,8 +52,8 @@ def correct(
             except BaseException as error:
                 stage = folder / CORRECTING
                 if (stage / RUN).is_file():
-                    then = "goes on with the correction" if has_state(stage) else "tries again"
-                    error.add_note(f"The run {folder} is as it was; the same command {then}.")
+                    then = "continues the correction" if has_state(stage) else "tries again"
+                    error.add_note(f"The run {folder} is unchanged; the same command {then}.")
                 raise
         if not quiet:
             print_summary(folder)

@@ -1,4 +1,4 @@
-"""Groups of commands of which one may be left out: ``evaluate ANSWERS`` is short for ``evaluate answers ANSWERS``."""
+"""Command groups with a default: ``evaluate ANSWERS`` is short for ``evaluate answers ANSWERS``."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typer.core import TyperGroup
 
 
 class WithDefault(TyperGroup):
-    """A group whose first word may be left out: what names no command belongs to the default one."""
+    """A group whose default command need not be named."""
 
     default: str
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Put the default command before what names none."""
+        """Insert the default command if the first word names none."""
         if args and args[0] not in self.commands and args[0] not in ("--help", "--debug"):
             args = [self.default, *args]
         return super().parse_args(ctx, args)

@@ -1,4 +1,4 @@
-"""``tracking3d demo``: the whole pipeline on a synthetic clip with exact truth."""
+"""``tracking3d demo``: the whole pipeline on a synthetic clip with exact ground truth."""
 
 from __future__ import annotations
 
@@ -8,17 +8,21 @@ from typing import Annotated
 import typer
 
 from tracking3d.cli.options import Debug, Quiet, configure
+from tracking3d.cli.options.panels import OUTPUT
 
 
 def demo(
     out: Annotated[
-        Path, typer.Option(metavar="DIR", help="Folder for the clip, the run and the summary.")
+        Path,
+        typer.Option(
+            metavar="DIR", help="Folder for the clip, the run and the summary.", rich_help_panel=OUTPUT
+        ),
     ] = Path("demo"),
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the clip and the run.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, metavar="N", help="Random seed of the clip and the run.")] = 0,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Make a short synthetic clip with exact truth, track its object with csrt and rgb, and score the answer.
+    """Render a short synthetic clip with exact ground truth, track its object with csrt and rgb, and score the run.
 
     Writes DIR/clip, DIR/run and DIR/summary.json.
     """
@@ -29,7 +33,9 @@ def demo(
     from tracking3d.cli.tables import print_figures
     from tracking3d.datasets.clip import read_truth
     from tracking3d.evaluation.score import score_run
-    from tracking3d.recording import record
+    from tracking3d.open_tracking import request_tracking
+    from tracking3d.prompts import PromptSet
+    from tracking3d.recording import RecordOptions, record_tracking
     from tracking3d.results.files import write_atomic
     from tracking3d.results.layout import REPORT
     from tracking3d.synthesis.convex_clips import make_demo_clip
@@ -39,9 +45,10 @@ def demo(
     clip, folder = make_demo_clip(out / "clip", seed=seed), out / "run"
     source = open_source(clip / "frames")
     box = read_truth(clip).box
-    command = f"tracking3d demo --seed {seed}"
-    with reported([folder]) as told, progress(source.count, quiet) as listener:
-        record(source, settings, folder, box=box, command=command, overwrite=True, listener=told(listener))
+    options = RecordOptions(f"tracking3d demo --seed {seed}", overwrite=True)
+    request = request_tracking(source, settings, PromptSet.of_one(box))
+    with reported([folder]) as reporting, progress(source.count, quiet) as listener:
+        record_tracking(request, folder, options, reporting(listener))
 
     scores = score_run(folder, clip)
     summary = {
@@ -56,6 +63,6 @@ def demo(
         print_summary(folder)
         print_figures(str(out / "summary.json"), summary)
         typer.echo(
-            f"Open {folder / REPORT} in a browser: the frames, the model to turn, and what to doubt.\n"
-            "Your own video: tracking3d pick VIDEO, or tracking3d run VIDEO --box X,Y,WIDTH,HEIGHT --out runs/mine"
+            f"Open {folder / REPORT} in a browser to see the frames, the 3D model, and which frames are uncertain.\n"
+            "To track your own video: tracking3d pick VIDEO, or tracking3d run VIDEO --box X,Y,WIDTH,HEIGHT"
         )

@@ -2,93 +2,133 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tracking3d.cli.options import Debug, Quiet, numbers
+from tracking3d.cli.options import AsJson, Debug, Quiet, Video, grouped, numbers
+from tracking3d.cli.options.panels import OUTPUT, VIDEO
 from tracking3d.errors import InputError
 
+if TYPE_CHECKING:
+    from tracking3d.export.exporter import ExportOptions
 
-def export(
-    run: Annotated[Path | None, typer.Argument(metavar="RUN", help="Run folder.")] = None,
-    to: Annotated[str | None, typer.Option(metavar="FORMAT", help="Format; --list shows all.")] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(metavar="PATH", help="File or folder to write; one in RUN/export if left out."),
-    ] = None,
-    answers: Annotated[
-        str, typer.Option(metavar="causal|final", help="Answers before or after the final refinement.")
-    ] = "final",
+_CONTENT = "Content"
+
+
+@dataclass(frozen=True)
+class ContentOptions:
+    """What of a run is exported."""
+
+    estimates: Annotated[
+        str,
+        typer.Option(
+            "--answers",
+            metavar="causal|final",
+            help="Estimates before or after the final refinement.",
+            rich_help_panel=_CONTENT,
+        ),
+    ] = "final"
     object_size: Annotated[
         float | None,
-        typer.Option(metavar="METRES", help="The object's longest side; lengths are then in metres."),
-    ] = None,
+        typer.Option(
+            metavar="METRES",
+            help="Longest side of the object; lengths are exported in metres then.",
+            rich_help_panel=_CONTENT,
+        ),
+    ] = None
     of: Annotated[
         str,
         typer.Option(
-            metavar="object|camera", help="Whose poses: the object's, or those of the camera about it."
+            metavar="object|camera",
+            help="Poses to export: of the object in the camera, or of the camera around the object.",
+            rich_help_panel=_CONTENT,
         ),
-    ] = "object",
-    fps: Annotated[
-        float | None, typer.Option(metavar="NUMBER", help="Frames per second of the source.")
-    ] = None,
-    source: Annotated[
-        str | None,
-        typer.Option(metavar="PATH", help="The video, where it is no longer where the run found it."),
-    ] = None,
+    ] = "object"
     cut_out: Annotated[
-        bool, typer.Option("--cut-out", help="Pictures as PNG, transparent around the object.")
-    ] = False,
+        bool,
+        typer.Option(
+            "--cut-out",
+            help="Write images as PNG with a transparent background.",
+            rich_help_panel=_CONTENT,
+        ),
+    ] = False
     images: Annotated[
-        bool, typer.Option("--images/--no-images", help="Whether pictures are written along.")
-    ] = True,
+        bool,
+        typer.Option("--images/--no-images", help="Write the images too.", rich_help_panel=_CONTENT),
+    ] = True
     undistorted: Annotated[
         bool,
         typer.Option(
-            "--undistorted", help="Masks without the distortion of the lens, as poses and cameras are."
+            "--undistorted",
+            help="Remove lens distortion from masks, as poses and cameras assume.",
+            rich_help_panel=_CONTENT,
         ),
-    ] = False,
+    ] = False
     xy: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="X,Y", help="A pixel on the object to follow; may be repeated. A grid if left out."
+            metavar="X,Y",
+            help="Pixel on the object to track; may be repeated. Default: a grid.",
+            rich_help_panel=_CONTENT,
+        ),
+    ] = None
+    frame: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="Frame that these pixels are in.", rich_help_panel=_CONTENT),
+    ] = None
+
+
+@dataclass(frozen=True)
+class SourceOptions:
+    """The video of the run."""
+
+    source: Video = None
+    fps: Annotated[
+        float | None,
+        typer.Option(metavar="NUMBER", help="Frame rate of the video.", rich_help_panel=VIDEO),
+    ] = None
+
+
+@grouped
+def export(
+    content: ContentOptions,
+    video: SourceOptions,
+    run: Annotated[Path | None, typer.Argument(metavar="RUN", help="Run folder.")] = None,
+    to: Annotated[
+        str | None,
+        typer.Option(metavar="FORMAT", help="Format; --list shows all.", rich_help_panel=OUTPUT),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PATH",
+            help="File or folder to write; default a new one in RUN/export.",
+            rich_help_panel=OUTPUT,
         ),
     ] = None,
-    frame: Annotated[int | None, typer.Option(help="Index of the frame those pixels are in.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier export.")] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace an earlier export.", rich_help_panel=OUTPUT)
+    ] = False,
     list_formats: Annotated[bool, typer.Option("--list", help="List the formats.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON only.")] = False,
+    as_json: AsJson = False,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Write poses, masks, points, model or scene of a run in the format of another tool.
+    """Write the poses, masks, points, model or scene of a run in the format of another tool.
 
-    Nothing is replaced without --overwrite, and what is written appears whole or not at all.
+    An existing file is replaced only with --overwrite. A failed export leaves nothing behind.
     """
     if list_formats:
         _print_formats(as_json)
         return
     if run is None or to is None:
-        raise InputError("export takes RUN and --to FORMAT; --list shows the formats.")
+        raise InputError("export needs RUN and --to FORMAT; --list shows the formats.")
     from tracking3d.export.exporting import export_run
-    from tracking3d.export.options import ExportOptions
 
-    pixels = tuple(numbers(text, 2, "--xy", "X,Y in pixels") for text in xy or ())
-    options = ExportOptions(
-        answers=answers,  # type: ignore[arg-type] # texts are checked where the library's are
-        object_size=object_size,
-        fps=fps,
-        source=source,
-        of=of,  # type: ignore[arg-type]
-        cut_out=cut_out,
-        images=images,
-        undistorted=undistorted,
-        frame=frame,
-        xy=pixels,  # type: ignore[arg-type]
-    )
-    done = export_run(run, to, out, options=options, overwrite=overwrite)
+    done = export_run(run, to, out, options=_exporter_options(content, video), overwrite=overwrite)
     if done.not_finished:
         typer.echo(done.not_finished, err=True)
     if as_json:
@@ -97,7 +137,25 @@ def export(
         document = {"path": str(done.path), "unit": done.unit, "frames": done.frames}
         typer.echo(json.dumps(document | {"without": list(done.without)}))
     elif not quiet:
-        typer.echo(f"{done.path} is written, {done.in_words}.")
+        typer.echo(f"Wrote {done.path}: {done.in_words}.")
+
+
+def _exporter_options(content: ContentOptions, video: SourceOptions) -> ExportOptions:
+    from tracking3d.export.exporter import ExportOptions
+
+    pixels = tuple(numbers(text, 2, "--xy", "X,Y in pixels") for text in content.xy or ())
+    return ExportOptions(
+        answers=content.estimates,  # type: ignore[arg-type] # the exporter checks the texts
+        object_size=content.object_size,
+        fps=video.fps,
+        source=video.source,
+        of=content.of,  # type: ignore[arg-type]
+        cut_out=content.cut_out,
+        images=content.images,
+        undistorted=content.undistorted,
+        frame=content.frame,
+        xy=pixels,  # type: ignore[arg-type]
+    )
 
 
 def _print_formats(as_json: bool) -> None:

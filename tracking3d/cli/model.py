@@ -1,4 +1,4 @@
-"""``tracking3d model``: the mesh of a run made anew, its shape and its texture."""
+"""``tracking3d model``: rebuild the mesh of a run, its texture or its shape too."""
 
 from __future__ import annotations
 
@@ -8,33 +8,35 @@ from typing import Annotated
 
 import typer
 
-from tracking3d.cli.options import Debug
+from tracking3d.cli.options import Debug, Run, Video
 from tracking3d.errors import InputError
+
+Largest = Annotated[int, typer.Option(min=64, max=8192, help="Maximum side of the texture image, in texels.")]
 
 
 class ModelQuality(StrEnum):
-    """How much work a model is worth."""
+    """What is rebuilt: the texture, or the shape too."""
 
     FAST = "fast"
     FINE = "fine"
 
 
 def model(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder.")],
+    run: Run,
     quality: Annotated[
         ModelQuality,
-        typer.Option(help="fast: the mesh of the online map; fine: its shape made anew from all frames."),
+        typer.Option(
+            help="fast re-textures the online mesh, fine also reconstructs the shape from all frames."
+        ),
     ] = ModelQuality.FAST,
-    source: Annotated[
-        str | None, typer.Option(help="The video, where it is no longer where the run names it.")
-    ] = None,
-    views: Annotated[int, typer.Option(min=1, max=500, help="Frames the texture is taken from.")] = 24,
-    largest: Annotated[int, typer.Option(min=64, max=8192, help="Most texels along a side.")] = 2048,
+    source: Video = None,
+    views: Annotated[int, typer.Option(min=1, max=500, help="Frames that the texture is taken from.")] = 24,
+    largest: Largest = 2048,
     debug: Debug = False,
 ) -> None:
-    """Take the texture of a run's mesh from its video anew, and with --quality fine make its shape anew too.
+    """Re-texture the mesh of a run from its video, and with --quality fine reconstruct its shape too.
 
-    `tracking3d run` takes the texture at its end where there is a final refinement.
+    `tracking3d run` does this at its end; its option --model chooses how.
     """
     from tracking3d.reconstruction.of_run import shape_run, texture_run
 
@@ -49,11 +51,16 @@ def model(
 
 
 def check_fine(source: str) -> None:
-    """Make sure, before anything is tracked, that a shape can be made anew at the end."""
+    """Make sure, before anything is tracked, that the shape can be reconstructed at the end.
+
+    Raises:
+        InputError: The source is a camera, whose frames cannot be read twice.
+        PluginError: A package is missing.
+    """
     from tracking3d.reconstruction.of_run import check_packages
 
     if source.isdigit() and not Path(source).exists():
         raise InputError(
-            "--model fine goes through the video once more, which a camera cannot; leave it out."
+            "--model fine reads the video a second time, which a camera does not allow; leave it out."
         )
     check_packages()

@@ -1,4 +1,4 @@
-"""``tracking3d models``: networks that are known by name, fetched into the user's cache and verified."""
+"""``tracking3d models``: list known networks, download them into the user's cache, and verify them."""
 
 from __future__ import annotations
 
@@ -9,22 +9,20 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tracking3d.cli.options import Debug, Quiet
+from tracking3d.cli.options import AsJson, Debug, Quiet
 from tracking3d.errors import InputError
 
 if TYPE_CHECKING:
     from tracking3d.networks.catalogue import KnownNetwork
 
 app = typer.Typer(
-    help="Known networks: list them, fetch them into your cache, verify them.", no_args_is_help=True
+    help="List known neural networks, download them into your cache, and verify them.", no_args_is_help=True
 )
-
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON only.")]
 
 
 @app.command(name="list")
 def list_networks(as_json: AsJson = False, debug: Debug = False) -> None:
-    """List the known networks: what for, size, licence, and whether they are in the cache."""
+    """List the known networks: purpose, size, licence, and whether they are in your cache."""
     import json
 
     from tracking3d.networks.catalogue import known_networks
@@ -44,7 +42,7 @@ def list_networks(as_json: AsJson = False, debug: Debug = False) -> None:
 
     from tracking3d.cli.tables import print_table
 
-    table = Table("name", "what for", "size", "licence", "state")
+    table = Table("name", "purpose", "size", "licence", "state")
     for network in networks:
         licence = escape(network.licence) + (" [red]non-commercial[/]" if network.non_commercial else "")
         state = "fetched" if there[network.name] else "manual" if network.address is None else ""
@@ -56,24 +54,25 @@ def list_networks(as_json: AsJson = False, debug: Debug = False) -> None:
 @app.command()
 def get(
     names: Annotated[
-        list[str] | None, typer.Argument(metavar="NAME...", help="Names that `models list` shows.")
+        list[str] | None,
+        typer.Argument(metavar="NAME...", help="Network names, as `models list` shows them."),
     ] = None,
     everything: Annotated[
         bool,
         typer.Option(
             "--all",
-            help="All that can be fetched; those under a non-commercial licence with --accept-licence.",
+            help="Download all networks; those with a non-commercial licence only with --accept-licence.",
         ),
     ] = False,
     file: Annotated[
         Path | None,
-        typer.Option("--from", metavar="FILE", help="Take this file, fetched elsewhere, instead."),
+        typer.Option("--from", metavar="FILE", help="Use this file, downloaded elsewhere, instead."),
     ] = None,
     mirror: Annotated[
         str | None,
         typer.Option(
             envvar="TRACKING3D_MIRROR",
-            help="Address of a folder that has NAME.onnx; tried before the known ones.",
+            help="Address of a folder that holds NAME.onnx; tried before the known addresses.",
         ),
     ] = None,
     accept_licence: Annotated[
@@ -82,16 +81,16 @@ def get(
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Fetch networks into your cache; what is not the known file, by its SHA-256, is refused.
+    """Download networks into your cache, and refuse files with an unexpected SHA-256.
 
-    A download that was stopped goes on where it was. Proxies are taken from https_proxy and http_proxy.
+    A stopped download continues where it stopped. Proxies are read from https_proxy and http_proxy.
     """
     from tracking3d.networks.catalogue import known_networks
     from tracking3d.networks.download import adopt, fetch
     from tracking3d.networks.store import State, find_known, network_path, state_of
 
     if bool(names) == everything or (file is not None and len(names or ()) != 1):
-        raise InputError("Say which network: one or more NAMEs, or --all; with --from FILE exactly one NAME.")
+        raise InputError("Give one or more NAMEs, or --all; with --from FILE exactly one NAME.")
     chosen = [find_known(name) for name in names or ()]
     if everything:
         fetchable = [network for network in known_networks().values() if network.addresses]
@@ -110,7 +109,7 @@ def get(
             failed.append(str(error))
             continue
         if not quiet:
-            checked = "" if network.sha256 else ", whose SHA-256 is not known and was not checked"
+            checked = "" if network.sha256 else "; its SHA-256 is unknown and was not checked"
             typer.echo(f"{path}: {network.name}, {network.licence}{checked}")
     if failed:
         raise InputError(" ".join(failed))
@@ -119,12 +118,12 @@ def get(
 @app.command()
 def verify(
     name: Annotated[
-        str | None, typer.Argument(metavar="[NAME]", help="A known network; all in the cache if left out.")
+        str | None, typer.Argument(metavar="[NAME]", help="Known network; default all in the cache.")
     ] = None,
     as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:
-    """Compare the networks in your cache with their known SHA-256."""
+    """Compare the SHA-256 of the networks in your cache with the known one."""
     import json
 
     from tracking3d.networks.catalogue import known_networks
@@ -138,22 +137,26 @@ def verify(
     if as_json:
         typer.echo(json.dumps(states, indent=2))
     elif not states:
-        typer.echo(f"{cache_folder()} holds no network; `tracking3d models list` shows those there are.")
+        typer.echo(f"{cache_folder()} holds no network; `tracking3d models list` shows the known ones.")
     else:
         for known, state in states.items():
             typer.echo(f"{known}: {_STATES[state]}")
     if damaged := [known for known, state in states.items() if state is State.DAMAGED]:
         raise InputError(
-            f"{', '.join(damaged)}: not the known file; fetch it anew with `tracking3d models get {damaged[0]}`."
+            f"{', '.join(damaged)}: not the known file; download it again with `tracking3d models get {damaged[0]}`."
         )
 
 
-_STATES = {"ok": "ok", "unchecked": "there, but its SHA-256 is not known", "damaged": "not the known file"}
+_STATES = {
+    "ok": "ok",
+    "unchecked": "in the cache, but its SHA-256 is unknown",
+    "damaged": "not the known file",
+}
 
 
 @contextmanager
 def _progress(network: KnownNetwork, quiet: bool) -> Iterator[Callable[[int], None]]:
-    """A progress bar on the standard error; yields what to tell the number of bytes that have arrived."""
+    """A progress bar on the standard error; yields the function to call with the number of new bytes."""
     from rich.console import Console
     from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
 

@@ -1,4 +1,4 @@
-"""What ``--box``, ``--mask`` and ``--object`` say of the objects, where they name files."""
+"""Files that ``--box`` and ``--mask`` name, and what ``--object`` excludes."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ _ALL = "@all"
 
 
 def given_box(text: str, frame: int) -> Box:
-    """``X,Y,WIDTH,HEIGHT``, or that of frame ``frame`` in a file of VOT's regions.
+    """Read ``X,Y,WIDTH,HEIGHT``, or the box of frame ``frame`` in a file in VOT's region format.
 
     Raises:
-        InputError: If it is neither.
+        InputError: The text is neither.
     """
     from tracking3d.prompts import parse_box
     from tracking3d.trackers.region_masks import box_in_file
@@ -29,10 +29,10 @@ def given_box(text: str, frame: int) -> Box:
 
 
 def given_masks(file: Path) -> list[Path]:
-    """The file, or ``FILE@N`` for every object of an indexed image ``FILE@all``.
+    """The file itself, or ``FILE@N`` for every object of an indexed image ``FILE@all``.
 
     Raises:
-        InputError: If there is no object in it.
+        InputError: The image shows no object.
     """
     from tracking3d.trackers.mask_images import objects_in
 
@@ -44,15 +44,15 @@ def given_masks(file: Path) -> list[Path]:
         raise InputError(f"--mask {image} does not exist.")
     numbers = objects_in(image)
     if not numbers:
-        raise InputError(f"--mask {name} is empty; mark the objects in it by numbers from 1.")
+        raise InputError(f"--mask {name} is empty; give each object a value from 1 upwards.")
     return [Path(f"{image}@{number}") for number in numbers]
 
 
-def check_object_options(settings: PipelineConfig, objects: int, fine: bool, split: bool) -> None:
-    """Make sure of what is asked for beside ``--object``.
+def check_known(settings: PipelineConfig, objects: int, fine: bool, split: bool) -> None:
+    """Make sure that the other options go with ``--object``.
 
     Raises:
-        InputError: If it does not go together.
+        InputError: One of them does not.
     """
     if settings.object.known is None:
         return
@@ -61,7 +61,9 @@ def check_object_options(settings: PipelineConfig, objects: int, fine: bool, spl
     check_one(settings, objects)
     if fine:
         raise InputError(
-            "The shape of an object that is known is held; leave out --model fine, or --object for a new one."
+            "The shape of a known object is fixed; leave out --model fine, or leave out --object to rebuild the shape."
         )
     if split:
-        raise InputError("--split joins parts that each get to know the object; leave it out with --object.")
+        raise InputError(
+            "--split merges parts that each reconstruct the object; leave out --split, or --object."
+        )

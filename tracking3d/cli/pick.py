@@ -1,4 +1,4 @@
-"""``tracking3d pick``: say in the browser what the object is; and ``run`` without a box, where a person is there."""
+"""``tracking3d pick``: mark the object in the browser; ``run`` without a prompt does so too, from a terminal."""
 
 from __future__ import annotations
 
@@ -10,42 +10,55 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quiet, configure
-from tracking3d.cli.view import Browser, Host, show_address
+from tracking3d.cli.options.output import Browser, Host, Overwrite, RunFolder
+from tracking3d.cli.options.panels import OUTPUT
+from tracking3d.cli.options.tracking import Tracker
+from tracking3d.cli.options.video import Frames
+from tracking3d.cli.view import show_address
 
 if TYPE_CHECKING:
     from tracking3d.config.models import PipelineConfig
     from tracking3d.picker.session import Picked
+    from tracking3d.prompts import PromptSet
 
 
 def pick(
-    source: Annotated[str, typer.Argument(metavar="VIDEO", help="Video file, folder or pattern of images.")],
-    tracker: Annotated[str | None, typer.Option(metavar="NAME", help="Mask tracker.")] = None,
-    out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Run folder; default runs/<source>.")
-    ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run in that folder.")] = False,
-    frames: Annotated[
-        str | None, typer.Option(metavar="START:STOP:STEP", help="Which frames, counted from 0.")
-    ] = None,
+    source: Annotated[
+        str, typer.Argument(metavar="VIDEO", help="Video file, image folder or quoted image pattern.")
+    ],
+    tracker: Tracker = None,
+    out: RunFolder = None,
+    overwrite: Overwrite = False,
+    frames: Frames = None,
     config: ConfigFile = None,
     preset: Preset = None,
     overrides: Overrides = None,
     host: Host = None,
     port: Annotated[
-        int, typer.Option(min=0, max=65535, help="Or the next one that is free; 0 for any.")
+        int,
+        typer.Option(
+            min=0,
+            max=65535,
+            help="Port, or the next free one above it; 0 for any free port.",
+            rich_help_panel=OUTPUT,
+        ),
     ] = 8090,
     browser: Browser = True,
     view: Annotated[
-        bool, typer.Option("--view", help="Look at the run, once it is started, in the viewer.")
+        bool,
+        typer.Option(
+            "--view", help="Show the run in the viewer once it has started.", rich_help_panel=OUTPUT
+        ),
     ] = False,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Say in the browser what the object is: box, points or paint on any frame. Then start the run there.
+    """Mark the object in the browser with a box, points or a brush on any frame, then start the run from the page.
 
-    The mask that the tracker makes of it is shown at once. The command and a YAML file can be copied instead.
+    The page shows at once the mask that the tracker makes from it. It also offers the command and a YAML file to copy.
     """
-    from tracking3d.cli.tracking import Given, default_folder, track
+    from tracking3d.cli.tracking import RunDisplay, RunRequest, default_folder, track
+    from tracking3d.recording import RecordOptions
     from tracking3d.viewer.opening import check_viser
 
     if view:
@@ -53,14 +66,17 @@ def pick(
     settings = configure(config, preset, overrides, tracker={"name": tracker})
     folder = out or default_folder(source)
     picked = picked_in_browser(source, frames, settings, folder, host, port, browser, overwrite)
-    about = {
-        "command": shlex.join(sys.argv),
-        "selection": frames,
-        "overwrite": overwrite,
-        "start_frame": picked.frame,
-    }
-    given = Given(picked.boxes, picked.masks)
-    track(source, settings, folder, given, about, quiet=quiet, view=view, host=host)
+    prompts = prompts_of(picked)
+    options = RecordOptions(shlex.join(sys.argv), frames, overwrite)
+    track(RunRequest(source, settings, folder, prompts, options), RunDisplay(quiet, view=view, host=host))
+
+
+def prompts_of(picked: Picked) -> PromptSet:
+    """The prompts that were marked in the browser."""
+    from tracking3d.prompts import PromptSet
+
+    several = len(picked.boxes) + len(picked.masks) > 1
+    return PromptSet(picked.boxes, picked.masks, start_frame=picked.frame, as_lists=several)
 
 
 def picked_in_browser(
@@ -73,21 +89,21 @@ def picked_in_browser(
     browser: bool = True,
     overwrite: bool = False,
 ) -> Picked:
-    """Serve the page until the person starts the run.
+    """Serve the page until the user starts the run.
 
     Args:
         source: The video.
         frames: ``START:STOP:STEP``.
-        settings: Of the run.
+        settings: Settings of the run.
         folder: The run folder.
         host: See `Access.on`.
-        port: The port, or the next one that is free.
-        browser: Open the page, where a person sits at this machine.
-        overwrite: Whether a run that is in the folder may be replaced.
+        port: The port, or the next free one above it.
+        browser: Open the page, if the program was started from a terminal.
+        overwrite: Whether an earlier run in the folder may be replaced.
 
     Raises:
-        InputError: If the video is none that frames can be picked in.
-        OutputError: If there is a run in the folder.
+        InputError: The source cannot be paused, so that no frame can be picked.
+        OutputError: There is a run in the folder.
     """
     from tracking3d.errors import InputError, OutputError
     from tracking3d.picker.outcome import command_of, save_picked, settings_as_yaml
@@ -100,10 +116,10 @@ def picked_in_browser(
     from tracking3d.web.access import Access
 
     if (folder / layout.RUN).exists() and not overwrite:
-        raise OutputError(f"{folder} holds a run already; give --overwrite or choose another {layout.OUT}.")
+        raise OutputError(f"{folder} already holds a run; give --overwrite or choose another {layout.OUT}.")
     opened, selection = open_source(source, frames), parse_selection(frames)
     if not opened.repeatable:
-        raise InputError(f"{opened.name} does not wait while one draws; say by --box what the object is.")
+        raise InputError(f"{opened.name} cannot be paused to draw in; give the object with --box.")
     images = frame_images(opened)
     session = PickingSession(source, images, within(selection, images.count or opened.count or 1), settings)
 

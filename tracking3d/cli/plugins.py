@@ -1,4 +1,4 @@
-"""``tracking3d plugins``: the mask trackers and feature encoders that are installed, and how to begin a new one.
+"""``tracking3d plugins``: list the installed mask trackers and feature encoders, or create a new one.
 
 ``tracking3d plugins`` alone is short for ``tracking3d plugins list``.
 """
@@ -19,7 +19,7 @@ DEFAULT = "list"
 
 
 class _Plugins(TyperGroup):
-    """A group whose command may be left out: without one it lists."""
+    """A group that lists the plug-ins if no command is given."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         return super().parse_args(ctx, args if args[:1] == ["--help"] else _with_command(args))
@@ -34,7 +34,7 @@ def _with_command(args: list[str]) -> list[str]:
 
 app = typer.Typer(
     cls=_Plugins,
-    help="List the mask trackers and feature encoders that are installed, or begin a new one.",
+    help="List the installed mask trackers and feature encoders, or create a new one.",
 )
 
 
@@ -46,11 +46,11 @@ class _Kind(StrEnum):
 @app.command(name=DEFAULT)
 def plugins(
     as_json: Annotated[
-        bool, typer.Option("--json", help="Print JSON only, with the schema of the options.")
+        bool, typer.Option("--json", help="Print JSON only, with the schema of each plug-in's options.")
     ] = False,
     debug: Debug = False,
 ) -> None:
-    """List the mask trackers and feature encoders that are installed, and what is wrong with a broken one."""
+    """List the installed mask trackers and feature encoders, and say what is wrong with a broken one."""
     import json
     from dataclasses import asdict
 
@@ -74,17 +74,20 @@ def plugins(
 
 @app.command()
 def new(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Name that will select the plug-in.")],
-    kind: Annotated[_Kind, typer.Option(help="Mask tracker or feature encoder.")],
+    name: Annotated[
+        str,
+        typer.Argument(metavar="NAME", help="Name of the plug-in, as --tracker or --features will take it."),
+    ],
+    kind: Annotated[_Kind, typer.Option(help="Kind of plug-in: mask tracker or feature encoder.")],
     out: Annotated[
-        Path, typer.Option(metavar="DIR", help="Folder that the package's own folder goes into.")
+        Path, typer.Option(metavar="DIR", help="Folder in which the package's folder is created.")
     ] = Path(),
     debug: Debug = False,
 ) -> None:
-    """Write a package with a new plug-in, ready to install: pyproject, module, test, README."""
+    """Create a package with a new plug-in, ready to install: pyproject, module, test and README."""
     from tracking3d.plugins.template import write_plugin
 
     folder = write_plugin(name, kind.value, out)
-    # Without a separator pip would take the folder's name for one on the package index.
+    # Without a separator pip would look for the name on the package index.
     place = shlex.quote(str(folder) if len(folder.parts) > 1 else f"./{folder}")
-    typer.echo(f"{folder} is written; next: pip install {place} pytest && pytest {place}")
+    typer.echo(f"Wrote {folder}. Next: pip install {place} pytest && pytest {place}")

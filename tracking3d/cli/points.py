@@ -1,13 +1,15 @@
-"""``tracking3d points``: where surface points are in every frame of a run."""
+"""``tracking3d points``: track surface points through every frame of a run."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tracking3d.cli.options import Debug, Quiet, numbers
+from tracking3d.cli.options import Debug, Quiet, Run, Video, grouped, numbers
+from tracking3d.cli.options.panels import OUTPUT
 from tracking3d.errors import InputError, OutputError
 
 if TYPE_CHECKING:
@@ -15,90 +17,168 @@ if TYPE_CHECKING:
     from tracking3d.results.run_reader import RunReader
     from tracking3d.video import FrameSource
 
-_RATE = 25.0  # frames per second of a video of images
+_QUERY = "Query"
+_RATE = 25.0  # frames per second, for images without a frame rate
 
 
-def points(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder.")],
+@dataclass(frozen=True)
+class QueryOptions:
+    """Which points are tracked, and from what."""
+
     xy: Annotated[
-        list[str] | None, typer.Option(metavar="X,Y", help="A pixel of that frame; may be repeated.")
-    ] = None,
+        list[str] | None,
+        typer.Option(
+            metavar="X,Y",
+            help="Pixel to track from the query frame; may be repeated.",
+            rich_help_panel=_QUERY,
+        ),
+    ] = None
     grid: Annotated[
         int | None,
-        typer.Option(metavar="STEP", min=1, help="Pixels at such distances all over the object."),
-    ] = None,
-    frame: Annotated[int, typer.Option(help="Index of the frame the pixels are in.")] = 0,
-    source: Annotated[
-        str | None,
         typer.Option(
-            metavar="SOURCE", help="The video, where it is not where it was.", show_default="as the run"
+            metavar="STEP",
+            min=1,
+            help="Track a grid of pixels with this spacing over the whole object.",
+            rich_help_panel=_QUERY,
         ),
-    ] = None,
+    ] = None
+    frame: Annotated[
+        int, typer.Option(metavar="N", help="Query frame, which the pixels are in.", rich_help_panel=_QUERY)
+    ] = 0
     any_pixel: Annotated[
         bool,
-        typer.Option("--any", help="Follow pixels beside the object too, in the images alone."),
-    ] = False,
+        typer.Option(
+            "--any",
+            help="Track pixels on the background too, from the images alone.",
+            rich_help_panel=_QUERY,
+        ),
+    ] = False
     by_mesh: Annotated[
-        bool, typer.Option("--by-mesh", help="Carry points by mesh and pose alone; looks at no image.")
-    ] = False,
+        bool,
+        typer.Option(
+            "--by-mesh",
+            help="Move points with mesh and pose alone; the images are not read.",
+            rich_help_panel=_QUERY,
+        ),
+    ] = False
     causal: Annotated[
-        bool, typer.Option("--causal", help="Begin with the answers before the final refinement.")
-    ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON only.")] = False,
-    csv: Annotated[Path | None, typer.Option("--csv", metavar="FILE", help="Write a CSV file.")] = None,
+        bool,
+        typer.Option(
+            "--causal",
+            help="Start from the estimates before the final refinement.",
+            rich_help_panel=_QUERY,
+        ),
+    ] = False
+    source: Video = None
+
+    def pixels(self) -> list[tuple[float, ...]]:
+        """The pixels of ``--xy``.
+
+        Raises:
+            InputError: One cannot be read, no point is given, or two options contradict each other.
+        """
+        pixels = [numbers(text, 2, "--xy", "X,Y in pixels") for text in self.xy or []]
+        if not pixels and self.grid is None:
+            raise InputError(
+                "No point is given; give pixels with --xy X,Y, or --grid STEP to cover the whole object."
+            )
+        if self.any_pixel and self.by_mesh:
+            raise InputError(
+                "--any tracks points in the images, which --by-mesh does not read; leave out one of them."
+            )
+        return pixels
+
+
+@grouped
+def points(
+    run: Run,
+    query: QueryOptions,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON only.", rich_help_panel=OUTPUT)] = False,
+    csv: Annotated[
+        Path | None,
+        typer.Option("--csv", metavar="FILE", help="Write a CSV file.", rich_help_panel=OUTPUT),
+    ] = None,
     video: Annotated[
         Path | None,
-        typer.Option("--video", metavar="FILE", help="Write an MP4 of the points and their trails."),
+        typer.Option(
+            "--video",
+            metavar="FILE",
+            help="Write an MP4 video of the points and their trails.",
+            rich_help_panel=OUTPUT,
+        ),
     ] = None,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Follow surface points through all frames: position, visibility, uncertainty.
+    """Track surface points through all frames: position, visibility and uncertainty.
 
-    Mesh and poses predict where a point goes and whether it is seen; the images correct it. What the mesh does not
-    cover is followed in the images. A pixel outside the frame is an error, and so is none on the object without --any.
+    Mesh and poses predict where a point is and whether it is visible; the images correct the prediction. Points that
+    the mesh does not cover are tracked in the images. A pixel outside the frame is an error, and so is one off the
+    object without --any.
     """
-    from tracking3d.results.correspondences import check_asked, grid_on_object, on_mask, track_points
-    from tracking3d.results.following import open_scene
-    from tracking3d.results.point_files import points_to_csv, points_to_json
-    from tracking3d.results.point_trails import write_trails
+    from tracking3d.results.correspondences import grid_on_object, track_points
     from tracking3d.results.run_reader import RunReader
 
-    pixels = [numbers(text, 2, "--xy", "X,Y in pixels") for text in xy or []]
-    if not pixels and grid is None:
-        raise InputError(
-            "No point is asked for; give pixels by --xy X,Y, or --grid STEP for all of the object."
-        )
-    if any_pixel and by_mesh:
-        raise InputError(
-            "--any follows points in the images, and --by-mesh looks at none; leave one of them out."
-        )
+    pixels = query.pixels()
     for file in (csv, video):
         if file is not None and not file.absolute().parent.is_dir():
-            raise OutputError(f"{file} cannot be written: there is no folder {file.parent}; make it first.")
-    reader = RunReader(run, refined=not causal)
-    if grid is not None:
-        pixels += grid_on_object(reader, frame, grid)
-    # Bad questions are told before the video is read.
-    tracks = track_points(reader, frame, pixels)
+            raise OutputError(
+                f"{file} cannot be written: the folder {file.parent} does not exist; make it first."
+            )
+    reader = RunReader(run, refined=not query.causal)
+    if query.grid is not None:
+        pixels += grid_on_object(reader, query.frame, query.grid)
+    tracks = track_points(reader, query.frame, pixels)  # before the video is read: it may refuse the query
     images: FrameSource | None = None
-    if not by_mesh or video is not None:
-        images = _images(reader, source, needed=any_pixel or source is not None or video is not None)
-    answered = tracks.on_object | any_pixel
-    if images is not None and not by_mesh:
-        answered |= on_mask(reader, frame, tracks.query)
-    otherwise = "" if by_mesh else ", or --any to follow them in the images alone"
-    told = [reader.not_finished, check_asked(tracks, reader.camera, answered, otherwise)]
-    if images is not None and not by_mesh:
-        tell = (
-            (lambda done: None) if quiet else (lambda done: typer.echo(f"landmarks, round {done}", err=True))
-        )
-        tracks = open_scene(reader, images, after_round=tell).track(frame, pixels, any_pixel)
+    if not query.by_mesh or video is not None:
+        needed = query.any_pixel or query.source is not None or video is not None
+        images = _images(reader, query.source, needed)
+    tracks, remarks = _followed(reader, query, pixels, tracks, images, quiet)
+    for remark in remarks:
+        typer.echo(remark, err=True)
+    _write(tracks, images, as_json, csv, video)
+
+
+def _followed(
+    reader: RunReader,
+    query: QueryOptions,
+    pixels: list[tuple[float, ...]],
+    tracks: PointTracks,
+    images: FrameSource | None,
+    quiet: bool,
+) -> tuple[PointTracks, list[str]]:
+    """The tracks that the images correct, if they are read, and what to print about them."""
+    from tracking3d.results.correspondences import check_asked, on_mask
+    from tracking3d.results.following import open_scene
+
+    by_images = images is not None and not query.by_mesh
+    covered = tracks.on_object | query.any_pixel
+    if by_images:
+        covered |= on_mask(reader, query.frame, tracks.query)
+    otherwise = "" if query.by_mesh else ", or --any to follow them in the images alone"
+    remarks = [reader.not_finished, check_asked(tracks, reader.camera, covered, otherwise)]
+    if images is not None and by_images:
+        report = _silent if quiet else _print_round
+        tracks = open_scene(reader, images, after_round=report).track(query.frame, pixels, query.any_pixel)
         if not quiet:
-            told.append(_by_images(tracks))
-    for sentence in told:
-        if sentence:
-            typer.echo(sentence, err=True)
+            remarks.append(_by_images(tracks))
+    return tracks, [remark for remark in remarks if remark]
+
+
+def _silent(done: int) -> None:
+    pass
+
+
+def _print_round(done: int) -> None:
+    typer.echo(f"Adjusting landmarks, round {done}", err=True)
+
+
+def _write(
+    tracks: PointTracks, images: FrameSource | None, as_json: bool, csv: Path | None, video: Path | None
+) -> None:
+    from tracking3d.results.point_files import points_to_csv, points_to_json
+    from tracking3d.results.point_trails import write_trails
+
     if csv is not None:
         try:
             csv.write_text(points_to_csv(tracks), encoding="utf-8")
@@ -113,18 +193,18 @@ def points(
 
 
 def _by_images(tracks: PointTracks) -> str:
-    """What to say of points that the mesh does not cover where they were asked for; empty where there are none."""
+    """What to print about points that the mesh does not cover in the query frame; empty if there are none."""
     alone, tied = (int((tracks.kind == kind).sum()) for kind in ("image", "tied"))
     if not alone + tied:
         return ""
     count = f"{alone + tied} of {len(tracks.kind)} points"
     return (
-        f"Followed in the images: {count}; {tied} of them came to lie on the mesh, which carries them since."
+        f"Tracked in the images: {count}; {tied} of them reached the mesh later and move with it from there."
     )
 
 
 def _images(reader: RunReader, source: str | None, needed: bool) -> FrameSource | None:
-    """The video of the run; where it is gone and not needed, None, and a word about it."""
+    """The video of the run; None, with a remark, if it is missing and not needed."""
     from tracking3d.results.run_source import open_run_source
 
     try:
@@ -132,5 +212,5 @@ def _images(reader: RunReader, source: str | None, needed: bool) -> FrameSource 
     except InputError as error:
         if needed:
             raise
-        typer.echo(f"Points are carried by mesh and pose alone. {error}", err=True)
+        typer.echo(f"Points move with mesh and pose alone. {error}", err=True)
         return None

@@ -1,7 +1,7 @@
 """How every command ends: one sentence instead of a traceback, and an exit code.
 
-0 done, 1 a fault of the program itself, 2 something the user gave cannot be used or the machine has too little of,
-130 interrupted, by Ctrl-C or SIGTERM, 141 nobody reads what is printed.
+0 success, 1 a bug in the program, 2 bad input or too little memory or disk space, 130 interrupted by Ctrl-C or SIGTERM,
+141 the output is piped into a program that has ended.
 """
 
 from __future__ import annotations
@@ -26,34 +26,34 @@ from tracking3d.errors import InputError, Tracking3dError
 
 INTERRUPTED = 130
 UNREAD = 141
-"""What a shell calls the end of a program whose output is piped into one that has ended, such as ``head``."""
+"""Exit code of a program whose output is piped into one that has ended, such as ``head``."""
 
 
 class Program(TyperGroup):
-    """The root command; ``--debug`` anywhere shows the traceback beside the sentence."""
+    """The root command; ``--debug`` anywhere shows the traceback too."""
 
     def main(self, args: Sequence[str] | None = None, *more: Any, **extra: Any) -> Any:
-        """Run a command line (``sys.argv`` if None) and leave with its exit code."""
+        """Run a command line (``sys.argv`` if None) and exit with its code."""
         arguments = sys.argv[1:] if args is None else list(args)
         _print_anything()
         try:
             _refuse_empty(arguments)
             code = super().main(arguments, *more, **{**extra, "standalone_mode": False})
-            if sys.stdout is not None:  # as it is where it was closed before the program began
+            if sys.stdout is not None:  # None if it was closed before the program started
                 sys.stdout.flush()
         except Exception as error:
             if "--debug" in arguments:
                 traceback.print_exc()
             code = _report(error)
-        except SystemExit as error:  # click and rich leave so where nobody reads what they print
+        except SystemExit as error:  # how click and rich exit if nobody reads what they print
             code = UNREAD if _is_unread(error.__context__) else error.code
         if code == UNREAD:
             _print_nowhere()
-        # Of what ended well, --help and --version give 0 and the other commands nothing.
+        # On success --help and --version return 0, and the other commands None.
         sys.exit(code if isinstance(code, int) else 0)
 
     def invoke(self, ctx: Any) -> Any:
-        """Call the command; Ctrl-C or SIGTERM ends it with what it has to say about that."""
+        """Call the command; Ctrl-C or SIGTERM ends it, and its notes are printed."""
         try:
             with _ended_as_by_ctrl_c():
                 return super().invoke(ctx)
@@ -63,15 +63,15 @@ class Program(TyperGroup):
 
 
 _AT_ONCE = 5.0
-"""Seconds after a first SIGTERM in which others mean the same."""
+"""Seconds after the first SIGTERM in which further ones are ignored."""
 
 
 @contextmanager
 def _ended_as_by_ctrl_c() -> Iterator[None]:
-    """Let SIGTERM, which containers and batch systems stop with, end the command as Ctrl-C does.
+    """Let SIGTERM, which containers and batch systems send, end the command as Ctrl-C does.
 
-    A second one, which some send at once, does not end what is written at the end. One that comes later does: a library
-    that is imported may have caught the first.
+    Some systems send a second one at once; it does not interrupt the writing of results. A later one does, because an
+    imported library may have caught the first.
     """
     first: list[float] = []
 
@@ -81,7 +81,7 @@ def _ended_as_by_ctrl_c() -> Iterator[None]:
             raise KeyboardInterrupt
 
     if threading.current_thread() is not threading.main_thread():
-        yield  # where no signal can be handled
+        yield  # signals can be handled in the main thread only
         return
     before = signal.signal(signal.SIGTERM, stop)
     try:
@@ -91,7 +91,7 @@ def _ended_as_by_ctrl_c() -> Iterator[None]:
 
 
 def _report(error: Exception) -> int:
-    """Print the error as a sentence and return the exit code."""
+    """Print the error as one sentence, and return the exit code."""
     if isinstance(error, typer.Abort):
         return INTERRUPTED
     if _is_unread(error):
@@ -104,23 +104,21 @@ def _report(error: Exception) -> int:
         sentence, code = too_little, 2
     else:
         what = f"{type(error).__name__}: {error}"
-        sentence, code = f"this is a fault of tracking3d ({what}); run it with --debug to see where.", 1
+        sentence, code = f"this is a bug in tracking3d ({what}); add --debug to see where.", 1
     if sentence:
         _print(f"error: {' '.join(sentence.split())}", error)
     return code
 
 
 def _too_little(error: BaseException) -> str:
-    """What the machine has too little of, in a sentence; empty where that is not the reason."""
+    """Which resource of the machine has run out, in a sentence; empty if none has."""
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
         _print_nowhere()
-        return (
-            f"what is printed cannot be written ({error.strerror}); free some space, or print somewhere else."
-        )
+        return f"the output cannot be written ({error.strerror}); free some disk space, or redirect it elsewhere."
     if isinstance(error, MemoryError) or _NO_MEMORY.search(str(error)):
         return (
             "there is not enough memory; lower --size (window.size), object.texture_size or solver.most_keyframes, "
-            "track fewer objects at once, or end other programs."
+            "track fewer objects at once, or close other programs."
         )
     return ""
 
@@ -130,7 +128,7 @@ _NO_MEMORY = re.compile(
     "bad_alloc|can't start new thread|failed to map segment",
     re.IGNORECASE,
 )
-"""How torch, OpenCV, LLVM and the system say that memory has ended; not all of them raise a `MemoryError`."""
+"""How torch, OpenCV, LLVM and the system report missing memory; not all of them raise a `MemoryError`."""
 
 
 def _is_unread(error: BaseException | None) -> bool:
@@ -138,14 +136,14 @@ def _is_unread(error: BaseException | None) -> bool:
 
 
 def _print_anything() -> None:
-    """A terminal that has no sign for a letter shows its number instead of ending the program."""
+    """A letter that the terminal cannot show is printed as its number, and does not end the program."""
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
 
 
 def _print_nowhere() -> None:
-    """What is still to be printed, when Python ends too, is lost in silence."""
+    """Discard all further output, also what Python flushes at its end."""
     with suppress(OSError, ValueError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())
@@ -153,10 +151,10 @@ def _print_nowhere() -> None:
 
 
 def _refuse_empty(arguments: Sequence[str]) -> None:
-    """An option with nothing behind it is an unset variable of a script more likely than a choice.
+    """Refuse empty values: most likely a script uses a variable that is not set.
 
     Raises:
-        InputError: If there is one, or an empty argument.
+        InputError: An option or an argument is empty.
     """
     for option, value in zip(["", *arguments], arguments, strict=False):
         if value == "" or re.fullmatch("--[a-z-]+=", value):
@@ -165,7 +163,7 @@ def _refuse_empty(arguments: Sequence[str]) -> None:
 
 
 def _print(line: str, error: BaseException) -> None:
-    with suppress(OSError):  # where nothing can be printed the exit code has to do
+    with suppress(OSError):  # if nothing can be printed, the exit code says enough
         for text in (line, *getattr(error, "__notes__", ())):
             typer.echo(text, err=True)
 
@@ -173,6 +171,6 @@ def _print(line: str, error: BaseException) -> None:
 def _usage(error: Any) -> str:
     context = getattr(error, "ctx", None)
     sentence = error.format_message().rstrip(".")
-    if not sentence:  # a group without a command has printed its help
+    if not sentence:  # a group without a command has already printed its help
         return ""
     return f"{sentence}; see `{context.command_path} --help`." if context else f"{sentence}."

@@ -1,4 +1,4 @@
-"""What a run shows while it goes on, and at its end."""
+"""Progress of a run, and its closing table."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ _COLOURS = {"tracked": "green", "uncertain": "yellow", "lost": "red", "skipped":
 
 @contextmanager
 def progress(count: int | None, quiet: bool, objects: int = 1) -> Iterator[Listener]:
-    """A progress bar on the standard error: frame, status, IoU against the initial mask, speed, time left.
+    """Show a progress bar on the standard error: frame, status, IoU with the initial mask, speed, time left.
 
-    It begins again where the frames come a second time, in the final refinement. Where the standard error is no
-    terminal, but a log, it is a line every now and then.
+    The final refinement gets a second bar. If the standard error is a log instead of a terminal, a line is printed
+    every ten seconds.
 
     Args:
-        count: Number of frames, where known.
+        count: Number of frames, if known.
         quiet: Show nothing.
-        objects: How many are tracked; the bar counts the frames of each.
+        objects: Number of objects; the bar counts the frames of each.
 
     Yields:
-        The listener to tell of every frame.
+        The listener to call with every frame.
     """
     console = Console(stderr=True)
     if not console.is_terminal:
@@ -59,7 +59,7 @@ def progress(count: int | None, quiet: bool, objects: int = 1) -> Iterator[Liste
         again = isinstance(frame, FrameRecord) and frame.refined
         if again and len(tasks) == 1:
             bar.update(tasks[0], visible=False)
-            tasks.append(bar.add_task("", total=bar.tasks[0].completed, frame="once more"))
+            tasks.append(bar.add_task("", total=bar.tasks[0].completed, frame="final refinement"))
         bar.update(tasks[-1], advance=1, frame=_line(frame))
 
     with bar:
@@ -71,7 +71,7 @@ def _silent(frame: FrameRecord | SkippedFrame) -> None:
 
 
 def _logged(console: Console, count: int | None) -> Listener:
-    """Prints how far it is, at most once in `_EVERY` seconds and not before these are over."""
+    """Print the progress once every `_EVERY` seconds."""
     last, done = time.monotonic(), {False: 0, True: 0}
 
     def listener(frame: FrameRecord | SkippedFrame) -> None:
@@ -107,17 +107,14 @@ def print_summary(folder: Path) -> None:
     if counts["failed"]:
         table.add_row("  with a plug-in failure", f"[red]{counts['failed']}[/]")
         for failure in run["failures"]:
-            table.add_row(f"    {failure['frames']} of them", escape(failure["reason"]))
+            table.add_row(f"    in {failure['frames']} of them", escape(failure["reason"]))
     if refinement := run.get("refinement"):
         took = f"{refinement['frames']} frames in {format_value(refinement['seconds'])} s"
         table.add_row("final refinement", took if refinement["frames"] else escape(refinement["reason"]))
     own = own_masks(run)
     if own is not None:
-        handed_back = counts["frames"] - own
-        told = f" of {counts['frames']}" + (
-            "; the others are the initial masks" if own and handed_back else ""
-        )
-        table.add_row("masks of its own", f"{own}{told if own else told + ': all are the initial masks'}")
+        rest = "" if own == counts["frames"] else "; the others keep the initial mask"
+        table.add_row("frames with an estimated mask", f"{own} of {counts['frames']}{rest if own else ''}")
     if own is None or own:
         table.add_row(
             "mean IoU with the initial masks"
@@ -151,8 +148,8 @@ _OUTPUTS = {
 def _line(frame: FrameRecord | SkippedFrame) -> str:
     if isinstance(frame, SkippedFrame):
         return f"[{_COLOURS['skipped']}]frame {frame.index} skipped[/]"
-    once_more = "once more: " if frame.refined else ""
+    phase = "final refinement, " if frame.refined else ""
     return (
-        f"{once_more}frame {frame.index} [{_COLOURS[frame.status]}]{frame.status}[/] "
+        f"{phase}frame {frame.index} [{_COLOURS[frame.status]}]{frame.status}[/] "
         f"IoU {format_value(frame.iou_initial)} {frame.seconds:.2f} s"
     )

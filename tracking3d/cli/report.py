@@ -1,15 +1,15 @@
-"""``tracking3d report``: pages about runs; and the report that every run ends with."""
+"""``tracking3d report``: write the report of a run, as every run does at its end."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
-from tracking3d.cli.options import Debug
+from tracking3d.cli.options import Debug, RunOrParent
 from tracking3d.errors import Tracking3dError
 
 if TYPE_CHECKING:
@@ -19,14 +19,12 @@ if TYPE_CHECKING:
 
 
 def report(
-    run: Annotated[
-        Path, typer.Argument(metavar="RUN", help="Run folder, or the folder with those of several objects.")
-    ],
+    run: RunOrParent,
     debug: Debug = False,
 ) -> None:
-    """Write RUN/report.html, one file to look at the run in any browser, and RUN/turntable.mp4.
+    """Write RUN/report.html, a single file that any browser shows, and RUN/turntable.mp4.
 
-    Of several objects each gets a report, and RUN/index.html links to them.
+    If there are several objects, each gets its own report, and RUN/index.html links to them.
     """
     from tracking3d.report.several import write_reports
     from tracking3d.results.layout import runs_in
@@ -37,25 +35,25 @@ def report(
 
 @contextmanager
 def reported(folders: Sequence[Path]) -> Iterator[Callable[[Listener], Listener]]:
-    """Write the reports of runs when what is within ends, in whatever way, if it got as far as a frame.
+    """Write the reports of runs when the block ends, however it ends, if at least one frame was tracked.
 
-    That a report cannot be written is said, and changes nothing about how the run ended.
+    If a report cannot be written, that is printed; it does not change how the run ended.
 
     Args:
-        folders: The run folders; none leaves reports out.
+        folders: The run folders; none means no reports.
 
     Yields:
-        What makes of a listener one that also notes that there is something to report.
+        A function that wraps a listener, to note that there is something to report.
     """
     begun = False
 
     def noting(listener: Listener) -> Listener:
-        def told(frame: FrameRecord | SkippedFrame) -> None:
+        def note(frame: FrameRecord | SkippedFrame) -> None:
             nonlocal begun
             begun = True
             listener(frame)
 
-        return told
+        return note
 
     try:
         yield noting
@@ -73,8 +71,8 @@ def _write(folders: Sequence[Path]) -> None:
     except Exception as error:
         sentence = error.at_the_command_line if isinstance(error, Tracking3dError) else f"{error}."
         typer.echo(
-            f"The report could not be written: {' '.join(sentence.split())} `tracking3d report` tries again.",
+            f"The report could not be written: {' '.join(sentence.split())} Try again with `tracking3d report`.",
             err=True,
         )
     except KeyboardInterrupt:
-        typer.echo("The report was not finished: interrupted. `tracking3d report` tries again.", err=True)
+        typer.echo("The report was interrupted. Try again with `tracking3d report`.", err=True)

@@ -4,356 +4,143 @@ from __future__ import annotations
 
 import shlex
 import sys
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING
 
 import typer
 
 from tracking3d.cli.model import check_fine
-from tracking3d.cli.objects import check_object_options, given_box, given_masks
-from tracking3d.cli.options import (
-    ConfigFile,
-    Debug,
-    Overrides,
-    Preset,
-    Quality,
-    Quiet,
-    camera_settings,
-    configure,
-)
+from tracking3d.cli.objects import check_known, given_box, given_masks
+from tracking3d.cli.options import Debug, Quiet, SettingsOptions, grouped
+from tracking3d.cli.options.camera import CameraOptions
+from tracking3d.cli.options.output import ModelChoice, OutputOptions
+from tracking3d.cli.options.performance import PerformanceOptions
+from tracking3d.cli.options.prompt import PromptOptions
+from tracking3d.cli.options.tracking import TrackingOptions
+from tracking3d.cli.options.video import Source, VideoOptions
 from tracking3d.cli.split import track_in_parts
-from tracking3d.cli.tracking import Given, a_person_is_there, default_folder, track
-from tracking3d.cli.view import Host
+from tracking3d.cli.tracking import RunDisplay, RunRequest, a_person_is_there, default_folder, track
 from tracking3d.errors import InputError
 
-_TRACKING, _CAMERA, _RUNNING = "The object and how to track it", "The camera", "Running"
+if TYPE_CHECKING:
+    from tracking3d.config.models import PipelineConfig
+    from tracking3d.corrections import Correction
+    from tracking3d.prompts import PromptSet
 
 
-class ModelChoice(StrEnum):
-    """What is made of the object at the end."""
-
-    NONE = "none"
-    FAST = "fast"
-    FINE = "fine"
-
-
+@grouped
 def run(
-    source: Annotated[
-        str,
-        typer.Argument(
-            metavar="SOURCE",
-            help="Video file, folder or pattern of images, number of a camera, or http(s) or rtsp(s) address.",
-        ),
-    ],
-    box: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="X,Y,W,H|FILE",
-            help="Object in the first frame, in pixels or as VOT's regions; may be repeated.",
-            rich_help_panel=_TRACKING,
-        ),
-    ] = None,
-    mask: Annotated[
-        list[Path] | None,
-        typer.Option(
-            metavar="FILE[@N|@all]",
-            help="Mask of the object in the first frame, or object N of an indexed one; may be repeated.",
-            rich_help_panel=_TRACKING,
-        ),
-    ] = None,
-    points: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="'X,Y+ X,Y-'",
-            help="Points of the first frame on the object (+) and beside it (-); may be repeated.",
-            rich_help_panel=_TRACKING,
-        ),
-    ] = None,
-    known: Annotated[
-        str | None,
-        typer.Option(
-            "--object",
-            metavar="RUN|MESH",
-            help="The object is that of an earlier run, or this mesh; found without a box, or with one.",
-            rich_help_panel=_TRACKING,
-        ),
-    ] = None,
-    start_frame: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            help="The object is given in frame N, and tracked both ways from there.",
-            rich_help_panel=_TRACKING,
-        ),
-    ] = None,
-    correct: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="FRAME:BOX|MASK|POINTS",
-            help="The object in a later frame, from which the tracker goes on; may be repeated.",
-            rich_help_panel=_TRACKING,
-        ),
-    ] = None,
-    masks: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR|FILE[@N]",
-            help="Masks of all frames: a folder, video, .npz, COCO's .json, VOT's .txt; the first is also the object.",
-            rich_help_panel=_TRACKING,
-        ),
-    ] = None,
-    tracker: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Mask tracker.", rich_help_panel=_TRACKING)
-    ] = None,
-    features: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Feature encoder.", rich_help_panel=_TRACKING)
-    ] = None,
-    flat: Annotated[
-        bool, typer.Option("--flat", help="The object is flat, like a card.", rich_help_panel=_TRACKING)
-    ] = False,
-    prototype: Annotated[
-        str | None,
-        typer.Option(help="First shape: sphere, ellipsoid or a mesh file.", rich_help_panel=_TRACKING),
-    ] = None,
-    fov: Annotated[
-        float | None, typer.Option(help="Vertical field of view in degrees.", rich_help_panel=_CAMERA)
-    ] = None,
-    intrinsics: Annotated[
-        str | None,
-        typer.Option(metavar="FX,FY,CX,CY", help="In pixels of the full frame.", rich_help_panel=_CAMERA),
-    ] = None,
-    distortion: Annotated[
-        str | None,
-        typer.Option(
-            metavar="K1,K2,P1,P2,...",
-            help="Of the lens, as OpenCV has it; fisheye:K1,K2,K3,K4 of a fisheye.",
-            rich_help_panel=_CAMERA,
-        ),
-    ] = None,
-    camera_file: Annotated[
-        str | None,
-        typer.Option(
-            "--camera",
-            metavar="FILE",
-            help="Camera with its lens: OpenCV's or ROS's YAML, Kalibr, COLMAP's cameras.txt.",
-            rich_help_panel=_CAMERA,
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Run folder; default runs/<source>.", rich_help_panel=_RUNNING),
-    ] = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace a run in that folder.", rich_help_panel=_RUNNING)
-    ] = False,
-    resume: Annotated[
-        bool,
-        typer.Option("--resume", help="Go on with the stopped run in that folder.", rich_help_panel=_RUNNING),
-    ] = False,
-    frames: Annotated[
-        str | None,
-        typer.Option(
-            metavar="START:STOP:STEP", help="Which frames, counted from 0.", rich_help_panel=_RUNNING
-        ),
-    ] = None,
-    fps: Annotated[
-        float | None,
-        typer.Option(help="Images per second of a folder or pattern of images.", rich_help_panel=_RUNNING),
-    ] = None,
-    skip_damaged: Annotated[
-        bool,
-        typer.Option(
-            "--skip-damaged",
-            help="Where the first frame cannot be read, take the box or mask for the first one that can.",
-            rich_help_panel=_RUNNING,
-        ),
-    ] = False,
-    split: Annotated[
-        str | None,
-        typer.Option(
-            metavar="SECONDS",
-            help="Track a long video in parts of such a length side by side, and join them.",
-            rich_help_panel=_RUNNING,
-        ),
-    ] = None,
-    workers: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            help="With --split: parts at a time; default all processors.",
-            rich_help_panel=_RUNNING,
-        ),
-    ] = None,
-    config: ConfigFile = None,
-    preset: Preset = None,
-    quality: Quality = None,
-    overrides: Overrides = None,
-    size: Annotated[
-        int | None, typer.Option(help="Working resolution in pixels.", rich_help_panel=_RUNNING)
-    ] = None,
-    device: Annotated[str | None, typer.Option(help="cpu, cuda or cuda:N.", rich_help_panel=_RUNNING)] = None,
-    seed: Annotated[
-        int | None, typer.Option(help="Seed of everything random.", rich_help_panel=_RUNNING)
-    ] = None,
-    final_refine: Annotated[
-        bool | None,
-        typer.Option(
-            "--final-refine/--no-final-refine",
-            help="When a file ends, answer for all frames once more; both answers are kept.",
-            show_default=False,
-            rich_help_panel=_RUNNING,
-        ),
-    ] = None,
-    on_plugin_failure: Annotated[
-        str | None,
-        typer.Option(
-            metavar="continue|stop",
-            help="When a plug-in fails in a later frame: go on with the last mask, or stop.",
-            rich_help_panel=_RUNNING,
-        ),
-    ] = None,
-    report: Annotated[
-        bool,
-        typer.Option(
-            "--report/--no-report",
-            help="When the run has ended in whatever way, write report.html and turntable.mp4.",
-            show_default=False,
-            rich_help_panel=_RUNNING,
-        ),
-    ] = True,
-    view: Annotated[
-        bool,
-        typer.Option(
-            "--view", help="Look at the run in the browser while it goes on.", rich_help_panel=_RUNNING
-        ),
-    ] = False,
-    host: Host = None,
-    model: Annotated[
-        ModelChoice | None,
-        typer.Option(
-            help="The mesh at the end: none takes no texture from the video, fast does, fine makes the shape anew too.",
-            show_default="fast",
-            rich_help_panel=_RUNNING,
-        ),
-    ] = None,
+    source: Source,
+    prompt: PromptOptions,
+    video: VideoOptions,
+    camera: CameraOptions,
+    tracking: TrackingOptions,
+    settings: SettingsOptions,
+    output: OutputOptions,
+    performance: PerformanceOptions,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
     """Track the object through SOURCE: masks, poses and a textured mesh in a run folder.
 
-    Say what the object is by --box, --mask, --points, --masks or --object. Several boxes, masks or --points are several
-    objects, each with a run folder of its own in the one of the run.
+    Give the object with --box, --mask, --points, --masks or --object. Each box, mask or --points is an object with a
+    run folder of its own.
     """
-    from tracking3d.config.loading import load_prompt
-
-    told = load_prompt(config)
-    boxes, object_masks, object_points = box or [], mask or [], points or []
-    if not (boxes or object_masks or object_points or masks):
-        boxes, object_points = list(told.box), list(told.points)
-        object_masks = [Path(file) for file in told.mask]
-    start_frame = told.start_frame if start_frame is None else start_frame
-    if resume and overwrite:
-        raise InputError(
-            "Give either --resume or --overwrite: one keeps the run that is there, one does not."
-        )
-    if sum(map(bool, (boxes, object_masks, object_points))) > 1:
-        raise InputError("Give either --box, --mask or --points, not more than one of them.")
-    if host is not None and not view:
-        raise InputError("--host is where --view serves its page; give both.")
-    if workers is not None and split is None:
-        raise InputError("--workers is how many parts of --split are tracked at a time; give both.")
-    fine = model is ModelChoice.FINE
-    if fine:
-        check_fine(source)
-    chosen: dict[str, Any] = {"name": tracker}
-    if masks is not None:
-        if tracker not in (None, "precomputed", "auto"):
-            raise InputError(f"--masks is for the tracker precomputed; leave out --tracker {tracker}.")
-        from tracking3d.trackers.mask_images import split_object
-
-        path, number = split_object(masks)
-        chosen = {"name": "precomputed", "path": str(path), "object": number}
-    camera = camera_settings(fov, intrinsics, distortion, camera_file)
-    settings = configure(
-        config,
-        preset,
-        overrides,
-        quality,
-        tracker=chosen,
-        features=features,
-        camera=camera,
-        object={
-            "known": known,
-            "flat": flat or None,
-            "prototype": prototype,
-            "texture_views": 0 if model is ModelChoice.NONE else None,
-            "shape": None if model is None else "fine" if fine else "online",
-        },
-        window={"size": size},
-        solver={"final_refine": final_refine},
-        runtime={"device": device, "seed": seed, "on_plugin_failure": on_plugin_failure},
-    )
     from tracking3d.arguments import needs_prompt
-    from tracking3d.corrections import checked_corrections, parse_correction
+    from tracking3d.recording import RecordOptions
+
+    prompt = prompt.completed_from(settings.config)
+    output.check()
+    performance.check()
+    if output.model is ModelChoice.FINE:
+        check_fine(source)
+    config = _configure(prompt, camera, tracking, settings, output, performance)
+    prompts = _parse_prompts(prompt, video.frames)
+    corrections = _parse_corrections(prompt, len(prompts))
+    folder = output.out or default_folder(source)
+    check_known(config, len(prompts), output.model is ModelChoice.FINE, performance.split is not None)
+    if not prompts and needs_prompt(config):
+        if not a_person_is_there() or quiet or output.resume or source.isdigit():
+            raise InputError(
+                "Give the object in the first frame with --box X,Y,W,H, --mask FILE, --points 'X,Y+ X,Y-' or "
+                "--masks DIR, or draw it with `tracking3d pick`."
+            )
+        prompts = _ask_in_browser(source, config, folder, video.frames, output.overwrite)
+    options = RecordOptions(_command(), video.frames, output.overwrite, output.resume)
+    request = RunRequest(source, config, folder, prompts, options, corrections, video.skip_damaged, video.fps)
+    display = RunDisplay(quiet, output.report, output.view, output.host)
+    if performance.split is not None:
+        track_in_parts(request, performance.split, performance.workers, display)
+    else:
+        track(request, display)
+
+
+def _configure(
+    prompt: PromptOptions,
+    camera: CameraOptions,
+    tracking: TrackingOptions,
+    settings: SettingsOptions,
+    output: OutputOptions,
+    performance: PerformanceOptions,
+) -> PipelineConfig:
+    """The configuration that the options make together."""
+    model = output.model
+    return settings.configure(
+        tracker=tracking.tracker_settings(prompt.masks),
+        features=tracking.features,
+        camera=camera.settings(),
+        object={
+            "known": prompt.known,
+            "flat": tracking.flat or None,
+            "prototype": tracking.prototype,
+            "texture_views": 0 if model is ModelChoice.NONE else None,
+            "shape": None if model is None else "fine" if model is ModelChoice.FINE else "online",
+        },
+        window={"size": performance.size},
+        solver={"final_refine": tracking.final_refine},
+        runtime={
+            "device": performance.device,
+            "seed": tracking.seed,
+            "on_plugin_failure": tracking.on_plugin_failure,
+        },
+    )
+
+
+def _parse_prompts(prompt: PromptOptions, frames: str | None) -> PromptSet:
+    """The objects that the options give."""
     from tracking3d.point_prompts import parse_points
+    from tracking3d.prompts import PromptSet
     from tracking3d.video.selection import parse_selection
+
+    start = prompt.start_frame
+    first = start if start is not None else parse_selection(frames).start
+    boxes = [given_box(text, first) for text in prompt.box or ()]
+    masks = [one for file in prompt.mask or () for one in given_masks(file)]
+    points = [parse_points(text) for text in prompt.points or ()]
+    several = len(boxes) + len(masks) + len(points) > 1
+    return PromptSet(boxes, masks, points, start, as_lists=several)
+
+
+def _parse_corrections(prompt: PromptOptions, objects: int) -> list[Correction]:
+    from tracking3d.corrections import checked_corrections, parse_correction
+
+    corrections = [parse_correction(text) for text in prompt.correct or ()]
+    checked_corrections(corrections, max(objects, 1))  # before anything is written
+    return corrections
+
+
+def _command() -> str:
+    """The command line, for the record; without the passwords in it."""
     from tracking3d.video.stream import without_password
 
-    first = start_frame if start_frame is not None else parse_selection(frames).start
-    given = Given(
-        [given_box(text, first) for text in boxes],
-        [one for file in object_masks for one in given_masks(file)],
-        [parse_points(text) for text in object_points],
-    )
-    corrections = [parse_correction(text) for text in correct or told.correct]
-    checked_corrections(corrections, max(len(given), 1))  # before anything is written
-    folder = out or default_folder(source)
-    check_object_options(settings, len(given), fine, split is not None)
-    if not given and needs_prompt(settings):
-        if not a_person_is_there() or quiet or resume or source.isdigit():
-            raise InputError(
-                "Say what the object is in the first frame: --box X,Y,W,H, --mask FILE, --points 'X,Y+ X,Y-', or "
-                "--masks DIR; or draw it with `tracking3d pick`."
-            )
-        from tracking3d.cli.pick import picked_in_browser
+    return shlex.join(map(without_password, sys.argv))
 
-        typer.echo("Say in the browser what the object is; Ctrl-C ends it.", err=True)
-        picked = picked_in_browser(source, frames, settings, folder, overwrite=overwrite)
-        given, start_frame = Given(picked.boxes, picked.masks), picked.frame
-    about = {
-        "command": shlex.join(map(without_password, sys.argv)),
-        "selection": frames,
-        "overwrite": overwrite,
-        "skip_damaged": skip_damaged,
-        "resume": resume,
-        "start_frame": start_frame,
-        "corrections": corrections,
-    }
-    if split is not None:
-        track_in_parts(
-            source,
-            settings,
-            folder,
-            given,
-            about,
-            split,
-            workers=workers,
-            fps=fps,
-            quiet=quiet,
-            report=report,
-            view=view,
-        )
-    else:
-        track(
-            source,
-            settings,
-            folder,
-            given,
-            about,
-            fps=fps,
-            quiet=quiet,
-            report=report,
-            view=view,
-            host=host,
-        )
+
+def _ask_in_browser(
+    source: str, config: PipelineConfig, folder: Path, frames: str | None, overwrite: bool
+) -> PromptSet:
+    """The objects that a person marks in the browser."""
+    from tracking3d.cli.pick import picked_in_browser, prompts_of
+
+    typer.echo("Mark the object in the browser; Ctrl-C cancels.", err=True)
+    return prompts_of(picked_in_browser(source, frames, config, folder, overwrite=overwrite))

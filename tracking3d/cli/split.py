@@ -1,4 +1,4 @@
-"""``tracking3d run --split``: a long video in parts, and what came of it."""
+"""``tracking3d run --split``: track a long video in parts, and print a summary."""
 
 from __future__ import annotations
 
@@ -6,105 +6,90 @@ import logging
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import typer
 
 from tracking3d.errors import InputError
 
 if TYPE_CHECKING:
-    from tracking3d.cli.tracking import Given
-    from tracking3d.config.models import PipelineConfig
+    from tracking3d.cli.tracking import RunDisplay, RunRequest
+    from tracking3d.splitting.long_video import SplitResult
 
 
-def track_in_parts(
-    source: str,
-    settings: PipelineConfig,
-    folder: Path,
-    given: Given,
-    about: dict[str, Any],
-    length: str,
-    *,
-    workers: int | None,
-    fps: float | None,
-    quiet: bool,
-    report: bool,
-    view: bool,
-) -> None:
-    """Track a video in parts, show how it goes, and print what came of it; see `tracking3d.cli.tracking.track`.
+def track_in_parts(request: RunRequest, length: str, workers: int | None, display: RunDisplay) -> None:
+    """Track a video in parts, show the progress, and print a summary.
 
     Args:
-        source: What SOURCE is.
-        settings: The configuration.
-        folder: The run folder.
-        given: What the object is.
-        about: Further arguments of `tracking3d.recording.record`.
-        length: Of a part, as ``--split`` has it.
-        workers: Processes at a time; as many as the machine has processors if None.
-        fps: Whether ``--fps`` was given.
-        quiet: Print nothing.
-        report: Write a report at the end.
-        view: Whether ``--view`` was given.
+        request: What is tracked.
+        length: Length of a part, as ``--split`` has it.
+        workers: Processes at the same time; one per processor if None.
+        display: What is shown.
 
     Raises:
-        InputError: If options do not go together.
+        InputError: Options do not go together.
     """
-    from tracking3d.cli.progress import print_summary, progress
+    from tracking3d.cli.progress import progress
     from tracking3d.cli.report import reported
-    from tracking3d.splitting.part_runs import InitialPrompt as GivenOfPart
     from tracking3d.splitting.split_run import record_in_parts
     from tracking3d.video import open_source
 
-    _check(given, about, workers, view, fps)
-    if quiet:
+    _check(request, workers, display)
+    if display.quiet:
         logging.getLogger("tracking3d").setLevel(logging.ERROR)
-    box, mask, points = (next(iter(one), None) for one in (given.boxes, given.masks, given.points))
+    folder, options = request.folder, request.options
     with ExitStack() as ends:
-        ends.enter_context(_to_be_resumed(folder))
-        reporting = ends.enter_context(reported([folder] if report else []))
-        listener = reporting(
-            ends.enter_context(progress(open_source(source, about["selection"]).count, quiet))
-        )
+        ends.enter_context(_resumable(folder))
+        reporting = ends.enter_context(reported([folder] if display.report else []))
+        count = open_source(request.source, options.selection).count
+        listener = reporting(ends.enter_context(progress(count, display.quiet)))
         ended = record_in_parts(
-            source,
-            settings,
+            request.source,
+            request.config,
             folder,
-            GivenOfPart(box, mask, points),
+            request.prompts,
             length=length,
             workers=workers or _processors(),
-            selection=about["selection"],
-            command=about["command"],
-            overwrite=about["overwrite"],
-            resume=about["resume"],
+            selection=options.selection,
+            command=options.command,
+            overwrite=options.overwrite,
+            resume=options.resume,
             listener=listener,
         )
-    if quiet:
-        return
+    if not display.quiet:
+        _print_summaries(ended)
+
+
+def _print_summaries(ended: SplitResult) -> None:
+    """Print the closing table, or those of all parts and why they could not be merged."""
+    from tracking3d.cli.progress import print_summary
+
     for one in ended.folders:
         print_summary(one)
     if len(ended.folders) > 1:
+        folders = ", ".join(map(str, ended.folders))
         typer.echo(
-            f"The {ended.parts} parts could not be joined: {ended.reason}. Each is a run of its own: "
-            f"{', '.join(map(str, ended.folders))}.",
+            f"The {ended.parts} parts could not be merged: {ended.reason}. Each is a run of its own: {folders}.",
             err=True,
         )
     elif ended.reason:
         typer.echo(f"Tracked as one part: {ended.reason}.", err=True)
 
 
-def _check(given: Given, about: dict[str, Any], workers: int | None, view: bool, fps: float | None) -> None:
+def _check(request: RunRequest, workers: int | None, display: RunDisplay) -> None:
     if workers is not None and workers < 1:
-        raise InputError(f"--workers {workers}: there has to be one worker at least.")
-    if len(given) > 1:
-        raise InputError("--split tracks one object; give one, or leave out --split.")
-    for option, value in {
-        "--start-frame": about["start_frame"] is not None,
-        "--correct": bool(about["corrections"]),
-        "--view": view,
-        "--fps": fps is not None,
-    }.items():
+        raise InputError(f"--workers {workers}: give at least 1.")
+    if len(request.prompts) > 1:
+        raise InputError("--split tracks one object; give one object, or leave out --split.")
+    given = {
+        "--start-frame": request.prompts.start_frame is not None,
+        "--correct": bool(request.corrections),
+        "--view": display.view,
+        "--fps": request.fps is not None,
+    }
+    for option, value in given.items():
         if value:
-            raise InputError(f"{option} and --split do not go together; leave out one of them.")
+            raise InputError(f"{option} cannot be combined with --split; leave out one of them.")
 
 
 def _processors() -> int:
@@ -114,8 +99,8 @@ def _processors() -> int:
 
 
 @contextmanager
-def _to_be_resumed(folder: Path) -> Iterator[None]:
-    """Whatever stops it, it says how to go on."""
+def _resumable(folder: Path) -> Iterator[None]:
+    """If the run is stopped, say how to continue it."""
     from tracking3d.splitting.plan import PARTS
 
     try:
@@ -123,6 +108,6 @@ def _to_be_resumed(folder: Path) -> Iterator[None]:
     except BaseException as error:
         if (folder / PARTS).is_dir():
             error.add_note(
-                f"What was finished is kept in {folder}; the same command with --resume goes on from there."
+                f"Finished parts are kept in {folder}; to continue, repeat the command with --resume."
             )
         raise

@@ -1,16 +1,18 @@
-"""``tracking3d synth``: synthetic sequences with exact truth."""
+"""``tracking3d synth``: render synthetic sequences with exact ground truth."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from tracking3d.cli.fresh import Count, Meshes, drawn_suite
-from tracking3d.cli.options import Debug, Quiet, numbers
+from tracking3d.cli.options import Debug, Quiet, grouped, numbers
+from tracking3d.cli.options.panels import OUTPUT, PERFORMANCE
 from tracking3d.errors import InputError
 
 if TYPE_CHECKING:
@@ -19,107 +21,133 @@ if TYPE_CHECKING:
 _ONE = "One sequence"
 
 
-def synth(
-    out: Annotated[
-        Path, typer.Argument(metavar="OUT", help="Folder of the suite, or of the one sequence.")
-    ] = Path("synthetic"),
-    suite: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="A suite: smoke, standard, hard, full, or fresh with --seed."),
-    ] = None,
-    count: Count = None,
-    meshes: Meshes = None,
+@dataclass(frozen=True)
+class SequenceOptions:
+    """One sequence: what it shows and how."""
+
     object_: Annotated[
         str | None,
         typer.Option(
             "--object",
             metavar="NAME|MESH",
-            help="box, bottle, blob, mug, card, wedge, vase; organic, assembly, stick, knob, bowl of a shape from the "
-            "seed; or a mesh file in metres.",
+            help="Object: box, bottle, blob, mug, card, wedge or vase; organic, assembly, stick, knob or bowl, whose "
+            "shape depends on the seed; or a mesh file in metres.",
             rich_help_panel=_ONE,
         ),
-    ] = None,
+    ] = None
     motion: Annotated[
         str | None,
         typer.Option(
             metavar="NAME",
-            help="tumble, turntable, turn_and_back, flip, fast, depth_drift, leave_and_return or walk_round.",
+            help="Motion: tumble, turntable, turn_and_back, flip, fast, depth_drift, leave_and_return or walk_round.",
             rich_help_panel=_ONE,
         ),
-    ] = None,
+    ] = None
     frames: Annotated[
         int | None, typer.Option(metavar="N", help="Number of frames.", rich_help_panel=_ONE)
-    ] = None,
+    ] = None
     size: Annotated[
         str | None, typer.Option(metavar="W,H", help="Image size in pixels.", rich_help_panel=_ONE)
-    ] = None,
+    ] = None
     degrees: Annotated[
         float | None,
-        typer.Option(metavar="DEGREES", help="Rotation per frame; the peak for fast.", rich_help_panel=_ONE),
-    ] = None,
+        typer.Option(
+            metavar="DEGREES",
+            help="Rotation per frame; with the motion fast, its maximum.",
+            rich_help_panel=_ONE,
+        ),
+    ] = None
     fov: Annotated[
         float | None,
         typer.Option(metavar="DEGREES", help="True vertical field of view.", rich_help_panel=_ONE),
-    ] = None,
+    ] = None
     background: Annotated[
         str | None,
         typer.Option(
             metavar="DIR|procedural",
-            help="Folder of images, one is chosen by the seed.",
+            help="Folder of background images, of which the seed chooses one; procedural paints one.",
             rich_help_panel=_ONE,
         ),
-    ] = None,
+    ] = None
     textureless: Annotated[
         bool, typer.Option("--textureless", help="Paint the object in one colour.", rich_help_panel=_ONE)
-    ] = False,
+    ] = False
     disturb: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME=STRENGTH",
-            help="light, highlights, motion_blur, noise, low_contrast, occluder, wrong_fov or jpeg, from 0 to 1; "
-            "may be repeated.",
+            help="Disturbance with a strength from 0 to 1: light, highlights, motion_blur, noise, low_contrast, "
+            "occluder, wrong_fov or jpeg; may be repeated.",
             rich_help_panel=_ONE,
         ),
-    ] = None,
+    ] = None
     seed: Annotated[
-        int | None, typer.Option(metavar="N", help="Seed of all that is random.", rich_help_panel=_ONE)
+        int | None,
+        typer.Option(metavar="N", help="Random seed; of the suite 'fresh' too.", rich_help_panel=_ONE),
+    ] = None
+
+    def given(self) -> dict[str, Any]:
+        """The options that are given, by the names of the command line."""
+        values = {field.name.rstrip("_"): getattr(self, field.name) for field in fields(self)}
+        values["textureless"] = self.textureless or None
+        values["disturb"] = self.disturb or None
+        return {name: value for name, value in values.items() if value is not None}
+
+
+@grouped
+def synth(
+    sequence: SequenceOptions,
+    out: Annotated[
+        Path, typer.Argument(metavar="OUT", help="Folder for the suite, or for the single sequence.")
+    ] = Path("synthetic"),
+    suite: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME", help="Suite: smoke, standard, hard or full; or fresh, which --seed draws."
+        ),
     ] = None,
+    count: Count = None,
+    meshes: Meshes = None,
     bop: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Write them as a data set in BOP's layout too.")
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="Write the sequences as a dataset in BOP format too.", rich_help_panel=OUTPUT
+        ),
     ] = None,
-    jobs: Annotated[int, typer.Option(min=1, max=256, help="Processes that make a suite.")] = 1,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Make again what is complete.")] = False,
+    overwrite: Annotated[
+        bool,
+        typer.Option("--overwrite", help="Render again what is already complete.", rich_help_panel=OUTPUT),
+    ] = False,
+    jobs: Annotated[
+        int,
+        typer.Option(
+            metavar="N",
+            min=1,
+            max=256,
+            help="Processes that render a suite.",
+            rich_help_panel=PERFORMANCE,
+        ),
+    ] = 1,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Render sequences with exact masks, poses, depth and point tracks: a suite, or one sequence.
+    """Render sequences with exact masks, poses, depth and point tracks: a suite, or a single sequence.
 
-    They are ray cast, not rendered by the renderer that tracks. What is complete already is not made again.
+    The images are ray traced, independently of the renderer that the tracker uses. Sequences that are already complete
+    are kept.
     """
-    given = {
-        "object": object_,
-        "motion": motion,
-        "frames": frames,
-        "size": size,
-        "degrees": degrees,
-        "fov": fov,
-        "background": background,
-        "textureless": textureless or None,
-        "disturb": disturb or None,
-        "seed": seed,
-    }
-    settings = {name: value for name, value in given.items() if value is not None}
-    drawn = drawn_suite(suite or "one sequence", seed if suite else None, count, meshes)
-    others = next((name for name in settings if (suite, name) != ("fresh", "seed")), None)
+    given = sequence.given()
+    drawn = drawn_suite(suite or "one sequence", sequence.seed if suite else None, count, meshes)
+    others = next((name for name in given if (suite, name) != ("fresh", "seed")), None)
     if suite is not None and others:
-        raise InputError(f"--suite {suite} is fixed and does not go with --{others}; leave one of them out.")
+        raise InputError(f"--{others} cannot change --suite {suite}, which is fixed; leave out one of them.")
     if suite is not None:
         folders = _make_suite(*drawn, out, jobs, overwrite, quiet)
-    elif object_ is not None:
-        folders = _make_one(settings, out, overwrite, quiet)
+    elif sequence.object_ is not None:
+        folders = _make_one(given, out, overwrite, quiet)
     else:
         raise InputError(
-            "Say what to make: --suite smoke, standard, hard, full or fresh, or one sequence by --object NAME."
+            "Give a suite with --suite smoke, standard, hard, full or fresh, or one sequence with --object NAME."
         )
     if bop is not None:
         _export(folders, bop, quiet)
@@ -144,7 +172,7 @@ def _export(folders: list[Path], bop: Path, quiet: bool) -> None:
 
     write_bop(bop, [read_truth(folder) for folder in folders])
     if not quiet:
-        typer.echo(f"{bop}: {len(folders)} scenes in BOP's layout")
+        typer.echo(f"{bop}: {len(folders)} scenes in BOP format")
 
 
 def _make_one(settings: dict[str, Any], out: Path, overwrite: bool, quiet: bool) -> list[Path]:
@@ -167,16 +195,16 @@ def _make_one(settings: dict[str, Any], out: Path, overwrite: bool, quiet: bool)
 
 
 def _strength(item: str) -> tuple[str, float]:
-    """``noise=0.5`` as a name and a number; whether there is such a disturbance is for the spec to say."""
+    """Read ``noise=0.5`` as a name and a number; the spec checks whether there is such a disturbance."""
     name, equals, value = item.partition("=")
     if not equals or not name:
-        raise InputError(f"--disturb {item} cannot be read; write it as NAME=STRENGTH, such as noise=0.5.")
+        raise InputError(f"--disturb {item} is not NAME=STRENGTH; write it like noise=0.5.")
     return name.strip(), numbers(value, 1, f"--disturb {name}", "a number from 0 to 1")[0]
 
 
 @contextmanager
 def _progress(total: int, what: str, quiet: bool) -> Iterator[Callable[[str], None]]:
-    """A progress bar on the standard error; yields what to tell the name of every part that is done."""
+    """A progress bar on the standard error; yields the function to call with the name of each finished part."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 

@@ -11,7 +11,7 @@ from rich.table import Table
 
 
 def print_table(table: Table) -> None:
-    """Print a table as wide as the terminal; in a file or a pipe as wide as it has to be."""
+    """Print a table: in a terminal at its width, in a file or a pipe as wide as the table needs."""
     console = Console()
     if not console.is_terminal:
         console = Console(width=10_000)
@@ -19,7 +19,7 @@ def print_table(table: Table) -> None:
 
 
 def print_figures(title: str, figures: Mapping[str, Any]) -> None:
-    """Print names and figures in two columns; None is a dash."""
+    """Print names and figures in two columns; None is shown as a dash."""
     table = Table(title=escape(title), show_header=False, title_justify="left")
     for name, value in figures.items():
         table.add_row(escape(name), escape(format_value(value)))
@@ -27,7 +27,7 @@ def print_figures(title: str, figures: Mapping[str, Any]) -> None:
 
 
 def format_value(value: Any) -> str:
-    """A figure as tables show it."""
+    """Format a figure for a table."""
     if value is None:
         return "-"
     return f"{value:.3f}" if isinstance(value, float) else str(value)

@@ -1,115 +1,137 @@
-"""What ``run`` and ``pick`` end in: the object is tracked, shown while it goes on, and summed up."""
+"""What ``run`` and ``pick`` have in common: track the object, show the progress, and print a summary."""
 
 from __future__ import annotations
 
 import logging
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import typer
 
 if TYPE_CHECKING:
     from tracking3d.config.models import PipelineConfig
+    from tracking3d.corrections import Correction
+    from tracking3d.prompts import PromptSet
+    from tracking3d.recording import RecordOptions
 
 
 @dataclass(frozen=True)
-class Given:
-    """What the objects are: one of these for each, or nothing where the mask tracker knows."""
+class RunRequest:
+    """What a run tracks, and the folder it writes.
 
-    boxes: Sequence[Any] = ()
-    masks: Sequence[Any] = ()
-    points: Sequence[Any] = ()
-
-    def __len__(self) -> int:
-        return len(self.boxes) + len(self.masks) + len(self.points)
-
-
-def track(
-    source: str,
-    settings: PipelineConfig,
-    folder: Path,
-    given: Given,
-    about: dict[str, Any],
-    *,
-    fps: float | None = None,
-    quiet: bool = False,
-    report: bool = True,
-    view: bool = False,
-    host: str | None = None,
-) -> None:
-    """Track, show how it goes, and print what came of it.
-
-    Args:
-        source: What SOURCE is.
-        settings: The configuration.
+    Attributes:
+        source: The command's argument SOURCE.
+        config: The configuration.
         folder: The run folder.
-        given: What the objects are.
-        about: Further arguments of `tracking3d.recording.record`, ``selection`` among them.
-        fps: Images per second of a source that has no times of its own.
-        quiet: Print nothing.
+        prompts: The objects; none if the mask tracker or a known object replaces the prompt.
+        options: How the run is recorded, ``selection`` of the frames included.
+        corrections: Prompts in later frames.
+        skip_damaged: If the first frame cannot be decoded, apply the prompts to the first frame that can.
+        fps: Frame rate of a source that has no timestamps.
+    """
+
+    source: str
+    config: PipelineConfig
+    folder: Path
+    prompts: PromptSet
+    options: RecordOptions
+    corrections: Sequence[Correction] = ()
+    skip_damaged: bool = False
+    fps: float | None = None
+
+
+@dataclass(frozen=True)
+class RunDisplay:
+    """What a run shows while it is tracked, and at its end.
+
+    Attributes:
+        quiet: Print errors only.
         report: Write a report at the end.
         view: Show the run in the browser.
-        host: Where that is served.
+        host: Address of this machine that the page is served on; this machine only if None.
     """
-    from tracking3d.cli.progress import print_summary, progress
+
+    quiet: bool = False
+    report: bool = True
+    view: bool = False
+    host: str | None = None
+
+
+def track(request: RunRequest, display: RunDisplay) -> None:
+    """Track, show the progress, and print a summary."""
+    from tracking3d.cli.progress import progress
     from tracking3d.cli.report import reported
     from tracking3d.cli.view import watched
-    from tracking3d.recording import record, record_objects
+    from tracking3d.open_tracking import request_tracking
+    from tracking3d.recording import record_tracking
     from tracking3d.results.layout import object_folders
     from tracking3d.results.run_reader import is_finished
     from tracking3d.video import open_source
 
-    opened = open_source(source, about.get("selection"), fps)
-    if quiet:
+    folder, options, prompts = request.folder, request.options, request.prompts
+    source = open_source(request.source, options.selection, request.fps)
+    if display.quiet:
         logging.getLogger("tracking3d").setLevel(logging.ERROR)
-    objects = max(len(given), 1)
+    objects = max(len(prompts), 1)
     folders = object_folders(folder, objects) if objects > 1 else [folder]
-    finished = {one: _written(one) for one in folders if about.get("resume") and is_finished(one)}
+    finished = {one: _written(one) for one in folders if options.resume and is_finished(one)}
     with ExitStack() as ends:
         ends.enter_context(resumable(folders))
-        reporting = ends.enter_context(reported(folders if report else []))
-        listener = reporting(ends.enter_context(progress(opened.count, quiet, objects)))
-        if view:
-            opened, listener = ends.enter_context(watched(opened, folder, listener, host, quiet))
-        about = {**about, "listener": listener}
-        if objects > 1:
-            several: dict[str, Any] = {"boxes": given.boxes, "masks": given.masks, "points": given.points}
-            record_objects(opened, settings, folder, **several, **about)
+        reporting = ends.enter_context(reported(folders if display.report else []))
+        listener = reporting(ends.enter_context(progress(source.count, display.quiet, objects)))
+        if display.view:
+            source, listener = ends.enter_context(
+                watched(source, folder, listener, display.host, display.quiet)
+            )
+        tracking = request_tracking(
+            source, request.config, prompts, request.corrections, request.skip_damaged
+        )
+        record_tracking(tracking, folder, options, listener)
+    if not display.quiet:
+        _print_summaries(folders, finished)
+
+
+def _print_summaries(folders: Sequence[Path], finished: Mapping[Path, int]) -> None:
+    """Print the closing table of each run that was not finished before.
+
+    Args:
+        folders: The run folders.
+        finished: When the runs that had been finished before were written.
+    """
+    from tracking3d.cli.progress import print_summary
+
+    for folder in folders:
+        if folder in finished and finished[folder] == _written(folder):
+            typer.echo(f"The run {folder} is already finished; there is nothing to resume.")
         else:
-            box, mask, points = (next(iter(one), None) for one in (given.boxes, given.masks, given.points))
-            record(opened, settings, folder, box=box, mask=mask, points=points, **about)
-    for one in () if quiet else folders:
-        if one in finished and finished[one] == _written(one):
-            typer.echo(f"The run {one} is finished already; there is nothing to resume.")
-        else:
-            print_summary(one)
+            print_summary(folder)
 
 
 def a_person_is_there() -> bool:
-    """Whether the program was called from a terminal, not by a script."""
+    """Whether the program was started from a terminal, not by a script."""
     return sys.stdin is not None and sys.stdin.isatty() and sys.stderr is not None and sys.stderr.isatty()
 
 
 @contextmanager
 def resumable(folders: list[Path]) -> Iterator[None]:
-    """Whatever stops a run, it says how to go on, where that is possible."""
+    """If a run is stopped, say how to continue it, if it can be continued."""
     from tracking3d.results.layout import CORRECTING, has_state
 
     try:
         yield
     except BaseException as error:
         if any(has_state(folder) or has_state(folder / CORRECTING) for folder in folders):
-            error.add_note("The same command with --resume goes on from there.")
+            error.add_note("To continue from there, repeat the command with --resume.")
         raise
 
 
 def default_folder(source: str) -> Path:
-    """``runs/<name>`` after the file, the folder of images, the camera, or the end of an address."""
+    """``runs/<name>``, named after the file, the image folder, the camera, or the last part of an address."""
     from tracking3d.video.stream import SCHEMES, scheme_of, without_password
 
     if source.isdigit() and not Path(source).exists():
@@ -126,7 +148,7 @@ def default_folder(source: str) -> Path:
 
 
 def _written(folder: Path) -> int:
-    """When the description of a run was written last."""
+    """When the description of a run was last written."""
     from tracking3d.results.layout import RUN
 
     return (folder / RUN).stat().st_mtime_ns

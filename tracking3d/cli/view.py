@@ -1,4 +1,4 @@
-"""``tracking3d view``: look at runs in the browser; and ``run --view``: at one that goes on."""
+"""``tracking3d view`` shows runs in the browser; ``run --view`` shows a run while it is tracked."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tracking3d.cli.options import Debug
+from tracking3d.cli.options import Debug, Video
+from tracking3d.cli.options.output import Browser, Host
+from tracking3d.cli.options.panels import OUTPUT
 
 if TYPE_CHECKING:
     from tracking3d.frames import SkippedFrame
@@ -22,37 +24,28 @@ if TYPE_CHECKING:
     from tracking3d.video.source import FrameSource
     from tracking3d.viewer.viewer import Viewer
 
-Host = Annotated[
-    str | None,
-    typer.Option(
-        metavar="ADDRESS",
-        help="Serve others too, on this address of the machine; the printed one then holds a token.",
-    ),
-]
-Browser = Annotated[
-    bool,
-    typer.Option("--browser/--no-browser", help="Open the page in the browser, where a person is there."),
-]
-
 
 def view(
     runs: Annotated[
-        list[Path], typer.Argument(metavar="RUN...", help="Run folders, finished or still going on.")
+        list[Path], typer.Argument(metavar="RUN...", help="Run folders, finished or still running.")
     ],
-    source: Annotated[
-        str | None,
-        typer.Option(metavar="VIDEO", help="The video, where it is not where the run found it."),
-    ] = None,
+    source: Video = None,
     host: Host = None,
     port: Annotated[
-        int, typer.Option(min=0, max=65535, help="Or the next one that is free; 0 for any.")
+        int,
+        typer.Option(
+            min=0,
+            max=65535,
+            help="Port, or the next free one above it; 0 for any free port.",
+            rich_help_panel=OUTPUT,
+        ),
     ] = 8080,
     browser: Browser = True,
     debug: Debug = False,
 ) -> None:
-    """Look at runs in the browser: model, camera path, video, masks, doubts. Ctrl-C ends it.
+    """Show runs in the browser: model, camera path, video, masks, and uncertain frames. Ctrl-C stops the server.
 
-    A run that still goes on is followed; several runs stand beside one another.
+    The page follows a run that is still running. Several runs are shown side by side.
     """
     from tracking3d.viewer.opening import check_viser, open_viewer
     from tracking3d.web.access import Access
@@ -70,20 +63,20 @@ def view(
 def watched(
     source: FrameSource, folder: Path, listener: Listener, host: str | None, quiet: bool
 ) -> Iterator[tuple[FrameSource, Listener]]:
-    """Show a run while it goes on, from its first answer; at its end, until Ctrl-C.
+    """Show a run while it is tracked, from its first estimate, and after its end until Ctrl-C.
 
     Args:
         source: The frames of the run.
         folder: Where it is written.
-        listener: Is told of its frames.
+        listener: Called with every frame.
         host: See `Access.on`.
-        quiet: Print no address.
+        quiet: Do not print the address.
 
     Yields:
         The source and the listener to give the run.
 
     Raises:
-        PluginError: If viser is not installed.
+        PluginError: viser is not installed.
     """
     from tracking3d.errors import InputError
     from tracking3d.video.any_frame import frame_images
@@ -110,7 +103,7 @@ def watched(
         yield passed_on, listening
         if opened:
             if not quiet:
-                typer.echo("The viewer stays open; Ctrl-C ends it.", err=True)
+                typer.echo("The viewer stays open; Ctrl-C stops it.", err=True)
             wait_for_the_end()
     finally:
         for viewer in opened:
@@ -118,14 +111,14 @@ def watched(
 
 
 def show_address(address: str, browser: bool) -> None:
-    """Print where the page is, and open it where a person sits at this machine."""
+    """Print the address of the page, and open it if the program was started from a terminal."""
     typer.echo(address, err=True)
     if browser and sys.stdin.isatty() and sys.stdout.isatty():
         webbrowser.open(address)
 
 
 def wait_for_the_end() -> None:
-    """Until Ctrl-C."""
+    """Block until Ctrl-C."""
     try:
         threading.Event().wait()
     except KeyboardInterrupt:

@@ -1,4 +1,4 @@
-"""The camera that a configuration asks for."""
+"""The camera that a configuration gives."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from tracking3d.geometry.camera import DEFAULT_FIELD_OF_VIEW, Camera
 from tracking3d.geometry.lens import Lens
 
 DISTORTION = argument("camera.distortion", "--distortion")
-"""What sentences call the coefficients of a lens."""
+"""Name of the lens coefficients in messages."""
 
 GIVEN = "given intrinsics"
-"""Where a camera comes from whose intrinsics the user gave."""
+"""Origin of a camera whose intrinsics the user gave."""
 
 USUAL_ANGLES = (3.0, 110.0)
-"""Fields of view in degrees beyond which a pinhole camera is more likely a mistake."""
+"""Range of plausible fields of view in degrees; a pinhole camera outside it is probably a mistake."""
 
-_ALL = 0.99  # of a picture that is kept, from which on nothing need be said
+_ALL = 0.99  # share of the image kept, above which no warning is needed
 
 _log = logging.getLogger(__name__)
 
@@ -34,13 +34,13 @@ def choose_camera(
     known: tuple[float, float, float, float] | None = None,
     known_origin: str = "",
 ) -> Camera:
-    """The camera by what is known best: a file, given intrinsics, given field of view, the source's own, 45 degrees.
+    """The camera from the best information: file, given intrinsics, given field of view, the source's own, 45 degrees.
 
-    With distortion it is the pinhole camera that pictures are turned into, and has its ``lens``.
+    With distortion it is the pinhole camera of the undistorted images, and has its ``lens``.
 
     Raises:
-        InputError: If the camera that was given cannot be of images of that size. Intrinsics that the source has are
-            then left aside, and the log says so.
+        InputError: The given camera cannot belong to images of that size. If the source's own intrinsics cannot, they
+            are ignored with a warning in the log.
     """
     if config.file is not None:
         return _measured(read_camera(config.file), width, height)
@@ -50,8 +50,8 @@ def choose_camera(
         return camera
     if camera.assumed:
         raise InputError(
-            f"{DISTORTION} means nothing without the focal lengths that it was measured with; give "
-            f"{argument('camera.intrinsics', '--intrinsics FX,FY,CX,CY')} too, or both in a camera file."
+            f"{DISTORTION} needs the focal lengths that it was calibrated with; give "
+            f"{argument('camera.intrinsics', '--intrinsics FX,FY,CX,CY')} too, or a camera file with both."
         )
     taken = CalibratedCamera(
         (camera.fx, camera.fy, camera.cx, camera.cy),
@@ -64,19 +64,19 @@ def choose_camera(
 
 
 def given_distortion(config: CameraConfig) -> tuple[float, ...]:
-    """The coefficients, as many as their model has; none where there is no distortion.
+    """The distortion coefficients, as many as their model has; none if there is no distortion.
 
     Raises:
-        InputError: If there are too many.
+        InputError: There are too many.
     """
     return as_coefficients(config.distortion_model, config.distortion or (), DISTORTION)
 
 
 def _measured(taken: CalibratedCamera, width: int, height: int) -> Camera:
-    """The pinhole camera that pictures of a measured one are turned into.
+    """The pinhole camera of the undistorted images of a calibrated camera.
 
     Raises:
-        InputError: If it cannot be of pictures of that size.
+        InputError: The camera cannot belong to images of that size.
     """
     fits = taken.for_frames(width, height)
     camera = Camera(*fits.intrinsics, width, height, fits.origin)
@@ -95,7 +95,7 @@ def _pinhole(
     known: tuple[float, float, float, float] | None,
     known_origin: str,
 ) -> Camera:
-    """The camera as far as it has no lens."""
+    """The camera without its lens."""
     if config.intrinsics is not None:
         camera = Camera(*config.intrinsics, width, height, GIVEN)
         _check(camera)
@@ -107,18 +107,20 @@ def _pinhole(
         if _usual(camera):
             return camera
         _log.warning(
-            "%s by the %s; that is hardly a camera's, and is left aside.", _told(camera), known_origin
+            "%s according to the %s, which is implausible; they are ignored.",
+            _described(camera),
+            known_origin,
         )
     origin = f"default field of view of {DEFAULT_FIELD_OF_VIEW:g} degrees"
     return replace(Camera.from_fov(width, height, DEFAULT_FIELD_OF_VIEW, origin), assumed=True)
 
 
 def warn_of_unlikely(camera: Camera) -> None:
-    """Tell the log where given intrinsics are possible for images of that size, but hardly meant; and what is lost."""
+    """Log a warning if given intrinsics are implausible for that image size, or a wide lens loses part of the image."""
     if camera.lens is not None and (kept := camera.lens.kept) < _ALL:
         _log.warning(
-            "The lens is so wide that %.0f %% of the picture, its outermost part, is not seen by the pinhole camera; "
-            "the object has no answer there.",
+            "The lens is so wide that the pinhole camera does not see the outermost %.0f %% of the image; the object "
+            "cannot be tracked there.",
             100 * (1 - kept),
         )
     if not camera.origin.startswith(GIVEN):
@@ -126,10 +128,15 @@ def warn_of_unlikely(camera: Camera) -> None:
     inside = 0 <= camera.cx < camera.width and 0 <= camera.cy < camera.height
     if not _usual(camera):
         _log.warning(
-            "%s; that is hardly a camera's, so look whether they are of images of that size.", _told(camera)
+            "%s, which is implausible; check that they belong to images of that size.", _described(camera)
         )
     elif not inside:
-        _log.warning("%s, whose centre %g, %g lies outside them.", _told(camera), camera.cx, camera.cy)
+        _log.warning(
+            "%s, and their principal point %g, %g lies outside the image.",
+            _described(camera),
+            camera.cx,
+            camera.cy,
+        )
 
 
 def _usual(camera: Camera) -> bool:
@@ -139,23 +146,25 @@ def _usual(camera: Camera) -> bool:
 
 def _check(camera: Camera) -> None:
     if not all(1 <= angle <= 170 for angle in _angles(camera)):
-        raise InputError(f"{_told(camera)}; camera.intrinsics is fx, fy, cx, cy in pixels of these images.")
+        raise InputError(
+            f"{_described(camera)}, which is impossible; camera.intrinsics is fx, fy, cx, cy in pixels of these images."
+        )
     if not (
         -camera.width <= camera.cx <= 2 * camera.width and -camera.height <= camera.cy <= 2 * camera.height
     ):
         raise InputError(
-            f"{_told(camera)}, but their centre {camera.cx:g}, {camera.cy:g} lies far outside them; "
+            f"{_described(camera)}, but their principal point {camera.cx:g}, {camera.cy:g} lies far outside; "
             "camera.intrinsics is fx, fy, cx, cy in pixels of these images."
         )
 
 
 def _angles(camera: Camera) -> tuple[float, float]:
-    """What the focal lengths alone say of the horizontal and vertical field of view, in degrees."""
+    """Horizontal and vertical field of view in degrees, from the focal lengths alone."""
     horizontal = 2 * math.atan2(camera.width / 2, camera.fx)
     return math.degrees(horizontal), math.degrees(2 * math.atan2(camera.height / 2, camera.fy))
 
 
-def _told(camera: Camera) -> str:
+def _described(camera: Camera) -> str:
     given = ",".join(f"{value:g}" for value in (camera.fx, camera.fy, camera.cx, camera.cy))
     horizontal, vertical = _angles(camera)
     return (

@@ -14,14 +14,14 @@ from pydantic import BaseModel, ValidationError
 
 
 def nearest(name: str, valid: Iterable[str]) -> str | None:
-    """The valid name that looks most like ``name``, or None where nothing comes close."""
+    """The valid name that is most similar to ``name``, or None if none is close."""
     by_lower = {candidate.lower(): candidate for candidate in valid}
     matches = difflib.get_close_matches(name.lower(), by_lower, n=1)
     return by_lower[matches[0]] if matches else None
 
 
 def hint(name: str, valid: Iterable[str]) -> str:
-    """What to write instead of ``name``: the nearest valid name, or all of them."""
+    """Advice on what to write instead of ``name``: the nearest valid name, or all of them."""
     names = sorted(valid)
     if best := nearest(name, names):
         return f"did you mean '{best}'?"
@@ -29,14 +29,14 @@ def hint(name: str, valid: Iterable[str]) -> str:
 
 
 def shown(value: Any) -> str:
-    """``value`` as messages show it, never longer than a line."""
+    """``value`` as messages show it, at most one line long."""
     short = reprlib.Repr()
     short.maxstring = short.maxother = 60
     return short.repr(value)
 
 
 def a_kind(value: Any) -> str:
-    """What ``value`` is, with its article: ``a list``, ``None``, ``a VideoCapture``."""
+    """The kind of ``value``, with its article: ``a list``, ``None``, ``a VideoCapture``."""
     if value is None:
         return "None"
     if isinstance(value, type):
@@ -48,15 +48,15 @@ def a_kind(value: Any) -> str:
 
 
 def describe_validation_error(error: ValidationError, model: type[BaseModel], noun: str = "setting") -> str:
-    """Say in one sentence what is wrong with the values given for ``model``.
+    """Explain in one sentence what is wrong with the values given for ``model``.
 
     Args:
-        error: What pydantic raised. An unknown key is reported first, for it often explains the rest.
+        error: What pydantic raised. An unknown key is reported first, because it often explains the rest.
         model: The model that was validated.
-        noun: What a key of this model is called.
+        noun: Word for a key of this model.
 
     Returns:
-        A sentence without a capital and with the dotted path of the key in it.
+        A sentence that begins with a small letter and contains the dotted path of the key.
     """
     problems = error.errors(include_url=False)
     unknown = [p["loc"] for p in problems if p["type"] == "extra_forbidden"]
@@ -69,7 +69,7 @@ def describe_validation_error(error: ValidationError, model: type[BaseModel], no
         case "missing":
             return f"the {noun} '{path}' is missing; it is required."
         case "model_type" | "model_attributes_type" | "dict_type" if problem["input"] is None:
-            return f"'{path}' must be a mapping of {noun}s, not null; leave it out to change nothing."
+            return f"'{path}' must be a mapping of {noun}s, not null; to change nothing, leave it out."
         case "model_type" | "model_attributes_type" | "dict_type":
             return f"'{path}' must be a mapping of {noun}s, not {given}."
         case "union_tag_invalid":
@@ -87,13 +87,13 @@ def unknown_key(
     noun: str = "setting",
     beside: Sequence[int | str] = (),
 ) -> str:
-    """Say that there is no such key, and which is meant: a sibling, or the same name in another section.
+    """Explain that a key does not exist, and which one is meant: a sibling, or the same name in another section.
 
     Args:
-        loc: Where the key is.
+        loc: Path of the key.
         model: The model that was validated.
-        noun: What a key of this model is called.
-        beside: All unknown keys of that section, where a section has the settings of what its name chooses.
+        noun: Word for a key of this model.
+        beside: All unknown keys of that section, if the name of the section chooses its settings.
     """
     *above, key = map(str, loc)
     section = _reach(model, above)
@@ -111,12 +111,12 @@ def unknown_key(
 
 @dataclass(frozen=True)
 class _Section:
-    """Where a path leads to.
+    """The section that a path leads to.
 
     Attributes:
-        path: The path as it is written, with dots.
-        model: The innermost model on the way.
-        choices: What the section's ``name`` can choose, if it chooses.
+        path: The path in dotted form.
+        model: The innermost model on the path.
+        choices: The models that the section's ``name`` chooses from, if it chooses.
     """
 
     path: str
@@ -124,7 +124,7 @@ class _Section:
     choices: Mapping[str, type[BaseModel]]
 
     def of_another_choice(self, keys: Sequence[str], noun: str) -> str | None:
-        """Say of what the ``keys`` are settings, where that is something else than what is chosen."""
+        """Explain that ``keys`` are settings of another choice than the present one, if they are."""
         for name, model in self.choices.items():
             written = [f"'{self.path}.{key}'" for key in keys if key in model.model_fields]
             if written and model is not self.model:
@@ -137,14 +137,14 @@ class _Section:
                 )
             if name in keys:
                 return (
-                    f"'{self.path}.{name}' is no section any more; the {noun}s of the {self.path} '{name}' stand "
-                    f"directly under '{self.path}', beside 'name: {name}'."
+                    f"'{self.path}.{name}' is not a section; write the {noun}s of the {self.path} '{name}' "
+                    f"directly under '{self.path}', next to 'name: {name}'."
                 )
         return None
 
 
 def _reach(model: type[BaseModel], loc: Sequence[int | str]) -> _Section:
-    """Follow a path of pydantic's; where a name chooses between models, its parts are the section and the choice."""
+    """Follow a path of pydantic's; if a name chooses between models, its parts are the section and the choice."""
     path: list[str] = []
     choices: dict[str, type[BaseModel]] = {}
     for part in map(str, loc):

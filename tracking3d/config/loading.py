@@ -1,7 +1,7 @@
 """One configuration from its layers: model defaults, preset, quality, file, ``--set``, and options given directly.
 
-A later layer wins key by key. Where a layer names another solver or plug-in, the settings that lower layers gave to
-the old one are dropped; settings without a name belong to whatever solver or plug-in is chosen.
+A later layer overrides an earlier one key by key. If a layer names another solver or plug-in, the settings that lower
+layers gave to the old one are dropped; settings without a name belong to whichever solver or plug-in is chosen.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from tracking3d.config.prompt_section import PromptSection
 from tracking3d.config.yaml_files import parse_yaml, read_mapping
 from tracking3d.errors import InputError, argument
 
-_MOST_LEAVES = 12  # settings of a layer that words tell one by one
+_MOST_LEAVES = 12  # settings of a layer that are listed one by one
 
 DEFAULT_PRESET = "default"
-"""The preset that is used when none is named."""
+"""The preset that is used if none is named."""
 
 _CHOICES = [
     "solver",
     *(name for name, field in PipelineConfig.model_fields.items() if field.annotation is PluginChoice),
 ]
-"""Sections whose ``name`` says what their other keys belong to."""
+"""Sections whose ``name`` decides what their other keys belong to."""
 
 Layer = tuple[str, Mapping[str, Any]]
-"""Where settings come from, as messages call it, and the settings."""
+"""Origin of settings, as messages name it, and the settings."""
 
 
 def load_config(
@@ -47,25 +47,25 @@ def load_config(
     Args:
         file: A YAML file, or the name of a ready one (`ready_files`); it may choose its preset by a top-level
             ``preset: name`` and its quality by ``quality: name``.
-        preset: Name of a preset; wins over the file's.
-        quality: ``draft``, ``good`` or ``best``: tracker, window, refinement and model together; wins over the preset,
-            and over the file's own.
+        preset: Name of a preset; overrides the file's.
+        quality: ``draft``, ``good`` or ``best``: tracker, resolution, refinement and final mesh together; overrides
+            the preset, and the file's own quality.
         overrides: ``section.key=value`` items as ``--set`` takes them; the value is YAML.
-        direct: Settings by section, such as ``camera={"fov": 60}`` or ``tracker="csrt"``; they win over all.
+        direct: Settings by section, such as ``camera={"fov": 60}`` or ``tracker="csrt"``; they override all others.
 
     Returns:
-        The validated configuration. The options of plug-ins are not checked here but by the plug-ins
-        themselves, see `tracking3d.plugins.check_options`.
+        The validated configuration. The options of plug-ins are not checked here; see
+        `tracking3d.plugins.check_options`.
 
     Raises:
-        InputError: A file, preset, key or value that cannot be used.
+        InputError: A file, preset, key or value cannot be used.
     """
     settings: dict[str, Any] = PipelineConfig().model_dump()
     layers = _files(file, preset, quality)
     spoken = [(_called(item), _parse_override(item)) for item in overrides]
     spoken.append(("", direct))
-    # What is chosen on the command line comes first, so that the options of a `--set tracker.path=...`
-    # beside a `--tracker precomputed` are those of the latter.
+    # The names chosen on the command line come first, so that with `--tracker precomputed` the option of
+    # `--set tracker.path=...` belongs to that tracker.
     chosen = [(origin, _chosen_names(layer)) for origin, layer in spoken]
 
     for origin, layer in [*layers, *chosen, *spoken]:
@@ -75,10 +75,10 @@ def load_config(
 
 
 def load_prompt(file: Path | None) -> PromptSection:
-    """What a configuration file says is tracked; nothing where there is no file.
+    """The prompt in a configuration file; empty if there is no file.
 
     Raises:
-        InputError: If the file or that section cannot be used.
+        InputError: The file or that section cannot be used.
     """
     return _prompt_of(file, read_mapping(_located(Path(file)), empty={}) if file is not None else {})
 
@@ -86,7 +86,7 @@ def load_prompt(file: Path | None) -> PromptSection:
 def layers_in_words(
     file: Path | None = None, preset: str | None = None, quality: str | None = None
 ) -> list[str]:
-    """The layers below what is said on the command line, the lowest first: where from, and what each sets.
+    """The layers below the command line, lowest first: the origin of each, and what it sets.
 
     Raises:
         InputError: As `load_config`.
@@ -105,7 +105,7 @@ def list_presets() -> list[str]:
 
 
 def list_qualities() -> list[str]:
-    """The names of the qualities, the quickest first."""
+    """The names of the qualities, fastest first."""
     return sorted(_names("qualities"), key=["draft", "good", "best"].index)
 
 
@@ -127,17 +127,17 @@ def config_schema() -> dict[str, Any]:
         "type": "string",
         "enum": list_presets(),
         "default": DEFAULT_PRESET,
-        "description": "The preset that the settings of this file change.",
+        "description": "Preset that the settings of this file override.",
     }
     schema["properties"]["quality"] = {
         "type": "string",
         "enum": list_qualities(),
-        "description": "Tracker, window, refinement and model together, which the settings of this file change.",
+        "description": "Tracker, resolution, refinement and final mesh together, which this file's settings override.",
     }
     prompt = PromptSection.model_json_schema()
     schema["properties"]["prompt"] = {
         **prompt,
-        "description": "What is tracked; read by `tracking3d run` only.",
+        "description": "The objects to track; read by `tracking3d run` only.",
     }
     choice = schema["$defs"]["PluginChoice"]
     schema["$defs"]["PluginChoice"] = {"anyOf": [{"type": "string"}, choice]}
@@ -149,14 +149,14 @@ def config_schema() -> dict[str, Any]:
 
 
 def _located(file: Path) -> Path:
-    """The file itself; where there is none, the ready one that is called so, with or without ``configs/``.
+    """The file itself; if it does not exist, the ready one of that name, with or without ``configs/``.
 
     Raises:
-        InputError: If there is neither.
+        InputError: Neither exists.
     """
     try:
         there = file.exists()
-    except OSError:  # a name that no file can have; opening it tells why
+    except OSError:  # an impossible file name; opening it says why
         there = True
     if there:
         return file
@@ -169,7 +169,7 @@ def _located(file: Path) -> Path:
 
 
 def _files(file: Path | None, preset: str | None, quality: str | None) -> list[Layer]:
-    """The layers that are written somewhere: preset, quality and file."""
+    """The layers that come from files: preset, quality and configuration file."""
     from_file = read_mapping(_located(Path(file)), empty={}) if file is not None else {}
     _prompt_of(file, from_file)
     named = {}
@@ -186,7 +186,7 @@ def _files(file: Path | None, preset: str | None, quality: str | None) -> list[L
 
 
 def _prompt_of(file: Path | None, from_file: dict[str, Any]) -> PromptSection:
-    """The section ``prompt``, which is taken out of what a file holds."""
+    """The section ``prompt``, removed from the content of a file."""
     given = from_file.pop("prompt", {})
     if not isinstance(given, dict):
         raise InputError(
@@ -217,7 +217,7 @@ def _leaves(settings: Mapping[str, Any], prefix: str = "") -> list[str]:
 
 
 def _called(override: str) -> str:
-    """What messages call a setting that was spoken."""
+    """Name of an override in messages."""
     return argument(f"overrides: {override}", f"--set {override}")
 
 
@@ -226,7 +226,7 @@ def _parse_override(item: str) -> dict[str, Any]:
     path, equals, text = item.partition("=")
     keys = [key.strip() for key in path.split(".")]
     if not equals or not all(keys):
-        raise InputError(f"{_called(item)} cannot be read; write it as section.key=value.")
+        raise InputError(f"{_called(item)} is not section.key=value; write it like runtime.seed=1.")
     value: Any = parse_yaml(text, _called(item))
     for key in reversed(keys[1:]):
         value = {key: value}
@@ -242,7 +242,7 @@ def _without_shorthand(layer: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _chosen_names(layer: Mapping[str, Any]) -> dict[str, Any]:
-    """What a layer chooses, without the settings of it."""
+    """The names that a layer chooses, without their settings."""
     return {
         section: {"name": value["name"]}
         for section, value in _without_shorthand(layer).items()
@@ -255,9 +255,8 @@ def _merged(
 ) -> dict[str, Any]:
     """``lower`` with the values of ``upper``, mapping by mapping.
 
-    The keys in ``choices`` have a name: under another one, nothing of ``lower`` is kept. They are those of the top
-    level, where null is refused when the result is validated; further down, a section whose every line is commented
-    out changes nothing.
+    The sections in ``choices`` have a name: if it changes, nothing of ``lower`` is kept. They are at the top level,
+    where validation refuses null; further down, a section with all lines commented out changes nothing.
     """
     result = dict(lower)
     for key, value in upper.items():

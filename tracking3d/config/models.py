@@ -1,4 +1,4 @@
-"""What can be configured, as pydantic models: every key, its default, its range and what it means.
+"""The settings as pydantic models: every key with its default, range and meaning.
 
 The defaults are those of preset ``default``; ``tracking3d/config/presets`` holds what other presets change.
 """
@@ -15,7 +15,7 @@ from tracking3d.config.solvers import OnlineConfig, SolverConfig
 
 
 class PluginChoice(BaseModel):
-    """A plug-in by name; every other key is an option of the plug-in and checked by its own ``Options``."""
+    """A plug-in by name; every other key is an option of the plug-in, which its own ``Options`` checks."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
@@ -36,27 +36,29 @@ class CameraConfig(Section):
     """The camera of the full frame."""
 
     fov: float | None = Field(
-        None, gt=1, lt=170, description="Vertical field of view in degrees; 45 when nothing better is known."
+        None, gt=1, lt=170, description="Vertical field of view in degrees; 45 if nothing better is known."
     )
     intrinsics: tuple[float, float, float, float] | None = Field(
-        None, description="fx, fy, cx, cy in pixels of the full frame; wins over fov."
+        None,
+        description="Focal lengths and principal point fx, fy, cx, cy in pixels of the full frame; overrides fov.",
     )
 
     distortion: tuple[float, ...] | None = Field(
         None,
         max_length=14,
         description=(
-            "k1, k2, p1, p2, k3 and so on of the lens, as OpenCV has them; pictures are undistorted on the way in, and "
-            "masks distorted on the way out."
+            "Lens distortion coefficients k1, k2, p1, p2, k3 and so on in OpenCV's order. Images are undistorted when "
+            "they are read, and masks distorted when they are written."
         ),
     )
     distortion_model: Literal["radtan", "fisheye"] = Field(
-        "radtan", description="What distortion is of: radtan (OpenCV's usual one) or fisheye (equidistant)."
+        "radtan",
+        description="Distortion model: radtan (radial-tangential, OpenCV's default) or fisheye (equidistant).",
     )
     file: str | None = Field(
         None,
         description=(
-            "Camera file instead of intrinsics and distortion: OpenCV's or ROS's YAML, Kalibr's camchain, or COLMAP's "
+            "Camera file, instead of intrinsics and distortion: YAML of OpenCV or ROS, Kalibr's camchain, or COLMAP's "
             "cameras.txt."
         ),
     )
@@ -64,14 +66,16 @@ class CameraConfig(Section):
     @model_validator(mode="after")
     def _are_said_once(self) -> CameraConfig:
         if self.file is not None and not (self.fov is self.intrinsics is self.distortion is None):
-            raise ValueError("file, or fov, intrinsics and distortion, since the file says both")
+            raise ValueError(
+                "give either file, or fov, intrinsics and distortion, because the file has them all"
+            )
         return self
 
     @field_validator("distortion")
     @classmethod
     def _is_of_a_lens(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
         if value is not None and not all(map(math.isfinite, value)):
-            raise ValueError("finite numbers k1, k2, p1, p2 and so on")
+            raise ValueError("give finite numbers k1, k2, p1, p2 and so on")
         return value
 
     @field_validator("intrinsics")
@@ -80,9 +84,9 @@ class CameraConfig(Section):
         cls, value: tuple[float, float, float, float] | None
     ) -> tuple[float, float, float, float] | None:
         if value is not None and min(value[:2]) <= 0:
-            raise ValueError("fx, fy, cx, cy with positive focal lengths fx and fy")
+            raise ValueError("give fx, fy, cx, cy with positive focal lengths fx and fy")
         if value is not None and (min(value[:2]) < 1 or max(map(abs, value)) > 1e6):
-            raise ValueError("fx, fy, cx, cy in pixels, which are from 1 to a million")
+            raise ValueError("give fx, fy, cx, cy in pixels, from 1 to a million")
         return value
 
 
@@ -92,13 +96,13 @@ class ObjectConfig(Section):
     known: str | None = Field(
         None,
         description=(
-            "The folder of an earlier run or a mesh file: the object is that one, and is found in the video without a "
-            "start by motion. Shape and colours are held: landmark_views and texture_views are 0, shape is online, and "
-            "prototype is not asked."
+            "Known object: the folder of an earlier run, or a mesh file. The object is detected in the video, without "
+            "initialization from motion. Shape and colours are fixed: landmark_views and texture_views are 0, shape is "
+            "online, and prototype is ignored."
         ),
     )
     prototype: str = Field(
-        "ellipsoid", description="sphere, ellipsoid (fitted to the first mask) or a mesh file."
+        "ellipsoid", description="Initial shape: sphere, ellipsoid (fitted to the first mask) or a mesh file."
     )
     frequency: int = Field(11, ge=1, le=40, description="Icosphere frequency f: 10 f^2 + 2 vertices.")
     texture_size: int = Field(150, ge=16, le=2048, description="Side of the feature texture in texels.")
@@ -107,8 +111,8 @@ class ObjectConfig(Section):
         ge=1,
         le=512,
         description=(
-            "Features with more channels are reduced to so many by a principal component analysis inside the "
-            "first mask, and given one spread; empty keeps them as they are (paper)."
+            "Features with more channels are reduced to this number by a principal component analysis inside the first "
+            "mask, and scaled to a common spread; null keeps them unchanged (paper)."
         ),
     )
     landmark_views: int = Field(
@@ -116,15 +120,15 @@ class ObjectConfig(Section):
         ge=0,
         le=2000,
         description=(
-            "Frames whose poses, lens (where nobody gave it) and surface are put right by points, at the end of the "
-            "final refinement; the others follow them. 0 leaves them as rendering has them."
+            "Keyframes in the final bundle adjustment of poses, surface and, if not given, focal length. The other "
+            "frames follow the keyframes. 0 switches the adjustment off."
         ),
     )
     evidence: bool = Field(
         True,
         description=(
-            "Masks are weighed once more, against the image, at the end of the final refinement: by shapes, colours "
-            "and motion in all frames together."
+            "Segment every frame again at the end of the final refinement, from shape, colour and motion in all frames "
+            "together."
         ),
     )
     texture_views: int = Field(
@@ -132,22 +136,22 @@ class ObjectConfig(Section):
         ge=0,
         le=500,
         description=(
-            "Frames that the mesh's texture is taken from at the video's resolution, after the final refinement; "
-            "0 leaves the solver's, of texture_size."
+            "Frames that the texture of the mesh is taken from at the resolution of the video, after the final "
+            "refinement; 0 keeps the solver's texture, of size texture_size."
         ),
     )
     largest_texture: int = Field(
-        2048, ge=64, le=8192, description="Most texels along a side of the mesh's texture."
+        2048, ge=64, le=8192, description="Maximum side of the texture image of the mesh, in texels."
     )
     shape: Literal["online", "fine"] = Field(
         "online",
         description=(
-            "The shape of the mesh at the end: the online map's, or fine, made anew from all frames after the final "
-            "refinement and kept where it explains frames that were left out better (extra model)."
+            "Shape of the final mesh: online takes that of the online map; fine reconstructs it from all frames after "
+            "the final refinement, and keeps the result if it explains held-out frames better (extra model)."
         ),
     )
     flat: bool = Field(
-        False, description="Flat prior: project all vertices onto one plane after each iteration."
+        False, description="Planar object: project all vertices onto one plane after each iteration."
     )
 
     @model_validator(mode="before")
@@ -159,52 +163,53 @@ class ObjectConfig(Section):
 
 
 class WindowConfig(Section):
-    """The window of the frame that is rendered."""
+    """The crop of the frame that is rendered and compared."""
 
-    size: int = Field(128, ge=32, le=1024, description="Working resolution: side of the window in pixels.")
+    size: int = Field(
+        128, ge=32, le=1024, description="Working resolution: side of the square crop in pixels."
+    )
     margin: float = Field(
         0.3,
         ge=0.05,
         le=2,
-        description="Free space on each side, relative to the longer side of the mask's box.",
+        description="Margin on each side, relative to the longer side of the mask's box.",
     )
 
 
 class RuntimeConfig(Section):
-    """Where and how it runs."""
+    """Device, threads, and what a run keeps and tolerates."""
 
     device: str = Field("cpu", description="cpu, cuda, or cuda:N.")
-    seed: int = Field(0, ge=0, lt=2**64, description="Seed of everything random.")
+    seed: int = Field(0, ge=0, lt=2**64, description="Random seed.")
     threads: int = Field(
         1,
         ge=1,
         description=(
-            "CPU threads of torch and of the renderer. One is never much slower here, and far faster on a busy "
-            "machine or when several runs share one. What is bundled at the end of a final refinement takes as many as "
-            "OpenCV has."
+            "CPU threads of torch and of the renderer. One is hardly slower than several, and far faster on a busy "
+            "machine or if several runs share it. The final bundle adjustment uses as many threads as OpenCV does."
         ),
     )
     renderer: Literal["auto", "torch", "numba"] = Field(
         "auto",
-        description="What renders: torch everywhere, numba on the CPU, or the fastest that can be used here.",
+        description="Rendering backend: torch (any device), numba (CPU), or auto, the fastest available.",
     )
     milestones: int = Field(
         8,
         ge=0,
         le=64,
         description=(
-            "States of earlier frames that are kept for corrections to go on from, also when the run is finished; "
-            "0 for none."
+            "Saved states of earlier frames that a correction can restart from, also after the run has finished; 0 for "
+            "none."
         ),
     )
     probabilities: bool = Field(
-        False, description="Write the object's probability in every pixel beside the masks, as 8-bit PNG."
+        False, description="Write the object probability of every pixel too, as 8-bit PNG."
     )
     on_plugin_failure: Literal["continue", "stop"] = Field(
         "continue",
         description=(
-            "When a plug-in fails after the first frame: record why and go on with the last mask, or stop and keep "
-            "what is finished."
+            "If a plug-in fails after the first frame: record the reason and continue with the last mask, or stop and "
+            "keep the finished frames."
         ),
     )
 

@@ -1,6 +1,6 @@
-"""The section ``prompt`` of a configuration file: what is tracked, as the options of ``tracking3d run`` have it.
+"""The section ``prompt`` of a configuration file: the prompt, written as for ``tracking3d run``.
 
-It belongs to one video and to no pipeline, so that only ``run`` reads it.
+It belongs to one video, not to the pipeline, so only ``run`` reads it.
 """
 
 from __future__ import annotations
@@ -21,12 +21,18 @@ Texts = Annotated[tuple[str, ...], BeforeValidator(_one_or_several)]
 
 
 class PromptSection(Section):
-    """What is tracked; every value is written as on the command line."""
+    """The objects to track; every value is written as on the command line."""
 
-    box: Texts = Field((), description="X,Y,W,H of an object in the first frame, or a list of several.")
-    mask: Texts = Field((), description="Mask file of an object in the first frame, or a list of several.")
-    points: Texts = Field(
-        (), description="'X,Y+ X,Y-' of an object in the first frame, or a list of several."
+    box: Texts = Field(
+        (), description="Box X,Y,W,H of the object in the first frame, or a list for several objects."
     )
-    start_frame: int | None = Field(None, ge=0, description="The frame in which the object is given.")
-    correct: Texts = Field((), description="FRAME:BOX, FRAME:MASK or FRAME:POINTS, or a list of several.")
+    mask: Texts = Field(
+        (), description="Mask file of the object in the first frame, or a list for several objects."
+    )
+    points: Texts = Field(
+        (), description="Points 'X,Y+ X,Y-' in the first frame, or a list for several objects."
+    )
+    start_frame: int | None = Field(None, ge=0, description="Frame of the prompt, if not the first.")
+    correct: Texts = Field(
+        (), description="Correction FRAME:BOX, FRAME:MASK or FRAME:POINTS, or a list of several."
+    )

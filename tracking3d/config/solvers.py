@@ -13,42 +13,49 @@ FinalRefine = Annotated[
     bool,
     Field(
         description=(
-            "When a video file ends, solve everything once more and every frame's pose anew; causal and refined "
-            "answers are both kept. Only for solvers that can."
+            "After the last frame, re-estimate every frame with the final model; causal estimates are kept too. Not "
+            "for live sources, nor for every solver."
         )
     ),
 ]
 CorrectTracker = Annotated[
-    bool, Field(description="Re-anchor the mask tracker on the answer's mask where that is confident.")
+    bool, Field(description="Re-anchor the mask tracker on the estimated mask if that is confident.")
 ]
 
 
 class OnlineConfig(Section):
-    """The solver ``online``: matched points joined with re-rendering."""
+    """The solver ``online``: tracked points combined with re-rendering."""
 
-    name: Literal["online"] = Field("online", description="Which solver: paper or online.")
+    name: Literal["online"] = Field("online", description="Name of the solver: paper or online.")
     final_refine: FinalRefine = True
     correct_tracker: CorrectTracker = True
-    appearance: float = Field(1.0, ge=0, description="Weight of the pixels' loss in a frame's pose.")
-    outline: float = Field(0.3, ge=0, description="Weight of the outline's distance from the mask, robust.")
-    points: float = Field(1.0, ge=0, description="Weight of the followed points' distances, robust.")
+    appearance: float = Field(1.0, ge=0, description="Weight of the photometric loss in the pose of a frame.")
+    outline: float = Field(
+        0.3, ge=0, description="Weight of the distance between the outline and the mask, robust."
+    )
+    points: float = Field(
+        1.0, ge=0, description="Weight of the reprojection errors of tracked points, robust."
+    )
     keyframe_rotation: float = Field(
         8.0,
         gt=0,
-        description="A frame is a keyframe if it is turned more than so many degrees from all others.",
+        description="A frame becomes a keyframe if it is rotated by more than this many degrees from all keyframes.",
     )
     window: int = Field(
         12,
         ge=2,
         le=64,
-        description="Keyframes that are refined together: half recent, half spread over the older.",
+        description="Keyframes in local mapping: half of them recent, half spread over the older ones.",
     )
     most_keyframes: int = Field(
-        64, ge=8, le=512, description="Keyframes that are kept; the one nearest to another view goes first."
+        64,
+        ge=8,
+        le=512,
+        description="Maximum number of keyframes; the one nearest to another view is culled first.",
     )
-    smoothness: float = Field(300.0, gt=0, description="Weight of the shape's Laplacian.")
+    smoothness: float = Field(300.0, gt=0, description="Weight of the Laplacian smoothness of the shape.")
     surface_prior: float = Field(
-        20.0, ge=0, description="How strongly points are held to the surface, per squared object unit."
+        20.0, ge=0, description="Weight that pulls points to the surface, per squared object unit."
     )
 
 
@@ -78,49 +85,53 @@ class KeyframeConfig(Section):
     """Which frames stay in the optimization (paper section 3.4)."""
 
     maximum: int = Field(6, ge=1, le=64, description="Number of most recent keyframes that are kept.")
-    silhouette: float = Field(0.3, gt=0, description="A keyframe's silhouette loss is below this.")
+    silhouette: float = Field(0.3, gt=0, description="The silhouette loss of a keyframe must be below this.")
     features: float | None = Field(
-        None, gt=0, description="A keyframe's appearance loss is below this; the encoder's tau if empty."
+        None,
+        gt=0,
+        description="The appearance loss of a keyframe must be below this; null takes the encoder's tau.",
     )
     translation: float = Field(
-        0.5, ge=0, description="New view: moved more than this times the object's size, or ..."
+        0.5, ge=0, description="A new view has moved by more than this times the size of the object, or ..."
     )
     rotation: float = Field(
-        45.0, ge=0, description="... turned more than this many degrees since the latest keyframe."
+        45.0, ge=0, description="... rotated by more than this many degrees since the latest keyframe."
     )
-    keep_first: bool = Field(False, description="Frame 0 stays a keyframe whatever happens.")
+    keep_first: bool = Field(False, description="Frame 0 always stays a keyframe.")
 
 
 class PaperConfig(Section):
     """The solver ``paper``. Defaults are the published recipe."""
 
-    name: Literal["paper"] = Field("paper", description="Which solver: paper or online.")
+    name: Literal["paper"] = Field("paper", description="Name of the solver: paper or online.")
     final_refine: FinalRefine = False
     correct_tracker: CorrectTracker = False
-    iterations: int = Field(500, ge=1, le=100_000, description="Most iterations a frame.")
+    iterations: int = Field(500, ge=1, le=100_000, description="Maximum number of iterations per frame.")
     tau: float | None = Field(
         None,
         gt=0,
-        description="Converged when the appearance loss is below this; the encoder's own if empty.",
+        description="A frame has converged if its appearance loss is below this; null takes the encoder's own value.",
     )
     cauchy_scale: float = Field(0.25, gt=0, description="Scale of the Cauchy loss.")
     sigma: float = Field(7000.0, gt=0, description="Sharpness of the soft silhouette, per squared NDC unit.")
     boxlen: float = Field(
-        0.02, gt=0, lt=1, description="Reach of the soft silhouette beyond a face's box, NDC."
+        0.02, gt=0, lt=1, description="Extent of the soft silhouette beyond the box of a face, in NDC."
     )
-    knum: int = Field(30, ge=1, description="Most faces that a soft-silhouette pixel counts.")
+    knum: int = Field(30, ge=1, description="Maximum number of faces per pixel of the soft silhouette.")
     band: Literal["erode", "soften", "none"] = Field(
         "erode",
         description=(
-            "How the bias of the soft band is removed: erode the silhouette 3x3, soften the target by the "
-            "same kernel, or not."
+            "How the bias of the soft silhouette is removed: erode the silhouette by 3x3, soften the target with the "
+            "same kernel, or not at all."
         ),
     )
     motion_translation: float = Field(
-        0.1, ge=0, description="Free translation a frame since the last keyframe, eq. 3."
+        0.1, ge=0, description="Translation per frame since the last keyframe that is not penalized, eq. 3."
     )
     motion_rotation: float = Field(
-        30.0, ge=0, description="Free rotation in degrees a frame since the last keyframe, eq. 3."
+        30.0,
+        ge=0,
+        description="Rotation in degrees per frame since the last keyframe that is not penalized, eq. 3.",
     )
     laplacian_of: Literal["vertices", "offsets"] = Field(
         "vertices",
@@ -131,47 +142,49 @@ class PaperConfig(Section):
         ge=0,
         le=1,
         description=(
-            "Answer with the initial mask where the rendered one overlaps it by less than this IoU; 0 never does "
-            "(paper)."
+            "Return the initial mask if its IoU with the rendered mask is below this; 0 always returns the rendered "
+            "mask (paper)."
         ),
     )
     stop: Literal["threshold", "plateau"] = Field(
         "threshold",
         description=(
-            "End a frame as soon as the appearance loss is below tau (paper), or when the total loss, "
-            "having beaten that of the start, no longer falls; the best state is kept."
+            "Stop a frame as soon as the appearance loss is below tau (paper), or as soon as the total loss is below "
+            "its initial value and no longer falls. The best state is kept."
         ),
     )
-    patience: int = Field(10, ge=1, description="With plateau: iterations without progress before the end.")
+    patience: int = Field(
+        10, ge=1, description="With plateau: iterations without progress before a frame stops."
+    )
     prediction: Literal["last", "velocity"] = Field(
         "last",
         description=(
-            "A frame starts from the last pose (paper), or from the best of last pose, constant velocity "
-            "and the mask's own shift."
+            "Motion model: a frame starts from the last pose (paper), or from the best of last pose, constant velocity "
+            "and the shift of the mask."
         ),
     )
     pose_iterations: int = Field(
         0,
         ge=0,
-        description="Iterations on the new frame's pose alone before the joint ones; 0 for none (paper).",
+        description="Iterations on the pose of the new frame alone, before the joint ones; 0 for none (paper).",
     )
     joint: Literal["always", "new_view"] = Field(
         "always",
         description=(
-            "Optimize shape, texture and all poses in every frame (paper), or only in frames that show a "
-            "new view or that their pose alone cannot explain; needs pose_iterations."
+            "Optimize shape, texture and all poses in every frame (paper), or only in frames that show a new view or "
+            "that their pose alone does not explain; needs pose_iterations."
         ),
     )
     texture_start: Literal["zero", "backprojected"] = Field(
         "zero",
-        description="Texels not seen before start at zero (paper), or at what the new frame shows there.",
+        description="Texels not seen before start at zero (paper), or at the features that the new frame shows there.",
     )
     unseen_charge: float | None = Field(
         None,
         ge=0,
         description=(
-            "What a pixel of never seen texture costs instead of its appearance loss; empty: no difference "
-            "is made (paper)."
+            "Loss of a pixel whose texture has never been seen, in place of its appearance loss; null treats it like "
+            "any other pixel (paper)."
         ),
     )
     start_frames: int = Field(
@@ -179,10 +192,13 @@ class PaperConfig(Section):
         ge=1,
         le=32,
         description=(
-            "Solve this many first frames together from several hypotheses of rotation; 1 for none (paper)."
+            "Number of first frames that are solved together from several rotation hypotheses; 1 switches this off "
+            "(paper)."
         ),
     )
-    start_iterations: int = Field(60, ge=1, description="Iterations of each hypothesis of that joint start.")
+    start_iterations: int = Field(
+        60, ge=1, description="Iterations of each hypothesis in that initialization."
+    )
     weights: Weights = Weights()
     learning_rates: LearningRates = LearningRates()
     keyframes: KeyframeConfig = KeyframeConfig()
@@ -191,7 +207,7 @@ class PaperConfig(Section):
 def _written_out(value: Any) -> Any:
     """``paper`` is short for ``{name: paper}``, and settings without a name are those of the default solver.
 
-    A section whose every line is commented out changes nothing.
+    A section with all lines commented out changes nothing.
     """
     if isinstance(value, str):
         return {"name": value}
@@ -204,4 +220,4 @@ def _written_out(value: Any) -> Any:
 SolverConfig = Annotated[
     OnlineConfig | PaperConfig, Field(discriminator="name"), BeforeValidator(_written_out)
 ]
-"""The solver that ``name`` chooses, with its own settings and no other's."""
+"""The solver that ``name`` chooses, with its own settings only."""

@@ -1,4 +1,4 @@
-"""YAML as configuration: plain data only, every key once, and one sentence for whatever is wrong."""
+"""Configuration in YAML: plain data only, every key once, and one sentence for every mistake."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _DEEPEST = 60
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """PyYAML's safe loader (no tag runs code), which also refuses keys given twice or not as text."""
+    """PyYAML's safe loader (no tag runs code), which also refuses duplicate keys and keys that are not text."""
 
 
 def _mapping(loader: _StrictLoader, node: yaml.MappingNode) -> dict[Any, Any]:
@@ -34,7 +34,7 @@ def _mapping(loader: _StrictLoader, node: yaml.MappingNode) -> dict[Any, Any]:
                 None, None, f"the key '{key}' is given twice", key_node.start_mark
             )
         seen.add(key)
-    # deep, so that a mapping that contains itself is found here instead of followed for ever elsewhere
+    # deep, so that a mapping that contains itself is found here and not followed for ever elsewhere
     return loader.construct_mapping(node, deep=True)
 
 
@@ -46,7 +46,7 @@ def parse_yaml(text: str, origin: str) -> Any:
 
     Args:
         text: The document.
-        origin: What messages call it, such as the file's name.
+        origin: Its name in messages, such as the file name.
 
     Raises:
         InputError: Not YAML, a tag that is not plain data, a key given twice or a key that is not text.
@@ -55,7 +55,7 @@ def parse_yaml(text: str, origin: str) -> Any:
 
 
 def _parsed(text: str, origin: str) -> tuple[Any, list[str]]:
-    """The document, and the keys of its top level that nothing is written for."""
+    """The document, and the keys of its top level that have no value."""
     loader = None
     try:
         loader = _StrictLoader(text)
@@ -78,7 +78,7 @@ def _parsed(text: str, origin: str) -> tuple[Any, list[str]]:
         raise InputError(f"{origin}: {problem}{_place(error)}.") from error
     except yaml.MarkedYAMLError as error:
         problem = error.problem or "it cannot be parsed"
-        if problem.startswith("but "):  # PyYAML's sentence began in the context
+        if problem.startswith("but "):  # PyYAML's sentence begins in the context
             problem = f"{error.context}, {problem}"
         raise InputError(f"{origin} is not valid YAML: {problem}{_place(error)}.") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
@@ -90,10 +90,10 @@ def _parsed(text: str, origin: str) -> tuple[Any, list[str]]:
 
 
 def _check_size(root: yaml.Node) -> None:
-    """Refuse nesting and aliases that stand for more than any configuration holds.
+    """Refuse deep nesting, and aliases that expand to more than any configuration holds.
 
     Raises:
-        ValueError: If there is too much of either.
+        ValueError: There is too much of either.
     """
     sizes: dict[int, int] = {}
 
@@ -101,22 +101,22 @@ def _check_size(root: yaml.Node) -> None:
         if depth > _DEEPEST:
             raise ValueError("nested too deeply")
         if id(node) not in sizes:
-            sizes[id(node)] = 0  # a node that holds itself is refused when it is constructed
+            sizes[id(node)] = 0  # a node that contains itself is refused when it is constructed
             inner = node.value if isinstance(node, yaml.CollectionNode) else ()
             parts = (part for item in inner for part in (item if isinstance(item, tuple) else (item,)))
             sizes[id(node)] = 1 + sum(size(part, depth + 1) for part in parts)
         return sizes[id(node)]
 
     if size(root, 0) > _MOST_VALUES:
-        raise ValueError(f"its aliases stand for more than {_MOST_VALUES:,} values")
+        raise ValueError(f"its aliases expand to more than {_MOST_VALUES:,} values")
 
 
 def read_mapping(file: Path, empty: Any = None) -> dict[str, Any]:
-    """Read a YAML file whose top level is a mapping; an empty file is an empty mapping.
+    """Read a YAML file whose top level is a mapping; an empty file gives an empty mapping.
 
     Args:
         file: The file.
-        empty: What a key of the top level stands for that has nothing behind its colon.
+        empty: Value of a top-level key that has nothing after its colon.
 
     Raises:
         InputError: The file cannot be read, is too long, is not text, or holds something other than a mapping.
@@ -125,7 +125,9 @@ def read_mapping(file: Path, empty: Any = None) -> dict[str, Any]:
         with file.open("rb") as opened:
             content = opened.read(_LONGEST + 1)
         if len(content) > _LONGEST:
-            raise InputError(f"{file} is longer than {_LONGEST >> 10} KiB, which no configuration is.")
+            raise InputError(
+                f"{file} is longer than {_LONGEST >> 10} KiB, too long for a configuration; give another file."
+            )
         text = content.decode("utf-8-sig")
     except FileNotFoundError as error:
         raise InputError(f"The configuration file {file} does not exist.") from error
@@ -139,7 +141,7 @@ def read_mapping(file: Path, empty: Any = None) -> dict[str, Any]:
     if not isinstance(data, dict):
         kind = "a list" if isinstance(data, list) else "a single value"
         raise InputError(
-            f"{file} holds {kind} at its top level; a configuration is a mapping such as 'tracker: csrt'."
+            f"{file} has {kind} at its top level; a configuration is a mapping such as 'tracker: csrt'."
         )
     return {**data, **dict.fromkeys(left_empty, empty)}
 

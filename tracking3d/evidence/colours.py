@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.rendering.backend import compiled
-from tracking3d.trackers.colour_models import Palette, histograms, local_shares, log_ratio
+from tracking3d.trackers.colour_models import Palette, histograms, log_ratio
 from tracking3d.trackers.outline import inside_distance
 
 _RATE = 0.1
@@ -90,13 +89,9 @@ def alike_around(
         radius: Half the side of the neighbourhood in pixels.
         size: More than any label.
     """
-    if compiled():
-        from tracking3d.evidence.kernels import colours
+    from tracking3d.evidence.kernels import colours
 
-        return colours.alike_around(labels, mask, radius, size)
-    sides = np.stack([mask, ~mask]).astype(np.float32)
-    total = np.maximum(np.stack([cv2.blur(one, (2 * radius + 1,) * 2) for one in sides]), 0.02)
-    return local_shares(labels, labels, sides[0], radius, size) / total
+    return colours.alike_around(labels, mask, radius, size)
 
 
 def relative_distance(

@@ -9,11 +9,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from tracking3d.evidence.scene import FrameWindow
-from tracking3d.rendering.backend import compiled
 from tracking3d.trackers.outline import inside_distance
 
 CELLS = 64
@@ -118,26 +116,11 @@ def sample_grid_distances(
     Returns:
         None where a cell is not in front of the camera.
     """
-    if compiled():
-        from tracking3d.evidence.kernels import consensus
+    from tracking3d.evidence.kernels import consensus
 
-        return consensus.sample_grid_distances(
-            distance, unknown, to_pixels, by_depth, beyond, _NEAR, CELLS, _UNKNOWN
-        )
-    z, y, x = np.mgrid[:CELLS, :CELLS, :CELLS].reshape(3, -1)
-    u, v, depth = to_pixels @ np.stack([x, y, z, np.ones_like(x)])
-    if (depth <= _NEAR).any():
-        return None
-    u, v = ((one / depth).astype(np.float32).reshape(CELLS, -1) for one in (u, v))
-    value, hidden = (
-        cv2.remap(plane, u, v, method, borderMode=cv2.BORDER_CONSTANT, borderValue=border).ravel()
-        for plane, method, border in (
-            (distance, cv2.INTER_LINEAR, beyond),
-            (unknown.astype(np.uint8), cv2.INTER_NEAREST, 0),
-        )
+    return consensus.sample_grid_distances(
+        distance, unknown, to_pixels, by_depth, beyond, _NEAR, CELLS, _UNKNOWN
     )
-    value = np.clip(np.rint(value * depth * by_depth), -_UNKNOWN + 1, _UNKNOWN - 1)
-    return np.where(hidden > 0, _UNKNOWN, value).astype(np.int8)
 
 
 def with_peaks(hulls: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -167,16 +150,6 @@ def marched(
         focal: Pixels that a distance of 1 has at a depth of 1.
         beyond: What rays get that miss the grid.
     """
-    if compiled():
-        from tracking3d.evidence.kernels import consensus
+    from tracking3d.evidence.kernels import consensus
 
-        return consensus.marched(hulls, origin, rays, depths, focal, beyond)
-    cells = origin + depths[:, None, None, None] * rays
-    grid = torch.from_numpy((2 * cells + 1) / np.float32(len(hulls)) - 1)
-    signed = torch.from_numpy(hulls[..., : hulls.shape[-1] // 2])
-    value = torch.nn.functional.grid_sample(
-        signed.permute(3, 0, 1, 2)[None], grid[None], align_corners=False, padding_mode="border"
-    )[0].numpy()
-    pixels = value / depths[:, None, None] * np.float32(focal)
-    missed = (grid.abs().amax(-1) > 1).numpy()
-    return np.asarray(np.where(missed, np.float32(beyond), pixels).max(1))
+    return consensus.marched(hulls, origin, rays, depths, focal, beyond)

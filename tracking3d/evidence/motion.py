@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from tracking3d.evidence.scene import FrameWindow, Mask, Plane
 from tracking3d.frames import Image
 from tracking3d.geometry.camera import Camera
-from tracking3d.rendering.backend import compiled
 
 _CORNERS, _LEAST_CORNERS = 300, 12
 _AGREEING = 0.3  # of the corners
@@ -151,22 +150,11 @@ def parted_ways(
     Returns:
         See `_parted_ways`.
     """
-    if compiled():
-        from tracking3d.evidence.kernels import motion
+    from tracking3d.evidence.kernels import motion
 
-        return motion.parted_ways(
-            inverse_depth, of_surface, np.ascontiguousarray(of_background), image_size, apart
-        )
-    near = inverse_depth[..., None]
-    moved = _carried(len(inverse_depth), of_surface[:, :3]) + near * of_surface[:, 3]
-    beyond = _carried(len(inverse_depth), of_background)
-    ways = np.stack([_projected(np.where(near > 0, moved, np.nan)), _projected(beyond)])
-    limit = np.array([image_size[1] - 1, image_size[0] - 1])
-    with np.errstate(invalid="ignore"):
-        inside = np.asarray(((ways > 0) & (ways < limit)).all((0, -1)))
-    ways = np.where(inside[..., None], ways, 0).astype(np.float32)
-    parted = np.linalg.norm(ways[0] - ways[1], axis=-1)
-    return ways, np.clip((parted - apart[0]) / (apart[1] - apart[0]), 0, 1) * inside
+    return motion.parted_ways(
+        inverse_depth, of_surface, np.ascontiguousarray(of_background), image_size, apart
+    )
 
 
 def _through(scene: FrameWindow, camera: Camera, T_cam_obj: Matrix) -> tuple[Matrix, Matrix]:

@@ -1,4 +1,4 @@
-"""The networks that are known by name: what for, where from, how large, which SHA-256, which licence."""
+"""The catalogue of known networks: purpose, address, size, SHA-256 and licence."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ class KnownNetwork(Section):
     """One entry of the catalogue.
 
     Attributes:
-        name: What selects it, here and wherever a network is asked for.
+        name: Name that selects it, wherever a network is given.
     """
 
     name: str = Field(pattern=r"^[a-z0-9][a-z0-9.-]*$")
-    purpose: str = Field(description="What it is and what it is for.")
-    licence: str = Field(description="SPDX identifier or the licence's own name.")
-    authors: str = Field(pattern="^https://", description="Where its authors publish it.")
+    purpose: str = Field(description="What the network does, and what uses it.")
+    licence: str = Field(description="SPDX identifier, or the name of the licence.")
+    authors: str = Field(pattern="^https://", description="Page on which its authors publish it.")
     address: str | None = Field(
         None,
         pattern="^https?://",
-        description="Address of the very file; none where that is not known for sure.",
+        description="Address of exactly this file; null if none is known for sure.",
     )
     mirrors: tuple[str, ...] = Field(
         (), description="Other addresses of the same bytes, in the order to try them."
@@ -35,23 +35,23 @@ class KnownNetwork(Section):
     size: int | None = Field(None, gt=0, description="Bytes.")
     sha256: str | None = Field(None, pattern="^[0-9a-f]{64}$")
     non_commercial: bool = Field(False, description="Whether its licence forbids commercial use.")
-    how: str = Field("", description="Without an address: how to come by the file.")
+    how: str = Field("", description="How to obtain the file, if there is no address.")
 
     @model_validator(mode="after")
     def _fetched_or_explained(self) -> KnownNetwork:
         if self.address is not None and (self.sha256 is None or self.size is None):
-            raise ValueError("an address needs a size and a sha256, for what is fetched is checked")
+            raise ValueError("an address needs a size and a sha256, because downloads are checked")
         if self.address is None and self.mirrors:
             raise ValueError("mirrors are further addresses; give the first one as address")
         if any(not mirror.startswith(("http://", "https://")) for mirror in self.mirrors):
             raise ValueError("mirrors begin with http:// or https://")
         if self.address is None and not self.how:
-            raise ValueError("without an address it must say how to come by the file")
+            raise ValueError("without an address, how must explain how to obtain the file")
         return self
 
     @property
     def addresses(self) -> tuple[str, ...]:
-        """Where it can be fetched, in the order to try."""
+        """Download addresses, in the order to try."""
         return () if self.address is None else (self.address, *self.mirrors)
 
     @property
@@ -70,17 +70,15 @@ def read_catalogue(file: Path) -> dict[str, KnownNetwork]:
     """Read a catalogue: a YAML mapping from names to entries.
 
     Raises:
-        InputError: If it cannot be read, or an entry is not complete.
+        InputError: It cannot be read, or an entry is incomplete.
     """
     networks = {}
     for name, entry in read_mapping(file).items():
         try:
             networks[name] = KnownNetwork.model_validate({"name": name, **(entry or {})})
         except (ValidationError, TypeError) as error:
-            told = (
-                describe_validation_error(error, KnownNetwork, "key")
-                if isinstance(error, ValidationError)
-                else str(error)
-            )
-            raise InputError(f"{file}, network '{name}': {told}") from error
+            reason = str(error)
+            if isinstance(error, ValidationError):
+                reason = describe_validation_error(error, KnownNetwork, "key")
+            raise InputError(f"{file}, network '{name}': {reason}") from error
     return networks

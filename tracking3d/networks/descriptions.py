@@ -1,4 +1,4 @@
-"""Descriptions of networks: short YAML files that say what a network takes and gives."""
+"""Descriptions of networks: short YAML files about the inputs and outputs of a network."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ def description_names(package: str) -> list[str]:
 
 
 def read_description(name: str | Path, package: str, noun: str) -> tuple[Path, dict[str, Any]]:
-    """Read a description that comes with a package, or a user's own.
+    """Read a description that comes with a package, or one of the user.
 
     Args:
         name: Name of one of the package's, or a YAML file.
         package: The package, such as ``tracking3d.features.onnx``.
-        noun: What is described, as messages call it.
+        noun: Word for what is described, in messages.
 
     Returns:
-        The file and its keys, not checked yet.
+        The file, and its keys, not validated yet.
 
     Raises:
-        InputError: If there is no such description, or it is no YAML mapping.
+        InputError: There is no such description, or it is not a YAML mapping.
     """
     names = description_names(package)
     if str(name) in names:

@@ -1,8 +1,8 @@
-"""Known networks into the cache: from their address or a mirror, or from a file that was fetched elsewhere.
+"""Download known networks into the cache, or copy a file that was downloaded elsewhere.
 
-What arrives is written beside its place, compared with the catalogue's SHA-256 and only then renamed into place:
-whatever goes wrong, nothing half or wrong is left in it. A download that was stopped is gone on with by the next one.
-Files are never unpickled, and nothing in them is run.
+A download is written to a temporary file, compared with the SHA-256 of the catalogue, and only then renamed: the cache
+never holds an incomplete or wrong file. The next download continues a stopped one. Files are never unpickled, and
+nothing in them is executed.
 """
 
 from __future__ import annotations
@@ -30,24 +30,23 @@ def fetch(
     listener: Listener = lambda count: None,
     mirror: str | None = None,
 ) -> Path:
-    """Download a known network into the cache, replacing what is there.
+    """Download a known network into the cache, replacing an existing file.
 
-    Its addresses are tried in order until one gives the known bytes. What had arrived of a download that was stopped
-    is not asked for again.
+    Its addresses are tried in order until one returns the known bytes. A stopped download is continued.
 
     Args:
         network: The network.
         accept_licence: Whether the user accepts a licence that forbids commercial use.
-        listener: Is told of the bytes as they arrive.
-        mirror: Address of a folder that has it as ``NAME.onnx``; tried before all others.
+        listener: Called with the number of new bytes.
+        mirror: Address of a folder that holds ``NAME.onnx``; tried before all others.
 
     Returns:
         The file in the cache.
 
     Raises:
-        InputError: If its licence is not accepted, no address of it is known or can be reached, or other bytes
-            arrive than the catalogue knows. The message says what to download and where to put it.
-        OutputError: If the cache cannot be written.
+        InputError: Its licence is not accepted, no address is known or can be reached, or the bytes differ from the
+            catalogue. The message says what to download and where to put it.
+        OutputError: The cache cannot be written.
     """
     _check_licence(network, accept_licence)
     addresses = network.addresses
@@ -55,7 +54,7 @@ def fetch(
         addresses = (_in_mirror(network, mirror), *addresses)
     if not addresses:
         raise InputError(
-            f"{network.name} cannot be fetched: {network.how} ({network.authors}), {_by_hand(network)}."
+            f"{network.name} cannot be downloaded: {network.how} ({network.authors}), {_by_hand(network)}."
         )
     with _arriving(network, keep=True) as part:
         reasons = []
@@ -65,7 +64,7 @@ def fetch(
             reasons.append(reason if len(addresses) == 1 else f"{address}: {reason}")
         else:
             raise InputError(
-                f"{network.name} could not be fetched ({'; '.join(reasons)}): download {addresses[-1]} elsewhere, "
+                f"{network.name} could not be downloaded ({'; '.join(reasons)}): download {addresses[-1]} elsewhere, "
                 f"{_by_hand(network)}."
             )
     return network_path(network)
@@ -73,19 +72,21 @@ def fetch(
 
 def _in_mirror(network: KnownNetwork, mirror: str) -> str:
     if not mirror.startswith(("http://", "https://")):
-        raise InputError(f"The mirror {mirror} is no address; give one that begins with http:// or https://.")
+        raise InputError(
+            f"The mirror {mirror} is not an address; give one that begins with http:// or https://."
+        )
     if network.sha256 is None or network.size is None:
         raise InputError(
-            f"{network.name} is not taken from a mirror, for its SHA-256 is not known: {network.how} "
+            f"{network.name} cannot be downloaded from a mirror, because its SHA-256 is unknown: {network.how} "
             f"({network.authors}), {_by_hand(network)}."
         )
     return f"{mirror.rstrip('/')}/{network.file}"
 
 
 def _fetch_from(address: str, network: KnownNetwork, part: BufferedRandom, listener: Listener) -> str:
-    """Let the part be the network from one address; returns why it is not, or nothing if it is.
+    """Download the network from one address into ``part``; returns why that failed, or an empty text.
 
-    What was kept of an earlier download may be of other bytes: then everything is asked for once more.
+    If the rest of an earlier download does not fit, everything is downloaded again.
     """
     size = network.size or 0
     kept = part.seek(0, 2)
@@ -104,15 +105,15 @@ def _fetch_from(address: str, network: KnownNetwork, part: BufferedRandom, liste
         listener(-part.tell())
         part.truncate(0)
         if not kept:
-            return f"what {address} gave {difference}"
+            return f"the file from {address} {difference}"
         kept = 0
 
 
 def adopt(network: KnownNetwork, file: Path, *, accept_licence: bool = False) -> Path:
-    """Copy a network that was fetched elsewhere into the cache, replacing what is there.
+    """Copy a network that was downloaded elsewhere into the cache, replacing an existing file.
 
     Args:
-        network: The network that the file is.
+        network: The network in the file.
         file: The file.
         accept_licence: Whether the user accepts a licence that forbids commercial use.
 
@@ -120,9 +121,9 @@ def adopt(network: KnownNetwork, file: Path, *, accept_licence: bool = False) ->
         The file in the cache.
 
     Raises:
-        InputError: If the licence is not accepted, the file cannot be read, is not what the catalogue knows, or,
-            where no hash is known, is no ONNX network.
-        OutputError: If the cache cannot be written.
+        InputError: The licence is not accepted, the file cannot be read, it differs from the catalogue, or, if no hash
+            is known, it is not an ONNX network.
+        OutputError: The cache cannot be written.
     """
     _check_licence(network, accept_licence)
     file = file.expanduser()
@@ -134,7 +135,7 @@ def adopt(network: KnownNetwork, file: Path, *, accept_licence: bool = False) ->
         _copy(source, part, network.size)
         if difference := _difference(network, Path(part.name)):
             raise InputError(
-                f"{file} {difference}; a network that you exported yourself is used by its path and needs no name."
+                f"{file} {difference}; to use a network that you exported yourself, give its path instead of a name."
             )
         if network.sha256 is None:
             try:
@@ -156,12 +157,12 @@ def _check_licence(network: KnownNetwork, accepted: bool) -> None:
 
 @contextmanager
 def _arriving(network: KnownNetwork, keep: bool = False) -> Iterator[BufferedRandom]:
-    """A file beside the network's place; renamed there if the block ends well, else gone.
+    """A temporary file, which is renamed to the network's path if the block succeeds, and else removed.
 
     Args:
         network: The network.
-        keep: Go on with what an earlier block left, and leave what there is to a later one. A block has the file for
-            itself: whoever fetches the same network meanwhile begins one of his own.
+        keep: Continue the file that an earlier block left, and leave it to a later one. Only one block uses the file:
+            a concurrent download of the same network starts a file of its own.
     """
     path = network_path(network)
     own = path.with_name(f".{path.name}.{os.getpid()}")
@@ -189,7 +190,7 @@ def _write(part: BufferedRandom, chunk: bytes) -> None:
 
 
 def _difference(network: KnownNetwork, file: Path) -> str:
-    """In what a file is not what the catalogue knows of the network, as a sentence goes on; nothing if it is."""
+    """How a file differs from the catalogue, as the end of a sentence; empty if it does not."""
     size = file.stat().st_size
     if network.size is not None and size != network.size:
         most = f"more than {network.size}" if size > network.size else f"{size} instead of {network.size}"
@@ -200,7 +201,7 @@ def _difference(network: KnownNetwork, file: Path) -> str:
 
 
 def _copy(source: IO[bytes], part: BufferedRandom, size: int | None) -> None:
-    """Copy the bytes; more than ``size`` are not copied to the end."""
+    """Copy the bytes, and stop once there are more than ``size``."""
     while (size is None or part.tell() <= size) and (chunk := source.read(_CHUNK)):
         _write(part, chunk)
     with _writing(Path(part.name)):
@@ -208,10 +209,10 @@ def _copy(source: IO[bytes], part: BufferedRandom, size: int | None) -> None:
 
 
 def _by_hand(network: KnownNetwork) -> str:
-    """What to do with a file that came another way."""
+    """Advice on how to add the file by hand."""
     keep = f"`tracking3d models get {network.name} --from FILE` or put it at {network_path(network)}"
-    if network.address is None and network.sha256 is not None:  # every export has other bytes
-        return f"and use your file by its path; if you have the one with SHA-256 {network.sha256}, {keep}"
+    if network.address is None and network.sha256 is not None:  # every export has different bytes
+        return f"and give the path of your file; if its SHA-256 is {network.sha256}, {keep}"
     return f"then {keep}"
 
 
@@ -221,6 +222,6 @@ def _writing(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise OutputError(
-            f"{path} cannot be written: {error.strerror or error}; make room there, or name another folder with "
+            f"{path} cannot be written: {error.strerror or error}; free some space, or choose another folder with "
             f"the environment variable {VARIABLE}."
         ) from error

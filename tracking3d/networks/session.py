@@ -1,6 +1,6 @@
 """A neural network in an ONNX file, run by onnxruntime on the CPU.
 
-Nothing but the ONNX graph is read: no code is run from a model file and nothing is unpickled.
+Only the ONNX graph is read: no code of a model file is executed, and nothing is unpickled.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from tracking3d.errors import InputError
 
 @dataclass(frozen=True)
 class TensorInfo:
-    """What a network says of one input or output.
+    """Description of one input or output of a network.
 
     Attributes:
         name: Its name.
-        shape: Its sizes; None where any size will do.
-        dtype: Its element type, as numpy calls it.
+        shape: Its sizes; None for a variable size.
+        dtype: Its element type, by NumPy's name.
     """
 
     name: str
@@ -32,7 +32,7 @@ class TensorInfo:
 
 
 class Network:
-    """An ONNX network ready to run; the same input gives the same output.
+    """An ONNX network ready to run, deterministically.
 
     Args:
         file: The ONNX file.
@@ -44,7 +44,7 @@ class Network:
         outputs: Its outputs by name, in the network's order.
 
     Raises:
-        InputError: If the file is absent or is no ONNX network that onnxruntime can run.
+        InputError: The file does not exist, or is not an ONNX network that onnxruntime can run.
     """
 
     def __init__(self, file: Path, threads: int = 1) -> None:
@@ -54,8 +54,8 @@ class Network:
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
         options.inter_op_num_threads = 1
-        options.log_severity_level = 4  # what fails is raised and told in one sentence
-        # Waiting threads must not occupy the cores that the renderer needs.
+        options.log_severity_level = 4  # failures are raised and reported in one sentence
+        # Waiting threads must not block the cores that the renderer needs.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         try:
             self._session = onnxruntime.InferenceSession(
@@ -78,7 +78,7 @@ class Network:
             Every output by name.
 
         Raises:
-            InputError: If the network does not take these arrays.
+            InputError: The network does not accept these arrays.
         """
         try:
             results = self._session.run(list(self.outputs), dict(feeds))
@@ -95,6 +95,6 @@ def _info(node: onnxruntime.NodeArg) -> TensorInfo:
 
 
 def _told(error: Exception) -> str:
-    """The first line of what onnxruntime says, without its error codes."""
+    """The first line of an onnxruntime error, without its error codes."""
     text = " ".join(str(error).split()).rpartition(" : ")[2].rstrip(".")
     return text if len(text) <= 200 else text[:197] + "..."

@@ -1,7 +1,7 @@
-"""Networks in the user's cache: which file a name or a path means, and whether it is what it should be.
+"""Networks in the user's cache: the file of a name or path, and whether it is the known one.
 
-The cache is the platform's own folder for that (``~/.cache/tracking3d`` on Linux); the environment variable
-``TRACKING3D_CACHE`` names another.
+The cache is in the platform's cache folder (``~/.cache/tracking3d`` on Linux); the environment variable
+``TRACKING3D_CACHE`` chooses another.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _CHUNK = 1 << 20
 
 
 class State(StrEnum):
-    """What the cache holds of a known network."""
+    """State of a known network in the cache."""
 
     ABSENT = "absent"
     OK = "ok"
@@ -40,7 +40,7 @@ def cache_folder() -> Path:
 
 
 def network_path(network: KnownNetwork) -> Path:
-    """Where the cache keeps a network, whether it is there or not."""
+    """Path of a network in the cache, whether it exists or not."""
     return cache_folder() / "models" / network.file
 
 
@@ -51,7 +51,7 @@ def find_network(name: str | Path) -> Path:
         name: The path of a file, or the name of a known network, see ``tracking3d models list``.
 
     Raises:
-        InputError: If there is no such file, or the network is known but not in the cache.
+        InputError: There is no such file, or the network is known but not in the cache.
     """
     file = Path(name).expanduser()
     if file.is_file():
@@ -65,35 +65,35 @@ def find_network(name: str | Path) -> Path:
     path = network_path(network)
     if not path.is_file():
         raise InputError(
-            f"The network {network.name} is not in {path.parent}; fetch it with "
+            f"The network {network.name} is not in {path.parent}; download it with "
             f"`tracking3d models get {network.name}`, or give the path of an ONNX file."
         )
     return path
 
 
 def find_known(name: str) -> KnownNetwork:
-    """The catalogue's entry of a name.
+    """The catalogue entry of a name.
 
     Raises:
-        InputError: If there is none; the nearest name is told.
+        InputError: There is none; the message has the nearest name.
     """
     networks = known_networks()
     if name in networks:
         return networks[name]
     best = nearest(name, networks)
-    advice = f"did you mean '{best}'?" if best else "`tracking3d models list` shows those that are."
+    advice = f"did you mean '{best}'?" if best else "`tracking3d models list` shows the known ones."
     raise InputError(f"There is no known network '{name}'; {advice}")
 
 
 def state_of(network: KnownNetwork, *, check: bool = True) -> State:
-    """Whether a network is in the cache, and whether its bytes are the catalogue's.
+    """Whether a network is in the cache, and whether its file matches the catalogue.
 
     Args:
         network: The network.
-        check: Read the file and compare its hash; without it a file that is there is unchecked.
+        check: Read the file and compare its hash; if false, an existing file counts as unchecked.
 
     Raises:
-        InputError: If its file cannot be read.
+        InputError: Its file cannot be read.
     """
     path = network_path(network)
     if not path.is_file():
@@ -107,7 +107,7 @@ def sha256_of(file: Path) -> str:
     """SHA-256 of a file's bytes, in hexadecimal.
 
     Raises:
-        InputError: If it cannot be read.
+        InputError: It cannot be read.
     """
     digest = hashlib.sha256()
     try:

@@ -1,17 +1,17 @@
-"""Mask trackers and feature encoders as plug-ins: found by entry point, checked, built from their options.
+"""Mask trackers and feature encoders as plug-ins: found by entry point, checked, and built from their options.
 
 A plug-in is a class with a nested pydantic model ``Options``, a classmethod ``from_options(options)`` and the
 methods of its protocol (`tracking3d.trackers.protocol`, `tracking3d.features.protocol`). Packages register it
 under the entry-point group ``tracking3d.trackers`` or ``tracking3d.features``; the built-in ones do the same.
 
 For development, the environment variable ``TRACKING3D_PLUGINS`` registers plug-ins without a package. It
-holds items ``group:name=module:Class`` with ``;`` between them, where ``module`` is importable or the path of
+holds items ``group:name=module:Class`` separated by ``;``, where ``module`` is importable or the path of
 a ``.py`` file::
 
     TRACKING3D_PLUGINS="tracking3d.trackers:mine=./my_tracker.py:MyTracker;tracking3d.features:lab=my.lab:Lab"
 
-Of several plug-ins with one name the first counts and the others are listed as duplicates: those of the
-variable come first, then this package's own, then the others by name of their package.
+If several plug-ins have the same name, the first is used and the others are listed as duplicates: those of the
+variable come first, then this package's own, then the others by package name.
 """
 
 from tracking3d.plugins.registration import FEATURES, TRACKERS, VARIABLE

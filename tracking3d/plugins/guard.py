@@ -1,7 +1,7 @@
-"""Plug-ins under guard: whatever goes wrong in one while it runs is told as its own fault.
+"""Guarded plug-ins: an error in one while it runs is reported as the error of that plug-in.
 
-A guarded plug-in does what the bare one does. An exception in it, or an answer that its protocol does not allow,
-becomes a `PluginFailure`, which knows the plug-in's name, package and version.
+A guarded plug-in does what the bare one does. An exception in it, or a result that violates its protocol, becomes a
+`PluginFailure`, which knows the plug-in's name, package and version.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ class PluginFailure(PluginError):
     """A plug-in failed while it ran.
 
     Args:
-        plugin: What messages call it, see `tracking3d.plugins.plugin_label`.
+        plugin: Its name in messages, see `tracking3d.plugins.plugin_label`.
         fault: What went wrong, without a full stop.
-        frame: What messages call the frame, where known.
+        frame: Name of the frame in messages, if known.
     """
 
     def __init__(self, plugin: str, fault: str, frame: str = "") -> None:
@@ -39,20 +39,20 @@ class PluginFailure(PluginError):
 
     @property
     def reason(self) -> str:
-        """Plug-in and fault, without the frame and a full stop."""
+        """Plug-in and fault, without the frame and the full stop."""
         return f"{self.plugin} failed: {self.fault}"
 
     def at(self, frame: str) -> PluginFailure:
-        """The same with the frame in its message."""
+        """The same failure, with the frame in its message."""
         return PluginFailure(self.plugin, self.fault, frame)
 
 
 class GuardedTracker:
-    """A mask tracker under guard; implements `tracking3d.trackers.protocol.MaskTracker`, but is built from one.
+    """A guarded mask tracker; wraps a `tracking3d.trackers.protocol.MaskTracker` and implements it.
 
     Args:
         tracker: The bare tracker.
-        label: What messages call it.
+        label: Its name in messages.
     """
 
     def __init__(self, tracker: MaskTracker, label: str) -> None:
@@ -63,18 +63,18 @@ class GuardedTracker:
         """Start on the first frame.
 
         Raises:
-            Tracking3dError: If the tracker says that it cannot start from this, in its own words.
-            PluginFailure: If it fails otherwise, or gives what is no answer.
+            Tracking3dError: The tracker cannot start from this prompt; the message is its own.
+            PluginFailure: It fails otherwise, or its result violates the protocol.
         """
         with in_stage("track"), _blamed(self._label, but=Tracking3dError):
             answer = self._tracker.init(frame, prompt)
         return self._checked(answer, frame)
 
     def step(self, frame: Frame) -> MaskEstimate:
-        """Answer for the next frame.
+        """Track the next frame.
 
         Raises:
-            PluginFailure: If the tracker fails or gives what is no answer.
+            PluginFailure: The tracker fails, or its result violates the protocol.
         """
         with in_stage("track"), _blamed(self._label):
             answer = self._tracker.step(frame)
@@ -86,20 +86,20 @@ class GuardedTracker:
         return isinstance(self._tracker, CorrectableTracker)
 
     def correct(self, frame: Frame, mask: NDArray[np.bool_]) -> None:
-        """Re-anchor the tracker on ``mask`` ``(H, W)`` in ``frame``, the latest one; nothing where it cannot be.
+        """Re-anchor the tracker on ``mask`` ``(H, W)`` in ``frame``, the latest one; does nothing if it cannot be.
 
         Raises:
-            PluginFailure: If the tracker fails.
+            PluginFailure: The tracker fails.
         """
         if isinstance(self._tracker, CorrectableTracker):
             with in_stage("track"), _blamed(self._label):
                 self._tracker.correct(frame, mask.copy())
 
     def announce(self, frame: Frame) -> None:
-        """Say which frame ``step`` is called with next; see `tracking3d.trackers.protocol.ForewarnedTracker`.
+        """Announce the frame that ``step`` is called with next; see `tracking3d.trackers.protocol.ForewarnedTracker`.
 
         Raises:
-            PluginFailure: If the tracker fails.
+            PluginFailure: The tracker fails.
         """
         if isinstance(self._tracker, ForewarnedTracker):
             with in_stage("track"), _blamed(self._label):
@@ -107,14 +107,14 @@ class GuardedTracker:
 
     @property
     def can_resume(self) -> bool:
-        """Whether the tracker's memory can be kept; see `tracking3d.trackers.protocol.ResumableTracker`."""
+        """Whether the tracker's state can be saved; see `tracking3d.trackers.protocol.ResumableTracker`."""
         return isinstance(self._tracker, ResumableTracker)
 
     def state(self) -> Any:
-        """The tracker's memory; None where it cannot tell.
+        """The tracker's state; None if it cannot be saved.
 
         Raises:
-            PluginFailure: If the tracker fails.
+            PluginFailure: The tracker fails.
         """
         if not isinstance(self._tracker, ResumableTracker):
             return None
@@ -122,10 +122,10 @@ class GuardedTracker:
             return self._tracker.state()
 
     def restore(self, frame: Frame, prompt: Prompt, state: Any) -> None:
-        """Give the tracker its memory back; nothing where it has none that can be kept.
+        """Restore the tracker's state; does nothing if it cannot be saved.
 
         Raises:
-            PluginFailure: If the tracker fails.
+            PluginFailure: The tracker fails.
         """
         if isinstance(self._tracker, ResumableTracker):
             with _blamed(self._label):
@@ -141,16 +141,16 @@ class GuardedTracker:
 
 
 class GuardedEncoder:
-    """A feature encoder under guard; implements `tracking3d.features.protocol.FeatureEncoder`, but is built from one.
+    """A guarded feature encoder; wraps a `tracking3d.features.protocol.FeatureEncoder` and implements it.
 
-    What else the encoder has, it has too.
+    Other attributes of the encoder are passed through.
 
     Args:
         encoder: The bare encoder.
-        label: What messages call it.
+        label: Its name in messages.
 
     Raises:
-        PluginError: If its channels, stride or tau are no positive numbers.
+        PluginError: Its channels, stride or tau are not positive numbers.
     """
 
     channels: int
@@ -177,10 +177,10 @@ class GuardedEncoder:
         return guarded
 
     def encode(self, images: Tensor) -> Tensor:
-        """Encode ``(B, 3, H, W)`` RGB in [0, 1]; nothing is remembered for gradients.
+        """Encode ``(B, 3, H, W)`` RGB in [0, 1]; no gradients are recorded.
 
         Raises:
-            PluginFailure: If the encoder fails or gives what are no features of these images.
+            PluginFailure: The encoder fails, or its result violates the protocol.
         """
         with in_stage("encode"), _blamed(self._label), torch.no_grad():
             features = self._encoder.encode(images)
@@ -190,9 +190,9 @@ class GuardedEncoder:
 
 
 def mask_fault(answer: Any, size: tuple[int, int]) -> str:
-    """Why this is no answer of a mask tracker for a frame of ``size`` ``(height, width)``, or nothing."""
+    """Why this is not a mask tracker's result for a frame of ``size`` ``(height, width)``; empty if it is."""
     if not isinstance(answer, MaskEstimate):
-        return f"it answered with {_kind(answer)} instead of a MaskEstimate"
+        return f"it returned {_kind(answer)} instead of a MaskEstimate"
     if not isinstance(answer.score, int | float | np.number) or not 0 <= answer.score <= 1:
         return f"its score is {answer.score!r} instead of a number from 0 to 1"
     mask: Any = answer.mask
@@ -201,14 +201,14 @@ def mask_fault(answer: Any, size: tuple[int, int]) -> str:
     if not isinstance(mask, np.ndarray) or mask.dtype.kind not in "fbiu":
         return f"its mask is {_kind(mask)} instead of an array of float32"
     if mask.shape != size:
-        return f"its mask has shape {mask.shape}, but the frame ({size[0]}, {size[1]})"
+        return f"its mask has shape {mask.shape}, but the frame has ({size[0]}, {size[1]})"
     if mask.size and not (mask.min() >= 0 and mask.max() <= 1):  # false for NaN too
         return f"its mask has values from {mask.min():g} to {mask.max():g} instead of from 0 to 1"
     return ""
 
 
 def attribute_fault(encoder: Any) -> str:
-    """Why the attributes of a feature encoder cannot be used, or nothing."""
+    """Why the attributes of a feature encoder cannot be used; empty if they can."""
     for name, kind in (("channels", int | np.integer), ("stride", int | np.integer), ("tau", int | float)):
         value = getattr(encoder, name, None)
         if not isinstance(value, kind) or isinstance(value, bool) or not 0 < value < float("inf"):
@@ -218,12 +218,12 @@ def attribute_fault(encoder: Any) -> str:
 
 
 def feature_fault(features: Any, images: Tensor, encoder: FeatureEncoder) -> str:
-    """Why these are no features of ``images`` ``(B, 3, H, W)`` by ``encoder``, or nothing."""
+    """Why these are not features of ``images`` ``(B, 3, H, W)`` by ``encoder``; empty if they are."""
     if not isinstance(features, Tensor) or not features.is_floating_point():
-        return f"it answered with {_kind(features)} instead of a tensor of float32"
+        return f"it returned {_kind(features)} instead of a tensor of float32"
     count, _, height, width = images.shape
     stride = encoder.stride
-    # Where the stride does not divide the size, the encoder may round either way.
+    # If the stride does not divide the size, the encoder may round either way.
     fits = features.ndim == 4 and all(
         abs(found - side / stride) < 1
         for found, side in zip(features.shape[2:], (height, width), strict=True)
@@ -243,7 +243,7 @@ def feature_fault(features: Any, images: Tensor, encoder: FeatureEncoder) -> str
 
 @contextmanager
 def _blamed(label: str, but: type[Exception] = PluginFailure) -> Iterator[None]:
-    """Turn what is raised into a failure of the plug-in, ``but`` let exceptions of that type pass."""
+    """Turn exceptions into failures of the plug-in, except those of the type ``but``."""
     try:
         yield
     except but:

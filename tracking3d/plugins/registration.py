@@ -1,4 +1,4 @@
-"""Which plug-ins are registered, by installed packages and by the environment variable, and how they are imported."""
+"""Plug-ins registered by installed packages and by the environment variable, and how they are imported."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ VARIABLE = "TRACKING3D_PLUGINS"
 """Environment variable that registers plug-ins for development."""
 
 KIND = {TRACKERS: "mask tracker", FEATURES: "feature encoder"}
-"""What a plug-in of each group is called."""
+"""Word for a plug-in of each group."""
 
 _METHODS = {TRACKERS: ("from_options", "init", "step"), FEATURES: ("from_options", "encode")}
 
 
 @dataclass(frozen=True)
 class Registered:
-    """A registered plug-in before anything of it is imported; ``value`` is ``module:Class``."""
+    """A registered plug-in that is not imported yet; ``value`` is ``module:Class``."""
 
     name: str
     group: str
@@ -44,15 +44,15 @@ class Registered:
 
     @property
     def label(self) -> str:
-        """What messages call it: kind, name, package and version."""
+        """Its name in messages: kind, name, package and version."""
         origin = f"{self.package} {self.version}".strip()
         return f"{KIND.get(self.group, 'plug-in')} '{self.name}' ({origin})"
 
 
 def registered_plugins(*groups: str) -> list[Registered]:
-    """Registered plug-ins of some groups, of all if none is named; imports none of them.
+    """Registered plug-ins of the given groups, of all groups by default; imports none of them.
 
-    Those come first that win over others of the same name. To ask for one group takes half the time.
+    Of plug-ins with the same name, the one that is used comes first. A single group takes half the time.
     """
     groups = groups or tuple(KIND)
     packaged = [plugin for group in groups for plugin in _packaged(group, _search_path())]
@@ -61,7 +61,7 @@ def registered_plugins(*groups: str) -> list[Registered]:
 
 
 def import_plugin(plugin: Registered) -> type[Any]:
-    """Import the class and check it; raises whatever the plug-in raises, or `PluginError` with a clause."""
+    """Import the class and check it; raises whatever the plug-in raises, or `PluginError` with a clause as message."""
     if not plugin.value:
         raise PluginError("it is not of the form group:name=module:Class with a known group")
     module, _, attribute = plugin.value.rpartition(":")
@@ -75,7 +75,7 @@ def import_plugin(plugin: Registered) -> type[Any]:
 
 
 def describe_exception(error: BaseException) -> str:
-    """An exception in one short line, without a full stop."""
+    """An exception as one short line, without a full stop."""
     text = " ".join(str(error).split()).rstrip(".")
     if not isinstance(error, Tracking3dError):
         text = f"{type(error).__name__}: {text}"
@@ -83,7 +83,7 @@ def describe_exception(error: BaseException) -> str:
 
 
 def _search_path() -> tuple[tuple[str, int], ...]:
-    """Where packages are looked for, and when each folder was last changed: installing one changes it."""
+    """Folders that hold packages, and when each was last changed: installing a package changes it."""
     times = []
     for folder in sys.path:
         with suppress(OSError):
@@ -93,7 +93,7 @@ def _search_path() -> tuple[tuple[str, int], ...]:
 
 @functools.lru_cache(maxsize=8)
 def _packaged(group: str, search_path: tuple[tuple[str, int], ...]) -> tuple[Registered, ...]:
-    """The plug-ins of installed packages; reading all their metadata is slow, so once for a state of the folders."""
+    """The plug-ins of installed packages; cached, because reading all metadata is slow."""
     origin = functools.cache(_origin)
     points = metadata.entry_points(group=group)
     return tuple(Registered(point.name, group, point.value, *origin(point.dist)) for point in points)
@@ -116,18 +116,18 @@ def _from_environment() -> list[Registered]:
         if group in KIND and name and ":" in value:
             version = _file_version(value.rpartition(":")[0])
             plugins.append(Registered(name, group, value, VARIABLE, version))
-        else:  # it stays in the list without a class, to be shown as broken
+        else:  # stays in the list without a class, and is shown as broken
             plugins.append(Registered(item, group, "", VARIABLE, ""))
     return plugins
 
 
 def _file_version(module: str) -> str:
-    """Short hash of the file of a module under development, in place of a version; empty where it is not found."""
+    """Short hash of a module under development, in place of a version; empty if its file is not found."""
     file: Path | None = None
     if module.endswith(".py"):
         file = Path(module)
     else:
-        with suppress(Exception):  # looking for a module imports the packages around it
+        with suppress(Exception):  # finding a module imports its parent packages
             spec = importlib.util.find_spec(module)
             file = Path(spec.origin) if spec and spec.origin else None
     try:
@@ -137,7 +137,7 @@ def _file_version(module: str) -> str:
 
 
 def _module_from(file: Path) -> Any:
-    """Import a file once, under a name that cannot hide another module."""
+    """Import a file once, under a name that cannot clash with another module."""
     name = f"_tracking3d_plugin_{file.stem}"
     known = sys.modules.get(name)
     if known and known.__file__ == str(file.resolve()):
@@ -147,7 +147,7 @@ def _module_from(file: Path) -> Any:
     spec = importlib.util.spec_from_file_location(name, file.resolve())
     assert spec and spec.loader
     module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # pydantic looks up postponed annotations here
+    sys.modules[name] = module  # pydantic resolves postponed annotations here
     try:
         spec.loader.exec_module(module)
     except BaseException:
@@ -157,14 +157,14 @@ def _module_from(file: Path) -> Any:
 
 
 def _fault(plugin: Registered, cls: Any) -> str:
-    """Why the class is no plug-in of its group, or nothing."""
+    """Why the class is not a plug-in of its group; empty if it is."""
     if not isinstance(cls, type):
         return f"{plugin.value} is not a class"
     options = getattr(cls, "Options", None)
     if not (isinstance(options, type) and issubclass(options, BaseModel)):
         return "it has no nested pydantic model Options"
     if "name" in options.model_fields:
-        return "its Options has a field 'name', which is the plug-in's own name in a configuration"
+        return "its Options has a field 'name', which a configuration uses for the name of the plug-in"
     if absent := [name for name in _METHODS[plugin.group] if not callable(getattr(cls, name, None))]:
         return f"it has no method {', '.join(absent)}"
     why_unavailable = getattr(cls, "why_unavailable", None)

@@ -1,4 +1,4 @@
-"""Plug-ins by name: listed with their status, loaded, checked, built from their options."""
+"""Plug-ins by name: listed with their status, loaded, checked, and built from their options."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from tracking3d.plugins.registration import (
 )
 
 _ATTRIBUTES: dict[str, tuple[str, ...]] = {TRACKERS: (), FEATURES: ("channels", "stride", "tau")}
-"""What an instance has besides methods; an encoder may know its channels only once it is built."""
+"""Attributes of an instance besides its methods; an encoder may know its channels only once it is built."""
 
 
 @dataclass(frozen=True)
 class PluginInfo:
-    """What is known about one registered plug-in.
+    """Description of one registered plug-in.
 
     Attributes:
         name: The name that selects it.
         group: Its entry-point group.
         package: The distribution that registers it, or ``TRACKING3D_PLUGINS``.
-        version: The distribution's version, of a module under development a short hash of its file; empty where
+        version: The distribution's version, or a short hash of the file of a module under development; empty if
             unknown.
-        status: ``duplicate`` means that another plug-in took the name first.
+        status: ``duplicate`` means that another plug-in has the name already.
         reason: Why the status is not ``ok``.
-        options: JSON schema of its options where it is ``ok``.
+        options: JSON schema of its options, if the status is ``ok``.
     """
 
     name: str
@@ -49,7 +49,7 @@ class PluginInfo:
 
 
 def list_plugins() -> list[PluginInfo]:
-    """Every registered plug-in with its status; imports all of them, and none can stop it."""
+    """Every registered plug-in with its status; imports all of them, and reports those that fail."""
     infos = []
     first: dict[tuple[str, str], Registered] = {}
     for plugin in registered_plugins():
@@ -77,16 +77,16 @@ def load_plugin(group: str, name: str) -> type[Any]:
         name: The plug-in's name.
 
     Raises:
-        PluginError: No plug-in of that name, or it cannot be imported or does not keep to the protocol.
+        PluginError: There is no plug-in of that name, it cannot be imported, or it does not follow the protocol.
     """
     return _load(_find(group, name))
 
 
 def plugin_label(group: str, name: str) -> str:
-    """What messages call a plug-in: ``mask tracker 'kcf' (tracking3d-kcf 0.1.0)``.
+    """Name of a plug-in in messages: ``mask tracker 'kcf' (tracking3d-kcf 0.1.0)``.
 
     Raises:
-        PluginError: If there is no plug-in of that name.
+        PluginError: There is no plug-in of that name.
     """
     return _find(group, name).label
 
@@ -98,7 +98,7 @@ def check_options(group: str, choice: PluginChoice) -> BaseModel:
         The plug-in's own ``Options`` with every default filled in.
 
     Raises:
-        PluginError: As `load_plugin`; or an option that is unknown, missing or out of range.
+        PluginError: As `load_plugin`; or an option is unknown, missing or out of range.
     """
     return _checked(_find(group, choice.name), choice)
 
@@ -106,7 +106,7 @@ def check_options(group: str, choice: PluginChoice) -> BaseModel:
 def _checked(plugin: Registered, choice: PluginChoice) -> BaseModel:
     model: type[BaseModel] = _load(plugin).Options
     unknown = [key for key in choice.options if key not in model.model_fields]
-    if unknown and model.model_config.get("extra", "ignore") == "ignore":  # in silence, as pydantic would
+    if unknown and model.model_config.get("extra", "ignore") == "ignore":  # pydantic would ignore it silently
         raise PluginError(f"{plugin.label}: {unknown_key(unknown[:1], model, 'option')}")
     try:
         return model.model_validate(choice.options)

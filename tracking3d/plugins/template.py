@@ -1,4 +1,4 @@
-"""A new plug-in as a package ready to install, from the templates beside this module."""
+"""A new plug-in as a package ready to install, from the templates next to this module."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ def write_plugin(name: str, kind: Kind, folder: Path) -> Path:
     """Write a package with one plug-in: pyproject, module, test, README.
 
     Args:
-        name: The plug-in's name: small letters, digits and single hyphens, a letter first.
-        kind: What it is.
-        folder: Where the package's own folder ``tracking3d-<name>`` goes; made if it is not there.
+        name: Name of the plug-in: lower-case letters, digits and single hyphens, a letter first.
+        kind: Kind of plug-in.
+        folder: Folder in which the package's folder ``tracking3d-<name>`` is created; created itself if needed.
 
     Returns:
         The package's folder.
 
     Raises:
-        InputError: If the name cannot be used or is taken, or the package's folder exists.
-        OutputError: If it cannot be written.
+        InputError: The name cannot be used or is taken, or the package's folder exists.
+        OutputError: The package cannot be written.
     """
     if not re.fullmatch(r"[a-z][a-z0-9]*(-[a-z0-9]+)*", name) or len(name) > 40:
         raise InputError(
-            f"'{name}' is no name for a plug-in; write it in small letters and digits with a letter first, and with "
-            "hyphens between words, such as my-tracker."
+            f"'{name}' cannot be the name of a plug-in; use lower-case letters and digits, a letter first, and hyphens "
+            "between words, such as my-tracker."
         )
     group = _GROUPS[kind]
     for plugin in registered_plugins():
@@ -43,7 +43,7 @@ def write_plugin(name: str, kind: Kind, folder: Path) -> Path:
     package = f"tracking3d-{name}"
     target = folder.expanduser() / package
     if target.exists():
-        raise InputError(f"{target} exists; choose another name or another --out.")
+        raise InputError(f"{target} already exists; choose another name or another --out.")
     module = package.replace("-", "_")
     words = {
         "name": name,

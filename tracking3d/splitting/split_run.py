@@ -10,10 +10,10 @@ from typing import Any
 from tracking3d.config.models import PipelineConfig
 from tracking3d.frames import SkippedFrame
 from tracking3d.passes import Listener
+from tracking3d.prompts import PromptSet
 from tracking3d.results.records import FrameRecord
 from tracking3d.splitting.beginning import begin
 from tracking3d.splitting.long_video import LongVideo, SplitResult
-from tracking3d.splitting.part_runs import InitialPrompt
 from tracking3d.splitting.processes import run_in_processes
 from tracking3d.splitting.steps import Step, steps_of
 
@@ -25,7 +25,7 @@ def record_in_parts(
     source: str | Path,
     config: PipelineConfig,
     folder: Path,
-    given: InitialPrompt,
+    prompts: PromptSet,
     *,
     length: str,
     workers: int = 2,
@@ -45,7 +45,7 @@ def record_in_parts(
         source: A video file, or a folder or pattern of images.
         config: The pipeline; of the solver ``online``, with its final refinement.
         folder: The run folder.
-        given: What the object is in the first frame.
+        prompts: What the object is in the first frame.
         length: Of a part, in seconds or frames, see `tracking3d.splitting.cutting.parse_length`.
         workers: Processes at a time.
         selection: ``START:STOP:STEP`` of the frames.
@@ -60,7 +60,7 @@ def record_in_parts(
         Tracking3dError: What was finished until then is kept, for ``resume``.
     """
     video = LongVideo(
-        str(source), config, folder, given, length, workers, selection, command, overwrite, resume
+        str(source), config, folder, prompts, length, workers, selection, command, overwrite, resume
     )
     told, map_jobs = _once(listener), map_jobs or partial(run_in_processes, workers=workers)
     begun = begin(told, video)

@@ -100,7 +100,7 @@ def test_a_side_that_nobody_knows_is_tracked_anew_and_said_to_lie_there_by_a_gue
     second = final(answers)[BACK:]
     assert state.guessed and len(state.aside) == 1
     assert all(answer.status is Status.LOST and GUESSED in answer.losses for answer in second[1:])
-    assert all("guess" in answer.reason and answer.confidence <= 0.05 for answer in second[1:])
+    assert all("re-initialized" in answer.reason and answer.confidence <= 0.05 for answer in second[1:])
     # Its masks are its own.
     assert all(answer.mask_source is not MaskSource.INITIAL for answer in second[-5:])
     assert rotation_errors(second).mean() < 4

@@ -8,14 +8,8 @@ import numpy as np
 import pytest
 from tracked_solids import degrees_between, disturbed, scene
 
-from tracking3d.bundle_adjustment import adjustment
 from tracking3d.bundle_adjustment.adjustment import AdjustmentProblem, Structure, Tracks, _damped, adjust
 from tracking3d.bundle_adjustment.reprojection import transform_to_camera
-
-
-@pytest.fixture(autouse=True, params=[True, False], ids=["compiled", "numpy"])
-def implementation(request, monkeypatch):
-    monkeypatch.setattr(adjustment, "compiled", lambda: request.param)
 
 
 def problem(given, fixed=1, free_focal=False, prior_weight=0.0):

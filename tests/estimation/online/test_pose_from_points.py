@@ -9,20 +9,15 @@ import torch
 from tracked_solids import degrees_between, scene
 
 from tracking3d.bundle_adjustment.reprojection import apply_pose_steps
-from tracking3d.estimation.online import pose_from_points as module
-from tracking3d.estimation.online.pose_from_points import (
-    point_equations,
-    pose_from_points,
-    pose_of_tracks,
-)
+from tracking3d.estimation.online.pose_from_points import pose_from_points, pose_of_tracks
 from tracking3d.rendering.normal_equations import NormalEquations
 
 THRESHOLD = 1.5
 
 
-@pytest.fixture(autouse=True, params=[True, False], ids=["compiled", "numpy"])
-def implementation(request, monkeypatch):
-    monkeypatch.setattr(module, "compiled", lambda: request.param)
+def point_equations(points, pixels, weight, K, R, t, scale):
+    """The equations at a pose."""
+    return pose_of_tracks(points, pixels, weight, K, R, t, scale, iterations=0).equations
 
 
 def seen(turn: float = 40.0, noise: float = 0.0, **settings):

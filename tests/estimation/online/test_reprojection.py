@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 from tracked_solids import intrinsics
+from twins.reprojection import pixel_by_point, pixel_by_pose
 
 from tracking3d.bundle_adjustment.reprojection import (
     apply_pose_steps,
     finite_rows,
-    pixel_by_point,
-    pixel_by_pose,
     project_camera_points,
     transform_to_camera,
 )

@@ -17,7 +17,7 @@ class _Batch(WithDefault):
 
 app = typer.Typer(
     cls=_Batch,
-    help="Track many videos, on this machine or on a Ray cluster; see how far that is.",
+    help="Track many videos, on this machine or on a Ray cluster, and show the progress.",
     no_args_is_help=True,
 )
 app.command(name="run")(run.run)

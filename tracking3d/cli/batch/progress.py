@@ -1,4 +1,4 @@
-"""What a batch shows while it goes on: a line a worker and one for all; or one line of JSON for all that happens."""
+"""Progress of a batch: one line per worker and one for the whole, or one line of JSON per event."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from tracking3d.batch.folder import BatchProgress as HowFar
 from tracking3d.batch.running import Happening, Listener
 
 _MOST_WORKERS = 32
-"""Lines of workers on the terminal."""
+"""Most lines of workers on the terminal."""
 _EVERY = 10.0  # seconds between two events of progress
 
 
 @contextmanager
 def show_batch_progress(quiet: bool, as_json: bool) -> Iterator[Listener]:
-    """Show how a batch goes on; yields what is to be told.
+    """Show the progress of a batch; yields the listener.
 
     Args:
         quiet: Show failures only.
@@ -72,13 +72,13 @@ def show_batch_progress(quiet: bool, as_json: bool) -> Iterator[Listener]:
 
 
 def in_words(progress: HowFar) -> str:
-    """How far a batch is, in a line."""
-    told = [f"{progress.finished} of {progress.total} videos"]
+    """The progress of a batch in one line."""
+    parts = [f"{progress.finished} of {progress.total} videos"]
     if progress.failed:
-        told.append(f"{progress.failed} failed")
+        parts.append(f"{progress.failed} failed")
     if progress.seconds_to_go is not None:
-        told.append(f"{_duration(progress.seconds_to_go)} to go")
-    return ", ".join(told)
+        parts.append(f"{_duration(progress.seconds_to_go)} left")
+    return ", ".join(parts)
 
 
 def _line(happening: Happening) -> str:
@@ -91,11 +91,11 @@ def _line(happening: Happening) -> str:
         note = f"; {rows[0]['note']}" if rows[0].get("note") else ""
         return f"{video}: {frames} frames in {seconds:.0f} s{sure}{note}"
     if happening.event == "again":
-        return f"{video} is tried again: {about['reason']}"
+        return f"{video} failed and is tried again: {about['reason']}"
     if happening.event == "failed":
         return f"{video} failed: {about['reason']}"
     if happening.event == "batch":
-        before = f", {happening.progress.before} of them before" if happening.progress.before else ""
+        before = f", {happening.progress.before} of them earlier" if happening.progress.before else ""
         return in_words(happening.progress) + before
     return ""
 

@@ -1,4 +1,4 @@
-"""``tracking3d batch status DIR``: how far a batch is, from anywhere that sees its folder."""
+"""``tracking3d batch status DIR``: progress of a batch, on any machine that can read its folder."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from typing import Annotated
 
 import typer
 
-from tracking3d.cli.options import Debug
+from tracking3d.cli.options import AsJson, Debug
 
 
 def status(
-    folder: Annotated[str, typer.Argument(metavar="DIR", help="What --out of the batch is.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON only.")] = False,
+    folder: Annotated[str, typer.Argument(metavar="DIR", help="Folder of the batch, its --out.")],
+    as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:
-    """Say how far the batch in DIR is: running, finished or stopped, what failed and why, and how long it will take."""
+    """Print the progress of the batch in DIR: its state, the time left, and which videos failed and why."""
     import json
     from dataclasses import asdict
 
@@ -29,8 +29,8 @@ def status(
     place = absolute(folder)
     progress, failures = read_progress(place), read_failures(place)
     if as_json:
-        told = {**asdict(progress), "failures": [asdict(one) for one in failures]}
-        typer.echo(json.dumps(told, indent=2))
+        document = {**asdict(progress), "failures": [asdict(one) for one in failures]}
+        typer.echo(json.dumps(document, indent=2))
         return
     table = Table(
         title=escape(f"{folder} ({progress.state_in_words})"), show_header=False, title_justify="left"
@@ -40,7 +40,7 @@ def status(
     for worker, about in progress.running.items():
         of = f" of {about['of']}" if about.get("of") else ""
         step = f", {about['step']}" if about.get("step") else ""
-        table.add_row(escape(worker), escape(f"{about['video']}{step}: {about.get('frames', 0)}{of} answers"))
+        table.add_row(escape(worker), escape(f"{about['video']}{step}: {about.get('frames', 0)}{of} frames"))
     for one in failures:
         table.add_row("failed", escape(f"{one.run}: {one.reason}"))
     print_table(table)

@@ -1,4 +1,4 @@
-"""``tracking3d evaluate``: score answers, run suites, fill the paper's tables, compare.
+"""``tracking3d evaluate``: score estimates, run suites, fill the paper's tables, compare.
 
 ``tracking3d evaluate ANSWERS --truth CLIP`` is short for ``tracking3d evaluate answers ANSWERS --truth CLIP``.
 """
@@ -19,7 +19,7 @@ class _Evaluate(WithDefault):
 
 app = typer.Typer(
     cls=_Evaluate,
-    help="Score answers against the truth, run suites, fill the paper's tables, compare.",
+    help="Score estimates against the ground truth, run suites, fill the paper's tables, compare.",
     no_args_is_help=True,
 )
 app.command(name=DEFAULT)(answers.score_answers)

@@ -1,4 +1,4 @@
-"""``tracking3d evaluate ANSWERS --truth CLIP``: score a run, or somebody else's results."""
+"""``tracking3d evaluate ANSWERS --truth CLIP``: score a run, or the results of another system."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from typing import Annotated, Any
 
 import typer
 
-from tracking3d.cli.options import Debug
+from tracking3d.cli.evaluate.options import Truth
+from tracking3d.cli.options import AsJson, Debug
 from tracking3d.errors import InputError
 
 
 class EstimateKind(StrEnum):
-    """Which answers of a run are scored."""
+    """Which estimates of a run are scored."""
 
     final = "final"
     causal = "causal"
@@ -24,36 +25,36 @@ def score_answers(
         Path,
         typer.Argument(
             metavar="ANSWERS",
-            help="Run folder, folder of masks, BOP csv, TUM trajectory, TAP-Vid pickle or COLMAP model.",
+            help="Estimates: run folder, mask folder, BOP CSV, TUM trajectory, TAP-Vid pickle or COLMAP model.",
         ),
     ],
-    truth: Annotated[Path, typer.Option(metavar="CLIP", help="Clip with frames/, masks/ and poses.json.")],
+    truth: Truth,
     form: Annotated[
         str | None,
-        typer.Option("--format", metavar="NAME", help="Format of the answers; recognised if left out."),
+        typer.Option("--format", metavar="NAME", help="Format of the estimates; detected if left out."),
     ] = None,
     options: Annotated[
         list[str] | None,
         typer.Option(
-            "--option", metavar="KEY=VALUE", help="Option of the format, such as of=camera; may be repeated."
+            "--option", metavar="KEY=VALUE", help="Option of that format, such as of=camera; may be repeated."
         ),
     ] = None,
     answers: Annotated[
         EstimateKind,
-        typer.Option(help="Of a run with a final refinement: score its final answers, or the causal ones."),
+        typer.Option(help="Score the estimates after the final refinement, or the causal ones before it."),
     ] = EstimateKind.final,
     offset: Annotated[
         int,
         typer.Option(
             metavar="N",
-            help="Of a run: its frame i is frame i + N of the clip; default 0.",
+            help="Offset of a run: its frame i is frame i + N of the clip; default 0.",
             show_default=False,
         ),
     ] = 0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON only.")] = False,
+    as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:
-    """Score ANSWERS against the truth of the clip in CLIP."""
+    """Score ANSWERS against the ground truth in CLIP."""
     import json
     from dataclasses import asdict
 
@@ -71,8 +72,8 @@ def score_answers(
         typer.echo(f"{results} is read as {kind}.", err=True)
     if not as_json:
         typer.echo(f"{given.matched(len(known.frames))}.", err=True)
-    if kind == A_RUN_FOLDER and (told := RunReader(results).not_finished):
-        typer.echo(told, err=True)
+    if kind == A_RUN_FOLDER and (warning := RunReader(results).not_finished):
+        typer.echo(warning, err=True)
     scores = score(given, known)
     if as_json:
         typer.echo(json.dumps(asdict(scores), indent=2))
@@ -81,11 +82,11 @@ def score_answers(
 
 
 def _read_options(items: list[str] | None) -> dict[str, Any]:
-    """``KEY=VALUE`` items; a value is YAML."""
+    """Read ``KEY=VALUE`` items; a value is YAML."""
     from tracking3d.config.yaml_files import parse_yaml
 
     pairs = [item.partition("=") for item in items or ()]
     for key, equals, value in pairs:
         if not key.isidentifier() or not equals:
-            raise InputError(f"--option {key}{equals}{value} cannot be read; write it as KEY=VALUE.")
+            raise InputError(f"--option {key}{equals}{value} is not KEY=VALUE; write it like of=camera.")
     return {key: parse_yaml(value, f"--option {key}={value}") for key, _, value in pairs}

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tracking3d.cli.evaluate.options import Data, Jobs, Masks, Out, Sequences
-from tracking3d.cli.options import Debug, Quiet, configure
+from tracking3d.cli.options import AsJson, Debug, Quiet, configure
+from tracking3d.cli.options.panels import DATA
 from tracking3d.errors import InputError
 
 if TYPE_CHECKING:
@@ -19,26 +20,30 @@ def compare(
     a: Annotated[
         str,
         typer.Argument(
-            metavar="A", help="Results of `evaluate suite` (.json), a configuration, or a preset."
+            metavar="A", help="Result file of `evaluate suite` (.json), a configuration file, or a preset."
         ),
     ],
-    b: Annotated[str, typer.Argument(metavar="B", help="The same, to be compared with A.")],
+    b: Annotated[str, typer.Argument(metavar="B", help="The same, to compare with A.")],
     suite: Annotated[
         str,
-        typer.Option(metavar="NAME", help="Dataset that configurations are run on; see `evaluate suite`."),
+        typer.Option(
+            metavar="NAME",
+            help="Dataset to run configurations on; see `evaluate suite`.",
+            rich_help_panel=DATA,
+        ),
     ] = "standard",
     data: Data = None,
     masks: Masks = "tracker",
     sequences: Sequences = None,
-    jobs: Jobs = 1,
     out: Out = Path("benchmark"),
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON only.")] = False,
+    jobs: Jobs = 1,
+    as_json: AsJson = False,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
     """Compare two sets of results, or two configurations, sequence by sequence.
 
-    Prints the mean difference of every measure with its 95 % interval over the sequences.
+    Prints the mean difference of every measure, with its 95 % confidence interval over the sequences.
     """
     import json
     from dataclasses import asdict
@@ -55,7 +60,7 @@ def compare(
     if all(given):
         of_a, of_b = read_results(Path(a)), read_results(Path(b))
     elif any(given):
-        raise InputError("Compare two files of results, or two configurations; not one of each.")
+        raise InputError("Give two result files or two configurations, not one of each.")
     else:
         variants = [_variant(name, masks) for name in (a, b)]
         with making_progress(quiet) as made:

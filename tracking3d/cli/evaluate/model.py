@@ -1,4 +1,4 @@
-"""``tracking3d evaluate model RUN...``: what the mesh of a run is worth, by pictures left out and by the true shape."""
+"""``tracking3d evaluate model RUN...``: score the mesh of a run, on held-out frames and against the true shape."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
-from tracking3d.cli.options import Debug
+from tracking3d.cli.model import Largest
+from tracking3d.cli.options import AsJson, Debug
+from tracking3d.cli.options.panels import DATA
 from tracking3d.errors import InputError
 
 _COLUMNS = {
@@ -19,7 +21,7 @@ _COLUMNS = {
     "shape_f_score_fitted": ("F 2 % fitted", "{:.3f}"),
     "shape_f_score_fine_fitted": ("F 1 % fitted", "{:.3f}"),
     "shape_normals": ("normals", "{:.3f}"),
-    "shape_genus_error": ("genus off", "{:d}"),
+    "shape_genus_error": ("genus error", "{:d}"),
 }
 
 
@@ -27,22 +29,28 @@ def score_models(
     runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Run folders.")],
     truth: Annotated[
         list[Path] | None,
-        typer.Option(metavar="CLIP", help="Clip with the true mesh; as many as runs, in their order."),
+        typer.Option(
+            metavar="CLIP",
+            help="Clip with the true mesh; one for each run, in the same order.",
+            rich_help_panel=DATA,
+        ),
     ] = None,
     source: Annotated[
         list[str] | None,
         typer.Option(
-            help="The video, where it is no longer where the run names it; as many as runs, in their order."
+            metavar="VIDEO",
+            help="Path of the video, if it has moved since the run; one for each run, in the same order.",
+            rich_help_panel=DATA,
         ),
     ] = None,
-    largest: Annotated[int, typer.Option(min=64, max=8192, help="Most texels along a side.")] = 2048,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON only.")] = False,
+    largest: Largest = 2048,
+    as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:
-    """Score the meshes of runs: as pictures of frames that they were not made from, and beside the true shape.
+    """Score the meshes of runs: by rendering held-out frames, and against the true shape.
 
-    Every eighth believed frame is left out of the texture, as `tracking3d model --quality fine` leaves it out of the
-    shape; its pose alone is fitted. Nothing is written.
+    Every eighth reliable frame is held out of the texture, as `tracking3d model --quality fine` holds it out of the
+    shape; only its pose is fitted. Nothing is written.
     """
     import json
 
@@ -54,7 +62,7 @@ def score_models(
     for name, given in (("--truth", truth), ("--source", source)):
         if given and len(given) != len(runs):
             raise InputError(
-                f"{name} is given {len(given)} times for {len(runs)} runs; give it once for each, in their order."
+                f"{name} is given {len(given)} times for {len(runs)} runs; give it once for each, in the same order."
             )
     scores = {
         str(run): _scores(run, truth[n] if truth else None, source[n] if source else None, largest)
@@ -77,18 +85,18 @@ def _scores(run: Path, clip: Path | None, source: str | None, largest: int) -> d
 
     found = asdict(explained_run(run, source, largest))
     if clip is not None:
-        found |= asdict(_beside_truth(run, clip))
+        found |= asdict(_against_truth(run, clip))
     return found
 
 
-def _beside_truth(run: Path, clip: Path) -> Any:
+def _against_truth(run: Path, clip: Path) -> Any:
     from tracking3d.datasets.clip import read_truth
     from tracking3d.datasets.run_answers import answers_of_run
     from tracking3d.evaluation.score import score_mesh
 
     truth = read_truth(clip)
     if truth.mesh is None:
-        raise InputError(f"{clip} has no mesh.obj, so there is no true shape to compare with.")
+        raise InputError(f"{clip} has no mesh.obj, which is the true shape; leave out --truth.")
     return score_mesh(answers_of_run(run, truth), truth)
 
 

@@ -7,37 +7,68 @@ from typing import Annotated
 
 import typer
 
+from tracking3d.cli.options.panels import DATA, OUTPUT, PERFORMANCE
+
 Data = Annotated[
     Path | None,
     typer.Option(
-        metavar="DIR", help="Where the dataset lies; synthetic suites are made in OUT/data if left out."
+        metavar="DIR",
+        help="Folder of the dataset; synthetic suites are rendered into OUT/data if left out.",
+        rich_help_panel=DATA,
     ),
 ]
 Masks = Annotated[
     str,
     typer.Option(
         metavar="SOURCE",
-        help="Initial masks: tracker, truth, initial, degraded:IOU, noise:PIXELS, hand, or a folder with one of masks "
-        "a sequence.",
+        help="Initial masks: tracker, truth, initial, degraded:IOU, noise:PIXELS, hand, or a folder with a mask folder "
+        "for each sequence.",
+        rich_help_panel=DATA,
     ),
 ]
 Sequences = Annotated[
     list[str] | None,
-    typer.Option("--sequence", metavar="PATTERN", help="Only sequences that match; may be repeated."),
+    typer.Option(
+        "--sequence",
+        metavar="PATTERN",
+        help="Use only sequences whose name matches; may be repeated.",
+        rich_help_panel=DATA,
+    ),
 ]
-Jobs = Annotated[int, typer.Option(min=1, max=256, help="Sequences run at the same time.")]
+Jobs = Annotated[
+    int,
+    typer.Option(
+        metavar="N",
+        min=1,
+        max=256,
+        help="Sequences processed at the same time.",
+        rich_help_panel=PERFORMANCE,
+    ),
+]
 Address = Annotated[
     str | None,
     typer.Option(
         metavar="ADDRESS",
-        help="Run them on a Ray cluster: auto, HOST:PORT, ray://HOST:PORT, or local for this machine.",
+        help="Ray cluster to run on: auto, HOST:PORT, ray://HOST:PORT, or local to start Ray on this machine.",
+        rich_help_panel=PERFORMANCE,
     ),
 ]
-Out = Annotated[Path, typer.Option(metavar="DIR", help="Folder for data, runs, results and tables.")]
+Out = Annotated[
+    Path,
+    typer.Option(metavar="DIR", help="Folder for data, runs, results and tables.", rich_help_panel=OUTPUT),
+]
+Truth = Annotated[
+    Path,
+    typer.Option(
+        metavar="CLIP",
+        help="Clip with the ground truth: frames/, masks/ and poses.json.",
+        rich_help_panel=DATA,
+    ),
+]
 
 
 def name_of_settings(config: Path | None, preset: str | None, overrides: list[str] | None, masks: str) -> str:
-    """What results are called when nobody says."""
+    """The default label of results: the settings that differ from the default."""
     parts = [config.stem if config else "", preset or ("" if config else "default"), *(overrides or ())]
     source = "" if masks == "tracker" else f"masks {Path(masks).name}"
     return " ".join(part for part in (*parts, source) if part)

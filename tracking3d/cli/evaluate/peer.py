@@ -1,4 +1,4 @@
-"""``tracking3d evaluate peer``: another system's answers on the same clip, by the same measures."""
+"""``tracking3d evaluate peer``: score the estimates of another system on the same clip, by the same measures."""
 
 from __future__ import annotations
 
@@ -7,22 +7,25 @@ from typing import Annotated
 
 import typer
 
-from tracking3d.cli.options import Debug
+from tracking3d.cli.evaluate.options import Truth
+from tracking3d.cli.options import AsJson, Debug
 from tracking3d.errors import InputError
 
 PEERS = ("colmap",)
 
 
 def peer(
-    system: Annotated[str, typer.Argument(metavar="SYSTEM", help="colmap.")],
-    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Its text or binary model of the clip.")],
-    truth: Annotated[Path, typer.Option(metavar="CLIP", help="Clip with frames/, masks/ and poses.json.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON only.")] = False,
+    system: Annotated[str, typer.Argument(metavar="SYSTEM", help="Name of the system: colmap.")],
+    model: Annotated[
+        Path, typer.Argument(metavar="MODEL", help="The system's model of the clip, as text or binary.")
+    ],
+    truth: Truth,
+    as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:
-    """Score what another system made of the clip in CLIP; frames that it has no pose for count as lost.
+    """Score what another system estimated on the clip in CLIP; frames without a pose count as lost.
 
-    COLMAP runs by itself, on the clip's frames with the object's masks; MODEL is the folder it wrote.
+    Run COLMAP yourself, on the clip's frames with the masks of the object; MODEL is the folder that it wrote.
     """
     if system not in PEERS:
         raise InputError(f"The system '{system}' is unknown; choose one of {', '.join(PEERS)}.")

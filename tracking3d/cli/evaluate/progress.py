@@ -1,4 +1,4 @@
-"""What the commands of ``tracking3d evaluate`` show while sequences are made and run."""
+"""Progress of the commands of ``tracking3d evaluate``, while sequences are rendered and run."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from tracking3d.benchmark.pool import JobOutcome, Listener
 
 @contextmanager
 def making_progress(quiet: bool) -> Iterator[Callable[[str], None]]:
-    """Says on the standard error which sequence of a suite was made; yields the listener."""
-    yield (lambda name: None) if quiet else (lambda name: typer.echo(f"made {name}", err=True))
+    """Print each rendered sequence of a suite on the standard error; yields the listener."""
+    yield (lambda name: None) if quiet else (lambda name: typer.echo(f"rendered {name}", err=True))
 
 
 @contextmanager
@@ -41,8 +41,8 @@ def _line(outcome: JobOutcome) -> str:
     if outcome.scores is None:
         return f"{what} failed: {outcome.error}"
     scores = outcome.scores
-    told = [f"IoU {scores['iou_mean']:.3f}"] if scores["iou_mean"] is not None else []
+    parts = [f"IoU {scores['iou_mean']:.3f}"] if scores["iou_mean"] is not None else []
     if scores["rotation_error_mean_deg"] is not None:
-        told.append(f"rotation {scores['rotation_error_mean_deg']:.1f} degrees")
-    took = "done before" if outcome.cached else f"{outcome.seconds:.0f} s"
-    return f"{what}: {', '.join([*told, took])}"
+        parts.append(f"rotation {scores['rotation_error_mean_deg']:.1f} degrees")
+    took = "from an earlier run" if outcome.cached else f"{outcome.seconds:.0f} s"
+    return f"{what}: {', '.join([*parts, took])}"

@@ -1,4 +1,4 @@
-"""``tracking3d evaluate spread``: how far answers part where they should not."""
+"""``tracking3d evaluate spread``: how much estimates vary if they should be equal."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quiet, 
 
 
 def spread(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="A dataset, as for evaluate suite.")] = "smoke",
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Dataset, as for `evaluate suite`.")] = "smoke",
     data: Data = None,
     masks: Masks = "tracker",
     sequences: Sequences = None,
@@ -21,21 +21,21 @@ def spread(
         typer.Option(
             "--variant",
             metavar="PATTERN",
-            help="Only variants that match, beside it as it is; may be repeated.",
+            help="Run only variants whose name matches, besides the unchanged one; may be repeated.",
         ),
     ] = None,
     config: ConfigFile = None,
     preset: Preset = None,
     overrides: Overrides = None,
-    jobs: Jobs = 1,
     out: Out = Path("benchmark"),
+    jobs: Jobs = 1,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Run sequences with other processors' kernels, another renderer and next to no noise: how far do answers part?
+    """Measure how much estimates vary with the processor's kernels, the renderer, and tiny noise on the images.
 
-    Prints mean, spread and worst case of every measure, and which sequences are tracked here and lost there. Writes
-    DIR/tables/spread-NAME-MASKS.md and .json; runs lie in DIR/runs and are not repeated.
+    Prints mean, spread and worst case of every measure, and which sequences some variants track and others lose. Writes
+    DIR/tables/spread-NAME-MASKS.md and .json; runs are kept in DIR/runs and are not repeated.
     """
     from tracking3d.benchmark.sequences import open_dataset
     from tracking3d.benchmark.spread import describe_flips, format_spreads, run_spread, write_spreads

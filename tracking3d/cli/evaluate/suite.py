@@ -1,4 +1,4 @@
-"""``tracking3d evaluate suite``: every sequence of a dataset, in parallel, cached."""
+"""``tracking3d evaluate suite``: run and score every sequence of a dataset, in parallel."""
 
 from __future__ import annotations
 
@@ -17,33 +17,31 @@ def suite(
         str,
         typer.Argument(
             metavar="NAME",
-            help="smoke, standard, hard, full, fresh (synthetic), real, the layout of a dataset, or a YAML file of "
-            "one.",
+            help="Dataset: smoke, standard, hard, full or fresh (synthetic), real, the name of a dataset layout, or a "
+            "YAML file with one.",
         ),
     ],
-    seed: Annotated[
-        int | None, typer.Option(metavar="N", help="Of the suite fresh: what its sequences are drawn from.")
-    ] = None,
+    seed: Annotated[int | None, typer.Option(metavar="N", help="Random seed of the suite 'fresh'.")] = None,
     count: Count = None,
     meshes: Meshes = None,
     data: Data = None,
     masks: Masks = "tracker",
     sequences: Sequences = None,
-    label: Annotated[str | None, typer.Option(help="What tables call the results.")] = None,
+    label: Annotated[str | None, typer.Option(metavar="NAME", help="Label of the results in tables.")] = None,
     config: ConfigFile = None,
     preset: Preset = None,
     quality: Quality = None,
     overrides: Overrides = None,
+    out: Out = Path("benchmark"),
     jobs: Jobs = 1,
     address: Address = None,
-    out: Out = Path("benchmark"),
-    as_json: Annotated[bool, typer.Option("--json", help="Print the file of the results only.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print only the path of the result file.")] = False,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Run and score every sequence of a dataset; what was done before is not done again.
+    """Run and score every sequence of a dataset; finished sequences are not run again.
 
-    Writes the scores to DIR/results/LABEL-NAME.json; runs lie in DIR/runs.
+    Writes the scores to DIR/results/LABEL-NAME.json, and keeps the runs in DIR/runs.
     """
     from tracking3d.benchmark.results import format_results, write_results
     from tracking3d.benchmark.sequences import open_dataset

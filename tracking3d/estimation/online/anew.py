@@ -38,7 +38,8 @@ _MOST_VIEWS = 24  # of another map that a keyframe is compared with
 _MOST_ASIDE = 4
 _WORSE = 1.2  # times what keyframes cost, from which two maps are none
 _REASON = (
-    "lost before and started anew: how this side lies to those seen before is a guess until one is seen again"
+    "re-initialized after tracking was lost; the pose relative to the earlier map is unknown until a known side is "
+    "seen"
 )
 
 

@@ -139,7 +139,7 @@ class ObjectMap:
 
 @dataclass(frozen=True, eq=False)
 class Aside:
-    """A map that the object is not tracked against now: nothing known tells how the present one lies to it.
+    """An inactive map; its transform to the active map is unknown.
 
     Attributes:
         known: The map.

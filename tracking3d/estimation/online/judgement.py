@@ -26,12 +26,12 @@ _TERMS = {  # weight, and the range that was seen
     "stiffness": (0.4711, -2.815, 2.374),
 }
 _REASONS = {
-    "missed": "the pose and the mask overlap too little ({fit.overlap:.2f})",
-    "unseen": "much of what is seen was never seen before (share {fit.unseen:.2f})",
-    "witnesses": "too few points agree ({support.witnesses})",
-    "strays": "too many points are elsewhere (share {support.strays:.2f})",
-    "points": "the points agree too loosely (loss {fit.points:.2f})",
-    "stiffness": "hardly anything holds the object against turning about the camera's axis ({axis})",
+    "missed": "the silhouette overlaps the mask too little (IoU {fit.overlap:.2f})",
+    "unseen": "much of the visible surface was never seen before (share {fit.unseen:.2f})",
+    "witnesses": "too few point inliers ({support.witnesses})",
+    "strays": "too many point outliers (share {support.strays:.2f})",
+    "points": "the reprojection error of the points is high (loss {fit.points:.2f})",
+    "stiffness": "rotation about camera axis ({axis}) is poorly constrained",
 }
 _DOUBTED = 0.4  # confidence at most where points agree and pixels do not
 _BY_OUTLINE = 0.2  # confidence at most where only the outline agrees
@@ -71,9 +71,9 @@ class Support:
 
 @dataclass(frozen=True)
 class Usual:
-    """What frames that were tracked have cost so far: running means, which stay near those of the first sound frames.
+    """Running mean losses of tracked frames, clamped near those of the first 15.
 
-    What follows a decay does not notice it.
+    So a slow drift cannot raise the baseline.
 
     Attributes:
         appearance: Appearance loss.
@@ -203,21 +203,19 @@ def judge(
     odd = unusual(fit, usual, support.mask_weight)
     far, few = odd > 1, not support.settles
     if few and not support.has_mask:
-        return Assessment(Status.LOST, "the object is out of sight: no mask, and no points of it", 0.05)
+        return Assessment(Status.LOST, "the object is out of sight: no mask and no points", 0.05)
     if far and guessed and not few:
-        return Assessment(Status.LOST, "no pose explains the frame; the best of many turns is a guess", 0.05)
+        return Assessment(Status.LOST, "no pose hypothesis explains the frame", 0.05)
     confidence = likelihood(fit, support)
     by_outline = support.plain and support.has_mask and fits_outline(fit, usual)
     if few and far and by_outline:
-        reason = (
-            f"the outline agrees, pixels do not (loss {fit.appearance:.2f}, usually {usual.appearance:.2f})"
-        )
+        reason = f"the outline agrees, the pixels do not (loss {fit.appearance:.2f}, usually {usual.appearance:.2f})"
         return Assessment(Status.UNCERTAIN, reason, min(confidence, _BY_OUTLINE))
     if few and far:
         pixels = f"neither pixels (loss {fit.appearance:.2f}, usually {usual.appearance:.2f})"
         mask, points = f"the mask (overlap {fit.overlap:.2f})", f"points ({support.witnesses})"
         if fits_outline(fit, usual):
-            reason = f"{pixels} nor {points} agree with any pose, though one fits {mask}"
+            reason = f"{pixels} nor {points} agree with any pose, although one fits {mask}"
         else:
             reason = f"{pixels}, nor {mask}, nor {points} agree with any pose"
         return Assessment(Status.LOST, reason, 0.05)
@@ -228,10 +226,12 @@ def judge(
     if astray and few and confidence < BELIEVED:
         status = Status.UNCERTAIN if by_outline and odd <= 0 else Status.LOST
         return Assessment(
-            status, "what was found after the loss may be something else", min(confidence, _BY_OUTLINE)
+            status,
+            "the object found after tracking was lost may be a different one",
+            min(confidence, _BY_OUTLINE),
         )
     if far:
-        reason = f"points agree, pixels do not (loss {fit.appearance:.2f})"
+        reason = f"the points agree, the pixels do not (loss {fit.appearance:.2f})"
         return Assessment(Status.UNCERTAIN, reason, min(confidence, _DOUBTED))
     if confidence >= BELIEVED:
         return Assessment(Status.TRACKED, "", confidence)
@@ -241,7 +241,7 @@ def judge(
 def _doubt(fit: PoseFit, support: Support) -> str:
     """What speaks most against a pose, in words."""
     if not support.settles and fit.unseen > _MOSTLY:
-        return "a side that was never seen before: only the outline and the motion so far tell the pose"
+        return "a side never seen before: only outline and motion constrain the pose"
     odds = _odds(fit, support)
     best = {name: weight * (high if weight > 0 else low) for name, (weight, low, high) in _TERMS.items()}
     worst = max(odds, key=lambda name: best[name] - odds[name])

@@ -1,0 +1,95 @@
+"""Groups of options: a command takes frozen dataclasses, the command line has one option for each of their fields."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from tracking3d.cli import app
+from tracking3d.cli.options import Quiet, grouped, panels
+
+
+@dataclass(frozen=True)
+class Shape:
+    size: Annotated[int, typer.Option(help="Side.")]
+    names: Annotated[list[str] | None, typer.Option("--name", help="Names.")] = None
+
+
+@dataclass(frozen=True)
+class Paint:
+    colour: Annotated[str, typer.Option(help="Colour.")] = "red"
+
+
+def called(*words: str) -> tuple[object, ...]:
+    """What a command with two groups is called with."""
+    received = []
+
+    @grouped
+    def draw(
+        target: Annotated[str, typer.Argument()], shape: Shape, paint: Paint, quiet: Quiet = False
+    ) -> None:
+        received.append((target, shape, paint, quiet))
+
+    program = typer.Typer()
+    program.command()(draw)
+    assert CliRunner().invoke(program, list(words)).exit_code == 0
+    return received[0]
+
+
+def test_options_arrive_in_their_groups():
+    words = ("page", "--size", "3", "--name", "a", "--name", "b", "--colour", "blue", "--quiet")
+    assert called(*words) == ("page", Shape(3, ["a", "b"]), Paint("blue"), True)
+
+
+def test_options_left_out_have_the_defaults_of_the_fields():
+    assert called("page", "--size", "3") == ("page", Shape(3, None), Paint("red"), False)
+
+
+def test_a_field_without_a_default_is_a_required_option():
+    @grouped
+    def draw(shape: Shape) -> None:
+        raise AssertionError("called without its required option")
+
+    program = typer.Typer()
+    program.command()(draw)
+    result = CliRunner().invoke(program, [])
+    assert result.exit_code == 2
+    assert "--size" in result.output
+
+
+def test_two_options_of_one_name_are_refused():
+    def draw(paint: Paint, colour: Annotated[str, typer.Option()] = "") -> None: ...
+
+    with pytest.raises(TypeError, match=r"^draw has two options named colour\.$"):
+        grouped(draw)
+
+
+def commands(command, path: str = "tracking3d"):
+    if not hasattr(command, "commands"):
+        yield path, command
+        return
+    for name, inner in command.commands.items():
+        yield from commands(inner, f"{path} {name}")
+
+
+SHARED = {
+    **dict.fromkeys(("--config", "--preset", "--quality", "--set"), panels.SETTINGS),
+    **dict.fromkeys(("--fov", "--intrinsics"), panels.CAMERA),
+    "--out": panels.OUTPUT,
+    "--frames": panels.VIDEO,
+    "--jobs": panels.PERFORMANCE,
+    "--workers": panels.PERFORMANCE,
+}
+
+
+@pytest.mark.parametrize("command", ["run", "pick", "batch run", "evaluate suite", "evaluate table"])
+def test_an_option_stands_in_the_same_panel_in_every_command(command):
+    found = dict(commands(typer.main.get_command(app)))[f"tracking3d {command}"]
+    shared = [parameter for parameter in found.params if parameter.opts[0] in SHARED]
+    assert shared
+    for parameter in shared:
+        assert parameter.rich_help_panel == SHARED[parameter.opts[0]], parameter.opts[0]
