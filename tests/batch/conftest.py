@@ -28,7 +28,7 @@ def videos(tmp_path):
 
 
 class Recorded:
-    """Stands for `tracking3d.recording.record`: a run of two frames is there at once, unless it is told to fail first.
+    """Stands for `tracking3d.recording.record_tracking`: two frames are there at once, unless it is to fail first.
 
     Args:
         run: That run.
@@ -43,8 +43,13 @@ class Recorded:
         self.calls: list[dict[str, Any]] = []
         self.faults: dict[str, list[BaseException]] = {}
 
-    def __call__(self, source: Any, config: Any, folder: Path, *, listener: Any, **about: Any) -> None:
-        self.calls.append({"source": source, "config": config, "folder": folder, **about})
+    def __call__(self, request: Any, folder: Path, options: Any, listener: Any) -> None:
+        several = request.prompts.as_lists
+        for number in range(max(len(request.prompts), 1)):
+            self._one(request.source, folder / f"object_{number}" if several else folder, options, listener)
+
+    def _one(self, source: Any, folder: Path, options: Any, listener: Any) -> None:
+        self.calls.append({"source": source, "folder": folder, "resume": options.resume})
         faults = next((faults for part, faults in self.faults.items() if part in source.name), [])
         shutil.rmtree(folder, ignore_errors=True)
         if faults:
@@ -52,13 +57,8 @@ class Recorded:
             raise faults.pop(0)
         for frame in source:
             listener(frame)
+        folder.parent.mkdir(parents=True, exist_ok=True)
         shutil.copytree(self._run, folder)
-
-    def several(self, source: Any, config: Any, folder: Path, *, boxes, masks, points, **about: Any) -> None:
-        """Stands for `tracking3d.recording.record_objects`."""
-        folder.mkdir(parents=True, exist_ok=True)
-        for number in range(len(boxes) + len(masks) + len(points)):
-            self(source, config, folder / f"object_{number}", **about)
 
 
 @pytest.fixture(scope="session")
@@ -75,8 +75,7 @@ def finished_run(tmp_path_factory):
 @pytest.fixture
 def recorded(monkeypatch, finished_run):
     record = Recorded(finished_run)
-    monkeypatch.setattr(one_video, "record", record)
-    monkeypatch.setattr(one_video, "record_objects", record.several)
+    monkeypatch.setattr(one_video, "record_tracking", record)
     return record
 
 

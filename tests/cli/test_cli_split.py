@@ -37,7 +37,7 @@ def test_what_is_given_reaches_the_library(call, clip, parts):
     )
     assert result.exit_code == 0, result.output
     [((_, config, folder, given), named)] = asked
-    assert (folder, given.boxes, config.solver.name) == (Path("run"), [(20, 10, 20, 20)], "online")
+    assert (folder, list(given.boxes), config.solver.name) == (Path("run"), [(20, 10, 20, 20)], "online")
     assert (named["length"], named["workers"], named["selection"]) == ("40f", 3, "0:4")
     assert (named["resume"], named["overwrite"]) == (True, False)
     assert "summary of run" in result.stdout
