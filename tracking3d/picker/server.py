@@ -162,11 +162,11 @@ class _Handler(BaseHTTPRequestHandler):
         elif found := _FRAME.fullmatch(path):
             picture = picker.session.picture(int(found[1]))
             if picture is None:
-                self._refuse(HTTPStatus.NOT_FOUND, "There is no such frame, or it cannot be read.")
+                self._refuse(HTTPStatus.NOT_FOUND, "The frame does not exist or cannot be read.")
             else:
                 self._send(HTTPStatus.OK, picture, "image/jpeg")
         else:
-            self._refuse(HTTPStatus.NOT_FOUND, "There is no such page.")
+            self._refuse(HTTPStatus.NOT_FOUND, "This page does not exist.")
 
     def do_POST(self) -> None:
         if not self._may(from_page=True) or (body := self._body()) is None:
@@ -176,7 +176,7 @@ class _Handler(BaseHTTPRequestHandler):
         except Tracking3dError as error:
             return self._refuse(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
         if done is None:
-            return self._refuse(HTTPStatus.NOT_FOUND, "There is no such page.")
+            return self._refuse(HTTPStatus.NOT_FOUND, "This page does not exist.")
         told, then = done
         self._send_json(told)
         then()
@@ -204,11 +204,11 @@ class _Handler(BaseHTTPRequestHandler):
         """What the request brings; None where it is refused for that."""
         told = self._one("Content-Length") or ""
         if not re.fullmatch(r"\d{1,12}", told) or self.headers.get("Transfer-Encoding"):
-            self._refuse(HTTPStatus.LENGTH_REQUIRED, "Say how long it is.")
+            self._refuse(HTTPStatus.LENGTH_REQUIRED, "The request has no Content-Length.")
         elif self._one("Content-Type") != "application/json":
-            self._refuse(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "Send JSON.")
+            self._refuse(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "The request is not JSON.")
         elif int(told) > LARGEST_BODY:
-            self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "That is too much.")
+            self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "The request is too large.")
         else:
             body = self.rfile.read(int(told))
             return body if len(body) == int(told) else None  # a browser that went away in the middle
@@ -241,7 +241,8 @@ def _listening(picker: Picker, host: str, port: int) -> _Server:
         except OSError as error:
             problem = error
     raise InputError(
-        f"No page can be served on {host}, port {port}: {problem.strerror}; choose another --host or --port."
+        f"The page cannot be served on {host}, port {port}: {problem.strerror}; choose another --host or "
+        "--port."
     )
 
 

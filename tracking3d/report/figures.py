@@ -17,22 +17,22 @@ from tracking3d.results.run_reader import RunReader
 from tracking3d.runtime.stage_times import STAGES, StageTimes
 
 _MEANINGS = {
-    "decode": "reading the frame",
-    "track": "the mask tracker",
+    "decode": "decoding the frame",
+    "track": "mask tracker",
     "encode": "features",
-    "solve": "the pose",
+    "solve": "pose",
     "map": "shape and texture",
-    "write": "masks and pictures",
+    "write": "writing masks and pictures",
 }
 
 
 def status_counts(records: Sequence[FrameRecord]) -> dict[str, int]:
-    """How many answers have each status."""
+    """How many estimates have each status."""
     return {status.value: sum(record.status is status for record in records) for status in Status}
 
 
 def reliable_poses(records: Sequence[FrameRecord]) -> NDArray[np.float64]:
-    """``(N, 4, 4)`` poses; NaN where the object was lost or that is no pose."""
+    """``(N, 4, 4)`` poses; NaN if the object was lost or the pose is invalid."""
     poses = np.full((len(records), 4, 4), np.nan)
     for number, record in enumerate(records):
         if record.status is not Status.LOST and is_rigid(record.T_cam_obj):

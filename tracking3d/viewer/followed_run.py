@@ -27,7 +27,7 @@ _MOST_AT_ONCE = 2**26
 
 @dataclass(frozen=True)
 class Streak:
-    """Frames in a row that the run doubts for one reason.
+    """Consecutive frames that are uncertain or lost for the same reason.
 
     Attributes:
         first: Index of the first frame.
@@ -158,7 +158,7 @@ class FollowedRun:
             return False
         whole = text[: text.rfind(b"\n") + 1]
         if not whole and len(text) > LONGEST_LINE:
-            raise InputError(f"{path} is damaged: a line of it has no end; restore it.")
+            raise InputError(f"{path} is damaged: one of its lines has no end; restore it.")
         self._read += len(whole)
         for line in whole.splitlines():
             try:

@@ -58,7 +58,8 @@ def start_server(access: Access, port: int) -> viser.ViserServer:
     if not guard.in_place:
         server.stop()
         raise PluginError(
-            f"viser {viser.__version__} cannot be guarded against other pages; install a version of tracking3d[view]."
+            f"viser {viser.__version__} cannot be protected from other web pages; install the version "
+            "required by tracking3d[view]."
         )
     guard.port = server.get_port()
     return server
@@ -110,7 +111,7 @@ class _Guard:
             async def recv(self, decode: bool | None = None) -> Any:
                 message = await super().recv(decode)
                 if not isinstance(message, bytes) or _UPLOAD in message:
-                    await self.close(1008, "not asked for")
+                    await self.close(1008, "not requested")
                     message = await super().recv(decode)  # raises that it is closed
                 return message
 

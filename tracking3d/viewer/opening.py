@@ -64,7 +64,7 @@ def open_viewer(
     for folder in folders:
         runs = runs_in(folder)
         if not runs:
-            raise InputError(f"{folder} holds no run; give a folder that --out of `tracking3d run` was.")
+            raise InputError(f"{folder} holds no run; give the --out folder of a `tracking3d run`.")
         own = images or images_of_run(str(runs[0].description.get("source", "")), runs[0].folder)
         corrections += [RunCorrection(run, own, source, access) for run in runs]
         videos.append(Video(folder.name or str(folder), runs, own or _drawn_images_of(runs[0])))

@@ -68,7 +68,7 @@ def draw_picture(
     width, height = max(round(camera.width * scale), 1), max(round(camera.height * scale), 1)
     if image is None:
         picture = np.full((height, width, 3), _GREY, np.uint8)
-        drawing.draw_text(picture, "this frame is not at hand", 12, 30, 12, drawing.INK)
+        drawing.draw_text(picture, "the image of this frame is not available", 12, 30, 12, drawing.INK)
     else:
         picture = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8)
     thin = max(round(width / 640), 1)
@@ -168,7 +168,7 @@ def _draw_axes(
 
 
 def _draw_frame_of_doubt(picture: Image, records: Iterable[FrameRecord | None], thickness: int) -> None:
-    """A border in the colour of the worst status, where there is a doubt."""
+    """A border in the colour of the worst status if a frame is uncertain or lost."""
     known = {record.status for record in records if record is not None}
     for status in (Status.LOST, Status.UNCERTAIN):
         if status in known:

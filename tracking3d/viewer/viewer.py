@@ -130,8 +130,8 @@ class Viewer:
             box.on_update(lambda _: self._want())
         keys: dict[str, tuple[str, Callable[[], None]]] = {
             "P": ("Play or pause", self._play_or_pause),
-            "N": ("Next doubtful frame", partial(self._step, "▶▶")),
-            "B": ("Doubtful frame before", partial(self._step, "◀◀")),
+            "N": ("Next uncertain or lost frame", partial(self._step, "▶▶")),
+            "B": ("Previous uncertain or lost frame", partial(self._step, "◀◀")),
         }
         for key, (label, act) in keys.items():
             self._server.gui.add_command(label, hotkey=key).on_trigger(partial(_ignoring_the_event, act))
