@@ -105,7 +105,7 @@ def test_get_wants_names_or_all_and_one_name_for_a_file(refused, catalogue, argu
 def test_get_asks_the_mirror_that_is_named(refused, catalogue, monkeypatch):
     monkeypatch.setenv("TRACKING3D_MIRROR", "http://mirror.invalid/networks")
     assert "http://mirror.invalid/networks/open.onnx" in refused("models", "get", "open")
-    assert "ftp://x is no address" in refused("models", "get", "open", "--mirror", "ftp://x")
+    assert "ftp://x is not an address" in refused("models", "get", "open", "--mirror", "ftp://x")
 
 
 def test_get_says_how_to_come_by_what_it_cannot_fetch(refused, catalogue):

@@ -49,7 +49,7 @@ def test_the_catalogue_knows_the_development_files(shared_models: Path):
 @pytest.mark.parametrize(
     ("entry", "words"),
     [
-        ("{purpose: p, licence: MIT, authors: 'https://a'}", "how to come by"),
+        ("{purpose: p, licence: MIT, authors: 'https://a'}", "how to obtain"),
         (
             "{purpose: p, licence: MIT, authors: 'https://a', address: 'https://b'}",
             "needs a size and a sha256",

@@ -194,9 +194,9 @@ def test_a_mirror_of_ones_own_is_checked_like_any_other(cache, network, serve):
     unknown = network(address=None, sha256=None, size=None, how="export net.pth")
     exported = network(address=None, how="export net.pth")
     refused(cache, InputError, "SHA-256 is", fetch, exported, mirror=folder)
-    refused(cache, InputError, "SHA-256 is not known", fetch, unknown, mirror=folder)
+    refused(cache, InputError, "SHA-256 is unknown", fetch, unknown, mirror=folder)
     for wrong in ("ftp://mirror", "/etc", "file:///etc"):
-        refused(cache, InputError, "is no address", fetch, network(), mirror=wrong)
+        refused(cache, InputError, "is not an address", fetch, network(), mirror=wrong)
 
 
 def test_a_proxy_of_the_environment_is_asked_instead(cache, network, serve_and_note, monkeypatch):

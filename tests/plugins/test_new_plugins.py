@@ -89,7 +89,7 @@ def test_a_new_plugin_is_registered_by_the_variable_that_its_readme_gives(tmp_pa
     ],
 )
 def test_a_name_that_cannot_be_used_is_refused(tmp_path, name):
-    with pytest.raises(InputError, match=r"is no name for a plug-in; .*such as my-tracker"):
+    with pytest.raises(InputError, match=r"is not a valid plug-in name; .*such as my-tracker"):
         write_plugin(name, "tracker", tmp_path)
     assert list(tmp_path.iterdir()) == []
 

@@ -151,7 +151,7 @@ def test_another_sequence_replaces_the_earlier_one_without_traces(written, tmp_p
 @pytest.mark.parametrize("name", ["info.json", "photo.jpg"])
 def test_a_folder_with_anything_else_in_it_is_never_touched(tmp_path, name):
     (tmp_path / name).write_text('{"source": "my own data"}')
-    with pytest.raises(OutputError, match="something other than a synthetic sequence"):
+    with pytest.raises(OutputError, match="not a synthetic sequence"):
         write_sequence(tmp_path, SPEC)
     assert [f.name for f in tmp_path.iterdir()] == [name]
 

@@ -1,4 +1,4 @@
-"""What a batch takes of a machine while it goes on: memory, open files, processes, shared memory and disk."""
+"""Resource usage of a running batch: memory, open files, processes, shared memory and disk."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Load:
 
 @contextmanager
 def measure_load(every: float = 1.0, unfinished: Path | None = None) -> Iterator[list[Load]]:
-    """Measure again and again while something goes on; the list grows, and stays empty where there is no ``/proc``.
+    """Measure again and again while something goes on; the list grows, and stays empty if there is no ``/proc``.
 
     Args:
         every: Seconds between two samples.
@@ -64,7 +64,7 @@ def measure_load(every: float = 1.0, unfinished: Path | None = None) -> Iterator
 
 
 def load_now(unfinished: Path | None = None) -> Load | None:
-    """What this process and those that it began take; None where the system does not tell."""
+    """What this process and those that it began take; None if the system does not tell."""
     if not (_PROCESSES / "self/stat").is_file():
         return None
     own, family = os.getpid(), _family(os.getpid())

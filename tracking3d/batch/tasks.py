@@ -1,4 +1,4 @@
-"""The tasks of a batch: one for a video; for a long one that is cut, one for each step, as those before it end."""
+"""The tasks of a batch: one per video; for a long video that is cut, one per step, as the earlier ones finish."""
 
 from __future__ import annotations
 
@@ -111,5 +111,5 @@ class Tasks:
 
 
 def is_whole(ended: Ended) -> bool:
-    """Whether a video is finished with a task; steps of long ones answer with other things than its rows."""
+    """Whether a task finishes its video; steps of long videos return something other than rows."""
     return isinstance(ended.value, Mapping) and "rows" in ended.value

@@ -1,4 +1,4 @@
-"""One GLB with the object moving before the camera, as glTF animation.
+"""One GLB with the object moving in front of the camera, as a glTF animation.
 
 glTF's axes: y up, the camera at the origin looks along -z. Nodes: ``tracking3d_object``, whose translation and
 rotation are animated, with the mesh in object coordinates; ``tracking3d_camera``, still. Between frames, and over

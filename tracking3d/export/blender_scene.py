@@ -1,4 +1,4 @@
-"""Build in Blender what ``scene.json`` beside this file describes: a tracked object moving before the camera.
+"""Build in Blender what ``scene.json`` next to this file describes: a tracked object moving in front of the camera.
 
 Run it by ``blender --python scene.py``, or open it in Blender's text editor and run it there.
 """

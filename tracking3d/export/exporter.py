@@ -1,4 +1,4 @@
-"""What a format is, and what may be asked of an export."""
+"""The description of an export format, and the options of an export."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class ExportOptions:
     """What may be asked of an export; a format that has no use for an option refuses it.
 
     Attributes:
-        answers: ``final`` takes the answers of the final refinement where there are any, ``causal`` those before it.
+        answers: ``final`` takes the estimates of the final refinement if there are any, ``causal`` those before it.
         object_size: Metres of the longest side of the smallest box around the object; None leaves the run's unit.
         fps: Frames per second; None takes what the run knows.
         source: The video, where it is no longer where the run found it.
@@ -48,7 +48,7 @@ class ExportOptions:
 
 
 ANYWHERE = frozenset({"answers"})
-"""Options that every format knows."""
+"""Options of all formats."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Exporter:
             ``scene``.
         writes: What it writes, in a few words.
         write: Writes a run to a path that does not exist yet: a file if there is a ``suffix``, else a folder.
-        suffix: Of the file; empty where a folder is written.
+        suffix: Of the file; empty if a folder is written.
         file_name: What it is called in the folder of exports, ``{run}`` standing for letters and digits of the run's
             name; empty for the format's name and suffix.
         options: Names of those `ExportOptions` that it has a use for, beside `ANYWHERE`.
@@ -92,8 +92,8 @@ class Exporter:
         """
         if not self.is_available:
             raise InputError(
-                f"The format {self.name} needs {' and '.join(self.modules)}, not installed here; "
-                f"run `pip install 'tracking3d[{self.extra}]'`."
+                f"The format {self.name} needs {' and '.join(self.modules)}, which is not installed; run "
+                f"`pip install 'tracking3d[{self.extra}]'`."
             )
 
     def check_options(self, options: ExportOptions, named: dict[str, str]) -> None:
@@ -110,4 +110,4 @@ class Exporter:
         known = self.options | ANYWHERE
         for option, label in named.items():
             if option not in known and getattr(options, option) != getattr(defaults, option):
-                raise InputError(f"The format {self.name} has no use for {label}; leave it out.")
+                raise InputError(f"The format {self.name} does not use {label}; leave it out.")

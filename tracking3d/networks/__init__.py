@@ -1,1 +1,1 @@
-"""Neural networks in ONNX files: where they are found and how they are run."""
+"""Neural networks in ONNX files: finding and running them."""

@@ -1,4 +1,4 @@
-"""The networks that are known by name: what for, where from, how large, which SHA-256, which licence."""
+"""The known networks: purpose, origin, size, SHA-256 and licence."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ class KnownNetwork(Section):
     @model_validator(mode="after")
     def _validate_origin(self) -> KnownNetwork:
         if self.address is not None and (self.sha256 is None or self.size is None):
-            raise ValueError("an address needs a size and a sha256, for what is fetched is checked")
+            raise ValueError("an address needs a size and a sha256 to check the download")
         if self.address is None and self.mirrors:
             raise ValueError("mirrors are further addresses; give the first one as address")
         if any(not mirror.startswith(("http://", "https://")) for mirror in self.mirrors):
             raise ValueError("mirrors begin with http:// or https://")
         if self.address is None and not self.how:
-            raise ValueError("without an address it must say how to come by the file")
+            raise ValueError("without an address, how to obtain the file must be given")
         return self
 
     @property

@@ -1,4 +1,4 @@
-"""Descriptions of networks: short YAML files that say what a network takes and gives."""
+"""Descriptions of networks: short YAML files with the inputs and outputs of a network."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Known networks into the cache: from their address or a mirror, or from a file that was fetched elsewhere.
+"""Fetching known networks into the cache: from their address, a mirror, or a file downloaded elsewhere.
 
-What arrives is written beside its place, compared with the catalogue's SHA-256 and only then renamed into place:
+A download is written next to its final path, compared with the catalogue's SHA-256 and only then renamed into place:
 whatever goes wrong, nothing half or wrong is left in it. A download that was stopped is gone on with by the next one.
 Files are never unpickled, and nothing in them is run.
 """
@@ -38,7 +38,7 @@ def fetch(
     Args:
         network: The network.
         accept_licence: Whether the user accepts a licence that forbids commercial use.
-        listener: Is told of the bytes as they arrive.
+        listener: Called with the number of bytes as they arrive.
         mirror: Address of a folder that has it as ``NAME.onnx``; tried before all others.
 
     Returns:
@@ -73,10 +73,12 @@ def fetch(
 
 def _in_mirror(network: KnownNetwork, mirror: str) -> str:
     if not mirror.startswith(("http://", "https://")):
-        raise InputError(f"The mirror {mirror} is no address; give one that begins with http:// or https://.")
+        raise InputError(
+            f"The mirror {mirror} is not an address; give one that begins with http:// or https://."
+        )
     if network.sha256 is None or network.size is None:
         raise InputError(
-            f"{network.name} is not taken from a mirror, for its SHA-256 is not known: {network.how} "
+            f"{network.name} cannot be fetched from a mirror, because its SHA-256 is unknown: {network.how} "
             f"({network.authors}), {_by_hand(network)}."
         )
     return f"{mirror.rstrip('/')}/{network.file}"
@@ -104,7 +106,7 @@ def _fetch_from(address: str, network: KnownNetwork, part: BufferedRandom, liste
         listener(-part.tell())
         part.truncate(0)
         if not kept:
-            return f"what {address} gave {difference}"
+            return f"the file from {address} {difference}"
         kept = 0
 
 
@@ -134,7 +136,7 @@ def adopt(network: KnownNetwork, file: Path, *, accept_licence: bool = False) ->
         _copy(source, part, network.size)
         if difference := _difference(network, Path(part.name)):
             raise InputError(
-                f"{file} {difference}; a network that you exported yourself is used by its path and needs no name."
+                f"{file} {difference}; use a network that you exported yourself by its path, without a name."
             )
         if network.sha256 is None:
             try:
@@ -221,6 +223,6 @@ def _writing(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise OutputError(
-            f"{path} cannot be written: {error.strerror or error}; make room there, or name another folder with "
-            f"the environment variable {VARIABLE}."
+            f"{path} cannot be written: {error.strerror or error}; free some space there, or set another "
+            f"folder with the environment variable {VARIABLE}."
         ) from error

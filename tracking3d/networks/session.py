@@ -22,7 +22,7 @@ class TensorInfo:
 
     Attributes:
         name: Its name.
-        shape: Its sizes; None where any size will do.
+        shape: Its sizes; None if any size will do.
         dtype: Its element type, as numpy calls it.
     """
 

@@ -1,4 +1,4 @@
-"""Networks in the user's cache: which file a name or a path means, and whether it is what it should be.
+"""Networks in the user's cache: resolving names and paths to files, and verifying them.
 
 The cache is the platform's own folder for that (``~/.cache/tracking3d`` on Linux); the environment variable
 ``TRACKING3D_CACHE`` names another.
@@ -81,7 +81,7 @@ def find_known(name: str) -> KnownNetwork:
     if name in networks:
         return networks[name]
     best = nearest(name, networks)
-    advice = f"did you mean '{best}'?" if best else "`tracking3d models list` shows those that are."
+    advice = f"did you mean '{best}'?" if best else "`tracking3d models list` shows the known ones."
     raise InputError(f"There is no known network '{name}'; {advice}")
 
 

@@ -1,4 +1,4 @@
-"""A file over HTTP into one that has its beginning already: ranges, silence, broken connections, proxies.
+"""Resumable HTTP downloads: ranges, timeouts, broken connections, proxies.
 
 Proxies are those of the environment (``http_proxy``, ``https_proxy``, ``no_proxy``), as `urllib` reads them.
 """
@@ -13,11 +13,11 @@ from collections.abc import Callable
 from io import BufferedRandom
 
 Listener = Callable[[int], None]
-"""Is told how many bytes have arrived since the last call; fewer than none where it begins anew."""
+"""Called with the number of bytes received since the last call; negative if the download restarts."""
 
 _CHUNK = 1 << 18
 _PATIENCE = 30.0
-"""Seconds without a byte after which the other side counts as silent."""
+"""Seconds without a byte after which the server counts as silent."""
 
 
 class TransferError(Exception):
@@ -36,7 +36,7 @@ def transfer(
         part: What has arrived before, which may be nothing.
         size: How many bytes there should be in the end.
         write: Appends to ``part``; an error of the disk is the caller's to tell.
-        listener: Is told of the bytes as they arrive.
+        listener: Called with the number of bytes as they arrive.
 
     Raises:
         TransferError: If the address cannot be reached, answers with an error, or stops bringing anything.

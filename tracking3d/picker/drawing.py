@@ -1,4 +1,4 @@
-"""What a person drew on a frame, as it comes from the network: checked and bounded before anything is done with it."""
+"""A user's drawing on a frame as received from the browser, validated and bounded before use."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a picked object becomes: the files and the command of a run."""
+"""The result of picking: the files and the command of a run."""
 
 from __future__ import annotations
 

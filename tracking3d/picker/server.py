@@ -1,4 +1,4 @@
-"""The page's server: a handful of answers, each bounded, on the standard library."""
+"""The page's server: a handful of bounded responses, on the standard library."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Picker:
     Args:
         session: What the page asks for.
         save: Writes what was picked to the run folder, and gives the command of the run and the settings as YAML.
-        access: Where to listen, and whom to answer.
+        access: Where to listen, and whom to serve.
         port: The port, or the next one that is free; 0 for any.
 
     Raises:
@@ -71,7 +71,7 @@ class Picker:
         return self.picked
 
     def told(self, path: str) -> Any | None:
-        """What is answered to a question of the page, as JSON has it; None where it is none."""
+        """The JSON response to a GET request of the page; None if there is none."""
         return _describe(self.session) if path == "/session.json" else None
 
     def order(self, path: str, body: bytes) -> tuple[Any, Callable[[], None]] | None:
@@ -82,7 +82,7 @@ class Picker:
             body: What it brings.
 
         Returns:
-            The answer as JSON has it, and what is to be done when it is sent; None where there is no such order.
+            The JSON response, and what to do after it is sent; None if there is no such command.
 
         Raises:
             Tracking3dError: If it cannot be done.
@@ -121,7 +121,7 @@ class _Server(ThreadingHTTPServer):
         super().__init__(address, _Handler)
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Work on a request beside the others, or hang up where there are too many."""
+        """Handle a request in a thread, or close the connection if there are too many."""
         if not self._free.acquire(blocking=False):
             self.shutdown_request(request)
             return
@@ -182,7 +182,7 @@ class _Handler(BaseHTTPRequestHandler):
         then()
 
     def _may(self, from_page: bool) -> bool:
-        """Whether the request is answered; where not, it is refused."""
+        """Whether the request is allowed; if not, it is refused."""
         picker = self.server.picker
         refusal = picker.access.refusal(
             self.path,

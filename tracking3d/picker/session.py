@@ -1,4 +1,4 @@
-"""A person picks objects in one video: its frames, the masks of what is drawn, and what comes of it."""
+"""A picking session in one video: its frames, the masks of drawings, and the resulting prompts."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class PickingSession:
         self.height, self.width = first.shape[:2]
 
     def picture(self, index: int) -> bytes | None:
-        """A frame as JPEG; None where there is none."""
+        """A frame as JPEG; None if there is none."""
         if index not in self.frames:
             return None
         image = self._images.image(index)

@@ -1,6 +1,6 @@
-"""Plug-ins under guard: whatever goes wrong in one while it runs is told as its own fault.
+"""Guarded plug-ins: any failure inside a plug-in is reported as its own.
 
-A guarded plug-in does what the bare one does. An exception in it, or an answer that its protocol does not allow,
+A guarded plug-in behaves like the bare one. An exception in it, or an estimate that its protocol does not allow,
 becomes a `PluginFailure`, which knows the plug-in's name, package and version.
 """
 
@@ -64,17 +64,17 @@ class GuardedTracker:
 
         Raises:
             Tracking3dError: If the tracker says that it cannot start from this, in its own words.
-            PluginFailure: If it fails otherwise, or gives what is no answer.
+            PluginFailure: If it fails otherwise, or returns an invalid estimate.
         """
         with in_stage("track"), _blame_plugin(self._label, but=Tracking3dError):
             answer = self._tracker.init(frame, prompt)
         return self._checked(answer, frame)
 
     def step(self, frame: Frame) -> MaskEstimate:
-        """Answer for the next frame.
+        """Estimate the mask in the next frame.
 
         Raises:
-            PluginFailure: If the tracker fails or gives what is no answer.
+            PluginFailure: If the tracker fails or returns an invalid estimate.
         """
         with in_stage("track"), _blame_plugin(self._label):
             answer = self._tracker.step(frame)
@@ -86,7 +86,7 @@ class GuardedTracker:
         return isinstance(self._tracker, CorrectableTracker)
 
     def correct(self, frame: Frame, mask: NDArray[np.bool_]) -> None:
-        """Re-anchor the tracker on ``mask`` ``(H, W)`` in ``frame``, the latest one; nothing where it cannot be.
+        """Re-anchor the tracker on ``mask`` ``(H, W)`` in ``frame``, the latest one; nothing if it cannot be.
 
         Raises:
             PluginFailure: If the tracker fails.
@@ -111,7 +111,7 @@ class GuardedTracker:
         return isinstance(self._tracker, ResumableTracker)
 
     def state(self) -> Any:
-        """The tracker's memory; None where it cannot tell.
+        """The tracker's state; None if it cannot be saved.
 
         Raises:
             PluginFailure: If the tracker fails.
@@ -122,7 +122,7 @@ class GuardedTracker:
             return self._tracker.state()
 
     def restore(self, frame: Frame, prompt: Prompt, state: Any) -> None:
-        """Give the tracker its memory back; nothing where it has none that can be kept.
+        """Give the tracker its memory back; nothing if it has none that can be kept.
 
         Raises:
             PluginFailure: If the tracker fails.
@@ -190,9 +190,9 @@ class GuardedEncoder:
 
 
 def mask_fault(answer: Any, size: tuple[int, int]) -> str:
-    """Why this is no answer of a mask tracker for a frame of ``size`` ``(height, width)``, or nothing."""
+    """Why this is not a valid mask estimate for a frame of ``size`` ``(height, width)``, or empty."""
     if not isinstance(answer, MaskEstimate):
-        return f"it answered with {_kind(answer)} instead of a MaskEstimate"
+        return f"it returned {_kind(answer)} instead of a MaskEstimate"
     if not isinstance(answer.score, int | float | np.number) or not 0 <= answer.score <= 1:
         return f"its score is {answer.score!r} instead of a number from 0 to 1"
     mask: Any = answer.mask
@@ -201,7 +201,7 @@ def mask_fault(answer: Any, size: tuple[int, int]) -> str:
     if not isinstance(mask, np.ndarray) or mask.dtype.kind not in "fbiu":
         return f"its mask is {_kind(mask)} instead of an array of float32"
     if mask.shape != size:
-        return f"its mask has shape {mask.shape}, but the frame ({size[0]}, {size[1]})"
+        return f"its mask has shape {mask.shape}, but the frame has ({size[0]}, {size[1]})"
     if mask.size and not (mask.min() >= 0 and mask.max() <= 1):  # false for NaN too
         return f"its mask has values from {mask.min():g} to {mask.max():g} instead of from 0 to 1"
     return ""
@@ -220,7 +220,7 @@ def attribute_fault(encoder: Any) -> str:
 def feature_fault(features: Any, images: Tensor, encoder: FeatureEncoder) -> str:
     """Why these are no features of ``images`` ``(B, 3, H, W)`` by ``encoder``, or nothing."""
     if not isinstance(features, Tensor) or not features.is_floating_point():
-        return f"it answered with {_kind(features)} instead of a tensor of float32"
+        return f"it returned {_kind(features)} instead of a tensor of float32"
     count, _, height, width = images.shape
     stride = encoder.stride
     # Where the stride does not divide the size, the encoder may round either way.

@@ -1,4 +1,4 @@
-"""Which plug-ins are registered, by installed packages and by the environment variable, and how they are imported."""
+"""Registered plug-ins, from installed packages and the environment variable, and their import."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ VARIABLE = "TRACKING3D_PLUGINS"
 """Environment variable that registers plug-ins for development."""
 
 KIND = {TRACKERS: "mask tracker", FEATURES: "feature encoder"}
-"""What a plug-in of each group is called."""
+"""Name in messages of a plug-in of each group."""
 
 _METHODS = {TRACKERS: ("from_options", "init", "step"), FEATURES: ("from_options", "encode")}
 
@@ -122,7 +122,7 @@ def _from_environment() -> list[Registered]:
 
 
 def _file_version(module: str) -> str:
-    """Short hash of the file of a module under development, in place of a version; empty where it is not found."""
+    """Short hash of the file of a module under development, in place of a version; empty if it is not found."""
     file: Path | None = None
     if module.endswith(".py"):
         file = Path(module)
@@ -164,7 +164,7 @@ def _fault(plugin: Registered, cls: Any) -> str:
     if not (isinstance(options, type) and issubclass(options, BaseModel)):
         return "it has no nested pydantic model Options"
     if "name" in options.model_fields:
-        return "its Options has a field 'name', which is the plug-in's own name in a configuration"
+        return "its Options has a field 'name', which is reserved for the plug-in's name in a configuration"
     if absent := [name for name in _METHODS[plugin.group] if not callable(getattr(cls, name, None))]:
         return f"it has no method {', '.join(absent)}"
     why_unavailable = getattr(cls, "why_unavailable", None)

@@ -21,7 +21,7 @@ from tracking3d.plugins.registration import (
 )
 
 _ATTRIBUTES: dict[str, tuple[str, ...]] = {TRACKERS: (), FEATURES: ("channels", "stride", "tau")}
-"""What an instance has besides methods; an encoder may know its channels only once it is built."""
+"""Attributes of an instance; an encoder may know its channels only once it is built."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class PluginInfo:
         name: The name that selects it.
         group: Its entry-point group.
         package: The distribution that registers it, or ``TRACKING3D_PLUGINS``.
-        version: The distribution's version, of a module under development a short hash of its file; empty where
+        version: The distribution's version, of a module under development a short hash of its file; empty if
             unknown.
         status: ``duplicate`` means that another plug-in took the name first.
         reason: Why the status is not ``ok``.
@@ -154,5 +154,5 @@ def _load(plugin: Registered) -> type[Any]:
         return import_plugin(plugin)
     except (Exception, SystemExit) as error:
         raise PluginError(
-            f"{plugin.label} is broken: {describe_exception(error)}; `tracking3d plugins` lists those that work."
+            f"{plugin.label} is broken: {describe_exception(error)}; `tracking3d plugins` lists working plug-ins."
         ) from error

@@ -1,4 +1,4 @@
-"""A new plug-in as a package ready to install, from the templates beside this module."""
+"""A new plug-in as an installable package, from the templates next to this module."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def write_plugin(name: str, kind: Kind, folder: Path) -> Path:
     """
     if not re.fullmatch(r"[a-z][a-z0-9]*(-[a-z0-9]+)*", name) or len(name) > 40:
         raise InputError(
-            f"'{name}' is no name for a plug-in; write it in small letters and digits with a letter first, and with "
-            "hyphens between words, such as my-tracker."
+            f"'{name}' is not a valid plug-in name; use lower-case letters, digits and hyphens, with a "
+            "letter first, such as my-tracker."
         )
     group = _GROUPS[kind]
     for plugin in find_plugins():
@@ -43,7 +43,7 @@ def write_plugin(name: str, kind: Kind, folder: Path) -> Path:
     package = f"tracking3d-{name}"
     target = folder.expanduser() / package
     if target.exists():
-        raise InputError(f"{target} exists; choose another name or another --out.")
+        raise InputError(f"{target} already exists; choose another name or another --out.")
     module = package.replace("-", "_")
     words = {
         "name": name,

@@ -1,4 +1,4 @@
-"""A page about what differs between runs, in one file."""
+"""The comparison page of several runs, in one file."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def _pairs(comparison: Comparison) -> list[tuple[str, list[dict[str, str] | None
 
 
 def _frames(comparison: Comparison) -> list[int]:
-    """Every frame that any run has answered: what the plots go over."""
+    """Every frame with an estimate in any run: the horizontal axis of the plots."""
     return sorted({record.index for run in comparison.runs for record in run.frames})
 
 
@@ -138,7 +138,7 @@ def _pictures(comparison: Comparison) -> list[dict[str, Any]]:
 
 
 def _around(comparison: Comparison, index: int, size: OverlaySize) -> tuple[slice, slice]:
-    """Rows and columns of the overlay around the masks of all runs; all of it where there is none."""
+    """Rows and columns of the overlay around the masks of all runs; all of it if there is none."""
     masks = [mask for run in comparison.runs if (mask := read_mask(run.mask_path(index))) is not None]
     boxes = [cv2.boundingRect(mask.astype(np.uint8)) for mask in masks if mask.any()]
     if not boxes:

@@ -1,4 +1,4 @@
-"""What differs between runs over one video: settings, masks, poses, statuses, time.
+"""Differences between runs of one video: settings, masks, poses, statuses, times.
 
 One run is what the others are held against; none of them is the truth.
 """
@@ -29,7 +29,7 @@ MOST_FRAMES = 6
 
 @dataclass(frozen=True, eq=False)
 class Difference:
-    """One run against the first one, over the ``N`` frames that both have answered.
+    """One run against the first one, over the ``N`` frames with estimates in both.
 
     Attributes:
         name: The run.
@@ -49,7 +49,7 @@ class Difference:
 
     @property
     def summary(self) -> dict[str, float | None]:
-        """Mean, median and worst of each; None where there is none."""
+        """Mean, median and worst of each; None if there is none."""
         return {
             "frames": len(self.indices),
             "iou_mean": _figure(np.mean, self.iou),
@@ -69,11 +69,11 @@ class Comparison:
     Attributes:
         runs: The runs; the first one is what the others are held against.
         names: What to call them; no two alike.
-        settings: By name, the value in each run as text, of those that differ; None where a run has none such.
+        settings: By name, the value in each run as text, of those that differ; None if a run has none such.
         differences: Of each run but the first.
         worst: Indices of the frames that differ most, in order of time.
         notes: What to know, in sentences.
-        iou_between: ``(R, R)`` mean IoU of the masks of every two runs; NaN where there is none.
+        iou_between: ``(R, R)`` mean IoU of the masks of every two runs; NaN if there is none.
         rotation_between: ``(R, R)`` degrees between their poses, in the median; NaN likewise.
     """
 

@@ -1,4 +1,4 @@
-"""Figures of a run that its pages plot: statuses, poses against the first one, times by stage."""
+"""Quantities of a run for its pages: statuses, poses relative to the first one, times by stage."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def distances(T_cam_obj: NDArray[np.float64], middle: NDArray[np.float64]) -> ND
     """``(N,)`` distances of a point of the object from the camera, over the first one that is known.
 
     Args:
-        T_cam_obj: ``(N, 4, 4)``, NaN where it is not known.
+        T_cam_obj: ``(N, 4, 4)``, NaN if unknown.
         middle: ``(3,)`` the point, in object coordinates.
     """
     away = np.linalg.norm(T_cam_obj[:, :3, :3] @ middle + T_cam_obj[:, :3, 3], axis=1)
@@ -89,7 +89,7 @@ class StageShare:
 
 
 def stage_shares(run: RunReader) -> list[StageShare]:
-    """The stages of a run that took any time, in order; none where they are not known.
+    """The stages of a run that took any time, in order; none if they are not known.
 
     Args:
         run: The run.
@@ -114,13 +114,13 @@ def stage_shares(run: RunReader) -> list[StageShare]:
 
 
 def stage_times(run: RunReader) -> tuple[StageTimes | None, StageTimes]:
-    """What the causal answers took, stage by stage, and what the final refinement did."""
+    """What the causal estimates took, stage by stage, and what the final refinement did."""
     causal = stages_of(RunReader(run.folder, refined=False).frames)
     return causal if run.frames else None, run.refinement_stages or StageTimes()
 
 
 def corrected_frames(run: RunReader) -> list[int]:
-    """Indices of the frames in which somebody has said what the object is, but the first."""
+    """Indices of the corrected frames."""
     given = run.description.get("given")
     told = given.get("corrections") if isinstance(given, dict) else None
     indices = [one.get("frame") for one in told if isinstance(one, dict)] if isinstance(told, list) else []

@@ -1,4 +1,4 @@
-"""The model of a run for the page's viewer: plain arrays, and the texture as one picture.
+"""The model of a run for the page's viewer: plain arrays and a texture image.
 
 The picture has two halves: above the colours, below how much of each texel was ever seen. The viewer paints what was
 never seen in a pale colour of the page instead of a guess. As an alpha channel it would not do: browsers forget the

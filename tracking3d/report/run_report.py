@@ -1,4 +1,4 @@
-"""``report.html``: a run to look at, in one file."""
+"""``report.html``: the report of a run in one file."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ def _data(
 def _rotations(
     records: list[FrameRecord], middle: NDArray[np.float64], pictures: FramePictures
 ) -> list[list[float] | None]:
-    """For every picture the side of the model that it shows; None where that is not known."""
+    """For every picture the side of the model that it shows; None if unknown."""
     shown = [records[position] for position in pictures.positions] or records[:1]
     found = [
         None if record.status is Status.LOST else side_shown(record.T_cam_obj, middle) for record in shown

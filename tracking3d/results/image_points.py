@@ -1,4 +1,4 @@
-"""Points of a run that its mesh does not cover, followed in the images; see `tracking3d.points.image_following`."""
+"""Points outside the mesh of a run, tracked in the images; see `tracking3d.points.image_following`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class ImagePoints:
-    """N points that began beside the mesh, in the T frames of a run.
+    """N points that started outside the mesh, in the T frames of a run.
 
     Attributes:
         followed: Positions in pixels of the frames; points in space of those that are tied to the surface.
@@ -41,7 +41,7 @@ class ImagePoints:
 
 
 def read_pictures(run: RunReader, source: FrameSource) -> list[Picture | None]:
-    """The frames of a run, in the order of its records; None where there is no image.
+    """The frames of a run, in the order of its records; None if there is no image.
 
     Args:
         run: The run.

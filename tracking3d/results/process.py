@@ -1,4 +1,4 @@
-"""Which process writes a run, so that others see when it is gone."""
+"""The identity of the process that writes a run, so that others can see whether it still exists."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ def this_process() -> dict[str, Any]:
 
 
 def is_gone(process: Mapping[str, Any]) -> bool | None:
-    """Whether a process that told of itself by `this_process` has ended; None where that cannot be known.
+    """Whether the process described by `this_process` has ended; None if it cannot be known.
 
-    A number is given anew when its process has ended: one that started at another time is another process.
+    A number is reused when its process has ended: one that started at another time is another process.
     """
     pid, started = process.get("pid"), process.get("started")
     if not isinstance(pid, int) or pid <= 0 or process.get("host") != socket.gethostname():
@@ -38,7 +38,7 @@ def is_gone(process: Mapping[str, Any]) -> bool | None:
 
 
 def _start_time(pid: int) -> str | None:
-    """When a process began: the machine's start and the clock ticks since then; None where nobody tells."""
+    """When a process began: the machine's start and the clock ticks since then; None if unknown."""
     try:
         # The name in parentheses may hold spaces and parentheses itself.
         fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2]

@@ -1,6 +1,6 @@
-"""The second answers of a run: kept aside until all are there, then put in the place of the causal ones.
+"""The refined estimates of a run: kept aside until all are there, then put in the place of the causal ones.
 
-Until then the run folder holds the causal answers whole, whatever ends the refinement.
+Until then the run folder holds the causal estimates whole, whatever ends the refinement.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ from tracking3d.runtime.stage_times import StageTimes, measure
 
 
 class RefinementWriter:
-    """Writes the answers of the final refinement of one run.
+    """Writes the estimates of the final refinement of one run.
 
     Args:
         folder: The run folder.
         camera: The camera of the full frame.
         fps: Speed of the overlay video.
-        causal: The causal answer for every frame.
-        kept: Bytes of answers that were kept when the run was stopped.
+        causal: The causal estimate for every frame.
+        kept: Bytes of estimates that were kept when the run was stopped.
         seconds: Wall time that they took.
 
     Attributes:
-        causal: The causal answers by frame index.
+        causal: The causal estimates by frame index.
         pictures: Overlay and crops of the second pass.
         together: What it took to solve everything once more, before the frames.
 
@@ -74,7 +74,7 @@ class RefinementWriter:
 
     @property
     def lines(self) -> int:
-        """Bytes of answers that are written."""
+        """Bytes of estimates that are written."""
         return (self._aside / layout.FRAMES).stat().st_size
 
     @property
@@ -83,13 +83,13 @@ class RefinementWriter:
         return time.monotonic() - self._started
 
     def answer(self, index: int) -> FrameRecord:
-        """The answer for frame ``index`` as it is now: the second one, or the causal one where there is none."""
+        """The estimate for frame ``index`` as it is now: the second one, or the causal one if there is none."""
         return self._records.get(index) or self.causal[index]
 
     def put(self, estimate: FrameRecord) -> None:
-        """Let a second answer be what it is in the end, see `adjusted_record`; causal ones stand.
+        """Let a refined estimate be what it is in the end, see `adjusted_record`; causal ones stand.
 
-        It is not kept for a run that is stopped here and goes on later: that finds it anew.
+        It is not kept for a run that is stopped here and goes on later: that computes it again.
         """
         if estimate.index in self._records:
             self._records[estimate.index] = estimate
@@ -101,14 +101,14 @@ class RefinementWriter:
         probability: NDArray[np.float32] | None,
         initial: NDArray[np.bool_] | None,
     ) -> None:
-        """Give a second answer another mask ``(H, W)``, weighed against the image; causal ones stand.
+        """Give a refined estimate another mask ``(H, W)``, weighed against the image; causal ones stand.
 
         Like a pose that is put right it is not kept for a run that is stopped here.
 
         Args:
             index: Of the frame.
             mask: ``(H, W)``.
-            probability: ``(H, W)`` of the object; None where it was written before.
+            probability: ``(H, W)`` of the object; None if it was written before.
             initial: ``(H, W)`` what the mask tracker gave.
 
         Raises:
@@ -127,11 +127,11 @@ class RefinementWriter:
             write_probability(self._aside, index, probability)
 
     def draw(self, frame: Frame, mask: NDArray[np.bool_], initial: NDArray[np.bool_] | None) -> None:
-        """Draw the answer for a frame.
+        """Draw the estimate for a frame.
 
         Args:
             frame: The frame.
-            mask: ``(H, W)`` the answer's.
+            mask: ``(H, W)`` the estimate's.
             initial: ``(H, W)`` what the mask tracker gave.
 
         Raises:
@@ -146,15 +146,15 @@ class RefinementWriter:
     def write(
         self, estimate: FrameEstimate | None, frame: Frame, initial: NDArray[np.bool_] | None
     ) -> FrameRecord:
-        """Keep the second answer for one frame; None lets the causal one stand.
+        """Keep the refined estimate for one frame; None lets the causal one stand.
 
         Args:
-            estimate: The answer.
+            estimate: The estimate.
             frame: The frame.
             initial: ``(H, W)`` what the mask tracker gave.
 
         Returns:
-            What the frame's answer will be.
+            What the frame's estimate will be.
 
         Raises:
             OutputError: If it cannot be written.
@@ -177,7 +177,7 @@ class RefinementWriter:
         return record
 
     def mask(self, record: FrameRecord) -> NDArray[np.bool_]:
-        """The mask ``(H, W)`` of an answer, empty where it cannot be read."""
+        """The mask ``(H, W)`` of an estimate, empty if it cannot be read."""
         if record.refined and (decided := self._decided.get(record.index)) is not None:
             mask = decode_mask(decided)
         else:
@@ -195,7 +195,7 @@ class RefinementWriter:
     def take_over(self, append: Callable[[Sequence[FrameRecord]], None]) -> None:
         """Put masks and video in their places; what they replace goes to ``causal/``, the mesh too.
 
-        Readers take them for the answers once their lines are there, and not before.
+        Readers take them for the estimates once their lines are there, and not before.
 
         Args:
             append: Appends records to ``frames.jsonl``, all or none.
@@ -226,7 +226,7 @@ class RefinementWriter:
                 (self._aside / layout.OVERLAY).replace(self._folder / layout.OVERLAY)
 
     def give_up(self, keep: bool) -> None:
-        """The causal answers are as they were; what was made is kept for another try, or removed.
+        """The causal estimates are as they were; what was made is kept for another try, or removed.
 
         Raises:
             OutputError: If it cannot be done.
@@ -251,12 +251,12 @@ def adjusted_record(
     assessment: Assessment | None = None,
     evidence: Mapping[str, float] | None = None,
 ) -> FrameRecord:
-    """A second answer with the pose that it has in the end.
+    """A refined estimate with the pose that it has in the end.
 
     Args:
         estimate: As it was.
         T_cam_obj: ``(4, 4)``, of the camera of the end.
-        assessment: How far it is believed in the end; as before, if left out.
+        assessment: How far it is trusted in the end; as before, if left out.
         evidence: What that comes from, added to the diagnostics.
     """
     diagnostics = estimate.diagnostics | dict(evidence or {})
@@ -284,7 +284,7 @@ def clear_refinement(folder: Path) -> None:
 
 
 def _undo_taking_over(folder: Path) -> None:
-    """Put the causal answers back where they were, and the refined masks aside; a kill may have come in between."""
+    """Put the causal estimates back where they were, and the refined masks aside; a kill may have come in between."""
     causal, aside = folder / layout.CAUSAL, folder / layout.REFINING
     if not causal.is_dir():
         return

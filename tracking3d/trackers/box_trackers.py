@@ -1,4 +1,4 @@
-"""Box trackers of OpenCV, made deterministic and safe to ask: a mask tracker's witnesses."""
+"""Box trackers of OpenCV, made deterministic and safe, that check a mask tracker."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class OpenCvBoxes:
         self._announced = image, _looking().submit(self._find, image)
 
     def update(self, image: Image) -> Box | None:
-        """The box in the next image, or None where the tracker has lost the object."""
+        """The box in the next image, or None if the tracker has lost the object."""
         announced, self._announced = self._announced, None
         if announced is not None:
             box = announced[1].result()

@@ -1,4 +1,4 @@
-"""What an outline says: a prior from where it may have moved to, its two sides, and a tidy mask.
+"""Outlines: a prior from the possible motion of the outline, its two sides, and a clean mask.
 
 All masks are those of one square crop, ``(S, S)``, and lengths are in its pixels.
 """

@@ -1,4 +1,4 @@
-"""Any frame of a video, decoded when it is asked for."""
+"""Random access to the frames of a video, decoded on demand."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from tracking3d.video.source import FrameSource
 from tracking3d.video.video_file import VideoFile, video_stream
 
 MOST_KEPT = 128 * 2**20
-"""Bytes of decoded frames that are kept for when they are asked for again."""
+"""Size in bytes of the cache of decoded frames."""
 _INDEXED = frozenset({"mp4", "matroska"})
-"""Containers that say of every packet when it is shown, and of which pictures need no other."""
+"""Containers that give the display time of every packet and mark keyframes."""
 
 
 class FrameImages(Protocol):
     """Gives the picture of a frame by its index."""
 
     def image(self, index: int) -> Image | None:
-        """``(H, W, 3)``, or None where there is none."""
+        """``(H, W, 3)``, or None if there is none."""
         ...
 
 
@@ -54,7 +54,7 @@ class KeptImages:
 
     Args:
         decode: Gives the picture of a frame, or None.
-        count: Number of all frames of the source, where it is known.
+        count: Number of all frames of the source, if known.
     """
 
     def __init__(self, decode: Callable[[int], Image | None], count: int | None) -> None:
@@ -64,7 +64,7 @@ class KeptImages:
         self._lock = threading.Lock()
 
     def image(self, index: int) -> Image | None:
-        """The frame ``(H, W, 3)``, or None where there is none."""
+        """The frame ``(H, W, 3)``, or None if there is none."""
         with self._lock:
             if index in self._kept:
                 self._kept.move_to_end(index)
@@ -89,7 +89,7 @@ class ImageFiles:
         self._files = sequence.files
 
     def image(self, index: int) -> Image | None:
-        """The frame ``(H, W, 3)``, or None where it cannot be read."""
+        """The frame ``(H, W, 3)``, or None if it cannot be read."""
         try:
             return read_image(self._files[index]) if 0 <= index < len(self._files) else None
         except InputError:
@@ -126,7 +126,7 @@ class VideoPictures:
         return len(self._times)
 
     def image(self, index: int) -> Image | None:
-        """The frame ``(H, W, 3)``, or None where it cannot be decoded."""
+        """The frame ``(H, W, 3)``, or None if it cannot be decoded."""
         if not self._times:
             return self._counted(index)
         if not 0 <= index < len(self._times):

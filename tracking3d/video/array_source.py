@@ -22,19 +22,19 @@ class ArraySource:
     See `tracking3d.video.source.FrameSource` for the other attributes.
 
     Attributes:
-        rate: Arrays per second, which times are counted by; None where nobody knows.
+        rate: Arrays per second, which times are counted by; None if unknown.
     """
 
     arrays: Iterable[Any]
     selection: range = EVERY_FRAME
-    name: str = "the frame iterable"
+    name: str = "the iterable of frames"
     rate: float | None = None
     intrinsics: Intrinsics | None = None
     intrinsics_origin: str = ""
 
     @property
     def fps(self) -> float | None:
-        """Selected arrays per second, where somebody has said."""
+        """Selected arrays per second, if given."""
         return None if self.rate is None else self.rate / self.selection.step
 
     @property

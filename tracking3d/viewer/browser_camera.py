@@ -1,4 +1,4 @@
-"""Where the browser looks at the scene from."""
+"""The camera of the browser's 3D view."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Runs that are corrected from the viewer: pages to draw on, and the process that computes.
+"""Corrections from the viewer: pages to draw on, and the process that computes.
 
 The process is our own program with a folder that the viewer was opened on; all that comes from the network is what was
 drawn, as numbers that were checked.
@@ -41,7 +41,7 @@ class RunCorrection:
         run: The run.
         images: Its frames.
         source: The video, where it is not where the run found it.
-        access: Where the page listens, and whom it answers.
+        access: Where the page listens, and whom it serves.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class RunCorrection:
 
     @property
     def why_not(self) -> str:
-        """Why the run cannot be corrected here, in a sentence; empty where it can."""
+        """Why the run cannot be corrected here, in a sentence; empty if it can."""
         run, given = self.run, self.run.description.get("given")
         if run.going_on:
             return "The run is not finished; it can be corrected afterwards."
@@ -73,7 +73,7 @@ class RunCorrection:
         return ""
 
     def why_not_frame(self, index: int) -> str:
-        """Why this frame of a run that can be corrected cannot be, in a sentence; empty where it can."""
+        """Why this frame of a run that can be corrected cannot be, in a sentence; empty if it can."""
         if index not in self.run.frames:
             return f"The run has no estimate for frame {index}."
         if index == self.run.description["given"]["first_frame"]:
@@ -195,14 +195,14 @@ class Corrections:
 
     Args:
         each: The runs.
-        access: Whom their pages answer.
+        access: Whom their pages serve.
     """
 
     def __init__(self, each: Sequence[RunCorrection], access: Access) -> None:
         self._each, self._access = each, access
 
     def offer(self, index: int) -> str:
-        """Links to correct a frame of each run, and how far corrections are, as HTML."""
+        """Links to correct a frame of each run and the progress of corrections, as HTML."""
         return (
             '<div style="font-size:12px;line-height:1.5;margin:4px 12px"><p>If the tracker follows the wrong thing, '
             "mark the object in that frame. All frames that depend on it are then re-estimated. "

@@ -1,4 +1,4 @@
-"""A viser server that answers nobody but its own page.
+"""A viser server that serves only its own page.
 
 Viser has no check of its own: it lets pages of any origin connect, takes messages of 50 MB and as many connections
 as there are. All of that is decided where it calls `websockets.asyncio.server.serve`, so that call is the one thing
@@ -41,7 +41,7 @@ def start_server(access: Access, port: int) -> viser.ViserServer:
     """Start a viser server behind the check of ``access``.
 
     Args:
-        access: Where it listens, and whom it answers.
+        access: Where it listens, and whom it serves.
         port: The port; where it is taken, the next one that is free. 0 for any.
 
     Raises:
@@ -69,7 +69,7 @@ class _Guard:
     """What stands between the network and viser.
 
     Args:
-        access: Whom to answer.
+        access: Whom to serve.
     """
 
     def __init__(self, access: Access) -> None:
@@ -141,7 +141,7 @@ class _Guard:
 
 
 def _one(request: Request, name: str) -> str | None:
-    """The header, where it comes once; what comes twice is nobody's."""
+    """The header if it occurs once; a repeated header is ignored."""
     values = request.headers.get_all(name)
     return values[0] if len(values) == 1 else ("" if values else None)
 

@@ -33,7 +33,7 @@ class Panel:
         server: Shows them.
         videos: How many stand beside one another.
         live: Whether a run may still grow.
-        causal: Whether there are answers of before a final refinement.
+        causal: Whether there are causal estimates besides refined ones.
     """
 
     def __init__(self, server: viser.ViserServer, videos: int, live: bool, causal: bool) -> None:

@@ -1,4 +1,4 @@
-"""A frame of the video with what was found in it drawn in, layer by layer."""
+"""A frame of the video with its estimates drawn in, layer by layer."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def draw_picture(
     """One frame with the outlines and axes of all its objects.
 
     Args:
-        image: ``(H, W, 3)``; None where the frame is not at hand.
+        image: ``(H, W, 3)``; None if the frame is not at hand.
         runs: The objects of one video.
         index: The frame.
         shown: What to draw.
@@ -154,7 +154,7 @@ def _draw_axes(
     scale: float,
     thickness: int,
 ) -> None:
-    """The axes x red, y green, z blue, the nearest on top; nothing where they reach behind the camera."""
+    """The axes x red, y green, z blue, the nearest on top; nothing if they reach behind the camera."""
     ends = np.concatenate([axes.origin[None], axes.origin + axes.length * np.eye(3)])
     points = ends @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3]
     if not np.isfinite(points).all() or points[:, 2].min() <= 0:

@@ -1,4 +1,4 @@
-"""What stands in space: each object's mesh, the path of the camera around it, and where the camera is now."""
+"""The 3D scene: each object's mesh, the camera path around it, and the current camera."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The viewer: runs that are followed, a frame that everything shows, and the threads that keep both up."""
+"""The viewer: the followed runs, the current frame, and the threads that update both."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Video:
     Attributes:
         name: What the viewer calls it.
         runs: The objects.
-        images: Gives the frames; None where they are not at hand.
+        images: Gives the frames; None if they are not at hand.
     """
 
     name: str
@@ -60,7 +60,7 @@ class Viewer:
 
     Args:
         videos: What to show.
-        access: Where to listen, and whom to answer.
+        access: Where to listen, and whom to serve.
         port: The port, or the next one that is free; 0 for any.
         corrections: Lets the runs be corrected.
 
@@ -97,7 +97,7 @@ class Viewer:
             thread.start()
 
     def go_to(self, index: int) -> None:
-        """Show the frame ``index``, or the nearest one that has an answer."""
+        """Show the frame ``index``, or the nearest one that has an estimate."""
         self._panel.slider.value = int(index)
         self._want(index)
 

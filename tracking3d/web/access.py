@@ -1,4 +1,4 @@
-"""Who may talk to a page that this program serves: the check that every request passes first.
+"""Access control of served pages: the check that every request passes first.
 
 A page on this machine is reached by every other page that is open in the same browser, unless it looks at two
 headers. ``Host`` is the name that the browser asked for: a stranger's name that was pointed at this machine (DNS
@@ -31,11 +31,12 @@ SAFE_HEADERS = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
-"""Of every answer: kept nowhere, shown in nobody's frame, and the address, which may hold the token, told to nobody."""
+"""Headers of every response: not cached, not framed, and the address, which may hold the token, is not sent as
+referrer."""
 
 
 class Refusal(NamedTuple):
-    """Why a request is not answered.
+    """Why a request is refused.
 
     Attributes:
         status: The HTTP status.
@@ -48,7 +49,7 @@ class Refusal(NamedTuple):
 
 @dataclass(frozen=True)
 class Access:
-    """Where a server listens, and whom it answers.
+    """Where a server listens, and whom it serves.
 
     Attributes:
         host: The address that it listens on.
