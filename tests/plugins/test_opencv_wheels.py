@@ -101,7 +101,7 @@ def test_a_box_tracker_that_an_option_asks_for_is_missed_when_it_is_built(wheels
     with pytest.raises(PluginError, match=rf"box tracker csrt .* lacks TrackerCSRT: .*{INSTALL}"):
         CsrtBoxes(CsrtTracker.Options())
     for witness, absent in (("csrt", "TrackerCSRT"), ("kcf", "TrackerKCF")):
-        with pytest.raises(PluginError, match=rf"witness {witness} .* has no {absent}: .*{INSTALL}"):
+        with pytest.raises(PluginError, match=rf"box tracker {witness} .* lacks {absent}: .*{INSTALL}"):
             FlowTracker.from_options(FlowTracker.Options(witness=witness))
 
 
