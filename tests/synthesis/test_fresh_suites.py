@@ -125,7 +125,7 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path):
 
 @pytest.mark.parametrize(
     ("seed", "count", "message"),
-    [(-1, 24, "--seed -1 is negative"), (1, 0, "--count 0"), (1, -3, "--count -3"), (1, 10**6, "to 1000")],
+    [(-1, 24, "--seed -1 is negative"), (1, 0, "--count 0"), (1, -3, "--count -3"), (1, 10**6, "1 and 1000")],
 )
 def test_a_seed_or_count_that_makes_no_sense_is_refused(seed, count, message):
     with pytest.raises(InputError, match=message):
@@ -135,7 +135,7 @@ def test_a_seed_or_count_that_makes_no_sense_is_refused(seed, count, message):
 def test_a_folder_without_meshes_is_refused(tmp_path):
     with pytest.raises(InputError, match="holds no mesh file"):
         fresh_suite(9000, meshes=tmp_path)
-    with pytest.raises(InputError, match="is no folder"):
+    with pytest.raises(InputError, match="is not a folder"):
         fresh_suite(9000, meshes=tmp_path / "nowhere")
 
 
@@ -168,7 +168,7 @@ def test_the_command_makes_a_fresh_suite(call, tmp_path, monkeypatch, meshes):
         ("evaluate suite fresh --seed 9000 --meshes .", "holds no mesh file"),
         ("evaluate suite standard --seed 9000", "--seed goes with the suite fresh only, not with standard"),
         ("evaluate suite smoke --meshes .", "--meshes goes with the suite fresh only"),
-        ("evaluate spread fresh", "say --seed N, or name it fresh-N"),
+        ("evaluate spread fresh", "give --seed N, or the name fresh-N"),
     ],
 )
 def test_what_the_commands_cannot_use_is_one_sentence(call, words, message):

@@ -219,7 +219,7 @@ def test_backgrounds_come_from_a_folder_by_the_seed(tmp_path):
 def test_a_background_without_images_is_refused(tmp_path, make):
     make(tmp_path / "photos")
     spec = SequenceSpec(background=str(tmp_path / "photos"))
-    with pytest.raises(InputError, match="photos' is no folder with images"):
+    with pytest.raises(InputError, match="photos' is not a folder of images"):
         render_sequence(spec)
 
 

@@ -261,7 +261,7 @@ def test_the_command_makes_a_suite(call, tiny, tmp_path):
         ("--object box --disturb noise=lots", "'lots' is not"),
         ("--object box --disturb noise=2", "'disturbances.noise' must be"),
         ("--object box --disturb nois=1", "did you mean 'disturbances.noise'"),
-        ("--object box --background nowhere", "'nowhere' is no folder"),
+        ("--object box --background nowhere", "'nowhere' is not a folder"),
     ],
 )
 def test_what_the_command_cannot_use_is_one_sentence(call, words, message):

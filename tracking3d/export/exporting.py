@@ -59,7 +59,7 @@ class Export:
 
     @property
     def in_words(self) -> str:
-        """How many frames there are, where it is not the model alone, and the unit where it is arbitrary."""
+        """The number of frames, unless only the model was exported, and the unit if it is arbitrary."""
         left_out = f", {len(self.without)} without an estimate" if self.without else ""
         unit = ", lengths in the arbitrary unit of the run" if self.unit == ARBITRARY else ""
         return f"the model{unit}" if self.of_model else f"{self.frames} frames{left_out}{unit}"

@@ -29,7 +29,7 @@ def transfer(
 ) -> None:
     """Go on with ``part`` until it has ``size`` bytes; what is more is not read to its end.
 
-    A connection that breaks off is taken up again where it broke, as long as every one of them brings something.
+    A broken connection is resumed at the same byte, as long as each attempt makes progress.
 
     Args:
         address: ``http`` or ``https``.

@@ -18,7 +18,7 @@ from tracking3d.web.access import Access
 
 @dataclass(frozen=True, eq=False)
 class DrawnCorrection:
-    """What was drawn: a box, where that says it all, else a mask.
+    """The drawing: a box if that is sufficient, else a mask.
 
     Attributes:
         frame: Index of the frame.

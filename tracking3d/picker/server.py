@@ -201,7 +201,7 @@ class _Handler(BaseHTTPRequestHandler):
         return values[0] if len(values) == 1 else ("" if values else None)
 
     def _body(self) -> bytes | None:
-        """What the request brings; None where it is refused for that."""
+        """The body of the request; None if it is refused."""
         told = self._one("Content-Length") or ""
         if not re.fullmatch(r"\d{1,12}", told) or self.headers.get("Transfer-Encoding"):
             self._refuse(HTTPStatus.LENGTH_REQUIRED, "The request has no Content-Length.")

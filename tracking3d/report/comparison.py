@@ -57,7 +57,7 @@ def write_comparison(comparison: Comparison, path: Path) -> None:
 
 
 def _pairs(comparison: Comparison) -> list[tuple[str, list[dict[str, str] | None]]]:
-    """Of every run its row in the table of every two, where there are more than two."""
+    """The rows of the table of all pairs, if there are more than two runs."""
     if len(comparison.runs) < 3:
         return []
     rows = []

@@ -309,7 +309,7 @@ def _notes(runs: list[RunReader], names: list[str], differences: list[Difference
 
 
 def _names(folders: list[Path]) -> list[str]:
-    """Their last part where that tells them apart, else all of it; a run that is given twice is numbered."""
+    """The folder names if they differ, else the full paths; a run that is given twice is numbered."""
     short = [folder.resolve().name for folder in folders]
     names = short if len(set(short)) == len(short) else [str(folder) for folder in folders]
     if len(set(names)) < len(names):

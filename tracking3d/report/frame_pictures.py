@@ -54,7 +54,7 @@ class FramePictures:
 def frame_pictures(run: RunReader, budget: int = BUDGET) -> FramePictures:
     """The overlay of a run's frames, without its status bar; none if there is no overlay that can be read.
 
-    Frames get smaller where there are many of them, and where that is not enough, only every n-th is taken.
+    Frames get smaller if there are many, and if that is not enough, only every n-th is used.
 
     Args:
         run: The run.

@@ -18,7 +18,7 @@ from tracking3d.results.files import read_mask, write_mask, writing
 def keep_given_masks(
     folder: Path, first: int, prompt: Prompt | None, corrections: Iterable[Correction] = ()
 ) -> None:
-    """Write the masks of the first frame and of corrections, where they were given as such.
+    """Write the masks of the first frame and of corrections, if they were given as masks.
 
     Args:
         folder: The run folder.

@@ -284,7 +284,7 @@ def clear_refinement(folder: Path) -> None:
 
 
 def _undo_taking_over(folder: Path) -> None:
-    """Put the causal estimates back where they were, and the refined masks aside; a kill may have come in between."""
+    """Restore the causal estimates and set the refined masks aside, also after a kill in between."""
     causal, aside = folder / layout.CAUSAL, folder / layout.REFINING
     if not causal.is_dir():
         return

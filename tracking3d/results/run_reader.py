@@ -185,7 +185,7 @@ class RunReader:
         return self.camera.mask_to_pinhole(self.mask(index))
 
     def probability(self, index: int) -> NDArray[np.float32] | None:
-        """The object's probability ``(H, W)`` in every pixel of the final estimate, where it was asked for, or None."""
+        """The object probabilities ``(H, W)`` of the final estimate; None if they were not requested."""
         return read_probability(self.folder, index) if self.refined else None
 
     def initial_mask(self, index: int) -> NDArray[np.bool_] | None:

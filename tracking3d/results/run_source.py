@@ -33,7 +33,7 @@ def open_run_source(run: RunReader, source: str | Path | None = None) -> FrameSo
 
 
 def places_of(source: str, folder: Path) -> list[Path]:
-    """Where the video of a run may lie, by what the run calls it: it was relative to where the run was begun.
+    """Candidate paths of a run's video: its path was relative to the working directory of the run.
 
     Args:
         source: What ``run.json`` calls it.

@@ -205,7 +205,7 @@ def _crop_to_frame(window: Window) -> NDArray[np.float64]:
 
 
 def _overlap(window: Window, shape: tuple[int, ...]) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """Where the window lies in the frame, and the frame in the window; empty slices where they do not meet."""
+    """Slices of the window in the frame and of the frame in the window; empty if they do not overlap."""
     rows, columns = (
         slice(min(max(start, 0), end), max(min(start + window.side, end), 0))
         for start, end in ((window.top, shape[0]), (window.left, shape[1]))

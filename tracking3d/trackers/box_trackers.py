@@ -35,7 +35,7 @@ class BoxOffset:
         return cls(((told[0] - x) / width, (told[1] - y) / height), (told[2] / width, told[3] / height))
 
     def apply(self, box: Box) -> Box:
-        """The object's box where the one that is followed is ``box``."""
+        """The object's box, given the tracked ``box``."""
         x, y, width, height = box
         across, down = self.factor
         return x + self.shift[0] * width, y + self.shift[1] * height, across * width, down * height

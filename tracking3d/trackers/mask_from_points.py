@@ -120,7 +120,8 @@ def _grab_cut(
     beside: NDArray[np.bool_],
     inside: NDArray[np.bool_],
 ) -> NDArray[np.bool_]:
-    """The object by its colours, as far as it hangs together with a point on it; what is likely where they are flat."""
+    """The object by its colours, as far as it is connected to an object point; the likely pixels if colours are
+    uniform."""
     labels = np.where(likely, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     labels[~inside | beside] = cv2.GC_BGD
     labels[on & inside] = cv2.GC_FGD

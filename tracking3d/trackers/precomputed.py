@@ -80,7 +80,7 @@ class PrecomputedMasks:
         return estimate
 
     def step(self, frame: Frame) -> MaskEstimate:
-        """The frame's mask, or an estimate without one where there is a gap.
+        """The frame's mask, or an estimate without a mask if it is missing.
 
         Raises:
             InputError: If the mask's proportions are not the frame's.
@@ -160,7 +160,7 @@ def _last_number(frame: Frame) -> int | None:
 
 
 def _numbers(names: Sequence[str]) -> list[int]:
-    """The number that tells the names apart, the last such; none where no number does."""
+    """The number that distinguishes the names, the last one; empty if there is none."""
     found = [[int(digits) for digits in re.findall(r"\d+", name)] for name in names]
     for place in range(1, min(map(len, found), default=0) + 1):
         numbers = [row[-place] for row in found]

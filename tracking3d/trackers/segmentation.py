@@ -86,7 +86,7 @@ class ColourSegmentation:
 
     @property
     def estimate(self) -> MaskEstimate:
-        """The latest frame's mask and score, or no mask and the reason where the object is not visible."""
+        """The latest frame's mask and score, or no mask and a reason if the object is not visible."""
         if box_of(self._mask) is None:
             return MaskEstimate(None, 0.0, "the object is not visible")
         return MaskEstimate(self._mask, self._judgement.score, self._judgement.doubt)

@@ -122,7 +122,7 @@ class VideoPictures:
 
     @property
     def count(self) -> int:
-        """Number of pictures; 0 where the file has no times to count them by."""
+        """Number of pictures; 0 if the file has no time stamps."""
         return len(self._times)
 
     def image(self, index: int) -> Image | None:
@@ -138,7 +138,7 @@ class VideoPictures:
             return None
 
     def _presentation_times(self) -> list[int]:
-        """Of all pictures, in the order in which they are shown; none where they are not to be relied on."""
+        """Time stamps of all pictures in display order; none if they are unreliable."""
         if self._video.interlaced or not _INDEXED & set(self._container.format.name.split(",")):
             return []  # a picture that is made of its neighbours' lines is not found alone
         try:
@@ -172,13 +172,13 @@ class VideoPictures:
             return None
 
     def _pictures(self) -> Iterator[av.VideoFrame]:
-        """From where the file stands, those that can be decoded."""
+        """The decodable pictures from the present position."""
         for packet in self._container.demux(self._stream):
             with suppress(FFmpegError):
                 yield from (picture for picture in packet.decode() if isinstance(picture, av.VideoFrame))
 
     def _counted(self, index: int) -> Image | None:
-        """The frame by reading on to it, or from the beginning where it is behind."""
+        """The frame by reading on to it, or from the beginning if it lies before the present position."""
         if index < self._next:
             self._reading, self._next = iter(()), 0
         if not self._next:

@@ -39,7 +39,7 @@ class ArraySource:
 
     @property
     def count(self) -> int | None:
-        """Number of selected frames where the iterable has a length."""
+        """Number of selected frames, if the iterable has a length."""
         return len(within(self.selection, len(self.arrays))) if isinstance(self.arrays, Sized) else None
 
     @property

@@ -56,7 +56,7 @@ def read_image(path: Path) -> Image:
 
 
 def read_intrinsics(path: Path) -> tuple[Intrinsics, str] | None:
-    """The pinhole camera that an image's EXIF data tell of, and in words where it came from.
+    """The pinhole camera from an image's EXIF data, and its origin in words.
 
     The 35 mm equivalent focal length is the one with the same *diagonal* field of view on a 36 x 24 mm frame
     (CIPA DCG-001), so ``f = f35 * diagonal in pixels / 43.27``; the principal point is the centre.

@@ -74,7 +74,7 @@ class FramesInMemory:
 
     @property
     def count(self) -> int | None:
-        """Number of frames where the iterable has a length."""
+        """Number of frames, if the iterable has a length."""
         if isinstance(self.frames, Sized):
             return len(self.frames)
         count: int | None = getattr(self.frames, "count", None)

@@ -183,7 +183,7 @@ class RunCorrection:
 
 
 def _lines_in(path: Path) -> int:
-    """How many lines a file has; none where it is not there."""
+    """The number of lines of a file; 0 if it does not exist."""
     try:
         return path.read_bytes().count(b"\n")
     except OSError:

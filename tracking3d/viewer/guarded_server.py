@@ -96,7 +96,7 @@ class _Guard:
         guard = self
 
         class CountedConnection(ServerConnection):
-            """Hangs up at once where there are too many, and on who uploads: the viewer asks for no file."""
+            """Closes the connection if there are too many, or if the client uploads: the viewer accepts no files."""
 
             def connection_made(self, transport: Any) -> None:
                 guard.connections += 1

@@ -263,7 +263,7 @@ class Viewer:
                 self._take_news(draw=False)
 
     def _colours(self, video: Video) -> list[Colour]:
-        """Of each object's outline, those of its curve, where a video has several."""
+        """Colours of the objects' outlines, those of their curves, if a video has several objects."""
         if len(video.runs) < 2:
             return []
         colours = timeline.RUN_COLOURS

@@ -88,7 +88,7 @@ class ColourJudge:
             self._colours.update(lab(crop_window(image, window)), *_sides(mask, window))
 
     def corrected(self, image: Image, mask: NDArray[np.float32]) -> ColourJudge:
-        """This judge after a correction; a new one where the mask shows that it knew the wrong colours."""
+        """This judge after a correction; a new one if the mask shows that its colours were wrong."""
         if self._judge(image, mask, None).doubt:
             return ColourJudge(image, mask)
         self.learn(image, mask)
@@ -105,7 +105,7 @@ class ColourJudge:
         return Judgement(separation, margin, None if witness is None else box_iou(box, witness))
 
     def _sharpen(self, image: Image, mask: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The network's shares and the colours as one; nothing is added where the network saw nothing."""
+        """The network's probabilities combined with the colours; nothing is added where the network found nothing."""
         box = box_of(mask)
         if box is None:
             return mask
