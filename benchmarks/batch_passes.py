@@ -1,7 +1,7 @@
-"""A batch of synthetic clips, with one worker and with more, and with everything gone wrong that can: what it takes.
+"""Measures a batch of synthetic clips with one worker, with several, and with injected faults.
 
 `demonstrate` makes the clips, tracks them with each number of workers, once more with faults, and compares every
-answer with that of a single run.
+estimate with that of a single run.
 """
 
 from __future__ import annotations
@@ -110,13 +110,13 @@ def demonstrate(
 ) -> list[Pass]:
     """Track clips with each number of workers, then with faults, then some by themselves.
 
-    After Ctrl-C, or when the time is over, what there is until then is the answer.
+    After Ctrl-C, or when the time is over, the results so far are returned.
 
     Args:
         config: The pipeline.
         folder: Gets clips and results; passes that are there are replaced.
         asked: Of how many clips, and how.
-        said: Is told what goes on, and what each pass came to.
+        said: Called with messages on progress and the result of each pass.
 
     Returns:
         A pass for each number of workers, with faults one more, and the single runs of some clips at the end.
@@ -179,7 +179,7 @@ def _write_clip(file: Path, spec: SyntheticSpec) -> str:
 
 
 def _with_faults(jobs: Sequence[VideoJob], folder: Path, disk: bool) -> list[VideoJob]:
-    """The same clips, and beside them one that is damaged, one whose plug-in aborts, and one that fills the disk."""
+    """The same clips, plus one that is damaged, one whose plug-in aborts, and one that fills the disk."""
     trackers = {"Aborting": ABORTING, "Filling": FILLING}
     entries = [
         f"tracking3d.trackers:{name}={faulty_trackers.__file__}:{kind}" for kind, name in trackers.items()

@@ -1,4 +1,4 @@
-"""Mask trackers that end badly, for demonstrations of what a batch outlives; `VARIABLE` of plug-ins names this file.
+"""Mask trackers that fail on purpose, to demonstrate the robustness of a batch; `VARIABLE` of plug-ins names this file.
 
 ``aborting`` ends its process in its third frame, every time. ``filling`` finds the disk full in its third frame, the
 first time only: the system then refuses what any program is refused on a full disk.

@@ -1,4 +1,4 @@
-"""What a batch takes of a machine while it goes on: memory, open files, processes, shared memory and disk."""
+"""Resource usage of a running batch: memory, open files, processes, shared memory and disk."""
 
 from __future__ import annotations
 

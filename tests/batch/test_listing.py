@@ -56,7 +56,7 @@ def test_a_video_that_nothing_is_said_of_is_a_fault_of_its_own(videos):
 def test_a_pattern_names_videos(videos):
     assert set(jobs_of(videos / "*.mp4")) == {"one"}
     assert set(jobs_of(videos / "**" / "*.mp4")) == {"one", "in/two"}
-    with pytest.raises(InputError, match="names no video"):
+    with pytest.raises(InputError, match="contains no video"):
         jobs_of(videos / "*.avi")
 
 
@@ -70,7 +70,7 @@ def test_no_run_folder_lies_within_another_or_among_the_logs(videos):
     write_video(videos / "logs.mp4")
     assert set(jobs_of(videos)) == {"one", "in.mp4", "in/two", "logs.mp4"}
     (videos / "jobs.csv").write_text("video,name\none.mp4,a\nin/two.mp4,a/b\n")
-    with pytest.raises(InputError, match="within another"):
+    with pytest.raises(InputError, match="inside another"):
         jobs_of(videos / "jobs.csv")
 
 

@@ -84,7 +84,7 @@ def test_a_folder_that_no_batch_has_written_is_left_alone(batch, videos, tmp_pat
     mine.write_text("mine")
     progress, _ = batch(videos)
     assert (progress.finished, progress.failed) == (1, 1) and mine.read_text() == "mine"
-    assert "no batch has written" in read_failures(str(tmp_path / "out"))[0].reason
+    assert "not written by a batch" in read_failures(str(tmp_path / "out"))[0].reason
 
 
 def test_a_video_that_fails_once_goes_on_where_it_was(batch, videos, recorded, tmp_path):
@@ -205,7 +205,7 @@ def test_two_batches_do_not_share_a_folder(batch, videos, tmp_path):
 
 
 def test_a_folder_of_no_batch_and_a_damaged_one_are_said(tmp_path):
-    with pytest.raises(InputError, match="is no folder of a batch"):
+    with pytest.raises(InputError, match="is not a batch folder"):
         read_progress(str(tmp_path))
     for text in ("{", "[]", json.dumps({"format": "other"}), json.dumps({"format": "tracking3d-batch"})):
         (tmp_path / "progress.json").write_text(text)
@@ -220,4 +220,4 @@ def test_a_batch_that_is_silent_for_long_is_said_to_be(batch, videos, tmp_path):
     batch(videos)
     file = tmp_path / "out/progress.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | {"state": "running", "updated": 0.0}))
-    assert "nothing was heard" in read_progress(str(tmp_path / "out")).state_in_words
+    assert "without progress" in read_progress(str(tmp_path / "out")).state_in_words

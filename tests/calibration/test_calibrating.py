@@ -33,7 +33,7 @@ def differs(found: Lens, true: Lens) -> float:
 def test_the_camera_is_found(views):
     grey = Frame(12, np.full((HEIGHT, WIDTH, 3), 90, np.uint8))
     found = calibrate([*views, grey, SkippedFrame(13, "damaged")], BOARD)
-    assert found.left_out == {12: "no board seen", 13: "damaged"}
+    assert found.left_out == {12: "no board found", 13: "damaged"}
     assert found.error < 0.2 and found.coverage > 0.6 and found.camera.size == (WIDTH, HEIGHT)
     assert found.camera.intrinsics[0] == pytest.approx(420, abs=2) and 0 < found.focal_deviation < 2
     camera = found.camera
@@ -65,7 +65,7 @@ def test_a_view_that_is_off_is_left_out(views, monkeypatch):
 
 
 def test_too_few_views_are_refused(views):
-    with pytest.raises(InputError, match="in 3 of 3 frames, and 6 at least"):
+    with pytest.raises(InputError, match="in 3 of 3 frames, but at least 6"):
         calibrate(views[:3], BOARD)
 
 
@@ -76,7 +76,7 @@ def test_another_board_is_refused(views):
 
 def test_views_that_leave_much_of_the_picture_out_are_refused():
     far = [view(BOARD, lens(), 4 * index, near=False) for index in range(7)]
-    with pytest.raises(InputError, match=r"of the picture of the source only, least in its .* part"):
+    with pytest.raises(InputError, match=r"of the image of the source, least in its .* part"):
         calibrate(far, BOARD)
 
 

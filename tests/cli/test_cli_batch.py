@@ -107,7 +107,7 @@ def test_a_dataset_is_tracked_from_its_boxes(call, tmp_path, script, opened):
 def test_what_cannot_be_used_is_said_before_anything_is_written(refused, shots, tmp_path):
     (tmp_path / "jobs.csv").write_text("video,wdith\nshots/cup,3\n")
     assert "'wdith'" in refused("batch", "jobs.csv", "--out", "out")
-    assert "names no video" in refused("batch", "absent/*.mp4", "--out", "out")
+    assert "contains no video" in refused("batch", "absent/*.mp4", "--out", "out")
     assert "progress.json" in refused("batch", "status", "shots")
     assert "no setting" in refused("batch", shots, "--out", "out", "--set", "solver.nothing=1")
     assert not (tmp_path / "out").exists()

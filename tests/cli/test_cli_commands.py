@@ -210,9 +210,9 @@ def test_evaluate_prints_a_table_or_json_only(call, finished, truth):
     result = call("evaluate", finished, "--truth", truth)
     assert result.exit_code == 0
     assert "IoU" in result.stdout
-    assert "5 of 5 answered frames match frames of the clip, 0 to 4 of its 5." in result.stderr
+    assert "5 of 5 estimated frames match frames of the clip, 0 to 4 of its 5." in result.stderr
     shifted = call("evaluate", finished, "--truth", truth, "--offset", 1)
-    assert "4 of 5 answered frames match frames of the clip, 1 to 4 of its 5." in shifted.stderr
+    assert "4 of 5 estimated frames match frames of the clip, 1 to 4 of its 5." in shifted.stderr
 
 
 def test_evaluate_names_the_folder_that_is_none(refused, finished, truth):
@@ -228,7 +228,7 @@ def test_points_are_followed_as_csv_and_json(call, finished):
     assert float(rows[0]["x"]) == pytest.approx(31.5, abs=0.01)
     assert (rows[0]["on_object"], rows[1]["on_object"]) == ("1", "0")
     result = call("points", finished, *pixels, "--json")
-    assert "Beside the object's mesh in frame 0: 0,0;" in result.stderr
+    assert "These pixels of frame 0 are outside the object's mesh: 0,0;" in result.stderr
     tracks = json.loads(result.stdout)
     assert tracks["frames"] == [0, 1, 2, 3, 4]
     result = call("points", finished, *pixels, "--csv", "points.csv")
@@ -283,15 +283,18 @@ def test_points_without_their_video_are_carried_by_the_mesh_and_that_is_said(cal
         ("points run --xy 1,1 --frame 9", "9"),
         ("points run --xy 1,1 --frame x", "--frame"),
         ("points run --xy 31,23 --csv run/no/points.csv", "run/no/points.csv"),
-        ("points run --xy 31,23 --xy 64,23", "There is no pixel 64,23 in frame 0, which has 64 x 48 pixels"),
-        ("points run --xy 31,-1", "There is no pixel 31,-1"),
-        ("points run --xy 1,1 --xy 2,1", "Beside the object's mesh in frame 0: 1,1 and 2,1;"),
+        ("points run --xy 31,23 --xy 64,23", "Frame 0 has no pixel 64,23: it has 64 x 48 pixels"),
+        ("points run --xy 31,-1", "has no pixel 31,-1"),
+        (
+            "points run --xy 1,1 --xy 2,1",
+            "These pixels of frame 0 are outside the object's mesh: 1,1 and 2,1;",
+        ),
         ("points run --xy 1,1", "or --any to follow them in the images alone"),
         (
             "points run --xy 1,1 --any --by-mesh",
             "--any tracks points in the images, which --by-mesh does not read",
         ),
-        ("points run --xy 99,1 --any", "There is no pixel 99,1 in frame 0"),
+        ("points run --xy 99,1 --any", "Frame 0 has no pixel 99,1"),
     ],
 )
 def test_bad_question_for_points_is_refused(refused, finished, arguments, words):

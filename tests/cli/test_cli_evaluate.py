@@ -170,7 +170,7 @@ def test_a_run_that_was_interrupted_is_scored_and_called_so(call, clips, script,
     assert "interrupted" not in call(*scored).stderr
     described = json.loads(Path("run/run.json").read_text())
     Path("run/run.json").write_text(json.dumps(described | {"state": "interrupted"}))
-    assert "The run in run is interrupted; frames with an answer so far: 3." in call(*scored).stderr
+    assert "The run in run is interrupted; frames estimated so far: 3." in call(*scored).stderr
 
 
 def made(clips):

@@ -45,7 +45,7 @@ def test_a_run_that_has_not_ended_is_exported_as_far_as_it_is(call, finished):
     file.write_text(json.dumps(json.loads(file.read_text()) | {"state": "interrupted"}))
     result = call("export", finished, "--to", "vot", "--out", "masks.txt")
     assert result.exit_code == 0
-    assert "is interrupted; frames with an answer so far: 5" in result.stderr
+    assert "is interrupted; frames estimated so far: 5" in result.stderr
 
 
 def test_pixels_are_followed(call, finished):
@@ -59,7 +59,7 @@ def test_what_cannot_be_used_is_refused(call, refused, finished):
     assert "--list" in refused("export", finished)
     assert "There is no format fbx; --to takes tum" in refused("export", finished, "--to", "fbx")
     assert "absent is not a run folder" in refused("export", "absent", "--to", "tum")
-    assert "no use for --cut-out" in refused("export", finished, "--to", "tum", "--cut-out")
+    assert "does not use --cut-out" in refused("export", finished, "--to", "tum", "--cut-out")
     assert "--object-size is -1" in refused("export", finished, "--to", "tum", "--object-size", "-1")
     assert "--of is object or camera" in refused("export", finished, "--to", "tum", "--of", "hand")
     assert "--xy 'a' is not 2 numbers" in refused("export", finished, "--to", "tapvid", "--xy", "a")

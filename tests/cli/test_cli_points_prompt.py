@@ -134,12 +134,15 @@ BAD = {
     ),
     "no such frame": (
         ["--box", "20,10,20,20", "--start-frame", "9"],
-        "--start-frame 9 is not among the frames",
+        "--start-frame 9 is not among the selected frames",
     ),
-    "a negative frame": (["--box", "20,10,20,20", "--start-frame", "-1"], "--start-frame -1 is no index"),
+    "a negative frame": (
+        ["--box", "20,10,20,20", "--start-frame", "-1"],
+        "--start-frame -1 is not a frame index",
+    ),
     "not selected": (
         ["--box", "20,10,20,20", "--start-frame", "2", "--frames", "1:5:2"],
-        "--start-frame 2 is not among the frames",
+        "--start-frame 2 is not among the selected frames",
     ),
     "a solver that goes forwards": (
         ["--box", "20,10,20,20", "--start-frame", "2", "--preset", "paper"],

@@ -111,8 +111,8 @@ def test_compare_says_what_is_not_finished_or_of_another_length(call, clip, scri
     script.faults[3] = KeyboardInterrupt()
     call("run", clip, *BOX, "--out", "part", "--no-report")
     said = " ".join(call("compare", "whole", "part").stderr.split())
-    assert "part is interrupted: 3 frames have an answer." in said
-    assert "they are compared in the 3 that both have" in said
+    assert "part is interrupted: 3 frames have an estimate." in said
+    assert "they are compared in the 3 frames that both have" in said
 
 
 @pytest.mark.parametrize(

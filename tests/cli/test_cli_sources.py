@@ -83,12 +83,12 @@ def test_a_box_comes_from_a_file_of_regions(call, images, script):
     assert call("run", images, "--box", "groundtruth.txt", "--frames", "1:", "--out", "run").exit_code == 0
     assert script.built[0][1].box == (3, 4, 12, 13)
     refused = call("run", images, "--box", "groundtruth.txt", "--frames", "3:", "--out", "other")
-    assert refused.exit_code == 2 and "has no box in its line 4" in refused.output
+    assert refused.exit_code == 2 and "has no box in line 4" in refused.output
 
 
 REFUSED = {
-    "--fps 0": "no rate of a video",
-    "--fps nan": "no rate of a video",
+    "--fps 0": "not a frame rate",
+    "--fps nan": "not a frame rate",
     "--distortion 0.1,0.2": None,
     "--distortion=1,2,3,4,5,6,7,8,9,10,11,12,13,14,15": "has 15 numbers",
     "--distortion=a,b": "K1,K2,P1,P2",
@@ -100,10 +100,10 @@ REFUSED = {
     "--camera none.yaml": "does not exist",
     "--camera camera.yaml --fov 40": "leave out --fov",
     "--camera camera.yaml --intrinsics camera.yaml": "not both",
-    "--camera wide.yaml": "no enlargement",
+    "--camera wide.yaml": "another aspect ratio",
     "--camera camera.yaml:left": "does not exist|has no camera left",
     "--mask first.png@3": "does not exist",
-    "--masks none.json": "no masks at none.json",
+    "--masks none.json": "none.json holds no masks",
     "--masks camera.yaml": "cannot be read as masks",
 }
 
@@ -163,7 +163,7 @@ def test_a_board_is_printed_at_its_true_size(call):
         (("nowhere.mp4",), "does not exist"),
         (("board", "--out", "board.doc"), "neither a .png nor a .pdf"),
         (("board", "--out", "no/board.png"), "cannot be written"),
-        (("board", "--out", "b.png", "--squares", "25x25"), "more markers than there are"),
+        (("board", "--out", "b.png", "--squares", "25x25"), "more than the available 250 markers"),
     ],
 )
 def test_what_cannot_be_calibrated_is_refused(call, images, arguments, told):

@@ -381,7 +381,7 @@ def test_missing_ground_truth_is_named(vot):
 
 def test_a_damaged_line_is_named_with_its_file(vot):
     write_lines(vot / "car/groundtruth.txt", "4,5,6,7", "4,5,six,7", "1,2,3,4")
-    with pytest.raises(InputError, match=r"groundtruth\.txt, line 2: 'six' is no number"):
+    with pytest.raises(InputError, match=r"groundtruth\.txt, line 2: 'six' is not a number"):
         read("vot", vot, "car")
 
 
@@ -439,7 +439,7 @@ def test_missing_files_of_a_scene_are_named(bop, file, reason):
         (
             "models/models_info.json",
             '{"11": {"symmetries_discrete": [[1,0,0,0, 0,1,0,0, 0,0,-1,0, 0,0,0,1]]}}',
-            "no rigid transform",
+            "not a rigid transform",
         ),
     ],
 )

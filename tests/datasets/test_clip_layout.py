@@ -265,7 +265,7 @@ def test_points_come_along_and_may_be_all_that_is_known(clip):
         ({"positions": np.array([{}]), "visible": np.ones(1)}, "cannot be read as positions and visible"),
         ({"positions": np.zeros((2, 2, 2)), "visible": np.ones((2, 2))}, "the clip's 3 frames"),
         ({"positions": np.zeros((3, 2, 3)), "visible": np.ones((3, 2))}, "the clip's 3 frames"),
-        ({"positions": np.full((3, 2, 2), np.nan), "visible": np.ones((3, 2))}, "no finite number"),
+        ({"positions": np.full((3, 2, 2), np.nan), "visible": np.ones((3, 2))}, "not finite"),
     ],
 )
 def test_points_of_another_form_are_named(clip, arrays, reason):
@@ -293,7 +293,7 @@ def test_points_that_are_no_archive_are_named(clip, data):
         ("camera.json", {"K": [[0, 0, 1], [0, 1, 1], [0, 0, 1]]}, "positive focal lengths"),
         ("camera.json", {"K": [[9, 2, 1], [0, 9, 1], [0, 0, 1]]}, "K must be fx 0 cx"),
         ("camera.json", {"K": [[9, 0, 1], [0, 9, 1], [0, 1, 1]]}, "K must be fx 0 cx"),
-        ("camera.json", {"width": "wide"}, "width and height whole"),
+        ("camera.json", {"width": "wide"}, "width and height must be whole"),
         ("truth_camera.json", {}, "K must be 3 x 3 numbers"),
         ("init.json", {"bbox_xywh": [1, 2, 3]}, "bbox_xywh must be four numbers"),
         ("init.json", {"bbox_xywh": None}, "bbox_xywh must be four numbers"),

@@ -129,8 +129,8 @@ def test_the_first_box_may_have_a_file_of_its_own(read, data):
         ("xywh", "1,2,3", "3 numbers instead of 4"),
         ("xyxy", "1,2,3,4,5", "5 numbers instead of 4"),
         ("xywh", "1,2,3,inf", "infinite"),
-        ("xywh", "1,2,3,wide", "'wide' is no number"),
-        ("polygon", "1,2,3,4", "no polygon"),
+        ("xywh", "1,2,3,wide", "'wide' is not a number"),
+        ("polygon", "1,2,3,4", "not a polygon"),
         ("vot", "", "is empty"),
     ],
 )
@@ -368,7 +368,7 @@ def test_the_camera_may_stand_in_the_description(read, data):
         ("", "json", "cannot be read as JSON"),
         ("{}", "json", "neither K nor fx"),
         ('{"K": "wide"}', "json", "K must be 3 x 3"),
-        ('{"intrinsics": [50, 51, 15, 11], "width": 0}', "json", "width and height positive"),
+        ('{"intrinsics": [50, 51, 15, 11], "width": 0}', "json", "width and height must be positive"),
     ],
 )
 def test_damaged_cameras_are_named(read, data, text, form, reason):

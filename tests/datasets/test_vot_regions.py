@@ -138,7 +138,7 @@ def test_the_mask_within_its_box():
     [
         ("", "a number is missing"),
         ("1,2,,4", "a number is missing"),
-        ("1,2,x,4", "'x' is no number"),
+        ("1,2,x,4", "'x' is not a number"),
         ("1,2", "2 numbers"),
         ("1,2,3,4,5", "5 numbers"),
         ("1,2,inf,4", "infinite"),

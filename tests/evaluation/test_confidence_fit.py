@@ -93,7 +93,7 @@ def test_the_pasted_table_is_python_and_says_the_same():
 
 @pytest.mark.parametrize("right", [np.ones(5, bool), np.zeros(5, bool)])
 def test_nothing_is_learnt_where_all_are_right_or_all_wrong(right):
-    with pytest.raises(ValueError, match="both kinds"):
+    with pytest.raises(ValueError, match="right and wrong ones"):
         fit_confidence({"a": np.arange(5.0)}, right)
 
 

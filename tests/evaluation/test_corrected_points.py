@@ -94,7 +94,7 @@ def test_with_landmarks_both_are_scored_and_named(run, sphere, truth):
     assert scores.points_corrected_average_jaccard > scores.points_average_jaccard + 0.05
     assert scores.points_corrected_occlusion_accuracy > 0.9
     said = table(scores)
-    assert "points by the mesh alone: share within 1 to 16 px" in said
+    assert "points from the mesh alone: share within 1 to 16 px" in said
     assert "points corrected by images: share within 1 to 16 px" in said
 
 

@@ -458,7 +458,7 @@ def test_the_table_shows_the_figures_and_names_what_is_unknown(write_run, clip):
     console.print(format_scores(scores))
     text = console.export_text()
     assert isinstance(scores, Scores)
-    assert "IoU of the answers, mean" in text and "1.000" in text and "50.0 %" in text
+    assert "IoU of the estimates, mean" in text and "1.000" in text and "50.0 %" in text
     assert "unknown" in text
 
 
@@ -598,7 +598,7 @@ def test_an_offset_says_which_frame_is_which(write_run, clip, by):
     assert answers.asked == range(FRAMES)
     assert (
         answers.matched(len(truth.frames))
-        == "10 of 10 answered frames match frames of the clip, 0 to 9 of its 10"
+        == "10 of 10 estimated frames match frames of the clip, 0 to 9 of its 10"
     )
     scores = score(answers, truth)
     assert (scores.frames_missing, scores.iou_mean) == (0, 1.0)
@@ -614,7 +614,7 @@ def test_frames_that_an_offset_moves_out_of_the_clip_are_not_asked_for(write_run
 
 def test_a_run_of_frames_of_another_size_is_refused(write_run, clip):
     camera = asdict(CAMERA) | {"width": 640, "height": 480}
-    with pytest.raises(InputError, match="frames of 640 x 480 pixels and the clip clip of 60 x 40"):
+    with pytest.raises(InputError, match="frames of 640 x 480 pixels, but the clip clip has 60 x 40"):
         score_run(write_run(camera=camera), clip)
 
 
@@ -628,7 +628,7 @@ def test_the_share_of_answers_of_its_own_is_told_beside_the_iou(write_run, clip)
     }
     scores = score_run(write_run(changes=sources), clip)
     assert scores.share_own_masks == pytest.approx(3 / 9)  # the given frame does not count
-    assert "not the initial mask" in text_of(scores)
+    assert "not the unchanged initial mask" in text_of(scores)
 
 
 def test_whose_masks_they_are_is_unknown_in_runs_of_older_versions(write_run, clip):
@@ -641,7 +641,7 @@ def test_stages_are_means_and_come_after_the_whole(write_run, clip):
     scores = score_run(write_run(changes={n: {"stages": stages} for n in range(FRAMES)}), clip)
     assert {stage: getattr(scores, f"seconds_{stage}") for stage in stages} == pytest.approx(stages)
     text = text_of(scores)
-    assert text.index("seconds a frame, mean") < text.index("of it decode") < text.index("of it write")
+    assert text.index("seconds per frame, mean") < text.index("stage decode") < text.index("stage write")
 
 
 def text_of(scores):

@@ -47,7 +47,7 @@ def test_a_folder_says_what_it_is(run, tmp_path):
 def test_nothing_is_replaced_unless_that_was_asked(run, tmp_path, to):
     place = tmp_path / "out"
     export_run(run, to, place)
-    with pytest.raises(OutputError, match="exists already"):
+    with pytest.raises(OutputError, match="already exists"):
         export_run(run, to, place)
     export_run(run, to, place, options=ExportOptions(of="camera"), overwrite=True)
     text = (place if to == "tum" else place / "poses.txt").read_text()
@@ -59,7 +59,7 @@ def test_nothing_is_replaced_unless_that_was_asked(run, tmp_path, to):
 def test_a_folder_of_somebody_elses_is_never_replaced(run, tmp_path):
     (tmp_path / "letters").mkdir()
     (tmp_path / "letters" / "dear.txt").write_text("dear")
-    with pytest.raises(OutputError, match="was not exported"):
+    with pytest.raises(OutputError, match="not an export"):
         export_run(run, "kitti", tmp_path / "letters", overwrite=True)
     assert names(tmp_path / "letters") == ["dear.txt"]
     with pytest.raises(OutputError, match="is a folder, and tum is a file"):
@@ -117,7 +117,7 @@ def test_files_of_the_run_are_not_replaced(run):
     before = (run / "run.json").read_bytes()
     with pytest.raises(OutputError, match="is a file of the run itself"):
         export_run(run, "coco", run / "run.json", overwrite=True)
-    with pytest.raises(OutputError, match="was not exported"):
+    with pytest.raises(OutputError, match="not an export"):
         export_run(run, "davis", run / "masks", overwrite=True)
     assert (run / "run.json").read_bytes() == before
 
@@ -172,16 +172,16 @@ def test_extras_are_declared():
     ("to", "options", "words"),
     [
         ("gltf", {}, "There is no format gltf; to= takes tum, kitti"),
-        ("tum", {"cut_out": True}, "no use for cut_out="),
-        ("vot", {"object_size": 1.0}, "no use for object_size="),
+        ("tum", {"cut_out": True}, "does not use cut_out="),
+        ("vot", {"object_size": 1.0}, "does not use object_size="),
         ("tum", {"fps": 0.0}, "fps= is 0"),
         ("tum", {"object_size": float("nan")}, "object_size= is nan"),
         ("tum", {"of": "hand"}, "Poses cannot be of 'hand'"),
-        ("tum", {"answers": "best"}, "There are no answers 'best'"),
-        ("tapvid", {"xy": ((500.0, 3.0),)}, "There is no pixel 500,3"),
+        ("tum", {"answers": "best"}, "Estimates cannot be 'best'"),
+        ("tapvid", {"xy": ((500.0, 3.0),)}, "has no pixel 500,3"),
         ("tapvid", {"frame": 2}, "lost in frame 2"),
         ("tapvid", {"frame": 99}, "no frame 99"),
-        ("cut-outs", {"source": "absent.mp4"}, "say with source= where"),
+        ("cut-outs", {"source": "absent.mp4"}, "give the present path of its video as source="),
     ],
 )
 def test_what_cannot_be_used_is_refused_in_a_sentence(run, tmp_path, to, options, words):
@@ -214,7 +214,7 @@ def test_a_relative_source_is_found_from_another_folder(run, tmp_path, monkeypat
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     assert export_run(moved, "cut-outs", tmp_path / "out").frames == 6
-    with pytest.raises(InputError, match="say with source= where"):
+    with pytest.raises(InputError, match="give the present path of its video as source="):
         export_run(moved, "cut-outs", tmp_path / "other", options=ExportOptions(source="clips/one"))
 
 
@@ -222,7 +222,7 @@ def test_a_camera_cannot_be_looked_through_again(run, tmp_path):
     shutil.copytree(run, tmp_path / "live")
     file = tmp_path / "live" / "run.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | {"source": "0"}))
-    with pytest.raises(InputError, match="no video that can be read again"):
+    with pytest.raises(InputError, match="cannot be read again"):
         export_run(tmp_path / "live", "colmap", tmp_path / "out")
     export_run(tmp_path / "live", "colmap", tmp_path / "out", options=ExportOptions(images=False))
 

@@ -139,12 +139,12 @@ def test_probabilities_are_grey_pictures_of_the_frames_that_have_them(export, li
 
 def test_what_a_run_has_no_probabilities_for_is_said(export, run, likely_run):
     with pytest.raises(
-        InputError, match=r"kept no probabilities; track again with runtime.probabilities=true"
+        InputError, match=r"stored no probabilities; track again with runtime.probabilities=true"
     ):
         export(run, "probabilities")
-    with pytest.raises(InputError, match="of its final answers only"):
+    with pytest.raises(InputError, match="of the final estimates only"):
         export(likely_run, "probabilities", answers="causal")
     shutil.rmtree(likely_run / "probabilities")
     (likely_run / "probabilities").mkdir()
-    with pytest.raises(InputError, match="no frame whose mask was weighed"):
+    with pytest.raises(InputError, match="no frame with a fused mask"):
         export(likely_run, "probabilities-16")

@@ -128,7 +128,7 @@ def test_rectangles_are_boxes_that_the_object_is_segmented_in(tmp_path):
         truth = np.zeros(SIZE, bool)
         truth[30:60, 40 + 4 * index : 80 + 4 * index] = True
         assert (answer.binary & truth).sum() / (answer.binary | truth).sum() > 0.9
-    assert answers[2].reason == "no box was given for this frame" and answers[2].score <= 0.5
+    assert answers[2].reason == "there is no box for this frame" and answers[2].score <= 0.5
 
 
 @pytest.mark.parametrize("text", ["", "1,2,3\n", "hello\n", "m1,2\n"])

@@ -130,9 +130,9 @@ def test_patches_are_windows_of_the_picture_one_after_another(stride):
     [
         (
             {"descriptor": "hardnet"},
-            r"^features.weights: hardnet needs the file of .* nothing is fetched",
+            r"^features.weights: hardnet needs a weights file, .*none is downloaded",
         ),
-        ({"descriptor": "disk"}, r"^features.weights: disk needs the file"),
+        ({"descriptor": "disk"}, r"^features.weights: disk needs a weights file"),
         ({"weights": "x.pth"}, r"^features.weights: dense-sift has no weights"),
         ({"descriptor": "hardnet", "weights": "nowhere.pth"}, r"^The weights nowhere.pth do not exist"),
     ],

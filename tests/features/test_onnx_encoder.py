@@ -152,15 +152,15 @@ def test_a_network_without_a_map_is_refused(tmp_path):
     vector = helper.make_tensor_value_info("vector", TensorProto.FLOAT, [1, None])
     nodes = [helper.make_node("Flatten", ["image"], ["vector"])]
     file = save(tmp_path / "net.onnx", nodes, [image], [vector], [])
-    with pytest.raises(InputError, match=r"vector \(1, 12288\).*cannot be told"):
+    with pytest.raises(InputError, match=r"vector \(1, 12288\).*ambiguous"):
         encoder(file)
 
 
 @pytest.mark.parametrize(
     ("description", "message"),
     [
-        ({"output": "desc"}, r"no feature map 'desc'.*gives coarse \(1, 6, 16, 16\), fine"),
-        ({"input": {"name": "picture"}}, "no input 'picture' but image; correct input.name"),
+        ({"output": "desc"}, r"no feature map 'desc'.*returns coarse \(1, 6, 16, 16\), fine"),
+        ({"input": {"name": "picture"}}, "no input 'picture'; it has image; correct input.name"),
         ({"output": ["coarse", "fine"], "combine": "sum"}, "6, 4 channels.*combine: concatenate"),
     ],
 )
@@ -172,7 +172,7 @@ def test_a_description_that_does_not_fit_is_refused(tmp_path, description, messa
 
 def test_a_network_of_two_images_is_refused(tmp_path):
     file = write_network(tmp_path / "net.onnx", {"features": (4, 8)}, inputs=("image", "other"))
-    with pytest.raises(InputError, match="inputs image, other, but a feature network takes an image alone"):
+    with pytest.raises(InputError, match="inputs image, other, but a feature network takes only an image"):
         encoder(file)
 
 

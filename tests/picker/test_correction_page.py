@@ -20,7 +20,7 @@ def begun() -> list:
 def page(session, begun):
     def begin(drawn):
         if drawn.frame == 5:
-            raise InputError("A correction goes on; wait for it.")
+            raise InputError("A correction is in progress; wait for it to finish.")
         begun.append(drawn)
 
     page = CorrectionPage(
@@ -73,7 +73,7 @@ def test_what_is_no_drawing_is_refused_and_begins_nothing(page, begun, told):
 
 def test_a_refusal_is_told_in_a_sentence(page):
     answer = post(page, "/correct", {**BOX, "frame": 5})
-    assert status(answer) == 422 and b"A correction goes on; wait for it." in answer
+    assert status(answer) == 422 and b"A correction is in progress; wait for it to finish." in answer
 
 
 @pytest.mark.parametrize("path", ["/start", "/save", "/correct/../start"])

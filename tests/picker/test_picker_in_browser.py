@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from browser import open_page
 
-SHOWN = "#status:has-text('the run begins with')"
+SHOWN = "#status:has-text('The run starts from this mask')"
 
 
 @pytest.fixture
@@ -65,6 +65,6 @@ def test_points_paint_and_undo_and_the_command_to_copy(page, picker, tmp_path):
 def test_what_cannot_be_used_is_said_in_red_and_nothing_starts(page, picker):
     page.keyboard.press("i")
     page.mouse.click(*at(page, 48, 32))
-    page.wait_for_selector("#status.problem:has-text('Nothing is marked')")
+    page.wait_for_selector("#status.problem:has-text('No object is marked')")
     page.click("#clear")
     page.wait_for_selector("#start:disabled")

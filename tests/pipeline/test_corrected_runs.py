@@ -323,7 +323,7 @@ def test_what_cannot_be_corrected_is_refused_in_a_sentence(clip, images, tmp_pat
         correct_run(folder, [Correction(6, box=(900, 1, 5, 5))])
     assert contents(folder) == before
     shutil.rmtree(folder / layout.PROMPTS)
-    with pytest.raises(InputError, match="say it again by `tracking3d run` with"):
+    with pytest.raises(InputError, match="give it again with `tracking3d run`"):
         correct_run(folder, told(clip))
     description = json.loads((folder / layout.RUN).read_text())
     del description["given"]

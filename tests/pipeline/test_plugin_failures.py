@@ -42,9 +42,9 @@ TRACKER_FAULTS = {
     "raises": "ZeroDivisionError: no pixels",
     "exits": "SystemExit: 3",
     "refuses": "The third mask is missing",
-    "says nothing": "it answered with None instead of a MaskEstimate",
-    "array": "it answered with a ndarray of float32 instead of a MaskEstimate",
-    "shape": "its mask has shape (3, 4), but the frame (64, 80)",
+    "says nothing": "it returned None instead of a MaskEstimate",
+    "array": "it returned a ndarray of float32 instead of a MaskEstimate",
+    "shape": "its mask has shape (3, 4), but the frame has (64, 80)",
     "nan": "its mask has values from nan to nan instead of from 0 to 1",
     "range": "its mask has values from 0 to 255 instead of from 0 to 1",
     "list": "its mask is a list instead of an array of float32",
@@ -52,12 +52,12 @@ TRACKER_FAULTS = {
 }
 ENCODER_FAULTS = {
     "raises": "ZeroDivisionError: no channels",
-    "array": "it answered with a ndarray of float32 instead of a tensor of float32",
+    "array": "it returned a ndarray of float32 instead of a tensor of float32",
     "channels": "its features have shape (1, 2, 32, 32) instead of (1, 3, 32, 32)",
     "stride": "its features have shape (1, 3, 16, 16) instead of (1, 3, 32, 32)",
     "batch": "its features have shape (3, 32, 32) instead of (1, 3, 32, 32)",
     "nan": "its features are not all finite numbers",
-    "integers": "it answered with a Tensor of torch.uint8 instead of a tensor of float32",
+    "integers": "it returned a Tensor of torch.uint8 instead of a tensor of float32",
 }
 
 

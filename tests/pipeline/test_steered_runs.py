@@ -130,7 +130,7 @@ def test_frames_come_forwards_and_then_backwards_however_little_memory_there_is(
 def test_the_first_and_the_last_frame_have_one_way_only():
     assert [item.index for item in both_ways(lambda: items(4), 0, "here")] == [0, 1, 2, 3]
     assert [item.index for item in both_ways(lambda: items(4), 3, "here")] == [3, 2, 1, 0]
-    with pytest.raises(InputError, match="start_frame=4 is not among the frames of here"):
+    with pytest.raises(InputError, match="start_frame=4 is not among the selected frames of here"):
         list(both_ways(lambda: items(4), 4, "here"))
 
 
@@ -265,15 +265,15 @@ def test_a_run_goes_on_from_the_frame_that_it_started_from_only(clip, images, tm
 
 
 def test_frames_that_come_once_only_cannot_be_gone_through_backwards(clip, tmp_path):
-    with pytest.raises(InputError, match="comes once only and cannot be gone through backwards"):
+    with pytest.raises(InputError, match="can be read only once and cannot be tracked backwards"):
         tracking3d.track(iter(list(clip.images)), mask=clip.masks[1], start_frame=1)
-    with pytest.raises(InputError, match="comes once only"):
+    with pytest.raises(InputError, match="can be read only once"):
         record(
             open_source(iter(list(clip.images))), None, tmp_path / "run", mask=clip.masks[1], start_frame=1
         )
     assert not (tmp_path / "run").exists()
     for wrong in (-1, 1.5, "3", True):
-        with pytest.raises(InputError, match="is no index of a frame"):
+        with pytest.raises(InputError, match="is not a frame index"):
             tracking3d.track(list(clip.images), mask=clip.masks[0], start_frame=wrong)
 
 

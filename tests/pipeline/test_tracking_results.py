@@ -168,9 +168,12 @@ def test_a_fine_model_needs_packages_and_says_which(clip, config, monkeypatch):
             {"refine": False, "model": "fast"},
             r"^model='fast' takes the texture .* without the final refinement",
         ),
-        ({"frames": iter(()), "refine": True}, r"^refine=True: the frame iterable comes once only"),
-        ({"frames": iter(()), "model": "fast"}, r"^model='fast' takes .* the frame iterable cannot"),
-        ({"frames": iter(()), "model": "fine"}, r"^model='fine' makes .* the frame iterable comes once only"),
+        ({"frames": iter(()), "refine": True}, r"^refine=True: the iterable of frames comes once only"),
+        ({"frames": iter(()), "model": "fast"}, r"^model='fast' takes .* the iterable of frames cannot"),
+        (
+            {"frames": iter(()), "model": "fine"},
+            r"^model='fine' makes .* the iterable of frames comes once only",
+        ),
         ({"config": "paper", "refine": True}, r"^refine=True: the solver .* gives causal answers only"),
     ],
 )
@@ -227,7 +230,7 @@ def test_a_tracking_that_is_closed_lets_go_of_its_source(clip, config):
 
 
 def test_no_frame_at_all_is_told(config):
-    with pytest.raises(InputError, match=r"^the frame iterable has no frame"):
+    with pytest.raises(InputError, match=r"^the iterable of frames has no frame"):
         track([], box=(1, 2, 3, 4), config=config).result()
 
 

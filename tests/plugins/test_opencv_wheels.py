@@ -41,7 +41,7 @@ def wheels(monkeypatch):
 
 def test_with_the_contrib_build_nothing_is_amiss():
     assert why_no_contrib("TrackerCSRT", "TrackerKCF", SMOOTHER) == ""
-    assert "no Tracker3000:" in why_no_contrib("TrackerCSRT", "Tracker3000")
+    assert "lacks Tracker3000:" in why_no_contrib("TrackerCSRT", "Tracker3000")
 
 
 @pytest.mark.parametrize(
@@ -59,7 +59,7 @@ def test_with_the_contrib_build_nothing_is_amiss():
 )
 def test_just_the_wheels_that_are_installed_are_to_be_removed(wheels, installed, remove):
     wheels(*installed)
-    assert why_no_contrib("TrackerCSRT") == f"the OpenCV in use has no TrackerCSRT: {remove}{INSTALL}"
+    assert why_no_contrib("TrackerCSRT") == f"the installed OpenCV lacks TrackerCSRT: {remove}{INSTALL}"
 
 
 @pytest.mark.parametrize("name", ["csrt", "flow"])
@@ -98,10 +98,10 @@ def test_a_box_tracker_that_an_option_asks_for_is_missed_when_it_is_built(wheels
     from tracking3d.trackers.onnx.boxes import CsrtBoxes
 
     wheels("opencv-python")
-    with pytest.raises(PluginError, match=rf"box tracker csrt .* has no TrackerCSRT: .*{INSTALL}"):
+    with pytest.raises(PluginError, match=rf"box tracker csrt .* lacks TrackerCSRT: .*{INSTALL}"):
         CsrtBoxes(CsrtTracker.Options())
     for witness, absent in (("csrt", "TrackerCSRT"), ("kcf", "TrackerKCF")):
-        with pytest.raises(PluginError, match=rf"witness {witness} .* has no {absent}: .*{INSTALL}"):
+        with pytest.raises(PluginError, match=rf"box tracker {witness} .* lacks {absent}: .*{INSTALL}"):
             FlowTracker.from_options(FlowTracker.Options(witness=witness))
 
 

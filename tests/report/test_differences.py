@@ -123,7 +123,7 @@ def test_runs_of_different_lengths_are_compared_where_both_have_answers(run_of):
     comparison = compare_runs([run_of("long"), run_of("short", frames=5)])
     assert comparison.differences[0].indices.tolist() == [0, 1, 2, 3, 4]
     assert comparison.notes == [
-        "long has answers for 12 frames and short for 5; they are compared in the 5 that both have."
+        "long has estimates for 12 frames and short for 5; they are compared in the 5 frames that both have."
     ]
 
 
@@ -131,10 +131,10 @@ def test_what_cannot_be_of_one_video_is_refused(run_of, tmp_path):
     folder = run_of("a", frames=3)
     clip = turning_sphere_of(2, 80, 60)
     written_run(tmp_path / "small", clip, with_model=False)
-    with pytest.raises(InputError, match=r"frames of 160 x 120 pixels and .* of 80 x 60"):
+    with pytest.raises(InputError, match=r"have 160 x 120 pixels and .* have 80 x 60"):
         compare_runs([folder, tmp_path / "small"])
     later = run_of("b", lambda estimate: dataclasses.replace(estimate, index=estimate.index + 100), frames=3)
-    with pytest.raises(InputError, match="no frame in common"):
+    with pytest.raises(InputError, match="no common frame"):
         compare_runs([folder, later])
     with pytest.raises(InputError, match="two run folders or more"):
         compare_runs([folder])
@@ -149,9 +149,9 @@ def test_doubts_about_the_comparison_are_said(run_of, clip):
     run = json.loads((b / "run.json").read_text())
     (b / "run.json").write_text(json.dumps(run | {"state": "interrupted"}))
     told = " ".join(compare_runs([a, b]).notes)
-    assert "b is interrupted: 12 frames have an answer." in told
-    assert "The first pictures of a and b are not the same" in told
-    assert "different lenses" in told
+    assert "b is interrupted: 12 frames have an estimate." in told
+    assert "The first images of a and b differ" in told
+    assert "different focal lengths" in told
 
 
 def test_worst_frames_are_few_and_apart():
@@ -185,7 +185,7 @@ def test_other_frames_that_were_asked_for_are_a_difference_of_settings(run_of):
     assert not compare_runs([a, b]).settings
     told = json.loads((b / "run.json").read_text()) | {"selection": "0:12"}
     (b / "run.json").write_text(json.dumps(told))
-    assert compare_runs([a, b]).settings == {"frames that were asked for": ["all", "0:12"]}
+    assert compare_runs([a, b]).settings == {"selected frames": ["all", "0:12"]}
 
 
 def test_any_run_may_be_the_one_that_others_are_held_against(run_of):
@@ -193,7 +193,7 @@ def test_any_run_may_be_the_one_that_others_are_held_against(run_of):
     comparison = compare_runs([a, b, c], against=b)
     assert comparison.names == ["b", "a", "c"]
     assert compare_runs([a], against=c).names == ["c", "a"]
-    with pytest.raises(InputError, match="nothing to compare one run with"):
+    with pytest.raises(InputError, match="needs two run folders or more"):
         compare_runs([a], against=a)
 
 
@@ -213,4 +213,4 @@ def test_every_two_runs_are_compared(run_of, tmp_path):
     told = comparison.as_json()["every_pair"]
     assert [one["runs"] for one in told] == [["a", "b"], ["a", "c"], ["b", "c"]]
     write_comparison(comparison, tmp_path / "page.html")
-    assert "Every two of them" in (tmp_path / "page.html").read_text()
+    assert "All pairs of runs" in (tmp_path / "page.html").read_text()

@@ -233,7 +233,7 @@ def test_what_are_no_points_is_said(tmp_path, turning_sphere, xy):
 
 def test_a_frame_the_run_does_not_have_is_said(tmp_path):
     run = run_of(tmp_path, box_model(), poses(2))
-    with pytest.raises(InputError, match=r"no frame 3; choose one that it holds \(10 to 11\)"):
+    with pytest.raises(InputError, match=r"no frame 3; choose one of its frames \(10 to 11\)"):
         track_points(run, 3, [[1, 1]])
 
 

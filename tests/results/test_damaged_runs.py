@@ -93,7 +93,7 @@ def test_a_frame_that_lacks_something_is_named_with_its_line(run, key):
     del fields[key]
     (run / "frames.jsonl").write_text("\n".join([*lines[:-1], json.dumps(fields)]) + "\n")
     assert "Line 8 of" in said(run)
-    assert f"there is no {key}" in said(run)
+    assert f"{key} is missing" in said(run)
 
 
 @pytest.mark.parametrize(

@@ -98,7 +98,7 @@ def test_masks_are_exported_as_taken_or_undistorted(runs, tmp_path):
     np.testing.assert_array_equal(undistorted, bent.pinhole_mask(0))
     assert (as_taken ^ undistorted).any()
     export_run(bent.folder, "vot", tmp_path / "masks.txt", options=ExportOptions(undistorted=True))
-    with pytest.raises(InputError, match="has no use for undistorted="):
+    with pytest.raises(InputError, match="does not use undistorted="):
         export_run(bent.folder, "tum", tmp_path / "poses.txt", options=ExportOptions(undistorted=True))
 
 

@@ -94,7 +94,7 @@ def test_a_run_whose_process_is_gone_is_seen(tmp_path, turning_sphere, start_run
 
         monkeypatch.setattr(lock, "_lock", none)
     assert RunReader(tmp_path).state_in_words == "running"
-    assert "is running; frames with an answer so far: 1" in RunReader(tmp_path).not_finished
+    assert "is running; frames estimated so far: 1" in RunReader(tmp_path).not_finished
     writer._lines.close()
     writer._pictures.close()
     path = tmp_path / layout.RUN

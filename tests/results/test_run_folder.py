@@ -190,8 +190,8 @@ def test_a_damaged_line_in_the_middle_is_named(tmp_path, turning_sphere, write_r
     [
         (None, "holds no run.json"),
         ("", "is damaged"),
-        ("[1]", "not one of tracking3d"),
-        ('{"state": "finished"}', "not one of tracking3d"),
+        ("[1]", "not written by tracking3d"),
+        ('{"state": "finished"}', "not written by tracking3d"),
         ('{"format": "tracking3d-run", "format_version": 99}', "update tracking3d"),
     ],
 )

@@ -47,7 +47,7 @@ def test_files_that_are_not_a_runs_are_never_touched(tmp_path, turning_sphere, n
     mine = tmp_path / name
     mine.parent.mkdir(exist_ok=True)
     mine.write_text("mine")
-    with pytest.raises(OutputError, match=r"not a readable run folder but holds .*; choose another folder"):
+    with pytest.raises(OutputError, match=r"not a readable run folder, but holds .*; choose another folder"):
         start_run(tmp_path, turning_sphere, overwrite=overwrite)
     assert mine.read_text() == "mine"
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == [mine]
@@ -56,7 +56,7 @@ def test_files_that_are_not_a_runs_are_never_touched(tmp_path, turning_sphere, n
 def test_a_file_in_place_of_the_folder_is_refused(tmp_path, turning_sphere, start_run):
     (tmp_path / "file").write_text("mine")
     for folder in (tmp_path / "file", tmp_path / "file" / "run"):
-        with pytest.raises(OutputError, match="not a folder, or lies inside a file"):
+        with pytest.raises(OutputError, match="not a folder or lies inside a file"):
             start_run(folder, turning_sphere)
 
 

@@ -89,7 +89,7 @@ def test_an_assumed_lens_is_noted(summary, turning_sphere):
     rows, sheet, run = summary(
         [MaskSource.RENDERED] * 8, dataclasses.replace(turning_sphere.camera, assumed=True)
     )
-    assert "nobody gave the lens: default field of view; give --fov" in dict(rows)["note"]
+    assert "no focal length was given: default field of view; give --fov" in dict(rows)["note"]
     assert len(json.loads((run / "run.json").read_text())["notes"]) == 1
     assert sheet.shape[0] % TILE == 16 + 2 * 23
 
@@ -98,7 +98,8 @@ def test_a_lens_that_was_solved_is_told():
     camera = {"assumed": True, "origin": "solved field of view of 52.1 degrees"}
     [note] = describe_camera_and_model(camera, None)
     assert (
-        note == "nobody gave the lens: solved field of view of 52.1 degrees; the final refinement solved it"
+        note
+        == "no focal length was given: solved field of view of 52.1 degrees; the final refinement estimated it"
     )
     assert describe_camera_and_model(camera | {"assumed": False}, None) == []
 
@@ -130,7 +131,7 @@ def test_frames_that_come_evenly_need_no_note(times):
 def test_a_variable_frame_rate_is_a_note_but_not_of_a_camera():
     records = timed(0, 40, 80, 200)  # every second frame
     [note] = notes_of_times(records)
-    assert note.startswith("frames come 20 to 60 ms apart (variable frame rate)")
+    assert note.startswith("frame intervals vary from 20 to 60 ms (variable frame rate)")
     run = {"source_notes": ["toned"], "camera": {"assumed": False, "origin": ""}, "given": {"frames": 4}}
     assert notes_of_run(run, None, records) == ["toned", note]
     assert notes_of_run(run | {"given": {"frames": None}}, None, records) == ["toned"]

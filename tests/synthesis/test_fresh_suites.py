@@ -125,7 +125,7 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path):
 
 @pytest.mark.parametrize(
     ("seed", "count", "message"),
-    [(-1, 24, "--seed -1 is negative"), (1, 0, "--count 0"), (1, -3, "--count -3"), (1, 10**6, "to 1000")],
+    [(-1, 24, "--seed -1 is negative"), (1, 0, "--count 0"), (1, -3, "--count -3"), (1, 10**6, "1 and 1000")],
 )
 def test_a_seed_or_count_that_makes_no_sense_is_refused(seed, count, message):
     with pytest.raises(InputError, match=message):
@@ -135,7 +135,7 @@ def test_a_seed_or_count_that_makes_no_sense_is_refused(seed, count, message):
 def test_a_folder_without_meshes_is_refused(tmp_path):
     with pytest.raises(InputError, match="holds no mesh file"):
         fresh_suite(9000, meshes=tmp_path)
-    with pytest.raises(InputError, match="is no folder"):
+    with pytest.raises(InputError, match="is not a folder"):
         fresh_suite(9000, meshes=tmp_path / "nowhere")
 
 

@@ -139,7 +139,7 @@ def test_an_impossible_iou_is_refused(clip, level):
 
 
 def test_faults_that_are_all_off_are_refused(clip):
-    with pytest.raises(ValueError, match="do not meet a mean IoU"):
+    with pytest.raises(ValueError, match="do not reach a mean IoU"):
         degrade_to_iou(clip.masks, clip.images, 0.5, seed=0, faults=NOTHING)
 
 

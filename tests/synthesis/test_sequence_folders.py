@@ -151,7 +151,7 @@ def test_another_sequence_replaces_the_earlier_one_without_traces(written, tmp_p
 @pytest.mark.parametrize("name", ["info.json", "photo.jpg"])
 def test_a_folder_with_anything_else_in_it_is_never_touched(tmp_path, name):
     (tmp_path / name).write_text('{"source": "my own data"}')
-    with pytest.raises(OutputError, match="something other than a synthetic sequence"):
+    with pytest.raises(OutputError, match="not a synthetic sequence"):
         write_sequence(tmp_path, SPEC)
     assert [f.name for f in tmp_path.iterdir()] == [name]
 
@@ -219,7 +219,7 @@ def test_backgrounds_come_from_a_folder_by_the_seed(tmp_path):
 def test_a_background_without_images_is_refused(tmp_path, make):
     make(tmp_path / "photos")
     spec = SequenceSpec(background=str(tmp_path / "photos"))
-    with pytest.raises(InputError, match="photos' is no folder with images"):
+    with pytest.raises(InputError, match="photos' is not a folder of images"):
         render_sequence(spec)
 
 

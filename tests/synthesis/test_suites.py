@@ -179,7 +179,7 @@ def test_two_processes_make_the_same_bytes_as_one(tiny, tmp_path):
 def test_an_error_in_a_process_is_the_error_of_the_suite(tiny, tmp_path):
     (tmp_path / "blob").mkdir()
     (tmp_path / "blob" / "mine.txt").write_text("keep")
-    with pytest.raises(OutputError, match="something other than a synthetic sequence"):
+    with pytest.raises(OutputError, match="not a synthetic sequence"):
         make_suite("smoke", tmp_path, jobs=2)
     assert (tmp_path / "blob" / "mine.txt").read_text() == "keep"
 
@@ -261,7 +261,7 @@ def test_the_command_makes_a_suite(call, tiny, tmp_path):
         ("--object box --disturb noise=lots", "'lots' is not"),
         ("--object box --disturb noise=2", "'disturbances.noise' must be"),
         ("--object box --disturb nois=1", "did you mean 'disturbances.noise'"),
-        ("--object box --background nowhere", "'nowhere' is no folder"),
+        ("--object box --background nowhere", "'nowhere' is not a folder"),
     ],
 )
 def test_what_the_command_cannot_use_is_one_sentence(call, words, message):

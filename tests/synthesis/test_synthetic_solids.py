@@ -239,7 +239,7 @@ def test_scans_are_loaded_with_all_faces_and_their_texture(shared_data):
 
 
 def test_an_object_that_does_not_exist_is_named_with_the_nearest_one():
-    with pytest.raises(InputError, match=r"no object 'botle'.*did you mean 'bottle'"):
+    with pytest.raises(InputError, match=r"object or mesh file 'botle'.*did you mean 'bottle'"):
         solid("botle")
 
 

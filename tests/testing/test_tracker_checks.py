@@ -180,7 +180,7 @@ class Shared(ColourTracker):
 
 
 class Hoarder(ColourTracker):
-    """Does not begin anew in init."""
+    """Does not reset the state in init."""
 
     seen = 0
 
@@ -235,20 +235,20 @@ BROKEN = {
     NotNumbers: "values from nan to nan",
     HighScore: "its score is 7.5 instead of a number from 0 to 1",
     NoScore: "its score is None",
-    NoReason: "an answer without a mask says in its reason why",
+    NoReason: "an estimate without a mask must give a reason",
     ReasonIsNone: "the reason is None instead of text",
     EmptyStart: "the first frame's mask must show the object",
     Painter: "has changed the frame's image; draw on a copy",
     PromptPainter: "has changed the prompt's mask; work on a copy",
-    OneBuffer: "the answer for frame 0 was changed while later frames were tracked",
+    OneBuffer: "the estimate for frame 0 was changed while later frames were tracked",
     Dice: "Two runs on the same frames differ at frame 0",
     OpencvDice: "Two runs on the same frames differ at frame 0",
-    Shared: "depends on what else was tracked before or beside it",
-    NeedsTwoPixels: "a box of one pixel ends in ValueError: corners must not coincide",
-    Terse: "is refused with 'no'; say in one sentence",
-    FailsInTheDark: "a first frame of grey value 0 ends in ZeroDivisionError: .*raise an InputError",
-    RefusesInTheDark: "a clip that turns to grey value 0, frame 2 ends in InputError",
-    WideOnly: "97 x 131 pixels, prompted by a mask, frame 0 ends in InputError",
+    Shared: "depends on other clips tracked before or at the same time",
+    NeedsTwoPixels: "a box of one pixel raises ValueError: corners must not coincide",
+    Terse: "is refused with 'no'; write one sentence",
+    FailsInTheDark: "a first frame of grey value 0 raises ZeroDivisionError: .*raise an InputError",
+    RefusesInTheDark: "a clip that turns to grey value 0, frame 2 raises InputError",
+    WideOnly: "97 x 131 pixels, prompted by a mask, frame 0 raises InputError",
 }
 
 
@@ -277,7 +277,7 @@ def test_a_class_is_built_from_its_options():
 def test_a_factory_and_a_tracker_are_checked_too():
     check_tracker(lambda: ColourTracker(50.0))
     check_tracker(ColourTracker(50.0))
-    with pytest.raises(AssertionError, match="begin anew in init"):
+    with pytest.raises(AssertionError, match="reset the state in init"):
         check_tracker(Hoarder())
     check_tracker(Hoarder)  # each of them begins anew
 
@@ -305,7 +305,7 @@ class TakesName(ColourTracker):
         (WithoutOptions, "no nested pydantic model Options"),
         (WithoutStep, "WithoutStep has no method step"),
         (TakesName, "field 'name'"),
-        (7, "7 is no plug-in"),
+        (7, "7 is not a plug-in"),
     ],
 )
 def test_what_is_no_plugin_is_told(thing, told):

@@ -137,7 +137,7 @@ def test_an_object_that_leaves_has_no_mask_and_is_found_when_it_comes_back() -> 
     for estimate, mask in zip(estimates, truth, strict=True):
         if not mask.any():
             assert estimate.mask is None and estimate.score == 0
-            assert estimate.reason == "the object is out of sight"
+            assert estimate.reason == "the object is not visible"
     assert min(ious(estimates[-3:], truth[-3:])) > 0.85
 
 

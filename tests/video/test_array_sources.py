@@ -96,5 +96,5 @@ def test_no_frames_are_an_input_error() -> None:
 
 
 def test_what_cannot_be_iterated_is_an_input_error() -> None:
-    with pytest.raises(InputError, match="int is no source"):
+    with pytest.raises(InputError, match="int is not a source"):
         open_source(0)  # type: ignore[arg-type]

@@ -59,7 +59,7 @@ def apart(image: np.ndarray, other: np.ndarray) -> float:
 def test_the_comb_is_gone_and_every_frame_is_there(clip):
     source = open_source(clip)
     assert source.interlaced and source.notes == (
-        "the video is interlaced; every frame was made of its two fields (bwdif)",
+        "the video is interlaced; frames were deinterlaced (bwdif)",
     )
     frames = list(source)
     assert [frame.index for frame in frames] == list(range(COUNT))

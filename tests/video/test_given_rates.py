@@ -35,12 +35,12 @@ def test_nobody_knows_where_nobody_says(folder):
 
 @pytest.mark.parametrize("fps", [0, -1, float("nan"), float("inf"), 1e9, "25", True])
 def test_what_is_no_rate_is_refused(folder, fps):
-    with pytest.raises(InputError, match="is no rate of a video"):
+    with pytest.raises(InputError, match="is not a frame rate"):
         open_source(folder, fps=fps)
 
 
 def test_a_video_keeps_its_own(tmp_path):
     from sample_videos import encode_video, moving_picture
 
-    with pytest.raises(InputError, match="has times of its own; fps= is for images"):
+    with pytest.raises(InputError, match="has its own time stamps; fps= is for images"):
         open_source(encode_video(tmp_path / "clip.mp4", [moving_picture(0)] * 3), fps=25)

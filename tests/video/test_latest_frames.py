@@ -187,5 +187,5 @@ def test_a_source_that_is_played_as_fast_as_it_comes_keeps_its_times():
 
 @pytest.mark.parametrize("rate", [0, -1, float("nan"), float("inf")])
 def test_a_rate_that_makes_no_sense_is_refused(rate):
-    with pytest.raises(InputError, match="frames a second"):
+    with pytest.raises(InputError, match="frames per second"):
         LatestFrames(open_source([IMAGE]), rate)

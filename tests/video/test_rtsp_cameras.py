@@ -37,7 +37,7 @@ def test_a_camera_is_played_and_asked_again_when_it_is_lost(camera, caplog):
     assert [frame.time for frame in frames] == sorted(frame.time for frame in frames)
     assert camera.methods[:4] == ["OPTIONS", "DESCRIBE", "SETUP", "PLAY"]
     assert camera.connections == 3 + stream.TRIES
-    assert "trying again" in caplog.text and "did not come back" in caplog.text
+    assert "trying again" in caplog.text and "could not be reconnected" in caplog.text
 
 
 def test_as_many_frames_as_were_asked_for(camera):

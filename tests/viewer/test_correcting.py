@@ -99,7 +99,7 @@ def test_why_it_failed_is_told_and_another_may_be_tried(correction, commands):
     correction.begin(DrawnCorrection(4, box=(1, 1, 5, 5)))
     now = wait(correction)
     assert now.failed
-    assert now.sentence == "The run was not corrected, and is as it was: no luck; try again."
+    assert now.sentence == "The correction failed and the run is unchanged: no luck; try again."
     correction.begin(DrawnCorrection(7, box=(1, 1, 5, 5)))
     assert not wait(correction).failed
 
@@ -107,19 +107,19 @@ def test_why_it_failed_is_told_and_another_may_be_tried(correction, commands):
 def test_one_at_a_time_and_it_ends_with_the_viewer(correction, commands, described):
     correction.begin(DrawnCorrection(9, box=(1, 1, 5, 5)))
     process = correction._process
-    with pytest.raises(InputError, match="A correction goes on"):
+    with pytest.raises(InputError, match="A correction is in progress"):
         correction.begin(DrawnCorrection(7, box=(1, 1, 5, 5)))
     stage = described / layout.CORRECTING
     stage.mkdir()
     (stage / layout.FRAMES).write_bytes((described / layout.FRAMES).read_bytes()[:-5])
     now = correction.progress()
-    assert (now.running, now.sentence) == (True, "Frame 9 is corrected: 11 of 12 frames answered.")
+    assert (now.running, now.sentence) == (True, "Correcting frame 9: 11 of 12 frames estimated.")
     correction.close()
     assert process.poll() is not None
 
 
 @pytest.mark.parametrize(
-    ("frame", "why"), [(0, "In frame 0 the object was given"), (12, "no answer for frame 12")]
+    ("frame", "why"), [(0, "The object was given in frame 0"), (12, "no estimate for frame 12")]
 )
 def test_frames_that_cannot_be_corrected_are_refused(correction, commands, frame, why):
     with pytest.raises(InputError, match=why):
@@ -130,7 +130,7 @@ def test_frames_that_cannot_be_corrected_are_refused(correction, commands, frame
 def test_a_link_is_offered_for_frames_that_can_be_corrected_only(correction):
     corrections = Corrections([correction], Access())
     assert "Correct frame 7" in corrections.offer(7)
-    for frame, why in [(0, "In frame 0 the object was given"), (12, "no answer for frame 12")]:
+    for frame, why in [(0, "The object was given in frame 0"), (12, "no estimate for frame 12")]:
         offered = corrections.offer(frame)
         assert why in offered
         assert "href" not in offered
@@ -140,7 +140,7 @@ def test_a_link_is_offered_for_frames_that_can_be_corrected_only(correction):
     ("change", "why"),
     [
         ({"given": None}, "earlier version"),
-        ({"config": {"tracker": {"name": "precomputed"}}}, "masks were made elsewhere"),
+        ({"config": {"tracker": {"name": "precomputed"}}}, "masks of the run are precomputed"),
     ],
 )
 def test_runs_that_cannot_be_corrected_say_why(described, change, why):
@@ -154,7 +154,7 @@ def test_a_run_whose_frames_are_gone_says_so(described):
     run = FollowedRun(described, "run")
     assert "--source" in RunCorrection(run, None, None, Access()).why_not
     passed = LatestImages(open_source(iter([frame_of(0).image])))
-    assert "of a camera" in RunCorrection(run, passed, None, Access()).why_not
+    assert "from a camera" in RunCorrection(run, passed, None, Access()).why_not
 
 
 @pytest.mark.slow
@@ -171,14 +171,14 @@ def test_a_person_draws_a_box_and_the_viewer_shows_how_it_goes(described, comman
             with page.context.expect_page() as opened:
                 page.click("a.correct:has-text('frame 7')")
             drawing = opened.value
-            drawing.wait_for_selector("h1:has-text('What is the object here?')")
+            drawing.wait_for_selector("h1:has-text('Mark the object in this frame')")
             assert drawing.input_value("#number") == "7"
             area = drawing.locator("#canvas").bounding_box()
             drawing.mouse.move(area["x"] + area["width"] * 0.3, area["y"] + area["height"] * 0.3)
             drawing.mouse.down()
             drawing.mouse.move(area["x"] + area["width"] * 0.7, area["y"] + area["height"] * 0.7, steps=3)
             drawing.mouse.up()
-            drawing.wait_for_selector("#status:has-text('the run goes on with')")
+            drawing.wait_for_selector("#status:has-text('The run continues from this mask')")
             drawing.click("#start")
             drawing.wait_for_selector("#status:has-text('Frame 7 is corrected.')")
             page.wait_for_selector("text=Frame 7 is corrected.")

@@ -46,7 +46,7 @@ def test_the_timeline_and_the_doubts_lead_to_their_frames(shown, run):
         page.mouse.click(area["x"] + area["width"] * 5 / 11, area["y"] + 60)
         wait_for_frame(page, 5)
         assert "<b onclick='alert(1)'>too few</b> points" in page.inner_text("body")
-        page.click("text=Doubts")
+        page.click("text=Problems")
         page.click(".streak >> nth=2")
         wait_for_frame(page, 8)
         page.click("text=▶▶")
@@ -61,11 +61,11 @@ def test_nothing_stands_before_the_model_when_looking_through_the_camera(shown, 
     with shown(run) as page:
         close_notice(page)
         wait_for_frame(page, 0)
-        for name in ("path of the camera", "present frame"):
+        for name in ("camera path", "current frame"):
             assert page.get_by_label(name).is_checked()
         page.click("text=Look through the camera")
         label = "[...document.querySelectorAll('label')].find(one => one.textContent.trim() === name)"
-        for name in ("path of the camera", "present frame"):
+        for name in ("camera path", "current frame"):
             page.wait_for_function(f"name => !{label}.control.checked", arg=name)
 
 

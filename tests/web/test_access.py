@@ -109,5 +109,5 @@ def test_only_a_host_that_others_reach_has_a_token_and_each_its_own():
 
 @pytest.mark.parametrize("host", ["", "no such name", "192.0.2.1", "a" * 300, "::zz", "12.34"])
 def test_a_host_that_is_not_this_machine_is_refused_at_once(host):
-    with pytest.raises(InputError, match="is no address of this machine"):
+    with pytest.raises(InputError, match="is not an address of this machine"):
         Access.on(host)

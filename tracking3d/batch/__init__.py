@@ -1,1 +1,1 @@
-"""Many videos: what is to be tracked, each in a worker, each into a run folder that appears whole or not at all."""
+"""Batches of videos: each is tracked in a worker, and its run folder appears completely or not at all."""

@@ -1,4 +1,4 @@
-"""The folder of a batch: its tables, which grow as videos end, and how far it is; readable at any time."""
+"""The folder of a batch: its tables, which grow as videos finish, and its progress; readable at any time."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class BatchProgress:
         workers: How many videos at a time.
         began: When, in seconds since 1970.
         updated: When this was written.
-        seconds_to_go: About how long it will take; None where that cannot be said yet.
+        seconds_to_go: About how long it will take; None if that cannot be said yet.
     """
 
     state: str
@@ -76,7 +76,7 @@ class BatchProgress:
         """The state; of a batch that has not said anything for long, that too."""
         silent = time.time() - self.updated
         if self.state == "running" and silent > _SILENT:
-            return f"running, but nothing was heard of it for {silent / 60:.0f} minutes"
+            return f"running, but without progress for {silent / 60:.0f} minutes"
         return self.state
 
 
@@ -102,16 +102,16 @@ def read_progress(out: str) -> BatchProgress:
     """
     content = read(join_path(out, PROGRESS))
     if content is None:
-        raise InputError(f"{out} is no folder of a batch: it holds no {PROGRESS}; give what --out was.")
+        raise InputError(
+            f"{out} is not a batch folder: it holds no {PROGRESS}; give the --out folder of a batch."
+        )
     try:
         document = json.loads(content)
         if document.pop("format") != FORMAT:
             raise ValueError("another format")
         return BatchProgress(**document)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(
-            f"{join_path(out, PROGRESS)} is damaged ({error}); run the batch once more."
-        ) from error
+        raise InputError(f"{join_path(out, PROGRESS)} is damaged ({error}); run the batch again.") from error
 
 
 def write_tables(out: str, rows: Sequence[Mapping[str, Any]], failures: Iterable[Failure]) -> None:
@@ -146,9 +146,7 @@ def read_failures(out: str) -> list[Failure]:
             for row in csv.DictReader(io.StringIO(content.decode("utf-8")), strict=True)
         ]
     except (ValueError, KeyError, TypeError, csv.Error) as error:
-        raise InputError(
-            f"{join_path(out, FAILURES)} is damaged ({error}); run the batch once more."
-        ) from error
+        raise InputError(f"{join_path(out, FAILURES)} is damaged ({error}); run the batch again.") from error
 
 
 def read_result_rows(out: str) -> list[dict[str, str]]:

@@ -1,4 +1,4 @@
-"""From what the user names to the videos of a batch: a folder, a pattern, a table, or a dataset."""
+"""The videos of a batch from a folder, a pattern, a table, or a dataset."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ Configure = Callable[[VideoRow], PipelineConfig]
 """Makes the pipeline of a row."""
 
 NO_PROMPT = (
-    "Nothing says what the object is: put VIDEO.box (X,Y,W,H), VIDEO.json or a first-frame mask VIDEO.png beside it, "
-    "or give a column box, mask or points."
+    "No prompt is given: put VIDEO.box (X,Y,W,H), VIDEO.json or a first-frame mask VIDEO.png next to the "
+    "video, or add a column box, mask or points."
 )
 
 
@@ -40,7 +40,7 @@ def list_jobs(place: str, configure: Configure, split: str = "") -> list[VideoJo
 
     Args:
         place: What the user named.
-        configure: Makes the pipeline of a row.
+        configure: Builds the pipeline of a row.
         split: Length of the parts that long videos are cut into, where a row does not say; empty for none.
 
     Raises:
@@ -144,17 +144,19 @@ def _names(rows: Sequence[VideoRow], root: str) -> list[str]:
             or PurePosixPath(name).is_absolute()
             or any(part.startswith(".") for part in parts)
         ):
-            raise InputError(f"The name '{name}' of {video} cannot be that of a run folder; give it another.")
+            raise InputError(
+                f"The name '{name}' of {video} cannot be used for a run folder; choose another name."
+            )
         if name in seen:
             raise InputError(
-                f"{video} and {seen[name]} would both be written to {name}; give them names in a column name."
+                f"{video} and {seen[name]} would both be written to {name}; add a column name with different names."
             )
         seen[name] = video
     if within := next(
         (name for name in names for one in PurePosixPath(name).parents if str(one) in seen), None
     ):
         raise InputError(
-            f"The run folder {within} would lie within another one; give it a name in a column name."
+            f"The run folder {within} would lie inside another one; add a column name with another name."
         )
     return names
 

@@ -1,4 +1,4 @@
-"""Networks on their way to workers: each is sent to a machine once, whatever the number of videos."""
+"""Distribution of networks to workers: each is sent to a machine once, whatever the number of videos."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a worker does for one video: tracks it in a folder beside, and puts the run folder into its place when whole."""
+"""A worker's task for one video: track it in a work folder, and move the complete run folder into place."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ from tracking3d.video.image_sequence import ImageSequence
 from tracking3d.video.source import FrameSource
 
 WORK = ".work"
-"""In the folder of a batch: what is not whole yet, and what a video that is tried again goes on from."""
+"""Folder inside the batch folder for unfinished runs, from which retried videos resume."""
 LOGS = "logs"
 RUN = "run"
-"""In the folder that a video is worked on in: what becomes its run folder."""
+"""Name of the later run folder inside the work folder of a video."""
 
 _ATTEMPTS = "attempts"
 _TELL = 1.0  # seconds between two words about how far it is
@@ -61,7 +61,7 @@ def work_folder(out: str, job: VideoJob) -> Path:
 
 
 def log_file(out: str, job: VideoJob) -> Path:
-    """Where a worker prints to: beside the results, or in its work folder where these are elsewhere."""
+    """The log of a worker: next to the results, or in its work folder if these are on other storage."""
     if (base := local(out)) is not None:
         return base / LOGS / f"{job.name}.log"
     return work_folder(out, job) / "log.txt"
@@ -80,7 +80,7 @@ def track_video(
     A video that was begun before and stopped in whatever way goes on from its last finished frame.
 
     Args:
-        tell: Is given a mapping of ``frames``, how many answers there are, and ``of`` how many, where known.
+        tell: Is given a mapping of ``frames``, how many estimates there are, and ``of`` how many, where known.
         job: The video.
         out: The folder of the batch.
         command: The command line, for the record.
@@ -163,7 +163,7 @@ def _track(tell: Tell, job: VideoJob, run: Path, command: str) -> None:
 
 
 def counting(tell: Tell, of: int | None, **about: Any) -> Callable[[FrameRecord | SkippedFrame], None]:
-    """A listener that tells how many answers there are, now and then, and at once that there are none."""
+    """A listener that reports the number of estimates from time to time, at first zero."""
     answers, last, process = 0, 0.0, os.getpid()
 
     def listener(frame: FrameRecord | SkippedFrame) -> None:
@@ -227,7 +227,7 @@ def _put_into_place(run: Path, place: str) -> None:
 
 
 def send_log(out: str, job: VideoJob) -> bool:
-    """Keep what was printed beside the results where these are elsewhere; whether this machine has it."""
+    """Upload the log next to results on other storage; returns whether this machine has it."""
     log = log_file(out, job)
     if local(out) is None and log.is_file():
         with suppress(OutputError):  # the results are what counts

@@ -1,4 +1,4 @@
-"""``index.html``: all runs of a batch on one page, to sort, to filter, and to go on to each report."""
+"""``index.html``: all runs of a batch on one page, sortable and filterable, with links to each report."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tracking3d.report.rendering import render_page
 from tracking3d.results import layout
 
 MOST_PICTURES = 2000
-"""Runs with a picture; of more, those with the least confidence have one."""
+"""Maximum number of runs with a picture; of more, those with the lowest confidence get one."""
 
 
 def write_overview(

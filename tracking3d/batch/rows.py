@@ -1,4 +1,4 @@
-"""One video as a row of a table, or as the JSON file beside it: columns are named as the options of ``run`` are."""
+"""One video as a row of a table or as its JSON file: columns are named like the options of ``run``."""
 
 from __future__ import annotations
 

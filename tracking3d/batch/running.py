@@ -1,4 +1,4 @@
-"""A batch from its first video to its last: what is whole is left alone, the rest is handed out, tables grow."""
+"""Running a batch: complete runs are skipped, the other videos become tasks, and the tables grow."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tracking3d.results.lock import try_lock
 _log = logging.getLogger(__name__)
 
 PROGRESS_EVERY, TABLES_EVERY, PAGE_EVERY = 2.0, 5.0, 60.0
-"""Seconds, at least, between two times that each is written."""
+"""Minimum seconds between two writes of each file."""
 _PATIENCE = 20.0  # a file that takes long to write is written less often: so many times as long lies between
 
 
@@ -59,7 +59,7 @@ class Batch:
         jobs: All videos.
         engine: Where they are tracked.
         report: Whether runs get reports.
-        listener: Is told what happens.
+        listener: Called with events.
 
     Attributes:
         progress: How far it is.
@@ -151,7 +151,7 @@ class Batch:
                 step()
             except OutputError as error:
                 problem = problem or error
-                _log.warning("%s It is tried again.", error)
+                _log.warning("%s It will be retried.", error)
             took = time.monotonic() - started
             self._due[name] = time.monotonic() + max(every, _PATIENCE * took)
         if now and problem:
@@ -173,13 +173,13 @@ class Batch:
         self._listener(Happening("batch", "", {}, self.progress))
 
     def _why_taken(self, job: VideoJob, marker: Mapping[str, Any] | None) -> str:
-        """Why a video's run folder cannot be had, in a sentence; empty where it can, or is there already."""
+        """Why a video's run folder cannot be had, in a sentence; empty if it can, or is there already."""
         place = join_path(self._out, job.name)
         if marker is not None:
-            what = "" if marker["key"] == job.key else "a run of another video, prompt or setting"
+            what = "" if marker["key"] == job.key else "a run with another video, prompt or settings"
         else:  # what is whole comes with its marker, but elsewhere, where a part of it may have been sent
             path = local(place)
-            what = "what no batch has written" if path is not None and path.exists() else ""
+            what = "files that were not written by a batch" if path is not None and path.exists() else ""
         return f"{place} holds {what}; give another --out, or --overwrite." if what else ""
 
     def _end(self, job: VideoJob, ended: Ended) -> None:
@@ -198,7 +198,8 @@ class Batch:
             return
         about = {"reason": fault.reason, "attempts": ended.attempts, "crashed": fault.crashed}
         if not ended.again:
-            # A worker that could say why it failed has sent its log; what one that crashed has printed may be here.
+            # A worker that could say why it failed has sent its log; what one that crashed has printed may be
+            # here.
             elsewhere = local(self._out) is None and not fault.crashed
             has_log = send_log(self._out, job) or elsewhere
             told = f"{LOGS}/{job.name}.log" if has_log else ""
@@ -268,7 +269,7 @@ def run_batch(
         overwrite: Track all videos again, and replace their run folders.
         report: Write a report of each run.
         command: The command line, for the record.
-        listener: Is told what happens.
+        listener: Called with events.
         pause: Seconds before a video is tried again.
 
     Raises:

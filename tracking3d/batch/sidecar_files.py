@@ -1,4 +1,4 @@
-"""Videos of a folder or a pattern, with what is tracked in them said by files beside them."""
+"""Videos of a folder or a pattern, with prompts in files next to them."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ VIDEOS = frozenset((
 
 BOX, JSON = ".box", ".json"
 MASKS = (".png", ".mask.png", ".jpg", ".mask.jpg")
-"""What is added to a video's name, with its suffix or without, for the files that say what is tracked in it."""
+"""Suffixes added to a video's name, with or without its own suffix, for the files with its prompts."""
 
 
 def videos_of(place: str) -> list[tuple[VideoRow, int]]:
     """The videos of a folder and of folders within it, or those that a pattern names; and the bytes of each.
 
-    A folder of images counts as a video where a file beside it says what is tracked in it.
+    A folder of images counts as a video if a file next to it gives its prompt.
 
     Raises:
-        InputError: If there is none, or a file beside one is damaged.
+        InputError: If there is none, or a file next to one is damaged.
     """
     if is_folder(place):
         sizes = names_in(place, everything=True)
@@ -46,7 +46,7 @@ def videos_of(place: str) -> list[tuple[VideoRow, int]]:
         beside = set(sizes)
     if not found:
         raise InputError(
-            f"{place} names no video; give a folder that has some, or a pattern such as 'clips/*.mp4'."
+            f"{place} contains no video; give a folder with videos, or a pattern such as 'clips/*.mp4'."
         )
     return [(_with_prompt(video, beside), size) for video, size in found]
 
@@ -88,7 +88,9 @@ def _from_json(file: str, video: str) -> VideoRow:
     try:
         values = json.loads(read(file) or b"")
         if not isinstance(values, dict):
-            raise ValueError("it holds no object")
+            raise ValueError("it is not a JSON object")
     except ValueError as error:
-        raise InputError(f"{file} cannot be read ({error}); it holds what a row of a table does.") from error
+        raise InputError(
+            f"{file} cannot be read ({error}); it must hold the same keys as a row of a table."
+        ) from error
     return read_row({**values, "video": video}, file)

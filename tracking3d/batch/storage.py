@@ -1,4 +1,4 @@
-"""Files here and elsewhere: a path of this machine, or a URL that fsspec knows, such as ``s3://bucket/folder``."""
+"""Local and remote files: a path of this machine, or a URL supported by fsspec, such as ``s3://bucket/folder``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _FILE = "file://"
 
 
 def local(place: str) -> Path | None:
-    """The path of this machine that is meant; None where the place is elsewhere."""
+    """The path of this machine that is meant; None if the place is elsewhere."""
     if place.startswith(_FILE):
         return Path(place.removeprefix(_FILE))
     return None if "://" in place else Path(place).expanduser()
@@ -53,7 +53,7 @@ def base(place: str) -> str:
 
 
 def read(place: str) -> bytes | None:
-    """What a file holds; None where there is none.
+    """What a file holds; None if there is none.
 
     Raises:
         InputError: If it cannot be read.
@@ -119,7 +119,7 @@ def names_in(folder: str, *, everything: bool = False) -> dict[str, int]:
     files, inner = _open(folder)
     with _reading(folder):
         if not files.isdir(inner):
-            raise InputError(f"{folder} is no folder.")
+            raise InputError(f"{folder} is not a folder.")
         listed = files.find(inner, detail=True).values() if everything else files.ls(inner, detail=True)
         start = len(inner.rstrip("/")) + 1
         return {one["name"].rstrip("/")[start:]: int(one.get("size") or 0) for one in listed}
@@ -200,12 +200,12 @@ def _open(place: str) -> tuple[Any, str]:
         files, inner = fsspec.core.url_to_fs(str(local(place) or place))
     except ImportError as error:
         kind = place.partition("://")[0]
-        what = f"pip install 'tracking3d[{_EXTRAS[kind]}]'" if kind in _EXTRAS else f"it says: {error}"
+        what = f"pip install 'tracking3d[{_EXTRAS[kind]}]'" if kind in _EXTRAS else f"the error is: {error}"
         raise InputError(
             f"Paths that begin with {kind}:// need a package that is not installed: {what}."
         ) from error
     except ValueError as error:
-        raise InputError(f"{place} is no path that can be opened ({error}).") from error
+        raise InputError(f"{place} cannot be opened ({error}).") from error
     files.invalidate_cache()
     return files, inner
 

@@ -1,4 +1,4 @@
-"""What workers do for a long video of a batch: cut it, do one step of it, and put into its place what became of it."""
+"""Tasks for a long video of a batch: cut it into submaps, do one step, and move the result into place."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def begin_in_parts(
     workers: int,
     networks: tuple[SharedNetwork, ...] = (),
 ) -> Begun | dict[str, Any]:
-    """Cut a video; one that is a single part is tracked here, and what `put_away` returns is the answer.
+    """Cut a video; a video that is a single submap is tracked here, and the result is that of `put_away`.
 
     Args:
         tell: See `tracking3d.batch.one_video.track_video`.
@@ -60,14 +60,14 @@ def begin_in_parts(
 def step_in_parts(
     tell: Tell, job: VideoJob, out: str, step: Step, whole: int, networks: tuple[SharedNetwork, ...] = ()
 ) -> Any:
-    """Do one step; its answer.
+    """Do one step and return its result.
 
     Args:
         tell: See `tracking3d.batch.one_video.track_video`; ``share`` is that of the whole video.
         job: The video.
         out: The folder of the batch.
         step: What is to be done.
-        whole: Answers of the whole video.
+        whole: Estimates of the whole video.
         networks: What the machine may lack.
 
     Raises:

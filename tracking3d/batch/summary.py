@@ -1,4 +1,4 @@
-"""What the tables of a batch tell of one run folder, and the picture of it that its page shows."""
+"""The summary of one run folder for the tables of a batch, and its image for the overview page."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tracking3d.results.overlay import OverlaySize
 from tracking3d.results.run_reader import RunReader
 
 MARKER = "batch.json"
-"""Lies in every run folder of a batch that is whole; elsewhere than on this machine it is written last."""
+"""Name of a file in every complete run folder of a batch; on remote storage it is written last."""
 
 FORMAT = "tracking3d-batch-run"
 _WIDTH = 200  # pixels of a thumbnail
@@ -48,7 +48,7 @@ COLUMNS = {
     "key": str,
     "note": str,
 }
-"""Columns of the table of results, one row a run folder, and their types."""
+"""Columns of the table of results, with one row per run folder, and their types."""
 
 
 def row_of(run: RunReader, name: str, job: VideoJob, attempts: int = 1, note: str = "") -> dict[str, Any]:
@@ -84,7 +84,7 @@ def row_of(run: RunReader, name: str, job: VideoJob, attempts: int = 1, note: st
 
 
 def thumbnail(run: RunReader) -> str:
-    """The overlay of the frame in the middle, as a small JPEG in base64; empty where there is none."""
+    """The overlay of the frame in the middle, as a small JPEG in base64; empty if there is none."""
     rows = OverlaySize.of(run.camera).picture
     for image in overlay_frames(run, [len(run.frames) // 2]):
         picture = image[:rows]
@@ -123,7 +123,7 @@ def write_marker(
 
 
 def read_marker(content: bytes | None) -> dict[str, Any] | None:
-    """What `write_marker` wrote; None where there is nothing that can be read."""
+    """What `write_marker` wrote; None if there is nothing that can be read."""
     try:
         marker = json.loads(content or b"")
         return marker if marker["format"] == FORMAT else None

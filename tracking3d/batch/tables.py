@@ -43,7 +43,7 @@ def read_table(place: str) -> list[VideoRow]:
     if not rows:
         raise InputError(f"The table {place} has no rows.")
     if odd := next((number for number, values in rows if not isinstance(values, dict)), None):
-        raise InputError(f"Line {odd} of {place} is no JSON object with a value for each column.")
+        raise InputError(f"Line {odd} of {place} is not a JSON object with a value for each column.")
     return [read_row(values, f"Line {number} of {place}") for number, values in rows]
 
 

@@ -1,4 +1,4 @@
-"""The tasks of a batch: one for a video; for a long one that is cut, one for each step, as those before it end."""
+"""The tasks of a batch: one per video; for a long video that is cut, one per step, as the earlier ones finish."""
 
 from __future__ import annotations
 

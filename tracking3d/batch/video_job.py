@@ -1,4 +1,4 @@
-"""One video of a batch: where it is, what is tracked in it, with which settings, and what its results are called."""
+"""One video of a batch: its path, prompt, settings, and the name of its results."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class VideoJob:
         frames: ``START:STOP:STEP``.
         sequence: Layout, folder and name of a sequence of a dataset, whose images are then the video.
         size: Bytes of the video, where known: large ones are begun first.
-        fault: Why it cannot be done, where that is known beforehand.
+        fault: Why it cannot be done, if known beforehand.
         split: Length of the parts that it is cut into, see `tracking3d.submaps.cuts.parse_length`; empty for none.
     """
 

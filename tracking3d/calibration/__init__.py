@@ -1,1 +1,1 @@
-"""Cameras with lenses: files that describe them, boards to measure them by, and the measurement."""
+"""Camera calibration: camera files, calibration boards, and the estimation."""

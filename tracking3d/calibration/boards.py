@@ -1,4 +1,4 @@
-"""Boards to measure a camera by: drawn to be printed, and found again in pictures."""
+"""Calibration boards: drawing them for print, and detecting them in images."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ DICTIONARY = cv2.aruco.DICT_5X5_250
 MARKER = 0.75
 """Side of a marker in squares."""
 LARGEST = 25
-"""Squares along a side; more are never told apart."""
+"""Largest number of squares along a side."""
 
 
 @dataclass(frozen=True)
@@ -39,12 +39,13 @@ class Board:
     def __post_init__(self) -> None:
         if not (3 <= self.columns <= LARGEST and 3 <= self.rows <= LARGEST):
             raise InputError(
-                f"A board of {self.columns} x {self.rows} squares cannot be used; give 3 to {LARGEST} along each side."
+                f"A board of {self.columns} x {self.rows} squares cannot be used; give 3 to {LARGEST} "
+                "squares along each side."
             )
         if self.kind == "charuco" and self.columns * self.rows // 2 > 250:
             raise InputError(
-                f"A ChArUco board of {self.columns} x {self.rows} squares has more markers than there are (250); give "
-                "fewer squares."
+                f"A ChArUco board of {self.columns} x {self.rows} squares needs more than the available 250 "
+                "markers; give fewer squares."
             )
         if not 0 < self.square < 10_000:
             raise InputError(f"Squares of {self.square:g} mm cannot be printed; give millimetres above 0.")

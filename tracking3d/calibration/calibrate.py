@@ -1,4 +1,4 @@
-"""A camera with its lens, measured by views of a board."""
+"""Calibration of a camera and its lens distortion from views of a board."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ LEAST_CORNERS = 8
 """Of one view."""
 LEAST_VIEWS = 6
 MOST_VIEWS = 40
-"""Of more, those that differ most are taken."""
+"""Maximum number of views; of more, those that differ most are used."""
 CELLS = (6, 8)
 """Rows and columns of the grid that coverage is counted in."""
 LEAST_COVERAGE = 0.4
 LEAST_TILT = 12.0
-"""Degrees between the two views of the board that differ most; without tilts nothing tells the focal length."""
+"""Degrees between the two views of the board that differ most; without tilts the focal length is not observable."""
 LARGEST_ERROR = 2.0
 """Pixels of reprojection error (root mean square) above which the corners are not those of the board."""
 _OUTLIER, _ROUNDS = 3.0, 3
@@ -84,7 +84,7 @@ def find_views(
         size = frame.size[1], frame.size[0]
         numbers, pixels = board.find(cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY))
         if len(numbers) < LEAST_CORNERS:
-            left_out[frame.index] = f"{len(numbers)} corners seen" if len(numbers) else "no board seen"
+            left_out[frame.index] = f"{len(numbers)} corners found" if len(numbers) else "no board found"
         elif _in_a_line(board.corners[numbers]):
             left_out[frame.index] = "its corners lie in one line"
         else:
@@ -95,13 +95,13 @@ def find_views(
 def calibrate(
     frames: Iterable[Frame | SkippedFrame], board: Board, model: Model = "radtan", name: str = "the source"
 ) -> Calibration:
-    """Measure a camera.
+    """Calibrate a camera.
 
     Args:
-        frames: Pictures of the board from many sides.
+        frames: Images of the board from many sides.
         board: The board.
         model: ``radtan`` with five coefficients, or ``fisheye``.
-        name: What sentences call the source.
+        name: Name of the source in messages.
 
     Raises:
         InputError: If there are too few views, they leave too much of the picture out, they are all from one side, or
@@ -110,9 +110,9 @@ def calibrate(
     views, size, left_out = find_views(frames, board)
     if len(views) < LEAST_VIEWS:
         raise InputError(
-            f"{name} shows the {board.kind} board of {board.columns} x {board.rows} squares in {len(views)} of "
-            f"{len(views) + len(left_out)} frames, and {LEAST_VIEWS} at least are needed; film it sharp, whole and "
-            "from many sides, and say by --squares and --board which it is."
+            f"{name} shows the {board.kind} board of {board.columns} x {board.rows} squares in {len(views)} "
+            f"of {len(views) + len(left_out)} frames, but at least {LEAST_VIEWS} are needed; film the whole "
+            "board sharply from many sides, and check --squares and --board."
         )
     kept = spread_views(views, size, MOST_VIEWS)
     left_out |= {view.index: "like another view" for view in views if view not in kept}
@@ -130,9 +130,9 @@ def calibrate(
     _check_coverage(kept, size, name)
     if solved.error > LARGEST_ERROR:
         raise InputError(
-            f"No camera explains the views of the board in {name}: the error is {solved.error:.1f} pixels; is the "
-            "board flat, sharp, and that of --squares, and was the zoom left alone? A very wide lens needs --model "
-            "fisheye."
+            f"No camera model fits the views of the board in {name}: the reprojection error is "
+            f"{solved.error:.1f} pixels; check that the board is flat, sharp and the one of --squares, and "
+            "that the zoom is fixed. A very wide lens needs --model fisheye."
         )
     return Calibration(
         solved.camera,
@@ -191,8 +191,8 @@ def _check_coverage(views: Sequence[BoardView], size: tuple[int, int], name: str
     }
     worst = min(thirds, key=lambda side: float(thirds[side].mean()))
     raise InputError(
-        f"The board was seen in {100 * cells.mean():.0f} % of the picture of {name} only, least in its {worst} part; "
-        f"move it through the whole picture, corners too ({100 * LEAST_COVERAGE:.0f} % at least)."
+        f"The board covers only {100 * cells.mean():.0f} % of the image of {name}, least in its {worst} "
+        f"part; move it through the whole image, corners included (at least {100 * LEAST_COVERAGE:.0f} %)."
     )
 
 
@@ -263,6 +263,7 @@ def _check_tilt(rotations: Sequence[NDArray[np.float64]], name: str) -> None:
     tilt = float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1).min())))
     if tilt < LEAST_TILT:
         raise InputError(
-            f"All views of the board in {name} are from one side (within {tilt:.0f} degrees), which does not tell the "
-            f"focal length; tilt the board by {LEAST_TILT:.0f} degrees and more, this way and that."
+            f"All views of the board in {name} are from one side (within {tilt:.0f} degrees), so the focal "
+            f"length cannot be estimated; tilt the board by {LEAST_TILT:.0f} degrees or more in several "
+            "directions."
         )

@@ -1,4 +1,4 @@
-"""A camera with its lens, as somebody measured it."""
+"""A calibrated camera with its lens distortion."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from tracking3d.geometry.lens import COUNTS, Model, Pinhole
 
 @dataclass(frozen=True)
 class CalibratedCamera:
-    """A camera as somebody measured it.
+    """A camera from a calibration.
 
     Attributes:
         intrinsics: ``(fx, fy, cx, cy)`` in pixels; (0, 0) is the centre of the top-left pixel.
         model: Formula of the distortion, see `tracking3d.geometry.lens`.
-        coefficients: Its coefficients; empty where there is none.
-        size: ``(width, height)`` in pixels of the pictures that it was measured with; None where nobody says.
+        coefficients: Its coefficients; empty if there is none.
+        size: ``(width, height)`` in pixels of the pictures that it was measured with; None if not stated.
         origin: Where it came from, in words.
     """
 
@@ -40,8 +40,8 @@ class CalibratedCamera:
         across, down = width / self.size[0], height / self.size[1]
         if abs(across / down - 1) > 0.01:
             raise InputError(
-                f"{self.origin} is a camera of {self.size[0]} x {self.size[1]} pixels, and the frames have {width} x "
-                f"{height}, which is no enlargement of that; calibrate the camera in the mode that the video has."
+                f"{self.origin} is a camera of {self.size[0]} x {self.size[1]} pixels, but the frames have "
+                f"{width} x {height}, another aspect ratio; calibrate the camera in the mode of the video."
             )
         fx, fy, cx, cy = self.intrinsics
         scaled = (fx * across, fy * down, (cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5)
@@ -78,9 +78,9 @@ def validate_camera(camera: CalibratedCamera, path: Path) -> CalibratedCamera:
     numbers = (*camera.intrinsics, *camera.coefficients)
     if not all(map(math.isfinite, numbers)) or not min(fx, fy) > 0:
         raise InputError(
-            f"The camera of {path} has no positive, finite focal lengths and numbers; restore the file."
+            f"The camera of {path} needs finite numbers and positive focal lengths; restore the file."
         )
     if camera.size is not None and not min(camera.size) > 0:
-        raise InputError(f"The size of the pictures in {path} is not positive; restore the file.")
+        raise InputError(f"The image size in {path} is not positive; restore the file.")
     coefficients = as_coefficients(camera.model, camera.coefficients, f"The distortion in {path}")
     return CalibratedCamera(camera.intrinsics, camera.model, coefficients, camera.size, camera.origin)

@@ -39,14 +39,16 @@ def _text(path: Path) -> str:
         with path.open("rb") as file:
             content = file.read(_LONGEST + 1)
         if len(content) > _LONGEST:
-            raise InputError(f"The camera file {path} is longer than {_LONGEST >> 10} KiB, which none is.")
+            raise InputError(
+                f"The camera file {path} is larger than {_LONGEST >> 10} KiB; it is not a camera file."
+            )
         return content.decode("utf-8-sig")
     except FileNotFoundError as error:
         raise InputError(
             f"The camera file {path} does not exist; `tracking3d calibrate` makes one."
         ) from error
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or "it is no text"
+        reason = getattr(error, "strerror", None) or "it is not text"
         raise InputError(f"The camera file {path} cannot be read: {reason}.") from error
 
 
@@ -58,7 +60,7 @@ def _choose_camera(
         raise InputError(f"{path} has no camera {chosen}; it has {names}.")
     if chosen is None and len(cameras) > 1:
         first = next(iter(cameras))
-        raise InputError(f"{path} holds several cameras ({names}); say which, as in {path}:{first}.")
+        raise InputError(f"{path} holds several cameras ({names}); choose one, as in {path}:{first}.")
     return cameras[chosen if chosen is not None else next(iter(cameras))]()
 
 

@@ -35,15 +35,15 @@ def colmap_cameras(text: str, path: Path) -> dict[str, Callable[[], CalibratedCa
     lines = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if not lines or any(len(line) < 5 for line in lines):
         raise InputError(
-            f"{path} is no cameras.txt of COLMAP, whose lines are CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]; give one, or "
-            "a YAML file of OpenCV, ROS or Kalibr."
+            f"{path} is not a COLMAP cameras.txt with lines CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]; give one, "
+            "or a YAML file of OpenCV, ROS or Kalibr."
         )
 
     def camera(line: list[str]) -> CalibratedCamera:
         name = line[1]
         if name not in _COLMAP:
             raise InputError(
-                f"{path} has a camera of the model {name}, which is not known here; known are {', '.join(_COLMAP)}."
+                f"{path} has a camera of the unknown model {name}; known models are {', '.join(_COLMAP)}."
             )
         focal, model, coefficients = _COLMAP[name]
         try:
@@ -54,7 +54,8 @@ def colmap_cameras(text: str, path: Path) -> dict[str, Callable[[], CalibratedCa
             k = coefficients(*values[focal + 2 :])
         except (ValueError, IndexError, TypeError):
             raise InputError(
-                f"The camera {line[0]} of {path} has not the numbers that the model {name} has; restore the file."
+                f"The camera {line[0]} of {path} has the wrong number of parameters for the model {name}; "
+                "restore the file."
             ) from None
         return validate_camera(
             CalibratedCamera((fx, fy, cx, cy), model, k, (width, height), f"{path.name}"), path

@@ -60,7 +60,7 @@ def _check_events(text: str) -> None:
     for event in yaml.parse(text, _Loader):
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if isinstance(event, yaml.AliasEvent) or depth > _DEEPEST:
-            raise yaml.YAMLError("it has aliases" if depth <= _DEEPEST else "it is nested too deeply")
+            raise yaml.YAMLError("it uses aliases" if depth <= _DEEPEST else "it is nested too deeply")
 
 
 _WANTED = (
@@ -99,7 +99,7 @@ def _opencv(content: Mapping[Any, Any], path: Path) -> CalibratedCamera:
     fisheye = str(named).casefold() in _FISHEYES or bool(content.get("fisheye_model"))
     if not fisheye and str(named).casefold() not in (*_PLAIN, "pinhole"):
         raise InputError(
-            f"{path} has a distortion of the model {named}, which is not known here; known are plumb_bob, "
+            f"{path} has a distortion of the unknown model {named}; known models are plumb_bob, "
             "rational_polynomial and fisheye (equidistant)."
         )
     camera = CalibratedCamera(
@@ -119,7 +119,7 @@ def _kalibr(content: Mapping[str, Any], path: Path) -> CalibratedCamera:
     }
     if kind != "pinhole" or lens not in models:
         raise InputError(
-            f"{path} has a camera of the models {kind} and {lens}, which are not known here; known are pinhole with "
+            f"{path} has a camera of the unknown models {kind} and {lens}; known are pinhole with "
             "radtan, equidistant or none."
         )
     intrinsics = _numbers(content["intrinsics"], path, "intrinsics")
@@ -151,6 +151,4 @@ def _whole(value: Any, path: Path) -> int:
     try:
         return int(value)
     except (TypeError, ValueError, OverflowError):
-        raise InputError(
-            f"The size of the pictures in {path} is not in whole pixels; restore the file."
-        ) from None
+        raise InputError(f"The image size in {path} is not in whole pixels; restore the file.") from None

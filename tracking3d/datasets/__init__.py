@@ -1,1 +1,1 @@
-"""What is known about clips, and what somebody estimated for them, in any layout on disk."""
+"""Ground truth of clips and estimates for them, in any layout on disk."""

@@ -1,7 +1,7 @@
-"""What somebody estimated for a clip, whoever did and in whatever format it came.
+"""Estimates for a clip, from any method and in any format.
 
 Frames are named by their index in the clip. None is what a method does not estimate; what it does estimate counts as
-wrong in the frames that it has no answer for.
+wrong in the frames that it has no estimate for.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from tracking3d.runtime.stage_times import StageTimes
 
 PointTracker = Callable[[int, ArrayLike], tuple[NDArray[np.float64], NDArray[np.bool_]]]
 """Follows the points ``(N, 2)`` of one frame: positions ``(T, N, 2)`` and visibility ``(T, N)`` in the frames of
-the clip; NaN and False where there is no answer."""
+the clip; NaN and False if there is no estimate."""
 
 
 @dataclass(frozen=True, eq=False)
 class Answers:
-    """One method's answers for one clip.
+    """One method's estimates for one clip.
 
     Attributes:
         origin: The folder or file they come from, for messages.
-        asked: Indices of the frames that the method was asked for; those it has no answer for count as wrong.
-        answered: Indices of the frames with any answer.
-        held: How many frames the method answered, in the clip or not, where known.
+        asked: Indices of the frames that the method was asked for; those it has no estimate for count as wrong.
+        answered: Indices of the frames with any estimate.
+        held: How many frames the method estimated, in the clip or not, if known.
         given: Index of the frame whose mask or box the method was given; it is not scored as a mask.
         masks: By frame index.
         initial_masks: What the mask tracker gave, by frame index.
@@ -40,7 +40,7 @@ class Answers:
         confidence: In [0, 1] by frame index.
         seconds: Wall time by frame index.
         stages: The same stage by stage, where it was recorded.
-        mask_sources: Where each answer's mask comes from, where it was recorded.
+        mask_sources: Origin of each estimated mask, if recorded.
         peak_memory_mb: Most memory held, in 10^6 bytes, where recorded.
         memory_growth_mb: How much more was held at most in the second half of the frames than in the first.
         mesh: Reads the estimated shape in object coordinates.
@@ -76,5 +76,5 @@ class Answers:
         answered = sorted(self.answered)
         count = len(answered) if self.held is None else f"{len(answered)} of {self.held}"
         spread = f", {answered[0]} to {answered[-1]}" if answered else ""
-        asked = f"; asked for were {len(self.asked)}" if len(self.asked) != len(answered) else ""
-        return f"{count} answered frames match frames of the clip{spread} of its {frames}{asked}"
+        asked = f"; {len(self.asked)} were requested" if len(self.asked) != len(answered) else ""
+        return f"{count} estimated frames match frames of the clip{spread} of its {frames}{asked}"

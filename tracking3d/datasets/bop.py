@@ -100,7 +100,7 @@ def read_symmetries(file: Path, object_id: int, largest_step: float = LARGEST_ST
         ) from error
     transforms = np.stack([turn @ symmetry for symmetry in discrete for turn in continuous])
     if not all(is_rigid(transform) for transform in transforms):
-        raise InputError(f"{file}: a symmetry of object {object_id} is no rigid transform; correct it.")
+        raise InputError(f"{file}: a symmetry of object {object_id} is not a rigid transform; correct it.")
     return transforms
 
 
@@ -127,7 +127,7 @@ def _annotation(entry: Any, instance: int, where: str) -> Annotation:
         object_id = int(entry["obj_id"])
     except (TypeError, ValueError, KeyError) as error:
         raise InputError(
-            f"{where} needs obj_id, cam_R_m2c (9) and cam_t_m2c (3); correct that entry."
+            f"{where} needs obj_id, cam_R_m2c (9 numbers) and cam_t_m2c (3 numbers); correct that entry."
         ) from error
     if not is_rigid(T):
         raise InputError(f"{where}: cam_R_m2c of object {object_id} is not a rotation; correct it.")

@@ -1,4 +1,4 @@
-"""Writing clips with known truth as a data set in the BOP format.
+"""Writing clips with ground truth as a data set in the BOP format.
 
 Every clip becomes a scene with one object, every frame the image of its index. Lengths are in millimetres, axes and
 pixels are those of this package: BOP's model-to-camera pose is ``T_cam_obj``, and pixel (0, 0) is the centre of
@@ -74,8 +74,7 @@ def write_bop(folder: Path, truths: Sequence[Truth], split: str = "test") -> Non
 def _required(truth: Truth) -> tuple[MeshFile, float]:
     if truth.camera is None or truth.mesh is None or truth.millimetres is None:
         raise InputError(
-            f"The clip {truth.name} lacks its camera, its mesh or the length of its unit in millimetres; "
-            "BOP needs all of them."
+            f"The clip {truth.name} lacks a camera, a mesh or its unit in millimetres; BOP needs all of them."
         )
     return truth.mesh, truth.millimetres
 
@@ -112,7 +111,7 @@ def _write_scene(scene: Path, truth: Truth, obj_id: int, millimetres: float) -> 
 
 
 def _masks(truth: Truth, n: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]] | None:
-    """The whole silhouette and its visible part; each stands in for the other where that is not known."""
+    """The whole silhouette and its visible part; each stands in for the other if unknown."""
     whole, seen = truth.masks.get(n), truth.visible_masks.get(n)
     if whole is None and seen is None:
         return None

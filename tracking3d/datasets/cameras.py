@@ -32,7 +32,9 @@ def camera_from_matrix(K: Any, width: Any, height: Any, origin: str) -> Camera:
         matrix = np.asarray(K, dtype=np.float64).reshape(3, 3)
         width, height = int(width), int(height)
     except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{origin}: K must be 3 x 3 numbers, width and height whole ones.") from error
+        raise InputError(
+            f"{origin}: K must be 3 x 3 numbers; width and height must be whole numbers."
+        ) from error
     pinhole = (
         np.isfinite(matrix).all()
         and min(matrix[0, 0], matrix[1, 1], width, height) > 0
@@ -42,7 +44,8 @@ def camera_from_matrix(K: Any, width: Any, height: Any, origin: str) -> Camera:
     )
     if not pinhole:
         raise InputError(
-            f"{origin}: K must be fx 0 cx, 0 fy cy, 0 0 1 with positive focal lengths, width and height positive."
+            f"{origin}: K must be fx 0 cx, 0 fy cy, 0 0 1 with positive focal lengths; width and height must "
+            "be positive."
         )
     fx, fy, cx, cy = matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     return Camera(fx, fy, cx, cy, width, height, origin)

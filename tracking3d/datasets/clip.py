@@ -1,4 +1,4 @@
-"""Clips with known truth on disk: reading and writing one folder.
+"""Clips with ground truth on disk: reading and writing one folder.
 
 ::
 
@@ -9,8 +9,8 @@
     depth/000000.png             uint16, along the camera's z axis
     poses.json                   per frame R, t or one of them, and trusted; OpenCV axes, x_cam = R x_obj + t; units
     camera.json                  K, width, height; depth_scale: unit of the poses per count of depth, else a millimetre;
-                                 told: false where a tracker is told no camera
-    truth_camera.json            the same of the true camera, where a tracker is told the wrong one
+                                 told: false if a tracker is given no camera
+    truth_camera.json            the true camera, if a tracker is given a wrong one
     init.json                    the first frame's bbox_xywh and mask
     mesh.obj                     the shape, in the unit of the poses
     points.npz                   positions (T, N, 2) and visible (T, N)
@@ -57,7 +57,7 @@ def read_truth(folder: Path) -> Truth:
     frames = _images(folder / "frames")
     if not frames:
         raise InputError(
-            f"The clip {folder} has no images in frames/; give a folder in the layout of a truth clip."
+            f"The clip {folder} has no images in frames/; give a folder with the layout of a ground-truth clip."
         )
     index = {file.stem: n for n, file in enumerate(frames)}
     masks = _masks(folder / "masks", index)
@@ -119,7 +119,7 @@ def read_poses(file: Path, index: dict[str, int]) -> tuple[dict[int, NDArray[np.
         try:
             R, t = entry.get("R"), entry.get("t")
             if R is None and t is None:
-                raise ValueError("neither is there")
+                raise ValueError("neither is given")
             T = np.eye(4)
             T[:3, :3] = np.eye(3) if R is None else np.asarray(R, np.float64).reshape(3, 3)
             T[:3, 3] = 0.0 if t is None else np.asarray(t, np.float64).reshape(3)
@@ -251,7 +251,7 @@ def _read_points(file: Path, frames: int) -> PointTruth | None:
             f"not {points.positions.shape} and {shape}."
         )
     if not np.isfinite(points.positions[points.visible]).all():
-        raise InputError(f"{file}: a visible point has a position that is no finite number; correct it.")
+        raise InputError(f"{file}: a visible point has a position that is not finite; correct it.")
     return points
 
 

@@ -1,4 +1,4 @@
-"""Which file belongs to which frame of a sequence."""
+"""Matching files to the frames of a sequence."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Rule = Literal["number", "name", "order"]
 
 
 def number_of(file: Path) -> int | None:
-    """The last number in a file's name without suffix; None where it has none."""
+    """The last number in a file's name without suffix; None if it has none."""
     numbers = re.findall("[0-9]+", file.stem)
     return int(numbers[-1]) if numbers else None
 
@@ -30,7 +30,7 @@ def frame_numbers(frames: Sequence[Path]) -> dict[int, int]:
         if number is None or number in index:
             other = "no number" if number is None else f"the same number as {frames[index[number]].name}"
             raise InputError(
-                f"The frame {frame} has {other} in its name; let the description match frames by name or order."
+                f"The frame {frame} has {other} in its name; set the description to match frames by name or order."
             )
         index[number] = n
     return index

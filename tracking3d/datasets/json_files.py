@@ -1,4 +1,4 @@
-"""JSON files as plain data, with one sentence for whatever is wrong."""
+"""JSON files as plain data, with errors in one sentence."""
 
 from __future__ import annotations
 

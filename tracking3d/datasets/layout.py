@@ -1,4 +1,4 @@
-"""Where a data set keeps what: its description, a short YAML file.
+"""The layout of a data set: its description, a short YAML file.
 
 All paths are relative to the data set's folder and may be glob patterns. ``{sequence}`` and ``{object}`` in them
 stand for the sequence and the object that are read, ``{frame}`` and ``{instance}`` for the number of a frame and
@@ -41,7 +41,7 @@ Patterns = Annotated[
     BeforeValidator(lambda value: (value,) if isinstance(value, str) else value),
     Field(min_length=1),
 ]
-"""One pattern, or several of which the first that leads somewhere counts."""
+"""One pattern, or several, of which the first that matches is used."""
 
 
 class Sequences(Section):
@@ -50,14 +50,12 @@ class Sequences(Section):
     folders: Pattern = Field(
         "*", description="Pattern of their folders; each folder's path is a sequence's name."
     )
-    inside: str = Field(
-        ".", description="Folder in which these folders lie, where it is not part of their names."
-    )
+    inside: str = Field(".", description="Parent of these folders, if it is not part of their names.")
     holding: Patterns | None = Field(
-        None, description="Only folders that hold something of one of these patterns are sequences."
+        None, description="Only folders that contain a match of one of these patterns are sequences."
     )
     list: Patterns | None = Field(
-        None, description="Text file with a name a line; where it is missing, the folders count."
+        None, description="Text file with one name per line; if it is missing, the folders are listed."
     )
 
 
@@ -67,8 +65,7 @@ class MaskLayout(Section):
     files: Patterns = Field(description="Pattern of the images; with {frame}, the image of each frame.")
     values: Literal["threshold", "nonzero", "objects"] | int | tuple[int, int, int] = Field(
         "threshold",
-        description="What is the object: brighter than half, what is not 0, the label {object}, one label, or "
-        "one colour red, green, blue.",
+        description="Object pixels: brighter than half, not 0, the label {object}, one label, or one colour.",
     )
 
 
@@ -77,24 +74,23 @@ class Regions(Section):
 
     file: Patterns
     form: Literal["vot", "xywh", "xyxy", "polygon"] = Field(
-        "vot", description="vot decides line by line: rectangles, polygons, encoded masks."
+        "vot", description="vot detects the form of each line: rectangle, polygon or encoded mask."
     )
     score: Literal["box", "mask"] = Field(
         "box",
-        description="Whether an answer's bounding box is compared with the rectangle, or its mask with the "
-        "rectangle filled.",
+        description="Compare the estimate's bounding box with the rectangle, or its mask with the filled rectangle.",
     )
     zero: Literal["absent", "unknown"] = Field(
-        "absent", description="What the code 0 and NaN say of the object: out of sight, or not annotated."
+        "absent", description="Meaning of the codes 0 and NaN: object not visible, or not annotated."
     )
-    header_lines: int = Field(0, ge=0, description="Lines to leave out at the start.")
+    header_lines: int = Field(0, ge=0, description="Number of header lines to skip.")
     frame_column: int | None = Field(
         None,
         ge=0,
-        description="Column, from 0, of the frame's number as in its name; else line n is frame n.",
+        description="Column, from 0, of the frame number as in its name; else line n is frame n.",
     )
-    first_column: int = Field(0, ge=0, description="Column, from 0, where the region begins.")
-    one_based: bool = Field(False, description="Whether the first pixel is 1.")
+    first_column: int = Field(0, ge=0, description="First column, from 0, of the region.")
+    one_based: bool = Field(False, description="Whether the first pixel has the coordinate 1.")
 
 
 class Poses(Section):
@@ -103,7 +99,7 @@ class Poses(Section):
     file: Patterns = Field(description="The file; with form matrices, the files of all frames.")
     form: Literal["clip", "bop", "matrices", "lines"] = Field(
         "clip",
-        description="poses.json, scene_gt.json, a text file of 3 x 4 or 4 x 4 numbers a frame, or a line a frame.",
+        description="poses.json, scene_gt.json, a text file of 3 x 4 or 4 x 4 numbers per frame, or a line each.",
     )
     inverse: bool = Field(False, description="Whether the matrices are T_obj_cam.")
 
@@ -131,7 +127,7 @@ class Depth(Section):
     scale: float | None = Field(
         None,
         gt=0,
-        description="Unit of the poses per count; else scene_camera.json tells, or it is a millimetre.",
+        description="Unit of the poses per count; else that of scene_camera.json, or a millimetre.",
     )
 
 
@@ -159,18 +155,17 @@ class DatasetLayout(Section):
     note: str = ""
     clips: bool = Field(
         False,
-        description="Whether each sequence is a clip as `tracking3d demo` writes it; nothing else is said.",
+        description="Whether each sequence is a clip as written by `tracking3d demo`; then no other key is needed.",
     )
     sequences: Sequences = Sequences()
     frames: Patterns = ("{sequence}/frames/*",)
     objects: Literal["one", "masks", "poses"] | Pattern = Field(
         "one",
-        description="Where a sequence's objects are listed: only one, the labels of the first mask, scene_gt.json, "
-        "or a pattern with {object} of files.",
+        description="Objects: only one, the labels of the first mask, scene_gt.json, or a pattern with {object}.",
     )
     match: Literal["number", "name", "order"] = Field(
         "number",
-        description="How files belong to frames: by the last number in their names, their names, or their order.",
+        description="How files are matched to frames: by the last number in their names, by name, or by order.",
     )
     every: int = Field(1, ge=1, description="With order: file n belongs to frame n times this.")
     masks: MaskLayout | None = Field(None, description="The whole object where known.")

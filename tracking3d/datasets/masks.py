@@ -1,4 +1,4 @@
-"""Masks as data sets store them, read when they are asked for. See `tracking3d.datasets.truth.MaskReference`."""
+"""Masks as data sets store them, read on demand. See `tracking3d.datasets.truth.MaskReference`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class IndexedMask:
     value: Label | None
 
     def read(self) -> NDArray[np.bool_]:
-        """See `MaskReference.read`; empty where no pixel has the label."""
+        """See `MaskReference.read`; empty if no pixel has the label."""
         labels = read_labels(self.path, colour=isinstance(self.value, tuple))
         if self.value is None:
             return labels != 0
@@ -76,6 +76,6 @@ def read_labels(path: Path, colour: bool = False) -> NDArray:
     # Tools that know no palettes save grey values as three equal channels.
     if not (labels[..., :1] == labels[..., :3]).all():
         raise InputError(
-            f"The mask {path} has colours instead of numbered labels; say which colour is the object."
+            f"The mask {path} has colours instead of numbered labels; specify the colour of the object."
         )
     return labels[..., 0]

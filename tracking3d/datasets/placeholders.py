@@ -25,7 +25,7 @@ class Place:
     Attributes:
         root: The data set's folder.
         sequence: Name of the sequence.
-        object: The object's name or number; None where the sequence has only one.
+        object: The object's name or number; None if the sequence has only one.
     """
 
     root: Path
@@ -43,8 +43,8 @@ class Place:
             return int(self.object or 1)
         except ValueError as error:
             raise InputError(
-                f"The object '{self.object}' of the sequence '{self.sequence}' is not a number, but the description "
-                "asks for one; correct the description."
+                f"The object '{self.object}' of the sequence '{self.sequence}' is not a number, but the "
+                "description requires one; correct the description."
             ) from error
 
     def files(self, patterns: Iterable[str]) -> list[Path]:
@@ -92,7 +92,7 @@ class Place:
         return [path.name for path in sorted(map(Path, names), key=natural_order)]
 
     def _fill(self, pattern: str, **more: str) -> str | None:
-        """The pattern with its placeholders filled; None where one has no value here."""
+        """The pattern with its placeholders filled; None if one has no value here."""
         values = {"sequence": glob.escape(self.sequence), **more}
         if self.object is not None:
             values["object"] = self.object

@@ -1,4 +1,4 @@
-"""Text files with the object's rectangle, polygon or mask in every frame, one a line."""
+"""Text files with the object's rectangle, polygon or mask in every frame, one per line."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def _corners(line: str) -> Region:
 def _polygon(line: str) -> Region:
     region = parse_region(line)
     if not isinstance(region, Polygon | Special):
-        raise ValueError("it is no polygon")
+        raise ValueError("it is not a polygon")
     return region
 
 

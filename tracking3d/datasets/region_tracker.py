@@ -1,4 +1,4 @@
-"""Regions that another tracker has written, one a frame, as a mask tracker: for plug-ins that read results."""
+"""A mask tracker that replays the regions written by another tracker, for plug-ins that read results."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from tracking3d.trackers.vot_regions import EncodedMask, Region, bounding_box, r
 
 
 class RegionTracker:
-    """Answers with the regions of a result; implements `tracking3d.trackers.protocol.MaskTracker`, but is built.
+    """Replays the regions of a result; implements `tracking3d.trackers.protocol.MaskTracker`, but is built.
 
-    An encoded mask is the answer itself. From a rectangle or a polygon, which bound the object only, the colour
-    segmentation makes the mask; where a frame has no region it goes on without one, with half the score.
+    An encoded mask is returned as it is. For a rectangle or a polygon, which only bound the object, the colour
+    segmentation makes the mask; in a frame without a region it continues without one, with half the score.
 
     Args:
         regions: By the frame's index in the source, counted from 0.
@@ -39,23 +39,25 @@ class RegionTracker:
     def step(self, frame: Frame) -> MaskEstimate:
         """The frame's region as a mask."""
         if self._segmentation is None:
-            raise PluginError(f"The results of {self._name} were asked for a frame before they were started.")
+            raise PluginError(
+                f"The results of {self._name} must be started with init before a frame is read."
+            )
         if (answer := self._encode(frame)) is not None:
             return answer
         region = self._regions.get(frame.index)
         box = None if region is None else bounding_box(region)
         estimate = self._segmentation.step(frame.image, box)
         if box is None and estimate.mask is not None:
-            reason = f"{self._name} gave no region for this frame"
+            reason = f"{self._name} has no region for this frame"
             return MaskEstimate(estimate.mask, estimate.score / 2, reason)
         return estimate
 
     def _encode(self, frame: Frame) -> MaskEstimate | None:
-        """The answer where the frame's region is a mask."""
+        """The estimate if the frame's region is a mask."""
         region = self._regions.get(frame.index)
         if not isinstance(region, EncodedMask):
             return None
         mask = rasterise(region, frame.size)
         if not mask.any():
-            return MaskEstimate(None, 0.0, f"{self._name} gave an empty mask")
+            return MaskEstimate(None, 0.0, f"{self._name} has an empty mask for this frame")
         return MaskEstimate(mask.astype(np.float32))

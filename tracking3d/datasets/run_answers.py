@@ -1,4 +1,4 @@
-"""A run folder as the answers of a method."""
+"""A run folder as the estimates of a method."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from tracking3d.video.image_sequence import ImageSequence
 from tracking3d.video.selection import parse_selection, within
 
 LEAST_SHARED = 0.5
-"""Share of a run's frames that the clip must hold: with fewer, the indices that both have are so by chance."""
+"""Minimum share of a run's frames that the clip must contain; with fewer, common indices are a coincidence."""
 
 
 def answers_of_run(folder: Path, truth: Truth, *, refined: bool = True, offset: int = 0) -> Answers:
-    """What a run answered for the clip that ``truth`` is about.
+    """The estimates of a run for the clip of ``truth``.
 
     A run's frame index is the position of the frame in the clip. If ``run.json`` holds a ``selection``
     ``START:STOP:STEP``, only those frames were asked for.
@@ -38,8 +38,8 @@ def answers_of_run(folder: Path, truth: Truth, *, refined: bool = True, offset: 
     Args:
         folder: The run folder.
         truth: The clip.
-        refined: Take the answers of the final refinement where there are any, else the causal ones everywhere. A
-            refined answer took the time of the causal one and an equal share of the refinement's.
+        refined: Take the estimates of the final refinement if there are any, else the causal ones everywhere. A
+            refined estimate took the time of the causal one and an equal share of the refinement's.
         offset: Frame ``i`` of the run is frame ``i + offset`` of the clip.
 
     Raises:
@@ -88,17 +88,17 @@ def _shift_range(selection: range, offset: int, count: int) -> range:
 def _check_shared(run: RunReader, records: Mapping[int, FrameRecord], truth: Truth, offset: int) -> None:
     """Make sure that run and clip are of one video, as far as that shows."""
     camera, what = run.camera, f"The run {run.folder}"
-    advice = "give the clip that it was made on, or with --offset N say that its frame i is frame i + N of the clip"
+    advice = "give the clip of the run, or --offset N if frame i of the run is frame i + N of the clip"
     if truth.camera is not None and (camera.width, camera.height) != (
         truth.camera.width,
         truth.camera.height,
     ):
         raise InputError(
-            f"{what} is of frames of {camera.width} x {camera.height} pixels and the clip {truth.name} of "
-            f"{truth.camera.width} x {truth.camera.height}; give the clip that it was made on."
+            f"{what} has frames of {camera.width} x {camera.height} pixels, but the clip {truth.name} has "
+            f"{truth.camera.width} x {truth.camera.height}; give the clip of the run."
         )
     if not run.frames:
-        raise InputError(f"{what} has no frame of the clip {truth.name}: it has none at all; track again.")
+        raise InputError(f"{what} has no frame of the clip {truth.name}: the run is empty; track again.")
     if len(records) < LEAST_SHARED * len(run.frames):
         first, last = run.frames[0].index + offset, run.frames[-1].index + offset
         shared = f"only {len(records)} frames" if records else "no frame"
@@ -109,7 +109,7 @@ def _check_shared(run: RunReader, records: Mapping[int, FrameRecord], truth: Tru
 
 
 def is_refined(folder: Path) -> bool:
-    """Whether a run holds answers of a final refinement beside the causal ones.
+    """Whether a run holds refined estimates besides the causal ones.
 
     Raises:
         InputError: If it is not a run folder.
@@ -120,7 +120,7 @@ def is_refined(folder: Path) -> bool:
 def _times(
     run: RunReader, records: Mapping[int, FrameRecord]
 ) -> tuple[dict[int, float], dict[int, StageTimes]]:
-    """Wall time by frame, and its stages where they are known; of refined answers with the causal ones before."""
+    """Wall time by frame, and its stages if they are known; of refined estimates with the causal ones before."""
     spent = {index: one.seconds for index, one in records.items()}
     stages = {index: one.stages for index, one in records.items()}
     if refined := [index for index, one in records.items() if one.refined]:

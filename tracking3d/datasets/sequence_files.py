@@ -1,4 +1,4 @@
-"""What the files of one sequence tell, found as a data set's description says."""
+"""The data in the files of one sequence, found by a data set's description."""
 
 from __future__ import annotations
 
@@ -114,8 +114,8 @@ class SequenceFiles:
             return {index[number]: region for number, region in regions.items() if number in index}
         if regions and max(regions) >= len(self.frames):
             raise InputError(
-                f"{file} has {len(regions)} lines, but the sequence '{self.place.sequence}' only "
-                f"{len(self.frames)} frames; restore what is missing."
+                f"{file} has {len(regions)} lines, but the sequence '{self.place.sequence}' has only "
+                f"{len(self.frames)} frames; restore the missing frames."
             )
         return regions
 
@@ -135,7 +135,7 @@ class SequenceFiles:
         return {n: T for n, T in poses.items() if n < len(self.frames)}
 
     def camera(self) -> Camera | None:
-        """The camera; None where it is not the same in all frames."""
+        """The camera; None if it is not the same in all frames."""
         told = self.layout.camera
         if told is None:
             return None

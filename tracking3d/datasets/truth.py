@@ -1,4 +1,4 @@
-"""What is known about one rigid object in one clip, whatever layout it was read from.
+"""Ground truth of one rigid object in one clip, from any layout.
 
 OpenCV camera axes; ``x_cam = R x_obj + t``; pixel (0, 0) is the centre of the top-left pixel. Everything but
 the frames may be absent, and may be known in some frames only.
@@ -128,8 +128,8 @@ class Truth:
         frames: The images in order.
         box: The object in frame 0 as ``(x, y, width, height)``, where a tracker starts from one.
         camera: Of all frames, where known.
-        given_camera: What a tracker is told that the camera is, where that is not the true one.
-        camera_told: Whether a tracker is told any camera.
+        given_camera: The camera given to a tracker, if it is not the true one.
+        camera_told: Whether a tracker is given a camera.
         T_cam_obj: ``(4, 4)`` pose by frame index; only those that are known and trusted. The rotation or the
             translation is NaN where only the other is known.
         masks: The object's mask by frame index, the part behind other things included if the data know it.

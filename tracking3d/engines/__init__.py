@@ -1,1 +1,1 @@
-"""Where work on many videos is done: processes of this machine, or a Ray cluster; and the loop that hands it out."""
+"""Engines for many videos: processes of this machine or a Ray cluster, and the loop that schedules tasks."""

@@ -1,4 +1,4 @@
-"""From what the user asks for to an engine."""
+"""The choice of an engine from the user's options."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def open_engine(
         needs: What each takes.
 
     Raises:
-        InputError: If Ray is asked for and not installed, or nothing answers there.
+        InputError: If Ray is asked for and not installed, or no cluster responds there.
     """
     if address is None:
         yield ProcessEngine(workers, needs)

@@ -1,4 +1,4 @@
-"""The engine without workers: every task is called where it stands, which is what a debugger wants."""
+"""The engine without workers: every task is called directly, for debugging."""
 
 from __future__ import annotations
 

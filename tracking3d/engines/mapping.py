@@ -1,4 +1,4 @@
-"""The loop that hands tasks to an engine: as many at a time as it has workers, and again where one came to nothing."""
+"""The loop that hands tasks to an engine: as many at a time as it has workers, with retries of failed ones."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from dataclasses import replace
 from tracking3d.engines.protocol import Began, Ended, Engine, Event, Task
 
 PAUSE = 2.0
-"""Seconds before a task is tried again; twice as long each further time, for what fails may be a disk or a network."""
+"""Seconds before a failed task is retried; doubled each further time, because a disk or a network may have failed."""
 LONGEST_PAUSE = 60.0
 _LOOK = 0.5  # seconds, at most, between two looks at what is to be tried again
 
 Listener = Callable[[Event], None]
-"""Is told of everything that happens."""
+"""Called with every event."""
 
 
 def map_tasks(
@@ -38,7 +38,7 @@ def map_tasks(
         tasks: What; their numbers differ.
         retries: How often a task that came to nothing is tried again.
         pause: See `PAUSE`.
-        listener: Is told of everything that happens; what it raises ends the loop.
+        listener: Called with every event; an exception that it raises ends the loop.
         further: What is to be done after a task that has ended for good, such as the next steps of the same video;
             it is begun before what has not begun yet.
         meanwhile: Is called again and again, at least twice a second, whether something happens or not.

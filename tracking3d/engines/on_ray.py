@@ -23,13 +23,13 @@ from tracking3d.engines.worker import call, last_words, threads_in_words
 from tracking3d.errors import InputError
 
 THIS_MACHINE = "local"
-"""The address of a Ray that is started for the batch, on this machine, and ended with it."""
+"""Address of a local Ray that is started for the batch and stopped with it."""
 
 GRACE = 20.0
-"""Seconds in which a task that is to stop can keep what is done."""
+"""Seconds that a stopped task has to save its state."""
 
 _CALLS = 20
-"""Tasks after which a worker is replaced: what libraries have piled up goes with it."""
+"""Number of tasks after which a worker is replaced, to release memory held by libraries."""
 _OBJECT_STORE = 100 * 2**20  # bytes; results are short, videos and run folders pass through files
 _VARIABLES = "TRACKING3D_"
 _QUIET = {
@@ -68,7 +68,8 @@ def open_ray(address: str, workers: int | None = None, needs: Needs = ONE_CORE) 
             ray.init(**begun)
         except Exception as error:  # a cluster can be out of reach in many ways
             raise InputError(
-                f"No Ray cluster answers at --address {address} ({' '.join(str(error).split())[:200]}); give auto on a "
+                f"No Ray cluster responds at --address {address} ({' '.join(str(error).split())[:200]}); "
+                "give auto on a "
                 f"machine of the cluster, HOST:PORT, ray://HOST:PORT, or {THIS_MACHINE}."
             ) from error
     _silence()
@@ -165,7 +166,7 @@ class RayEngine:
         return {**threads_in_words(self._needs.threads), **ours}
 
     def _letters(self) -> list[Event]:
-        """What tasks have told since."""
+        """Reports of tasks since the last call."""
         try:
             letters = _ray().get(self._mailbox.take.remote(), timeout=GRACE)
         except Exception:  # it died with its machine, and is made again: progress is lost, and nothing else
@@ -205,7 +206,7 @@ class _InObjectStore:
 
 
 class _Mailbox:
-    """What tasks tell, until somebody takes it."""
+    """Reports of tasks until they are collected."""
 
     def __init__(self) -> None:
         self._letters: list[tuple[int, str, Any]] = []
@@ -254,7 +255,7 @@ def _ray() -> Any:
         import ray
     except ImportError as error:
         raise InputError(
-            "--address needs Ray, which is not installed: pip install 'tracking3d[ray]'; without --address the "
-            "processes of this machine do the work."
+            "--address needs Ray, which is not installed: pip install 'tracking3d[ray]'; without --address, "
+            "the batch runs in processes of this machine."
         ) from error
     return ray

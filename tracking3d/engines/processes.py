@@ -1,4 +1,4 @@
-"""The engine of one machine: a process for every task, forked from one that has imported everything already.
+"""The engine of one machine: a process for every task, forked from one that has already imported everything.
 
 A process that ends takes its memory, threads and open files along, whatever a thousand videos did in it; one that
 crashes costs its own task.
@@ -25,7 +25,7 @@ from tracking3d.engines.protocol import ONE_CORE, Began, Ended, Event, Fault, Ne
 from tracking3d.engines.worker import call, interruptible, last_words, threads_in_words
 
 GRACE = 20.0
-"""Seconds in which a task that is to stop can keep what is done."""
+"""Seconds that a stopped task has to save its state."""
 
 PRELOADED = [
     "tracking3d.pipeline.record",
@@ -38,7 +38,7 @@ PRELOADED = [
     "tracking3d.batch.one_video",
     "tracking3d.speed.kernels_loaded",
 ]
-"""What takes seconds to import or to load, and is so once; every task then begins with it."""
+"""Modules that take seconds to import or to load; they are loaded once, before the first task."""
 
 
 @dataclass
@@ -165,7 +165,7 @@ def default_workers(needs: Needs) -> int:
 
 
 def _handles(running: _Running) -> tuple[Any, ...]:
-    """What to wait for: after its answer only the end of a process."""
+    """What to wait for: after its result, only the end of a process."""
     if running.answered:
         return (running.process.sentinel,)
     return running.process.sentinel, running.connection
@@ -201,7 +201,7 @@ def _work(connection: Connection, task: Task, threads: int, environment: dict[st
 
 
 def _stop_when_alone(connection: Connection) -> None:
-    """Where the process that hands out tasks is gone, nobody takes the result: end as if told to."""
+    """If the process that hands out tasks is gone, the result is not collected: stop."""
     try:
         connection.recv()
     except (EOFError, OSError):

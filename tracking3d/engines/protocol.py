@@ -1,4 +1,4 @@
-"""What an engine is: it calls functions in workers, tells how they go on, and outlives whatever kills one of them."""
+"""The protocol of engines: they call functions in workers, report progress, and survive the death of a worker."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 Tell = Callable[[Any], None]
-"""By this a function in a worker tells how far it is; what it tells is pickled."""
+"""Called by a function in a worker to report its progress; the report is pickled."""
 
 
 @dataclass(frozen=True)
@@ -90,8 +90,8 @@ class Ended:
 
     Attributes:
         number: Of the task.
-        value: What the function returned; None where it came to nothing.
-        fault: Why it came to nothing; None where it did not.
+        value: What the function returned; None if it came to nothing.
+        fault: Why it came to nothing; None if it did not.
         attempts: How often it was begun.
         again: Whether it will be tried once more.
     """
@@ -134,7 +134,7 @@ class Engine(Protocol):
         ...
 
     def share(self, file: Path) -> Shared | None:
-        """Make a file known to workers, as an argument of tasks; None where they see this machine's files anyway."""
+        """Make a file known to workers, as an argument of tasks; None if they see this machine's files anyway."""
         ...
 
     def stop(self) -> None:

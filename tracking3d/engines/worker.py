@@ -1,4 +1,4 @@
-"""What a worker does around a task, whatever process it is in: prints into the log, few threads, failure as data."""
+"""The environment of a task in any worker: output to the log, few threads, failures as data."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tracking3d.engines.protocol import Fault, Task, Tell
 from tracking3d.errors import Tracking3dError
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""What libraries take the number of their threads from when they are imported."""
+"""Environment variables from which libraries read their number of threads when they are imported."""
 
 _DUMP = 100  # lines, at most, of what the fault handler writes
 
@@ -50,7 +50,7 @@ def sentence_of(error: BaseException) -> str:
 
 
 def last_words(log: Path | None) -> str:
-    """The last line of a log, and where the rest is; empty where there is none."""
+    """The last line of a log, and where the rest is; empty if there is none."""
     if log is None:
         return ""
     try:
@@ -59,7 +59,7 @@ def last_words(log: Path | None) -> str:
         return ""
     # Where Python's fault handler is on, it lists modules after what matters.
     fatal = [line for line in lines[-_DUMP:] if line.startswith("Fatal Python error")]
-    said = (fatal or lines[-1:] or ["it said nothing"])[0]
+    said = (fatal or lines[-1:] or ["it left no message"])[0]
     return f": {said.strip()}; see {log}"
 
 

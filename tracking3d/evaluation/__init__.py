@@ -1,1 +1,1 @@
-"""Measures of estimates against the truth."""
+"""Metrics of estimates against ground truth."""

@@ -1,4 +1,4 @@
-"""One similarity between the object frame of an estimate and that of the truth, and what it leaves of translations.
+"""The similarity that aligns the object frame of an estimate with ground truth, and the remaining translation errors.
 
 The camera frame is common. The object frames differ by a rotation ``A`` and an ``offset``, and the whole estimated
 scene by one ``scale``, because one camera cannot tell size from distance. The true origin lies at ``offset`` in the

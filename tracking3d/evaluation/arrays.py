@@ -1,4 +1,4 @@
-"""Checks of the arrays that measures are given; what does not fit is the caller's mistake."""
+"""Checks of arrays passed to metrics; a wrong shape is the caller's mistake."""
 
 from __future__ import annotations
 

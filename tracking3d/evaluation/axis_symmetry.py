@@ -1,4 +1,4 @@
-"""Rotation errors of objects of revolution: how far they have turned about their axis is not seen, so does not count.
+"""Rotation errors of objects of revolution: the rotation about their axis is not observable and does not count.
 
 What is left of a rotation ``R`` is where it takes the axis: ``R a``, with the unit vector ``a`` in true object
 coordinates. In estimated ones the axis is an unknown ``b``. The error of a frame is the angle between ``R_est b`` and
@@ -22,7 +22,7 @@ _STARTS = 100
 def aligned_axis_errors(R_est: Rotations, R_true: Rotations, axis: ArrayLike) -> Angles:
     """Error of every frame with the ``b`` of the least sum of errors, the robust median on the sphere.
 
-    Weiszfeld steps from the best of the frames' own answers, as in `tracking3d.evaluation.metrics`.
+    Weiszfeld steps from the best of the frames' own estimates, as in `tracking3d.evaluation.metrics`.
 
     Args:
         R_est, R_true: ``(N, 3, 3)``.

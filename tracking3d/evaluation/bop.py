@@ -35,7 +35,7 @@ class AverageRecall:
     """Share of right poses, averaged over the thresholds (and over the misalignment tolerances of VSD).
 
     Attributes:
-        vsd, mssd, mspd: Of each error; None where it could not be computed.
+        vsd, mssd, mspd: Of each error; None if it could not be computed.
     """
 
     vsd: float | None
@@ -60,7 +60,7 @@ def average_recall(
     """Average recall over N frames. A frame without an estimate has infinite errors.
 
     Args:
-        vsd_errors: ``(N, 10)`` by tolerance, of `tracking3d.evaluation.vsd`; None where there is no depth.
+        vsd_errors: ``(N, 10)`` by tolerance, of `tracking3d.evaluation.vsd`; None if there is no depth.
         mssd_errors: ``(N,)`` in the unit of ``diameter``.
         mspd_errors: ``(N,)`` pixels.
         diameter: Of the model.
@@ -190,7 +190,7 @@ def _points(points: ArrayLike) -> NDArray[np.float64]:
 
 
 def _equivalent_poses(T_true: Pose, symmetries: ArrayLike | None) -> NDArray[np.float64]:
-    """``(S, 4, 4)`` true poses that cannot be told apart."""
+    """``(S, 4, 4)`` true poses that cannot be distinguished."""
     same = np.eye(4)[None] if symmetries is None else finite("symmetries", symmetries, None, 4, 4)
     if not len(same):
         raise ValueError("symmetries needs shape (S, 4, 4) with S > 0, got (0, 4, 4)")

@@ -90,7 +90,7 @@ def davis_statistics(values: ArrayLike, semi_supervised: bool = True) -> Sequenc
         semi_supervised: Leave out the first frame, whose mask was given, and the last, as DAVIS does.
 
     Returns:
-        None where no frame is left.
+        None if no frame is left.
 
     Raises:
         ValueError: If the shape is another.

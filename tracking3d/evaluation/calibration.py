@@ -1,4 +1,4 @@
-"""Whether confidence can be believed, and whether "lost" is said when it should be."""
+"""Calibration of confidence, and precision and recall of the status lost."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ BINS = 10
 
 @dataclass(frozen=True, eq=False)
 class Reliability:
-    """Answers sorted into bins by confidence, the data of a reliability diagram.
+    """Estimates sorted into bins by confidence, the data of a reliability diagram.
 
     Bin ``m`` holds confidences above its lower edge up to its upper edge; the first holds 0 too.
 
     Attributes:
         edges: ``(M + 1,)``.
-        count: ``(M,)`` answers in each bin.
+        count: ``(M,)`` estimates in each bin.
         confidence: ``(M,)`` their mean confidence; NaN in an empty bin.
         accuracy: ``(M,)`` the share of them that is right; NaN in an empty bin.
     """
@@ -38,9 +38,9 @@ class Detection:
     """How well something is detected.
 
     Attributes:
-        precision: Share of what was called that is; None where nothing was called.
-        recall: Share of what is that was called; None where nothing is.
-        f1: Their harmonic mean, ``2 TP / (2 TP + FP + FN)``; None where nothing is and nothing was called.
+        precision: Share of what was called that is; None if nothing was called.
+        recall: Share of what is that was called; None if nothing is.
+        f1: Their harmonic mean, ``2 TP / (2 TP + FP + FN)``; None if nothing is and nothing was called.
     """
 
     precision: float | None
@@ -49,7 +49,7 @@ class Detection:
 
 
 def reliability(confidence: ArrayLike, right: ArrayLike, bins: int = BINS) -> Reliability:
-    """Sort N answers into ``bins`` bins of equal width.
+    """Sort N estimates into ``bins`` bins of equal width.
 
     Args:
         confidence: ``(N,)`` in [0, 1].
@@ -76,9 +76,9 @@ def reliability(confidence: ArrayLike, right: ArrayLike, bins: int = BINS) -> Re
 
 
 def expected_calibration_error(confidence: ArrayLike, right: ArrayLike, bins: int = BINS) -> float | None:
-    """Mean over all answers of the gap between accuracy and mean confidence of their bin.
+    """Mean over all estimates of the gap between accuracy and mean confidence of their bin.
 
-    Guo et al., "On calibration of modern neural networks", ICML 2017. None without answers.
+    Guo et al., "On calibration of modern neural networks", ICML 2017. None without estimates.
 
     Args:
         confidence: ``(N,)`` in [0, 1].
@@ -96,9 +96,9 @@ def expected_calibration_error(confidence: ArrayLike, right: ArrayLike, bins: in
 
 
 def area_under_roc(score: ArrayLike, right: ArrayLike) -> float | None:
-    """Area under the ROC curve: the probability that a right answer has a higher score than a wrong one.
+    """Area under the ROC curve: the probability that a right estimate has a higher score than a wrong one.
 
-    By ranks (Mann and Whitney, 1947); ties count for a half. None where all are right or all wrong.
+    By ranks (Mann and Whitney, 1947); ties count for a half. None if all are right or all wrong.
 
     Args:
         score: ``(N,)``.

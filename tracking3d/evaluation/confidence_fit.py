@@ -1,4 +1,4 @@
-"""A confidence from evidence: logistic regression of whether an answer is right on a few numbers known without truth.
+"""Fit of the confidence: logistic regression of correctness on a few features known without ground truth.
 
 Cox, "The regression analysis of binary sequences", 1958. A number counts between the bounds that it was seen within,
 so that no outlier decides, and where it is missing a constant stands for it. The result is a small table.
@@ -33,7 +33,7 @@ class Term:
         name: Of the evidence.
         weight: Its coefficient.
         low, high: It is clipped to them.
-        missing: What is added where it is not known.
+        missing: What is added if unknown.
     """
 
     name: str
@@ -56,7 +56,7 @@ class LogisticConfidence:
     terms: tuple[Term, ...]
 
     def __call__(self, evidence: Mapping[str, ArrayLike]) -> NDArray[np.float64]:
-        """Confidences ``(N,)`` in [0, 1] of N answers, from their evidence ``(N,)`` by name; NaN is not known.
+        """Confidences ``(N,)`` in [0, 1] of N estimates, from their evidence ``(N,)`` by name; NaN is not known.
 
         Raises:
             KeyError: If evidence that the fit used is not there.
@@ -76,18 +76,21 @@ def fit_confidence(
     """Fit the confidence that makes what was seen the likeliest, with small coefficients.
 
     Args:
-        evidence: ``(N,)`` by name; NaN where it is not known. What never differs gets the weight 0.
-        right: ``(N,)`` bool, whether the answers were right.
-        signs: 1 for evidence that can only speak for an answer, -1 for what can only speak against it, as a loss does;
+        evidence: ``(N,)`` by name; NaN if unknown. What never differs gets the weight 0.
+        right: ``(N,)`` bool, whether the estimates were right.
+        signs: 1 for evidence that can only speak for an estimate, -1 for what can only speak against it, as a loss
+            does;
             what is not named may do either.
         penalty: See `PENALTY`.
 
     Raises:
-        ValueError: If a shape does not fit, or all answers are right or all wrong: then nothing can be learnt.
+        ValueError: If a shape does not fit, or all estimates are right or all wrong: then nothing can be learnt.
     """
     was_right = booleans("right", right, None)
     if was_right.all() or not was_right.any():
-        raise ValueError(f"of {len(was_right)} answers {was_right.sum()} are right; both kinds are needed")
+        raise ValueError(
+            f"of {len(was_right)} estimates {was_right.sum()} are right; right and wrong ones are needed"
+        )
     names = list(evidence)
     values = [floats(name, evidence[name], len(was_right)) for name in names]
     columns, scales = zip(*(_standardize(value) for value in values), strict=True) if names else ((), ())

@@ -1,4 +1,4 @@
-"""Does the method know when it is wrong? Calibration of its confidence, and its calls of ``lost``."""
+"""Scores of a method's self-assessment: calibration of its confidence, and its frames with status ``lost``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tracking3d.evaluation.mask_scores import FrameMasks
 from tracking3d.evaluation.vot import LongTermScores, LongTermSequence, long_term_scores
 
 RIGHT_ROTATION, RIGHT_IOU = 10.0, 0.7
-"""A frame is right below this rotation error in degrees and above this IoU, where they are known."""
+"""A frame is right below this rotation error in degrees and above this IoU, if they are known."""
 
 LOST_ROTATION, LOST_IOU = 30.0, 0.3
 """A frame is truly lost above this rotation error in degrees or below this IoU."""
@@ -59,7 +59,7 @@ def right_frames(
     Args:
         answers: The method's.
         rotation: Rotation error in degrees by frame.
-        masks: The masks beside the true ones, by frame.
+        masks: Estimated and true masks, by frame.
     """
     return {
         n: rotation.get(n, 0.0) < RIGHT_ROTATION and (n not in masks or masks[n].iou > RIGHT_IOU)
@@ -75,7 +75,7 @@ def score_confidence(
     Args:
         answers: The method's.
         rotation: Rotation error in degrees by frame.
-        masks: The masks beside the true ones, by frame.
+        masks: Estimated and true masks, by frame.
     """
     by_frame = right_frames(answers, rotation, masks)
     if not by_frame:

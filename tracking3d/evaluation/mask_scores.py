@@ -1,4 +1,4 @@
-"""What masks are worth: against the truth, and against the masks that the method started from."""
+"""Scores of masks, against ground truth and compared with the initial masks."""
 
 from __future__ import annotations
 
@@ -26,18 +26,19 @@ _EQUAL = 1e-9
 class MaskScores:
     """Masks over the frames with a true mask or box, except the one that the method was given.
 
-    All are None where there is no such frame. Where only boxes are known, the box around a mask is compared, and
+    All are None if there is no such frame. Where only boxes are known, the box around a mask is compared, and
     there is no boundary.
 
     Attributes:
         iou_initial_mean: Mean IoU of the mask tracker's masks.
-        iou_mean: Mean IoU of the answers.
+        iou_mean: Mean IoU of the estimates.
         iou_gain_percent: How much larger `iou_mean` is than `iou_initial_mean`.
-        share_own_masks: Share of frames whose answer is not the initial mask handed back; no answer is none.
-            None where nobody recorded where masks come from.
-        share_worse_than_initial: Share of frames where the answer's IoU is the smaller one by more than 1e-9.
+        share_own_masks: Share of frames whose estimate is not the unchanged initial mask; a missing estimate counts as
+            unchanged.
+            None if the origin of masks was not recorded.
+        share_worse_than_initial: Share of frames where the estimate's IoU is the smaller one by more than 1e-9.
         boundary_f_initial_mean: Mean boundary F of the mask tracker's masks.
-        boundary_f_mean: Mean boundary F of the answers.
+        boundary_f_mean: Mean boundary F of the estimates.
         davis_j_mean, davis_f_mean: IoU and boundary F as DAVIS takes them, without the last frame too.
         frames_with_mask: Number of the frames that the first four are means of.
     """
@@ -56,14 +57,14 @@ class MaskScores:
 
 @dataclass(frozen=True)
 class FrameMasks:
-    """One frame's masks beside the true one; NaN without a true boundary.
+    """One frame's masks against the true one; NaN without a true boundary.
 
-    In a frame with an answer, no mask is an empty one; in one without, everything is 0.
+    In a frame with an estimate, no mask is an empty one; in one without, everything is 0.
 
     Attributes:
-        iou: Of the answer.
+        iou: Of the estimate.
         iou_initial: Of the mask tracker's mask.
-        boundary_f: Of the answer.
+        boundary_f: Of the estimate.
         boundary_f_initial: Of the mask tracker's mask.
         visible: Whether the truth shows the object at all.
     """
@@ -128,8 +129,9 @@ def _compare(answers: Answers, truth: Truth, index: int) -> FrameMasks:
     for mask in masks:
         if mask is not None and mask.shape != true.shape:
             raise InputError(
-                f"Frame {index}: the mask of {answers.origin} is {mask.shape[1]} x {mask.shape[0]} pixels and the "
-                f"true one of {truth.name} {true.shape[1]} x {true.shape[0]}; give the clip it was made on."
+                f"Frame {index}: the mask of {answers.origin} is {mask.shape[1]} x {mask.shape[0]} pixels "
+                f"and the true one of {truth.name} {true.shape[1]} x {true.shape[0]}; give the clip of the "
+                "run."
             )
     ious = [0.0 if mask is None else mask_iou(mask, true) for mask in masks]
     if truth.boxes:  # true masks beside boxes are empty ones: they tell nothing of boundaries

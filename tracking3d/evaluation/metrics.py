@@ -1,4 +1,4 @@
-"""Measures of masks and rotations against the truth.
+"""Metrics of masks and rotations against ground truth.
 
 The object frames of estimate and truth differ by one unknown rotation ``A``: ``R_true = R_est A``. Rotations
 map object to camera. All angles are in degrees.
@@ -34,7 +34,7 @@ def rotation_alignment(R_est: Rotations, R_true: Rotations) -> NDArray[np.float6
     """The ``(3, 3)`` rotation ``A`` with the least sum of angles between ``R_est A`` and ``R_true``.
 
     That is the geodesic L1 median of ``R_est^T R_true``, robust to a minority of wrong frames. It has local
-    minima, so the frames' own answers are the starts and Weiszfeld steps on SO(3) refine the best of them
+    minima, so the frames' own estimates are the starts and Weiszfeld steps on SO(3) refine the best of them
     (Hartley, Aftab and Trumpf, "L1 rotation averaging using the Weiszfeld algorithm", CVPR 2011).
 
     Raises:

@@ -1,4 +1,4 @@
-"""Poses and shape judged with the true mesh: BOP's average recall, Chamfer distance and F-score."""
+"""Scores of poses and shape against the true mesh: BOP's average recall, Chamfer distance and F-score."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What point correspondences are worth, as TAP-Vid measures them."""
+"""Scores of point correspondences with TAP-Vid's metrics."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tracking3d.video.image_file import read_image
 class PointTrackScores:
     """Points asked for where each is first seen (TAP-Vid's query mode ``first``) and followed from there.
 
-    All are None where no true points are known or the method follows none, and of an object with an axis of symmetry:
+    All are None if no true points are known or the method follows none, and of an object with an axis of symmetry:
     nothing in the images tells its points around the axis from each other.
 
     Attributes:
@@ -63,7 +63,7 @@ def score_points(answers: Answers, truth: Truth) -> PointTrackScores:
 
 
 def _score_track(tracker: PointTracker | None, truth: Truth) -> tuple[PointScores, int] | None:
-    """Scores of all true points, and how many these are; None where there are none or nobody follows them."""
+    """Scores of all true points, and how many these are; None if there are none or the method does not track points."""
     if truth.points is None or tracker is None or truth.symmetry_axis is not None:
         return None
     tracks, occluded = truth.points.positions.transpose(1, 0, 2), ~truth.points.visible.T

@@ -1,4 +1,4 @@
-"""What poses are worth: rotations and translations, each up to what one camera cannot know."""
+"""Scores of poses: rotations and translations, up to the ambiguities of a single camera."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ GOOD_TRANSLATION = 5.0
 class PoseScores:
     """Poses over the frames with a trusted pose; see `tracking3d.evaluation.metrics` and `...alignment`.
 
-    All are None where there is no such frame; those of rotations, or of translations, also where a truth knows only
+    All are None if there is no such frame; those of rotations, or of translations, also where a truth knows only
     the others. Every one of these frames counts in all figures of rotations: one that
     was called lost with the error of its pose, and as not right for the shares; one without a pose with 180 degrees.
     Turns about an axis of symmetry do not count, see `tracking3d.evaluation.axis_symmetry`.
@@ -114,7 +114,7 @@ class PosePairs:
 
 
 def pair_poses(answers: Answers, truth: Truth) -> PosePairs | None:
-    """The estimates beside the truth; None if the method gives no poses or none is known."""
+    """Estimated and true poses; None if the method gives no poses or none is known."""
     frames = [n for n in answers.asked if n in truth.T_cam_obj]
     poses = answers.T_cam_obj
     if not frames or poses is None:
@@ -140,7 +140,7 @@ def fit_alignment(pairs: PosePairs | None, diameter: float | None) -> ObjectAlig
 
 
 def rotation_errors(pairs: PosePairs) -> dict[int, float]:
-    """Aligned error in degrees of each frame whose true rotation is known; 180 where there is no estimate."""
+    """Aligned error in degrees of each frame whose true rotation is known; 180 if there is no estimate."""
     pairs = pairs.with_rotation
     return dict(zip(pairs.frames, _align(pairs).tolist(), strict=True))
 
@@ -158,7 +158,7 @@ def _align(pairs: PosePairs) -> NDArray[np.float64]:
 
 
 def return_error(pairs: PosePairs) -> float | None:
-    """Error in degrees of the turn from the first frame to the last; None where the last view is not the first again.
+    """Error in degrees of the turn from the first frame to the last; None if the last view is not the first again.
 
     180 if either has no estimate.
     """

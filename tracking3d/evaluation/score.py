@@ -1,4 +1,4 @@
-"""Everything that is known about the worth of one method's answers for one clip.
+"""All scores of one method's estimates for one clip.
 
 Every frame of the clip counts, or every frame that the method was asked for. A frame that it skipped or never came to
 counts as wrong: IoU 0, rotation 180 degrees, every pose threshold missed.
@@ -33,18 +33,18 @@ from tracking3d.runtime.stage_times import STAGES, StageTimes
 
 @dataclass(frozen=True, kw_only=True)
 class Scores(MaskScores, PoseScores, PointTrackScores, ModelScores, ConfidenceScores):
-    """What answers are worth; `dataclasses.asdict` gives the JSON of ``tracking3d evaluate``.
+    """Scores of estimates; `dataclasses.asdict` gives the JSON of ``tracking3d evaluate``.
 
     Attributes:
         frames: Number of frames of the clip that the method was asked for.
-        frames_missing: How many of them it has no answer for.
+        frames_missing: How many of them it has no estimate for.
         frames_lost: How many of them it called lost.
-        share_lost: Share of `frames` that it called lost or has no answer for.
-        seconds_per_frame, seconds_per_frame_median: Mean and median wall time of a frame; None where it was not
+        share_lost: Share of `frames` that it called lost or has no estimate for.
+        seconds_per_frame, seconds_per_frame_median: Mean and median wall time of a frame; None if it was not
             recorded.
         seconds_decode, seconds_track, seconds_encode, seconds_solve, seconds_map, seconds_write: Mean wall time of each
-            stage of a frame, see `tracking3d.runtime.stage_times.StageTimes`; None where it was not recorded.
-        peak_memory_mb: Most memory held, in 10^6 bytes; None where it was not recorded.
+            stage of a frame, see `tracking3d.runtime.stage_times.StageTimes`; None if it was not recorded.
+        peak_memory_mb: Most memory held, in 10^6 bytes; None if it was not recorded.
         memory_growth_mb: How much more was held at most in the second half of the frames than in the first.
     """
 
@@ -65,7 +65,7 @@ class Scores(MaskScores, PoseScores, PointTrackScores, ModelScores, ConfidenceSc
 
 
 def score(answers: Answers, truth: Truth) -> Scores:
-    """Score answers against the truth, by every measure that both sides have what it takes for.
+    """Score estimates against ground truth, by every measure for which both sides have data.
 
     Raises:
         InputError: If a file that one side names cannot be read, or a mask has not the size of the true one.
@@ -97,7 +97,7 @@ def score(answers: Answers, truth: Truth) -> Scores:
 
 
 def score_mesh(answers: Answers, truth: Truth) -> ModelScores:
-    """The scores of the shape alone, and of poses by the true mesh; empty where there is none.
+    """The scores of the shape alone, and of poses by the true mesh; empty if there is none.
 
     Raises:
         InputError: If a file that one side names cannot be read.

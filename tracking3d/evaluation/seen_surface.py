@@ -1,4 +1,4 @@
-"""What of a true surface the frames of a clip show."""
+"""The part of a true surface that is visible in a clip."""
 
 from __future__ import annotations
 

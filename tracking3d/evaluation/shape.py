@@ -1,4 +1,4 @@
-"""How far an estimated surface is from the true one, on all of it and on what the frames showed.
+"""Distance of an estimated surface from the true one, over all of it and over its visible part.
 
 Distances run from points spread evenly over one mesh to the surface of the other. Figures are in object diameters. The
 alignment is given (`tracking3d.evaluation.alignment`); none is searched here.
@@ -40,8 +40,8 @@ class ShapeScores:
         recall: Share of the true surface that is on the estimated one.
         f_score: Harmonic mean of the two.
         f_score_fine: The same at `FINE_TOLERANCE`.
-        f_score_seen: `f_score` of what was seen: of the true surface, and of what lies nearest to that; None where
-            nobody says what was seen.
+        f_score_seen: `f_score` of what was seen: of the true surface, and of what lies nearest to that; None if
+            it is unknown what was seen.
         f_score_fine_seen: The same at `FINE_TOLERANCE`.
         normals: Mean cosine between the normals of points of either surface and those of the nearest of the other.
         genus_error: By how many handles the estimate differs; None unless both are one closed surface.

@@ -1,4 +1,4 @@
-"""Answers of any origin: our run folders, and the formats of others."""
+"""Estimates of any origin: our run folders, and the formats of others."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ def open_answers(
     offset: int = 0,
     **options: Any,
 ) -> tuple[Answers, str]:
-    """Read answers for the clip that ``truth`` is about.
+    """Read estimates for the clip that ``truth`` is about.
 
     Args:
         path: A run folder, or what `tracking3d.datasets.readers.read_answers` reads.
         truth: The clip.
         form: ``run`` or a format of `read_answers`; recognised if None.
-        refined: Of a run folder: take the answers of the final refinement where there are any, else the causal ones.
+        refined: Of a run folder: take the estimates of the final refinement if there are any, else the causal ones.
         offset: Of a run folder: its frame ``i`` is frame ``i + offset`` of the clip.
         options: Of that format, such as ``of`` of a trajectory; a run folder has none.
 
     Returns:
-        The answers, and what they were read as, in words.
+        The estimates, and what they were read as, in words.
 
     Raises:
         InputError: If there is nothing that can be read, or nothing of this clip.

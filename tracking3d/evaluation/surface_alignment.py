@@ -1,6 +1,6 @@
 """The similarity between two object frames that fits the surfaces, from the one that fits the poses.
 
-Where nobody told the lens, a method's shape can be right in all but its size: a focal length that is off takes the
+If no focal length was given, a method's shape can be right in all but its size: a focal length that is off takes the
 object nearer or farther, and the scale that fits the poses is then that of the distances, not of the object. As for
 "Tanks and temples" (Knapitsch et al., 2017) poses say where to begin, and the surfaces how to go on.
 """
@@ -19,7 +19,7 @@ SAMPLES = 4000
 """Points on each surface."""
 _STEPS = 40
 _SCALE = 0.01  # distance in diameters at which a pair counts half
-_SHARE = 0.8  # of the true surface's points that are believed to have a counterpart
+_SHARE = 0.8  # of the true surface's points that are assumed to have a counterpart
 _NEAR = 0.02  # in diameters; those that are as near always have
 _FARTHEST = 0.05  # change of size in a step
 _HELD = 1e-4  # what the surfaces leave open, such as turning a ball, stays

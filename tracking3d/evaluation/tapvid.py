@@ -1,4 +1,4 @@
-"""TAP-Vid: how well points are followed through a video.
+"""TAP-Vid: metrics of point tracking.
 
 As ``compute_tapvid_metrics`` of ``tapnet`` computes them (Doersch et al., "TAP-Vid: a benchmark for tracking any point
 in a video", NeurIPS 2022): N queries in a video of T frames, positions x and y at 256 x 256 pixels.

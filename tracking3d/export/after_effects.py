@@ -19,7 +19,7 @@ from tracking3d.export.exported_run import ExportedRun
 PIXELS_PER_UNIT = 1000.0
 
 _SCRIPT = """\
-// tracking3d: run it by File > Scripts > Run Script File.
+// tracking3d: run this script with File > Scripts > Run Script File.
 (function () {
     var numbers = %s;
     // Names of properties are translated in other languages' versions; these are not.

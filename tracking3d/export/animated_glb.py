@@ -1,4 +1,4 @@
-"""One GLB with the object moving before the camera, as glTF animation.
+"""One GLB with the object moving in front of the camera, as a glTF animation.
 
 glTF's axes: y up, the camera at the origin looks along -z. Nodes: ``tracking3d_object``, whose translation and
 rotation are animated, with the mesh in object coordinates; ``tracking3d_camera``, still. Between frames, and over
@@ -81,7 +81,7 @@ def _add_accessors(tree: dict[str, Any], tracks: dict[str, NDArray[np.float32]])
 def _add_scene(
     tree: dict[str, Any], camera: Camera, near: float, tracks: dict[str, NDArray[np.float32]]
 ) -> None:
-    """The object, at rest where it is in the first frame, and the camera."""
+    """The object, with the pose of the first frame as rest pose, and the camera."""
     place = {name: tracks[name][0].tolist() for name in ("translation", "rotation")}
     perspective = {
         "yfov": 2 * math.atan2(camera.height / 2, camera.fy),

@@ -1,4 +1,4 @@
-"""Rigid transforms and the axes of other tools.
+"""Rigid transforms and the axis conventions of other tools.
 
 Ours are OpenCV's: x right, y down, z forward. OpenGL, glTF, USD, Nuke and nerfstudio have x right, y up, z backward,
 which is half a turn about x.

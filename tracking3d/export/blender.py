@@ -70,7 +70,7 @@ def _lens(camera: Camera) -> dict[str, float]:
 
 
 def _background(run: ExportedRun) -> str | None:
-    """The video, or the first picture of its folder, where that still is where the run found it and fits the camera."""
+    """The video, or the first image of its folder, if it is still at its path and fits the camera."""
     if run.camera.lens is not None:  # the scene's camera has none of its distortion
         return None
     source = Path(run.options.source or str(run.reader.description.get("source", "")))

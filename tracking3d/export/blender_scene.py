@@ -1,4 +1,4 @@
-"""Build in Blender what ``scene.json`` beside this file describes: a tracked object moving before the camera.
+"""Build in Blender what ``scene.json`` next to this file describes: a tracked object moving in front of the camera.
 
 Run it by ``blender --python scene.py``, or open it in Blender's text editor and run it there.
 """
@@ -56,7 +56,7 @@ def add_camera(scene, numbers):
 
 
 def add_object(scene, numbers, folder):
-    """Add the textured mesh, its pose in every frame, and hide it where it has none."""
+    """Add the textured mesh with its pose in every frame, and hide it in frames without one."""
     mesh = bpy.data.meshes.new("tracking3d_object")
     mesh.from_pydata(numbers["vertices"], [], numbers["faces"])
     layer = mesh.uv_layers.new(name="UVMap")

@@ -17,7 +17,7 @@ MILLIMETRES = 1000.0
 
 
 def write_bop_poses(run: ExportedRun, path: Path) -> None:
-    """Write the table; ``time`` is what the answer took, -1 where that is not known."""
+    """Write the table; ``time`` is what the estimate took, -1 if unknown."""
     with path.open("w", encoding="ascii", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(COLUMNS)

@@ -53,9 +53,7 @@ def write_alpha_video(
         InputError: If this build of FFmpeg has no such encoder.
     """
     if encoder not in av.codecs_available:
-        raise InputError(
-            f"The FFmpeg that came with PyAV has no encoder {encoder}; take the format cut-outs."
-        )
+        raise InputError(f"The FFmpeg bundled with PyAV has no encoder {encoder}; use the format cut-outs.")
     # Chroma of half the width needs even sizes; the added row or column is transparent.
     height, width = (side + side % 2 for side in (run.camera.height, run.camera.width))
     rate = Fraction(run.fps / run.span.step).limit_denominator(1001)

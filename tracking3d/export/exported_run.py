@@ -1,4 +1,4 @@
-"""What a format is given of a run: poses, masks, mesh and pictures, with lengths in metres where these are known."""
+"""The data of a run for an export: poses, masks, mesh and images, in metres if the scale is known."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from tracking3d.results.run_reader import RunReader
 from tracking3d.video.selection import parse_selection
 
 FRAMES_PER_SECOND = 30.0
-"""Taken by formats that cannot do without, where nobody knows."""
+"""Assumed by formats that require a frame rate if it is unknown."""
 
 ARBITRARY = "arbitrary"
-"""What the unit of a run is called whose object nobody measured."""
+"""Name of the unit of a run whose object was not measured."""
 
 _HARDLY_SEEN = 0.1
-"""Share of the faces below which nothing can be said about an object's length from those that were seen."""
+"""Minimum share of seen faces for which the object's length can be computed from them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class PosedFrame:
 
     Attributes:
         index: Its index in the source.
-        seconds: Time since the source's start, None where not known.
+        seconds: Time since the source's start, None if not known.
         T_cam_obj: ``(4, 4)`` float64, with the translation in the unit of the export.
         camera: The camera that the pose is of.
         record: Everything else that the run knows of it; lengths there are in the run's unit.
@@ -71,7 +71,7 @@ class ExportedRun:
     """A run, as its export was asked for.
 
     Args:
-        reader: The run with the answers that were asked for.
+        reader: The run with the estimates that were asked for.
         options: What was asked.
     """
 
@@ -91,18 +91,20 @@ class ExportedRun:
 
     @cached_property
     def records(self) -> dict[int, FrameRecord]:
-        """The answers by frame index, in order."""
+        """The estimates by frame index, in order."""
         return {record.index: record for record in self.reader.frames}
 
     @cached_property
     def span(self) -> range:
-        """The frames from the first to the last answer, those that were skipped in between too.
+        """The frames from the first to the last estimate, those that were skipped in between too.
 
         Raises:
-            InputError: If the run has no answer.
+            InputError: If the run has no estimate.
         """
         if not self.records:
-            raise InputError(f"The run {self.reader.folder} has no frame yet; there is nothing to export.")
+            raise InputError(
+                f"The run {self.reader.folder} has no frames yet, so there is nothing to export."
+            )
         step = parse_selection(self.reader.description.get("selection")).step
         return range(min(self.records), max(self.records) + 1, step)
 
@@ -120,7 +122,7 @@ class ExportedRun:
         ]
         if not posed:
             raise InputError(
-                f"The run {self.reader.folder} has no frame with a pose; there is nothing to export."
+                f"The run {self.reader.folder} has no frame with a pose, so there is nothing to export."
             )
         return posed
 
@@ -132,7 +134,7 @@ class ExportedRun:
 
     @property
     def known_fps(self) -> float | None:
-        """Frames of the source per second, counted by index; None where nobody knows."""
+        """Frames of the source per second, counted by index; None if unknown."""
         if self.options.fps is not None:
             return self.options.fps
         fps = self.reader.description.get("fps")
@@ -143,11 +145,11 @@ class ExportedRun:
 
     @property
     def fps(self) -> float:
-        """Frames of the source per second; `FRAMES_PER_SECOND` where nobody knows."""
+        """Frames of the source per second; `FRAMES_PER_SECOND` if unknown."""
         return self.known_fps or FRAMES_PER_SECOND
 
     def seconds(self, index: int) -> float | None:
-        """Time of a frame since the start of the source; None where nobody knows."""
+        """Time of a frame since the start of the source; None if unknown."""
         record = self.records.get(index)
         if self.options.fps is None and record is not None and record.time is not None:
             return record.time
@@ -180,7 +182,7 @@ class ExportedRun:
         return replace(model, vertices=model.vertices * self.scale)
 
     def mask(self, index: int) -> NDArray[np.bool_]:
-        """``(H, W)``: the answer's mask of a frame of `span`; empty where the frame was skipped."""
+        """``(H, W)``: the estimated mask of a frame of `span`; empty if the frame was skipped."""
         if index not in self.records:
             return np.zeros((self.camera.height, self.camera.width), bool)
         return self.reader.pinhole_mask(index) if self.options.undistorted else self.reader.mask(index)
@@ -193,11 +195,11 @@ class ExportedRun:
 
     @cached_property
     def with_probability(self) -> list[int]:
-        """The frames whose answer has a probability in every pixel."""
+        """The frames whose estimate has a probability in every pixel."""
         return [index for index in self.records if self.reader.probability(index) is not None]
 
     def probability(self, index: int) -> NDArray[np.float32] | None:
-        """``(H, W)``: the object's in every pixel of a frame's answer, or None where it has none."""
+        """``(H, W)``: the object's in every pixel of a frame's estimate, or None if it has none."""
         found = self.reader.probability(index)
         if found is None or not self.options.undistorted:
             return found
@@ -209,7 +211,7 @@ class ExportedRun:
             yield replace(frame, image=self.camera.undistort(frame.image))
 
     def pictures(self) -> Iterator[Frame]:
-        """The pictures of all frames that have an answer, read from the source once more.
+        """The pictures of all frames that have an estimate, read from the source once more.
 
         Raises:
             InputError: If the source is not there any more, or is another one.

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 ANYWHERE = frozenset({"answers"})
-"""Options that every format knows."""
+"""Options of all formats."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Exporter:
             ``scene``.
         writes: What it writes, in a few words.
         write: Writes a run to a path that does not exist yet: a file if there is a ``suffix``, else a folder.
-        suffix: Of the file; empty where a folder is written.
+        suffix: Of the file; empty if a folder is written.
         file_name: What it is called in the folder of exports, ``{run}`` standing for letters and digits of the run's
             name; empty for the format's name and suffix.
         options: Names of those `ExportOptions` that it has a use for, beside `ANYWHERE`.
@@ -60,8 +60,8 @@ class Exporter:
         """
         if not self.is_available:
             raise InputError(
-                f"The format {self.name} needs {' and '.join(self.modules)}, not installed here; "
-                f"run `pip install 'tracking3d[{self.extra}]'`."
+                f"The format {self.name} needs {' and '.join(self.modules)}, which is not installed; run "
+                f"`pip install 'tracking3d[{self.extra}]'`."
             )
 
     def check_options(self, options: ExportOptions, named: dict[str, str]) -> None:
@@ -78,4 +78,4 @@ class Exporter:
         known = self.options | ANYWHERE
         for option, label in named.items():
             if option not in known and getattr(options, option) != getattr(defaults, option):
-                raise InputError(f"The format {self.name} has no use for {label}; leave it out.")
+                raise InputError(f"The format {self.name} does not use {label}; leave it out.")

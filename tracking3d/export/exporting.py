@@ -1,4 +1,4 @@
-"""Exporting a run: which answers, where to, and that it appears whole or not at all."""
+"""Exporting a run: checks of options and paths; an export is written completely or not at all."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from tracking3d.results.layout import OVERWRITE, partial_path, run_files
 from tracking3d.results.run_reader import RunReader
 
 FOLDER = "export"
-"""In the run folder, where exports go if nothing else is said."""
+"""Default folder of exports, in the run folder."""
 LABEL = "export.json"
-"""In every folder that is exported: what it is; and that it may be replaced."""
+"""Name of a file in every exported folder that describes the export and allows replacing it."""
 _FORMAT = "tracking3d-export"
 _OUT = argument("out=", "--out")
 _TO = argument("to=", "--to")
@@ -44,7 +44,7 @@ class Export:
 
     Attributes:
         path: The file or folder.
-        unit: The unit of lengths, in words; None where the format has none.
+        unit: The unit of lengths, in words; None if the format has none.
         frames: How many frames have what the format is about, a pose or a mask; of a model, those it is of.
         without: Frames between the first and the last that have none: skipped, and of poses, lost.
         not_finished: A sentence about a run that has not come to its end; empty for one that has.
@@ -60,9 +60,9 @@ class Export:
 
     @property
     def in_words(self) -> str:
-        """How many frames there are, where it is not the model alone, and the unit where it is arbitrary."""
-        left_out = f", {len(self.without)} without an answer" if self.without else ""
-        unit = ", lengths in the run's own unit" if self.unit == ARBITRARY else ""
+        """The number of frames, unless only the model was exported, and the unit if it is arbitrary."""
+        left_out = f", {len(self.without)} without an estimate" if self.without else ""
+        unit = ", lengths in the arbitrary unit of the run" if self.unit == ARBITRARY else ""
         return f"the model{unit}" if self.of_model else f"{self.frames} frames{left_out}{unit}"
 
 
@@ -129,9 +129,9 @@ def _check(options: ExportOptions) -> None:
         if value is not None and not 0 < value < float("inf"):
             raise InputError(f"{_NAMED[name]} is {value:g}; give a number above 0.")
     if options.answers not in ("final", "causal"):
-        raise InputError(f"There are no answers '{options.answers}'; say final or causal.")
+        raise InputError(f"Estimates cannot be '{options.answers}'; choose final or causal.")
     if options.of not in ("object", "camera"):
-        raise InputError(f"Poses cannot be of '{options.of}'; {_NAMED['of']} is object or camera.")
+        raise InputError(f"Poses cannot be of '{options.of}'; {_NAMED['of']} must be object or camera.")
 
 
 def _frames_with_estimates(exporter: Exporter, run: ExportedRun) -> set[int]:
@@ -142,7 +142,7 @@ def _frames_with_estimates(exporter: Exporter, run: ExportedRun) -> set[int]:
 
 
 def _label(exporter: Exporter, run: ExportedRun, without: tuple[int, ...]) -> dict[str, object]:
-    """What somebody who finds the folder alone should know."""
+    """Description of the export for readers of the folder."""
     return {
         "format": _FORMAT,
         "to": exporter.name,
@@ -166,9 +166,9 @@ def _check_place(path: Path, exporter: Exporter, overwrite: bool) -> None:
             f"{path} is a {kinds[1]}, and {exporter.name} is a {kinds[0]}; choose another {_OUT}."
         )
     if not overwrite:
-        raise OutputError(f"{path} exists already; choose another {_OUT} or pass {OVERWRITE}.")
+        raise OutputError(f"{path} already exists; choose another {_OUT} or pass {OVERWRITE}.")
     if is_folder and not _is_export(path):
-        raise OutputError(f"{path} holds something that was not exported; choose another {_OUT}.")
+        raise OutputError(f"{path} holds files that are not an export; choose another {_OUT}.")
 
 
 def _is_export(folder: Path) -> bool:

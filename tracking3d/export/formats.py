@@ -38,7 +38,7 @@ _ALL = (
     Exporter(
         "parquet",
         "poses",
-        "the same table as Parquet",
+        "table of poses as Parquet",
         write_parquet,
         ".parquet",
         options=_TIMED,
@@ -64,13 +64,17 @@ _ALL = (
         extra="ros",
     ),
     Exporter(
-        "colmap", "cameras", "COLMAP model as text, pictures, masks", write_colmap_text, options=_TRAINING
+        "colmap", "cameras", "COLMAP model as text, images, masks", write_colmap_text, options=_TRAINING
     ),
-    Exporter("colmap-binary", "cameras", "the same, binary", write_colmap_binary, options=_TRAINING),
     Exporter(
-        "nerfstudio", "cameras", "transforms.json, pictures, masks", write_nerfstudio, options=_TRAINING
+        "colmap-binary",
+        "cameras",
+        "COLMAP model, binary, images, masks",
+        write_colmap_binary,
+        options=_TRAINING,
     ),
-    Exporter("davis", "masks", "indexed PNG as DAVIS has them", write_davis, options=_MASKS),
+    Exporter("nerfstudio", "cameras", "transforms.json, images, masks", write_nerfstudio, options=_TRAINING),
+    Exporter("davis", "masks", "indexed PNG as in DAVIS", write_davis, options=_MASKS),
     Exporter(
         "youtube-vos", "masks", "indexed PNG and meta.json of YouTube-VOS", write_youtube_vos, options=_MASKS
     ),
@@ -96,14 +100,14 @@ _ALL = (
     Exporter(
         "probabilities",
         "probabilities",
-        "the object's in every pixel, grey PNG",
+        "object probability per pixel, grey PNG",
         write_probabilities,
         options=_MASKS,
     ),
     Exporter(
         "probabilities-16",
         "probabilities",
-        "the same with 16 bits",
+        "object probability per pixel, 16-bit PNG",
         write_probabilities_16,
         options=_MASKS,
     ),
@@ -115,7 +119,7 @@ _ALL = (
     Exporter(
         "animated-glb",
         "scene",
-        "the object moving before the camera",
+        "animated object in front of the camera",
         write_animated_glb,
         ".glb",
         options=_TIMED,
@@ -123,7 +127,7 @@ _ALL = (
     Exporter(
         "usdz",
         "scene",
-        "the same as USDZ",
+        "animated object as USDZ",
         write_usdz,
         ".usdz",
         options=_TIMED,
@@ -140,7 +144,7 @@ _ALL = (
     Exporter(
         "rerun",
         "scene",
-        "recording with pictures, masks, mesh and poses",
+        "recording with images, masks, mesh and poses",
         write_rerun,
         ".rrd",
         options=_TIMED | _PICTURES | {"images"},

@@ -2,7 +2,7 @@
 
 A line of ``poses.txt`` holds the upper three rows of a pose, row by row. Lines have no number: line n is frame n of
 those that were asked for, and a frame without a pose is a line of ``nan``. ``calib.txt`` has the projection of the
-camera as P0 to P3, ``times.txt`` seconds, where these are known. https://www.cvlibs.net/datasets/kitti/eval_odometry.php
+camera as P0 to P3, ``times.txt`` seconds, if they are known. https://www.cvlibs.net/datasets/kitti/eval_odometry.php
 """
 
 from __future__ import annotations

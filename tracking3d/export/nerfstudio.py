@@ -1,4 +1,4 @@
-"""A data set of nerfstudio's: ``transforms.json``, pictures, masks, and a point cloud to start from.
+"""A nerfstudio data set: ``transforms.json``, images, masks, and an initial point cloud.
 
 The camera moves about the still object. ``transform_matrix`` maps camera to world with OpenGL's camera axes: x right, y
 up, z backward; the world is the object, with the object's own axes. Pixel (0.5, 0.5) is the centre of the top-left one.

@@ -1,4 +1,4 @@
-"""The pictures of a run, read from its source once more."""
+"""The images of a run, read from its source again."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def read_selected_images(run: RunReader, source: str | None, wanted: Container[i
 
     Args:
         run: The run.
-        source: Where the video is; None where the run found it, from the present folder or from those above the run's.
+        source: Where the video is; None if the run found it, from the present folder or from those above the run's.
         wanted: Frame indices.
 
     Raises:
@@ -27,17 +27,15 @@ def read_selected_images(run: RunReader, source: str | None, wanted: Container[i
     """
     name = source if source is not None else run.description.get("source")
     if not isinstance(name, str) or name.isdigit():
-        raise InputError(
-            f"The run {run.folder} is of no video that can be read again; give one as {_SOURCE}."
-        )
+        raise InputError(f"The video of the run {run.folder} cannot be read again; give it as {_SOURCE}.")
     places = places_of(name, run.folder) if source is None else []
     name = next((str(place) for place in places if place.exists()), name)
     try:
         opened = open_source(name, run.description.get("selection"))
     except InputError as error:
         raise InputError(
-            f"The pictures of the run {run.folder} cannot be read: {str(error).rstrip('.')}; say with {_SOURCE} where "
-            f"its video is now."
+            f"The images of the run {run.folder} cannot be read: {str(error).rstrip('.')}; give the present "
+            f"path of its video as {_SOURCE}."
         ) from error
     first = (run.description.get("given") or {}).get("first_picture")
     size = run.camera.height, run.camera.width
@@ -47,15 +45,17 @@ def read_selected_images(run: RunReader, source: str | None, wanted: Container[i
             continue
         if frame.size != size:
             raise InputError(
-                f"Frame {frame.index} of {name} has {pixels(frame.size)} pixels, those of the run {run.folder} have "
-                f"{pixels(size)}; give the video of the run as {_SOURCE}."
+                f"Frame {frame.index} of {name} has {pixels(frame.size)} pixels, but frames of the run "
+                f"{run.folder} have {pixels(size)}; give the video of the run as {_SOURCE}."
             )
         if not begun and first is not None and checksum(frame.image) != first:
             raise InputError(
-                f"{name} is not the video of the run {run.folder}: frame {frame.index} is another picture; give the "
-                f"right one as {_SOURCE}."
+                f"{name} is not the video of the run {run.folder}: the image of frame {frame.index} differs; "
+                f"give the right video as {_SOURCE}."
             )
         begun = True
         yield frame
     if not begun:
-        raise InputError(f"{name} has no frame of the run {run.folder}; give its video as {_SOURCE}.")
+        raise InputError(
+            f"{name} has no frame of the run {run.folder}; give the video of the run as {_SOURCE}."
+        )

@@ -18,7 +18,7 @@ from tracking3d.results.correspondences import PointTracks, check_asked, track_p
 from tracking3d.results.point_files import points_to_csv
 
 _GRID = 100
-"""About how many points are taken where none are asked for."""
+"""Approximate number of points if none are given."""
 
 
 def write_points_csv(run: ExportedRun, path: Path) -> None:
@@ -57,7 +57,7 @@ def write_tapvid(run: ExportedRun, path: Path) -> None:
 def _tracks(run: ExportedRun) -> PointTracks:
     frame = run.poses[0].index if run.options.frame is None else run.options.frame
     if frame not in run.records:
-        raise InputError(f"The run {run.reader.folder} has no frame {frame}; choose one that it holds.")
+        raise InputError(f"The run {run.reader.folder} has no frame {frame}; choose one of its frames.")
     asked = run.options.xy or None
     xy = np.array(asked, dtype=float) if asked else _grid(run, frame)
     tracks = track_points(run.reader, frame, xy)

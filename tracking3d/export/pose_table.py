@@ -1,4 +1,4 @@
-"""Poses as a table, CSV or Parquet: one row a frame, with everything that the run says of it in one number.
+"""Poses as a table, CSV or Parquet: one row per frame, with all scalar values of the run.
 
 Columns: ``index``, ``seconds``, ``name``, ``status``, ``confidence``; ``tx``, ``ty``, ``tz`` and ``qw``, ``qx``,
 ``qy``, ``qz`` of ``T_cam_obj``; ``fx``, ``fy``, ``cx``, ``cy`` of the camera that the pose is of; ``area`` of the

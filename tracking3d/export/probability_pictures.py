@@ -1,6 +1,6 @@
-"""The object's probability in every pixel as grey PNG: black is 0, white is 1; 8 bits, or 16 where a tool wants that.
+"""Object probabilities per pixel as grey PNG: black is 0, white is 1; 8 or 16 bits.
 
-Files are numbered by frame index. A frame whose mask was handed back as the mask tracker gave it has no probability,
+Files are numbered by frame index. A frame whose mask was kept unchanged as the mask tracker gave it has no probability,
 and no file. The run keeps 8 bits: 16 are the same 256 steps.
 """
 
@@ -42,12 +42,12 @@ def _why_none(run: ExportedRun) -> str:
     kept = (folder / layout.PROBABILITIES).is_dir()
     if kept and not run.reader.refined:
         return (
-            f"The run {folder} keeps probabilities of its final answers only; leave out "
+            f"The run {folder} keeps probabilities of the final estimates only; leave out "
             f"{argument('answers=', '--answers')}."
         )
     if kept:
-        return f"The run {folder} has no frame whose mask was weighed, and no probability; take its masks."
+        return f"The run {folder} has no frame with a fused mask and thus no probabilities; export its masks."
     return (
-        f"The run {folder} kept no probabilities; track again with runtime.probabilities=true "
+        f"The run {folder} stored no probabilities; track again with runtime.probabilities=true "
         f"({argument('overrides=', '--set')})."
     )

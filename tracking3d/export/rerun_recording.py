@@ -1,4 +1,4 @@
-"""A recording for the viewer rerun: pictures, masks, mesh, poses, and what the run says of each frame.
+"""A recording for the viewer rerun: images, masks, mesh, poses, and the status and confidence of each frame.
 
 Entities: ``camera`` (pinhole, OpenCV's axes), ``camera/image``, ``camera/mask``, ``camera/object`` (pose and mesh),
 ``status`` and ``confidence``. Timelines: ``frame``, and ``time`` where the run knows it. Where there is no pose,

@@ -1,4 +1,4 @@
-"""Which vertices of the object are seen in which frames, and their colours."""
+"""Visibility of the object's vertices in frames, and their colours."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class SeenSurface:
         points: ``(V, 3)`` object coordinates in the unit of the export.
         colours: ``(V, 3)`` uint8 RGB.
         pixels: ``(N, V, 2)`` where they are; (0, 0) is the centre of the top-left pixel.
-        seen: ``(N, V)`` whether they are seen: in the frame, unhidden, and within the answer's mask.
+        seen: ``(N, V)`` whether they are seen: in the frame, unhidden, and within the estimated mask.
     """
 
     points: NDArray[np.float64]

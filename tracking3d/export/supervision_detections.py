@@ -1,4 +1,4 @@
-"""Answers of a run as `supervision.Detections`, to draw, filter and write them with that library."""
+"""Estimates of a run as `supervision.Detections`, to draw, filter and write them with that library."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def detections(run: RunReader, index: int) -> Detections:
     """The object in one frame: mask, box, confidence, and its pose in ``data["T_cam_obj"]`` ``(1, 4, 4)``.
 
     Needs the extra ``supervision``. Boxes are x and y of the first pixel's corner and of the last one's, as that
-    library makes them from masks. Class and tracker id are 0. Without an answer, or with an empty mask, there are
+    library makes them from masks. Class and tracker id are 0. Without an estimate, or with an empty mask, there are
     no detections.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Pictures and masks in files, as tools that learn a scene from photographs read them."""
+"""Image and mask files for tools that reconstruct a scene from photographs."""
 
 from __future__ import annotations
 

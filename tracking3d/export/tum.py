@@ -1,6 +1,6 @@
 """Trajectories in the TUM format: ``timestamp tx ty tz qx qy qz qw`` in each line.
 
-Frames without a pose have no line. Timestamps are seconds since the start of the source; where nobody knows them, frame
+Frames without a pose have no line. Timestamps are seconds since the start of the source; if unknown, frame
 indices. https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats
 """
 

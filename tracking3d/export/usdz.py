@@ -1,4 +1,4 @@
-"""One USDZ with the object moving before the camera.
+"""One USDZ with the object moving in front of the camera.
 
 Axes: y up, the camera at the origin looks along -z. Prims: ``/tracking3d/object`` with the mesh below it in object
 coordinates, and ``/tracking3d/camera``. Time codes are frame indices. In frames without a pose the object is invisible.
@@ -49,7 +49,7 @@ def write_usdz(run: ExportedRun, path: Path) -> None:
     _add_camera(UsdGeom.Camera.Define(stage, "/tracking3d/camera"), run.camera)
     stage.GetRootLayer().Save()
     if not UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(parts / "scene.usdc")), str(path)):
-        raise OutputError(f"USD could not put {path.name} together; run again with --debug for its reasons.")
+        raise OutputError(f"USD could not package {path.name}; run again with --debug to see why.")
 
 
 def _move(moving: Any, run: ExportedRun) -> None:

@@ -1,4 +1,4 @@
-"""Kornia's descriptors as dense features: those that are dense, and those of patches, one patch around every pixel.
+"""Kornia's descriptors as dense features: dense ones, and patch descriptors with one patch around every pixel.
 
 Kornia would fetch the weights of a network when it is built; here they come from a file that the user names.
 """
@@ -34,8 +34,7 @@ _OF_PATCHES: dict[str, Callable[..., nn.Module]] = {
 class KorniaEncoder:
     """Encoder ``kornia``: 128 channels of length 1 from one of kornia's descriptors.
 
-    ``dense-sift`` needs no weights and answers at stride 2, ``disk`` at stride 1, descriptors of patches at
-    ``stride``.
+    ``dense-sift`` needs no weights and has stride 2, ``disk`` stride 1, patch descriptors ``stride``.
 
     Args:
         descriptor: Which; see ``Options``.
@@ -57,17 +56,18 @@ class KorniaEncoder:
         model_config = ConfigDict(extra="forbid", frozen=True)
 
         descriptor: Literal["dense-sift", "disk", "hardnet", "hardnet8", "hynet", "sosnet", "tfeat"] = Field(
-            "dense-sift", description="Which of kornia's descriptors; all but dense-sift need weights."
+            "dense-sift", description="The kornia descriptor; all but dense-sift need weights."
         )
         weights: str | None = Field(
-            None, description="File of the weights, .safetensors, .pth or .pt; nothing is fetched."
+            None, description="Weights file: .safetensors, .pth or .pt; nothing is downloaded."
         )
-        stride: Literal[2, 4, 8] = Field(4, description="Pixels between patches, for descriptors of patches.")
+        stride: Literal[2, 4, 8] = Field(4, description="Pixels between patches, for patch descriptors.")
 
     def __init__(self, descriptor: str, network: nn.Module | None = None, stride: int = 4) -> None:
         self._descriptor = descriptor
         if network is None:
-            # Sixteen cells of four pixels: with this padding the answers lie in the middle of their two pixels.
+            # Sixteen cells of four pixels: with this padding the features lie in the middle of their two
+            # pixels.
             network, stride = DenseSIFTDescriptor(stride=2, padding=5), 2
         elif descriptor == "disk":
             stride = 1
@@ -85,13 +85,13 @@ class KorniaEncoder:
         if given.descriptor == "dense-sift":
             if given.weights is not None:
                 raise InputError(
-                    "features.weights: dense-sift has no weights; name another features.descriptor."
+                    "features.weights: dense-sift has no weights; choose another features.descriptor."
                 )
             return cls(given.descriptor)
         if given.weights is None:
             raise InputError(
-                f"features.weights: {given.descriptor} needs the file of its weights, and nothing is fetched; give its "
-                "path, or take dense-sift, which needs none."
+                f"features.weights: {given.descriptor} needs a weights file, and none is downloaded; give "
+                "its path, or use dense-sift, which needs none."
             )
         network = DISK() if given.descriptor == "disk" else _OF_PATCHES[given.descriptor](pretrained=False)
         load_weights(network, Path(given.weights).expanduser(), given.descriptor)

@@ -1,4 +1,4 @@
-"""Deep features that change little with the light: a dense network after S2DNet, trained by this project."""
+"""Illumination-robust deep features: a dense network after S2DNet, trained by this project."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torch.nn import functional
 from tracking3d.networks.session import Network
 
 _MULTIPLE = 16
-"""The network halves images four times."""
+"""The network downsamples images by two four times."""
 
 
 class S2DNetEncoder:

@@ -1,4 +1,4 @@
-"""Weights of torch networks from files, with nothing in them run: no pickle but torch's restricted one."""
+"""Loading weights of torch networks without executing code: only torch's restricted unpickler is used."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from tracking3d.errors import InputError
 
 _WRAPPED = ("state_dict", "extractor", "model")
-"""Under which keys checkpoints hold the weights themselves."""
+"""Keys under which checkpoints store the weights."""
 
 
 def read_weights(file: Path) -> dict[str, Tensor]:
@@ -31,12 +31,11 @@ def read_weights(file: Path) -> dict[str, Tensor]:
             return safetensors.torch.load_file(file)
         loaded = torch.load(file, map_location="cpu", weights_only=True)
     except ImportError as error:
-        raise InputError(
-            f"{file} is read by the package safetensors; install it, or give a .pth file."
-        ) from error
+        raise InputError(f"{file} needs the package safetensors; install it, or give a .pth file.") from error
     except Exception as error:  # damaged files make the readers raise many kinds
         raise InputError(
-            f"{file} cannot be read as weights, or holds more than tensors, which is not loaded; give a .safetensors "
+            f"{file} cannot be read as weights, or holds objects other than tensors, which are not loaded; "
+            "give a .safetensors "
             "file, or a .pth file with a state dict."
         ) from error
     for key in _WRAPPED:

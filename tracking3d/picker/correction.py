@@ -1,4 +1,4 @@
-"""The picker's page for one frame of a run that is there: what the object is in it."""
+"""The picker's page for correcting one frame of an existing run."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tracking3d.web.access import Access
 
 @dataclass(frozen=True, eq=False)
 class DrawnCorrection:
-    """What was drawn: a box, where that says it all, else a mask.
+    """The drawing: a box if that is sufficient, else a mask.
 
     Attributes:
         frame: Index of the frame.
@@ -37,9 +37,9 @@ class CorrectionProgress:
 
     Attributes:
         running: Whether it goes on.
-        sentence: How far, or how it ended; empty where there was none.
+        sentence: How far, or how it ended; empty if there was none.
         failed: Whether it ended without a result.
-        share: Of the frames that are done, in [0, 1]; None where that is not known.
+        share: Of the frames that are done, in [0, 1]; None if unknown.
     """
 
     running: bool = False
@@ -56,7 +56,7 @@ class CorrectionPage(Picker):
         name: What the object is called.
         begin: Begins to correct the run; raises a `Tracking3dError` where it cannot.
         progress: How far that is.
-        access: Where to listen, and whom to answer.
+        access: Where to listen, and whom to serve.
         port: The port, or the next one that is free; 0 for any.
     """
 

@@ -1,4 +1,4 @@
-"""What a person drew on a frame, as it comes from the network: checked and bounded before anything is done with it."""
+"""A user's drawing on a frame as received from the browser, validated and bounded before use."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class DrawnObject(_Drawn):
     @classmethod
     def _one_line(cls, name: str) -> str:
         if not name.strip() or not name.isprintable():
-            raise ValueError("the name has no letter, or a sign that cannot be printed")
+            raise ValueError("the name has no letter, or a character that cannot be printed")
         return name.strip()
 
     @property
@@ -112,4 +112,4 @@ def read_drawing(text: bytes) -> Drawing:
 def _in_words(error: ValidationError) -> str:
     first = error.errors()[0]
     where = ".".join(str(part) for part in first["loc"])
-    return f"What was drawn cannot be used: {where or 'it'}: {first['msg']}."
+    return f"The drawing cannot be used: {where or 'it'}: {first['msg']}."

@@ -1,4 +1,4 @@
-"""From what was drawn to a mask."""
+"""The mask of a drawing."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _LEAST_CONTRAST = 2.0
 
 
 def drawn_mask(image: Image, drawn: DrawnObject) -> NDArray[np.bool_] | None:
-    """The mask ``(H, W)`` of what was drawn; None where nothing was, or only a box, which a tracker takes as it is.
+    """The mask ``(H, W)`` of what was drawn; None if nothing was, or only a box, which a tracker takes as it is.
 
     Points alone make the mask that they make as a prompt (`mask_from_points`); in a box they decide by colour (GrabCut,
     Rother et al. 2004, with the points as what is known). Paint is what it says.
@@ -46,7 +46,7 @@ def drawn_mask(image: Image, drawn: DrawnObject) -> NDArray[np.bool_] | None:
 
 
 def _of_points(image: Image, drawn: DrawnObject) -> NDArray[np.uint8]:
-    """The object by points alone, of those inside the image; nothing where none of them is on it."""
+    """The object by points alone, of those inside the image; nothing if none of them is on it."""
     height, width = image.shape[:2]
     points = [
         (one.x, one.y, one.on) for one in drawn.points if 0 <= one.x <= width - 1 and 0 <= one.y <= height - 1

@@ -1,4 +1,4 @@
-"""What a picked object becomes: the files and the command of a run."""
+"""The result of picking: the files and the command of a run."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tracking3d.results.files import write_atomic, write_mask, writing
 from tracking3d.video import parse_selection
 
 FOLDER = "picked"
-"""In the run folder: the masks that were drawn."""
+"""Name of the file with the drawn masks in the run folder."""
 DESCRIPTION, SETTINGS = "picked.json", "picked.yaml"
 
 

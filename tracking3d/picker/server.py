@@ -1,4 +1,4 @@
-"""The page's server: a handful of answers, each bounded, on the standard library."""
+"""The page's server: a handful of bounded responses, on the standard library."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Picker:
     Args:
         session: What the page asks for.
         save: Writes what was picked to the run folder, and gives the command of the run and the settings as YAML.
-        access: Where to listen, and whom to answer.
+        access: Where to listen, and whom to serve.
         port: The port, or the next one that is free; 0 for any.
 
     Raises:
@@ -71,7 +71,7 @@ class Picker:
         return self.picked
 
     def told(self, path: str) -> Any | None:
-        """What is answered to a question of the page, as JSON has it; None where it is none."""
+        """The JSON response to a GET request of the page; None if there is none."""
         return _describe(self.session) if path == "/session.json" else None
 
     def order(self, path: str, body: bytes) -> tuple[Any, Callable[[], None]] | None:
@@ -82,7 +82,7 @@ class Picker:
             body: What it brings.
 
         Returns:
-            The answer as JSON has it, and what is to be done when it is sent; None where there is no such order.
+            The JSON response, and what to do after it is sent; None if there is no such command.
 
         Raises:
             Tracking3dError: If it cannot be done.
@@ -121,7 +121,7 @@ class _Server(ThreadingHTTPServer):
         super().__init__(address, _Handler)
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Work on a request beside the others, or hang up where there are too many."""
+        """Handle a request in a thread, or close the connection if there are too many."""
         if not self._free.acquire(blocking=False):
             self.shutdown_request(request)
             return
@@ -162,11 +162,11 @@ class _Handler(BaseHTTPRequestHandler):
         elif found := _FRAME.fullmatch(path):
             picture = picker.session.picture(int(found[1]))
             if picture is None:
-                self._refuse(HTTPStatus.NOT_FOUND, "There is no such frame, or it cannot be read.")
+                self._refuse(HTTPStatus.NOT_FOUND, "The frame does not exist or cannot be read.")
             else:
                 self._send(HTTPStatus.OK, picture, "image/jpeg")
         else:
-            self._refuse(HTTPStatus.NOT_FOUND, "There is no such page.")
+            self._refuse(HTTPStatus.NOT_FOUND, "This page does not exist.")
 
     def do_POST(self) -> None:
         if not self._may(from_page=True) or (body := self._body()) is None:
@@ -176,13 +176,13 @@ class _Handler(BaseHTTPRequestHandler):
         except Tracking3dError as error:
             return self._refuse(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
         if done is None:
-            return self._refuse(HTTPStatus.NOT_FOUND, "There is no such page.")
+            return self._refuse(HTTPStatus.NOT_FOUND, "This page does not exist.")
         told, then = done
         self._send_json(told)
         then()
 
     def _may(self, from_page: bool) -> bool:
-        """Whether the request is answered; where not, it is refused."""
+        """Whether the request is allowed; if not, it is refused."""
         picker = self.server.picker
         refusal = picker.access.refusal(
             self.path,
@@ -201,14 +201,14 @@ class _Handler(BaseHTTPRequestHandler):
         return values[0] if len(values) == 1 else ("" if values else None)
 
     def _body(self) -> bytes | None:
-        """What the request brings; None where it is refused for that."""
+        """The body of the request; None if it is refused."""
         told = self._one("Content-Length") or ""
         if not re.fullmatch(r"\d{1,12}", told) or self.headers.get("Transfer-Encoding"):
-            self._refuse(HTTPStatus.LENGTH_REQUIRED, "Say how long it is.")
+            self._refuse(HTTPStatus.LENGTH_REQUIRED, "The request has no Content-Length.")
         elif self._one("Content-Type") != "application/json":
-            self._refuse(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "Send JSON.")
+            self._refuse(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "The request is not JSON.")
         elif int(told) > LARGEST_BODY:
-            self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "That is too much.")
+            self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "The request is too large.")
         else:
             body = self.rfile.read(int(told))
             return body if len(body) == int(told) else None  # a browser that went away in the middle
@@ -241,7 +241,8 @@ def _listening(picker: Picker, host: str, port: int) -> _Server:
         except OSError as error:
             problem = error
     raise InputError(
-        f"No page can be served on {host}, port {port}: {problem.strerror}; choose another --host or --port."
+        f"The page cannot be served on {host}, port {port}: {problem.strerror}; choose another --host or "
+        "--port."
     )
 
 

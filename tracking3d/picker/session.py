@@ -1,4 +1,4 @@
-"""A person picks objects in one video: its frames, the masks of what is drawn, and what comes of it."""
+"""A picking session in one video: its frames, the masks of drawings, and the resulting prompts."""
 
 from __future__ import annotations
 
@@ -59,11 +59,11 @@ class PickingSession:
         self._busy = threading.Lock()
         first = images.image(frames.start)
         if first is None:
-            raise InputError(f"The first frame of {source} cannot be read; begin with another one.")
+            raise InputError(f"The first frame of {source} cannot be read; start with another frame.")
         self.height, self.width = first.shape[:2]
 
     def picture(self, index: int) -> bytes | None:
-        """A frame as JPEG; None where there is none."""
+        """A frame as JPEG; None if there is none."""
         if index not in self.frames:
             return None
         image = self._images.image(index)
@@ -84,12 +84,12 @@ class PickingSession:
         with self._busy:  # a tracker takes all that the machine has
             given = drawn_mask(frame.image, drawn)
             if given is None and drawn.box is None:
-                raise InputError("Nothing is marked as the object yet.")
+                raise InputError("No object is marked yet.")
             prompt = make_prompt(frame, drawn.box if given is None else None, given)
             tracker: MaskTracker = build_plugin(TRACKERS, self.config.tracker)
             mask = tracker.init(frame, prompt).binary
         if mask is None or not mask.any():
-            raise InputError("The tracker finds no object there; draw it another way.")
+            raise InputError("The tracker finds no object there; mark it differently.")
         return mask
 
     def veil(self, mask: NDArray[np.bool_], colour: str) -> str:
@@ -102,7 +102,7 @@ class PickingSession:
         return "data:image/png;base64," + base64.b64encode(cv2.imencode(".png", layer)[1].tobytes()).decode()
 
     def picked(self, drawing: Drawing) -> Picked:
-        """What the run is to begin with.
+        """The prompts that the run starts with.
 
         Raises:
             InputError: If the objects are not of one frame, or one cannot be used.
@@ -110,9 +110,9 @@ class PickingSession:
         frames = sorted({one.frame for one in drawing.objects})
         if len(frames) > 1:
             told = " and ".join(str(index) for index in frames)
-            raise InputError(f"The objects are drawn on frames {told}; a run begins with all of them on one.")
+            raise InputError(f"The objects are drawn on frames {told}; draw all of them on one frame.")
         if len(drawing.objects) > 1 and self.config.tracker.name == "precomputed":
-            raise InputError("Precomputed masks are of one object; pick one.")
+            raise InputError("The tracker precomputed has masks of one object; pick one object.")
         frame = self._frame(frames[0])
         if all(one.only_a_box for one in drawing.objects):
             boxes = [one.box for one in drawing.objects if one.box is not None]
@@ -122,5 +122,5 @@ class PickingSession:
     def _frame(self, index: int) -> Frame:
         image = self._images.image(index) if index in self.frames else None
         if image is None:
-            raise InputError(f"Frame {index} cannot be read; pick in another one.")
+            raise InputError(f"Frame {index} cannot be read; choose another frame.")
         return Frame(index, image, name=f"frame {index}")

@@ -154,5 +154,5 @@ def _load(plugin: Registered) -> type[Any]:
         return import_plugin(plugin)
     except (Exception, SystemExit) as error:
         raise PluginError(
-            f"{plugin.label} is broken: {describe_exception(error)}; `tracking3d plugins` lists those that work."
+            f"{plugin.label} is broken: {describe_exception(error)}; `tracking3d plugins` lists working plug-ins."
         ) from error

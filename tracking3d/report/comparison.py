@@ -1,4 +1,4 @@
-"""A page about what differs between runs, in one file."""
+"""The comparison page of several runs, in one file."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def write_comparison(comparison: RunComparison, path: Path) -> None:
         if len(comparison.names) == 2
         else f"{len(comparison.names)} runs",
         names=comparison.names,
-        facts=[("Source", str(first.description.get("source", ""))), ("Held against", comparison.names[0])],
+        facts=[("Source", str(first.description.get("source", ""))), ("Reference run", comparison.names[0])],
         notes=comparison.notes,
         settings=comparison.settings,
         pairs=_pairs(comparison),
@@ -92,7 +92,7 @@ def _plots(comparison: RunComparison) -> list[list[Curve]]:
     for title, attribute, unit, upwards in (
         ("Overlap of masks (IoU)", "iou", "", False),
         ("Difference in rotation", "rotation", "°", True),
-        ("Difference in translation, of the distance", "translation", " %", True),
+        ("Difference in translation (% of the distance)", "translation", " %", True),
     ):
         drawn = [(one.name, spread(one.indices, getattr(one, attribute))) for one in comparison.differences]
         known = np.concatenate([values[np.isfinite(values)] for _, values in drawn])
@@ -109,7 +109,7 @@ def _strips(comparison: RunComparison) -> list[dict[str, Any]]:
     frames, strips = _frames(comparison), []
     for name, run in zip(comparison.names, comparison.runs, strict=True):
         status = {record.index: record.status.value for record in run.frames}
-        told = [status.get(index, "no answer") for index in frames]
+        told = [status.get(index, "no estimate") for index in frames]
         counts = ", ".join(f"{told.count(kind)} {kind}" for kind in dict.fromkeys(told))
         strips.append(
             {"name": name, "stretches": stretches(frames, told, [""] * len(told)), "summary": counts}
@@ -132,7 +132,7 @@ def _pictures(comparison: RunComparison) -> list[dict[str, Any]]:
             rows, columns = _around(comparison, frame["index"], size)
             picture = "" if image is None else base64.b64encode(jpeg_of(image[rows, columns])).decode("ascii")
             record = run.frames[positions[frame["index"]]] if frame["index"] in positions else None
-            status = "no answer" if record is None else record.status.value
+            status = "no estimate" if record is None else record.status.value
             frame["pictures"].append({"name": name, "picture": picture, "status": status})
     return shown
 

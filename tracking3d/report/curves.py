@@ -1,4 +1,4 @@
-"""Figures over the frames of a run, as paths of an SVG picture that is as wide as the page."""
+"""Plots over the frames of a run, as paths of an SVG as wide as the page."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Curve:
 
     Attributes:
         title: What it is.
-        path: The curve as the ``d`` of an SVG path; it is broken where there is no figure. Figures that stand alone
+        path: The curve as the ``d`` of an SVG path; it has gaps where there is no value. Values that stand alone
             are short dashes.
         low: The figure at the lower edge, with its unit.
         high: That at the upper edge.
@@ -45,13 +45,13 @@ def curve(
 
     Args:
         title: What it is.
-        values: ``(N,)``; not finite where there is none.
+        values: ``(N,)``; not finite if there is none.
         unit: Written behind the figures, with a space before it where it needs one.
         limits: Figures at the lower and the upper edge; the least and the greatest if None.
         digits: After the decimal point.
 
     Returns:
-        The curve; None where there is not one figure.
+        The curve; None if there is not one figure.
     """
     y = np.asarray(values, dtype=np.float64)
     known = y[np.isfinite(y)]
@@ -108,7 +108,7 @@ class Stretch:
 
     Attributes:
         status: What they share.
-        reason: Why; empty where nothing was said.
+        reason: Why; empty if nothing was said.
         first: Position of the first one.
         last: Position of the last one.
         first_index: Index of the first frame in the source, and of the last one.

@@ -1,4 +1,4 @@
-"""What differs between runs over one video: settings, masks, poses, statuses, time.
+"""Differences between runs of one video: settings, masks, poses, statuses, times.
 
 One run is what the others are held against; none of them is the truth.
 """
@@ -29,7 +29,7 @@ MOST_FRAMES = 6
 
 @dataclass(frozen=True, eq=False)
 class Difference:
-    """One run against the first one, over the ``N`` frames that both have answered.
+    """One run against the first one, over the ``N`` frames with estimates in both.
 
     Attributes:
         name: The run.
@@ -49,7 +49,7 @@ class Difference:
 
     @property
     def summary(self) -> dict[str, float | None]:
-        """Mean, median and worst of each; None where there is none."""
+        """Mean, median and worst of each; None if there is none."""
         return {
             "frames": len(self.indices),
             "iou_mean": _figure(np.mean, self.iou),
@@ -69,11 +69,11 @@ class RunComparison:
     Attributes:
         runs: The runs; the first one is what the others are held against.
         names: What to call them; no two alike.
-        settings: By name, the value in each run as text, of those that differ; None where a run has none such.
+        settings: By name, the value in each run as text, of those that differ; None if a run has none such.
         differences: Of each run but the first.
         worst: Indices of the frames that differ most, in order of time.
         notes: What to know, in sentences.
-        iou_between: ``(R, R)`` mean IoU of the masks of every two runs; NaN where there is none.
+        iou_between: ``(R, R)`` mean IoU of the masks of every two runs; NaN if there is none.
         rotation_between: ``(R, R)`` degrees between their poses, in the median; NaN likewise.
     """
 
@@ -140,7 +140,7 @@ def compare_runs(folders: Sequence[Path], against: Path | None = None) -> RunCom
     if against is not None:
         folders = [against, *(folder for folder in folders if folder.resolve() != against.resolve())]
     if len(folders) < 2:
-        raise InputError("There is nothing to compare one run with; give two run folders or more.")
+        raise InputError("A comparison needs two run folders or more.")
     runs = [RunReader(folder) for folder in folders]
     first, *others = runs
     for other in others:
@@ -265,19 +265,19 @@ def _check_same_video(first: RunReader, other: RunReader) -> None:
     sizes = [f"{run.camera.width} x {run.camera.height}" for run in (first, other)]
     if sizes[0] != sizes[1]:
         raise InputError(
-            f"{first.folder} is of frames of {sizes[0]} pixels and {other.folder} of {sizes[1]}; compare runs of one "
-            "video."
+            f"Frames of {first.folder} have {sizes[0]} pixels and those of {other.folder} have {sizes[1]}; "
+            "compare runs of one video."
         )
     if not {record.index for record in first.frames} & {record.index for record in other.frames}:
         raise InputError(
-            f"{first.folder} and {other.folder} have no frame in common that both have answered; compare runs of "
-            "the same frames."
+            f"{first.folder} and {other.folder} have estimates for no common frame; compare runs of the same "
+            "frames."
         )
 
 
 def _notes(runs: list[RunReader], names: list[str], differences: list[Difference]) -> list[str]:
     notes = [
-        f"{name} is {run.state_in_words}: {len(run.frames)} frames have an answer."
+        f"{name} is {run.state_in_words}: {len(run.frames)} frames have an estimate."
         for name, run in zip(names, runs, strict=True)
         if run.state != "finished"
     ]
@@ -285,8 +285,8 @@ def _notes(runs: list[RunReader], names: list[str], differences: list[Difference
     for name, run, one in zip(names[1:], runs[1:], differences, strict=True):
         if len(one.indices) < max(len(first.frames), len(run.frames)):
             notes.append(
-                f"{names[0]} has answers for {len(first.frames)} frames and {name} for {len(run.frames)}; they are "
-                f"compared in the {len(one.indices)} that both have."
+                f"{names[0]} has estimates for {len(first.frames)} frames and {name} for {len(run.frames)}; "
+                f"they are compared in the {len(one.indices)} frames that both have."
             )
         given = [
             told if isinstance(told := each.description.get("given"), dict) else {} for each in (first, run)
@@ -295,11 +295,13 @@ def _notes(runs: list[RunReader], names: list[str], differences: list[Difference
             [about.get(key) for about in given] for key in ("first_frame", "first_picture")
         )
         if start == start_too and None not in (picture, picture_too) and picture != picture_too:
-            notes.append(f"The first pictures of {names[0]} and {name} are not the same: is it one video?")
+            notes.append(
+                f"The first images of {names[0]} and {name} differ; make sure that both runs are of one video."
+            )
         if abs(first.camera.fx - run.camera.fx) > 1e-3 * first.camera.fx:
             notes.append(
-                f"{names[0]} and {name} see through different lenses (focal lengths {first.camera.fx:.0f} and "
-                f"{run.camera.fx:.0f} pixels), which alone makes poses differ."
+                f"{names[0]} and {name} use different focal lengths ({first.camera.fx:.0f} and "
+                f"{run.camera.fx:.0f} pixels), which alone makes their poses differ."
             )
         if not np.isfinite(one.rotation).any():
             notes.append(f"No frame has a pose in both {names[0]} and {name}.")
@@ -307,7 +309,7 @@ def _notes(runs: list[RunReader], names: list[str], differences: list[Difference
 
 
 def _names(folders: list[Path]) -> list[str]:
-    """Their last part where that tells them apart, else all of it; a run that is given twice is numbered."""
+    """The folder names if they differ, else the full paths; a run that is given twice is numbered."""
     short = [folder.resolve().name for folder in folders]
     names = short if len(set(short)) == len(short) else [str(folder) for folder in folders]
     if len(set(names)) < len(names):

@@ -1,4 +1,4 @@
-"""What to doubt about a run, in sentences: the most serious first."""
+"""What limits how far a run can be trusted, in sentences, the most serious first."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from tracking3d.results.run_reader import RunReader
 
 
 def doubts_of(run: RunReader) -> list[str]:
-    """Sentences about what of a run cannot be relied on, and why; empty where there is nothing to say.
+    """Sentences on what in a run is unreliable, and why; empty if nothing is.
 
     Args:
         run: The run, finished or not.
@@ -27,14 +27,14 @@ def _about_its_end(run: RunReader) -> list[str]:
         why = run.description.get("error")
         told.append(
             f"The run is {run.state_in_words}{f': {why}' if why else ''}. "
-            f"What is here are the {len(run.frames)} frames that it had answered until then."
+            f"This report shows the {len(run.frames)} frames that were estimated before it stopped."
         )
     refinement = run.description.get("refinement") or {}
     if run.frames and refinement.get("state") not in (None, "finished"):
         reason = refinement.get("reason")
         told.append(
-            f"The final refinement is {refinement['state']}{f' ({reason})' if reason else ''}: answers are those "
-            "given frame by frame, from what was seen until then."
+            f"The final refinement is {refinement['state']}{f' ({reason})' if reason else ''}. The estimates "
+            "are causal: each uses only the frames up to its own."
         )
     return told
 
@@ -49,14 +49,14 @@ def _about_frames(run: RunReader) -> list[str]:
     skipped = len(run.description.get("skipped") or [])
     if lost:
         told.append(
-            f"The object was lost in {_of(lost, count)}: their poses mean nothing, and their masks, if they "
-            "have any, are the mask tracker's."
+            f"The object was lost in {_of(lost, count)}: their poses are meaningless, and their masks, if "
+            "any, come from the mask tracker."
         )
     if guessed:
         told.append(
-            f"In {_of(guessed, count)} the object came back by a side that nothing had shown. How that lies to the "
-            "rest is a guess, so that they count as lost; their masks are answers, and their poses right among "
-            "themselves at most."
+            f"In {_of(guessed, count)} tracking was re-initialized on a side of the object that had not been "
+            "seen before. The pose relative to the earlier map is unknown, so these frames count as lost: "
+            "their masks can be used, and their poses are consistent with each other at most."
         )
     if uncertain:
         told.append(
@@ -66,8 +66,8 @@ def _about_frames(run: RunReader) -> list[str]:
         told.append(f"A plug-in failed in {_of(failed, count)}.")
     if skipped:
         told.append(
-            f"{skipped} {'frame was' if skipped == 1 else 'frames were'} not taken: unreadable, of another size, or "
-            "dropped to keep up with a camera."
+            f"{skipped} {'frame was' if skipped == 1 else 'frames were'} skipped: unreadable, of another "
+            "size, or dropped to keep up with a camera."
         )
     return told
 
@@ -77,15 +77,15 @@ def _about_masks(run: RunReader) -> list[str]:
     if not run.frames or None in sources:
         return []
     if not any(source is not None and source.is_own for source in sources):
-        return ["All masks are the mask tracker's, handed back as they were: nothing was added to them."]
+        return ["All masks are the mask tracker's, unchanged."]
     handed_back = sum(
         record.mask_source is MaskSource.INITIAL and record.status is not Status.LOST for record in run.frames
     )
     if not handed_back:
         return []
     return [
-        f"In {_of(handed_back, len(sources))} that {_are(handed_back)} not lost the mask is the mask tracker's, "
-        "handed back as it was."
+        f"In {_of(handed_back, len(sources))} that {_are(handed_back)} not lost, the mask is the mask "
+        "tracker's, unchanged."
     ]
 
 
@@ -100,8 +100,9 @@ def _about_pictures(run: RunReader) -> list[str]:
     if not revised:
         return []
     return [
-        f"Pictures show the first answer for each frame; {_of(revised, len(run.frames))} "
-        f"{'was' if revised == 1 else 'were'} answered anew later, and all figures are those of the later answer."
+        f"Pictures show the first estimate of each frame. {_of(revised, len(run.frames))} "
+        f"{'was' if revised == 1 else 'were'} re-estimated later, and all figures are those of the later "
+        "estimate."
     ]
 
 

@@ -1,4 +1,4 @@
-"""Figures of a run that its pages plot: statuses, poses against the first one, times by stage."""
+"""Quantities of a run for its pages: statuses, poses relative to the first one, times by stage."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from tracking3d.results.run_reader import RunReader
 from tracking3d.runtime.stage_times import STAGES, StageTimes
 
 _MEANINGS = {
-    "decode": "reading the frame",
-    "track": "the mask tracker",
+    "decode": "decoding the frame",
+    "track": "mask tracker",
     "encode": "features",
-    "solve": "the pose",
+    "solve": "pose",
     "map": "shape and texture",
-    "write": "masks and pictures",
+    "write": "writing masks and pictures",
 }
 
 
 def status_counts(records: Sequence[FrameRecord]) -> dict[str, int]:
-    """How many answers have each status."""
+    """How many estimates have each status."""
     return {status.value: sum(record.status is status for record in records) for status in Status}
 
 
 def reliable_poses(records: Sequence[FrameRecord]) -> NDArray[np.float64]:
-    """``(N, 4, 4)`` poses; NaN where the object was lost or that is no pose."""
+    """``(N, 4, 4)`` poses; NaN if the object was lost or the pose is invalid."""
     poses = np.full((len(records), 4, 4), np.nan)
     for number, record in enumerate(records):
         if record.status is not Status.LOST and is_rigid(record.T_cam_obj):
@@ -44,7 +44,7 @@ def distances(T_cam_obj: NDArray[np.float64], middle: NDArray[np.float64]) -> ND
     """``(N,)`` distances of a point of the object from the camera, over the first one that is known.
 
     Args:
-        T_cam_obj: ``(N, 4, 4)``, NaN where it is not known.
+        T_cam_obj: ``(N, 4, 4)``, NaN if unknown.
         middle: ``(3,)`` the point, in object coordinates.
     """
     away = np.linalg.norm(T_cam_obj[:, :3, :3] @ middle + T_cam_obj[:, :3, 3], axis=1)
@@ -89,7 +89,7 @@ class StageShare:
 
 
 def stage_shares(run: RunReader) -> list[StageShare]:
-    """The stages of a run that took any time, in order; none where they are not known.
+    """The stages of a run that took any time, in order; none if they are not known.
 
     Args:
         run: The run.
@@ -114,13 +114,13 @@ def stage_shares(run: RunReader) -> list[StageShare]:
 
 
 def stage_times(run: RunReader) -> tuple[StageTimes | None, StageTimes]:
-    """What the causal answers took, stage by stage, and what the final refinement did."""
+    """What the causal estimates took, stage by stage, and what the final refinement did."""
     causal = stages_of(RunReader(run.folder, refined=False).frames)
     return causal if run.frames else None, run.refinement_stages or StageTimes()
 
 
 def corrected_frames(run: RunReader) -> list[int]:
-    """Indices of the frames in which somebody has said what the object is, but the first."""
+    """Indices of the corrected frames."""
     given = run.description.get("given")
     told = given.get("corrections") if isinstance(given, dict) else None
     indices = [one.get("frame") for one in told if isinstance(one, dict)] if isinstance(told, list) else []

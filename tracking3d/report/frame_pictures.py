@@ -1,4 +1,4 @@
-"""Pictures of a run's frames as JPEG, as large and as many as a page has room for.
+"""Images of a run's frames as JPEG, limited in size and number for a page.
 
 They are taken from the overlay video, since the source may be gone. JPEG and not the video itself: a slider then
 shows exactly the frame that it names, in any browser, whatever codecs that has.
@@ -34,7 +34,7 @@ class FramePictures:
     """Pictures of some frames of a run.
 
     Attributes:
-        positions: Which of the run's answers each picture shows, rising: positions in ``RunReader.frames``.
+        positions: Which of the run's estimates each picture shows, rising: positions in ``RunReader.frames``.
         jpegs: The pictures.
         width: Pixels across.
         height: Pixels down.
@@ -47,14 +47,14 @@ class FramePictures:
 
     @property
     def step(self) -> int:
-        """How many answers one picture stands for."""
+        """How many estimates one picture stands for."""
         return self.positions[1] - self.positions[0] if len(self.positions) > 1 else 1
 
 
 def frame_pictures(run: RunReader, budget: int = BUDGET) -> FramePictures:
-    """The overlay of a run's frames, without its status bar; none where there is no overlay that can be read.
+    """The overlay of a run's frames, without its status bar; none if there is no overlay that can be read.
 
-    Frames get smaller where there are many of them, and where that is not enough, only every n-th is taken.
+    Frames get smaller if there are many, and if that is not enough, only every n-th is used.
 
     Args:
         run: The run.
@@ -80,9 +80,9 @@ def frame_pictures(run: RunReader, budget: int = BUDGET) -> FramePictures:
 
 
 def overlay_frames(run: RunReader, positions: Sequence[int]) -> Iterator[Image]:
-    """The overlays ``(H, W, 3)`` of the answers at ``positions``, status bar included.
+    """The overlays ``(H, W, 3)`` of the estimates at ``positions``, status bar included.
 
-    The video has one frame an answer, in their order. It may end before, as where the run was killed, or be damaged:
+    The video has one frame per estimate, in their order. It may end early, as if the run was killed, or be damaged:
     then so do these.
 
     Args:

@@ -1,4 +1,4 @@
-"""The model of a run for the page's viewer: plain arrays, and the texture as one picture.
+"""The model of a run for the page's viewer: plain arrays and a texture image.
 
 The picture has two halves: above the colours, below how much of each texel was ever seen. The viewer paints what was
 never seen in a pale colour of the page instead of a guess. As an alpha channel it would not do: browsers forget the
@@ -103,11 +103,11 @@ def _fault(model: ObjectModel) -> str:
         and model.texture_weight.shape == model.texture.shape[:2]
     )
     if not shapes or not np.issubdtype(model.faces.dtype, np.integer):
-        return "has arrays that do not belong together"
+        return "has arrays of inconsistent sizes"
     if not 0 < len(model.faces) <= MOST_FACES:
         return f"has {len(model.faces)} faces"
     if not 0 <= model.faces.min() <= model.faces.max() < count:
-        return "has faces of vertices that are not there"
+        return "has faces with missing vertices"
     if not (np.isfinite(model.vertices).all() and np.isfinite(model.face_uvs).all()):
-        return "has vertices that are no sensible numbers"
+        return "has vertices with invalid coordinates"
     return ""

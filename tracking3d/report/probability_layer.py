@@ -1,4 +1,4 @@
-"""The object's probability to be laid over the pictures of a page: small pictures of sixteen colours.
+"""Object probabilities as overlays for a page: small images of sixteen colours.
 
 Blue is hardly, yellow is surely the object, as in the viewer; what is below a thirtieth is transparent.
 """
@@ -26,7 +26,7 @@ _FAINTEST, _STRONGEST = 40, 150  # of 255; what is hardly the object's is hardly
 def probability_layers(
     run: RunReader, positions: Sequence[int], budget: int = BUDGET
 ) -> tuple[bytes | None, ...]:
-    """A layer as PNG for each of some answers; None for one without a probability, nothing where none has one.
+    """A layer as PNG for each of some estimates; None for one without a probability, nothing if none has one.
 
     Args:
         run: The run.

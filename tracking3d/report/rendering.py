@@ -21,7 +21,7 @@ def render_page(template: str, scripts: tuple[str, ...] = (), **values: Any) -> 
     """One self-contained HTML file, in UTF-8.
 
     Its content security policy allows the page's own script and style by their hashes and pictures within the page,
-    and nothing else: no network, and no script that somebody got into a value.
+    and nothing else: no network, and no script injected through a value.
 
     Args:
         template: Name of a file in ``page/``.

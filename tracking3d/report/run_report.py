@@ -1,4 +1,4 @@
-"""``report.html``: a run to look at, in one file."""
+"""``report.html``: the report of a run in one file."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ def _data(
 def _rotations(
     records: list[FrameRecord], middle: NDArray[np.float64], pictures: FramePictures
 ) -> list[list[float] | None]:
-    """For every picture the side of the model that it shows; None where that is not known."""
+    """For every picture the side of the model that it shows; None if unknown."""
     shown = [records[position] for position in pictures.positions] or records[:1]
     found = [
         None if record.status is Status.LOST else side_shown(record.T_cam_obj, middle) for record in shown
@@ -182,15 +182,15 @@ def _curves(records: list[FrameRecord], model: ObjectModel | None) -> list[Curve
     ious = [_own_overlap(record) for record in records]
     drawn = [
         curve("Confidence", [record.confidence for record in records], "", (0.0, 1.0)),
-        curve("Turned against the first frame", figures.turns(poses), "°", digits=1),
-        curve("Distance, 1 in the first frame", figures.distances(poses, middle), "", digits=3),
-        curve("Overlap of answer and mask tracker (IoU)", ious, "", digits=3),
+        curve("Rotation from the first frame", figures.turns(poses), "°", digits=1),
+        curve("Distance relative to the first frame", figures.distances(poses, middle), "", digits=3),
+        curve("IoU of the mask with the mask tracker's", ious, "", digits=3),
     ]
     return [one for one in drawn if one is not None]
 
 
 def _own_overlap(record: FrameRecord) -> float:
-    """IoU of the answer and the initial mask; NaN where the one is the other, handed back."""
+    """IoU of the estimated and the initial mask; NaN if the initial mask was kept unchanged."""
     handed_back = record.mask_source is not None and not record.mask_source.is_own
     return math.nan if record.iou_initial is None or handed_back else record.iou_initial
 
@@ -212,8 +212,8 @@ def _facts(run: RunReader) -> list[tuple[str, str]]:
         ("Solver", names[2]),
         ("State", run.state_in_words),
         ("Time", _time_per_frame(run)),
-        ("Corrected in", ", ".join(f"frame {index}" for index in figures.corrected_frames(run))),
-        ("Begun", str(about.get("created", "")).replace("T", " ").replace("+00:00", " UTC")),
+        ("Corrected frames", ", ".join(f"frame {index}" for index in figures.corrected_frames(run))),
+        ("Started", str(about.get("created", "")).replace("T", " ").replace("+00:00", " UTC")),
     ]
     return [(name, str(value)) for name, value in facts if value]
 
@@ -234,14 +234,16 @@ def _machine(run: RunReader) -> list[tuple[str, str]]:
 
 def _time_in_words(run: RunReader) -> str:
     total = (run.description.get("timings") or {}).get("seconds_total")
-    took = [f"{total:.1f} seconds in all" if isinstance(total, int | float) else ""]
+    took = [f"{total:.1f} seconds in total" if isinstance(total, int | float) else ""]
     words = ", ".join(filter(None, [*took, _time_per_frame(run)]))
-    return f"{words}; what is made once, such as compiled code and the mesh, is in no stage."
+    return f"{words}; one-time work, such as compiling code and building the mesh, belongs to no stage."
 
 
 def _time_per_frame(run: RunReader) -> str:
     causal, refined = figures.stage_times(run)
-    return "" if causal is None else f"{(causal.whole + refined.whole) / len(run.frames):.2f} seconds a frame"
+    return (
+        "" if causal is None else f"{(causal.whole + refined.whole) / len(run.frames):.2f} seconds per frame"
+    )
 
 
 def _megabytes(value: Any) -> str:
@@ -249,7 +251,7 @@ def _megabytes(value: Any) -> str:
 
 
 def _sheet(path: Path) -> str:
-    """The contact sheet as JPEG; empty where there is none that can be read."""
+    """The contact sheet as JPEG; empty if there is no readable one."""
     image = None
     with suppress(OSError, cv2.error):
         image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR)

@@ -17,7 +17,7 @@ class Setting:
     Attributes:
         name: With its section, such as ``solver.local_window``.
         value: As text.
-        usual: The value of preset ``default``, where that is another one; None where it is the same or unknown.
+        usual: The value of preset ``default``, where that is another one; None if it is the same or unknown.
     """
 
     name: str
@@ -26,7 +26,7 @@ class Setting:
 
 
 def settings_of(config: Mapping[str, Any]) -> list[Setting]:
-    """Every setting of a run, beside what it would be if nobody had said anything.
+    """Every setting of a run, next to its default.
 
     Args:
         config: The configuration as ``run.json`` holds it.

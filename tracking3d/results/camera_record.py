@@ -1,4 +1,4 @@
-"""The camera in ``run.json``: a pinhole camera, and the lens that its pictures were taken through, if there is one."""
+"""The camera in ``run.json``: a pinhole camera, and its lens distortion, if any."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ def _read_lens(lens: Any, camera: Mapping[str, Any]) -> Lens:
         raise ValueError(f"lens is {lens!r:.40}")
     model = lens.get("model")
     if model not in COUNTS:
-        raise ValueError(f"the lens has the model {model!r:.40}")
+        raise ValueError(f"the lens has the unknown model {model!r:.40}")
     coefficients = _numbers(lens, "coefficients", COUNTS[model])
     picture, pinhole = (_numbers(lens, name, (4,)) for name in ("picture", "pinhole"))
     if not min(*picture[:2], *pinhole[:2]) > 0:
         raise ValueError("the lens has no focal length")
     if (lens.get("width"), lens.get("height")) != (camera.get("width"), camera.get("height")):
-        raise ValueError("the lens is one of pictures of another size")
+        raise ValueError("the lens belongs to images of another size")
     return Lens(model, coefficients, picture, pinhole, lens["width"], lens["height"])
 
 

@@ -1,4 +1,4 @@
-"""One picture of a whole run: crops spread over the clip, the texture and the model from sides that were seen."""
+"""One image of a whole run: crops from the whole clip, the texture, and views of the model from seen sides."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _LETTERS = 11
 
 @dataclass(frozen=True, eq=False)
 class Thumbnail:
-    """One crop of the overlay, ``(TILE, TILE, 3)``, the answer's pose, and what is written on it."""
+    """One crop of the overlay, ``(TILE, TILE, 3)``, the estimate's pose, and what is written on it."""
 
     index: int
     image: Image
@@ -55,7 +55,7 @@ class Thumbnails:
         Args:
             picture: ``(H, W, 3)`` overlay without its bar.
             scale: Overlay pixels per frame pixel.
-            estimate: The answer that it shows.
+            estimate: The estimate that it shows.
         """
         if self._frames % self._step == 0:
             crop = drawing.fit(_around(picture, estimate.mask, scale), TILE)
@@ -85,7 +85,7 @@ def draw_contact_sheet(
         thumbnails: Crops in the order of the clip.
         model: The object; None leaves texture and mesh out.
         run: ``run.json`` of the run, as it is at the end.
-        replaced: Frames whose crop shows an answer that is not the last one.
+        replaced: Frames whose crop shows an estimate that is not the last one.
 
     Returns:
         ``(H, COLUMNS * TILE, 3)``.
@@ -136,7 +136,7 @@ def _views(thumbnails: Sequence[Thumbnail], model: ObjectModel) -> list[Image]:
 
 def _add_label(thumbnail: Thumbnail, replaced: bool) -> Image:
     title = f"#{thumbnail.index} {thumbnail.status.value}" + (", keyframe" if thumbnail.keyframe else "")
-    title += ", first answer" if replaced else ""
+    title += ", first estimate" if replaced else ""
     tile = _add_title(thumbnail.image, title, drawing.STATUS[thumbnail.status])
     if thumbnail.keyframe:
         cv2.rectangle(tile, (1, 1), (TILE - 2, TILE - 2), drawing.KEYFRAME, 3)
@@ -156,8 +156,8 @@ def _legend(run: dict[str, Any]) -> Image:
         (f"{counts['frames']} frames", drawing.INK),
         *((f"{counts[status.value]} {status.value}", drawing.STATUS[status]) for status in Status),
         (f"{counts['keyframes']} keyframes", drawing.KEYFRAME),
-        ("outline of the answer", drawing.REFINED),
-        ("of the mask tracker", drawing.INITIAL),
+        ("estimated outline", drawing.REFINED),
+        ("mask tracker's outline", drawing.INITIAL),
         *((text, drawing.INK) for text in _of_masks(run)),
     ]
     for row, (text, colour) in enumerate(lines):
@@ -166,12 +166,12 @@ def _legend(run: dict[str, Any]) -> Image:
 
 
 def _of_masks(run: dict[str, Any]) -> list[str]:
-    """How many answers are more than the initial mask handed back, and how near those are to it."""
+    """How many masks are the solver's instead of the initial mask, and their IoU with it."""
     own, iou = own_masks(run), run["iou_initial_mean_own"]
     if own is None:
         return []
-    nearness = f"their IoU with initial {iou:.3f}" if iou is not None else "no initial masks beside"
-    return [f"{own} masks of its own", *([nearness] if own else [])]
+    nearness = f"IoU with initial masks {iou:.3f}" if iou is not None else "no initial masks to compare"
+    return [f"{own} masks of the solver", *([nearness] if own else [])]
 
 
 def _footer(run: dict[str, Any]) -> Image:
@@ -180,7 +180,7 @@ def _footer(run: dict[str, Any]) -> Image:
     lines = []
     if whole is not None:
         parts = [f"{name} {getattr(stages, name):.3f}" for name in STAGES] if stages else []
-        lines.append((": ".join(filter(None, (f"{whole:.3f} s a frame", ", ".join(parts)))), drawing.INK))
+        lines.append((": ".join(filter(None, (f"{whole:.3f} s per frame", ", ".join(parts)))), drawing.INK))
     lines += [(f"Note: {note}", drawing.STATUS[Status.UNCERTAIN]) for note in run.get("notes", ())]
     band = np.full((23 * len(lines) + 16 * bool(lines), COLUMNS * TILE, 3), drawing.PAPER, dtype=np.uint8)
     for row, (text, colour) in enumerate(lines):

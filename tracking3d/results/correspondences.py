@@ -1,6 +1,6 @@
-"""Where the surface points under some pixels of one frame are in every frame, and whether they are seen.
+"""Correspondences: positions and visibility in every frame of the surface points under pixels of one frame.
 
-The mesh and the poses of a run answer both: a pixel's ray meets the mesh in one surface point, which every
+The mesh and the poses of a run give both: a pixel's ray meets the mesh in one surface point, which every
 frame's pose carries along. A point is seen if it lies inside the frame, faces the camera and nothing of the
 object is in front of it. Other things in front of the object are unknown to the mesh.
 """
@@ -27,14 +27,14 @@ from tracking3d.results.run_reader import RunReader
 
 
 class PointKind(StrEnum):
-    """By what a point is followed."""
+    """How a point is tracked."""
 
     NONE = "none"
-    """By nothing: it lies beside the object."""
+    """Not tracked: it lies on the background."""
     SURFACE = "surface"
-    """By mesh and pose, and by the images where they are looked at."""
+    """By mesh and pose, and by the images if they are used."""
     TIED = "tied"
-    """By the images where the mesh does not cover it, and by mesh and pose since it came to lie on the mesh."""
+    """By the images while the mesh does not cover the point, and by mesh and pose once the point lies on the mesh."""
     IMAGE = "image"
     """By the images alone."""
 
@@ -141,7 +141,7 @@ def kinds(on_surface: NDArray[np.bool_]) -> NDArray[np.str_]:
 def check_asked(
     tracks: PointTracks, camera: Camera, answered: NDArray[np.bool_] | None = None, otherwise: str = ""
 ) -> str:
-    """Make sure that the pixels that were asked for can have an answer.
+    """Check that the query pixels can be tracked.
 
     Args:
         tracks: By the mesh.
@@ -150,10 +150,10 @@ def check_asked(
         otherwise: What else can be done about the others.
 
     Returns:
-        What to say of pixels beside the object, of which nothing is known; empty where there are none.
+        A sentence about pixels outside the object, which cannot be tracked; empty if there are none.
 
     Raises:
-        InputError: If one lies outside the frame, or all lie beside the object.
+        InputError: If one lies outside the frame, or all lie outside the object.
     """
 
     def listed(pixels: NDArray[np.float64]) -> str:
@@ -163,15 +163,16 @@ def check_asked(
     outside = tracks.query[~in_frame(camera, tracks.query)]
     if len(outside):
         raise InputError(
-            f"There is no pixel {listed(outside)} in frame {tracks.query_frame}, which has {camera.width} x "
-            f"{camera.height} pixels counted from 0; give pixels on the object."
+            f"Frame {tracks.query_frame} has no pixel {listed(outside)}: it has {camera.width} x "
+            f"{camera.height} pixels, counted from 0; give pixels on the object."
         )
     beside = tracks.query[~(tracks.on_object if answered is None else answered)]
     if not len(beside):
         return ""
     said = (
-        f"Beside the object's mesh in frame {tracks.query_frame}: {listed(beside)}; give pixels inside its outline, "
-        f"which {OVERLAY} shows{otherwise}."
+        f"These pixels of frame {tracks.query_frame} are outside the object's mesh: {listed(beside)}; give "
+        "pixels inside "
+        f"its outline, which {OVERLAY} shows{otherwise}."
     )
     if len(beside) == len(tracks.query):
         raise InputError(said)
@@ -256,7 +257,7 @@ def as_points(xy: ArrayLike) -> NDArray[np.float64]:
 
 
 def tracked_record(run: RunReader, frame: int) -> FrameRecord:
-    """The record of a frame whose pose can be relied on.
+    """The record of a frame that is not lost.
 
     Raises:
         InputError: If the run has none.
@@ -264,7 +265,7 @@ def tracked_record(run: RunReader, frame: int) -> FrameRecord:
     record = next((record for record in run.frames if record.index == frame), None)
     if record is None:
         held = f"{run.frames[0].index} to {run.frames[-1].index}" if run.frames else "none"
-        raise InputError(f"The run {run.folder} has no frame {frame}; choose one that it holds ({held}).")
+        raise InputError(f"The run {run.folder} has no frame {frame}; choose one of its frames ({held}).")
     if record.status == Status.LOST or not np.isfinite(record.T_cam_obj).all():
         raise InputError(
             f"The object was lost in frame {frame} of {run.folder}; choose a frame that was tracked."

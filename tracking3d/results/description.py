@@ -1,4 +1,4 @@
-"""The contents of ``run.json``: how a run was made and what came of it."""
+"""The contents of ``run.json``: the settings and the outcome of a run."""
 
 from __future__ import annotations
 
@@ -98,8 +98,8 @@ def refinement(
     Args:
         state: ``running``, ``finished``, ``interrupted``, ``failed`` or ``left out``.
         reason: Why it has that state, in words.
-        causal: The causal answer for every frame.
-        refined: The second answers.
+        causal: The causal estimate for every frame.
+        refined: The refined estimates.
         seconds: Wall time it took.
         together: What it took to solve everything once more, before the frames.
     """
@@ -123,10 +123,10 @@ def summary(
     """Counts, plug-in failures, timings, mean IoU, where masks come from and highest memory of a run.
 
     Args:
-        records: The answer for every frame.
+        records: The estimate for every frame.
         skipped: Number of frames that could not be decoded.
         seconds: Wall time of the whole run.
-        causal: The causal answers, whose seconds are the run's; ``records`` themselves if None.
+        causal: The causal estimates, whose seconds are the run's; ``records`` themselves if None.
     """
     causal = records if causal is None else causal
     per_frame = [record.seconds for record in causal]
@@ -180,7 +180,7 @@ def time_per_frame(run: Mapping[str, Any]) -> tuple[float | None, StageTimes | N
 
 
 def own_masks(run: Mapping[str, Any]) -> int | None:
-    """How many answers are masks of the tracker's own, not the initial mask handed back; None where it is not known.
+    """How many estimates have the solver's own mask instead of the unchanged initial mask; None if unknown.
 
     Args:
         run: ``run.json`` of a run that is over.

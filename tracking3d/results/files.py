@@ -1,4 +1,4 @@
-"""Writing files so that a kill leaves either the old one or the new one, and errors in one sentence."""
+"""Atomic writing of files, with errors in one sentence."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ def writing(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         if error.errno in _FULL:
-            what = f"The disk is full at {path}; free some space (what was finished is kept)."
+            what = f"The disk is full at {path}; free some space (finished frames are kept)."
         elif error.errno in _FORBIDDEN:
             what = f"{path} is not writable; choose another {OUT}."
         elif error.errno in _NOT_A_FOLDER:
-            what = f"{path} is not a folder, or lies inside a file; choose another {OUT}."
+            what = f"{path} is not a folder or lies inside a file; choose another {OUT}."
         else:
             what = f"{path} cannot be written: {error.strerror or error}; choose another {OUT}."
         raise OutputError(what) from error
@@ -106,7 +106,7 @@ def read_mask(path: Path) -> NDArray[np.bool_] | None:
 
 
 def decode_mask(data: bytes) -> NDArray[np.bool_] | None:
-    """A mask from the bytes of such a file; None where they are no image."""
+    """A mask from the bytes of such a file; None if they are no image."""
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
     return None if image is None else image >= 128
 

@@ -1,4 +1,4 @@
-"""The file ``frames.jsonl`` of a run that goes on: whole lines only, and one writer only."""
+"""The file ``frames.jsonl`` of a running run: complete lines and a single writer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The masks that a person gave of the object, kept so that a correction can begin from what the run began with."""
+"""The masks given by the user, stored so that a correction can restart from the same prompts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tracking3d.results.files import read_mask, write_mask, writing
 def keep_given_masks(
     folder: Path, first: int, prompt: Prompt | None, corrections: Iterable[Correction] = ()
 ) -> None:
-    """Write the masks of the first frame and of corrections, where they were given as such.
+    """Write the masks of the first frame and of corrections, if they were given as masks.
 
     Args:
         folder: The run folder.
@@ -48,7 +48,7 @@ def read_given_mask(folder: Path, index: int) -> NDArray[np.bool_]:
     mask = read_mask(path := layout.prompt_path(folder, index))
     if mask is None:
         raise InputError(
-            f"{path} is missing or damaged, the mask that the run was given; say it again by `tracking3d run` with "
-            "--resume, --mask and --correct."
+            f"The mask {path} that was given to the run is missing or damaged; give it again with "
+            "`tracking3d run` --resume, --mask and --correct."
         )
     return mask

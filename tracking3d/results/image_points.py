@@ -1,4 +1,4 @@
-"""Points of a run that its mesh does not cover, followed in the images; see `tracking3d.points.image_following`."""
+"""Points outside the mesh of a run, tracked in the images; see `tracking3d.points.image_following`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class ImagePoints:
-    """N points that began beside the mesh, in the T frames of a run.
+    """N points that started outside the mesh, in the T frames of a run.
 
     Attributes:
         followed: Positions in pixels of the frames; points in space of those that are tied to the surface.

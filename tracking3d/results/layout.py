@@ -1,12 +1,12 @@
-"""What lies where in a run folder.
+"""The layout of a run folder.
 
 ::
 
     run.json            configuration as used, camera, versions, seed, counts, timings, state
-    frames.jsonl        one line a frame, flushed; a better answer for an earlier frame is a further line
-    masks/              the answers, 0/255 PNG at full resolution, named by frame index
+    frames.jsonl        one line a frame, flushed; a better estimate for an earlier frame is a further line
+    masks/              the estimates, 0/255 PNG at full resolution, named by frame index
     initial_masks/      what the mask tracker gave
-    probabilities/      the object's in every pixel of the answers, where that was asked for
+    probabilities/      the object's in every pixel of the estimates, where that was asked for
     overlay.mp4         the video with outlines and axes
     contact_sheet.png   the run at a glance
     report.html         the run to look at, in one file
@@ -14,7 +14,7 @@
     mesh.obj, mesh.mtl, texture.png, mesh.glb, features.npz
     landmarks.npz       surface and poses as points were followed by, once they were
     causal/             masks and mesh as they were before the final refinement
-    online/             the mesh of the online map, where its shape was made anew
+    online/             the mesh of the online map, where its shape was rebuilt
     .refining/          what the final refinement has made so far, until it has ended
     .state/             what a stopped run goes on from; when it is finished, what a correction goes on from
     prompts/            the masks that were given of the object, named by frame index
@@ -43,7 +43,7 @@ STATE = ".state"
 PROMPTS = "prompts"
 CORRECTING = ".correcting"
 DRAWN = ".drawn.png"
-"""A mask that was drawn in the viewer, until the correction by it has begun."""
+"""A mask drawn in the viewer, kept until its correction has started."""
 STATE_FILE = "state.json"
 JOURNAL = "journal.jsonl"
 OVERLAY = "overlay.mp4"
@@ -51,7 +51,7 @@ CONTACT_SHEET = "contact_sheet.png"
 REPORT = "report.html"
 TURNTABLE = "turntable.mp4"
 INDEX = "index.html"
-"""Beside the folders of several objects: links to the report of each."""
+"""Next to the folders of several objects: links to the report of each."""
 OBJ = "mesh.obj"
 MTL = "mesh.mtl"
 TEXTURE = "texture.png"
@@ -61,17 +61,20 @@ LANDMARKS = "landmarks.npz"
 
 OUT = argument("folder", "--out")
 OVERWRITE = argument("overwrite=True", "--overwrite")
-"""What sentences call the arguments of `tracking3d.pipeline.record.record`, and of ``tracking3d run``."""
+"""Names in messages of the arguments of `tracking3d.pipeline.record.record` and of ``tracking3d run``."""
 
 CONVENTIONS = {
     "axes": "OpenCV camera axes: x right, y down, z forward.",
-    "pixels": "Pixel (0, 0) is the centre of the top-left pixel; K is that of the full frame.",
+    "pixels": "Pixel (0, 0) is the centre of the top-left pixel; K belongs to the full frame.",
     "T_cam_obj": "Object to camera: x_cam = R x_obj + t, a row-major 4 x 4 matrix.",
-    "scale": "The unit of length is arbitrary unless the user gave one; only ratios mean anything.",
-    "mesh": "mesh.obj is in object coordinates; in mesh.glb a node turns them by 180 degrees about x, so that y is up.",
+    "scale": "The unit of length is arbitrary unless the user gave one; only ratios are meaningful.",
+    "mesh": (
+        "mesh.obj is in object coordinates; a node in mesh.glb rotates them by 180 degrees about x, so that "
+        "y is up."
+    ),
     "revisions": (
-        "The last line for an index in frames.jsonl is the answer; of those that are not refined, the last one "
-        "is the causal answer."
+        "The last line for an index in frames.jsonl is the final estimate; the last line that is not "
+        "refined is the causal estimate."
     ),
 }
 
@@ -83,7 +86,7 @@ _OF_STATE = re.compile(r"\d{8,}\.npz|milestone_\d{6,}\.json")
 
 
 def mask_path(folder: Path, index: int) -> Path:
-    """Where the answer's mask of frame ``index`` lies: in the run folder, or in `CAUSAL` or `REFINING` within it."""
+    """Where the estimated mask of frame ``index`` lies: in the run folder, or in `CAUSAL` or `REFINING` within it."""
     return folder / MASKS / f"{index:06d}.png"
 
 
@@ -101,7 +104,9 @@ def object_folders(folder: Path, count: int) -> list[Path]:
     if (folder / RUN).exists():
         raise OutputError(f"{folder} holds a run of one object; choose another {OUT} for several.")
     if (more := folder / f"object_{count}").exists():
-        raise OutputError(f"{folder} holds a run of more objects, such as {more.name}; choose another {OUT}.")
+        raise OutputError(
+            f"{folder} holds a run of several objects, such as {more.name}; choose another {OUT}."
+        )
     return [folder / f"object_{number}" for number in range(count)]
 
 

@@ -31,7 +31,7 @@ def try_lock(descriptor: int, shared: bool = False) -> bool:
 
 
 def is_locked(path: Path) -> bool | None:
-    """Whether somebody holds the lock on ``path``; None on a file system without locks."""
+    """Whether the lock on ``path`` is held; None on a file system without locks."""
     try:
         with path.open("rb") as file:
             free = _try_lock(file.fileno(), shared=True)

@@ -186,12 +186,10 @@ def _mesh_fault(mesh: Any) -> str:
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         return "has no faces"
     if not (np.abs(mesh.vertices) < _FARTHEST).all():
-        return "has vertices that are no sensible numbers"
+        return "has vertices with invalid coordinates"
     faces = np.asarray(mesh.faces)
     return (
-        "has faces of vertices that are not there"
-        if not 0 <= faces.min() <= faces.max() < len(mesh.vertices)
-        else ""
+        "has faces with missing vertices" if not 0 <= faces.min() <= faces.max() < len(mesh.vertices) else ""
     )
 
 
@@ -215,7 +213,7 @@ def load_model(folder: Path) -> ObjectModel:
 def _existing(path: Path) -> Path:
     if not path.is_file():
         raise InputError(
-            f"{path.parent} holds no {path.name}; the run has not ended, or ended without a mesh."
+            f"{path.parent} holds no {path.name}; the run is not finished, or finished without a mesh."
         )
     return path
 

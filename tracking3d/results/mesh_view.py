@@ -1,4 +1,4 @@
-"""Pictures of the textured mesh from any side."""
+"""Views of the textured mesh from any side."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def side_shown(T_cam_obj: NDArray[np.float64], middle: NDArray[np.float64]) -> N
         middle: ``(3,)`` the object's middle.
 
     Returns:
-        None where the pose is no number, or the object not before the camera.
+        None if the pose is no number, or the object not before the camera.
     """
     if not np.isfinite(T_cam_obj).all():
         return None

@@ -1,4 +1,4 @@
-"""What somebody who looks at a run should know, in sentences: what was assumed, and what was never seen."""
+"""Notes for readers of a run, in sentences: what was assumed, and what was never seen."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.results.records import FrameRecord
 
 MOSTLY = 0.5
-"""Share of the surface never seen from which a note says so."""
+"""Share of unseen surface above which a note is written."""
 UNEVEN = 1.5
-"""How much longer than the shortest the longest time between two frames is, for a note to say so."""
+"""Ratio of the longest to the shortest frame interval above which a note is written."""
 
 _CORNERS = 6  # points a side of a face at which the texture is asked
 
@@ -25,9 +25,9 @@ def notes_of_run(run: dict[str, Any], model: ObjectModel | None, records: Sequen
     Args:
         run: Its ``run.json``, before the notes are in it.
         model: The object; None if there is none.
-        records: The answer for every frame, in order.
+        records: The estimate for every frame, in order.
     """
-    # Nobody expects frames to come evenly from a camera, which has no number of frames either.
+    # A camera is not expected to deliver frames evenly; it has no number of frames either.
     counted = (run.get("given") or {}).get("frames") is not None
     return [
         *run["source_notes"],
@@ -47,20 +47,20 @@ def describe_camera_and_model(camera: dict[str, Any], model: ObjectModel | None)
     if camera["assumed"]:
         solved = camera["origin"].startswith("solved")
         told = (
-            "the final refinement solved it" if solved else "give --fov or --intrinsics where depth matters"
+            "the final refinement estimated it" if solved else "give --fov or --intrinsics if depth matters"
         )
-        notes.append(f"nobody gave the lens: {camera['origin']}; {told}")
+        notes.append(f"no focal length was given: {camera['origin']}; {told}")
     unseen = unseen_share(model) if model is not None else 0.0
     if unseen > MOSTLY:
-        notes.append(f"{100 * unseen:.0f} % of the mesh's surface was never seen; what is there is a guess")
+        notes.append(f"{100 * unseen:.0f} % of the mesh's surface was never seen; its shape there is a guess")
     return notes
 
 
 def notes_of_times(records: Sequence[FrameRecord]) -> list[str]:
-    """What one should know of the times of a run's frames: that they do not come evenly.
+    """A note if the frames of a run are not evenly spaced in time.
 
     Args:
-        records: The answer for every frame, in order.
+        records: The estimate for every frame, in order.
     """
     timed = [(one.index, one.time) for one in records if one.time is not None]
     steps = np.array(
@@ -74,8 +74,8 @@ def notes_of_times(records: Sequence[FrameRecord]) -> list[str]:
         return []
     shortest, longest = 1000 * steps.min(), 1000 * steps.max()
     return [
-        f"frames come {shortest:.0f} to {longest:.0f} ms apart (variable frame rate); time stamps are the video's, and "
-        "overlay.mp4 shows them evenly"
+        f"frame intervals vary from {shortest:.0f} to {longest:.0f} ms (variable frame rate); time stamps "
+        "are those of the video, but overlay.mp4 plays at a constant rate"
     ]
 
 

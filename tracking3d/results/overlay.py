@@ -1,7 +1,7 @@
-"""One frame with everything the tracker said about it drawn in.
+"""The overlay: one frame with its estimates drawn in.
 
-The picture has the outline of the initial mask (thin, orange) and of the answer (thicker, cyan), the object's
-axes (x red, y green, z blue) and below it a status bar. Axes are drawn where the pose is believed only: in frames that
+The picture has the outline of the initial mask (thin, orange) and of the estimate (thicker, cyan), the object's
+axes (x red, y green, z blue) and below it a status bar. Axes are drawn where the pose is trusted: in frames that
 are tracked, and where they begin on the object.
 """
 
@@ -91,11 +91,11 @@ def draw_overlay(
 
     Args:
         frame: The input.
-        estimate: The answer for it.
-        record: The same answer as it is recorded.
+        estimate: The estimate for it.
+        record: The same estimate as it is recorded.
         camera: The camera of the full frame.
         axes: The object's axes; None leaves them out. So does a frame that is not tracked, and a pose that puts
-            them beside the object.
+            them on the background.
 
     Returns:
         ``(height, width, 3)`` as `OverlaySize.of` gives them.
@@ -146,7 +146,7 @@ def _draw_axes(
 def _is_on(mask: NDArray[np.bool_], pixel: NDArray[np.float64]) -> bool:
     """Whether the pixel ``(2,)`` x and y is one of the mask's, or of a hole in it.
 
-    The middle of a mug is seen through its handle at times, that of a gate always: it is not beside the object.
+    The middle of a mug is seen through its handle at times, that of a gate always: it does not lie on the background.
     """
     column, row = np.clip(pixel, -1, max(mask.shape)).round().astype(int)
     if not (0 <= row < mask.shape[0] and 0 <= column < mask.shape[1]):
@@ -173,10 +173,10 @@ def _draw_bar(bar: Image, record: FrameRecord) -> None:
         left = drawing.draw_text(bar, text, left + gap, base, letters, drawing.INK)
     if record.keyframe:
         left = drawing.draw_text(bar, "key", left + gap, base, letters, drawing.KEYFRAME)
-    legend = width - drawing.text_width("initial answer", letters) - gap
+    legend = width - drawing.text_width("initial estimate", letters) - gap
     if legend > left + gap:
         after = drawing.draw_text(bar, "initial ", legend, base, letters, drawing.INITIAL)
-        drawing.draw_text(bar, "answer", after, base, letters, drawing.REFINED)
+        drawing.draw_text(bar, "estimate", after, base, letters, drawing.REFINED)
     reason = drawing.shorten(
         record.reason, letters, (legend if legend > left + gap else width) - left - 2 * gap
     )

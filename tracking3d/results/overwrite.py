@@ -1,4 +1,4 @@
-"""Making room for a run in a folder, where that takes nothing but an earlier run."""
+"""Clearing a folder for a run, only if it holds nothing but an earlier run."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def clear_run_folder(folder: Path, overwrite: bool) -> None:
         earlier = RunReader(folder)
     except InputError as error:
         raise OutputError(
-            f"{folder} is not a readable run folder but holds {there[0].relative_to(folder)}, "
-            f"which a run would replace; choose another {layout.OUT}."
+            f"{folder} is not a readable run folder, but holds {there[0].relative_to(folder)}, which a run "
+            f"would replace; choose another {layout.OUT}."
         ) from error
     if earlier.frames and not overwrite:
         raise OutputError(

@@ -1,4 +1,4 @@
-"""What a run shows of itself: the overlay video and the crops of the contact sheet, drawn frame by frame."""
+"""Visualizations of a run: the overlay video and the crops of the contact sheet, drawn frame by frame."""
 
 from __future__ import annotations
 
@@ -55,12 +55,12 @@ class Pictures:
         mask: NDArray[np.bool_] | None,
         initial: NDArray[np.bool_] | None,
     ) -> None:
-        """Draw the next frame from what was kept of its answer.
+        """Draw the next frame from what was kept of its estimate.
 
         Args:
             frame: The frame.
-            record: Its answer.
-            mask: ``(H, W)`` the answer's mask, and the initial one; None where there is none.
+            record: Its estimate.
+            mask: ``(H, W)`` the estimated mask, and the initial one; None if there is none.
             initial: See ``mask``.
 
         Raises:
@@ -97,7 +97,7 @@ class Pictures:
         Args:
             model: The object; None leaves texture and mesh out.
             run: ``run.json`` of the run, as it is at the end.
-            replaced: Frames that were answered anew after they were drawn.
+            replaced: Frames that were re-estimated after they were drawn.
         """
         thumbnails = self._thumbnails.spread(CROPS)
         return draw_contact_sheet(thumbnails, model, run, replaced) if thumbnails else None

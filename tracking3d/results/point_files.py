@@ -34,7 +34,7 @@ COLUMNS = [
 def points_to_csv(tracks: PointTracks) -> str:
     """One row a frame and point, with the columns `COLUMNS`.
 
-    x, y and uncertainty are pixels, X, Y and Z object coordinates; empty where they are unknown. ``kind`` says by
+    x, y and uncertainty are pixels, X, Y and Z object coordinates; empty if they are unknown. ``kind`` says by
     what a point is followed, see `PointKind`.
     """
     text = io.StringIO()

@@ -1,4 +1,4 @@
-"""Points of a run followed with the help of its video; see `tracking3d.points`.
+"""Points of a run tracked with its video; see `tracking3d.points`.
 
 Surface and poses that the video has put right are kept in the run folder, so that they are found once.
 """
@@ -41,7 +41,7 @@ from tracking3d.results.run_source import open_run_source
 from tracking3d.video import FrameSource
 
 _DAMAGED = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
-_VERSION = 1  # of what is kept; another one is found anew
+_VERSION = 1  # of what is kept; another one is computed again
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class RunScene:
     Attributes:
         run: The run.
         scene: Its surface in the frames, in their order.
-        pictures: Reads the whole frames, in the same order, for points that the surface does not cover; None where
+        pictures: Reads the whole frames, in the same order, for points that the surface does not cover; None if
             such points are not followed.
     """
 
@@ -68,7 +68,7 @@ class RunScene:
             frame: Index of the frame that ``xy`` is in.
             xy: ``(N, 2)`` pixels; (0, 0) is the centre of the top-left pixel. Those that lie a few pixels beside the
                 surface count as on its rim; their ``face`` is -1.
-            beside_object: Follow pixels beside the object too, in the images alone; else they have no answer.
+            beside_object: Follow pixels on the background too, in the images alone; else they have no estimate.
 
         Raises:
             InputError: If the run has no such frame, the object was lost there, or ``xy`` are no points.
@@ -119,7 +119,7 @@ def open_scene(
     """Read the frames of a run and put its surface and poses right by them.
 
     What is found is written to ``landmarks.npz`` beside the mesh, and taken from there the next time. Where the folder
-    cannot be written it is found anew each time.
+    cannot be written it is computed again each time.
 
     Args:
         run: A run with a mesh.
@@ -165,8 +165,8 @@ def _view(
     camera = run.camera_of(record)
     if image.shape[:2] != (camera.height, camera.width):
         raise InputError(
-            f"Frame {record.index} of the video has {image.shape[1]} x {image.shape[0]} pixels, the run {run.folder} "
-            f"{camera.width} x {camera.height}; say by --source which video it was made on."
+            f"Frame {record.index} of the video has {image.shape[1]} x {image.shape[0]} pixels, but the run "
+            f"{run.folder} has {camera.width} x {camera.height}; give the run's video as --source."
         )
     if record.status == Status.LOST:
         return None

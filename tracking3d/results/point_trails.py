@@ -1,4 +1,4 @@
-"""Followed points drawn over the frames: where each is, and the way that it came."""
+"""Tracked points drawn over the frames: the position of each and its trail."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from tracking3d.results.drawing import Colour
 from tracking3d.video import VideoWriter
 
 TRAIL = 6
-"""Frames that a trail goes back."""
+"""Length of a trail in frames."""
 SMALLEST_SIDE = 480
-"""Frames with shorter longer sides are enlarged."""
+"""Frames whose longer side is shorter are enlarged."""
 _SHIFT = 4  # binary digits of OpenCV's fractions of pixels
 
 

@@ -1,4 +1,4 @@
-"""The object's probability in every pixel of an answer, as files: 0 for 0, 255 for 1."""
+"""Object probabilities per pixel as files: 0 for 0, 255 for 1."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tracking3d.results.files import write_image, writing
 
 
 def write_probability(folder: Path, index: int, probability: NDArray[np.float32] | None) -> None:
-    """Write it ``(H, W)`` beside the masks of a folder; None takes away what an earlier answer had.
+    """Write it ``(H, W)`` beside the masks of a folder; None takes away what an earlier estimate had.
 
     Raises:
         OutputError: If it cannot be written.
@@ -28,7 +28,7 @@ def write_probability(folder: Path, index: int, probability: NDArray[np.float32]
 
 
 def read_probability(folder: Path, index: int) -> NDArray[np.float32] | None:
-    """It again ``(H, W)``, in steps of 1/255; None where there is none."""
+    """It again ``(H, W)``, in steps of 1/255; None if there is none."""
     path = layout.probability_path(folder, index)
     if not path.is_file() or not path.stat().st_size:
         return None
@@ -37,7 +37,7 @@ def read_probability(folder: Path, index: int) -> NDArray[np.float32] | None:
 
 
 def take_over_probability(aside: Path, folder: Path, index: int) -> None:
-    """Let the refined answer's take the place of the causal one's, in a run that has them.
+    """Let the refined estimate's take the place of the causal one's, in a run that has them.
 
     Raises:
         OSError: If it cannot be moved.

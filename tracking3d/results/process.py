@@ -1,4 +1,4 @@
-"""Which process writes a run, so that others see when it is gone."""
+"""The identity of the process that writes a run, so that others can see whether it still exists."""
 
 from __future__ import annotations
 

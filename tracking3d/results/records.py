@@ -58,14 +58,14 @@ class FrameRecord:
         iterations: Optimizer iterations spent.
         keyframe: Whether the frame became a keyframe.
         seconds: Wall time spent on the frame, all stages together; of a revision 0, see `latest`.
-        iou_initial: IoU of the answer and the initial mask; None without an initial mask.
-        area: Pixels of the answer's mask.
-        revision: Whether this replaces an earlier answer.
-        failure: Which plug-in failed at this frame, and why; empty where none did.
-        hypothesis: Which start of the pose won, in a word or two; empty where there was no choice.
-        refined: Whether this is the answer of the final refinement, not the causal one.
-        stages: The same time stage by stage; None where it is not known, as in runs of older versions.
-        mask_source: Where the answer's mask comes from; None where it is not known.
+        iou_initial: IoU of the estimate and the initial mask; None without an initial mask.
+        area: Pixels of the estimated mask.
+        revision: Whether this replaces an earlier estimate.
+        failure: Which plug-in failed at this frame, and why; empty if none did.
+        hypothesis: Which start of the pose won, in a word or two; empty if there was no choice.
+        refined: Whether this is the estimate of the final refinement, not the causal one.
+        stages: The same time stage by stage; None if unknown, as in runs of older versions.
+        mask_source: Where the estimated mask comes from; None if unknown.
         camera: fx, fy, cx, cy of the camera that the pose is of; None if it is the run's.
         diagnostics: What else tells how far the pose is to be trusted, by name; NaN if it was not a number.
     """
@@ -163,7 +163,7 @@ class FrameRecord:
                 fields["camera"] = fx, fy, cx, cy
             return cls(**{key: value for key, value in fields.items() if key in cls.__dataclass_fields__})
         except KeyError as error:
-            raise ValueError(f"there is no {error.args[0]}") from error
+            raise ValueError(f"{error.args[0]} is missing") from error
         except (TypeError, AttributeError, OverflowError, RecursionError) as error:
             raise ValueError(f"not a frame record: {error}") from error
 
@@ -173,11 +173,11 @@ class FrameRecord:
 
 
 def latest(records: Iterable[FrameRecord], refined: bool = True) -> list[FrameRecord]:
-    """The answer for every frame: the last record of each index, sorted by index.
+    """The estimate for every frame: the last record of each index, sorted by index.
 
     Args:
         records: In the order in which they were written.
-        refined: Take the answers of the final refinement where there are any, else the causal ones everywhere.
+        refined: Take the estimates of the final refinement if there are any, else the causal ones everywhere.
     """
     estimates: dict[int, FrameRecord] = {}
     for record in records:
@@ -223,19 +223,19 @@ def read_stages(value: Any) -> StageTimes:
     try:
         return StageTimes(**{stage: _number(seconds) for stage, seconds in value.items()})
     except (TypeError, AttributeError) as error:
-        raise ValueError(f"{value!r:.40} are no times of stages") from error
+        raise ValueError(f"{value!r:.40} are not stage times") from error
 
 
 def _check_kinds(fields: Any) -> None:
     if not isinstance(fields, dict):
-        raise ValueError("it is no JSON object")
+        raise ValueError("it is not a JSON object")
     for name, kind in _KINDS.items():
         value = fields.get(name)
         given = name in fields and (kind is bool or not isinstance(value, bool))
         if name in fields and not (given and isinstance(value, kind)):
             raise ValueError(f"{name} is {value!r:.40}")
     if not all(0 <= fields[name] <= _MOST for name in ("index", "area", "iterations")):
-        raise ValueError("index, area or iterations are no count")
+        raise ValueError("index, area or iterations is not a count")
 
 
 def _number(value: float | None) -> float:

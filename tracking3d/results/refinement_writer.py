@@ -1,6 +1,6 @@
-"""The second answers of a run: kept aside until all are there, then put in the place of the causal ones.
+"""The refined estimates of a run: kept aside until all are there, then put in the place of the causal ones.
 
-Until then the run folder holds the causal answers whole, whatever ends the refinement.
+Until then the run folder holds the causal estimates whole, whatever ends the refinement.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ class RefinementWriter(RefinedEstimates):
         folder: The run folder.
         camera: The camera of the full frame.
         fps: Speed of the overlay video.
-        causal: The causal answer for every frame.
-        kept: Bytes of answers that were kept when the run was stopped.
+        causal: The causal estimate for every frame.
+        kept: Bytes of estimates that were kept when the run was stopped.
         seconds: Wall time that they took.
 
     Attributes:
@@ -70,7 +70,7 @@ class RefinementWriter(RefinedEstimates):
 
     @property
     def lines(self) -> int:
-        """Bytes of answers that are written."""
+        """Bytes of estimates that are written."""
         return (self._aside / layout.FRAMES).stat().st_size
 
     @property
@@ -79,11 +79,11 @@ class RefinementWriter(RefinedEstimates):
         return time.monotonic() - self._started
 
     def draw(self, frame: Frame, mask: NDArray[np.bool_], initial: NDArray[np.bool_] | None) -> None:
-        """Draw the answer for a frame.
+        """Draw the estimate for a frame.
 
         Args:
             frame: The frame.
-            mask: ``(H, W)`` the answer's.
+            mask: ``(H, W)`` the estimate's.
             initial: ``(H, W)`` what the mask tracker gave.
 
         Raises:
@@ -98,15 +98,15 @@ class RefinementWriter(RefinedEstimates):
     def write(
         self, estimate: FrameEstimate | None, frame: Frame, initial: NDArray[np.bool_] | None
     ) -> FrameRecord:
-        """Keep the second answer for one frame; None lets the causal one stand.
+        """Keep the refined estimate for one frame; None lets the causal one stand.
 
         Args:
-            estimate: The answer.
+            estimate: The estimate.
             frame: The frame.
             initial: ``(H, W)`` what the mask tracker gave.
 
         Returns:
-            What the frame's answer will be.
+            What the frame's estimate will be.
 
         Raises:
             OutputError: If it cannot be written.
@@ -124,7 +124,7 @@ class RefinementWriter(RefinedEstimates):
     def take_over(self, append: Callable[[Sequence[FrameRecord]], None]) -> None:
         """Put masks and video in their places; what they replace goes to ``causal/``, the mesh too.
 
-        Readers take them for the answers once their lines are there, and not before.
+        Readers take them for the estimates once their lines are there, and not before.
 
         Args:
             append: Appends records to ``frames.jsonl``, all or none.
@@ -155,7 +155,7 @@ class RefinementWriter(RefinedEstimates):
                 (self._aside / layout.OVERLAY).replace(self._folder / layout.OVERLAY)
 
     def give_up(self, keep: bool) -> None:
-        """The causal answers are as they were; what was made is kept for another try, or removed.
+        """The causal estimates are as they were; what was made is kept for another try, or removed.
 
         Raises:
             OutputError: If it cannot be done.
@@ -180,12 +180,12 @@ def adjusted_record(
     assessment: Assessment | None = None,
     evidence: Mapping[str, float] | None = None,
 ) -> FrameRecord:
-    """A second answer with the pose that it has in the end.
+    """A refined estimate with the pose that it has in the end.
 
     Args:
         estimate: As it was.
         T_cam_obj: ``(4, 4)``, of the camera of the end.
-        assessment: How far it is believed in the end; as before, if left out.
+        assessment: How far it is trusted in the end; as before, if left out.
         evidence: What that comes from, added to the diagnostics.
     """
     diagnostics = estimate.diagnostics | dict(evidence or {})
@@ -213,7 +213,7 @@ def clear_refinement(folder: Path) -> None:
 
 
 def _undo_taking_over(folder: Path) -> None:
-    """Put the causal answers back where they were, and the refined masks aside; a kill may have come in between."""
+    """Restore the causal estimates and set the refined masks aside, also after a kill in between."""
     causal, aside = folder / layout.CAUSAL, folder / layout.REFINING
     if not causal.is_dir():
         return

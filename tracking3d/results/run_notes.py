@@ -1,4 +1,4 @@
-"""What is added to the description of a run that has stopped."""
+"""Notes and totals added to the description of a stopped run."""
 
 from __future__ import annotations
 

@@ -42,16 +42,15 @@ _KINDS: dict[str, Any] = {
     "notes": list,
 }
 
-_RUN = argument("the folder that `record` wrote", "what --out of `tracking3d run` was")
+_RUN = argument("the folder that `record` wrote", "the --out folder of a `tracking3d run`")
 
 
 class RunReader:
     """A run folder as it was when each part was first asked for.
 
     Args:
-        folder: The run folder.
-        refined: Give the answers of the final refinement where there are any, else the causal ones everywhere:
-            frames, masks and mesh.
+        folder: The run folder. refined: Whether frames, masks and mesh are those of the final refinement, if there is
+        one; else all are causal.
 
     Raises:
         InputError: If it is not a run folder, or one of a newer version.
@@ -87,7 +86,7 @@ class RunReader:
         return camera
 
     def camera_of(self, record: FrameRecord) -> Camera:
-        """The camera that a frame's pose is of: where nobody gave the lens it can be another one than in the end.
+        """The camera that a frame's pose is of: if no focal length was given it can be another one than in the end.
 
         Raises:
             InputError: If there is none that can be.
@@ -101,7 +100,7 @@ class RunReader:
 
     @property
     def refinement_stages(self) -> StageTimes | None:
-        """What the final refinement took, stage by stage; None where that is not known.
+        """What the final refinement took, stage by stage; None if unknown.
 
         Raises:
             InputError: If it is damaged.
@@ -131,19 +130,21 @@ class RunReader:
 
     @property
     def state_in_words(self) -> str:
-        """The state, and where the run was abandoned, that it was."""
+        """The state; if the run was abandoned, this is added."""
         return f"{self.state} (its process is gone)" if self.abandoned else self.state
 
     @property
     def not_finished(self) -> str:
-        """A sentence about a run that did not come to its end, or has not yet; empty for one that did."""
+        """A sentence about a run that is not finished; empty for a finished run."""
         if self.state == "finished":
             return ""
-        return f"The run in {self.folder} is {self.state_in_words}; frames with an answer so far: {len(self.frames)}."
+        return (
+            f"The run in {self.folder} is {self.state_in_words}; frames estimated so far: {len(self.frames)}."
+        )
 
     @cached_property
     def frames(self) -> list[FrameRecord]:
-        """The answer for every frame, sorted by index.
+        """The estimate for every frame, sorted by index.
 
         Raises:
             InputError: If a line before the last is damaged.
@@ -155,14 +156,14 @@ class RunReader:
         return frozenset(record.index for record in self.frames if record.refined)
 
     def mask_path(self, index: int) -> Path:
-        """Where the answer's mask of frame ``index`` lies."""
+        """Where the estimated mask of frame ``index`` lies."""
         causal = layout.mask_path(self.folder / layout.CAUSAL, index)
         if index in self._refined_frames or not causal.is_file():
             return layout.mask_path(self.folder, index)
         return causal
 
     def mask(self, index: int) -> NDArray[np.bool_]:
-        """The answer's mask ``(H, W)`` of frame ``index``.
+        """The estimated mask ``(H, W)`` of frame ``index``.
 
         Raises:
             InputError: If there is none.
@@ -176,7 +177,7 @@ class RunReader:
         return mask
 
     def pinhole_mask(self, index: int) -> NDArray[np.bool_]:
-        """The answer's mask ``(H, W)`` as the camera of the poses sees it, without the distortion of a lens.
+        """The estimated mask ``(H, W)`` as the camera of the poses sees it, without the distortion of a lens.
 
         Raises:
             InputError: If there is none.
@@ -184,7 +185,7 @@ class RunReader:
         return self.camera.mask_to_pinhole(self.mask(index))
 
     def probability(self, index: int) -> NDArray[np.float32] | None:
-        """The object's probability ``(H, W)`` in every pixel of the final answer, where it was asked for, or None."""
+        """The object probabilities ``(H, W)`` of the final estimate; None if they were not requested."""
         return read_probability(self.folder, index) if self.refined else None
 
     def initial_mask(self, index: int) -> NDArray[np.bool_] | None:
@@ -193,7 +194,7 @@ class RunReader:
 
     @property
     def mesh_folder(self) -> Path:
-        """Where the mesh that belongs to the answers lies, if there is one; see `load_mesh` and `load_model`."""
+        """Where the mesh that belongs to the estimates lies, if there is one; see `load_mesh` and `load_model`."""
         causal = self.folder / layout.CAUSAL
         of_causal = not self._refined_frames and (causal / layout.OBJ).is_file()
         return causal if of_causal else self.folder
@@ -272,7 +273,7 @@ def _read_description(folder: Path) -> dict[str, Any]:
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path} is damaged: it cannot be read ({error}); restore it.") from error
     if not isinstance(description, dict) or description.get("format") != layout.FORMAT:
-        raise InputError(f"{folder} is not a run folder: its run.json is not one of tracking3d.")
+        raise InputError(f"{folder} is not a run folder: its run.json was not written by tracking3d.")
     version = description.get("format_version")
     if not isinstance(version, int):
         raise InputError(f"{path} is damaged: it holds no format version.")

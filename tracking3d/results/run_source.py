@@ -1,4 +1,4 @@
-"""The video that a run was made on, where it lies now."""
+"""The video of a run at its present path."""
 
 from __future__ import annotations
 
@@ -21,21 +21,19 @@ def open_run_source(run: RunReader, source: str | Path | None = None) -> FrameSo
     """
     named = source if source is not None else run.description.get("source")
     if not isinstance(named, str | Path) or not str(named) or str(named).isdigit():
-        raise InputError(
-            f"The run {run.folder} does not name a video that can be read again; give it by --source."
-        )
+        raise InputError(f"The video of the run {run.folder} cannot be read again; give it as --source.")
     places = [Path(named)] if source is not None else places_of(str(named), run.folder)
     there = next((place for place in places if place.exists()), named)
     try:
         return open_source(str(there), run.description.get("selection"))
     except InputError as error:
         raise InputError(
-            f"The video of the run {run.folder} cannot be read ({str(error).rstrip('.')}); say by --source where it is."
+            f"The video of the run {run.folder} cannot be read ({str(error).rstrip('.')}); give its path as --source."
         ) from error
 
 
 def places_of(source: str, folder: Path) -> list[Path]:
-    """Where the video of a run may lie, by what the run calls it: it was relative to where the run was begun.
+    """Candidate paths of a run's video: its path was relative to the working directory of the run.
 
     Args:
         source: What ``run.json`` calls it.

@@ -45,7 +45,7 @@ SKIPS_EVERY = 1.0
 RESERVE = 2048  # bytes that ``run.json`` has to spare for saying, on a full disk, how the run ended
 _STAYS = {"created", "refinement", "split", "tracker_choice"}  # of a run that goes on
 DEFAULT_FPS = 10.0
-"""Speed of the overlay video where the source has none, such as a folder of images."""
+"""Frame rate of the overlay video if the source has none, such as a folder of images."""
 
 
 class RunWriter:
@@ -109,7 +109,7 @@ class RunWriter:
         return self._lines.size
 
     def draw_again(self, frame: Frame) -> FrameRecord | None:
-        """Draw a frame that was answered before the run was stopped; None where it has no answer."""
+        """Draw a frame that was estimated before the run was stopped; None if it has no estimate."""
         record = self._kept.get(frame.index)
         if record is not None:
             initial = read_mask(layout.initial_mask_path(self.folder, frame.index))
@@ -128,10 +128,10 @@ class RunWriter:
         self._kept = {record.index: record for record in latest(read_records(self.folder / layout.FRAMES))}
 
     def write(self, estimate: FrameEstimate, frame: Frame) -> FrameRecord:
-        """Keep the answer for one frame, and those it revises.
+        """Keep the estimate for one frame, and those it revises.
 
-        Overlay and contact sheet show each frame's first answer, since they are drawn while its image is there;
-        a final refinement draws them anew.
+        Overlay and contact sheet show each frame's first estimate, since they are drawn while its image is there;
+        a final refinement redraws them.
 
         Returns:
             What was recorded of ``estimate``.
@@ -164,11 +164,11 @@ class RunWriter:
     def begin_refinement(
         self, model: ObjectModel | None, kept: int = 0, seconds: float = 0.0
     ) -> RefinementWriter:
-        """All frames have their causal answers; whatever comes now, the folder holds them whole.
+        """All frames have their causal estimates; whatever comes now, the folder holds them whole.
 
         Args:
-            model: The object as it is now; its mesh is written. None where that was done before the run was stopped.
-            kept: Bytes of second answers that were kept then.
+            model: The object as it is now; its mesh is written. None if that was done before the run was stopped.
+            kept: Bytes of refined estimates that were kept then.
             seconds: Wall time that they took.
 
         Raises:
@@ -187,19 +187,19 @@ class RunWriter:
         return self._refinement
 
     def refine_camera(self, camera: Camera) -> None:
-        """From here on answers are those of ``camera``; ``run.json`` names it when the refinement has ended."""
+        """From here on estimates are those of ``camera``; ``run.json`` names it when the refinement has ended."""
         assert self._refinement is not None
         self._camera = self._refinement.pictures.camera = camera
 
     def use_camera(self, camera: Camera) -> None:
-        """From here on causal answers are those of ``camera``."""
+        """From here on causal estimates are those of ``camera``."""
         if camera != self._camera:
             self._camera = self._pictures.camera = camera
             self._description["camera"] = asdict(camera)
             self._write_description()
 
     def end_refinement(self) -> None:
-        """Put the refined answers in the place of the causal ones, which go to ``causal/``.
+        """Put the refined estimates in the place of the causal ones, which go to ``causal/``.
 
         Raises:
             OutputError: If it cannot be done.
@@ -262,7 +262,7 @@ class RunWriter:
             self.finish(None, ended, str(error) if isinstance(error, Exception) else None)
 
     def is_initial_mask(self, frame: Frame, estimate: MaskEstimate) -> bool:
-        """Whether a mask tracker's answer for a frame is the one that is kept of it."""
+        """Whether a mask tracker's estimate for a frame is the one that is kept of it."""
         kept, given = read_mask(layout.initial_mask_path(self.folder, frame.index)), estimate.binary
         if kept is None or given is None:
             return all(mask is None or not mask.any() for mask in (kept, given))

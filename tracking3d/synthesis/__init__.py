@@ -1,1 +1,1 @@
-"""Clips with exact truth, made by ray casting that shares nothing with the renderer under test."""
+"""Synthetic clips with exact ground truth, made by ray casting that shares no code with the renderer under test."""

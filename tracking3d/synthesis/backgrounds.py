@@ -1,4 +1,4 @@
-"""What is behind the object: painted clutter, or an image from a folder of the user's."""
+"""Backgrounds: painted clutter, or an image from the user's folder."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def make_background(spec: SequenceSpec) -> NDArray[np.float32]:
     files = images_among(folder.iterdir()) if folder.is_dir() else []
     if not files:
         raise InputError(
-            f"The background '{folder}' is no folder with images in it; give one, or {PROCEDURAL_BACKGROUND}."
+            f"The background '{folder}' is not a folder of images; give one, or {PROCEDURAL_BACKGROUND}."
         )
     image = read_image(files[rng.integers(len(files))])
     scale = max(width / image.shape[1], height / image.shape[0])

@@ -1,4 +1,4 @@
-"""From the light that reaches the sensor to an 8-bit image: contrast, noise, encoding.
+"""Camera effects from light at the sensor to an 8-bit image: contrast, noise, encoding.
 
 Encoding is a plain power law of 2.2, which is near sRGB's.
 """

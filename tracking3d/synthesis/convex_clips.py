@@ -1,4 +1,4 @@
-"""Short clips with exact truth: a textured convex object turns and drifts before a cluttered background.
+"""Short clips with exact ground truth: a textured convex object turns and drifts in front of a cluttered background.
 
 OpenCV axes; pixel (0, 0) is the centre of the top-left pixel; ``x_cam = R x_obj + t``. A pixel belongs to the
 mask if the ray through its centre meets the object. One `SyntheticSpec` always gives the same clip.

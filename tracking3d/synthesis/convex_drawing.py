@@ -1,4 +1,4 @@
-"""Images of a posed surface by casting rays: shaded by one fixed light, antialiased, with an exact mask."""
+"""Ray-cast images of a posed surface: shaded by one fixed light, antialiased, with an exact mask."""
 
 from __future__ import annotations
 

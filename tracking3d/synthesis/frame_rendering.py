@@ -72,7 +72,7 @@ def render_frame(scene: Scene, frame: int) -> RenderedFrame:
 
 
 def _lamp(scene: Scene, frame: int) -> Lamp:
-    """The lamp of a frame in camera axes: it stays with the camera, or in the room where there is one."""
+    """The lamp of a frame in camera axes: it stays with the camera, or in the room if there is one."""
     T_start, T_now = scene.path.T_cam_obj(np.array([0.0, frame]))
     lamp = lamp_at(scene.spec, frame, T_start[:3, 3], scene.solid.radius)
     if scene.room is None:

@@ -1,4 +1,4 @@
-"""Suites that nobody has tuned on: every sequence is drawn from a seed.
+"""Suites on which nothing was tuned: every sequence is generated from a seed.
 
 Object, motion, lens and so on are dealt from decks of cards that are shuffled by the seed, one deck after the other:
 each kind comes as often as it is in the deck, and any two dozen sequences in a row hold every one. What the cards leave
@@ -19,13 +19,13 @@ from tracking3d.errors import InputError
 from tracking3d.synthesis.spec import Disturbances, SequenceSpec
 
 FRESH = "fresh"
-"""What the suites are called; with ``-SEED`` it is one of them."""
+"""Name of the suites; with ``-SEED`` it is one of them."""
 
 COUNT = 24
-"""Sequences of a suite, if nobody says."""
+"""Default number of sequences of a suite."""
 
 MESHES = (".obj", ".ply", ".stl", ".glb", ".gltf", ".off")
-"""Suffixes of the mesh files that are looked for in a folder."""
+"""Suffixes of mesh files that are searched in a folder."""
 
 NARROWEST, WIDEST = 8.0, 75.0
 """Vertical fields of view in degrees."""
@@ -35,7 +35,8 @@ _MOST = 1000  # sequences; their names have three digits
 # What is dealt; a card that is there twice comes twice as often.
 OBJECTS = ("organic", "assembly", "stick", "knob", "bowl", "organic", "assembly", "knob")
 
-# The motions with their slowest and fastest rotation in degrees a frame; `flip` and `fast` name the mean and the peak.
+# The motions with their slowest and fastest rotation in degrees a frame; `flip` and `fast` name the mean and
+# the peak.
 _SPEEDS = {
     "tumble": (2.0, 6.0),
     "turntable": (3.0, 9.0),
@@ -90,9 +91,9 @@ def fresh_suite(seed: int, count: int = COUNT, meshes: Path | None = None) -> li
         InputError: If seed or count make no sense, or the folder holds no mesh file.
     """
     if seed < 0:
-        raise InputError(f"--seed {seed} is negative; give a number from 0 on.")
+        raise InputError(f"--seed {seed} is negative; give a number of 0 or more.")
     if not 1 <= count <= _MOST:
-        raise InputError(f"--count {count} is not a number of sequences from 1 to {_MOST}.")
+        raise InputError(f"--count {count} is not between 1 and {_MOST} sequences.")
     files = _mesh_files(meshes) if meshes else []
     cards = (*OBJECTS, *[None] * (len(OBJECTS) // 2 if files else 0))
     kinds = [_dealt(seed, "object", index, cards) for index in range(count)]
@@ -104,7 +105,7 @@ def fresh_suite(seed: int, count: int = COUNT, meshes: Path | None = None) -> li
 
 
 def _dealt(seed: int, purpose: str, index: int, cards: Sequence[_Card]) -> _Card:
-    """The card that comes as number ``index`` from decks of all the ``cards``, each deck shuffled anew."""
+    """The card that comes as number ``index`` from decks of all the ``cards``, each deck shuffled again."""
     deck, place = divmod(index, len(cards))
     order = np.random.default_rng([seed, deck, *purpose.encode()]).permutation(len(cards))
     return cards[order[place]]
@@ -149,7 +150,7 @@ def _lamp(rng: np.random.Generator) -> tuple[float, float, float]:
 def _mesh_files(folder: Path) -> list[tuple[str, str]]:
     """Names of their own for the mesh files of a folder, and their paths, in order."""
     if not folder.is_dir():
-        raise InputError(f"--meshes {folder} is no folder; give one with mesh files in it.")
+        raise InputError(f"--meshes {folder} is not a folder; give a folder with mesh files.")
     files = sorted(file for file in folder.rglob("*") if file.suffix.lower() in MESHES and file.is_file())
     if not files:
         raise InputError(f"--meshes {folder} holds no mesh file ({', '.join(MESHES)}); give another folder.")

@@ -17,7 +17,7 @@ from tracking3d.evaluation.metrics import mask_iou
 from tracking3d.frames import Image
 
 TOLERANCE = 0.005
-"""How near to the asked mean IoU the bisection stops."""
+"""Tolerance of the mean IoU at which the bisection stops."""
 
 _GRID = 32
 _MARGIN = 1.0
@@ -86,7 +86,7 @@ def degrade_to_iou(
     """Rough masks whose IoU with ``masks`` is ``mean_iou`` on average over all frames but the first.
 
     The first frame keeps its true mask, since a tracker is given it; frames without an object stay empty. Faults
-    grow over the first frames, then come and go; a dropped frame's mask is empty. One seed gives one answer, and
+    grow over the first frames, then come and go; a dropped frame's mask is empty. One seed gives one result, and
     the same faults at every ``mean_iou``, only stronger or weaker.
 
     Args:
@@ -117,7 +117,7 @@ def degrade_to_iou(
             return rough
         low, high = (strength, high) if excess > 0 else (low, strength)
         strength = 2 * low if high == np.inf else 0.5 * (low + high)
-    raise ValueError(f"These faults do not meet a mean IoU of {mean_iou}; give more frames or other faults")
+    raise ValueError(f"These faults do not reach a mean IoU of {mean_iou}; give more frames or other faults")
 
 
 def _plan(

@@ -1,4 +1,5 @@
-"""Rough masks with one known fault: a boundary that is off by so many pixels, or a hand that is taken for the object.
+"""Rough masks with one known fault: a boundary that is a given number of pixels off, or a hand that is taken for the
+object.
 
 Where `tracking3d.synthesis.mask_degradation` mixes all faults until a mean IoU is met, these tell apart noise with
 the mean zero, which a good fit averages out, and a bias, which it cannot.

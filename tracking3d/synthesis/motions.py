@@ -1,6 +1,6 @@
 """How objects move: smooth paths of poses, evaluated at any time, so that a shutter can stay open.
 
-Or how a camera moves round an object that stands still, which is told by the same poses.
+Or how a camera moves round a still object, which the same poses describe.
 
 Time is counted in frames. Rotations turn the object about its centre in camera axes; positions are given
 relative to where the object's enclosing sphere fills the asked share of the image height, in its radii.

@@ -66,7 +66,7 @@ class RayMesh:
             from trimesh.ray.ray_pyembree import RayMeshIntersector
         except ImportError as error:
             raise InputError(
-                "Synthetic sequences need the package embreex; get it with: pip install 'tracking3d[synth]'."
+                "Synthetic sequences need the package embreex; install it with: pip install 'tracking3d[synth]'."
             ) from error
         vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
         a, b, c = vertices[faces].transpose(1, 0, 2)

@@ -1,4 +1,4 @@
-"""What rays that miss the object see of the room around it."""
+"""Rendering of the room for rays that miss the object."""
 
 from __future__ import annotations
 

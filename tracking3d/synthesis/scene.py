@@ -1,4 +1,4 @@
-"""Everything of a sequence that is made once: the object, its path, camera, background or room, and occluder."""
+"""The parts of a sequence that are made once: the object, its path, camera, background or room, and occluder."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tracking3d.synthesis.spec import SequenceSpec
 
 Array = NDArray[np.float64]
 
-_WIDEST = 120.0  # degrees; no tracker is told a wider field of view
+_WIDEST = 120.0  # degrees; no tracker is given a wider field of view
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,13 +36,13 @@ class Scene:
     Attributes:
         spec: What was asked for.
         camera: The true camera of all frames.
-        given_camera: The one that a tracker is told; another where `Disturbances.wrong_fov` is on.
+        given_camera: The camera given to a tracker; a wrong one if `Disturbances.wrong_fov` is on.
         solid: The object.
         surface: The object for rays.
         path: Its poses over time.
         background: ``(H, W, 3)`` linear light.
         hand: What moves in front of it.
-        texture: ``(h, w, 3)`` linear light, no finer than the rays resolve; None where vertices have colours.
+        texture: ``(h, w, 3)`` linear light, no finer than the rays resolve; None if vertices have colours.
         room: What is around the object instead of the background where the camera walks round it, else None.
     """
 
@@ -99,8 +99,8 @@ def make_solid(spec: SequenceSpec) -> Solid:
     file = FilePath(spec.object)
     if not file.suffix and not file.exists():
         raise InputError(
-            f"There is no object '{spec.object}' and no such mesh file "
-            f"(objects: {', '.join(PROCEDURAL)}); {hint(spec.object, PROCEDURAL)}"
+            f"There is no object or mesh file '{spec.object}' (objects: {', '.join(PROCEDURAL)}); "
+            f"{hint(spec.object, PROCEDURAL)}"
         )
     return fade_texture(load_solid(file, spec), spec.print_strength)
 

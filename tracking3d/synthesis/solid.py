@@ -18,9 +18,9 @@ class Solid:
     Attributes:
         vertices: ``(V, 3)``.
         faces: ``(F, 3)`` int64.
-        texture: ``(H, W, 3)`` uint8, or None where the vertices have colours.
+        texture: ``(H, W, 3)`` uint8, or None if the vertices have colours.
         uvs: ``(V, 2)`` texture coordinates, v upwards; or None.
-        colours: ``(V, 3)`` uint8, or None where there is a texture.
+        colours: ``(V, 3)`` uint8, or None if there is a texture.
         millimetres: Length of the unit.
         symmetries: ``(S, 4, 4)`` transforms that leave shape and look as they are, the identity first.
         axis: ``(3,)`` unit, the axis through the origin of a continuous symmetry; `symmetries` then holds steps.

@@ -1,4 +1,4 @@
-"""What a synthetic sequence is made of: object, motion, camera, disturbances and seed, all in one checked model.
+"""The specification of a synthetic sequence: object, motion, camera, disturbances and seed.
 
 One `SequenceSpec` always gives the same sequence. Every random choice draws from its own stream of the seed, so
 that switching one disturbance on or off leaves all else as it is.
@@ -18,7 +18,7 @@ from tracking3d.config.models import Section
 from tracking3d.errors import InputError
 
 Strength = Annotated[float, Field(ge=0, le=1)]
-"""0 is off, 1 the strongest."""
+"""0 is off, 1 is strongest."""
 
 Motion = Literal[
     "tumble", "turntable", "turn_and_back", "flip", "fast", "depth_drift", "leave_and_return", "walk_round"
@@ -31,10 +31,10 @@ PROCEDURAL_BACKGROUND = "procedural"
 class Disturbances(Section):
     """What makes a sequence hard; each with a strength from 0 (off) to 1."""
 
-    light: Strength = Field(0.0, description="The light's direction, brightness and colour change.")
+    light: Strength = Field(0.0, description="Direction, brightness and colour of the light change.")
     highlights: Strength = Field(0.0, description="Specular highlights on the object.")
     motion_blur: Strength = Field(
-        0.0, description="Share of the time between frames that the shutter is open."
+        0.0, description="Share of the frame interval during which the shutter is open."
     )
     noise: Strength = Field(
         0.0, description="Sensor noise; 1 is a standard deviation of about 20 grey levels."
@@ -45,7 +45,7 @@ class Disturbances(Section):
     )
     wrong_fov: Strength = Field(
         0.0,
-        description="The camera that a tracker is told has a wider field of view, at 1 twice the true one.",
+        description="The camera given to a tracker has a wider field of view, at 1 twice the true one.",
     )
     jpeg: Strength = Field(
         0.0, description="JPEG compression: quality 95 near 0, 15 at 1; 0 is lossless PNG."
@@ -57,19 +57,19 @@ class SequenceSpec(Section):
 
     name: str = Field("sequence", pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", description="Name of its folder.")
     object: str = Field("box", min_length=1, description="A procedural object, or a mesh file.")
-    textured: bool = Field(True, description="Printed with patterns, or nearly one plain colour.")
+    textured: bool = Field(True, description="Printed with patterns, or nearly a single colour.")
     print_strength: float = Field(
         1.0,
         ge=0,
         le=1,
-        description="How strongly the print shows on its mean colour; 0 is that colour alone.",
+        description="Contrast of the print against its mean colour; 0 is that colour alone.",
     )
-    motion: Motion = Field("tumble", description="How the object moves.")
+    motion: Motion = Field("tumble", description="Motion of the object.")
     degrees_per_frame: float = Field(4.0, ge=0, le=60, description="Speed of rotation; the peak for `fast`.")
     frames: int = Field(40, ge=1, le=10_000, description="Number of frames.")
     size: tuple[int, int] = Field((320, 240), description="Width and height in pixels.")
     fov: float = Field(45.0, ge=5, le=100, description="True vertical field of view in degrees.")
-    camera_told: bool = Field(True, description="Whether a tracker is told any camera.")
+    camera_told: bool = Field(True, description="Whether a tracker is given the camera.")
     fill: float = Field(
         0.7,
         ge=0.1,
@@ -85,7 +85,7 @@ class SequenceSpec(Section):
     )
     disturbances: Disturbances = Disturbances()
     supersample: int = Field(3, ge=1, le=9, description="Rays per pixel and axis; odd: one meets the centre.")
-    seed: int = Field(0, ge=0, lt=2**32, description="Seed of all that is random.")
+    seed: int = Field(0, ge=0, lt=2**32, description="Seed of the random numbers.")
 
     @field_validator("size")
     @classmethod
@@ -105,13 +105,13 @@ class SequenceSpec(Section):
     @classmethod
     def _the_lamp_is_somewhere(cls, lamp: tuple[float, float, float]) -> tuple[float, float, float]:
         if not 0 < math.hypot(*lamp) < math.inf:
-            raise ValueError("it must be three numbers that are not all 0")
+            raise ValueError("it must be three numbers, not all 0")
         return lamp
 
     @model_validator(mode="after")
     def _a_room_has_walls_of_its_own(self) -> SequenceSpec:
         if self.motion == "walk_round" and self.background != PROCEDURAL_BACKGROUND:
-            raise ValueError("walk_round has a room of its own and no other background; leave background out")
+            raise ValueError("walk_round has its own room as background; leave background out")
         return self
 
     @model_validator(mode="after")

@@ -1,4 +1,4 @@
-"""The suites of synthetic sequences, fixed or drawn from a seed: the same everywhere, for one version of them."""
+"""The suites of synthetic sequences, fixed or generated from a seed, and identical everywhere for one version."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def load_suite(name: str) -> list[SequenceSpec]:
     if (seed := seed_of(name)) is not None:
         return fresh_suite(seed)
     if name == FRESH:
-        raise InputError(f"The suite {FRESH} is drawn from a seed; say --seed N, or name it {FRESH}-N.")
+        raise InputError(f"The suite {FRESH} is generated from a seed; give --seed N, or the name {FRESH}-N.")
     if name not in SUITES:
         known = (*SUITES, FRESH)
         raise InputError(f"There is no suite '{name}'; {hint(name, known)}")
@@ -63,7 +63,7 @@ def make_suite(
         specs: The sequences; those of `load_suite` if left out.
         jobs: Processes.
         overwrite: Make complete sequences too.
-        listener: Is told the name of every sequence as it is made.
+        listener: Called with the name of every generated sequence.
 
     Returns:
         The folders of all sequences, in the order of the suite.
@@ -98,8 +98,8 @@ def _in_parallel(specs: list[SequenceSpec], folder: Path, jobs: int, listener: C
                 listener(waiting[done])
         except BrokenProcessPool as error:
             raise OutputError(
-                f"A process that makes sequences in {folder} was ended from outside, as when memory runs out; "
-                "call again with fewer --jobs, what is finished is kept."
+                f"A process that generates sequences in {folder} was killed, for example because memory ran "
+                "out; run again with fewer --jobs. Finished sequences are kept."
             ) from error
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)

@@ -1,4 +1,4 @@
-"""Colours of textures where rays meet them."""
+"""Texture lookup at ray hits."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ from tracking3d.synthesis.solid import Solid
 from tracking3d.synthesis.spec import SequenceSpec
 
 SUITE_VERSION = 1
-"""Grows with every change to the generator or the suites that changes an image or a truth."""
+"""Increases with every change to the generator or the suites that changes an image or ground truth."""
 
 _INFO = "info.json"
 _SOURCE = "tracking3d synth"
@@ -57,7 +57,7 @@ def write_sequence(
     Args:
         folder: Made if absent; an earlier synthetic sequence in it is replaced.
         spec: The sequence.
-        listener: Is told of every frame that is written.
+        listener: Called for every written frame.
 
     Returns:
         The folder.
@@ -103,7 +103,7 @@ def _check_replaceable(folder: Path) -> None:
     except (OSError, ValueError, KeyError, TypeError):
         ours = False
     if not ours:
-        raise OutputError(f"{folder} holds something other than a synthetic sequence; choose another folder.")
+        raise OutputError(f"{folder} holds files that are not a synthetic sequence; choose another folder.")
 
 
 def _write_frame(folder: Path, name: str, frame: RenderedFrame, spec: SequenceSpec, scale: float) -> None:
@@ -147,7 +147,7 @@ def _documents(scene: Scene, box: list[int], scale: float) -> dict[str, dict[str
         "init.json": {"frame": 0, "bbox_xywh": box, "mask": "masks/000000.png"},
     }
     if not spec.camera_told:
-        documents["camera.json"] |= {"told": False, "note": "true, and no tracker is told of it"}
+        documents["camera.json"] |= {"told": False, "note": "true, but not given to a tracker"}
     if scene.given_camera != scene.camera:
         documents["camera.json"]["note"] = "wrong on purpose; the true camera is in truth_camera.json"
         documents["truth_camera.json"] = {**_intrinsics(scene.camera), "depth_scale": scale}

@@ -1,4 +1,4 @@
-"""Conformance checks that authors of plug-ins run in a test of one line.
+"""Conformance checks for plug-ins, run in a one-line test.
 
 >>> from tracking3d.testing import check_tracker
 >>> def test_it_conforms() -> None:

@@ -67,7 +67,7 @@ def _encode(encoder: FeatureEncoder, images: Tensor, what: str = "") -> Tensor:
     with expect_success(what):
         features = encoder.encode(images)
     assert torch.is_grad_enabled() == enabled, (
-        f"{what}: the encoder has switched gradients {'off' if enabled else 'on'} for the whole program; use "
+        f"{what}: the encoder has switched gradients {'off' if enabled else 'on'} globally; use "
         "torch.no_grad() as a context."
     )
     fault = feature_fault(features, images, encoder)
@@ -89,10 +89,10 @@ def _check_batch(encoder: FeatureEncoder, images: Tensor) -> None:
         alone = _encode(encoder, images[position : position + 1])
         difference = float((together[position : position + 1] - alone).abs().max())
         assert difference <= _TOLERANCE * max(largest, 1e-12), (
-            f"Image {position} of a batch has other features than alone (by {difference:g}); each image is encoded "
-            "by itself."
+            f"Image {position} of a batch has other features than alone (difference {difference:g}); encode "
+            "each image independently."
         )
-    assert not torch.allclose(together[0], together[1]), "Two different images have the same features."
+    assert not torch.allclose(together[0], together[1]), "Two different images have equal features."
 
 
 def _check_repeatable(encoder: FeatureEncoder, images: Tensor) -> None:
@@ -101,5 +101,6 @@ def _check_repeatable(encoder: FeatureEncoder, images: Tensor) -> None:
         with random_state(seed):
             runs.append(_encode(encoder, images))
     assert torch.equal(*runs), (
-        "The same images encoded twice differ; switch dropout off and seed what is random from the options."
+        "Encoding the same images twice gives different features; disable dropout and take random seeds "
+        "from the options."
     )

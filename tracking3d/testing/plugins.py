@@ -1,4 +1,4 @@
-"""What the checks of trackers and of encoders share."""
+"""Checks shared by trackers and encoders."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def factory_of(plugin: Any, methods: tuple[str, ...], options: dict[str, Any]) -
     build = _from_class(plugin, options) if isinstance(plugin, type) else plugin
     if all(callable(getattr(plugin, name, None)) for name in methods) and not isinstance(plugin, type):
         return lambda: plugin
-    assert callable(build), f"{plugin!r} is no plug-in: give its class, or a function that builds one."
+    assert callable(build), f"{plugin!r} is not a plug-in; give its class, or a function that builds one."
     instance = build()
     for name in methods:
         assert callable(getattr(instance, name, None)), f"{_name(instance)} has no method {name}."
@@ -76,11 +76,12 @@ def allow_refusal(what: str) -> Iterator[None]:
     except Tracking3dError as error:
         sentence = str(error).strip()
         assert sentence.count(" ") >= 2 and "\n" not in sentence, (
-            f"{what} is refused with {sentence!r}; say in one sentence what is wrong and what to do."
+            f"{what} is refused with {sentence!r}; write one sentence with what is wrong and what to do."
         )
     except Exception as error:
         raise AssertionError(
-            f"{what} ends in {type(error).__name__}: {error}; answer, or raise an InputError of one sentence."
+            f"{what} raises {type(error).__name__}: {error}; return an estimate, or raise an InputError of "
+            "one sentence."
         ) from error
 
 
@@ -92,7 +93,7 @@ def expect_success(what: str) -> Iterator[None]:
     except AssertionError:
         raise
     except Exception as error:
-        raise AssertionError(f"{what} ends in {type(error).__name__}: {error}.") from error
+        raise AssertionError(f"{what} raises {type(error).__name__}: {error}.") from error
 
 
 def _name(instance: Any) -> str:

@@ -29,10 +29,10 @@ def check_tracker(
     """Check that a mask tracker keeps to its protocol, `tracking3d.trackers.protocol.MaskTracker`.
 
     It is run on short clips of a moving disc, prompted by a mask and by a box: shapes, types and ranges of the
-    answers, the same answers again and beside another tracker of its kind, frames, prompts and given answers left
-    unchanged. Then on what a pipeline can meet: frames that turn black or white, tiny frames and objects, boxes at
-    the border, blank first frames. Those it may refuse when it starts, by a `tracking3d.errors.InputError` of one
-    sentence; once started it answers every frame.
+    estimates, equal estimates when repeated and next to another tracker of its kind, and unchanged frames, prompts and
+    returned estimates. Then on what a pipeline can meet: frames that turn black or white, tiny frames and objects,
+    boxes at the border, blank first frames. Those it may refuse when it starts, by a `tracking3d.errors.InputError` of
+    one sentence; once started it must return an estimate for every frame.
 
     Args:
         tracker: The plug-in's class, a function that builds one, or a tracker.
@@ -66,7 +66,7 @@ def check_tracker(
 
 
 def _run(tracker: MaskTracker, clip: Clip, what: str) -> list[MaskEstimate]:
-    """Every answer, checked, and copied as it was when it was given."""
+    """Every estimate, checked, and copied as it was when it was given."""
     answers = []
     for position, frame in enumerate(clip.frames):
         answer = _ask(tracker, frame, None if position else clip.prompt(True), f"{what}, frame {position}")
@@ -75,7 +75,7 @@ def _run(tracker: MaskTracker, clip: Clip, what: str) -> list[MaskEstimate]:
 
 
 def _ask(tracker: MaskTracker, frame: Frame, prompt: Prompt | None, what: str) -> MaskEstimate:
-    """One answer, to be given and valid; with a prompt for the first frame."""
+    """One estimate, to be given and valid; with a prompt for the first frame."""
     with expect_success(what):
         answer = tracker.step(frame) if prompt is None else tracker.init(frame, prompt)
     return _check_estimate(answer, frame, what)
@@ -85,9 +85,7 @@ def _check_estimate(answer: Any, frame: Frame, what: str) -> MaskEstimate:
     fault = mask_fault(answer, frame.size)
     assert not fault, f"{what}: {fault}."
     assert isinstance(answer.reason, str), f"{what}: the reason is {answer.reason!r} instead of text."
-    assert answer.mask is not None or answer.reason, (
-        f"{what}: an answer without a mask says in its reason why there is none."
-    )
+    assert answer.mask is not None or answer.reason, f"{what}: an estimate without a mask must give a reason."
     assert answer.mask is None or answer.mask.dtype == np.float32, (
         f"{what}: the mask is of {answer.mask.dtype} instead of float32."
     )
@@ -101,7 +99,7 @@ def _copy_estimate(answer: MaskEstimate) -> MaskEstimate:
 
 
 def _check_answers(build: Callable[[], MaskTracker], clip: Clip, with_mask: bool) -> None:
-    """The answers on an easy clip, and that nothing given or taken is changed."""
+    """The estimates on an easy clip, and that nothing given or taken is changed."""
     height, width = clip.mask.shape
     what = f"{width} x {height} pixels, prompted by a {'mask' if with_mask else 'box'}"
     prompt = clip.prompt(with_mask)
@@ -122,25 +120,26 @@ def _check_answers(build: Callable[[], MaskTracker], clip: Clip, with_mask: bool
     )
     for position, (answer, copy) in enumerate(zip(given, copies, strict=True)):
         assert _same(answer, copy), (
-            f"{what}: the answer for frame {position} was changed while later frames were tracked; give a new array."
+            f"{what}: the estimate for frame {position} was changed while later frames were tracked; return "
+            "a new array."
         )
 
 
 def _check_repeatable(build: Callable[[], MaskTracker], clip: Clip) -> None:
-    """The same frames give the same answers, whatever the global random generators hold."""
+    """The same frames give the same estimates, whatever the global random generators hold."""
     runs = []
     for seed in (1, 2):
         with random_state(seed):
             runs.append(_run(build(), clip, "a repeated run"))
     for position, (once, again) in enumerate(zip(*runs, strict=True)):
         assert _same(once, again), (
-            f"Two runs on the same frames differ at frame {position}; seed what is random from the options, and "
-            "begin anew in init."
+            f"Two runs on the same frames differ at frame {position}; take random seeds from the options, "
+            "and reset the state in init."
         )
 
 
 def _check_independent(build: Callable[[], MaskTracker], clip: Clip, other: Clip) -> None:
-    """A tracker beside another on other frames answers as it does alone: nothing is shared, nothing looks ahead."""
+    """A tracker next to another one gives the same estimates as alone: no shared state, no look-ahead."""
     first, second = build(), build()
     if first is second:  # one tracker was given, which cannot be in two clips at once
         alone = _run(first, clip, "a clip")
@@ -155,15 +154,15 @@ def _check_independent(build: Callable[[], MaskTracker], clip: Clip, other: Clip
             _ask(second, distraction, None if position else other.prompt(True), what)
     for position, (once, again) in enumerate(zip(alone, beside, strict=True)):
         assert _same(once, again), (
-            f"The answer for frame {position} depends on what else was tracked before or beside it; keep what is "
-            "remembered in the tracker itself, and begin anew in init."
+            f"The estimate for frame {position} depends on other clips tracked before or at the same time; "
+            "keep all state in the tracker instance, and reset it in init."
         )
 
 
 def _check_hostile(
     build: Callable[[], MaskTracker], frames: Sequence[Frame], prompt: Prompt, what: str
 ) -> None:
-    """It may refuse to start, in one sentence; once started it answers."""
+    """It may refuse to start, in one sentence; once started it must return estimates."""
     tracker = build()
     started = False
     with allow_refusal(what):

@@ -1,4 +1,4 @@
-"""What lies around and behind the object: remembered pixel by pixel, and moved as the camera moves.
+"""The background model: learnt per pixel and warped with the camera motion.
 
 A running Gaussian average of every pixel outside the mask (Wren et al., "Pfinder: real-time tracking of the human
 body", PAMI 1997). What differs from it has come in front of it: a new side of the object, or a hand. What a mask misses
@@ -32,7 +32,7 @@ class BackgroundMemory:
 
     Args:
         image: ``(H, W, 3)`` RGB, the first frame.
-        beside: ``(H, W)`` what surely is not the object there.
+        beside: ``(H, W)`` pixels that are certainly background.
     """
 
     def __init__(self, image: Image, beside: NDArray[np.bool_]) -> None:
@@ -71,7 +71,7 @@ class BackgroundMemory:
             self._frames[:] = 0
 
     def change(self, image: Image, window: Window) -> NDArray[np.float32]:
-        """``(S, S)`` in [-0.5, 1]: has a pixel changed against the background? 0 where that is not known.
+        """``(S, S)`` in [-0.5, 1]: has a pixel changed against the background? 0 if unknown.
 
         Where the camera has moved there is nothing above 0.
 
@@ -179,7 +179,7 @@ def _crop_to_frame(window: Window) -> NDArray[np.float64]:
 
 
 def _overlap(window: Window, shape: tuple[int, ...]) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """Where the window lies in the frame, and the frame in the window; empty slices where they do not meet."""
+    """Slices of the window in the frame and of the frame in the window; empty if they do not overlap."""
     rows, columns = (
         slice(min(max(start, 0), end), max(min(start + window.side, end), 0))
         for start, end in ((window.top, shape[0]), (window.left, shape[1]))

@@ -1,4 +1,4 @@
-"""Box trackers of OpenCV, made deterministic and safe to ask: a mask tracker's witnesses."""
+"""Box trackers of OpenCV, made deterministic and safe, that check a mask tracker."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class BoxOffset:
         return cls(((told[0] - x) / width, (told[1] - y) / height), (told[2] / width, told[3] / height))
 
     def apply(self, box: Box) -> Box:
-        """The object's box where the one that is followed is ``box``."""
+        """The object's box, given the tracked ``box``."""
         x, y, width, height = box
         across, down = self.factor
         return x + self.shift[0] * width, y + self.shift[1] * height, across * width, down * height
@@ -73,7 +73,7 @@ class OpenCvBoxes:
         self._announced = image, _looking().submit(self._find, image)
 
     def update(self, image: Image) -> Box | None:
-        """The box in the next image, or None where the tracker has lost the object."""
+        """The box in the next image, or None if the tracker has lost the object."""
         announced, self._announced = self._announced, None
         if announced is not None:
             box = announced[1].result()

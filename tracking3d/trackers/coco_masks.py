@@ -17,7 +17,7 @@ from tracking3d.trackers.mask_images import UnreadableMaskError, natural_key, of
 _LONGEST = 1 << 30
 _MOST_PIXELS = 2**28
 _SAME_OBJECT = ("track_id", "instance_id", "object_id", "category_id")
-"""What tells the objects of a video apart, by preference; COCO itself knows categories only."""
+"""Keys that identify the objects of a video, by preference; COCO itself has only categories."""
 
 
 class CocoMasks:
@@ -28,7 +28,7 @@ class CocoMasks:
 
     Args:
         path: The file.
-        object: Number of the object by `_SAME_OBJECT`; None where there is one only.
+        object: Number of the object by `_SAME_OBJECT`; None if there is one only.
 
     Raises:
         InputError: If the file cannot be read as COCO, holds no such object, or several and none is chosen.
@@ -83,7 +83,7 @@ def decode(segmentation: Any, size: tuple[int, int] | None) -> NDArray[np.bool_]
         size: ``(H, W)`` of the image, which polygons do not tell.
 
     Raises:
-        ValueError: If it is none of them, or the runs do not fill the image.
+        ValueError: If it is none of them, or the run lengths do not fill the image.
     """
     if isinstance(segmentation, list):
         if size is None:
@@ -99,7 +99,7 @@ def decode(segmentation: Any, size: tuple[int, int] | None) -> NDArray[np.bool_]
     runs = np.array(decompress(counts) if isinstance(counts, str | bytes) else counts, dtype=np.int64)
     pixels = height * width
     if min(height, width) <= 0 or pixels > _MOST_PIXELS or (runs < 0).any() or runs.sum() != pixels:
-        raise ValueError("the runs do not fill the image")
+        raise ValueError("the run lengths do not fill the image")
     return np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(width, height).T
 
 
@@ -115,7 +115,7 @@ def decompress(text: str | bytes) -> list[int]:
     for sign in data:
         bits = sign - 48
         if not 0 <= bits < 64 or shift > 60:
-            raise ValueError("no run-length encoding")
+            raise ValueError("it is not a run-length encoding")
         value |= (bits & 31) << shift
         shift += 5
         if bits & 32:
@@ -125,18 +125,16 @@ def decompress(text: str | bytes) -> list[int]:
         runs.append(value + (runs[-2] if len(runs) > 2 else 0))
         value = shift = 0
     if shift:
-        raise ValueError("the run-length encoding is cut off")
+        raise ValueError("the run-length encoding is truncated")
     return runs
 
 
 def _read(path: Path) -> tuple[dict[Any, Mapping[str, Any]], list[Mapping[str, Any]]]:
     """Images by their number, and annotations."""
-    wanted = "give images and annotations as COCO has them, or a list of its results"
+    wanted = "give COCO images and annotations, or a list of COCO results"
     try:
         if path.stat().st_size > _LONGEST:
-            raise InputError(
-                f"{path} is longer than {_LONGEST >> 30} GiB, which is too much for one object's masks."
-            )
+            raise InputError(f"{path} is larger than {_LONGEST >> 30} GiB, too large for one object's masks.")
         content = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"The masks {path} cannot be read as JSON; {wanted}.") from error
@@ -146,7 +144,7 @@ def _read(path: Path) -> tuple[dict[Any, Mapping[str, Any]], list[Mapping[str, A
     images = content.get("images") if isinstance(content, dict) else None
     annotations = content.get("annotations") if isinstance(content, dict) else None
     if not isinstance(images, list) or not isinstance(annotations, list) or not images:
-        raise InputError(f"{path} holds no masks of COCO; {wanted}.")
+        raise InputError(f"{path} holds no COCO masks; {wanted}.")
     known: dict[Any, Mapping[str, Any]] = {
         one["id"]: one for one in images if isinstance(one, dict) and isinstance(one.get("id"), int | str)
     }

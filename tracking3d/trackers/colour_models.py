@@ -1,4 +1,4 @@
-"""Colour models of an object and its surroundings: a global one that remembers, and a local one."""
+"""Colour models of an object and its surroundings: a global one with memory, and a local one."""
 
 from __future__ import annotations
 
@@ -170,7 +170,7 @@ def local_shares(
     radius: int,
     size: int,
 ) -> NDArray[np.float32]:
-    """``(2, S, S)``: the shares of a pixel's neighbourhood that had its label in the mask, and beside it.
+    """``(2, S, S)``: the shares of a pixel's neighbourhood that had its label inside the mask, and outside.
 
     Args:
         labels: See `Palette.local_log_ratio`.

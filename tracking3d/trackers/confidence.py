@@ -1,4 +1,4 @@
-"""How much a mask can be trusted, without knowing the truth.
+"""Confidence of a mask without ground truth.
 
 Agreement with one's own prediction says nothing, since a stuck mask agrees with itself; what tells is an
 independent box, and whether colours and motion support the outline.
@@ -17,7 +17,7 @@ from tracking3d.trackers.outline import inside_distance
 _BAND = 0.08  # width of the bands along the outline, relative to the square root of the area
 _LOST_SEPARATION = 0.1
 _LOST_AGREEMENT = 0.3
-_USUAL_AGREEMENT = 0.75  # stands in where there is no witness
+_USUAL_AGREEMENT = 0.75  # used if there is no box tracker
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Judgement:
         separation: How much better than its surroundings the mask fits the first frame's colours, in [-1, 1].
         margin: The same just inside and outside the outline, by all the evidence but the prior, in [-1, 1].
         agreement: IoU of the mask's box and the witness's; None without a witness.
-        believed: False where the moved last mask stands in for a segmentation that changed too much.
+        believed: False if the propagated last mask replaces a segmentation that changed too much.
     """
 
     separation: float
@@ -54,8 +54,8 @@ class Judgement:
         if self.agreement is not None and self.agreement < _LOST_AGREEMENT:
             return "the mask and the box tracker disagree"
         if self.separation < _LOST_SEPARATION:
-            return "the mask's colours are not the object's"
-        return "" if self.believed else "the segmentation changed too much, the last mask was moved along"
+            return "the mask's colours do not match the object"
+        return "" if self.believed else "the segmentation changed too much; the last mask was propagated"
 
 
 def outline_margin(evidence: NDArray[np.float32], mask: NDArray[np.bool_]) -> float:

@@ -53,13 +53,13 @@ def paste_mask(mask: NDArray[np.bool_], window: Window, shape: tuple[int, ...]) 
 
 
 def box_of(mask: NDArray) -> Box | None:
-    """The bounding box of ``mask > 0.5``, or None where it is empty."""
+    """The bounding box of ``mask > 0.5``, or None if it is empty."""
     x, y, width, height = cv2.boundingRect((mask > 0.5).astype(np.uint8))
     return (float(x), float(y), float(width), float(height)) if width and height else None
 
 
 def clip_box(box: Box, shape: tuple[int, ...]) -> Box | None:
-    """The part of ``box`` inside a frame of ``shape`` ``(H, W, ...)``; None where under a pixel is left."""
+    """The part of ``box`` inside a frame of ``shape`` ``(H, W, ...)``; None if under a pixel is left."""
     x0, y0 = max(box[0], 0.0), max(box[1], 0.0)
     x1, y1 = min(box[0] + box[2], float(shape[1])), min(box[1] + box[3], float(shape[0]))
     return (x0, y0, x1 - x0, y1 - y0) if x1 - x0 >= 1 and y1 - y0 >= 1 else None

@@ -21,17 +21,17 @@ from tracking3d.trackers.protocol import Options
 from tracking3d.trackers.segmentation import SMOOTHER, ColourSegmentation
 
 STRAYED = 0.7
-"""IoU of a correction's box and the box tracker's below which the latter is off the object and begins anew. Above,
-what its filter has learnt over many frames is worth more than a box that fits a little better."""
+"""IoU of a correction's box and the box tracker's below which the latter has left the object and is re-initialized.
+Above, the filter learnt over many frames is worth more than a box that fits a little better."""
 
 _CUES = Cues(outline=0.0, background=2.0, novelty=0.0)  # the box does the work of the others
 
 
 class CsrtTracker:
-    """Mask tracker ``csrt``: CSR-DCF proposes the box, the colour segmentation answers with the mask.
+    """Mask tracker ``csrt``: CSR-DCF proposes the box, the colour segmentation makes the mask.
 
-    The box is a witness: it holds the mask back from spilling, judges it, and lets it begin anew when it has
-    lost the object. Answers are deterministic: OpenCV's random generator is seeded before each use.
+    The box keeps the mask from spilling, checks it, and re-initializes it when it has lost the object. Estimates are
+    deterministic: OpenCV's random generator is seeded before each use.
 
     Defaults were chosen by the mean IoU of the box over four real clips: colour features save a car in shadow
     (0.16 to 0.78), and CSR-DCF's own spatial reliability map costs half the time and gains nothing.
@@ -43,19 +43,21 @@ class CsrtTracker:
         segmentation_size: int = Field(
             224, ge=64, le=1024, description="Side of the segmentation's crop in pixels."
         )
-        resolution: float = Field(1.0, gt=0, le=1, description="Scale of the image the box tracker sees.")
-        use_rgb: bool = Field(True, description="Raw colour as features of the filter.")
-        use_hog: bool = Field(True, description="Histograms of gradients as features of the filter.")
-        use_color_names: bool = Field(True, description="Colour names as features of the filter.")
-        use_gray: bool = Field(True, description="Grey value as a feature of the filter.")
-        use_channel_weights: bool = Field(True, description="Weigh features by how well they discriminate.")
-        use_segmentation: bool = Field(False, description="CSR-DCF's own spatial reliability map.")
+        resolution: float = Field(1.0, gt=0, le=1, description="Scale of the box tracker's image.")
+        use_rgb: bool = Field(True, description="Use raw colour as a feature of the filter.")
+        use_hog: bool = Field(True, description="Use histograms of gradients as a feature of the filter.")
+        use_color_names: bool = Field(True, description="Use colour names as a feature of the filter.")
+        use_gray: bool = Field(True, description="Use grey values as a feature of the filter.")
+        use_channel_weights: bool = Field(True, description="Weight features by how well they discriminate.")
+        use_segmentation: bool = Field(False, description="Use CSR-DCF's own spatial reliability map.")
         template_size: float = Field(200.0, ge=16, le=1000, description="Side of the filter in pixels.")
         padding: float = Field(3.0, ge=1, le=10, description="Search region relative to the box.")
         filter_lr: float = Field(0.02, ge=0, le=1, description="Learning rate of the filter.")
         weights_lr: float = Field(0.02, ge=0, le=1, description="Learning rate of the channel weights.")
-        psr_threshold: float = Field(0.035, ge=0, description="Peak below which the filter says it is lost.")
-        number_of_scales: int = Field(33, ge=1, le=101, description="Scales tried in every frame.")
+        psr_threshold: float = Field(
+            0.035, ge=0, description="Filter response below which the object is lost."
+        )
+        number_of_scales: int = Field(33, ge=1, le=101, description="Number of scales tried in every frame.")
         scale_step: float = Field(1.02, gt=1, le=2, description="Factor from one scale to the next.")
         scale_lr: float = Field(0.025, ge=0, le=1, description="Learning rate of the scale filter.")
 
@@ -70,16 +72,16 @@ class CsrtTracker:
     def from_options(cls, options: BaseModel) -> Self:
         """Build the tracker from its validated options."""
         if not isinstance(options, CsrtTracker.Options):
-            raise PluginError("The tracker csrt was built with options that are not its own.")
+            raise PluginError("The tracker csrt was given the options of another tracker.")
         return cls(options)
 
     @classmethod
     def why_unavailable(cls) -> str:
-        """What the OpenCV in use lacks for this tracker; empty where it lacks nothing."""
+        """What the OpenCV in use lacks for this tracker; empty if it lacks nothing."""
         return why_no_contrib("TrackerCSRT", SMOOTHER)
 
     def init(self, frame: Frame, prompt: Prompt) -> MaskEstimate:
-        """Start from a box or a mask; the prompt's mask is the first answer, else the box's segmentation."""
+        """Start from a box or a mask; the prompt's mask is the first estimate, else the box's segmentation."""
         if clip_box(prompt.box, frame.image.shape) is None:
             raise InputError(
                 f"The box {prompt.box} lies outside {frame.name or 'the first frame'}; give a box inside it."
@@ -91,9 +93,9 @@ class CsrtTracker:
         return self._segmentation.estimate
 
     def step(self, frame: Frame) -> MaskEstimate:
-        """Answer for the next frame."""
+        """Estimate the mask in the next frame."""
         if self._segmentation is None or self._boxes is None:
-            raise PluginError("The tracker csrt was asked for a frame before it was started with init.")
+            raise PluginError("The tracker csrt must be started with init before it tracks a frame.")
         self._followed = self._boxes.update(frame.image)
         box = self._witness
         estimate = self._segmentation.step(frame.image, box)
@@ -102,7 +104,7 @@ class CsrtTracker:
         return estimate
 
     def announce(self, frame: Frame) -> None:
-        """Look for the box of the frame that comes next beside; a correction that moves the box forgets it."""
+        """Search the box of the next frame concurrently; a correction that moves the box discards it."""
         if self._boxes is not None:
             self._boxes.announce(frame.image)
 
@@ -120,7 +122,7 @@ class CsrtTracker:
 
     @property
     def _witness(self) -> Box | None:
-        """The box as the last correction had it; None where the box tracker has lost the object."""
+        """The box as the last correction had it; None if the box tracker has lost the object."""
         return None if self._followed is None else self._offset.apply(self._followed)
 
     def _begin(self, image: Image, box: Box) -> None:

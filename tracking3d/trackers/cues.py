@@ -1,4 +1,4 @@
-"""The cues that make a mask, and how they are put together; everything in the pixels of one square crop."""
+"""The cues of a mask and their combination, in the pixels of one square crop."""
 
 from __future__ import annotations
 

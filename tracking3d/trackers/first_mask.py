@@ -42,7 +42,7 @@ def mask_in_box(image: Image, box: Box, iterations: int = 5) -> NDArray[np.float
 
 
 def _grab_cut(colours: NDArray[np.uint8], candidate: NDArray[np.bool_], iterations: int) -> NDArray[np.bool_]:
-    """The object among the candidate pixels; none where the colours cannot tell it from the rest."""
+    """The object among the candidate pixels; empty if colours do not separate it."""
     if candidate.all() or not candidate.any() or colours.std(axis=(0, 1)).max() < _LEAST_CONTRAST:
         return np.zeros_like(candidate)
     labels = np.where(candidate, cv2.GC_PR_FGD, cv2.GC_BGD).astype(np.uint8)

@@ -1,4 +1,5 @@
-"""Mask tracker ``flow``: optical flow, colours, motion and background carry the mask; no box leads it."""
+"""Mask tracker ``flow``: the mask is propagated by optical flow, colours, motion and background, without a leading
+box."""
 
 from __future__ import annotations
 
@@ -25,10 +26,10 @@ _WITNESSES = {"csrt": "TrackerCSRT", "kcf": "TrackerKCF"}  # in OpenCV's contrib
 
 
 class FlowTracker:
-    """Mask tracker ``flow``: the segmentation of ``csrt`` without a box tracker, or with one as witness only.
+    """Mask tracker ``flow``: the segmentation of ``csrt`` without a box tracker, or with one only to check the mask.
 
-    Every cue has a weight of its own; 0 switches it off. An object that leaves the frame is answered with no mask
-    and found again by its colours.
+    Every cue has its own weight; 0 switches it off. While the object is outside the frame there is no mask; it is found
+    again by its colours.
     """
 
     class Options(Options):
@@ -41,35 +42,42 @@ class FlowTracker:
             _CUES.prior, ge=0, le=100, description="Weight of the distance to the outline of the moved mask."
         )
         outline: float = Field(
-            _CUES.outline, ge=0, le=100, description="Weight in the prior of the last outline, shifted only."
+            _CUES.outline,
+            ge=0,
+            le=100,
+            description="Weight in the prior of the last outline, only translated.",
         )
         similarity: bool = Field(
             _CUES.similarity,
-            description="Prior also by one similarity, fitted to the flow that forward and backward agree on.",
+            description="Also use a prior from one similarity transform, fitted to consistent flow.",
         )
         global_colours: float = Field(
-            _CUES.global_colours, ge=0, le=100, description="Weight of remembered colours."
+            _CUES.global_colours,
+            ge=0,
+            le=100,
+            description="Weight of the object's and background's colour models.",
         )
         local_colours: float = Field(
-            _CUES.local_colours, ge=0, le=100, description="Weight of colours nearby, one frame ago."
+            _CUES.local_colours, ge=0, le=100, description="Weight of local colours in the previous frame."
         )
         motion: float = Field(
-            _CUES.motion, ge=0, le=100, description="Weight of motion with the object or the background."
+            _CUES.motion,
+            ge=0,
+            le=100,
+            description="Weight of motion consistent with the object or the background.",
         )
         background: float = Field(
-            _CUES.background, ge=0, le=100, description="Weight of change against the remembered background."
+            _CUES.background, ge=0, le=100, description="Weight of differences from the learnt background."
         )
         novelty: float = Field(
-            _CUES.novelty, ge=0, le=100, description="Weight of never seen colours within the outline."
+            _CUES.novelty, ge=0, le=100, description="Weight of unseen colours inside the outline."
         )
-        smoother: bool = Field(
-            _CUES.smoother, description="Smooth the evidence along the edges of the image."
-        )
+        smoother: bool = Field(_CUES.smoother, description="Smooth the log-odds along image edges.")
         witness: Literal["none", "csrt", "kcf"] = Field(
-            "none", description="Box tracker that judges the mask and helps where it is lost."
+            "none", description="Box tracker that checks the mask and recovers it if it is lost."
         )
         witness_weight: float = Field(
-            _CUES.witness, ge=0, le=100, description="Weight of the distance beyond the witness's box."
+            _CUES.witness, ge=0, le=100, description="Weight of the distance outside the box of `witness`."
         )
 
     def __init__(self, options: FlowTracker.Options) -> None:
@@ -82,19 +90,19 @@ class FlowTracker:
     def from_options(cls, options: BaseModel) -> Self:
         """Build the tracker from its validated options."""
         if not isinstance(options, FlowTracker.Options):
-            raise PluginError("The tracker flow was built with options that are not its own.")
+            raise PluginError("The tracker flow was given the options of another tracker.")
         witness = _WITNESSES.get(options.witness)
         if witness and (why := why_no_contrib(witness)):
-            raise PluginError(f"The witness {options.witness} of the tracker flow cannot be used: {why}.")
+            raise PluginError(f"The box tracker {options.witness} of the tracker flow cannot be used: {why}.")
         return cls(options)
 
     @classmethod
     def why_unavailable(cls) -> str:
-        """What the OpenCV in use lacks for this tracker; empty where it lacks nothing."""
+        """What the OpenCV in use lacks for this tracker; empty if it lacks nothing."""
         return why_no_contrib(SMOOTHER)
 
     def init(self, frame: Frame, prompt: Prompt) -> MaskEstimate:
-        """Start from a box or a mask; the prompt's mask is the first answer, else the box's segmentation."""
+        """Start from a box or a mask; the prompt's mask is the first estimate, else the box's segmentation."""
         if clip_box(prompt.box, frame.image.shape) is None:
             raise InputError(
                 f"The box {prompt.box} lies outside {frame.name or 'the first frame'}; give a box inside it."
@@ -110,14 +118,14 @@ class FlowTracker:
         return self._segmentation.estimate
 
     def step(self, frame: Frame) -> MaskEstimate:
-        """Answer for the next frame."""
+        """Estimate the mask in the next frame."""
         if self._segmentation is None:
-            raise PluginError("The tracker flow was asked for a frame before it was started with init.")
+            raise PluginError("The tracker flow must be started with init before it tracks a frame.")
         self._witnessed = self._witness.update(frame.image) if self._witness else None
         return self._segmentation.step(frame.image, self._witnessed)
 
     def correct(self, frame: Frame, mask: NDArray[np.bool_]) -> None:
-        """Go on from ``mask`` ``(H, W)`` in ``frame``, the witness too if it has strayed."""
+        """Continue from ``mask`` ``(H, W)`` in ``frame``; re-initialize the box tracker too if it has drifted."""
         box = box_of(mask)
         if box is None or self._segmentation is None:
             return

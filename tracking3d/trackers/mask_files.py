@@ -1,4 +1,4 @@
-"""Masks on disk, whatever holds them: opened cheaply, decoded one at a time."""
+"""Masks on disk in any supported form: opened cheaply, decoded one at a time."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class MaskFiles(Protocol):
     """Masks in their natural order.
 
     Attributes:
-        names: What each mask is called, without folder and suffix; empty where masks are only in order.
+        names: What each mask is called, without folder and suffix; empty if masks are only in order.
     """
 
     names: Sequence[str]
@@ -57,7 +57,7 @@ def open_masks(path: Path, object: int | None = None) -> MaskFiles:
     """
     if not path.exists():
         raise InputError(
-            f"There are no masks at {path}; give a folder, a video, an .npz or an .npy file, COCO's .json or "
+            f"{path} holds no masks; give a folder, a video, an .npz or an .npy file, COCO's .json or "
             "VOT's .txt."
         )
     if path.is_dir():
@@ -69,7 +69,7 @@ def open_masks(path: Path, object: int | None = None) -> MaskFiles:
     if suffix == ".json":
         return CocoMasks(path, object)
     if object is not None:
-        raise InputError(f"{path} holds masks of one object; leave out which one is meant (object {object}).")
+        raise InputError(f"{path} holds masks of one object; leave out the object number ({object}).")
     if suffix == ".txt":
         return RegionMasks(path)
     return ArrayMasks(path) if suffix in (".npy", ".npz") else VideoMasks(path)

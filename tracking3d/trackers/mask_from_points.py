@@ -1,4 +1,5 @@
-"""The first mask from points on the object and beside it: geodesic distances, then GrabCut with the points as seeds."""
+"""The first mask from points on the object and the background: geodesic distances, then GrabCut with the points as
+seeds."""
 
 from __future__ import annotations
 
@@ -14,7 +15,7 @@ from tracking3d.trackers.colour_models import lab
 from tracking3d.trackers.crops import box_of, crop_window, inside_frame, paste_mask
 
 Points = NDArray[np.float32]
-"""``(N, 3)``: x, y in pixels of the image, and 1 on the object or 0 beside it."""
+"""``(N, 3)``: x, y in pixels of the image, and 1 for the object or 0 for the background."""
 
 _WHOLE, _SIZE = (
     200,
@@ -33,7 +34,7 @@ def mask_from_points(image: Image, points: Points) -> NDArray[np.float32]:
     """Segment the object that points tell of in an RGB ``image`` ``(H, W, 3)``; deterministic.
 
     A pixel begins as the object's where the way to a point on it, which is long across edges, is shorter than that to
-    a point beside it or to the frame's border. From there the colours decide (GrabCut) in the whole frame, and once
+    a background point or to the frame's border. From there the colours decide (GrabCut) in the whole frame, and once
     more about the outline at a finer resolution. Only parts with a point on them stay.
 
     Args:
@@ -119,7 +120,8 @@ def _grab_cut(
     beside: NDArray[np.bool_],
     inside: NDArray[np.bool_],
 ) -> NDArray[np.bool_]:
-    """The object by its colours, as far as it hangs together with a point on it; what is likely where they are flat."""
+    """The object by its colours, as far as it is connected to an object point; the likely pixels if colours are
+    uniform."""
     labels = np.where(likely, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     labels[~inside | beside] = cv2.GC_BGD
     labels[on & inside] = cv2.GC_FGD

@@ -63,7 +63,7 @@ class ImageMasks:
         self.names: Sequence[str] = [file.stem for file in self._files]
         if not any(self.shape(position) for position in range(len(files))):
             raise InputError(
-                f"No image in {path} can be read as a mask; put one mask a frame there, as PNG for example."
+                f"No image in {path} can be read as a mask; give one mask per frame, for example as PNG."
             )
 
     def label(self, position: int) -> str:
@@ -71,7 +71,7 @@ class ImageMasks:
         return str(self._files[position])
 
     def shape(self, position: int) -> tuple[int, int] | None:
-        """``(H, W)`` by the file's header alone, or None where it cannot be read."""
+        """``(H, W)`` by the file's header alone, or None if it cannot be read."""
         try:
             with warnings.catch_warnings(action="ignore"), Pillow.open(self._files[position]) as image:
                 return image.height, image.width
@@ -98,7 +98,7 @@ def split_object(path: Path) -> tuple[Path, int | None]:
 
 
 def of_objects(numbers: Collection[Any], chosen: int | None, path: Path) -> Any:
-    """Which of the objects of a file is meant; None where there is none at all.
+    """Which of the objects of a file is meant; None if there is none at all.
 
     Raises:
         InputError: If the chosen one is not there, or there are several and none is chosen.
@@ -108,7 +108,7 @@ def of_objects(numbers: Collection[Any], chosen: int | None, path: Path) -> Any:
         raise InputError(f"{path} has no object {chosen}; it has {listed or 'none'}.")
     if chosen is None and len(numbers) > 1:
         raise InputError(
-            f"{path} has several objects ({listed}); say which one, as in {path}@{min(numbers, key=str)}."
+            f"{path} has several objects ({listed}); choose one, as in {path}@{min(numbers, key=str)}."
         )
     return chosen if chosen is not None else next(iter(numbers), None)
 
@@ -123,7 +123,7 @@ def objects_in(path: Path) -> list[int]:
         with warnings.catch_warnings(action="ignore"), Pillow.open(path) as image:
             found = np.unique(_numbers_in(image))
     except Exception as error:  # decoders raise whatever a damaged file leads them to
-        raise InputError(f"{path} cannot be read as an image of numbered objects.") from error
+        raise InputError(f"{path} cannot be read as an image with object numbers.") from error
     return [int(number) for number in found if number not in (0, 255)]
 
 

@@ -1,4 +1,4 @@
-"""Where the last mask has moved, by dense optical flow and a similarity, and what moves with it.
+"""The motion of the last mask, by dense optical flow and a similarity, and the pixels consistent with it.
 
 Everything is in the pixels of two equally large crops, the last frame's and the present one's.
 """
@@ -36,7 +36,7 @@ class MaskMotion:
         cue: ``(S, S)`` float32 pixels: how much better a pixel's motion fits the object's affine motion than
             the background's; 0 where it cannot be told.
         background: ``(3, 3)``, the background's homography from present to last pixels, a similarity where that
-            explains as much; None where it cannot be told.
+            explains as much; None if it cannot be told.
     """
 
     source: NDArray[np.float32]
@@ -114,7 +114,7 @@ def _background_motion(
     selected: NDArray[np.bool_],
     shift: tuple[float, float],
 ) -> NDArray[np.float64] | None:
-    """``(3, 3)`` from present to last pixels ``(S, S, 2)``, by those that are selected; None where they are too few."""
+    """``(3, 3)`` from present to last pixels ``(S, S, 2)``, by those that are selected; None if they are too few."""
     pick = selected[::_STRIDE, ::_STRIDE]
     if np.count_nonzero(pick) < _LEAST:
         return None

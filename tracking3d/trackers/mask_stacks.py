@@ -70,7 +70,7 @@ class _Members(Sequence[NDArray]):
 def _plane(array: NDArray) -> NDArray:
     plane = np.squeeze(array, axis=tuple(a for a in (0, -1) if array.ndim == 3 and array.shape[a] == 1)[:1])
     if plane.ndim != 2 or not plane.size or plane.dtype.kind not in "biuf":
-        raise ValueError(f"no mask: shape {array.shape}, type {array.dtype}")
+        raise ValueError(f"not a mask: shape {array.shape}, type {array.dtype}")
     return plane
 
 

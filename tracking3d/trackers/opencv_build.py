@@ -1,4 +1,4 @@
-"""Which OpenCV is installed: several wheels bring the module ``cv2``, and not all have what trackers need."""
+"""Which OpenCV is installed: several wheels provide the module ``cv2``, and not all contain what trackers need."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from operator import attrgetter
 import cv2
 
 CONTRIB = "opencv-contrib-python-headless"
-"""The wheel that tracking3d asks for."""
+"""The wheel that tracking3d requires."""
 
 _WHEELS = ("opencv-python", "opencv-python-headless", "opencv-contrib-python", CONTRIB)
 
@@ -27,7 +27,7 @@ def why_no_contrib(*names: str) -> str:
         return ""
     installed = [wheel for wheel in _WHEELS if _is_installed(wheel)]
     remove = f"`pip uninstall -y {' '.join(installed)}`, then " if installed else ""
-    return f"the OpenCV in use has no {', '.join(absent)}: {remove}`pip install {CONTRIB}`"
+    return f"the installed OpenCV lacks {', '.join(absent)}: {remove}`pip install {CONTRIB}`"
 
 
 def _has(name: str) -> bool:

@@ -1,4 +1,4 @@
-"""What an outline says: a prior from where it may have moved to, its two sides, and a tidy mask.
+"""Outlines: a prior from the possible motion of the outline, its two sides, and a clean mask.
 
 All masks are those of one square crop, ``(S, S)``, and lengths are in its pixels.
 """
@@ -60,7 +60,7 @@ def both_sides(mask: NDArray) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
 
 
 def touches_border(mask: NDArray[np.bool_], in_frame: NDArray[np.bool_]) -> bool:
-    """Whether ``mask`` reaches the border of the frame, where the crop ``in_frame`` shows it."""
+    """Whether ``mask`` reaches the border of the frame inside the crop, given by ``in_frame``."""
     within = cv2.erode(in_frame.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     return bool((mask & in_frame & ~within).any())
 

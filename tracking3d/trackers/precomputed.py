@@ -1,4 +1,4 @@
-"""Masks that another program has made, as a mask tracker."""
+"""Mask tracker ``precomputed``: masks from another program."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ class PrecomputedMasks:
 
         path: str = Field(
             description=(
-                "Folder of images, video, .npz or .npy file; object where above half or above 0. Or COCO's JSON, or a "
-                "text file of VOT."
+                "Folder of images, video, .npz or .npy file; values above half or above 0 are the object. "
+                "Or a COCO JSON or VOT text file."
             )
         )
         object: int | None = Field(
             None,
             ge=0,
-            description="Which object, where files hold several: its palette index, or COCO's number.",
+            description="The object if files hold several: its palette index, or COCO's number.",
         )
 
     def __init__(self, masks: MaskFiles) -> None:
@@ -55,16 +55,16 @@ class PrecomputedMasks:
 
     @classmethod
     def from_options(cls, options: BaseModel) -> Self | PrecomputedBoxes:
-        """Open the masks at ``options.path``, or boxes; raises `InputError` where there are none."""
+        """Open the masks at ``options.path``, or boxes; raises `InputError` if there are none."""
         if not isinstance(options, PrecomputedMasks.Options):
-            raise PluginError("The tracker precomputed was built with options that are not its own.")
+            raise PluginError("The tracker precomputed was given the options of another tracker.")
         masks = open_masks(Path(options.path), options.object)
         if isinstance(masks, RegionMasks) and masks.has_rectangles:
             return PrecomputedBoxes(masks)
         return cls(masks)
 
     def init(self, frame: Frame, prompt: Prompt) -> MaskEstimate:
-        """The first frame's mask; the prompt's where there is none.
+        """The first frame's mask; the prompt's if there is none.
 
         Raises:
             InputError: If a mask's proportions are not the frame's.
@@ -80,24 +80,22 @@ class PrecomputedMasks:
         return estimate
 
     def step(self, frame: Frame) -> MaskEstimate:
-        """The frame's mask, or an estimate without one where there is a gap.
+        """The frame's mask, or an estimate without a mask if it is missing.
 
         Raises:
             InputError: If the mask's proportions are not the frame's.
         """
         if self._find is None:
-            raise PluginError(
-                "The tracker precomputed was asked for a frame before it was started with init."
-            )
+            raise PluginError("The tracker precomputed must be started with init before it tracks a frame.")
         position = self._find(frame)
         if position is None:
-            return MaskEstimate(None, 0.0, "no mask was given for this frame")
+            return MaskEstimate(None, 0.0, "there is no mask for this frame")
         try:
             mask = self._masks.read(position)
         except UnreadableMaskError as error:
             return MaskEstimate(None, 0.0, str(error))
         if mask is None:
-            return MaskEstimate(None, 0.0, "no mask was given for this frame")
+            return MaskEstimate(None, 0.0, "there is no mask for this frame")
         if not mask.any():
             return MaskEstimate(None, 0.0, f"the mask {self._masks.label(position)} is empty")
         self._check(mask.shape, position, frame)
@@ -135,7 +133,7 @@ def match_masks(names: Sequence[str], first: Frame) -> Callable[[Frame], int | N
     3. Else by order: mask n belongs to frame n of the source.
 
     Args:
-        names: The masks' names, in order; empty where they have none.
+        names: The masks' names, in order; empty if they have none.
         first: The first frame.
 
     Returns:
@@ -162,7 +160,7 @@ def _last_number(frame: Frame) -> int | None:
 
 
 def _numbers(names: Sequence[str]) -> list[int]:
-    """The number that tells the names apart, the last such; none where no number does."""
+    """The number that distinguishes the names, the last one; empty if there is none."""
     found = [[int(digits) for digits in re.findall(r"\d+", name)] for name in names]
     for place in range(1, min(map(len, found), default=0) + 1):
         numbers = [row[-place] for row in found]

@@ -1,4 +1,4 @@
-"""Boxes that another program has made: the object is segmented within them by its colours."""
+"""Boxes from another program: the object is segmented in them by its colours."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class PrecomputedBoxes:
         self._segmentation: ColourSegmentation | None = None
 
     def init(self, frame: Frame, prompt: Prompt) -> MaskEstimate:
-        """The mask in the first frame's box; the prompt's mask where there is one.
+        """The mask in the first frame's box; the prompt's mask if there is one.
 
         Raises:
             InputError: If that box lies outside the frame.
@@ -43,13 +43,11 @@ class PrecomputedBoxes:
     def step(self, frame: Frame) -> MaskEstimate:
         """The mask in the frame's box; without a box, what the segmentation finds by itself, not to be relied on."""
         if self._segmentation is None:
-            raise PluginError(
-                "The tracker precomputed was asked for a frame before it was started with init."
-            )
+            raise PluginError("The tracker precomputed must be started with init before it tracks a frame.")
         box = self._regions.box(frame.index)
         estimate = self._segmentation.step(frame.image, box)
         if box is None and estimate.mask is not None:
             return MaskEstimate(
-                np.asarray(estimate.mask, np.float32), estimate.score / 2, "no box was given for this frame"
+                np.asarray(estimate.mask, np.float32), estimate.score / 2, "there is no box for this frame"
             )
         return estimate

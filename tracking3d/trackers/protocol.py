@@ -35,11 +35,11 @@ class MaskTracker(Protocol):
         ...
 
     def init(self, frame: Frame, prompt: Prompt) -> MaskEstimate:
-        """Start on the first frame from a box or a mask, and answer for that frame."""
+        """Start on the first frame from a box or a mask, and estimate the mask in that frame."""
         ...
 
     def step(self, frame: Frame) -> MaskEstimate:
-        """Answer for the next frame."""
+        """Estimate the mask in the next frame."""
         ...
 
 
@@ -54,7 +54,7 @@ class CorrectableTracker(Protocol):
 
 @runtime_checkable
 class ForewarnedTracker(Protocol):
-    """A mask tracker that can begin with a frame while the answer for the one before is still worked on."""
+    """A mask tracker that can begin with a frame while the estimate for the one before is still worked on."""
 
     def announce(self, frame: Frame) -> None:
         """``step`` will be called with ``frame`` next, if at all; a correction may come before."""
@@ -65,17 +65,17 @@ class ForewarnedTracker(Protocol):
 class ResumableTracker(Protocol):
     """A mask tracker that can be asked for its memory, and be given it again in another process.
 
-    A stopped run goes on without it too: the tracker is then taken through the frames again, which is as good where
-    it gives the same answers, but takes as long as it did.
+    A stopped run can be resumed without it too: the tracker then runs through the frames again, which gives the same
+    result if it is deterministic, but takes as long as before.
     """
 
     def state(self) -> Any:
-        """All that later answers depend on, beside the first frame: numpy arrays, lists, dicts and plain values.
+        """All that later estimates depend on, beside the first frame: numpy arrays, lists, dicts and plain values.
 
-        What was given out never changes afterwards.
+        A returned state never changes afterwards.
         """
         ...
 
     def restore(self, frame: Frame, prompt: Prompt, state: Any) -> None:
-        """Be what ``state`` tells of; ``frame`` and ``prompt`` are those that ``init`` was given."""
+        """Restore ``state``; ``frame`` and ``prompt`` are those that ``init`` was given."""
         ...

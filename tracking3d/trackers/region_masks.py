@@ -51,7 +51,7 @@ class RegionMasks:
         return rasterise(self.regions[position], self._size)
 
     def box(self, position: int) -> Box | None:
-        """The box around region ``position``; None beyond the last, and where there is none."""
+        """The box around region ``position``; None beyond the last, and if there is none."""
         return bounding_box(self.regions[position]) if position < len(self.regions) else None
 
 
@@ -63,25 +63,25 @@ def box_in_file(path: Path, index: int, label: str) -> Box:
     """
     box = RegionMasks(path).box(index)
     if box is None:
-        raise InputError(f"{label} has no box in its line {index + 1}, which is that of frame {index}.")
+        raise InputError(f"{label} has no box in line {index + 1} for frame {index}.")
     return box
 
 
 def _read(path: Path) -> list[Region]:
     try:
         if path.stat().st_size > _LONGEST:
-            raise InputError(f"{path} is longer than {_LONGEST >> 30} GiB, which is too much for regions.")
+            raise InputError(f"{path} is larger than {_LONGEST >> 30} GiB, too large for regions.")
         lines = path.read_text(encoding="utf-8-sig").rstrip().splitlines()
     except (OSError, ValueError) as error:
-        raise InputError(f"The regions {path} cannot be read as text; restore the file.") from error
+        raise InputError(f"The regions file {path} cannot be read as text; restore it.") from error
     if not lines:
-        raise InputError(f"The regions {path} are empty; give one region a line.")
+        raise InputError(f"The regions file {path} is empty; give one region per line.")
     regions = []
     for number, line in enumerate(lines, 1):
         try:
             regions.append(parse_region(line))
         except (ValueError, OverflowError) as error:
             raise InputError(
-                f"{path}, line {number}: {error}; give a rectangle, polygon or mask of VOT in every line."
+                f"{path}, line {number}: {error}; give a VOT rectangle, polygon or mask in every line."
             ) from error
     return regions

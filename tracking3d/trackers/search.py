@@ -1,4 +1,4 @@
-"""Finding the object again, anywhere in the frame, by the colours that it had at first."""
+"""Re-detection of the object anywhere in the frame by its initial colours."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def find_by_colours(
 
     Returns:
         The mask ``(size, size)`` in a window, the window, and how well its colours tell it from its surroundings,
-        in [-1, 1]; None where nothing of a possible size has such colours.
+        in [-1, 1]; None if nothing of a possible size has such colours.
     """
     scale = min(_OVERVIEW / max(image.shape[:2]), 1.0)
     overview = lab(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))

@@ -1,10 +1,11 @@
-"""Temporally consistent segmentation of one object: the last mask moved along, colours and background kept.
+"""Temporally consistent segmentation of one object: the last mask is propagated, models of colours and background are
+kept.
 
-GrabCut gives the first mask. From then on every pixel of a crop around the object collects log-odds from where
-the last mask has moved to, from global and local colours that are kept, from how the pixel moves, from whether it
-has changed against the background, and from a box tracker's box where there is one; an edge-aware smoother, far
-cheaper than a graph cut, turns them into a mask. The box is a *witness*, not the master: the object is segmented
-anew from it only when the mask looks lost. Any box tracker will do. Everything is deterministic and causal.
+GrabCut gives the first mask. From then on every pixel of a crop around the object collects log-odds from where the last
+mask has moved to, from global and local colours that are kept, from how the pixel moves, from whether it has changed
+against the background, and from a box tracker's box if there is one; an edge-aware smoother, far cheaper than a graph
+cut, turns them into a mask. The box only supports the mask: the object is segmented again from it only if the mask
+looks lost. Any box tracker will do. Everything is deterministic and causal.
 """
 
 from __future__ import annotations
@@ -29,13 +30,13 @@ from tracking3d.trackers.outline import both_sides, inside_distance, remove_spec
 from tracking3d.trackers.search import find_by_colours
 
 SMOOTHER = "ximgproc.fastGlobalSmootherFilter"
-"""What the segmentation needs of OpenCV's contrib modules, see `tracking3d.trackers.opencv_build`."""
+"""OpenCV contrib modules that the segmentation needs, see `tracking3d.trackers.opencv_build`."""
 
 _MARGIN = 0.45  # free space around the last box: how far the mask may move or grow in one frame
-_AREA_CHANGE = 0.35  # a larger relative change against the moved mask is not believed
-_LEAST_PART = 0.1  # of the usual area; less of it at the frame's border is out of sight
+_AREA_CHANGE = 0.35  # a larger relative change against the moved mask is not trusted
+_LEAST_PART = 0.1  # of the usual area; less than this at the frame's border counts as not visible
 _LEAST_PIXELS = 9  # of the crop; fewer are no mask
-_PATIENCE = 3  # doubtful frames in a row before each attempt to begin anew
+_PATIENCE = 3  # doubtful frames in a row before each attempt to re-initialize
 _SLACK = 0.1  # of a box's sides: it may be drawn too small
 _FAR = 0.3  # of the root of the area: what is further from the mask is background
 _PARTED = 3.0  # pixels by which something moved as the background does rather than with the object, to be it
@@ -85,9 +86,9 @@ class ColourSegmentation:
 
     @property
     def estimate(self) -> MaskEstimate:
-        """The latest frame's mask and score, or no mask and the reason where the object is out of sight."""
+        """The latest frame's mask and score, or no mask and a reason if the object is not visible."""
         if box_of(self._mask) is None:
-            return MaskEstimate(None, 0.0, "the object is out of sight")
+            return MaskEstimate(None, 0.0, "the object is not visible")
         return MaskEstimate(self._mask, self._judgement.score, self._judgement.doubt)
 
     def correct(self, image: Image, mask: NDArray[np.bool_]) -> None:
@@ -109,7 +110,7 @@ class ColourSegmentation:
 
         Args:
             image: ``(H, W, 3)`` uint8 RGB.
-            witness: ``(x, y, w, h)``, a box tracker's opinion, or None where there is none.
+            witness: ``(x, y, w, h)``, a box tracker's opinion, or None if there is none.
         """
         witness = None if witness is None else clip_box(witness, image.shape)
         box = box_of(self._mask)
@@ -179,7 +180,7 @@ class ColourSegmentation:
     def _restart(
         self, image: Image, witness: Box, mask: NDArray[np.float32], judgement: Judgement
     ) -> _Answer:
-        """Segment from the witness's box; keep the old mask unless the new one looks more like the object."""
+        """Segment from the box tracker's box; keep the old mask unless the new one looks more like the object."""
         fresh = mask_in_box(image, witness)
         view = FrameCrop.of(image, Window.around(witness, _MARGIN, self._size))
         separation = self._separation(view, crop_window(fresh, view.window))

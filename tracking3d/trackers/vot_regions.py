@@ -90,7 +90,7 @@ def parse_region(text: str) -> Region:
         return Rectangle(*numbers)
     if len(numbers) >= 6 and len(numbers) % 2 == 0:
         return Polygon(tuple(zip(numbers[::2], numbers[1::2], strict=True)))
-    raise ValueError(f"{len(numbers)} numbers are no region")
+    raise ValueError(f"{len(numbers)} numbers are not a region")
 
 
 def parse_numbers(text: str) -> list[float]:
@@ -104,7 +104,7 @@ def parse_numbers(text: str) -> list[float]:
         try:
             numbers.append(float(token))
         except ValueError as error:
-            raise ValueError(f"{token!r} is no number" if token else "a number is missing") from error
+            raise ValueError(f"{token!r} is not a number" if token else "a number is missing") from error
     return numbers
 
 
@@ -168,7 +168,7 @@ def rasterise(region: Region, shape: tuple[int, int]) -> NDArray[np.bool_]:
 
 
 def bounding_box(region: Region) -> Box | None:
-    """``(x, y, width, height)`` around it, not cut off at the frame; None where it has no area."""
+    """``(x, y, width, height)`` around it, not cut off at the frame; None if it has no area."""
     box = 0.0, 0.0, 0.0, 0.0
     match region:
         case Rectangle():
@@ -189,13 +189,13 @@ def _parse_mask(tokens: list[str]) -> EncodedMask:
     try:
         numbers = np.array(tokens).astype(np.int64)
     except (ValueError, OverflowError) as error:
-        raise ValueError("a mask holds whole numbers only") from error
+        raise ValueError("a mask must hold only whole numbers") from error
     if len(numbers) < 5:
-        raise ValueError("a mask is x, y, width, height and runs")
+        raise ValueError("a mask needs x, y, width, height and runs")
     left, top, width, height = numbers[:4].tolist()
     runs = numbers[4:]
     if min(width, height) < 0 or (runs < 0).any():
-        raise ValueError("a mask has no negative sizes and runs")
+        raise ValueError("a mask must not have negative sizes or runs")
     if width * height > _MOST_PIXELS:
         raise ValueError(f"the mask's box of {width} x {height} pixels is larger than any frame")
     if runs.sum() > width * height:

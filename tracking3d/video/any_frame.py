@@ -1,4 +1,4 @@
-"""Any frame of a video, decoded when it is asked for."""
+"""Random access to the frames of a video, decoded on demand."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from tracking3d.video.source import FrameSource
 from tracking3d.video.video_file import VideoFile, video_stream
 
 MOST_KEPT = 128 * 2**20
-"""Bytes of decoded frames that are kept for when they are asked for again."""
+"""Size in bytes of the cache of decoded frames."""
 _INDEXED = frozenset({"mp4", "matroska"})
-"""Containers that say of every packet when it is shown, and of which pictures need no other."""
+"""Containers that give the display time of every packet and mark keyframes."""
 
 
 class FrameImages(Protocol):
     """Gives the picture of a frame by its index."""
 
     def image(self, index: int) -> Image | None:
-        """``(H, W, 3)``, or None where there is none."""
+        """``(H, W, 3)``, or None if there is none."""
         ...
 
 
@@ -54,7 +54,7 @@ class KeptImages:
 
     Args:
         decode: Gives the picture of a frame, or None.
-        count: Number of all frames of the source, where it is known.
+        count: Number of all frames of the source, if known.
     """
 
     def __init__(self, decode: Callable[[int], Image | None], count: int | None) -> None:
@@ -64,7 +64,7 @@ class KeptImages:
         self._lock = threading.Lock()
 
     def image(self, index: int) -> Image | None:
-        """The frame ``(H, W, 3)``, or None where there is none."""
+        """The frame ``(H, W, 3)``, or None if there is none."""
         with self._lock:
             if index in self._kept:
                 self._kept.move_to_end(index)
@@ -89,7 +89,7 @@ class ImageFiles:
         self._files = sequence.files
 
     def image(self, index: int) -> Image | None:
-        """The frame ``(H, W, 3)``, or None where it cannot be read."""
+        """The frame ``(H, W, 3)``, or None if it cannot be read."""
         try:
             return read_image(self._files[index]) if 0 <= index < len(self._files) else None
         except InputError:
@@ -122,11 +122,11 @@ class VideoPictures:
 
     @property
     def count(self) -> int:
-        """Number of pictures; 0 where the file has no times to count them by."""
+        """Number of pictures; 0 if the file has no time stamps."""
         return len(self._times)
 
     def image(self, index: int) -> Image | None:
-        """The frame ``(H, W, 3)``, or None where it cannot be decoded."""
+        """The frame ``(H, W, 3)``, or None if it cannot be decoded."""
         if not self._times:
             return self._counted(index)
         if not 0 <= index < len(self._times):
@@ -138,7 +138,7 @@ class VideoPictures:
             return None
 
     def _presentation_times(self) -> list[int]:
-        """Of all pictures, in the order in which they are shown; none where they are not to be relied on."""
+        """Time stamps of all pictures in display order; none if they are unreliable."""
         if self._video.interlaced or not _INDEXED & set(self._container.format.name.split(",")):
             return []  # a picture that is made of its neighbours' lines is not found alone
         try:
@@ -172,13 +172,13 @@ class VideoPictures:
             return None
 
     def _pictures(self) -> Iterator[av.VideoFrame]:
-        """From where the file stands, those that can be decoded."""
+        """The decodable pictures from the present position."""
         for packet in self._container.demux(self._stream):
             with suppress(FFmpegError):
                 yield from (picture for picture in packet.decode() if isinstance(picture, av.VideoFrame))
 
     def _counted(self, index: int) -> Image | None:
-        """The frame by reading on to it, or from the beginning where it is behind."""
+        """The frame by reading on to it, or from the beginning if it lies before the present position."""
         if index < self._next:
             self._reading, self._next = iter(()), 0
         if not self._next:

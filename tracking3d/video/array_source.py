@@ -31,7 +31,7 @@ class ArraySource:
 
     images: Iterable[Any]
     selection: range = EVERY_FRAME
-    name: str = "the frame iterable"
+    name: str = "the iterable of frames"
     rate: float | None = None
     intrinsics: Intrinsics | None = None
     intrinsics_origin: str = ""

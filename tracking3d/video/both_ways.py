@@ -11,10 +11,10 @@ from tracking3d.errors import InputError, argument
 from tracking3d.frames import Frame, SkippedFrame
 
 START_FRAME = argument("start_frame=", "--start-frame ")
-"""What sentences call the frame in the middle, before its number."""
+"""Name in messages of the start frame, before its number."""
 _OPTION = argument("start_frame=", "--start-frame")
 MOST_BYTES = 512 << 20
-"""Memory for frames that are held, so as to give them backwards; a longer beginning is read more than once."""
+"""Memory in bytes for frames that are played backwards; a longer beginning is read more than once."""
 
 Item = Frame | SkippedFrame
 
@@ -26,11 +26,11 @@ def check_start_frame(start: Any, repeatable: bool, name: str) -> None:
         InputError: If not.
     """
     if not isinstance(start, int) or isinstance(start, bool) or start < 0:
-        raise InputError(f"{START_FRAME}{start!r:.40} is no index of a frame; frames count from 0.")
+        raise InputError(f"{START_FRAME}{start!r:.40} is not a frame index; frames count from 0.")
     if not repeatable:
         raise InputError(
-            f"{name} comes once only and cannot be gone through backwards; leave out {_OPTION} and "
-            "begin with the frame in which the object is given."
+            f"{name} can be read only once and cannot be tracked backwards; leave out {_OPTION} and start "
+            "with the frame in which the object is given."
         )
 
 
@@ -55,9 +55,7 @@ def both_ways(again: Callable[[], Iterable[Item]], start: int, name: str) -> Gen
             began = True
             yield item
     if not began:
-        raise InputError(
-            f"{START_FRAME}{start} is not among the frames of {name}, or not among those that were selected."
-        )
+        raise InputError(f"{START_FRAME}{start} is not among the selected frames of {name}.")
     yield from backwards(again, start)
 
 

@@ -1,11 +1,11 @@
-"""How many threads FFmpeg may take: it asks no library's setting, and with a process a core it must take one."""
+"""The number of FFmpeg threads: it follows no library's setting, and must be one if there is a process per core."""
 
 from __future__ import annotations
 
 import os
 
 VARIABLE = "OMP_NUM_THREADS"
-"""Environment variable that says how many threads the libraries of a process take."""
+"""Environment variable with the number of threads of libraries in a process."""
 
 
 def codec_threads() -> int:

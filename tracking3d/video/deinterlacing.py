@@ -1,4 +1,4 @@
-"""Whole pictures from interlaced ones, whose odd and even lines were taken at different moments."""
+"""Deinterlacing of pictures whose odd and even lines were taken at different times."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reading one image file of any common kind as RGB, and what its EXIF data say about the lens."""
+"""Reading an image file as RGB, and the focal length from its EXIF data."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def read_exif_intrinsics(path: Path) -> tuple[Intrinsics, str] | None:
     (CIPA DCG-001), so ``f = f35 * diagonal in pixels / 43.27``; the principal point is the centre.
 
     Returns:
-        ``((fx, fy, cx, cy), origin)`` in pixels of the upright image, or None where the file does not tell.
+        ``((fx, fy, cx, cy), origin)`` in pixels of the upright image, or None if the file does not tell.
     """
     try:
         with _open(path) as image:
@@ -70,7 +70,7 @@ def read_exif_intrinsics(path: Path) -> tuple[Intrinsics, str] | None:
             width, height = image.size
             if _orientation(image) >= 5:
                 width, height = height, width
-    except Exception:  # no answer is a fine answer; read_image reports damaged files
+    except Exception:  # None is fine here; read_image reports damaged files
         return None
     if not 0 < focal_length < math.inf:
         return None

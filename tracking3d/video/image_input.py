@@ -1,4 +1,4 @@
-"""Pictures of whatever kind the caller has, as the arrays that everything here works on."""
+"""Conversion of the caller's images to RGB arrays."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tracking3d.frames import Image
 from tracking3d.video.image_file import read_image
 
 WANTED = "(H, W, 3) arrays of uint8, RGB"
-"""What sentences ask for; the other kinds are named by the documentation."""
+"""The input that messages ask for; the documentation names the other kinds."""
 
 
 def validate_image(image: Any, position: int) -> Image:

@@ -32,7 +32,7 @@ class ImageSequence:
     See `tracking3d.video.source.FrameSource` for the other attributes.
 
     Attributes:
-        rate: Images per second of all files, selected or not, which their times are counted by; None where nobody
+        rate: Images per second of all files, selected or not, which their times are counted by; None if nobody
             knows.
     """
 
@@ -59,7 +59,7 @@ class ImageSequence:
         files = tuple(images_among(paths))
         if not files:
             raise InputError(
-                f"{name} holds no image; give a folder or pattern of {', '.join(sorted(SUFFIXES))} files."
+                f"{name} holds no images; give a folder or pattern of {', '.join(sorted(SUFFIXES))} files."
             )
         wanted = within(selection, len(files))
         if not wanted:
@@ -72,7 +72,7 @@ class ImageSequence:
 
     @property
     def fps(self) -> float | None:
-        """Selected images per second, where somebody has said."""
+        """Selected images per second, if given."""
         return None if self.rate is None else self.rate / self.selection.step
 
     @property

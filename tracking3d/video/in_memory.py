@@ -1,4 +1,4 @@
-"""The frames that a caller of the library has, in whatever form, as a source."""
+"""A frame source from the caller's own frames in memory."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tracking3d.video.image_input import WANTED, validate_image
 from tracking3d.video.opening import open_source
 from tracking3d.video.source import FrameSource, Intrinsics
 
-_KINDS = f"{WANTED}, tensors, Pillow's pictures or paths of images; or the path of a video or folder"
+_KINDS = f"{WANTED}, tensors, Pillow images or paths of images; or the path of a video or folder"
 
 
 def open_frames(frames: Any) -> FrameSource:
@@ -87,7 +87,7 @@ class CapturedFrames:
             InputError: If it is not open.
         """
         if not capture.isOpened():
-            raise InputError("frames= is a VideoCapture that is not open; open it on a file or camera.")
+            raise InputError("frames= is a VideoCapture that is not open; open it with a file or camera.")
         length, start = (
             int(capture.get(what)) for what in (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_POS_FRAMES)
         )
@@ -120,10 +120,10 @@ class CapturedFrames:
                     self._first = rgb
                 elif self.repeatable and not np.array_equal(self._first, rgb):
                     raise InputError(
-                        f"{self.name} shows another picture when it is taken back to frame {self.start}; give the path "
-                        "of the video."
+                        f"{self.name} cannot be rewound to frame {self.start}: another image is there; give "
+                        "the path of the video."
                     )
             yield Frame(index, rgb, time=index / self.fps if self.fps else None, name=f"frame {index}")
             index += 1
         if not index:
-            raise InputError(f"{self.name} has no frame left that can be read.")
+            raise InputError(f"{self.name} has no readable frame left.")

@@ -46,7 +46,7 @@ class LatestFrames:
     def __post_init__(self) -> None:
         if self.rate is not None and not (isinstance(self.rate, Real) and 0 < self.rate < float("inf")):
             raise InputError(
-                f"A source cannot be played at {self.rate!r:.60} frames a second; give a positive rate."
+                f"A source cannot be played at {self.rate!r:.60} frames per second; give a positive rate."
             )
 
     @property
@@ -119,7 +119,7 @@ class _Slot:
         self._error: BaseException | None = None
 
     def put(self, item: Frame | SkippedFrame) -> None:
-        """Leave an item; the frame that nobody took is dropped for it, unless it is the first one."""
+        """Leave an item; a frame that was not taken yet is dropped for it, unless it is the first one."""
         with self._changed:
             if isinstance(item, SkippedFrame):
                 self._skipped.append(item)
@@ -138,7 +138,7 @@ class _Slot:
             self._changed.notify()
 
     def stop(self) -> None:
-        """Nobody will take any more."""
+        """No more items will be taken."""
         self.stopped.set()
 
     def take(self) -> list[Frame | SkippedFrame]:
@@ -166,7 +166,7 @@ class _Slot:
 
 
 def _read_frames(frames: Iterable[Frame | SkippedFrame], rate: float | None, slot: _Slot) -> None:
-    """What the thread does: leave item after item, until there is none or nobody takes them."""
+    """The thread's loop: leave item after item until there is none or none is taken any more."""
     error: BaseException | None = None
     iterator: Iterator[Frame | SkippedFrame] = iter(())
     try:

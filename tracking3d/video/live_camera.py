@@ -1,4 +1,4 @@
-"""Frames from a camera that is plugged in: always the newest one, whoever takes them and however slowly."""
+"""Frames from a connected camera: always the newest one, however slow the consumer is."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def _open(number: int) -> cv2.VideoCapture:
         camera = cv2.VideoCapture(number)
     if not camera.isOpened():
         raise InputError(
-            f"Camera {number} cannot be opened; check that it is plugged in and not in use, "
-            "or give a file or folder that exists."
+            f"Camera {number} cannot be opened; check that it is connected and not in use, or give an "
+            "existing file or folder."
         )
     return camera

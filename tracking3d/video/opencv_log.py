@@ -1,4 +1,4 @@
-"""Keeping OpenCV's own messages off the terminal where we say the same in our words."""
+"""Suppressing OpenCV's log messages when an error of our own reports the same."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From what the user names to a frame source."""
+"""Opening a frame source from a path, address or camera number."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ def open_source(
         if fps is None:
             return opened
         if not isinstance(opened, ImageSequence):
-            raise InputError(f"{opened.name} has times of its own; {_FPS} is for images.")
+            raise InputError(f"{opened.name} has its own time stamps; {_FPS} is for images only.")
         return replace(opened, rate=fps)
     if isinstance(source, Iterable):
         return ArraySource(source, selection, rate=fps)
     raise InputError(
-        f"A {type(source).__name__} is no source of frames; give a path or an iterable of RGB arrays."
+        f"A {type(source).__name__} is not a source of frames; give a path or an iterable of RGB arrays."
     )
 
 
@@ -61,7 +61,7 @@ def _validate_fps(fps: float | None) -> float | None:
     number = isinstance(fps, Real) and not isinstance(fps, bool)
     if not number or not LEAST_FPS <= fps <= MOST_FPS:
         raise InputError(
-            f"{_FPS} {fps!r:.40} is no rate of a video; give images per second from {LEAST_FPS:g} to {MOST_FPS:g}."
+            f"{_FPS} {fps!r:.40} is not a frame rate; give images per second from {LEAST_FPS:g} to {MOST_FPS:g}."
         )
     return float(fps)
 
@@ -69,7 +69,7 @@ def _validate_fps(fps: float | None) -> float | None:
 def _open_path(name: str, selection: range) -> FrameSource:
     if not name.strip():
         raise InputError(
-            "The source has no name; give a video file, a folder or pattern of images, or a camera number."
+            "The source is empty; give a video file, a folder or pattern of images, or a camera number."
         )
     path = Path(name).expanduser()
     try:
@@ -85,7 +85,7 @@ def _open_path(name: str, selection: range) -> FrameSource:
         return open_stream(name, selection)
     if scheme is not None and not glob.has_magic(name):
         raise InputError(
-            f"{name} does not exist, and addresses that begin with {scheme}: are not opened; give a path, or an "
+            f"{name} does not exist, and addresses with {scheme}: are not supported; give a path, or an "
             f"address that begins with {', '.join(SCHEMES[:-1])} or {SCHEMES[-1]}."
         )
     if glob.has_magic(name):
@@ -100,5 +100,5 @@ def _open_file(name: str, path: Path, selection: range) -> VideoFile:
     if path.stat().st_size == 0:
         raise InputError(f"{name} is empty; give a video file or a folder of images.")
     if is_still_image(path):
-        raise InputError(f"{name} is a single image; give the folder that it is in, or a video.")
+        raise InputError(f"{name} is a single image; give its folder, or a video.")
     return VideoFile.open(name, path, selection)

@@ -1,4 +1,4 @@
-"""Turning pictures upright: EXIF orientations of images and display matrices of videos are the same eight."""
+"""Rotating images upright: the eight EXIF orientations, which video display matrices share."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from tracking3d.frames import Image
 
 UPRIGHT = 1
-"""The EXIF orientation of a picture that is stored as it is to be seen."""
+"""The EXIF orientation of an image that is stored upright."""
 
 _TURNS: dict[int, Callable[[Image], Image]] = {
     1: lambda image: image,

@@ -15,7 +15,7 @@ from tracking3d.video.tone_mapping import ToneMapping, tone_mapping_of
 
 
 class PictureConverter:
-    """Makes arrays of the pictures of one video; how they are turned and toned is told by the first one."""
+    """Converts the pictures of one video to arrays; the first one determines rotation and tone mapping."""
 
     def __init__(self) -> None:
         # Asked once, because asking PyAV for side data keeps the picture until Python collects cycles.
@@ -51,5 +51,5 @@ def said_of(picture: av.VideoFrame) -> tuple[str, ...]:
     tone_mapping = tone_mapping_of(picture)
     said = [] if tone_mapping is None else [tone_mapping.said]
     if picture.interlaced_frame:
-        said.append("the video is interlaced; every frame was made of its two fields (bwdif)")
+        said.append("the video is interlaced; frames were deinterlaced (bwdif)")
     return tuple(said)

@@ -1,4 +1,4 @@
-"""Which frames of a source are wanted, and in which order files come."""
+"""The selection of frames, and the order of files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tracking3d.errors import InputError, argument
 _FRAMES = argument("frames=", "--frames ")
 
 EVERY_FRAME = range(0, sys.maxsize, 1)
-"""The selection when nothing is asked for."""
+"""The default selection."""
 
 
 def parse_selection(text: str | None) -> range:

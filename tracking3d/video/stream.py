@@ -1,4 +1,4 @@
-"""Videos by their address: files on a web server, and streams that go on, over HTTP(S) and RTSP(S), through FFmpeg.
+"""Videos by address: files on a web server and live streams over HTTP(S) and RTSP(S), through FFmpeg.
 
 A file (whose length the server tells) is read like one on disk; where the connection breaks off, it is taken up again
 where it was. A stream gives its newest frame, as a camera does; where it breaks off it is asked for again, a few times.
@@ -33,13 +33,13 @@ from tracking3d.video.video_decoding import decode_pictures
 from tracking3d.video.video_file import VideoFile, describe_video, frame_of, video_stream
 
 SCHEMES = ("http", "https", "rtsp", "rtsps")
-"""Of the addresses that are opened."""
+"""Schemes of supported addresses."""
 OPENING, READING = 10.0, 10.0
-"""Seconds after which a server that says nothing is given up: at the beginning, and between two packets."""
+"""Timeouts in seconds: for the first data of a server, and between two packets."""
 TRIES = 3
-"""How often a connection that was lost is asked for again, one after the other, before the video is over."""
+"""Number of consecutive attempts to reconnect before the video counts as ended."""
 PAUSE = 1.0
-"""Seconds before the first of these; before each further one twice as long."""
+"""Seconds before the first attempt; the wait doubles before each further one."""
 
 _PROTOCOLS = {
     "http": "http,https,tcp,tls,httpproxy,crypto",
@@ -87,7 +87,7 @@ def open_stream(address: str, selection: range = EVERY_FRAME) -> NetworkFile | L
     except ValueError:
         host = None
     if not host:
-        raise InputError(f"{name} names no server; write it as {scheme}://server/path.")
+        raise InputError(f"{name} contains no server; write it as {scheme}://server/path.")
     with _open(name, address) as container:
         found = describe_video(container, name, Path(address), selection)
         if scheme in ("http", "https") and found.count is not None:
@@ -154,7 +154,9 @@ class LiveStream:
             failed += 1
             if failed > TRIES:
                 _log.warning(
-                    "%s did not come back after %d tries; the run ends with what was seen.", self.name, TRIES
+                    "%s could not be reconnected after %d attempts; the run ends with the frames received.",
+                    self.name,
+                    TRIES,
                 )
                 return
             pause = PAUSE * 2 ** (failed - 1)
@@ -167,7 +169,7 @@ class LiveStream:
         with _open(self.name, self.address) as container:
             stream, convert = video_stream(container), PictureConverter()
             if stream is None:
-                raise InputError(f"{self.name} has no video in it any more.")
+                raise InputError(f"{self.name} no longer contains a video.")
             for picture in deinterlace(decode_pictures(container, stream)):
                 yield picture if isinstance(picture, str) else (picture, convert)
 
@@ -193,8 +195,8 @@ def _open(name: str, address: str) -> InputContainer:
         return av.open(address, options=options, timeout=(OPENING, READING), metadata_errors="ignore")
     except (FFmpegError, OSError, ValueError) as error:
         late = isinstance(error, av.error.ExitError)  # what the time-out ends with
-        reason = "no answer" if late else getattr(error, "strerror", None) or error
+        reason = "no response" if late else getattr(error, "strerror", None) or error
         raise InputError(
-            f"{name} cannot be opened ({reason}); look whether the address is right and the server answers within "
+            f"{name} cannot be opened ({reason}); check the address and that the server responds within "
             f"{OPENING:g} seconds."
         ) from error

@@ -1,4 +1,4 @@
-"""HDR pictures as sRGB: what is brighter than a sheet of white paper is rolled off, wide colours are brought in.
+"""Tone mapping of HDR to sRGB: luminance above diffuse white is compressed, wide colours are converted.
 
 Signals become light in cd/m2 by the transfer function that the video names, PQ (SMPTE ST 2084) or HLG, both in ITU-R
 BT.2100. Light up to `SOURCE_PEAK` is brought below `WHITE` by the EETF of Report ITU-R BT.2390 (5.4.1), by the
@@ -24,7 +24,7 @@ from tracking3d.frames import Image
 WHITE = 203.0
 """cd/m2 of the white of SDR (Report ITU-R BT.2408)."""
 SOURCE_PEAK = 1000.0
-"""cd/m2 that videos are taken to be mastered for."""
+"""Assumed mastering luminance of videos in cd/m2."""
 
 _TO_709 = np.array(
     [[1.660491, -0.587641, -0.072850], [-0.124550, 1.132900, -0.008349], [-0.018151, -0.100579, 1.118730]],
@@ -53,7 +53,7 @@ class ToneMapping:
         """A clause for who looks at the run."""
         colours = "the wide colours of BT.2020" if self.wide else "its colours"
         if self.transfer == "SDR":
-            return f"{colours} were brought into sRGB"
+            return f"{colours} were converted to sRGB"
         how = f"BT.2390, {SOURCE_PEAK:g} to {WHITE:g} cd/m2"
         return f"the video is HDR ({self.transfer}); it was tone-mapped to sRGB ({how})"
 
@@ -75,7 +75,7 @@ class ToneMapping:
 
 
 def tone_mapping_of(picture: av.VideoFrame) -> ToneMapping | None:
-    """What a decoded picture needs to be sRGB; None where it is that already, nearly."""
+    """What a decoded picture needs to be sRGB; None if it is that already, nearly."""
     primaries = getattr(picture, "color_primaries", _UNSPECIFIED)  # older versions of PyAV do not tell
     wide = primaries == _BT2020
     hdr = _HDR.get(getattr(picture, "color_trc", _UNSPECIFIED))

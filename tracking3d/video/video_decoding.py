@@ -21,7 +21,7 @@ def decode_pictures(container: InputContainer, stream: VideoStream) -> Iterator[
     """All pictures of a stream in the order they are shown.
 
     Errors come in decoding order, pictures in presentation order, and some pictures are missing without an
-    error. So each packet waits by its presentation time until a picture answers it; packets that a later
+    error. So each packet waits by its presentation time until a picture with that time arrives; packets that a later
     picture overtakes were not decoded.
 
     Args:
@@ -51,7 +51,7 @@ def decode_pictures(container: InputContainer, stream: VideoStream) -> Iterator[
             if reason and packet.pts is None:
                 yield reason
             elif packet.pts is not None and (reason or (silent and not packet.is_discard)):
-                waiting[packet.pts] = reason or "it cannot be decoded, or needs a picture that cannot"
+                waiting[packet.pts] = reason or "it cannot be decoded, or refers to a frame that cannot"
         for picture in pictures:
             if picture.interlaced_frame:  # a second field may have a packet of its own, which is no picture
                 silent = False
@@ -62,7 +62,7 @@ def decode_pictures(container: InputContainer, stream: VideoStream) -> Iterator[
                 yield from _take(waiting, latest, picture.pts)
                 waiting.pop(picture.pts, None)
                 latest = picture.pts
-            yield "its data are damaged" if picture.is_corrupt else picture
+            yield "its data is damaged" if picture.is_corrupt else picture
     yield from _take(waiting)
     if _breaks_off(stream, packets, end):
         yield f"the video ends after {packets} of {stream.frames} frames; it may be truncated"

@@ -99,9 +99,9 @@ def describe_video(container: InputContainer, name: str, path: Path, selection: 
         raise InputError(f"{name} is not a video; give a video file or a folder of images.")
     stream = video_stream(container)
     if stream is None:
-        raise InputError(f"{name} has no video in it; give a file with a video stream.")
+        raise InputError(f"{name} contains no video; give a file with a video stream.")
     if stream.codec_context is None:
-        raise InputError(f"{name} uses a video codec that is not known here; convert it to H.264 first.")
+        raise InputError(f"{name} uses an unsupported video codec; convert it to H.264 first.")
     frames = _announced_frames(container, stream)
     rate = stream.average_rate or stream.guessed_rate
     first = _first_picture(container, stream)
@@ -127,7 +127,9 @@ def open_container(name: str, path: Path) -> InputContainer:
         return av.open(f"file:{path}", metadata_errors="ignore")
     except (FFmpegError, OSError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise InputError(f"{name} cannot be read as a video; is it complete? ({reason})") from error
+        raise InputError(
+            f"{name} cannot be read as a video ({reason}); check that the file is complete."
+        ) from error
 
 
 def video_stream(container: InputContainer) -> VideoStream | None:
@@ -137,7 +139,7 @@ def video_stream(container: InputContainer) -> VideoStream | None:
 
 
 def _announced_frames(container: InputContainer, stream: VideoStream) -> int | None:
-    """How many frames the header tells of, or the rate makes likely; None where neither is known."""
+    """How many frames the header tells of, or the rate makes likely; None if neither is known."""
     if stream.frames:
         return stream.frames
     if stream.duration and stream.time_base:

@@ -25,7 +25,7 @@ ENCODERS = ("libx264", "libopenh264", "h264_videotoolbox", "h264_mf", "mpeg4")
 _OPTIONS = {"libx264": {"crf": "20", "preset": "veryfast", "tune": "zerolatency"}, "mpeg4": {"qscale": "3"}}
 
 _FRAGMENTED = {"movflags": "+frag_every_frame+empty_moov+default_base_moof", "flush_packets": "1"}
-"""Every frame is a fragment of its own, so that a killed process leaves all but the last of them."""
+"""Every frame is its own fragment, so that a killed process loses only the last one."""
 
 
 class VideoWriter:

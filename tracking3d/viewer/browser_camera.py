@@ -1,4 +1,4 @@
-"""Where the browser looks at the scene from."""
+"""The camera of the browser's 3D view."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def aside_of(path: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _mean_direction(path: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Where the cameras are, seen from the object; short where they are all around it."""
+    """The mean direction of the cameras from the object; short if they are all around it."""
     directions = path / np.maximum(np.linalg.norm(path, axis=1, keepdims=True), 1e-9)
     mean = directions.mean(axis=0)
     length = float(np.linalg.norm(mean))
@@ -88,7 +88,7 @@ def _mean_direction(path: NDArray[np.float64]) -> NDArray[np.float64]:
 def look_through(
     server: viser.ViserServer, T_world_cam: NDArray[np.floating], fov: float, aspect: float
 ) -> None:
-    """Let every browser look where a camera stands, and see all that it saw.
+    """Move every browser's view to a camera, with its whole field of view.
 
     Args:
         server: Serves the browsers.

@@ -1,4 +1,4 @@
-"""The points on the surface that a run follows, out of the state that it keeps until it is finished."""
+"""The landmarks of a run, read from the checkpoint that it keeps until it is finished."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _ARRAY = re.compile(r"\d{8,}\.npz")
 
 
 def landmarks_of_checkpoint(folder: Path) -> NDArray[np.float32] | None:
-    """The landmarks ``(N, 3)`` of a run that goes on or was stopped, in object coordinates; None where none are kept.
+    """The landmarks ``(N, 3)`` of a run that goes on or was stopped, in object coordinates; None if none are kept.
 
     Args:
         folder: The run folder.

@@ -1,4 +1,4 @@
-"""Runs that are corrected from the viewer: pages to draw on, and the process that computes.
+"""Corrections from the viewer: pages to draw on, and the process that computes.
 
 The process is our own program with a folder that the viewer was opened on; all that comes from the network is what was
 drawn, as numbers that were checked.
@@ -41,7 +41,7 @@ class RunCorrection:
         run: The run.
         images: Its frames.
         source: The video, where it is not where the run found it.
-        access: Where the page listens, and whom it answers.
+        access: Where the page listens, and whom it serves.
     """
 
     def __init__(
@@ -57,27 +57,27 @@ class RunCorrection:
 
     @property
     def why_not(self) -> str:
-        """Why the run cannot be corrected here, in a sentence; empty where it can."""
+        """Why the run cannot be corrected here, in a sentence; empty if it can."""
         run, given = self.run, self.run.description.get("given")
         if run.going_on:
-            return "It goes on; it can be corrected when it has ended."
+            return "The run is not finished; it can be corrected afterwards."
         if self._images is None:
-            return "Its video is not at hand; open the viewer with --source."
+            return "The video of the run was not found; open the viewer with --source."
         if not isinstance(given, dict) or "first_frame" not in given:
-            return "It is of an earlier version, which did not keep what it was begun with."
+            return "The run is from an earlier version, which did not store its prompt."
         if not getattr(self._images, "repeatable", True):
-            return "It is of a camera, whose frames are gone."
+            return "The run is from a camera, whose frames were not stored."
         tracker = run.description.get("config", {}).get("tracker")
         if isinstance(tracker, dict) and tracker.get("name") == "precomputed":
-            return "Its masks were made elsewhere; put the better mask among them."
+            return "The masks of the run are precomputed; replace the wrong mask there."
         return ""
 
     def why_not_frame(self, index: int) -> str:
-        """Why this frame of a run that can be corrected cannot be, in a sentence; empty where it can."""
+        """Why this frame of a run that can be corrected cannot be, in a sentence; empty if it can."""
         if index not in self.run.frames:
-            return f"The run has no answer for frame {index}."
+            return f"The run has no estimate for frame {index}."
         if index == self.run.description["given"]["first_frame"]:
-            return f"In frame {index} the object was given; correct a later one, or make the run anew."
+            return f"The object was given in frame {index}; correct another frame, or run again with a better prompt."
         return ""
 
     def port(self) -> int:
@@ -93,7 +93,7 @@ class RunCorrection:
             try:
                 config = PipelineConfig.model_validate(self.run.description["config"])
             except (KeyError, ValidationError) as error:
-                raise InputError("Its settings are of another version of tracking3d.") from error
+                raise InputError("The settings of the run are from another version of tracking3d.") from error
             indices = within(parse_selection(selection), frames[-1] + 1) if frames else range(1)
             session = PickingSession(self.run.name, self._images, indices, config)
             self._page = CorrectionPage(
@@ -117,7 +117,7 @@ class RunCorrection:
             if self.why_not:
                 raise InputError(self.why_not)
             if self.progress().running:
-                raise InputError("A correction goes on; wait for it.")
+                raise InputError("A correction is in progress; wait for it to finish.")
             if why := self.why_not_frame(drawn.frame):
                 raise InputError(why)
             if drawn.mask is not None:
@@ -146,10 +146,10 @@ class RunCorrection:
             for path in (stage / layout.FRAMES, stage / layout.REFINING / layout.FRAMES)
         )
         if not done:
-            return CorrectionProgress(True, f"Frame {self._frame} is corrected: one moment …")
-        told = f"{again} of {total} refined" if again else f"{done} of {total} frames answered"
+            return CorrectionProgress(True, f"Correcting frame {self._frame}: starting …")
+        told = f"{again} of {total} refined" if again else f"{done} of {total} frames estimated"
         share = (done + again) / (2 * total if self.run.refined else total)
-        return CorrectionProgress(True, f"Frame {self._frame} is corrected: {told}.", share=min(share, 1.0))
+        return CorrectionProgress(True, f"Correcting frame {self._frame}: {told}.", share=min(share, 1.0))
 
     def close(self) -> None:
         """Stop serving; a correction that goes on is stopped, and can go on by the command."""
@@ -173,15 +173,17 @@ class RunCorrection:
         (self.run.folder / layout.DRAWN).unlink(missing_ok=True)
         if code == 0:
             return CorrectionProgress(sentence=f"Frame {self._frame} is corrected.")
-        told = next((line for line in lines if line.startswith("error: ")), "error: it was stopped.")
+        told = next(
+            (line for line in lines if line.startswith("error: ")), "error: the correction was stopped."
+        )
         return CorrectionProgress(
-            sentence=f"The run was not corrected, and is as it was: {told.removeprefix('error: ')}",
+            sentence=f"The correction failed and the run is unchanged: {told.removeprefix('error: ')}",
             failed=True,
         )
 
 
 def _lines_in(path: Path) -> int:
-    """How many lines a file has; none where it is not there."""
+    """The number of lines of a file; 0 if it does not exist."""
     try:
         return path.read_bytes().count(b"\n")
     except OSError:
@@ -193,18 +195,19 @@ class Corrections:
 
     Args:
         each: The runs.
-        access: Whom their pages answer.
+        access: Whom their pages serve.
     """
 
     def __init__(self, each: Sequence[RunCorrection], access: Access) -> None:
         self._each, self._access = each, access
 
     def offer(self, index: int) -> str:
-        """Links to correct a frame of each run, and how far corrections are, as HTML."""
+        """Links to correct a frame of each run and the progress of corrections, as HTML."""
         return (
-            '<div style="font-size:12px;line-height:1.5;margin:4px 12px"><p>Where the answer is on something else, say '
-            "what the object is: what depends on that frame is computed again. The run stays as it is until that is "
-            f"done.</p>{''.join(self._offer(one, index) for one in self._each)}</div>"
+            '<div style="font-size:12px;line-height:1.5;margin:4px 12px"><p>If the tracker follows the wrong thing, '
+            "mark the object in that frame. All frames that depend on it are then re-estimated. "
+            "The run stays unchanged until that is done.</p>"
+            f"{''.join(self._offer(one, index) for one in self._each)}</div>"
         )
 
     def close(self) -> None:

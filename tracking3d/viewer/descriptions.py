@@ -1,4 +1,4 @@
-"""What runs say of themselves, as HTML: a frame's answer, the doubtful frames, the run as a whole.
+"""Descriptions as HTML: a frame's estimate, the uncertain and lost frames, the run as a whole.
 
 All of it is text of files, and escaped.
 """
@@ -17,11 +17,11 @@ from tracking3d.viewer.followed_run import FollowedRun, Streak
 from tracking3d.viewer.timeline import hexadecimal, jump
 
 LONGEST_LIST = 200
-"""Entries of the list of doubtful frames; the rest is counted."""
+"""Maximum entries in the list of uncertain and lost frames; the rest is only counted."""
 
 
 def list_streaks(runs: Sequence[FollowedRun]) -> str:
-    """The doubtful frames of all runs with their reasons; a click goes there."""
+    """The uncertain and lost frames of all runs with their reasons; a click goes to a frame."""
     rows = [(run, streak) for run in runs for streak in run.streaks()]
     told = "".join(_row(run, streak, len(runs) > 1) for run, streak in rows[:LONGEST_LIST])
     if not rows:
@@ -37,7 +37,7 @@ def describe_frame(run: FollowedRun, record: FrameRecord | None, colour: Colour 
     if colour is not None:
         name = f'<span style="color:{hexadecimal(colour)}">▬</span> {name}'
     if record is None:
-        return f"<div><b>{name}</b> has no answer for this frame</div>"
+        return f"<div><b>{name}</b> has no estimate for this frame</div>"
     figures = f"confidence {record.confidence:.2f}"
     if record.iou_initial is not None:
         figures += f", IoU with the initial mask {record.iou_initial:.2f}"
@@ -50,7 +50,7 @@ def describe_frame(run: FollowedRun, record: FrameRecord | None, colour: Colour 
 
 
 def about(run: FollowedRun) -> str:
-    """What a run says of itself."""
+    """A run's state, source, tracker and notes."""
     description: dict[str, Any] = run.description
     tracker = description.get("config", {}).get("tracker")
     seconds = description.get("timings", {}).get("seconds_total")
@@ -90,5 +90,6 @@ def _row(run: FollowedRun, streak: Streak, named: bool) -> str:
     return (
         f'<div class="streak" role="button" tabindex="0" onclick="{going}" '
         f'onkeydown="if(event.key===\'Enter\')this.click()" style="cursor:pointer;padding:3px 0">'
-        f"{_badge(streak.status)} {name}<b>{frames}</b>: {html.escape(streak.reason) or 'no reason given'}</div>"
+        f"{_badge(streak.status)} {name}<b>{frames}</b>: "
+        f"{html.escape(streak.reason) or 'no reason given'}</div>"
     )

@@ -27,7 +27,7 @@ _MOST_AT_ONCE = 2**26
 
 @dataclass(frozen=True)
 class Streak:
-    """Frames in a row that the run doubts for one reason.
+    """Consecutive frames that are uncertain or lost for the same reason.
 
     Attributes:
         first: Index of the first frame.
@@ -49,7 +49,7 @@ class FollowedRun:
     Attributes:
         folder: The run folder.
         name: What the viewer calls it.
-        frames: The final answers by frame index, in order.
+        frames: The final estimates by frame index, in order.
         causal: Those from before the final refinement.
         model: The object, once the run has written it.
         description: What ``run.json`` says.
@@ -84,7 +84,7 @@ class FollowedRun:
 
     @property
     def refined(self) -> bool:
-        """Whether there are answers of a final refinement."""
+        """Whether there are estimates of a final refinement."""
         return any(record.refined for record in self.frames.values())
 
     def look_again(self) -> bool:
@@ -100,7 +100,7 @@ class FollowedRun:
         return self._look_at_model() or described or grown
 
     def mask(self, index: int, kind: str) -> NDArray[np.bool_] | None:
-        """A mask ``(H, W)`` of frame ``index``: ``refined`` (the answer), ``causal`` or ``initial``; None without."""
+        """A mask ``(H, W)`` of frame ``index``: ``refined`` (the estimate), ``causal`` or ``initial``; None without."""
         if kind == "initial":
             path = layout.initial_mask_path(self.folder, index)
         else:
@@ -145,7 +145,7 @@ class FollowedRun:
         try:
             told = path.stat()
             size = told.st_size
-            # Begun anew, cut back to where a stopped run goes on, or replaced by a corrected one.
+            # Restarted, cut back to where a stopped run goes on, or replaced by a corrected one.
             if size < self._read or told.st_ino != self._inode:
                 self._lines.clear()
                 self._read, self._inode = 0, told.st_ino
@@ -158,7 +158,7 @@ class FollowedRun:
             return False
         whole = text[: text.rfind(b"\n") + 1]
         if not whole and len(text) > LONGEST_LINE:
-            raise InputError(f"{path} is damaged: a line of it has no end; restore it.")
+            raise InputError(f"{path} is damaged: one of its lines has no end; restore it.")
         self._read += len(whole)
         for line in whole.splitlines():
             try:

@@ -1,4 +1,4 @@
-"""A viser server that answers nobody but its own page.
+"""A viser server that serves only its own page.
 
 Viser has no check of its own: it lets pages of any origin connect, takes messages of 50 MB and as many connections
 as there are. All of that is decided where it calls `websockets.asyncio.server.serve`, so that call is the one thing
@@ -41,7 +41,7 @@ def start_server(access: Access, port: int) -> viser.ViserServer:
     """Start a viser server behind the check of ``access``.
 
     Args:
-        access: Where it listens, and whom it answers.
+        access: Where it listens, and whom it serves.
         port: The port; where it is taken, the next one that is free. 0 for any.
 
     Raises:
@@ -58,7 +58,8 @@ def start_server(access: Access, port: int) -> viser.ViserServer:
     if not guard.in_place:
         server.stop()
         raise PluginError(
-            f"viser {viser.__version__} cannot be guarded against other pages; install a version of tracking3d[view]."
+            f"viser {viser.__version__} cannot be protected from other web pages; install the version "
+            "required by tracking3d[view]."
         )
     guard.port = server.get_port()
     return server
@@ -68,7 +69,7 @@ class _Guard:
     """What stands between the network and viser.
 
     Args:
-        access: Whom to answer.
+        access: Whom to serve.
     """
 
     def __init__(self, access: Access) -> None:
@@ -95,7 +96,7 @@ class _Guard:
         guard = self
 
         class CountedConnection(ServerConnection):
-            """Hangs up at once where there are too many, and on who uploads: the viewer asks for no file."""
+            """Closes the connection if there are too many, or if the client uploads: the viewer accepts no files."""
 
             def connection_made(self, transport: Any) -> None:
                 guard.connections += 1
@@ -110,7 +111,7 @@ class _Guard:
             async def recv(self, decode: bool | None = None) -> Any:
                 message = await super().recv(decode)
                 if not isinstance(message, bytes) or _UPLOAD in message:
-                    await self.close(1008, "not asked for")
+                    await self.close(1008, "not requested")
                     message = await super().recv(decode)  # raises that it is closed
                 return message
 
@@ -140,7 +141,7 @@ class _Guard:
 
 
 def _one(request: Request, name: str) -> str | None:
-    """The header, where it comes once; what comes twice is nobody's."""
+    """The header if it occurs once; a repeated header is ignored."""
     values = request.headers.get_all(name)
     return values[0] if len(values) == 1 else ("" if values else None)
 

@@ -45,7 +45,7 @@ def open_viewer(
 
     Args:
         folders: Run folders, or folders of the several objects of one video.
-        access: Where to listen, and whom to answer.
+        access: Where to listen, and whom to serve.
         port: The port, or the next one that is free; 0 for any.
         source: The video, where it is not where the runs found it.
         images: Gives the frames of all runs, where they are at hand already.
@@ -64,7 +64,7 @@ def open_viewer(
     for folder in folders:
         runs = open_followed_runs(folder)
         if not runs:
-            raise InputError(f"{folder} holds no run; give a folder that --out of `tracking3d run` was.")
+            raise InputError(f"{folder} holds no run; give the --out folder of a `tracking3d run`.")
         own = images or images_of_run(str(runs[0].description.get("source", "")), runs[0].folder)
         corrections += [RunCorrection(run, own, source, access) for run in runs]
         videos.append(Video(folder.name or str(folder), runs, own or _drawn_images_of(runs[0])))

@@ -1,4 +1,4 @@
-"""What can be clicked: the video with its timeline on the left, what is shown and what is doubted on the right."""
+"""The controls: the video with its timeline on the left, layers and uncertain frames on the right."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _ON_A_PHONE = """<style>
 """Viser's panel on a phone leaves a strip beside it and hides the middle of the model. Where a version of viser is made
 otherwise, this says nothing."""
 _STEPS = ("◀◀", "◀", "▶", "▶▶")
-_STEP_HINT = "Doubtful frame before, frame before, next frame, next doubtful frame."
+_STEP_HINT = "Previous uncertain or lost frame, previous frame, next frame, next uncertain or lost frame."
 
 
 class Panel:
@@ -33,7 +33,7 @@ class Panel:
         server: Shows them.
         videos: How many stand beside one another.
         live: Whether a run may still grow.
-        causal: Whether there are answers of before a final refinement.
+        causal: Whether there are causal estimates besides refined ones.
     """
 
     def __init__(self, server: viser.ViserServer, videos: int, live: bool, causal: bool) -> None:
@@ -55,9 +55,9 @@ class Panel:
         with panel.add_tab("Show"):
             self._add_choices(causal)
             self.follow = gui.add_checkbox(
-                "newest frame", live, visible=live, hint="Stay at the end of the run."
+                "newest frame", live, visible=live, hint="Follow the run while it grows."
             )
-        with panel.add_tab("Doubts"):
+        with panel.add_tab("Problems"):
             self.doubts = gui.add_html("")
         with panel.add_tab("Correct"):
             self.correct = gui.add_html("")
@@ -75,7 +75,7 @@ class Panel:
             "causal": "causal mask",
             "refined": "refined mask" if causal else "mask",
         }
-        with gui.add_folder("In the video"):
+        with gui.add_folder("Video"):
             self.layers = {
                 layer: gui.add_checkbox(names[layer], layer != "causal", visible=causal or layer != "causal")
                 for layer in LAYERS
@@ -83,22 +83,25 @@ class Panel:
             self.legend = gui.add_html(_legend(names if causal else {**names, "causal": ""}))
             self.axes = gui.add_checkbox("axes", True)
             self.probability = gui.add_checkbox(
-                "probability", False, visible=False, hint="Of the object: yellow is sure, blue is hardly."
+                "probability",
+                False,
+                visible=False,
+                hint="Probability of the object: yellow is high, blue is low.",
             )
-        with gui.add_folder("In space"):
+        with gui.add_folder("3D view"):
             self.mesh = gui.add_checkbox("model", True)
-            self.path = gui.add_checkbox(
-                "path of the camera", True, hint="Click a frustum to go to its frame."
+            self.path = gui.add_checkbox("camera path", True, hint="Click a frustum to go to its frame.")
+            self.here = gui.add_checkbox(
+                "current frame", True, hint="The image of the current frame at its camera pose."
             )
-            self.here = gui.add_checkbox("present frame", True, hint="Its picture, where the camera stood.")
             self.landmarks = gui.add_checkbox("landmarks", True, visible=False)
             self.still = gui.add_checkbox(
-                "camera stands still", False, hint="Move the object, not the camera."
+                "fixed camera", False, hint="Move the object instead of the camera."
             )
             self.look = gui.add_button("Look through the camera")
 
     def show_causal(self) -> None:
-        """There are now answers of before a final refinement."""
+        """Show that there are causal estimates besides refined ones."""
         if not self.layers["causal"].visible:
             self.layers["causal"].visible = True
             self.layers["refined"].label = "refined mask"

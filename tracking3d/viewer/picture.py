@@ -1,4 +1,4 @@
-"""A frame of the video with what was found in it drawn in, layer by layer."""
+"""A frame of the video with its estimates drawn in, layer by layer."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def draw_picture(
     """One frame with the outlines and axes of all its objects.
 
     Args:
-        image: ``(H, W, 3)``; None where the frame is not at hand.
+        image: ``(H, W, 3)``; None if the frame is not at hand.
         runs: The objects of one video.
         index: The frame.
         shown: What to draw.
@@ -68,7 +68,7 @@ def draw_picture(
     width, height = max(round(camera.width * scale), 1), max(round(camera.height * scale), 1)
     if image is None:
         picture = np.full((height, width, 3), _GREY, np.uint8)
-        drawing.draw_text(picture, "this frame is not at hand", 12, 30, 12, drawing.INK)
+        drawing.draw_text(picture, "the image of this frame is not available", 12, 30, 12, drawing.INK)
     else:
         picture = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8)
     thin = max(round(width / 640), 1)
@@ -154,7 +154,7 @@ def _draw_axes(
     scale: float,
     thickness: int,
 ) -> None:
-    """The axes x red, y green, z blue, the nearest on top; nothing where they reach behind the camera."""
+    """The axes x red, y green, z blue, the nearest on top; nothing if they reach behind the camera."""
     ends = np.concatenate([axes.origin[None], axes.origin + axes.length * np.eye(3)])
     points = ends @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3]
     if not np.isfinite(points).all() or points[:, 2].min() <= 0:
@@ -168,7 +168,7 @@ def _draw_axes(
 
 
 def _draw_frame_of_doubt(picture: Image, records: Iterable[FrameRecord | None], thickness: int) -> None:
-    """A border in the colour of the worst status, where there is a doubt."""
+    """A border in the colour of the worst status if a frame is uncertain or lost."""
     known = {record.status for record in records if record is not None}
     for status in (Status.LOST, Status.UNCERTAIN):
         if status in known:

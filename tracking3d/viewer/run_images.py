@@ -1,4 +1,4 @@
-"""The frames that a run was made from, or what is left of them."""
+"""The frames of a run's video, as far as they are still available."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tracking3d.video.video_file import VideoFile
 
 
 def images_of_run(source: str, folder: Path) -> FrameImages | None:
-    """The frames that a run was made from; None where they are no longer there.
+    """The frames that a run was made from; None if they are no longer there.
 
     Args:
         source: What ``run.json`` calls the source; relative to where the run was started, which is tried from the

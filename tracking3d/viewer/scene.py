@@ -1,4 +1,4 @@
-"""What stands in space: each object's mesh, the path of the camera around it, and where the camera is now."""
+"""The 3D scene: each object's mesh, the camera path around it, and the current camera."""
 
 from __future__ import annotations
 
@@ -190,7 +190,8 @@ def _as_seen(camera: Camera, image: Image) -> Image:
 
 
 def _spread_frames(records: list[FrameRecord]) -> list[int]:
-    """Places of those records that get a frustum: the keyframes, the doubtful, and others between, spread evenly."""
+    """Positions of the records that get a frustum: keyframes, uncertain and lost frames, and others spread evenly
+    between."""
     keyframes = [place for place, record in enumerate(records) if record.keyframe]
     doubtful = [
         place

@@ -1,6 +1,6 @@
-"""Status, keyframes and one quantity over time, as a picture that can be clicked.
+"""The timeline: status, keyframes and one quantity over time, as a clickable image.
 
-Viser's plots tell nobody where they are clicked, so the plot is HTML of our own. A click writes the frame's number
+Viser's plots do not report where they are clicked, so the plot is HTML of our own. A click writes the frame's number
 into the field beside the slider, as a person would; everything else follows from that.
 """
 
@@ -78,7 +78,7 @@ def cursor(frame: int, first: int, last: int) -> str:
 
 
 def colour_of(number: int, runs: int) -> Colour | None:
-    """The colour of a run's curve; None where there is but one run to tell apart."""
+    """The colour of a run's curve; None if there is but one run to tell apart."""
     return RUN_COLOURS[number % len(RUN_COLOURS)] if runs > 1 else None
 
 

@@ -1,4 +1,4 @@
-"""The viewer: runs that are followed, a frame that everything shows, and the threads that keep both up."""
+"""The viewer: the followed runs, the current frame, and the threads that update both."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Video:
     Attributes:
         name: What the viewer calls it.
         runs: The objects.
-        images: Gives the frames; None where they are not at hand.
+        images: Gives the frames; None if they are not at hand.
     """
 
     name: str
@@ -60,7 +60,7 @@ class Viewer:
 
     Args:
         videos: What to show.
-        access: Where to listen, and whom to answer.
+        access: Where to listen, and whom to serve.
         port: The port, or the next one that is free; 0 for any.
         corrections: Lets the runs be corrected.
 
@@ -97,7 +97,7 @@ class Viewer:
             thread.start()
 
     def go_to(self, index: int) -> None:
-        """Show the frame ``index``, or the nearest one that has an answer."""
+        """Show the frame ``index``, or the nearest one that has an estimate."""
         self._panel.slider.value = int(index)
         self._want(index)
 
@@ -130,8 +130,8 @@ class Viewer:
             box.on_update(lambda _: self._want())
         keys: dict[str, tuple[str, Callable[[], None]]] = {
             "P": ("Play or pause", self._play_or_pause),
-            "N": ("Next doubtful frame", partial(self._step, "▶▶")),
-            "B": ("Doubtful frame before", partial(self._step, "◀◀")),
+            "N": ("Next uncertain or lost frame", partial(self._step, "▶▶")),
+            "B": ("Previous uncertain or lost frame", partial(self._step, "◀◀")),
         }
         for key, (label, act) in keys.items():
             self._server.gui.add_command(label, hotkey=key).on_trigger(partial(_ignoring_the_event, act))
@@ -263,7 +263,7 @@ class Viewer:
                 self._take_news(draw=False)
 
     def _colours(self, video: Video) -> list[Colour]:
-        """Of each object's outline, those of its curve, where a video has several."""
+        """Colours of the objects' outlines, those of their curves, if a video has several objects."""
         if len(video.runs) < 2:
             return []
         colours = timeline.RUN_COLOURS

@@ -1,1 +1,1 @@
-"""Who may talk to the pages that tracking3d serves."""
+"""Access control of the pages that tracking3d serves."""

@@ -1,4 +1,4 @@
-"""Who may talk to a page that this program serves: the check that every request passes first.
+"""Access control of served pages: the check that every request passes first.
 
 A page on this machine is reached by every other page that is open in the same browser, unless it looks at two
 headers. ``Host`` is the name that the browser asked for: a stranger's name that was pointed at this machine (DNS
@@ -31,11 +31,12 @@ SAFE_HEADERS = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
-"""Of every answer: kept nowhere, shown in nobody's frame, and the address, which may hold the token, told to nobody."""
+"""Headers of every response: not cached, not framed, and the address, which may hold the token, is not sent as
+referrer."""
 
 
 class Refusal(NamedTuple):
-    """Why a request is not answered.
+    """Why a request is refused.
 
     Attributes:
         status: The HTTP status.
@@ -48,7 +49,7 @@ class Refusal(NamedTuple):
 
 @dataclass(frozen=True)
 class Access:
-    """Where a server listens, and whom it answers.
+    """Where a server listens, and whom it serves.
 
     Attributes:
         host: The address that it listens on.
@@ -102,15 +103,15 @@ class Access:
         """
         told = [text for text in (path, host, origin, cookie) if text is not None]
         if any(len(text) > _LONGEST for text in told):
-            return Refusal(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, "A header is too long.")
+            return Refusal(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, "A header of the request is too long.")
         if not host or (not self.token and _name(host) not in _OUR_NAMES):
-            return Refusal(HTTPStatus.FORBIDDEN, "This name is not one of this server's.")
+            return Refusal(HTTPStatus.FORBIDDEN, "The server is not known by this host name.")
         if (origin is None and from_page) or (origin is not None and not _same(origin, host)):
-            return Refusal(HTTPStatus.FORBIDDEN, "Only this server's own page may ask for that.")
+            return Refusal(HTTPStatus.FORBIDDEN, "Only the server's own page may request this.")
         if self.token and not (self.gives_token(path) or self._matches(_in_cookie(cookie, port))):
             return Refusal(
                 HTTPStatus.UNAUTHORIZED,
-                "Open the address that was printed, with its token, to see this page.",
+                "Open the printed address, including its token, to see this page.",
             )
         return None
 
@@ -131,7 +132,7 @@ def _check_own(host: str) -> None:
             probe.bind(place)
     except (OSError, UnicodeError) as error:
         raise InputError(
-            f"--host {host} is no address of this machine ({error}); 0.0.0.0 is all of them."
+            f"--host {host} is not an address of this machine ({error}); 0.0.0.0 means all of them."
         ) from error
 
 

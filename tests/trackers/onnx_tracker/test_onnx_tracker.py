@@ -209,7 +209,7 @@ def test_a_doubtful_carried_mask_is_segmented_before_its_turn(saliency, disc, sc
 @pytest.mark.parametrize(
     ("broken", "reason"),
     [
-        (lambda mask: np.zeros_like(mask), "found nothing"),
+        (lambda mask: np.zeros_like(mask), "found no object"),
         (lambda mask: np.where(mask > 0.5, 0.6, 0.3).astype(np.float32), "blurred"),
         (lambda mask: np.roll(mask, (-40, -50), (0, 1)), "disagree"),
     ],
@@ -229,7 +229,7 @@ def test_a_mask_that_cannot_be_used_leaves_the_carried_one_with_a_low_score(
     monkeypatch.setattr(tracker._segmenter, "propose", spoilt)
     estimates = track(tracker, disc)
     for estimate in estimates[1:]:
-        assert reason in estimate.reason and "carried" in estimate.reason
+        assert reason in estimate.reason and "propagated" in estimate.reason
         assert estimate.score <= 0.5
     assert min(ious(estimates, disc[1])) > 0.8
 
@@ -239,7 +239,7 @@ def test_a_network_that_finds_nothing_at_first_leaves_the_colours_in_the_box(fol
     first = build({"segmenter": str(folder / "saliency.yaml"), "model": str(model)}).init(
         disc[0][0], Prompt(box_around(disc[1][0]))
     )
-    assert "colours in the box" in first.reason
+    assert "segmented by colour" in first.reason
     assert first.score <= 0.5
     assert ious([first], disc[1][:1])[0] > 0.8
 

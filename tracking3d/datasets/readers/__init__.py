@@ -1,4 +1,4 @@
-"""Results that other people's tools wrote, as `tracking3d.datasets.answers.Answers`; one module a format."""
+"""Results of other tools, as `tracking3d.datasets.answers.Answers`; one module per format."""
 
 from __future__ import annotations
 

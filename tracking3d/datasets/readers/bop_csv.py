@@ -49,7 +49,7 @@ def answers_from_bop_csv(
     Args:
         file: The table, with or without a header.
         truth: The clip.
-        scene_id, obj_id: Which; may be None where the table has only one.
+        scene_id, obj_id: Which; may be None if the table has only one.
         im_ids: The image of each frame; None takes the numbers that are the frames' names, else their indices.
 
     Raises:
@@ -111,7 +111,7 @@ def _estimate(file: Path, number: int, row: list[str]) -> _Estimate:
             f"Line {number} of {file} is not {','.join(COLUMNS)} with nine numbers in R and three in t; correct it."
         ) from error
     if not (math.isfinite(one.score) and math.isfinite(one.seconds)):
-        raise InputError(f"Line {number} of {file} has a score or time that is no finite number; correct it.")
+        raise InputError(f"Line {number} of {file} has a score or time that is not finite; correct it.")
     return one
 
 
@@ -119,7 +119,7 @@ def _only(what: str, asked: int | None, known: set[int], file: Path) -> int:
     if asked is None and len(known) == 1:
         return next(iter(known))
     if asked is None:
-        raise InputError(f"{file} is about {len(known)} {what}s; say which {what} the clip shows.")
+        raise InputError(f"{file} has {len(known)} {what}s; give the {what} of the clip.")
     if asked not in known:
         raise InputError(f"{file} has no {what} {asked}; it has {', '.join(map(str, sorted(known)[:10]))}.")
     return asked

@@ -47,7 +47,7 @@ def answers_from_colmap(folder: Path, truth: Truth) -> Answers:
     models = {file: _read_images(file) for file in _models(folder)}
     if not models:
         raise InputError(
-            f"{folder} holds no COLMAP model; give the folder of images.bin or images.txt, or the one above it."
+            f"{folder} holds no COLMAP model; give the folder of images.bin or images.txt, or its parent."
         )
     index = {name: n for n, name in enumerate(truth.names)}
     largest = max(models, key=lambda file: len(models[file]))
@@ -116,7 +116,7 @@ def _read_binary(file: Path) -> Poses:
             (points,) = _COUNT.unpack_from(data, end + 1)
             position = end + 1 + _COUNT.size + _POINT_SIZE * points
             if position > len(data):
-                raise ValueError("it ends too early")
+                raise ValueError("it is truncated")
             poses[name] = _pose(np.array(values), f"Image {image} of {file}")
     except (OSError, ValueError, struct.error) as error:
         raise InputError(

@@ -1,4 +1,4 @@
-"""Reading anybody's results: the format is recognised by what a file or folder holds."""
+"""Reading results of any method: the format is recognized from the contents of a file or folder."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ ANSWER_FORMATS = {
 
 
 def read_answers(path: Path, truth: Truth, format: str | None = None, **options: Any) -> tuple[Answers, str]:
-    """Read somebody's results for a clip.
+    """Read the results of any method for a clip.
 
     Args:
         path: File or folder.
@@ -51,7 +51,7 @@ def read_answers(path: Path, truth: Truth, format: str | None = None, **options:
         options: Of that format's function, such as ``object_id`` or ``of``.
 
     Returns:
-        The answers, and what they were read as, in words.
+        The estimates, and what they were read as, in words.
 
     Raises:
         InputError: If the format is unknown or not recognised, has no such option, or the results cannot be read.
@@ -79,7 +79,7 @@ def recognise_format(path: Path) -> str:
         InputError: If it is nothing of these.
     """
     if not path.exists():
-        raise InputError(f"There is nothing at {path}; check the path.")
+        raise InputError(f"{path} does not exist; check the path.")
     if path.is_dir():
         if any(
             next(path.glob(f"{below}images.{suffix}"), None) for below in _BELOW for suffix in ("bin", "txt")
@@ -91,7 +91,7 @@ def recognise_format(path: Path) -> str:
             return "masks"
     elif path.suffix.lower() in _SUFFIXES:
         return _SUFFIXES[path.suffix.lower()]
-    raise InputError(f"{path} is in no format known here; name one of {', '.join(ANSWER_FORMATS)}.")
+    raise InputError(f"The format of {path} is not recognized; choose one of {', '.join(ANSWER_FORMATS)}.")
 
 
 _BELOW = ("", "*/", "sparse/*/")

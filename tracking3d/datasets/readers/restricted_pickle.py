@@ -1,4 +1,4 @@
-"""Pickles from strangers: numpy arrays and plain values are read, anything else is refused before it is built."""
+"""Untrusted pickles: numpy arrays and plain values are read, anything else is refused before it is built."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class _Unpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in _ADMITTED:
             raise pickle.UnpicklingError(
-                f"it holds {module}.{name}, only numpy arrays and plain values are read"
+                f"it holds {module}.{name}, but only numpy arrays and plain values are read"
             )
         return super().find_class(module, name)
 
@@ -43,4 +43,4 @@ def read_pickle(file: Path) -> Any:
         raise InputError(f"There is no file {file}; check the path.") from error
     except Exception as error:  # a damaged pickle can call what is admitted with anything
         reason = str(error) or type(error).__name__
-        raise InputError(f"{file} cannot be read as a pickle: {reason}; ask for an .npz file.") from error
+        raise InputError(f"{file} cannot be read as a pickle: {reason}; use an .npz file.") from error

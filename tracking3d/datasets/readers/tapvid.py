@@ -23,7 +23,7 @@ from tracking3d.errors import InputError
 from tracking3d.video.image_file import read_image
 
 RASTER = (256, 256)
-"""Width and height of TAP-Vid's raster, taken where a file does not tell."""
+"""Width and height of TAP-Vid's raster, assumed if a file does not state one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +118,7 @@ def _of_clip(document: Any, file: Path, truth: Truth, name: str | None) -> Mappi
     name = name or (truth.name if truth.name in document or len(document) > 1 else next(iter(document)))
     clip = document.get(name)
     if not isinstance(clip, dict):
-        raise InputError(f"{file} has no clip {name}; give the name that it has there.")
+        raise InputError(f"{file} has no clip {name}; give the clip's name in that file.")
     return clip
 
 
@@ -136,7 +136,7 @@ def _array(
         values = values.astype(np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(
-            f"{key} of {file} is no array of numbers ({error}); see TAP-Vid's format."
+            f"{key} of {file} is not an array of numbers ({error}); see TAP-Vid's format."
         ) from error
     if values.ndim == len(shape) + 1 and len(values) == 1:
         values = values[0]
@@ -160,7 +160,7 @@ def _raster(
     if len(shape) >= 4:
         return np.array([shape[-2], shape[-3]], dtype=np.float64)
     if np.quantile(finite, 0.9) > max(RASTER):
-        raise InputError(f"{file} has positions beyond 256 x 256 pixels; say which raster they are in.")
+        raise InputError(f"{file} has positions beyond 256 x 256 pixels; specify their raster.")
     return np.array(RASTER, dtype=np.float64)
 
 
@@ -175,8 +175,8 @@ def _query_frames(
     if queries is None:
         if truth.points is None or truth.points.positions.shape != shape:
             raise InputError(
-                f"{file} has {shape[1]} tracks but no query_points, and the clip {truth.name} has not as many "
-                "true points; add query_points."
+                f"{file} has {shape[1]} tracks but no query_points, and the clip {truth.name} has another "
+                "number of true points; add query_points."
             )
         return truth.points.positions
     frames = queries[:, 0].round()

@@ -1,4 +1,4 @@
-"""Text files of others, with one sentence for whatever is wrong."""
+"""Text files of other tools, with errors in one sentence."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from tracking3d.datasets.truth import Truth
 from tracking3d.errors import InputError
 
 _TIMING = 0.25
-"""Frames that a timestamp may be off."""
+"""Tolerance of a timestamp in frames."""
 
 
 def answers_from_tum(
@@ -31,15 +31,15 @@ def answers_from_tum(
         truth: The clip.
         of: ``object`` if the lines are the object's poses in camera coordinates, ``T_cam_obj``; ``camera`` if they
             are the camera's poses in object coordinates, ``T_obj_cam``, as SLAM programs give them.
-        fps: Frames a second where timestamps are in seconds since frame 0; None where they are frame indices.
+        fps: Frames a second where timestamps are in seconds since frame 0; None if they are frame indices.
 
     Raises:
         InputError: If the file is no trajectory, two lines are about one frame, or none about a frame of the clip.
     """
     if of not in ("object", "camera"):
-        raise InputError(f"The poses of {file} cannot be of '{of}'; say object or camera.")
+        raise InputError(f"The poses of {file} cannot be of '{of}'; choose object or camera.")
     if fps is not None and not 0 < fps < np.inf:
-        raise InputError(f"{fps:g} frames a second make no clip; give a positive number.")
+        raise InputError(f"{fps:g} frames per second is not a frame rate; give a positive number.")
     poses: dict[int, NDArray[np.float64]] = {}
     for number, line in enumerate(read_text(file).splitlines(), 1):
         if not line.strip() or line.lstrip().startswith("#"):
@@ -49,12 +49,10 @@ def answers_from_tum(
         if not abs(frame) < 2**53 or abs(frame - round(frame)) > _TIMING:
             raise InputError(
                 f"Line {number} of {file}: timestamp {time:g} is not the time of a frame; timestamps are "
-                f"{'seconds since frame 0' if fps else 'frame indices unless frames a second are given'}."
+                f"{'seconds since frame 0' if fps else 'frame indices unless a frame rate is given'}."
             )
         if round(frame) in poses:
-            raise InputError(
-                f"Line {number} of {file} is the second one about frame {round(frame)}; remove one."
-            )
+            raise InputError(f"Line {number} of {file} is a second pose of frame {round(frame)}; remove one.")
         poses[round(frame)] = T if of == "object" else _inverse(T)
     poses = {n: T for n, T in poses.items() if 0 <= n < len(truth.frames)}
     if not poses:
@@ -71,7 +69,7 @@ def _parse(file: Path, number: int, line: str) -> tuple[float, NDArray[np.float6
     try:
         values = np.array([float(value) for value in line.split()])
     except ValueError as error:
-        raise InputError(f"Line {number} of {file} has something other than numbers; correct it.") from error
+        raise InputError(f"Line {number} of {file} has values that are not numbers; correct it.") from error
     if len(values) != 8 or not np.isfinite(values).all() or abs(np.linalg.norm(values[4:]) - 1) > 0.01:
         raise InputError(
             f"Line {number} of {file} is not timestamp tx ty tz qx qy qz qw with a unit quaternion; correct it."

@@ -56,7 +56,7 @@ class FrameTracker(SolverBase):
         image: NDArray[np.uint8],
         starts: dict[str, Pose],
     ) -> PoseCandidate:
-        """The pose near the predicted ones; relocalized if its losses are unusual, anywhere in the frame if doubtful."""
+        """The pose near the predicted ones; relocalized if the losses are unusual, in the whole frame if doubtful."""
         assert state.surface is not None
         object_map, camera = state.object_map, state.camera
         on_object = view.points.only(~object_map.candidate[view.points.landmark])

@@ -1,1 +1,2 @@
-"""Feature encoder ``onnx``: any dense network in an ONNX file, told by a few lines of YAML what it takes and gives."""
+"""Feature encoder ``onnx``: any dense network in an ONNX file, with inputs and outputs described in a few lines of
+YAML."""

@@ -1,4 +1,4 @@
-"""What a feature network takes and gives: a short YAML description that users can write themselves."""
+"""The inputs and outputs of a feature network: a short YAML description that users can write."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tracking3d.errors import InputError
 from tracking3d.networks.descriptions import description_names, read_description
 
 PACKAGE = "tracking3d.features.onnx"
-"""Whose folder ``descriptions`` holds those that come along."""
+"""The package whose folder ``descriptions`` holds the built-in descriptions."""
 
 Triple = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0)]
@@ -22,46 +22,47 @@ Positive = Annotated[float, Field(gt=0)]
 class NetworkInput(Section):
     """How an image becomes a network's input: RGB in [0, 1] scaled, the mean removed, divided by the deviation."""
 
-    name: str | None = Field(None, description="The input's name; the network's only one if not given.")
-    scale: float = Field(1.0, gt=0, description="The image is multiplied by it first: 1 or 255.")
-    mean: Triple = Field((0.0, 0.0, 0.0), description="Subtracted after that: red, green, blue.")
+    name: str | None = Field(None, description="Name of the input; the network's only input if not given.")
+    scale: float = Field(1.0, gt=0, description="Factor for the image, applied first: 1 or 255.")
+    mean: Triple = Field((0.0, 0.0, 0.0), description="Mean subtracted after that: red, green, blue.")
     std: tuple[Positive, Positive, Positive] = Field(
-        (1.0, 1.0, 1.0), description="Divided by after that: red, green, blue."
+        (1.0, 1.0, 1.0), description="Standard deviation divided by after that: red, green, blue."
     )
     channels: Literal["rgb", "bgr"] = Field("rgb", description="Order of the channels.")
     multiple: int = Field(
         32,
         ge=1,
         le=1024,
-        description="Height and width must be multiples of it, unless the network fixes them.",
+        description="Height and width must be multiples of this, unless the network fixes them.",
     )
     fit: Literal["pad", "resize"] = Field(
         "pad",
-        description="How sizes become multiples: the border repeated at the right and below, or by resizing.",
+        description="How sizes become multiples: by repeating the right and lower border, or by resizing.",
     )
 
 
 class EncoderDescription(Section):
     """A dense feature network. Without any key it is what most are: RGB in [0, 1], one map, unit length."""
 
-    title: str = Field("", description="What it is, for readers.")
-    link: str = Field("", description="Where it comes from, for readers.")
+    title: str = Field("", description="Description for readers.")
+    link: str = Field("", description="Origin, for readers.")
     input: NetworkInput = NetworkInput()
     output: str | tuple[str, ...] | None = Field(
-        None, description="The feature map, or several; the one with the most channels if not given."
+        None,
+        description="Name of the feature map, or of several; the one with the most channels if not given.",
     )
     combine: Literal["concatenate", "sum"] = Field(
-        "concatenate", description="What becomes of several maps, after they have the size of the result."
+        "concatenate", description="How several maps are combined after resizing to the size of the result."
     )
     stride: int | None = Field(
         None,
         ge=1,
         le=256,
-        description="Image pixels per feature pixel; as the (first) map has it if not given.",
+        description="Image pixels per feature pixel; that of the (first) map if not given.",
     )
     normalise: Literal["unit", "each", "none"] = Field(
         "unit",
-        description="Features of unit length; each of several maps first and then all; or as they are.",
+        description="Whether features are normalized to unit length: each of several maps and then all, or not at all.",
     )
     tau: float = Field(0.05, gt=0, description="Appearance loss below which a frame counts as explained.")
 

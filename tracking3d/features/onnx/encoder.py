@@ -14,7 +14,7 @@ from tracking3d.features.onnx.description import EncoderDescription, NetworkInpu
 from tracking3d.networks.session import Network, TensorInfo
 from tracking3d.networks.store import find_network
 
-_HOW_TO = "describe the network in a YAML file and give it as features.description"
+_HOW_TO = "describe the network in a YAML file and set features.description to it"
 _TRIAL_SIDE = 64  # pixels, enlarged to a multiple of what the network wants
 
 
@@ -42,8 +42,7 @@ class OnnxEncoder:
         model: str = Field(description="ONNX file, or name of a known network.")
         description: str | None = Field(
             None,
-            description="What the network takes and gives: a name that comes along, or a YAML file; "
-            "guessed from the network if not given.",
+            description="Description of inputs and outputs: a built-in name or a YAML file; guessed if not given.",
         )
         threads: int = Field(1, ge=1, le=256, description="CPU threads of the network.")
 
@@ -143,11 +142,11 @@ def _input(network: Network, how: NetworkInput) -> TensorInfo:
     names = list(network.inputs)
     if how.name is not None and how.name not in names:
         raise InputError(
-            f"{network.file} has no input '{how.name}' but {', '.join(names)}; correct input.name."
+            f"{network.file} has no input '{how.name}'; it has {', '.join(names)}; correct input.name."
         )
     if len(names) != 1:
         raise InputError(
-            f"{network.file} has the inputs {', '.join(names)}, but a feature network takes an image alone; "
+            f"{network.file} has the inputs {', '.join(names)}, but a feature network takes only an image; "
             "export it with one input."
         )
     info = network.inputs[names[0]]
@@ -169,7 +168,8 @@ def _outputs(
     for name in description.outputs:
         if name not in maps:
             raise InputError(
-                f"{network.file} has no feature map '{name}'; on an image of zeros it gives {shapes}: correct output."
+                f"{network.file} has no feature map '{name}'; for an image of zeros it returns {shapes}: "
+                "correct output."
             )
     if description.outputs:
         _check_sum(network, description, [maps[name] for name in description.outputs])
@@ -178,7 +178,7 @@ def _outputs(
     best = [name for name, value in maps.items() if value.shape[1] == most]
     if len(best) != 1:
         raise InputError(
-            f"{network.file} gives {shapes}, and which of them are the features cannot be told; {_HOW_TO}, "
+            f"{network.file} returns {shapes}; it is ambiguous which output is the feature map; {_HOW_TO}, "
             f"with a line such as 'output: {next(iter(answers), 'NAME')}'."
         )
     return (best[0],)

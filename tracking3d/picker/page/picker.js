@@ -3,11 +3,11 @@
 
 const COLOURS = ["#00a5e0", "#e64ba0", "#7cb518", "#f08c1e", "#8f6ce0", "#e5484d"];
 const HINTS = {
-  box: "Drag a box around the object." + (matchMedia("(pointer: fine)").matches ? " The wheel looks closer." : ""),
-  on: "Click on the object. Right click: beside it.",
-  beside: "Click on what is not the object.",
+  box: "Drag a box around the object." + (matchMedia("(pointer: fine)").matches ? " The mouse wheel zooms." : ""),
+  on: "Click on the object. Right click marks the background.",
+  beside: "Click on the background.",
   paint: "Paint over the object.",
-  erase: "Paint over what is not the object.",
+  erase: "Erase what is not the object.",
 };
 const byId = (id) => document.getElementById(id);
 const canvas = byId("canvas");
@@ -157,7 +157,7 @@ canvas.addEventListener("pointerdown", (event) => {
   canvas.setPointerCapture(event.pointerId);
   const [x, y] = place(event);
   if (tool === "on" || tool === "beside") {
-    if (one().points.length >= 200) return say("That are enough points.", true);
+    if (one().points.length >= 200) return say("An object can have at most 200 points.", true);
     begin();
     one().points = [...one().points, { x, y, on: tool === "on" && event.button !== 2 }];
     return changed();
@@ -188,7 +188,7 @@ canvas.addEventListener("pointerup", () => {
     begin();
     one().box = was.box;
   } else {
-    if (one().strokes.length >= 400) return say("That are enough strokes; undo some.", true);
+    if (one().strokes.length >= 400) return say("An object can have at most 400 strokes; undo some.", true);
     begin();
     one().strokes = [...one().strokes, was.stroke];
   }
@@ -218,7 +218,7 @@ async function showMask() {
     return draw();
   }
   const number = ++asked;
-  say(`${session.tracker} makes a mask of it …`);
+  say(`${session.tracker} is computing the mask …`);
   try {
     const { veil, area } = await ask("mask", plain(object));
     if (number !== asked) return;
@@ -227,7 +227,7 @@ async function showMask() {
     await image.decode();
     object.veil = image;
     object.told = `${area} px`;
-    say(session.correcting ? "That is the mask that the run goes on with." : "That is the mask that the run begins with.");
+    say(session.correcting ? "The run continues from this mask." : "The run starts from this mask.");
   } catch (error) {
     if (number !== asked) return;
     object.veil = null;
@@ -251,7 +251,7 @@ function list() {
     name.addEventListener("focus", () => choose(number));
     name.addEventListener("input", () => { object.name = name.value; });
     const told = document.createElement("small");
-    told.textContent = isEmpty(object) ? "not drawn" : object.frame === frame ? object.told : `frame ${object.frame}`;
+    told.textContent = isEmpty(object) ? "not marked" : object.frame === frame ? object.told : `frame ${object.frame}`;
     const remove = Object.assign(document.createElement("button"), { textContent: "✕", title: "Remove" });
     remove.addEventListener("click", () => {
       objects.splice(number, 1);
@@ -280,7 +280,7 @@ function choose(number) {
 }
 
 byId("add").addEventListener("click", () => {
-  if (objects.length >= 16) return say("That are enough objects.", true);
+  if (objects.length >= 16) return say("A run can have at most 16 objects.", true);
   objects.push(newObject());
   current = objects.length - 1;
   list();
@@ -364,9 +364,9 @@ async function copy(text, what) {
   byId("told").textContent = text;
   try {
     await navigator.clipboard.writeText(text);
-    say(`${what} is copied; it is below, too.`);
+    say(`${what} was copied to the clipboard and is shown below.`);
   } catch {
-    say(`${what} is below.`);
+    say(`${what} is shown below.`);
   }
 }
 
@@ -386,16 +386,16 @@ byId("start").addEventListener("click", async () => {
   canvas.style.pointerEvents = "none";
   byId("told").hidden = false;
   byId("told").textContent = told.command;
-  say("The run has started; the terminal shows how it goes. This page can be closed.");
+  say("The run has started; its progress is shown in the terminal. You can close this page.");
 });
 
 // ---- a run that is there is corrected ----
 
 function offerCorrection() {
   document.title = `tracking3d correct ${session.correcting}`;
-  document.querySelector("h1").textContent = "What is the object here?";
+  document.querySelector("h1").textContent = "Mark the object in this frame";
   for (const id of ["objects", "objects-title", "add", "save", "yaml"]) byId(id).hidden = true;
-  byId("start").textContent = "Correct the run from here on";
+  byId("start").textContent = "Correct the run";
   follow();
 }
 
@@ -404,7 +404,7 @@ async function follow() {
   try {
     told = await (await fetch("progress.json")).json();
   } catch {
-    return say("The viewer has ended; a correction that it had begun was stopped.", true);
+    return say("The viewer was closed; its unfinished correction was stopped.", true);
   }
   byId("start").disabled = told.running || isEmpty(one());
   if (told.sentence) say(told.sentence, told.failed);

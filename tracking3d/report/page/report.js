@@ -34,7 +34,7 @@
     if (data.pictured.length) {
       const picture = pictureOf(at);
       byId("picture").src = "data:image/jpeg;base64," + data.pictures[picture];
-      byId("picture").alt = `Frame ${data.indices[data.pictured[picture]]} with what the tracker answered drawn into it`;
+      byId("picture").alt = `Frame ${data.indices[data.pictured[picture]]} with the estimated outline and pose`;
       const none = showProbability(picture);
       if (none) words.push(none);
       if (data.pictured[picture] !== at) words.push(`picture of frame ${data.indices[data.pictured[picture]]}`);
@@ -57,7 +57,7 @@
     layer.hidden = !(asked && found);
     byId("ramp").hidden = !asked;
     if (!layer.hidden) layer.src = "data:image/png;base64," + found;
-    return asked && !found ? "no probability, the mask was not weighed" : "";
+    return asked && !found ? "no probability, the mask was not fused" : "";
   }
 
   function go(to) {
@@ -65,7 +65,7 @@
     show();
   }
 
-  // Doubts begin where status or reason become something else than tracked.
+  // Jump targets: frames at which the status or reason changes to anything but tracked.
   function doubt(direction) {
     const begins = data.doubts.filter((at) => direction > 0 ? at > position() : at < position());
     if (begins.length) go(direction > 0 ? begins[0] : begins[begins.length - 1]);

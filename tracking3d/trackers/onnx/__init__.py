@@ -1,1 +1,1 @@
-"""Mask tracker ``onnx``: a box tracker proposes, a segmentation network in an ONNX file disposes."""
+"""Mask tracker ``onnx``: a box tracker gives the region, a segmentation network in an ONNX file the mask."""

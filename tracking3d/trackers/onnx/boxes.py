@@ -26,7 +26,7 @@ class BoxProposer(Protocol):
         ...
 
     def update(self, image: Image) -> Box | None:
-        """The box in the next image, or None where the object is lost."""
+        """The box in the next image, or None if the object is lost."""
         ...
 
 
@@ -112,14 +112,14 @@ def _read_output(file: Path) -> Any:
         return cv2.dnn.readNetFromONNX(str(file))
     except cv2.error as error:
         raise InputError(
-            f"{file} is not a network that OpenCV can run; give an ONNX file made for OpenCV's tracker."
+            f"{file} is not a network that OpenCV can run; give an ONNX file exported for OpenCV's tracker."
         ) from error
     finally:
         cv2.utils.logging.setLogLevel(level)
 
 
 def _rectangle(box: Box, shape: tuple[int, ...]) -> list[int] | None:
-    """Whole pixels inside the frame; a smaller box is grown about its corner. None where nothing is left."""
+    """Whole pixels inside the frame; a smaller box is grown about its corner. None if nothing is left."""
     visible = clip_box(box, shape)
     if visible is None:
         return None

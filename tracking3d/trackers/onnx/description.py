@@ -1,4 +1,4 @@
-"""What a segmentation network takes and gives: a short YAML description that users can write themselves.
+"""The inputs and outputs of a segmentation network: a short YAML description that users can write.
 
 Two kinds are known. A *saliency* network finds the object that stands out in a crop (U2-Net, IS-Net). A
 *promptable* one is an encoder, run once on an image, and a decoder that takes a box, points and a mask
@@ -18,7 +18,7 @@ from tracking3d.errors import InputError
 from tracking3d.networks.descriptions import description_names, read_description
 
 PACKAGE = "tracking3d.trackers.onnx"
-"""Whose folder ``descriptions`` holds those that come along."""
+"""The package whose folder ``descriptions`` holds the built-in descriptions."""
 
 Side = Annotated[int, Field(ge=16, le=4096)]
 Triple = tuple[float, float, float]
@@ -27,7 +27,7 @@ Triple = tuple[float, float, float]
 class ImageInput(Section):
     """How an image becomes a network's input: resized, its grey values divided, mean and deviation removed."""
 
-    name: str | None = Field(None, description="The input's name; the network's first if not given.")
+    name: str | None = Field(None, description="Name of the input; the network's first input if not given.")
     size: Side | tuple[Side, Side] | None = Field(
         None, description="Side, or height and width, in pixels; the image's own size if not given."
     )
@@ -37,11 +37,11 @@ class ImageInput(Section):
     )
     padding: Triple = Field((0.0, 0.0, 0.0), description="Red, green, blue of the padding, 0 to 255.")
     divisor: float | Literal["max"] = Field(
-        255.0, description="Grey values are divided by it; max is the largest one of the image."
+        255.0, description="Divisor of pixel values; max is the largest value of the image."
     )
-    mean: Triple = Field((0.0, 0.0, 0.0), description="Subtracted after the division: red, green, blue.")
+    mean: Triple = Field((0.0, 0.0, 0.0), description="Mean subtracted after the division: red, green, blue.")
     std: tuple[Annotated[float, Field(gt=0)], ...] = Field(
-        (1.0, 1.0, 1.0), min_length=3, max_length=3, description="Divided by after that: red, green, blue."
+        (1.0, 1.0, 1.0), min_length=3, max_length=3, description="Divisor after that: red, green, blue."
     )
     channels: Literal["rgb", "bgr"] = Field("rgb", description="Order of the channels.")
     layout: Literal["nchw", "nhwc", "chw", "hwc"] = Field(
@@ -53,19 +53,21 @@ class SaliencyNetwork(Section):
     """A network that finds what stands out in an image, without a prompt."""
 
     kind: Literal["saliency"]
-    title: str = Field("", description="What it is, for readers.")
-    link: str = Field("", description="Where it comes from, for readers.")
+    title: str = Field("", description="Description for readers.")
+    link: str = Field("", description="Origin, for readers.")
     model: str | None = Field(
-        None, description="ONNX file, or name of a known network, used where the option model is not given."
+        None, description="ONNX file, or name of a known network, used if the option model is not given."
     )
     input: ImageInput = ImageInput()
-    output: str | None = Field(None, description="Name of the output; the network's first if not given.")
-    channel: int = Field(0, ge=0, description="Which channel of the output is the object.")
+    output: str | None = Field(
+        None, description="Name of the output; the network's first output if not given."
+    )
+    channel: int = Field(0, ge=0, description="Channel of the output that is the object.")
     activation: Literal["none", "sigmoid", "softmax"] = Field(
-        "none", description="What makes shares of the output: sigmoid for logits, softmax over channels."
+        "none", description="Activation of the output: sigmoid for logits, softmax over channels."
     )
     normalise: bool = Field(
-        False, description="Stretch the result so that its least value is 0 and its greatest 1."
+        False, description="Rescale the result so that its minimum is 0 and its maximum 1."
     )
 
 
@@ -77,19 +79,19 @@ class Decoder(Section):
         "point_labels", description="Input: 1 object, 0 background, 2 and 3 a box's corners, -1 padding."
     )
     mask: str | None = Field("mask_input", description="Input: the previous mask as logits; null if none.")
-    has_mask: str | None = Field("has_mask_input", description="Input: 1 where that mask counts; or null.")
+    has_mask: str | None = Field("has_mask_input", description="Input: 1 if that mask is used; or null.")
     frame_size: str | None = Field(
         "orig_im_size", description="Input: height and width of the image before the encoder; null if none."
     )
     coordinates: Literal["input", "image", "unit"] = Field(
         "input",
-        description="Points in pixels of the encoder's input, of the image, or as shares of its sides.",
+        description="Coordinates: pixels of the encoder's input or of the image, or fractions of its sides.",
     )
     masks: str | None = Field(None, description="Output with the mask or masks; the first if not given.")
     grid: Literal["image", "input"] = Field(
         "image", description="What the masks cover: the image, or the encoder's input with its padding."
     )
-    logits: bool = Field(True, description="Masks are logits; false for shares in [0, 1].")
+    logits: bool = Field(True, description="Masks are logits; false for probabilities in [0, 1].")
     padding_point: bool = Field(False, description="Add a padding point, label -1, to prompts without a box.")
 
 
@@ -97,13 +99,13 @@ class PromptableNetwork(Section):
     """A network of two files: an image encoder, and a decoder of prompts."""
 
     kind: Literal["promptable"]
-    title: str = Field("", description="What it is, for readers.")
-    link: str = Field("", description="Where it comes from, for readers.")
+    title: str = Field("", description="Description for readers.")
+    link: str = Field("", description="Origin, for readers.")
     encoder_model: str | None = Field(
         None,
-        description="ONNX file or known name of the encoder, used where the option encoder is not given.",
+        description="ONNX file or known name of the encoder, used if the option encoder is not given.",
     )
-    decoder_model: str | None = Field(None, description="The same of the decoder.")
+    decoder_model: str | None = Field(None, description="The same for the decoder.")
     input: ImageInput = ImageInput(size=1024, fit="pad", divisor=1.0)
     embeddings: dict[str, str] = Field(
         {},

@@ -1,4 +1,4 @@
-"""From an image to a network's input, and from its pixels back."""
+"""Conversion of an image to a network's input, and of pixels back."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Judging and sharpening masks that networks propose, by the object's colours and an independent box."""
+"""Rating and refining proposed masks by the object's colours and an independent box."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Verdict:
     def score(self) -> float:
         """How likely the mask is right, in [0, 1], by colours, the box, and how sharp the network's mask was.
 
-        Powers are those of a few that told masks of IoU 0.7 and more from others best on four clips and two
+        Powers are those of a few that best separated masks of IoU 0.7 and more from others on four clips and two
         networks: the area under the curve is 0.79, that of the judgement alone 0.46, since a hand in the mask
         is blurred at its cut far more often than it spoils colours or box.
         """
@@ -76,7 +76,7 @@ class ColourJudge:
         Args:
             image: ``(H, W, 3)`` RGB.
             proposal: What a network proposes.
-            witness: ``(x, y, w, h)``, a box tracker's opinion, or None where it has none.
+            witness: ``(x, y, w, h)``, a box tracker's opinion, or None if it has none.
         """
         mask = self._sharpen(image, proposal.mask)
         return Verdict(replace(proposal, mask=mask), self._judge(image, mask, witness))
@@ -88,7 +88,7 @@ class ColourJudge:
             self._colours.update(lab(crop_window(image, window)), *_sides(mask, window))
 
     def corrected(self, image: Image, mask: NDArray[np.float32]) -> ColourJudge:
-        """This judge after a correction; a new one where the mask shows that it knew the wrong colours."""
+        """This judge after a correction; a new one if the mask shows that its colours were wrong."""
         if self._judge(image, mask, None).doubt:
             return ColourJudge(image, mask)
         self.learn(image, mask)
@@ -105,7 +105,7 @@ class ColourJudge:
         return Judgement(separation, margin, None if witness is None else box_iou(box, witness))
 
     def _sharpen(self, image: Image, mask: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The network's shares and the colours as one; nothing is added where the network saw nothing."""
+        """The network's probabilities combined with the colours; nothing is added where the network found nothing."""
         box = box_of(mask)
         if box is None:
             return mask

@@ -22,27 +22,31 @@ class OnnxOptions(Options):
     """Options of ``onnx``."""
 
     segmenter: str = Field(
-        "u2netp", description="What the network takes and gives: a name that comes along, or a YAML file."
+        "u2netp", description="Description of inputs and outputs: a built-in name, or a YAML file."
     )
     model: str | None = Field(None, description="Saliency network: ONNX file, or name of a known network.")
-    encoder: str | None = Field(None, description="Promptable network: the image encoder, alike.")
-    decoder: str | None = Field(None, description="Promptable network: the prompt decoder, alike.")
+    encoder: str | None = Field(None, description="Image encoder: ONNX file or known name.")
+    decoder: str | None = Field(None, description="Prompt decoder: ONNX file or known name.")
     box: Literal["csrt", "nano", "vit"] = Field(
         "csrt", description="Box tracker: CSR-DCF, or OpenCV's NanoTrack or VitTrack from ONNX files."
     )
     nano_backbone: str = Field(
         "nanotrack-backbone", description="NanoTrack's backbone: ONNX file, or name of a known network."
     )
-    nano_head: str = Field("nanotrack-head", description="NanoTrack's head, alike.")
-    vit_model: str = Field("vittrack", description="VitTrack's network, alike.")
-    csrt: CsrtTracker.Options = Field(CsrtTracker.Options(), description="CSR-DCF's own options.")
+    nano_head: str = Field(
+        "nanotrack-head", description="NanoTrack's head: ONNX file, or name of a known network."
+    )
+    vit_model: str = Field(
+        "vittrack", description="VitTrack's network: ONNX file, or name of a known network."
+    )
+    csrt: CsrtTracker.Options = Field(CsrtTracker.Options(), description="Options of CSR-DCF.")
     every: int = Field(
-        1, ge=1, le=1000, description="Run the network in every k-th frame; flow carries the mask between."
+        1, ge=1, le=1000, description="Run the network in every k-th frame; flow propagates the mask."
     )
     crops: tuple[Annotated[float, Field(ge=1, le=4)], ...] = Field(
         (1.2, 1.5), min_length=1, description="Saliency network: factors by which the box is enlarged."
     )
-    anchor: bool = Field(True, description="Start the box tracker anew on the box of a confident mask.")
+    anchor: bool = Field(True, description="Re-initialize the box tracker on the box of a confident mask.")
     threads: int = Field(1, ge=1, le=256, description="CPU threads of the network.")
 
 
@@ -84,7 +88,7 @@ def build_boxes(options: OnnxOptions) -> BoxProposer:
 def _file(option: str, name: str | None, whose: str) -> Path:
     """The file of a network; errors name the option that gives it."""
     if name is None:
-        raise InputError(f"No ONNX file is given for {whose}; give it by the option tracker.{option}.")
+        raise InputError(f"No ONNX file is given for {whose}; set the option tracker.{option}.")
     try:
         return find_network(name)
     except InputError as error:

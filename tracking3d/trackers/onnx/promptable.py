@@ -1,4 +1,4 @@
-"""Promptable networks: an encoder run once a frame, and a decoder asked with boxes, points and masks."""
+"""Promptable networks: an encoder run once per frame, and a decoder prompted with boxes, points and masks."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tracking3d.trackers.onnx.proposals import Proposal, sharpness
 from tracking3d.trackers.onnx.saliency import validate_name
 
 Points = NDArray[np.float32]
-"""``(N, 3)``: x, y in pixels of the image, and 1 on the object or 0 beside it."""
+"""``(N, 3)``: x, y in pixels of the image, and 1 for the object or 0 for the background."""
 
 _LOGIT = 10.0  # of a previous mask's certain pixels; beyond, the sigmoid is flat
 
@@ -84,7 +84,7 @@ class PromptableSegmenter:
         return proposals
 
     def look(self, image: Image) -> Look:
-        """Run the encoder on ``image`` ``(H, W, 3)``; the answer can be asked many times."""
+        """Run the encoder on ``image`` ``(H, W, 3)``; the result can be queried many times."""
         fit = fit_image(image.shape[:2], self._description.input)
         outputs = self._encoder.run({self._input: network_input(image, fit, self._description.input)})
         embeddings = {name: outputs[source] for name, source in self._embeddings.items()}
@@ -116,7 +116,7 @@ class Look:
 
         Args:
             box: ``(x, y, w, h)`` in pixels of the image.
-            points: ``(N, 3)``: x and y in pixels of the image, and 1 on the object or 0 beside it.
+            points: ``(N, 3)``: x and y in pixels of the image, and 1 for the object or 0 for the background.
             mask: ``(H, W)`` in [0, 1], what the object looked like before.
             origin: What the proposals are called.
 

@@ -1,4 +1,4 @@
-"""What segmentation networks propose, and the protocol they share."""
+"""Mask proposals of segmentation networks, and their protocol."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Proposal:
 
 
 class Segmenter(Protocol):
-    """A segmentation network that is told roughly where the object is."""
+    """A segmentation network that is given the rough position of the object."""
 
     def propose(self, image: Image, box: Box, last: NDArray[np.float32] | None) -> list[Proposal]:
         """Masks of the object in ``image`` ``(H, W, 3)`` RGB.
@@ -42,14 +42,14 @@ class Segmenter(Protocol):
 
 @runtime_checkable
 class PointSegmenter(Protocol):
-    """A segmentation network that takes points on the object and beside it, too."""
+    """A segmentation network that also takes object and background points."""
 
     def propose_by_points(self, image: Image, points: NDArray[np.float32]) -> list[Proposal]:
         """Masks of the object in ``image`` ``(H, W, 3)`` RGB.
 
         Args:
             image: The frame.
-            points: ``(N, 3)``: x, y in pixels of the image, and 1 on the object or 0 beside it.
+            points: ``(N, 3)``: x, y in pixels of the image, and 1 for the object or 0 for the background.
         """
         ...
 

@@ -1,4 +1,4 @@
-"""Saliency networks on a crop around the box: what stands out in it is taken for the object."""
+"""Saliency networks on a crop around the box: the salient region is taken as the object."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from tracking3d.trackers.onnx.description import SaliencyNetwork
 from tracking3d.trackers.onnx.images import enlarge, fit_image, network_input, on_image, sigmoid
 from tracking3d.trackers.onnx.proposals import Proposal, sharpness
 
-# Nothing beyond the box, enlarged by this, is the object; the user's first box is nearer to it than a tracker's.
+# Nothing beyond the box, enlarged by this, is the object; the user's first box is nearer to it than a
+# tracker's.
 _FIRST_SLACK, _SLACK = 1.05, 1.1
 
 

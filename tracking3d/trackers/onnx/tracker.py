@@ -1,4 +1,4 @@
-"""Mask tracker ``onnx``: a box tracker proposes, a segmentation network in an ONNX file disposes."""
+"""Mask tracker ``onnx``: a box tracker gives the region, a segmentation network in an ONNX file the mask."""
 
 from __future__ import annotations
 
@@ -26,11 +26,10 @@ _PATIENCE = 3  # confident masks in a row that find the box tracker off the obje
 class OnnxTracker:
     """Mask tracker ``onnx``.
 
-    In every frame the box tracker says where to look, the network segments there, and the masks it proposes
-    are judged by colours and by the box, never by the network's own opinion of them. The best one is the
-    answer. Beside it goes a mask carried by flow and colours: the answer between the frames that are
-    segmented, and where the network's masks cannot be used. Confident masks start the box tracker anew where
-    it has strayed from them.
+    In every frame the box tracker gives the search region, the network segments there, and the proposed masks are rated
+    by colours and by the box, never by the network's own score. The best one is the estimate. A second mask is
+    propagated by flow and colours: it is the estimate between the segmented frames, and if the network's masks cannot
+    be used. Confident masks re-initialize the box tracker if it has drifted from them.
     """
 
     Options = OnnxOptions
@@ -48,11 +47,11 @@ class OnnxTracker:
     def from_options(cls, options: BaseModel) -> Self:
         """Build the tracker from its validated options."""
         if not isinstance(options, OnnxOptions):
-            raise PluginError("The tracker onnx was built with options that are not its own.")
+            raise PluginError("The tracker onnx was given the options of another tracker.")
         return cls(options)
 
     def init(self, frame: Frame, prompt: Prompt) -> MaskEstimate:
-        """Start from a box or a mask; the prompt's mask is the first answer, else the box's segmentation.
+        """Start from a box or a mask; the prompt's mask is the first estimate, else the box's segmentation.
 
         Raises:
             InputError: If the box lies outside the frame.
@@ -73,9 +72,9 @@ class OnnxTracker:
         return estimate
 
     def step(self, frame: Frame) -> MaskEstimate:
-        """Answer for the next frame."""
+        """Estimate the mask in the next frame."""
         if self._carried is None:
-            raise PluginError("The tracker onnx was asked for a frame before it was started with init.")
+            raise PluginError("The tracker onnx must be started with init before it tracks a frame.")
         image = frame.image
         box = self._boxes.update(image)
         carried = self._carried.step(image, box)
@@ -104,7 +103,9 @@ class OnnxTracker:
         judge = ColourJudge(image, guess.mask)
         best = self._best(judge, image, prompt.box, None, prompt.box)
         if reason := _unusable(best):
-            return MaskEstimate(guess.mask, guess.score / 2, f"{reason}; colours in the box stand in")
+            return MaskEstimate(
+                guess.mask, guess.score / 2, f"{reason}; the box was segmented by colour instead"
+            )
         return MaskEstimate(best.proposal.mask, best.score)
 
     def _by_points(
@@ -127,7 +128,7 @@ class OnnxTracker:
         return MaskEstimate(best.proposal.mask, best.score)
 
     def _segment(self, image: Image, witness: Box | None, carried: MaskEstimate) -> MaskEstimate:
-        """The network's answer, or the carried one where the network has none that can be used."""
+        """The network's mask, or the propagated one if the network has no usable mask."""
         assert self._carried is not None
         box = witness if witness is not None else self._place(carried)
         best = self._best(self._judge, image, box, carried.mask, witness)
@@ -139,7 +140,7 @@ class OnnxTracker:
         if reason := _unusable(best):
             if carried.mask is None:
                 return MaskEstimate(None, 0.0, reason)
-            return MaskEstimate(carried.mask, carried.score / 2, f"{reason}; the last mask was carried on")
+            return MaskEstimate(carried.mask, carried.score / 2, f"{reason}; the last mask was propagated")
         mask = best.proposal.mask
         self._carried.correct(image, mask > 0.5)
         self._last_box = box_of(mask) or box
@@ -152,7 +153,7 @@ class OnnxTracker:
         return MaskEstimate(mask, best.score, best.judgement.doubt)
 
     def _anchor(self, image: Image, best: Verdict, witness: Box | None) -> None:
-        """Start the box tracker anew where confident masks have found it off the object, or it is lost."""
+        """Re-initialize the box tracker if confident masks show that it has left the object, or if it is lost."""
         strayed = witness is None or box_iou(self._last_box, witness) < _STRAYED
         self._strayed = self._strayed + 1 if strayed and best.score_without_box >= _CONFIDENT else 0
         if self._strayed >= (1 if witness is None else _PATIENCE):
@@ -185,9 +186,9 @@ def _count_kept_points(mask: NDArray[np.float32], points: NDArray[np.float32]) -
 
 
 def _unusable(verdict: Verdict) -> str:
-    """Why a mask cannot be the answer, or empty."""
+    """Why a mask cannot be the estimate, or empty."""
     if box_of(verdict.proposal.mask) is None:
-        return "the network found nothing"
+        return "the network found no object"
     if verdict.proposal.sharpness < _LEAST_SHARPNESS:
         return "the network's mask is blurred"
     agreement = verdict.judgement.agreement
