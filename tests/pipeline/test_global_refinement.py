@@ -167,7 +167,7 @@ def test_masks_are_weighed_once_more_and_the_causal_ones_stand(clip, source, tmp
         assert before.mask_source is not MaskSource.FUSED
         assert before.area == np.count_nonzero(causal.mask(frame.index))
     assert any(frame.mask_source is MaskSource.FUSED for frame in final.frames)
-    assert final.config["object"]["evidence"]
+    assert final.config["object"]["refine_masks"]
 
 
 def test_the_mask_tracker_runs_once_and_its_masks_come_again_as_they_were(

@@ -172,7 +172,9 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_end(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("owner", "name", "call"), [(Session, "step", 4), (Session, "refine_frame", 3)], ids=["tracked", "refined"]
+    ("owner", "name", "call"),
+    [(Session, "step", 4), (Session, "refine_frame", 3)],
+    ids=["tracked", "refined"],
 )
 def test_the_state_of_the_online_solver_is_kept_whole(
     clip, images, whole, tmp_path, monkeypatch, online, owner, name, call

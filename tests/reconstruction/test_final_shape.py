@@ -60,4 +60,4 @@ def test_nothing_is_done_where_nothing_is_asked(run, monkeypatch):
 def test_the_best_quality_asks_for_it_and_what_is_known_is_held():
     assert load_config(quality="best").object.shape == "fine"
     assert load_config(quality="good").object.shape == "fast"
-    assert ObjectConfig(model="mug.obj", shape="fine").shape == "online"
+    assert ObjectConfig(model="mug.obj", shape="fine").shape == "fast"

@@ -51,13 +51,13 @@ def test_a_frame_is_tracked_from_the_confidence_on_at_which_it_is_believed():
 
 def test_doubt_says_why():
     barely = Assessment(Status.TRACKED, "", 0.52)
-    assert "(0 agree of 40" in judge_with_landmarks(barely, Support(40, 0)).reason
+    assert "(0 of 40 matched landmarks" in judge_with_landmarks(barely, Support(40, 0)).reason
     assert judge_with_landmarks(DOUBTED, Support(40, 0)).reason == DOUBTED.reason
 
 
 def test_doubt_about_a_plain_object_says_that_it_is_plain():
     hardly = Assessment(Status.TRACKED, "", 0.03)
-    assert "plain" in judge_with_landmarks(hardly, Support(300, 300, telling=False)).reason
+    assert "hardly any texture" in judge_with_landmarks(hardly, Support(300, 300, telling=False)).reason
 
 
 def test_what_is_lost_stays_lost():
