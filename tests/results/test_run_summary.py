@@ -132,6 +132,6 @@ def test_a_variable_frame_rate_is_a_note_but_not_of_a_camera():
     records = timed(0, 40, 80, 200)  # every second frame
     [note] = notes_of_times(records)
     assert note.startswith("frame intervals vary from 20 to 60 ms (variable frame rate)")
-    run = {"source_notes": ["toned"], "camera": {"assumed": False, "origin": ""}, "given": {"frames": 4}}
+    run = {"source_notes": ["toned"], "camera": {"assumed": False, "origin": ""}, "prompt": {"frames": 4}}
     assert notes_of_run(run, None, records) == ["toned", note]
-    assert notes_of_run(run | {"given": {"frames": None}}, None, records) == ["toned"]
+    assert notes_of_run(run | {"prompt": {"frames": None}}, None, records) == ["toned"]

@@ -24,7 +24,7 @@ from tracking3d.frames import SkippedFrame
 from tracking3d.results import layout
 from tracking3d.results.files import read_mask, write_atomic, write_mask, writing
 
-VERSION = 1
+VERSION = 2
 MOST_KEPT = 200 * 10**6
 """Bytes that milestones may take in the folder of a run that is finished."""
 
@@ -102,14 +102,15 @@ class Checkpoint:
         """What was kept last.
 
         Raises:
-            InputError: If it is damaged, or of another version.
+            InputError: If it is damaged, or was written by another version.
         """
         path = self._folder / layout.STATE_FILE
         try:
             state = json.loads(path.read_bytes())
             if state["version"] != VERSION:
                 raise InputError(
-                    f"{path} was written by another version of tracking3d; start anew with {layout.OVERWRITE}."
+                    f"{path} was written by another version of tracking3d (format {state['version']}); "
+                    f"run it again with {layout.OVERWRITE}."
                 )
             self._journal = int(state["journal"])
             journal = self._folder / layout.JOURNAL

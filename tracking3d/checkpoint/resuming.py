@@ -49,7 +49,7 @@ def prompt_record(
         "width": width,
         "height": height,
         "first_frame": first.index,
-        "first_picture": checksum(first.image),
+        "first_image_crc": checksum(first.image),
         "box": None if prompt is None else [float(value) for value in prompt.box],
         "mask": mask,
         "points": None if prompt is None or prompt.points is None else prompt.points.tolist(),
@@ -73,12 +73,12 @@ _NAMES = {
     "width": "width of the frames",
     "height": "height of the frames",
     "first_frame": "index of the first frame",
-    "first_picture": "first picture",
+    "first_image_crc": "first image",
     "box": "object's box",
     "mask": "object's mask",
     "points": "object's points",
 }
-_CHECKSUMS = ("first_picture", "mask")
+_CHECKSUMS = ("first_image_crc", "mask")
 
 
 def earlier_run(
@@ -131,7 +131,7 @@ def changed_frames(folder: Path, given: Mapping[str, Any]) -> set[int]:
 
 def _changed(before: Mapping[str, Any], given: Mapping[str, Any]) -> set[int]:
     """Frames that are corrected now and were not, or otherwise."""
-    then, now = _by_frame(before.get("given") or {}), _by_frame(given)
+    then, now = _by_frame(before.get("prompt") or {}), _by_frame(given)
     return {frame for frame in now if then.get(frame) != now[frame]}
 
 
@@ -149,7 +149,7 @@ def _differences(
     for key in sorted(then.keys() | now.keys()):
         if then.get(key) != now.get(key):
             yield f"{key} was {then.get(key)} and is {now.get(key)}"
-    earlier = before.get("given") or {}
+    earlier = before.get("prompt") or {}
     if gone := sorted(_by_frame(earlier).keys() - _by_frame(given).keys()):
         yield f"it was corrected in {_frames(gone)}, which is not asked for now"
     for key, name in _NAMES.items():

@@ -74,14 +74,14 @@ def _copy_run(folder: Path, stage: Path, milestones: list[Milestone], journal: b
             link_or_copy(one.path, stage / layout.STATE / one.path.name)
         (stage / layout.STATE / layout.JOURNAL).write_bytes(journal)
         link_or_copy(milestones[-1].path, stage / layout.STATE / layout.STATE_FILE)
-    told = {**run.description, "state": "interrupted", "refinement": None}
-    corrections = (run.description.get("given") or {}).get("corrections") or []
+    description = {**run.description, "state": "interrupted", "refinement": None}
+    corrections = (run.description.get("prompt") or {}).get("corrections") or []
     answered = {record.index for record in records}
-    told["given"] = {
-        **(run.description.get("given") or {}),
+    description["prompt"] = {
+        **(run.description.get("prompt") or {}),
         "corrections": [one for one in corrections if one["frame"] in answered],
     }
-    write_atomic(stage / layout.RUN, json.dumps(jsonable(told)).encode() + b"\n")
+    write_atomic(stage / layout.RUN, json.dumps(jsonable(description)).encode() + b"\n")
 
 
 def remove_run(folder: Path) -> None:
@@ -109,14 +109,12 @@ def remove_empty(folder: Path) -> None:
 
 
 def prompt_record_in(run: RunReader) -> dict[str, Any]:
-    """What ``run.json`` tells of source and object, see `tracking3d.checkpoint.resuming.prompt_record`.
+    """The prompt in ``run.json``, see `tracking3d.checkpoint.resuming.prompt_record`.
 
     Raises:
-        InputError: If it does not, as one of an earlier version.
+        InputError: If it has none.
     """
-    given = run.description.get("given")
-    if not isinstance(given, dict):
-        raise InputError(
-            f"The run {run.folder} does not say what it was begun with; make it anew, with the correction."
-        )
-    return given
+    prompt = run.description.get("prompt")
+    if not isinstance(prompt, dict):
+        raise InputError(f"The run {run.folder} names no prompt; run the video again, with the correction.")
+    return prompt

@@ -179,7 +179,7 @@ class TrackingResult:
         """
         if self._queries is None:
             return ()
-        first = (self.run.description.get("given") or {}).get("first_frame", 0)
+        first = (self.run.description.get("prompt") or {}).get("first_frame", 0)
         frames = np.where(self._queries[:, 0] < 0, first, self._queries[:, 0]).astype(int)
         return tuple(
             self.track_points(int(frame), self._queries[frames == frame, 1:]) for frame in np.unique(frames)

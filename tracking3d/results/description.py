@@ -69,7 +69,7 @@ def description_at_start(header: RunHeader) -> dict[str, Any]:
         "resumed": [],
         "source": header.source,
         "selection": header.selection,
-        "given": header.given,
+        "prompt": header.given,
         "fps": header.fps,
         "command": header.command,
         "source_notes": list(header.source_notes),
@@ -96,7 +96,7 @@ def refinement(
     """What came of a final refinement.
 
     Args:
-        state: ``running``, ``finished``, ``interrupted``, ``failed`` or ``left out``.
+        state: ``running``, ``finished``, ``interrupted``, ``failed`` or ``skipped``.
         reason: Why it has that state, in words.
         causal: The causal estimate for every frame.
         refined: The refined estimates.
@@ -107,7 +107,7 @@ def refinement(
         "state": state,
         "reason": reason,
         "frames": len(refined),
-        "kept": len(causal) - len(refined),
+        "kept_causal": len(causal) - len(refined),
         "seconds": seconds,
         "stages": _plain(stages_of(refined), together),
         "causal": {**_by_status(causal), "iou_initial_mean": _mean_iou(causal)},

@@ -29,7 +29,7 @@ from pathlib import Path
 from tracking3d.errors import OutputError, argument
 
 FORMAT = "tracking3d-run"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 RUN = "run.json"
 FRAMES = "frames.jsonl"

@@ -28,7 +28,7 @@ def notes_of_run(run: dict[str, Any], model: ObjectModel | None, records: Sequen
         records: The estimate for every frame, in order.
     """
     # A camera is not expected to deliver frames evenly; it has no number of frames either.
-    counted = (run.get("given") or {}).get("frames") is not None
+    counted = (run.get("prompt") or {}).get("frames") is not None
     return [
         *run["source_notes"],
         *(notes_of_times(records) if counted else ()),

@@ -64,7 +64,7 @@ class FrameRecord:
         failure: Which plug-in failed at this frame, and why; empty if none did.
         hypothesis: Which start of the pose won, in a word or two; empty if there was no choice.
         refined: Whether this is the estimate of the final refinement, not the causal one.
-        stages: The same time stage by stage; None if unknown, as in runs of older versions.
+        stages: The same time stage by stage; None in revisions.
         mask_source: Where the estimated mask comes from; None if unknown.
         camera: fx, fy, cx, cy of the camera that the pose is of; None if it is the run's.
         diagnostics: What else tells how far the pose is to be trusted, by name; NaN if it was not a number.

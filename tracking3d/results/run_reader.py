@@ -45,6 +45,10 @@ _KINDS: dict[str, Any] = {
 _RUN = argument("the folder that `record` wrote", "the --out folder of a `tracking3d run`")
 
 
+class FormatError(InputError):
+    """A run folder was written by a version of tracking3d with another format."""
+
+
 class RunReader:
     """A run folder as it was when each part was first asked for.
 
@@ -53,7 +57,8 @@ class RunReader:
         one; else all are causal.
 
     Raises:
-        InputError: If it is not a run folder, or one of a newer version.
+        InputError: If it is not a run folder.
+        FormatError: If it was written by an earlier or a later version.
     """
 
     def __init__(self, folder: Path, refined: bool = True) -> None:
@@ -277,12 +282,17 @@ def _read_description(folder: Path) -> dict[str, Any]:
     version = description.get("format_version")
     if not isinstance(version, int):
         raise InputError(f"{path} is damaged: it holds no format version.")
-    for name, kind in _KINDS.items():
-        if name in description and not isinstance(description[name], kind):
-            raise InputError(f"{path} is damaged: {name} is {description[name]!r:.40}; restore it.")
     if version > layout.FORMAT_VERSION:
-        raise InputError(
+        raise FormatError(
             f"The run {folder} has format version {version}, newer than the "
             f"{layout.FORMAT_VERSION} that this tracking3d reads; update tracking3d."
         )
+    if version < layout.FORMAT_VERSION:
+        raise FormatError(
+            f"The run {folder} was written by an earlier version of tracking3d (format {version}); "
+            f"run it again with {layout.OVERWRITE}."
+        )
+    for name, kind in _KINDS.items():
+        if name in description and not isinstance(description[name], kind):
+            raise InputError(f"{path} is damaged: {name} is {description[name]!r:.40}; restore it.")
     return description

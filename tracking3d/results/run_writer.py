@@ -158,7 +158,7 @@ class RunWriter:
 
     def leave_out_refinement(self, reason: str) -> None:
         """Record that there is no final refinement though one was asked for, and why."""
-        self._description["refinement"] = description.refinement("left out", reason)
+        self._description["refinement"] = description.refinement("skipped", reason)
         self._write_description()
 
     def begin_refinement(

@@ -109,10 +109,10 @@ def join(tell: Tell, tracked: Tracked) -> Again | Refused | Joined:
     about = {
         "workers": video.workers,
         "parts": [[run.part.start, run.part.stop] for run in whole.runs],
-        "looked_at": begun.plan.looked_at,
-        "tracked_again": list(tracked.again),
-        "joints": whole.joints,
-        "dearer": whole.dearer,
+        "preview_frames": begun.plan.preview_frames,
+        "retracked": list(tracked.again),
+        "alignments": whole.alignments,
+        "cost_ratio": whole.cost_ratio,
     }
     writer = _begin_writing(begun, opened, whole)
     owned = _owned_ranges(begun)

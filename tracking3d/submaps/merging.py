@@ -31,7 +31,7 @@ from tracking3d.submaps.plan import Plan, part_folder
 from tracking3d.submaps.similarity import fit_similarity
 from tracking3d.submaps.state_merging import merge_states
 
-MOST_DEARER = 1.75
+MAX_COST_RATIO = 1.75
 """How many times what the parts' keyframes cost by themselves they may cost together; see `keyframe_cost`."""
 _FEWEST_KEYFRAMES = 3
 _SAME_LENS = math.log(1.05)
@@ -45,15 +45,15 @@ class MergedMap:
         runs: The parts, with how each lies in the joined object.
         session: The state of a session that has seen all of them.
         camera: Of the causal answers.
-        joints: What is known of each joint, for the record.
-        dearer: How many times what they cost by themselves the keyframes cost together.
+        alignments: What is known of each alignment, for the record.
+        cost_ratio: How many times what they cost by themselves the keyframes cost together.
     """
 
     runs: Sequence[PartRun]
     session: Mapping[str, Any]
     camera: Camera
-    joints: Sequence[Mapping[str, Any]]
-    dearer: float
+    alignments: Sequence[Mapping[str, Any]]
+    cost_ratio: float
 
 
 def merge_submaps(session: Session, config: PipelineConfig, plan: Plan, folder: Path) -> MergedMap:
@@ -82,7 +82,7 @@ def merge_submaps(session: Session, config: PipelineConfig, plan: Plan, folder: 
             refused.append(error)
     if not tried:
         raise DisagreementError(f"{refused[0]}{_of_lenses(lenses)}") from refused[0]
-    best = min(tried, key=lambda one: one.dearer)
+    best = min(tried, key=lambda one: one.cost_ratio)
     runs, updated = best.runs, best.belief
     settled = [
         replace(run, similarity=_refine_alignment(updated.object_map, own.object_map, similarity))
@@ -96,7 +96,13 @@ def merge_submaps(session: Session, config: PipelineConfig, plan: Plan, folder: 
         "camera": updated.camera,
         "steering": (first_pose, FrameOrder(presented.first), last, anew),
     }
-    return MergedMap(settled, state, updated.camera, [_describe(joint) for joint in best.joints], best.dearer)
+    return MergedMap(
+        settled,
+        state,
+        updated.camera,
+        [_describe(alignment) for alignment in best.alignments],
+        best.cost_ratio,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,10 +111,10 @@ class _Try:
 
     runs: Sequence[PartRun]
     beliefs: Sequence[SolverState]
-    joints: Sequence[SubmapAlignment]
+    alignments: Sequence[SubmapAlignment]
     similarities: Sequence[Similarity]
     belief: SolverState
-    dearer: float
+    cost_ratio: float
 
 
 def _lenses(states: Sequence[SolverState]) -> list[Camera]:
@@ -141,15 +147,15 @@ def _try_alignment(
     seen = [by_lens(state, run.records, camera) for state, run in zip(states, runs, strict=True)]
     by_it = [state for state, _ in seen]
     own = [replace(run, records=records) for run, (_, records) in zip(runs, seen, strict=True)]
-    joints = [
-        _joint(number, by_it[number - 1 : number + 1], own[number - 1 : number + 1])
+    alignments = [
+        _align_pair(number, by_it[number - 1 : number + 1], own[number - 1 : number + 1])
         for number in range(1, len(own))
     ]
     similarities = [Similarity.identity()]
-    for joint in joints:
-        similarities.append(similarities[-1].after(joint.fit.similarity))
-    state, dearer = merge_submap_states(by_it, similarities, config, encoder, states)
-    return _Try(own, by_it, joints, similarities, state, dearer)
+    for alignment in alignments:
+        similarities.append(similarities[-1].after(alignment.fit.similarity))
+    state, cost_ratio = merge_submap_states(by_it, similarities, config, encoder, states)
+    return _Try(own, by_it, alignments, similarities, state, cost_ratio)
 
 
 def merge_submap_states(
@@ -175,7 +181,7 @@ def merge_submap_states(
     own = float(np.mean([keyframe_cost(state.object_map) for state in before or states]))
     state = merge_states(states, similarities, config, encoder)
     together = keyframe_cost(state.object_map)
-    if together > MOST_DEARER * own:
+    if together > MAX_COST_RATIO * own:
         raise DisagreementError(
             f"one object explains what they show {together / own:.1f} times as badly as one each does"
         )
@@ -201,7 +207,7 @@ def _read_submaps(
     return runs, states
 
 
-def _joint(number: int, states: Sequence[SolverState], runs: Sequence[PartRun]) -> SubmapAlignment:
+def _align_pair(number: int, states: Sequence[SolverState], runs: Sequence[PartRun]) -> SubmapAlignment:
     try:
         return align_submaps(states[0], states[1], runs[0].records, runs[1].records)
     except DisagreementError as error:
@@ -230,11 +236,11 @@ def own_points(object_map: ObjectMap) -> np.ndarray:
     return np.asarray(object_map.vertices.double().cpu().numpy())
 
 
-def _describe(joint: SubmapAlignment) -> dict[str, Any]:
-    fit = joint.fit
+def _describe(alignment: SubmapAlignment) -> dict[str, Any]:
+    fit = alignment.fit
     return {
-        "frames": joint.frames,
-        "landmarks": joint.landmarks,
+        "frames": alignment.frames,
+        "landmarks": alignment.landmarks,
         "degrees": float(np.median(fit.angles)),
         "distance": float(np.median(fit.distances)),
         "scale": fit.similarity.scale,

@@ -34,12 +34,12 @@ class Plan:
     Attributes:
         parts: The parts, at least one.
         seconds: What the look ahead took.
-        looked_at: Frames that it looked at.
+        preview_frames: Number of frames in the preview.
     """
 
     parts: Sequence[Part]
     seconds: float = 0.0
-    looked_at: int = 0
+    preview_frames: int = 0
 
 
 def selection_of(whole: range, start: int, stop: int) -> str:
