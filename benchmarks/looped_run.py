@@ -46,7 +46,7 @@ class Sample:
         seconds: From the frame before to this one.
         memory: Megabytes of the process.
         descriptors: Open files of the process.
-        status: Of the answer.
+        status: Of the estimate.
     """
 
     index: int

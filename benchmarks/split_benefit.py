@@ -36,12 +36,12 @@ class SplitMeasurement:
 
     Attributes:
         seconds: Wall time.
-        rotation_mean: Mean rotation error in degrees, refined answers; causal ones are left out.
+        rotation_mean: Mean rotation error in degrees, refined estimates; causal ones are left out.
         rotation_median: The median.
         tracked: Share of the frames.
         stages: Seconds of what a split run does, by name; empty of a whole one.
         parts: How many.
-        reason: Why parts were not joined; empty where they were.
+        reason: Why parts were not merged; empty where they were.
     """
 
     seconds: float
@@ -147,7 +147,7 @@ def measure_split(
 
 def _measured(folder: Path, T_true: NDArray[np.float64]) -> SplitMeasurement:
     taken = json.loads((folder / _TAKEN).read_text(encoding="utf-8"))
-    if not (folder / layout.RUN).is_file():  # the parts were not joined
+    if not (folder / layout.RUN).is_file():  # the parts were not merged
         return SplitMeasurement(taken["seconds"], np.nan, np.nan, np.nan, {}, taken["parts"], taken["reason"])
     run = RunReader(folder)
     R = np.stack([one.T_cam_obj[:3, :3] for one in run.frames])
@@ -176,5 +176,5 @@ def format_split(measured: dict[str, SplitMeasurement]) -> Table:
         table.add_row(f"  {stage}", *(f"{one.stages.get(stage, 0):.1f}" for one in measured.values()))
     for one in measured.values():
         if one.reason:
-            table.add_row("not joined", "", one.reason)
+            table.add_row("not merged", "", one.reason)
     return table

@@ -80,7 +80,7 @@ def track_video(
     A video that was begun before and stopped in whatever way goes on from its last finished frame.
 
     Args:
-        tell: Is given a mapping of ``frames``, how many estimates there are, and ``of`` how many, where known.
+        tell: Is given a mapping of ``frames``, how many estimates there are, and ``of`` how many, if known.
         job: The video.
         out: The folder of the batch.
         command: The command line, for the record.

@@ -122,4 +122,4 @@ def _video(job: VideoJob, work: Path, command: str, workers: int) -> LongVideo:
 
 
 def _note(ended: SplitResult) -> str:
-    return f"its {ended.parts} parts could not be joined: {ended.reason}" if len(ended.folders) > 1 else ""
+    return f"its {ended.parts} parts could not be merged: {ended.reason}" if len(ended.folders) > 1 else ""

@@ -111,5 +111,5 @@ class Tasks:
 
 
 def is_finished_video(ended: Ended) -> bool:
-    """Whether a video is finished with a task; steps of long ones answer with other things than its rows."""
+    """Whether a video is finished with a task; steps of long ones estimate with other things than its rows."""
     return isinstance(ended.value, Mapping) and "rows" in ended.value

@@ -26,7 +26,7 @@ class VideoJob:
         start_frame: The frame in which the objects are given; None for the first.
         frames: ``START:STOP:STEP``.
         sequence: Layout, folder and name of a sequence of a dataset, whose images are then the video.
-        size: Bytes of the video, where known: large ones are begun first.
+        size: Bytes of the video, if known: large ones are begun first.
         fault: Why it cannot be done, if known beforehand.
         split: Length of the parts that it is cut into, see `tracking3d.submaps.cuts.parse_length`; empty for none.
     """
@@ -47,7 +47,7 @@ class VideoJob:
 
     @property
     def in_parts(self) -> bool:
-        """Whether it is cut where it is long: parts are joined of one object that is given in the first frame."""
+        """Whether it is cut where it is long: parts are merged of one object that is given in the first frame."""
         whole = self.sequence is not None or self.start_frame is not None or self.correct or self.objects > 1
         return bool(self.split) and not whole
 

@@ -101,7 +101,7 @@ class TrackerMeasurement:
     error: str = ""
 
     def figures(self) -> dict[str, float | int | None]:
-        """The measures by name; None where there is nothing to measure.
+        """The measures by name; None if there is nothing to measure.
 
         ``iou_mean``, ``boundary_f_mean``, ``share_under_half`` (of frames with an IoU under 0.5),
         ``milliseconds`` (median of a frame), ``auc_50`` and ``auc_70`` (area under the ROC curve of the score as
@@ -184,7 +184,7 @@ def overall(results: Sequence[TrackerMeasurement]) -> dict[str, dict[str, float 
 def track_masks(
     choice: PluginChoice, truth: Truth, start: Start = "box"
 ) -> Iterator[tuple[Frame, MaskEstimate, float]]:
-    """Send a sequence through a mask tracker; yields each frame, the answer and the seconds it took.
+    """Send a sequence through a mask tracker; yields each frame, the estimate and the seconds it took.
 
     Raises:
         InputError: If the sequence cannot be read or does not tell where the object is at first.

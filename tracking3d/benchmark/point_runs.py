@@ -67,7 +67,7 @@ class MeasuredRun:
     Attributes:
         sequence: Its sequence.
         masks: Where its initial masks came from.
-        refined: Whether its refined answers were taken.
+        refined: Whether its refined estimates were taken.
         rows: By method.
         inside: Share of the errors inside twice the uncertainty.
         errors: Of the corrected points.
@@ -114,7 +114,7 @@ def measure_run(job: Job, folder: Path, refined: bool = True, beside: bool = Fal
     Args:
         job: A finished job.
         folder: Its run folder.
-        refined: Take the refined answers, else the causal ones.
+        refined: Take the refined estimates, else the causal ones.
         beside: Score the other methods too.
 
     Raises:

@@ -50,7 +50,7 @@ class Kernels:
 
 
 def detect_kernels(environment: Mapping[str, str]) -> Kernels | None:
-    """What a process with these environment variables computes with; None where this processor cannot run it."""
+    """What a process with these environment variables computes with; None if this processor cannot run it."""
     found = subprocess.run(
         [sys.executable, "-c", _PROBE],
         env={**os.environ, "OPENBLAS_VERBOSE": "2", **environment},

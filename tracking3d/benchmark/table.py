@@ -39,7 +39,7 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class Line:
-    """A filled row: the paper's figures and those measured here; None where there is none.
+    """A filled row: the paper's figures and those measured here; None if there is none.
 
     Attributes:
         label: The row's name.
@@ -50,7 +50,7 @@ class Line:
         rotation_error_mean_deg: Mean rotation error, where the poses are known.
         seconds_per_frame: Mean wall time.
         sequences: Number of sequences that the figures here are the mean of.
-        improved: Number of those whose mean IoU is above that of their initial masks; None where none is compared.
+        improved: Number of those whose mean IoU is above that of their initial masks; None if none is compared.
         note: Why something is missing.
     """
 
@@ -133,7 +133,7 @@ def _choose_sequences(table: Table, dataset: Dataset) -> Dataset:
 def _lines(
     row: TableRow, table: Table, plan: Mapping[str, Variant | str], results: Mapping[str, ResultSet]
 ) -> list[Line]:
-    """A row's line; two, causal and refined, where its run has both answers and the row shows answers."""
+    """A row's line; two, causal and refined, where its run has both estimates and the row shows estimates."""
     result = results.get(row.plan)
     if result is None or row.initial or not result.causal:
         return [_line(row, table, plan, results)]

@@ -33,7 +33,7 @@ class TableRow:
         label: Its name.
         paper: What the paper prints there, if anything.
         plan: Name in the plan of what is run for it; empty where the paper stands alone.
-        initial: Whether it shows the initial masks of that run, not its answers.
+        initial: Whether it shows the initial masks of that run, not its estimates.
     """
 
     label: str

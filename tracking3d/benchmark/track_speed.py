@@ -53,14 +53,14 @@ class TrackSpeed:
 
     Attributes:
         name: Of the contender.
-        frames: Frames with a causal answer.
+        frames: Frames with a causal estimate.
         wall: Seconds of the whole command, start of the process and imports included.
-        processor: Seconds of all processors for it; None where the system does not say.
-        first_answer: Seconds from the command to the first answer: start of the process, imports, and that frame.
-        frames_per_second: Causal answers a second of wall time, from the first to the last.
-        delays: Seconds from when a frame is asked for to when its answer is written: percentiles as `PERCENTILES`.
+        processor: Seconds of all processors for it; None if the system does not say.
+        first_answer: Seconds from the command to the first estimate: start of the process, imports, and that frame.
+        frames_per_second: Causal estimates a second of wall time, from the first to the last.
+        delays: Seconds from when a frame is asked for to when its estimate is written: percentiles as `PERCENTILES`.
         stages: Mean seconds a frame.
-        refinement: Seconds a frame of the final refinement; None where there is none.
+        refinement: Seconds a frame of the final refinement; None if there is none.
         peak_memory: Megabytes.
         over_time: ``(N, stages)`` seconds of every frame, in the order of `STAGES`.
     """
@@ -154,7 +154,7 @@ def _parse_speed(name: str, folder: Path, wall: float, processor: float | None) 
             first.setdefault(record.index, record)
     answers = list(first.values())
     if not answers:
-        raise InputError(f"{name} has answered no frame; see {folder}.")
+        raise InputError(f"{name} has estimated no frame; see {folder}.")
     times = [record.stages or StageTimes(solve=record.seconds) for record in answers]
     whole = [one.whole for one in times]
     refinement = run.get("refinement") or {}

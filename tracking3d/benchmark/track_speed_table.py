@@ -25,7 +25,7 @@ def speed_table(speeds: Sequence[TrackSpeed]) -> Table:
     rows: list[tuple[str, list[str]]] = [
         ("frames", [str(one.frames) for one in speeds]),
         ("frames a second, after the first", [_number(one.frames_per_second, 2) for one in speeds]),
-        ("first answer, s", [_number(one.first_answer, 1) for one in speeds]),
+        ("first estimate, s", [_number(one.first_answer, 1) for one in speeds]),
         ("whole command, s", [_number(one.wall, 1) for one in speeds]),
         ("  of all processors, s", [_number(one.processor, 1) for one in speeds]),
         *(

@@ -26,7 +26,7 @@ from tracking3d.results.files import read_mask, write_atomic, write_mask, writin
 
 VERSION = 2
 MOST_KEPT = 200 * 10**6
-"""Bytes that milestones may take in the folder of a run that is finished."""
+"""Bytes that rollback points may take in the folder of a run that is finished."""
 
 
 class Checkpoint:
@@ -36,7 +36,7 @@ class Checkpoint:
         folder: The run folder.
         classes: See `TreeFolder`.
         device: See `TreeFolder`.
-        milestones: How many states of earlier frames may be kept, see `tracking3d.checkpoint.milestones`.
+        rollback points: How many states of earlier frames may be kept, see `tracking3d.checkpoint.milestones`.
 
     Raises:
         OutputError: If the folder cannot be written.
@@ -71,7 +71,7 @@ class Checkpoint:
             progress: Where the run stands.
             session: The session's state.
             taken: The frame, where it was taken for the first time.
-            revised: Earlier frames whose answers are others since it: no correction can go on from between.
+            revised: Earlier frames whose estimates are others since it: no correction can go on from between.
 
         Raises:
             OutputError: If it cannot be written; the state before is then still there.
@@ -123,7 +123,7 @@ class Checkpoint:
                 RunProgress(**state["progress"]), self._trees.read(state["session"]), taken, skipped
             )
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(f"{path} is damaged ({error}); start anew with {layout.OVERWRITE}.") from error
+            raise InputError(f"{path} is damaged ({error}); run it again with {layout.OVERWRITE}.") from error
         return kept
 
     def clear_strangers(self) -> None:
@@ -155,11 +155,11 @@ class Checkpoint:
         """
         mask = read_mask(path := layout.mask_path(self._folder, index))
         if mask is None:
-            raise InputError(f"{path} is missing or damaged; start anew with {layout.OVERWRITE}.")
+            raise InputError(f"{path} is missing or damaged; run it again with {layout.OVERWRITE}.")
         return mask
 
     def finish(self) -> None:
-        """The run is finished: keep its milestones only, see `finish_state`.
+        """The run is finished: keep its rollback points only, see `finish_state`.
 
         Raises:
             OutputError: If something cannot be removed.

@@ -1,6 +1,6 @@
 """States of earlier frames that are kept beside the latest, for a correction of a frame to go on from.
 
-A milestone is the state's text as it was after a frame; what it names stays. Its arrays are mostly those of the states
+A rollback point is the state's text as it was after a frame; what it names stays. Its arrays are mostly those of the states
 around it, so that few of them, spread evenly over the run, cost little.
 """
 
@@ -91,7 +91,7 @@ class Milestones:
             self._drop([one for one in self._kept if one.taken % self._gap])
 
     def forget_after(self, taken: int) -> None:
-        """Remove those of after so many frames: an answer from before them is another one now.
+        """Remove those of after so many frames: an estimate from before them is another one now.
 
         Raises:
             OSError: If one cannot be removed.
@@ -105,7 +105,7 @@ class Milestones:
 
 
 def milestones_in(folder: Path) -> list[Milestone]:
-    """The milestones in the folder of a state, the earliest first."""
+    """The rollback points in the folder of a state, the earliest first."""
     found = []
     for path in sorted(folder.glob("milestone_*.json")) if folder.is_dir() else ():
         if name := _NAME.fullmatch(path.name):
@@ -115,11 +115,11 @@ def milestones_in(folder: Path) -> list[Milestone]:
 
 
 def keep_milestones_only(folder: Path, most_bytes: int) -> None:
-    """Leave of the state in a run folder what its milestones need, and of these no more than take so many bytes.
+    """Leave of the state in a run folder what its rollback points need, and of these no more than take so many bytes.
 
     Args:
         folder: The run folder.
-        most_bytes: Before they are compressed. Every second milestone goes until the rest is no larger; the last one
+        most_bytes: Before they are compressed. Every second rollback point goes until the rest is no larger; the last one
             stays longest.
 
     Raises:
@@ -159,7 +159,7 @@ def link_or_copy(source: Path, target: Path) -> None:
 
 
 def _compress(path: Path) -> None:
-    """Write an array file anew, a third as large; while the run goes on there is no time for that."""
+    """Write an array file again, a third as large; while the run goes on there is no time for that."""
     with zipfile.ZipFile(path) as file:
         if all(one.compress_type == zipfile.ZIP_DEFLATED for one in file.infolist()):
             return

@@ -19,11 +19,11 @@ class RunProgress:
     """Where a run stands.
 
     Attributes:
-        last: Index of the last frame that has its causal answer; -1 before the first.
+        last: Index of the last frame that has its causal estimate; -1 before the first.
         lines: Bytes of ``frames.jsonl`` up to there.
         refining: Whether everything was solved once more.
-        last_refined: Index of the last frame that was looked at again; -1 before the first.
-        refined_lines: Bytes of the second answers up to there.
+        last_refined: Index of the last frame that was refined again; -1 before the first.
+        refined_lines: Bytes of the second estimates up to there.
         seconds: Wall time of the run up to there, pauses left out.
         refinement_seconds: The same of the final refinement.
     """
@@ -45,7 +45,7 @@ class JournalEntry:
         index: The frame's index in the source.
         picture: Checksum of its image, see `checksum`.
         score: Of its initial mask; reason: of the same.
-        corrected: Whether the answer was handed back to the mask tracker.
+        corrected: Whether the estimate was handed back to the mask tracker.
         failure: Which plug-in failed at it, and why; empty where none did.
     """
 
@@ -108,7 +108,7 @@ def read_journal(text: bytes) -> tuple[dict[int, JournalEntry], tuple[SkippedFra
 
 
 def check_picture(kept: SavedState, frame: Frame | SkippedFrame) -> None:
-    """Make sure that a frame is the one that was answered before the run was stopped.
+    """Make sure that a frame is the one that was estimated before the run was stopped.
 
     Raises:
         InputError: If it is not.
@@ -120,6 +120,6 @@ def check_picture(kept: SavedState, frame: Frame | SkippedFrame) -> None:
         )
     if taken is not None and taken.picture != checksum(frame.image):
         raise InputError(
-            f"{frame.name or f'frame {frame.index}'} shows another picture than when it was answered; a run goes "
+            f"{frame.name or f'frame {frame.index}'} shows another picture than when it was estimated; a run goes "
             "on with the same source only."
         )

@@ -21,7 +21,7 @@ from tracking3d.results.run_reader import RunReader
 
 Earlier = Literal["none", "stopped", "finished", "outdated"]
 """What is in a run folder: nothing that could be resumed, a run that was stopped, one that is done, or one in which a
-frame that is answered is now corrected."""
+frame that is estimated is now corrected."""
 
 
 def prompt_record(
@@ -36,8 +36,8 @@ def prompt_record(
     Args:
         first: The first frame.
         prompt: The object in it.
-        count: Number of frames, where known.
-        start_frame: The frame from which it is tracked both ways; None where frames come in order of time.
+        count: Number of frames, if known.
+        start_frame: The frame from which it is tracked both ways; None if frames come in order of time.
         corrections: What was said of the object in later frames.
     """
     height, width = first.size
@@ -106,12 +106,12 @@ def earlier_run(
         if len(run.frames) <= 1:  # stopped before the first state was kept
             return "none"
         raise InputError(
-            f"The run {folder} cannot be resumed: its state was not kept; start anew with {layout.OVERWRITE}."
+            f"The run {folder} cannot be resumed: its state was not kept; run it again with {layout.OVERWRITE}."
         )
     if what := next(_differences(run.description, config, selection, given), None):
         raise InputError(
             f"The run {folder} cannot be resumed with other settings or another source: {what}; "
-            f"give what it was begun with, or start anew with {layout.OVERWRITE}."
+            f"give what it was begun with, or run it again with {layout.OVERWRITE}."
         )
     if changed := _changed(run.description, given):
         answered = {record.index for record in run.frames}

@@ -21,11 +21,11 @@ def roll_back(folder: Path, stage: Path, changed: Collection[int]) -> int | None
 
     Args:
         folder: The run; nothing of it is changed.
-        stage: Gets the earlier run: its last milestone of before then, and the answers that there were.
+        stage: Gets the earlier run: its last rollback point of before then, and the estimates that there were.
         changed: Indices of those frames.
 
     Returns:
-        How many frames are answered in it; None where no state of before then was kept, and nothing was made.
+        How many frames are estimated in it; None if no state of before then was kept, and nothing was made.
 
     Raises:
         OutputError: If it cannot be written.

@@ -272,7 +272,7 @@ class TreeFolder:
 
 
 def _only_zero_and_one(array: NDArray[Any]) -> bool:
-    """Whether a bit is enough for every value; most arrays are told from that by a few of theirs."""
+    """Whether a bit is enough for every value; most arrays are given from that by a few of theirs."""
     if array.dtype.kind == "b":
         return True
     few = array.reshape(-1)[:: max(array.size // 64, 1)]

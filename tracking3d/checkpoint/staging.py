@@ -30,7 +30,7 @@ def stage_correction(
     given: Mapping[str, Any],
     ends: ExitStack,
 ) -> tuple[Path, Earlier]:
-    """Where a run is computed in which an answered frame is corrected: from the last state before it, if one was kept.
+    """Where a run is computed in which an estimated frame is corrected: from the last state before it, if one was kept.
 
     Args:
         folder: The run folder.
@@ -62,7 +62,7 @@ def stage_correction(
     if answered is None:
         _log.warning(
             "No state of before frame %d was kept in %s, so that all is computed again; frames before the correction "
-            "get the answers that they had.",
+            "get the estimates that they had.",
             min(changed),
             folder,
         )
@@ -80,7 +80,7 @@ def take_over(folder: Path) -> None:
     try:
         if not is_finished(stage) or is_locked(stage / layout.FRAMES):
             return
-    except InputError:  # damaged: the next correction makes it anew
+    except InputError:  # damaged: the next correction makes it again
         return
     with writing(folder):
         new = [path.relative_to(stage) for path in layout.run_files(stage)]

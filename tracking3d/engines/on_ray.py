@@ -50,7 +50,7 @@ def open_ray(address: str, workers: int | None = None, needs: Needs = ONE_CORE) 
         needs: What each takes.
 
     Raises:
-        InputError: If Ray is not installed, or nothing answers at the address.
+        InputError: If Ray is not installed, or nothing estimates at the address.
     """
     os.environ.update({name: os.environ.get(name, value) for name, value in _QUIET.items()})
     ray = _ray()

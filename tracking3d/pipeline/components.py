@@ -1,4 +1,4 @@
-"""What a session is built of: solvers by name, the feature encoder, the device; and what its answers took."""
+"""What a session is built of: solvers by name, the feature encoder, the device; and what its estimates took."""
 
 from __future__ import annotations
 
@@ -106,6 +106,6 @@ def check_backward_tracking(config: PipelineConfig) -> None:
 
 
 def add_times(estimate: FrameEstimate, watch: Stopwatch, frame: Frame) -> FrameEstimate:
-    """An answer with what it took, reading the frame included."""
+    """An estimate with what it took, reading the frame included."""
     stages = watch.times + StageTimes(decode=frame.decoding)
     return replace(estimate, stages=stages, seconds=stages.whole)

@@ -136,7 +136,7 @@ class FinalRefinement:
         return self._last.masks is not None
 
     def collect_mask(self, frame: Frame) -> None:
-        """Adjust the pose of a frame, and keep what it says of the object's masks."""
+        """Adjust the pose of a frame, and collect its evidence for the object's masks."""
         if self._last.masks is not None and frame.index in self._estimates.causal:
             self._estimates.put(self._last.adjusted(frame))
             self._last.collect_mask(frame)

@@ -65,12 +65,12 @@ class ActiveRecordings:
 
     @contextmanager
     def guard(self, recording: ObjectRecorder) -> Iterator[None]:
-        """If something fails within, this recording ends and the others go on."""
+        """If the body raises, this recording ends and the others continue."""
         try:
             yield
         except Exception as error:
             self._active.remove(recording)
-            with suppress(Exception):  # the first error is the one to tell
+            with suppress(Exception):  # the first error is reported
                 self.tell(recording.written())
             recording.give_up(error)
             self.errors.append(error)
@@ -81,7 +81,7 @@ class ActiveRecordings:
             recording.give_up(error)
 
     def tell(self, done: FrameRecord | SkippedFrame | None) -> None:
-        """Call the listener, if there is something to tell."""
+        """Call the listener, if there is a new frame."""
         if done:
             self._listener(done)
 
@@ -93,7 +93,7 @@ def run_passes(
     listener: Listener,
     first_pass_only: bool = False,
 ) -> None:
-    """Run all passes. A recording that fails is ended; the others go on.
+    """Run all passes. A recording that fails is ended; the others continue.
 
     Args:
         source: Where the frames come from.

@@ -78,7 +78,7 @@ class ObjectRecorder:
             self._work.end()
 
     def written(self) -> Any:
-        """Wait until all estimates are written; what is to be told of the last one."""
+        """Wait until all estimates are written; returns the last one for the listener."""
         return self._work.wait()
 
     @property
@@ -89,14 +89,14 @@ class ObjectRecorder:
     def take(
         self, frame: Frame | SkippedFrame, coming: Frame | SkippedFrame | None = None
     ) -> FrameRecord | SkippedFrame | None:
-        """Estimate the object in the next frame and write the estimate; what a stopped run has estimated stands.
+        """Estimate the object in the next frame and write the estimate; estimates of a resumed run stay.
 
         Args:
             frame: The frame.
             coming: The one that will be taken next, if it is known.
 
         Returns:
-            What is to be told: of this frame, or of the one before while `writing_beside`.
+            The frame for the listener: this one, or the one before while `writing_beside`.
         """
         if isinstance(frame, Frame):
             self._unmet.discard(frame.index)
@@ -217,7 +217,7 @@ class ObjectRecorder:
             self._writer.leave_out_refinement(
                 f"{source.name} cannot be read a second time"
                 if self._session.can_refine
-                else f"the solver {self._session.config.solver.name} gives causal answers only"
+                else f"the solver {self._session.config.solver.name} gives causal estimates only"
             )
             return None
         self._causal_model = self._session.result()
@@ -267,12 +267,12 @@ class ObjectRecorder:
         folder = self._writer.folder
         if self._causal_model is not None and not self._temporary:
             error.add_note(
-                f"The final refinement was not finished; the causal answers are whole in {folder}."
+                f"The final refinement was not finished; the causal estimates are whole in {folder}."
             )
         elif self._answered and not self._temporary:
-            error.add_note(f"What was finished until then is kept in {folder}.")
+            error.add_note(f"The frames finished until then are in {folder}.")
         model = self._causal_model or _model_so_far(self._session)
-        with suppress(OutputError):  # the first error is the one to tell
+        with suppress(OutputError):  # the first error is reported
             self._writer.finish(model, "failed" if failed else "interrupted", str(error) or None)
 
 

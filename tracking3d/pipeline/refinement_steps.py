@@ -36,7 +36,7 @@ from tracking3d.segmentation.frame_window import Answered
 from tracking3d.segmentation.whole_video import SegmentedMask, VideoSegmenter
 
 Decision = tuple[Frame, SegmentedMask | None]
-"""A frame whose turn has come, and its mask; None if the mask that it has stands."""
+"""A frame that is due, and its mask; None if its present mask stays."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class PrecomputedRefinement:
 def estimate_again(
     session: Session, frame: Frame, causal: FrameRecord, initial: MaskEstimate
 ) -> FrameEstimate | None:
-    """Estimate the object in a frame again, with the final model; None if a plug-in fails and the run may go on.
+    """Estimate the object in a frame again, with the final model; None if a plug-in fails and the run may continue.
 
     Args:
         session: Has refined everything, see `Session.refine`.
@@ -133,7 +133,7 @@ class RefinementSteps:
         self.masks = VideoSegmenter(pinhole, self.look.vertices_of_landmarks, self.look.faces, known)
 
     def collect_mask(self, frame: Frame) -> None:
-        """Keep what a frame says of the object, if its pose and mask are reliable; its pose is adjusted already."""
+        """Collect a frame's evidence for the mask, if its pose and mask are reliable; its pose is adjusted already."""
         assert self.masks is not None
         if self.masks.wants(frame.index):
             self.masks.see(self._answered(frame))

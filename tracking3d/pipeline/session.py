@@ -53,9 +53,9 @@ class Session:
     Attributes:
         config: The pipeline.
         renderer: What renders, and why, see `tracking3d.rendering.backend.choose_backend`.
-        initial_mask: What the solver was given for the latest frame: the mask tracker's answer, or what stands in.
-        corrected: Whether the latest answer was handed back to the mask tracker.
-        coming: The frame of the ``step`` after the next, where it is there: the mask tracker may begin with it.
+        initial_mask: The solver's input for the latest frame: the mask tracker's estimate, or its replacement.
+        corrected: Whether the latest estimate was handed back to the mask tracker.
+        coming: The frame of the next ``step``, if it is known: the mask tracker may begin with it.
         refining: What ``refine`` took.
 
     Raises:
@@ -111,14 +111,14 @@ class Session:
 
         Args:
             frame: The frame.
-            prompt: What the object is in this frame, where somebody has said so: the mask tracker is set on
+            prompt: The object in this frame, if it is corrected here: the mask tracker is re-anchored to
                 it, and the solver trusts the mask that it makes. Not for the first frame.
 
         Raises:
             InputError: If this is no `Frame` of uint8 RGB, the first one has no object, another size than the first, or
                 the solver cannot track backwards.
             PluginError: If a plug-in fails: in the first frame, or with ``runtime.on_plugin_failure`` ``stop`` in
-                any. With ``continue`` a later frame is answered with what there is, and ``failure`` says why.
+                any. With ``continue`` a later frame is estimated with what there is, and ``failure`` says why.
             RuntimeError: After ``refine``.
         """
         if self._refined:
@@ -159,7 +159,7 @@ class Session:
         return (Camera, Lens, MaskEstimate, FrameOrder, RandomState, StageTimes, *own)
 
     def kept(self) -> dict[str, Any]:
-        """All that another session needs to go on after the latest frame, see `resume`; its parts never change."""
+        """The state that another session needs to continue after the latest frame, see `resume`; it is immutable."""
         return {
             "solver": self._state,
             "camera": self._camera,
@@ -173,18 +173,18 @@ class Session:
         }
 
     def resume(self, first: Frame, kept: Mapping[str, Any], failures: Mapping[int, str]) -> None:
-        """Be the session that was `kept`, instead of starting on a first frame.
+        """Restore a saved session (`kept`), instead of starting on a first frame.
 
-        Where `replays`, the frames up to the one after which it was kept are to come to `replay` before the next
+        If `replays`, pass the frames up to the one after which it was saved to `replay` before the next
         ``step``.
 
         Args:
             first: The first frame.
-            kept: What `kept` gave.
+            kept: The value of `kept`.
             failures: Which plug-ins failed in which frames.
 
         Raises:
-            PluginError: If the mask tracker cannot go on.
+            PluginError: If the mask tracker cannot be restored.
         """
         self._solver = self._begun(first)
         self._state, self._camera = kept["solver"], kept["camera"]
@@ -204,16 +204,16 @@ class Session:
     def replay(
         self, frame: Frame, first: bool, correction: NDArray[np.bool_] | None, prompt: Prompt | None = None
     ) -> MaskEstimate | None:
-        """Take the mask tracker alone through a frame that is answered already.
+        """Take the mask tracker alone through a frame that is estimated already.
 
         Args:
             frame: The frame.
             first: Whether it is the first one.
-            correction: ``(H, W)`` what was handed back to the tracker after it, if anything was.
+            correction: ``(H, W)`` the feedback to the tracker after it, if any.
             prompt: What ``step`` was given with it.
 
         Returns:
-            The tracker's answer; None where it fails.
+            The tracker's estimate; None if it fails.
         """
         estimate = None
         try:
@@ -264,14 +264,14 @@ class Session:
         return self._with_failure(replace(estimate, revised=revised))
 
     def _hand_back(self, frame: Frame, estimate: FrameEstimate) -> None:
-        """Set the mask tracker on an answer that is sure and unlike its own; on the first one, where it waits."""
+        """Re-anchor the mask tracker to a reliable estimate unlike its own, or to the first one if it waits."""
         corrected = self.config.solver.tracker_feedback and self._tracker.can_correct and corrects(estimate)
         if corrected or (self._tracker.waits and estimate.status is not Status.LOST):
             self.corrected = True
             self._tracker.correct(frame, estimate.mask)
 
     def _facing(self, frame: Frame) -> Solver[Any]:
-        """The solver, turned back to the first frame where this one is the first from before it."""
+        """The solver, restarted backwards if this frame is the first one before the prompt frame."""
         solver, first = self._solver, self._first
         assert solver is not None and first is not None
         if self._presented.last is None:
@@ -285,17 +285,17 @@ class Session:
         return solver
 
     def _tolerate(self, error: PluginFailure) -> str:
-        """Why a plug-in failed, where the run goes on in spite of it."""
+        """Why a plug-in failed, if the run continues in spite of it."""
         if self.config.runtime.on_plugin_failure == "stop":
             raise error
         return error.reason
 
     def failure_at(self, index: int) -> str:
-        """Which plug-in failed at frame ``index``, and why; empty where none did."""
+        """Which plug-in failed at frame ``index``, and why; empty if none did."""
         return self._failures.get(index, "")
 
     def _with_failure(self, estimate: FrameEstimate) -> FrameEstimate:
-        """The answer for a frame in which plug-ins failed says so, and is not relied on."""
+        """The estimate for a frame in which plug-ins failed says so, and is not relied on."""
         failure = self._failures.get(estimate.index)
         if failure is None:
             return estimate
@@ -320,9 +320,9 @@ class Session:
         return isinstance(self._solver, RefiningSolver)
 
     def refine(self) -> None:
-        """Solve everything once more over what is known of the whole video.
+        """Refine the whole model with the observations of the whole video.
 
-        A focal length that nobody gave may be solved too: ``camera`` is then another one, for the refined answers.
+        A focal length that nobody gave may be solved too: ``camera`` is then another one, for the refined estimates.
         ``step`` is over then: ``revisit`` takes the frames again, and ``result`` gives the final object.
 
         Raises:
@@ -335,15 +335,15 @@ class Session:
         self._refined = True
 
     def refine_frame(self, frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]) -> FrameEstimate:
-        """Answer for a frame once more, against the final object. Frames come in order of time.
+        """Estimate for a frame once more, against the final object. Frames come in order of time.
 
         Args:
             frame: The frame.
             mask: Its initial mask as it was, see ``initial_mask``.
-            T_cam_obj: ``(4, 4)`` the causal answer.
+            T_cam_obj: ``(4, 4)`` the causal estimate.
 
         Raises:
-            PluginError: If a plug-in fails; the causal answer then stands, and the next frame may be asked for.
+            PluginError: If a plug-in fails; the causal estimate then stands, and the next frame may be asked for.
             RuntimeError: Before ``refine``.
         """
         solver = self._refining()

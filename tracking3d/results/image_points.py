@@ -41,7 +41,7 @@ class ImagePoints:
 
 
 def read_run_images(run: RunReader, source: FrameSource) -> list[Picture | None]:
-    """The frames of a run, in the order of its records; None where there is no image.
+    """The frames of a run, in the order of its records; None if there is no image.
 
     Args:
         run: The run.

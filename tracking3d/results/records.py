@@ -48,7 +48,7 @@ class FrameRecord:
 
     Attributes:
         index: The frame's index in the source.
-        time: Seconds since the start of the video, where known.
+        time: Seconds since the start of the video, if known.
         name: What messages call the frame.
         T_cam_obj: ``(4, 4)`` float64 from object to camera; NaN where the estimate had no number.
         status: The estimator's judgement.

@@ -29,7 +29,7 @@ from tracking3d.runtime.stage_times import StageTimes, measure
 
 
 class RefinementWriter(RefinedEstimates):
-    """Writes the answers of the final refinement of one run.
+    """Writes the estimates of the final refinement of one run.
 
     Args:
         folder: The run folder.

@@ -118,7 +118,7 @@ class RunWriter:
         return record
 
     def begin_drawing_anew(self) -> None:
-        """All frames are answered: from here on `draw_again` draws them, in the order in which they come.
+        """All frames are estimated: from here on `draw_again` draws them, in the order in which they come.
 
         Raises:
             OutputError: If the video that was drawn so far cannot be finished.

@@ -28,7 +28,7 @@ _MOST_TRANSLATION_ERROR = 0.5  # in radii
 
 
 class DisagreementError(Exception):
-    """Two parts cannot be joined; the text says why, as the end of a sentence."""
+    """Two parts cannot be merged; the text says why, as the end of a sentence."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ def _is_there(record: FrameRecord) -> bool:
 
 
 def check_agreement(fit: SimilarityFit, radius: float) -> None:
-    """Make sure that two parts can be joined.
+    """Make sure that two parts can be merged.
 
     Args:
         fit: Of their poses.
@@ -110,11 +110,11 @@ def align_submaps(
     Args:
         first: What the first part knows in the end.
         second: What the second does, by the first's camera.
-        of_first: The first's answers.
+        of_first: The first's estimates.
         of_second: The second's, by the first's camera.
 
     Raises:
-        DisagreementError: If they cannot be joined.
+        DisagreementError: If they cannot be merged.
     """
     radius = first.object_map.radius
     T_first, T_second = common_poses(of_first, of_second)
@@ -139,7 +139,7 @@ def align_submaps(
 def by_lens(
     state: SolverState, records: Sequence[FrameRecord], camera: Camera
 ) -> tuple[SolverState, list[FrameRecord]]:
-    """A part's knowledge and answers as another lens would have them."""
+    """A part's knowledge and estimates as another lens would have them."""
     lens = (camera.fx, camera.fy, camera.cx, camera.cy)
     seen = []
     for record in records:

@@ -32,8 +32,8 @@ class Sighting:
         position: Of the frame among the selected ones, from 0.
         area: Pixels of the mask, at whatever resolution all sightings share; 0 where there is none.
         touches_border: Whether the mask comes up to the image's border.
-        score: How far the mask is believed, in [0, 1].
-        mask: ``(H, W)`` bool at that resolution; None where it is not kept.
+        score: How far the mask is reliable, in [0, 1].
+        mask: ``(H, W)`` bool at that resolution; None if it is not kept.
     """
 
     position: int
@@ -51,8 +51,8 @@ class Part:
         number: From 0.
         start: Position of its first frame.
         stop: One past its last.
-        owns_from: Position of the first frame that the joined run has its answer of: frames that the part before
-            tracked as well are answered by that one, whose model is the older.
+        owns_from: Position of the first frame that the merged run has its estimate of: frames that the part before
+            tracked as well are estimated by that one, whose model is the older.
     """
 
     number: int

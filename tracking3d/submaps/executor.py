@@ -52,7 +52,7 @@ def run_in_processes(
 
 @dataclass(frozen=True)
 class _Raised:
-    """An error in a sentence, as the answer of a process: engines tell of errors by their words only."""
+    """An error in a sentence, as the estimate of a process: engines tell of errors by their words only."""
 
     error: Tracking3dError
 

@@ -62,9 +62,9 @@ class SplitResult:
     """What became of a video that was to be split.
 
     Attributes:
-        folders: Its run folder, or those of its parts where they could not be joined.
+        folders: Its run folder, or those of its parts where they could not be merged.
         parts: How many there were.
-        reason: Why they could not be joined, or why it was not cut; empty where it was.
+        reason: Why they could not be merged, or why it was not cut; empty where it was.
     """
 
     folders: tuple[Path, ...]
@@ -73,14 +73,14 @@ class SplitResult:
 
 
 def refuse_what_cannot_be_joined(config: PipelineConfig) -> None:
-    """Parts are joined in the final refinement of one solver.
+    """Parts are merged in the final refinement of one solver.
 
     Raises:
         InputError: If the configuration is without it.
     """
     if not isinstance(config.solver, OnlineConfig) or not config.solver.final_refine:
         raise InputError(
-            "Parts of a video are joined in the final refinement of the solver online; leave out --split, or what "
+            "Parts of a video are merged in the final refinement of the solver online; leave out --split, or what "
             "chooses otherwise (solver.name, solver.final_refine, --quality draft)."
         )
 

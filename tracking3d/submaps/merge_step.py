@@ -40,7 +40,7 @@ part before ends with. One of them may well have lost a side of the object."""
 
 @dataclass(frozen=True, eq=False)
 class Tracked:
-    """A video whose parts have their causal answers.
+    """A video whose parts have their causal estimates.
 
     Attributes:
         begun: The video.
@@ -65,18 +65,18 @@ class Again:
 
 @dataclass(frozen=True)
 class Refused:
-    """Why parts cannot be joined."""
+    """Why parts cannot be merged."""
 
     reason: str
 
 
 @dataclass(frozen=True, eq=False)
 class Joined:
-    """A video whose parts are one run, but for its second answers.
+    """A video whose parts are one run, but for its second estimates.
 
     Attributes:
         begun: The video.
-        looks: Frames to be looked at again, by parts.
+        looks: Frames to be refined again, by parts.
         about: What ``run.json`` says of the parts.
         seconds: What each step took, by name.
     """
@@ -88,7 +88,7 @@ class Joined:
 
 
 def join(tell: Tell, tracked: Tracked) -> Again | Refused | Joined:
-    """Make one run of the parts, up to where all frames are looked at again.
+    """Make one run of the parts, up to where all frames are refined again.
 
     Raises:
         Tracking3dError: If something cannot be read or written; what was finished until then is kept.
@@ -102,7 +102,7 @@ def join(tell: Tell, tracked: Tracked) -> Again | Refused | Joined:
     try:
         whole = merge_submaps(session, begun.config, begun.plan, video.folder)
     except DisagreementError as error:
-        _log.warning("The parts could not be joined: %s.", error)
+        _log.warning("The parts could not be merged: %s.", error)
         return Refused(str(error))
     seconds = {"look_ahead": begun.plan.seconds, "parts": tracked.seconds}
     seconds["join"], clock = time.monotonic() - clock, time.monotonic()
@@ -127,10 +127,10 @@ def join(tell: Tell, tracked: Tracked) -> Again | Refused | Joined:
 
 @dataclass(frozen=True, eq=False)
 class Ending:
-    """A video whose frames are all answered, to be drawn.
+    """A video whose frames are all estimated, to be drawn.
 
     Attributes:
-        joined: The run; its ``seconds`` tell what all steps took.
+        merged: The run; its ``seconds`` tell what all steps took.
         precomputed: What the last steps of its final refinement come to.
     """
 
@@ -139,10 +139,10 @@ class Ending:
 
 
 def end(tell: Tell, ending: Ending) -> None:
-    """Draw what is answered, and write what is made at the end; the parts are removed.
+    """Draw what is estimated, and write what is made at the end; the parts are removed.
 
     Args:
-        tell: Is given the answers that are drawn.
+        tell: Is given the estimates that are drawn.
         ending: All that is known.
 
     Raises:
@@ -202,14 +202,14 @@ def _find_running(tracked: Tracked) -> Again | None:
 
 
 def _owned_ranges(begun: Begun) -> list[range]:
-    """Indices of the frames that each part answers for."""
+    """Indices of the frames that each part estimates for."""
     whole = begun.video.frames(begun.count)
     starts = [part.owns_from for part in begun.plan.parts]
     return [whole[start:stop] for start, stop in zip(starts, [*starts[1:], len(whole)], strict=True)]
 
 
 def _begin_writing(begun: Begun, opened: OpenTracking, whole: MergedMap) -> RunWriter:
-    """The writer of the joined run, with all that a run knows of itself before its first frame."""
+    """The writer of the merged run, with all that a run knows of itself before its first frame."""
     video, source, [one] = begun.video, opened.source, opened.objects
     header = RunHeader(
         config=begun.config.model_dump(mode="json"),

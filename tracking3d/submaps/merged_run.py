@@ -36,8 +36,8 @@ class PartRun:
         part: Which frames it has.
         folder: Its run folder.
         kept: Its state.
-        records: Its causal answers, by the first part's lens.
-        similarity: From its object to that of the joined run.
+        records: Its causal estimates, by the first part's lens.
+        similarity: From its object to that of the merged run.
     """
 
     part: Part
@@ -50,13 +50,13 @@ class PartRun:
 def write_merged_run(
     writer: RunWriter, session: Session, parts: Sequence[PartRun], owned: Sequence[range], seconds: float
 ) -> None:
-    """Write the answers of all parts and the state after them.
+    """Write the estimates of all parts and the state after them.
 
     Args:
         writer: Of the folder, just begun; it is ended.
-        session: That has the joined object, refined; see `write_causal_mesh` for the object before that.
+        session: That has the merged object, refined; see `write_causal_mesh` for the object before that.
         parts: All of them.
-        owned: Indices of the frames that each part answers for.
+        owned: Indices of the frames that each part estimates for.
         seconds: Wall time so far.
 
     Raises:
@@ -97,12 +97,12 @@ def write_causal_mesh(folder: Path, session: Session) -> None:
 
 
 def take_second_answers(folder: Path, session: Session, made: Sequence[Path], seconds: float) -> None:
-    """Put the second answers of all parts where the run looks for what it has looked at again.
+    """Put the second estimates of all parts where the run looks for what it has refined again.
 
     Args:
-        folder: The joined run's.
-        session: With the joined object.
-        made: Folders of the parts' second answers, in order of time; they are emptied.
+        folder: The merged run's.
+        session: With the merged object.
+        made: Folders of the parts' second estimates, in order of time; they are emptied.
         seconds: Wall time of the refinement so far.
 
     Raises:

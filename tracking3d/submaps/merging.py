@@ -42,9 +42,9 @@ class MergedMap:
     """All parts as one.
 
     Attributes:
-        runs: The parts, with how each lies in the joined object.
+        runs: The parts, with how each lies in the merged object.
         session: The state of a session that has seen all of them.
-        camera: Of the causal answers.
+        camera: Of the causal estimates.
         alignments: What is known of each alignment, for the record.
         cost_ratio: How many times what they cost by themselves the keyframes cost together.
     """
@@ -66,7 +66,7 @@ def merge_submaps(session: Session, config: PipelineConfig, plan: Plan, folder: 
         folder: The run folder.
 
     Raises:
-        DisagreementError: If they cannot be joined.
+        DisagreementError: If they cannot be merged.
         InputError: If a part's folder is damaged.
     """
     assert isinstance(config.solver, OnlineConfig)
@@ -107,7 +107,7 @@ def merge_submaps(session: Session, config: PipelineConfig, plan: Plan, folder: 
 
 @dataclass(frozen=True, eq=False)
 class _Try:
-    """The parts joined by one lens; runs and beliefs are those that it makes of them."""
+    """The parts merged by one lens; runs and beliefs are those that it makes of them."""
 
     runs: Sequence[PartRun]
     beliefs: Sequence[SolverState]
@@ -127,12 +127,12 @@ def _lenses(states: Sequence[SolverState]) -> list[Camera]:
 
 
 def _of_lenses(lenses: Sequence[Camera]) -> str:
-    """What is to be said of lenses that differ: parts that are told one have the better chance to agree."""
+    """What is to be said of lenses that differ: parts that are given one have the better chance to agree."""
     if len(lenses) < 2:
         return ""
     degrees = sorted(one.fov for one in lenses)
     return (
-        f"; each part solved the lens anew (vertical fields of view of {degrees[0]:.0f} to {degrees[-1]:.0f} degrees), "
+        f"; each part solved the lens again (vertical fields of view of {degrees[0]:.0f} to {degrees[-1]:.0f} degrees), "
         "so that saying what it is (--fov or --intrinsics) may mend that"
     )
 
@@ -215,7 +215,7 @@ def _align_pair(number: int, states: Sequence[SolverState], runs: Sequence[PartR
 
 
 def _refine_alignment(object_map: ObjectMap, own: ObjectMap, similarity: Similarity) -> Similarity:
-    """How a part lies in the joined object after the refinement moved its keyframes."""
+    """How a part lies in the merged object after the refinement moved its keyframes."""
     after = {view.index: view.pose for view in object_map.keyframes}
     before = {view.index: view.pose for view in transform_map(own, similarity).keyframes}
     common = sorted(before.keys() & after.keys())

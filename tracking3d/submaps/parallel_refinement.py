@@ -1,4 +1,4 @@
-"""The last steps of a joined run's final refinement, taken by several processes: adjustment, then poses, then masks.
+"""The last steps of a merged run's final refinement, taken by several processes: adjustment, then poses, then masks.
 
 Each process takes its range of frames through `tracking3d.pipeline.refinement_steps.RefinementSteps`. The adjustment,
 and what masks have in common, are computed once, for all frames; what they say of a frame depends only on frames a few
@@ -35,7 +35,7 @@ from tracking3d.video.selection import parse_selection
 
 @dataclass(frozen=True, eq=False)
 class Settling:
-    """Second answers of all parts, to be put together.
+    """Second estimates of all parts, to be put together.
 
     Attributes:
         looks: The frames that were looked at, by parts, in order of time.

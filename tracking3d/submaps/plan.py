@@ -112,7 +112,7 @@ def read_plan(
     prompt: Prompt | None,
     selection: str | None,
 ) -> Plan | None:
-    """The plan that was kept; None where there is none. See `make_plan`.
+    """The plan that was kept; None if there is none. See `make_plan`.
 
     Raises:
         InputError: If it was made for something else, or is damaged.
@@ -126,12 +126,12 @@ def read_plan(
         parts = [Part(**part) for part in plan.pop("parts")]
         found = Plan(parts, **plan)
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-        raise InputError(f"{path} is damaged ({error}); start anew with {layout.OVERWRITE}.") from error
+        raise InputError(f"{path} is damaged ({error}); run it again with {layout.OVERWRITE}.") from error
     asked = jsonable(_planned_settings(config, selection, count, length, first, prompt))
     if different := sorted(key for key in asked if kept.get(key) != asked[key]):
         raise InputError(
             f"The parts in {folder} were begun with another {' and '.join(different)}; give what they were begun with, "
-            f"or start anew with {layout.OVERWRITE}."
+            f"or run it again with {layout.OVERWRITE}."
         )
     return found
 
@@ -142,7 +142,7 @@ def has_plan(folder: Path) -> bool:
 
 
 def remove_parts(folder: Path) -> None:
-    """Remove the parts of a run, where there are some."""
+    """Remove the parts of a run, if there are some."""
     if has_plan(folder):
         shutil.rmtree(folder / PARTS, ignore_errors=True)
 
@@ -160,7 +160,7 @@ def _cut_mask(folder: Path, part: Part) -> Any:
     path = folder / PARTS / f"cut_{part.number}.png"
     mask = read_mask(path)
     if mask is None:
-        raise InputError(f"{path} is missing or damaged; start anew with {layout.OVERWRITE}.")
+        raise InputError(f"{path} is missing or damaged; run it again with {layout.OVERWRITE}.")
     return mask
 
 

@@ -1,4 +1,4 @@
-"""The first step of a long video: look ahead and cut; or track it whole, where it is one part or was joined before."""
+"""The first step of a long video: look ahead and cut; or track it whole, where it is one part or was merged before."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Begun:
     Attributes:
         video: What is tracked.
         config: The pipeline with the mask tracker that was chosen.
-        choice: Why it is that one; None where the user named it.
+        choice: Why it is that one; None if the user named it.
         count: Frames that were asked for.
         plan: Where it is cut.
         jobs: Its parts.
@@ -53,7 +53,7 @@ class Begun:
 
 
 def begin(tell: Tell, video: LongVideo) -> Begun | SplitResult:
-    """Cut a video, unless it is one part, or done; ``tell`` is given the answers where it is tracked here.
+    """Cut a video, unless it is one part, or done; ``tell`` is given the estimates where it is tracked here.
 
     Raises:
         InputError: If the video cannot be split, or what is there is of something else.
@@ -69,7 +69,7 @@ def begin(tell: Tell, video: LongVideo) -> Begun | SplitResult:
     if not windows(count, frames):
         record_tracking(request, folder, options, tell)
         return SplitResult((folder,), 1, f"{opened.name} has {count} frames, which is one part")
-    if resume and (layout.has_state(folder) or is_there(folder)):  # joined already
+    if resume and (layout.has_state(folder) or is_there(folder)):  # merged already
         record_tracking(request, folder, options, tell)
         remove_parts(folder)
         return SplitResult((folder,), 1)

@@ -43,7 +43,7 @@ def preview_video(
 
     Args:
         source: The frames.
-        prompt: The object in the first of them; None where the tracker knows.
+        prompt: The object in the first of them; None if the tracker knows.
         tracker: See `tracker_for_looking`.
         allowed: Positions among which cuts may be; only there are masks kept.
 

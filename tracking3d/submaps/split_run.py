@@ -38,7 +38,7 @@ def record_in_parts(
 ) -> SplitResult:
     """Track a long video in parts, side by side, and write one run folder; see the module.
 
-    Parts that cannot be joined are finished each by itself, in folders within ``folder``. What there is only one of is
+    Parts that cannot be merged are finished each by itself, in folders within ``folder``. What there is only one of is
     done in this process.
 
     Args:
@@ -52,7 +52,7 @@ def record_in_parts(
         command: For the record.
         overwrite: Replace a run that is in the folder.
         resume: Go on with what is there.
-        listener: Is told of every answer, the first ones and those of the refinement.
+        listener: Is told of every estimate, the first ones and those of the refinement.
         map_jobs: What takes the place of `run_in_processes` with so many workers.
 
     Raises:
@@ -83,7 +83,7 @@ def take_step(tell: Callable[[Any], None], step: Step) -> Any:
 
 
 def _once(listener: Listener) -> Listener:
-    """Frames of two parts, and answers that are only drawn again, are told once."""
+    """Frames of two parts, and estimates that are only drawn again, are given once."""
     told: set[tuple[int, bool]] = set()
 
     def tell(frame: FrameRecord | SkippedFrame) -> None:

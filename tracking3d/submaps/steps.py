@@ -28,10 +28,10 @@ class Step:
     """One call in a worker.
 
     Attributes:
-        function: Called as ``function(tell, argument)``; ``tell`` takes the record of every frame that is answered.
+        function: Called as ``function(tell, argument)``; ``tell`` takes the record of every frame that is estimated.
         argument: What it is called with; it can be pickled, as can what is returned.
         label: What it is called, for who looks on.
-        frames: How many answers it gives; 0 where that is not known.
+        frames: How many estimates it gives; 0 where that is not known.
     """
 
     function: Callable[[Any, Any], Any]
@@ -67,7 +67,7 @@ def steps_of(begun: Begun) -> Steps:
     clock = time.monotonic()
     looks = found.looks
     yield [
-        Step(refine_submap, look, f"second look {number} of {of}", _frames(look))
+        Step(refine_submap, look, f"refinement pass {number} of {of}", _frames(look))
         for number, look in enumerate(looks, 1)
     ]
     seconds = {**found.seconds, "second_look": time.monotonic() - clock}
@@ -76,7 +76,7 @@ def steps_of(begun: Begun) -> Steps:
 
 
 def steps_to_the_end(joined: Joined) -> Generator[list[Step], list[Any], None]:
-    """What is left to be done when all frames of a joined run were looked at again."""
+    """What is left to be done when all frames of a merged run were refined again."""
     precomputed, seconds = yield from _last_looks(joined)
     joined = replace(joined, seconds={**joined.seconds, **seconds})
     yield [Step(end, Ending(joined, precomputed), "its end")]

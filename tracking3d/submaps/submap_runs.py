@@ -1,4 +1,4 @@
-"""The parts of a video as runs: tracked to the end of their first pass, and looked at again against the whole object.
+"""The parts of a video as runs: tracked to the end of their first pass, and refined again against the whole object.
 
 What is here runs in processes of its own.
 """
@@ -45,7 +45,7 @@ class PartJob:
         prompts: What the object is in its first frame.
         command: For the record.
         resume: Go on with what is there.
-        first_pass_only: Stop when every frame has its causal answer.
+        first_pass_only: Stop when every frame has its causal estimate.
     """
 
     source: str
@@ -75,7 +75,7 @@ def track_part(tell: Tell, job: PartJob) -> None:
 
 
 def is_tracked(folder: Path, source: FrameSource) -> bool:
-    """Whether a part has all its causal answers, and the state to go on from."""
+    """Whether a part has all its causal estimates, and the state to go on from."""
     if not ((folder / layout.RUN).is_file() and layout.has_state(folder)):
         return False
     run = RunReader(folder, refined=False)
@@ -84,16 +84,16 @@ def is_tracked(folder: Path, source: FrameSource) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Revisit:
-    """Frames of the joined run, to be answered against the whole object.
+    """Frames of the merged run, to be estimated against the whole object.
 
     Attributes:
         source: The video.
         whole: All selected frames of it, ``START:STOP:STEP``, or None.
         selection: The frames that are looked at.
         config: The pipeline.
-        folder: The joined run's.
+        folder: The merged run's.
         prompts: What the object is in the video's first frame.
-        out: Folder that gets ``masks/`` and ``frames.jsonl`` of the second answers.
+        out: Folder that gets ``masks/`` and ``frames.jsonl`` of the second estimates.
     """
 
     source: str
@@ -106,10 +106,10 @@ class Revisit:
 
 
 def refine_submap(tell: Tell, job: Revisit) -> int:
-    """Answer for some frames once more, in order of time; ``tell`` is given each answer's record.
+    """Estimate for some frames once more, in order of time; ``tell`` is given each estimate's record.
 
     Returns:
-        How many have a second answer.
+        How many have a second estimate.
 
     Raises:
         Tracking3dError: If a plug-in fails that may not, or something cannot be read or written.
@@ -133,7 +133,7 @@ def refine_submap(tell: Tell, job: Revisit) -> int:
 
 
 def resume_submap(job: Revisit) -> tuple[SavedState, Session]:
-    """The state of the joined run, and a session that has its object.
+    """The state of the merged run, and a session that has its object.
 
     Raises:
         Tracking3dError: If it cannot be read.
@@ -150,7 +150,7 @@ def resume_submap(job: Revisit) -> tuple[SavedState, Session]:
 def _second_answer(
     session: Session, job: Revisit, kept: SavedState, frame: Frame, causal: FrameRecord
 ) -> FrameRecord | None:
-    """The record of a frame's second answer, its mask written; None lets the first stand."""
+    """The record of a frame's second estimate, its mask written; None lets the first stand."""
     mask = read_mask(layout.initial_mask_path(job.folder, frame.index))
     taken = kept.taken[frame.index]
     initial = MaskEstimate(None if mask is None else mask.astype(np.float32), taken.score, taken.reason)

@@ -36,7 +36,7 @@ class ObjectSessions:
             new: Say what each new object is, given the frame.
 
         Returns:
-            An answer for each object, in the order in which they came.
+            An estimate for each object, in the order in which they came.
 
         Raises:
             Tracking3dError: If the image or a prompt cannot be used.

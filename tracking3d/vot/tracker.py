@@ -26,7 +26,7 @@ _COLOUR = ("color", "visible", "rgb")
 
 
 class VotTracker:
-    """Follows any number of objects. Each answer is a mask or rectangle and its ``confidence`` in [0, 1].
+    """Follows any number of objects. Each estimate is a mask or rectangle and its ``confidence`` in [0, 1].
 
     Written against ``vot.tracker.python`` of vot-toolkit 0.9.0. All arguments are strings, since ``arg_`` lines of
     ``trackers.ini`` are.
@@ -35,7 +35,7 @@ class VotTracker:
         config: A YAML file of the pipeline.
         preset: Name of a preset; by default that in ``TRACKING3D_PRESET``, or else the default one.
         overrides: ``section.key=value`` items with spaces between.
-        region: What is answered: ``mask`` or ``rectangle``.
+        region: What is estimated: ``mask`` or ``rectangle``.
 
     Raises:
         RuntimeError: If one of them cannot be used. Other errors than the built-in ones would leave the toolkit
