@@ -1,4 +1,4 @@
-"""A run as it was before a frame, as a run folder of its own that goes on from there."""
+"""A run rolled back to before a frame, as a run folder of its own that continues from there."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from tracking3d.results.run_reader import RunReader, read_records
 
 
 def roll_back(folder: Path, stage: Path, changed: Collection[int]) -> int | None:
-    """Make of an empty folder the run as it was, stopped, before the first of some frames was taken.
+    """Copy a run, rolled back to before the first of some frames, into an empty folder, as a stopped run.
 
     Args:
         folder: The run; nothing of it is changed.
-        stage: Gets the earlier run: its last rollback point of before then, and the estimates that there were.
+        stage: Gets the earlier run: its last rollback point before then, and its estimates.
         changed: Indices of those frames.
 
     Returns:
-        How many frames are estimated in it; None if no state of before then was kept, and nothing was made.
+        Number of frames estimated in it; None if no earlier state was saved, and nothing was copied.
 
     Raises:
         OutputError: If it cannot be written.
@@ -39,7 +39,7 @@ def roll_back(folder: Path, stage: Path, changed: Collection[int]) -> int | None
             journal = (inner / layout.JOURNAL).read_bytes()[: state["journal"]]
             taken, _ = read_journal(journal)
             lines = int(state["progress"]["lines"])
-        except (OSError, ValueError, KeyError, TypeError):  # damaged: an earlier one does it too
+        except (OSError, ValueError, KeyError, TypeError):  # damaged: try an earlier one
             taken, journal, lines = {}, b"", -1
         if lines >= 0 and not taken.keys() & set(changed):
             _copy_run(folder, stage, milestones, journal, lines)
@@ -85,7 +85,7 @@ def _copy_run(folder: Path, stage: Path, milestones: list[Milestone], journal: b
 
 
 def remove_run(folder: Path) -> None:
-    """Remove the files of a run, and what of its folders is empty then; others stay.
+    """Remove the files of a run, and its folders if they are empty then; others stay.
 
     Raises:
         OutputError: If one cannot be removed.

@@ -6,7 +6,7 @@
     frames.jsonl        one line a frame, flushed; a better estimate for an earlier frame is a further line
     masks/              the estimates, 0/255 PNG at full resolution, named by frame index
     initial_masks/      what the mask tracker gave
-    probabilities/      the object's in every pixel of the estimates, where that was asked for
+    probabilities/      object probabilities of the estimated masks, if requested
     overlay.mp4         the video with outlines and axes
     contact_sheet.png   the run at a glance
     report.html         the run to look at, in one file
@@ -14,11 +14,11 @@
     mesh.obj, mesh.mtl, texture.png, mesh.glb, features.npz
     landmarks.npz       surface and poses as points were followed by, once they were
     causal/             masks and mesh as they were before the final refinement
-    online/             the mesh of the online map, where its shape was rebuilt
+    online/             the mesh of the online map, if its shape was rebuilt
     .refining/          what the final refinement has made so far, until it has ended
-    .state/             what a stopped run goes on from; when it is finished, what a correction goes on from
-    prompts/            the masks that were given of the object, named by frame index
-    .correcting/        a run folder: the run as it is corrected, until that is finished
+    .state/             checkpoint of a stopped run; in a finished run, checkpoints for corrections
+    prompts/            the given masks of the object, named by frame index
+    .correcting/        a run folder: the corrected run, until it is finished
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ STATE = ".state"
 PROMPTS = "prompts"
 CORRECTING = ".correcting"
 DRAWN = ".drawn.png"
-"""A mask drawn in the viewer, kept until its correction has started."""
+"""A mask drawn in the viewer, saved until its correction has started."""
 STATE_FILE = "state.json"
 JOURNAL = "journal.jsonl"
 OVERLAY = "overlay.mp4"
@@ -162,12 +162,12 @@ def probability_path(folder: Path, index: int) -> Path:
 
 
 def prompt_path(folder: Path, index: int) -> Path:
-    """Where the mask lies that was given of the object in frame ``index``."""
+    """Path of the given mask of the object in frame ``index``."""
     return folder / PROMPTS / f"{index:06d}.png"
 
 
 def has_state(folder: Path) -> bool:
-    """Whether the state of a stopped run is kept in its folder."""
+    """Whether a run folder has the checkpoint of a stopped run."""
     return (folder / STATE / STATE_FILE).is_file()
 
 

@@ -50,7 +50,7 @@ class FormatError(InputError):
 
 
 class RunReader:
-    """A run folder as it was when each part was first asked for.
+    """A run folder as it was when each part was first read.
 
     Args:
         folder: The run folder. refined: Whether frames, masks and mesh are those of the final refinement, if there is
@@ -105,14 +105,14 @@ class RunReader:
 
     @property
     def refinement_stages(self) -> StageTimes | None:
-        """What the final refinement took, stage by stage; None if unknown.
+        """Times of the final refinement, stage by stage; None if unknown.
 
         Raises:
             InputError: If it is damaged.
         """
-        told = (self.description.get("refinement") or {}).get("stages")
+        stages = (self.description.get("refinement") or {}).get("stages")
         try:
-            return None if told is None else read_stages(told)
+            return None if stages is None else read_stages(stages)
         except ValueError as error:
             raise InputError(
                 f"{self.folder / layout.RUN} is damaged: stages of the refinement, {error}; restore it."
@@ -264,8 +264,8 @@ def _camera_fault(camera: Camera) -> str:
         number = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _FARTHEST
         if not number or (name in ("fx", "fy") and not value > 0):
             return f"{name} is {value!r:.40}"
-    told = isinstance(camera.origin, str) and isinstance(camera.assumed, bool)
-    return "" if told else f"origin is {camera.origin!r:.40}, assumed {camera.assumed!r:.40}"
+    described = isinstance(camera.origin, str) and isinstance(camera.assumed, bool)
+    return "" if described else f"origin is {camera.origin!r:.40}, assumed {camera.assumed!r:.40}"
 
 
 def _read_description(folder: Path) -> dict[str, Any]:

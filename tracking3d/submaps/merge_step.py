@@ -34,7 +34,7 @@ from tracking3d.video import open_source
 
 _log = logging.getLogger(__name__)
 _SAME_OBJECT = 0.5
-"""Share of the smaller one of two masks that lies within the other, below which a part began on something else than the
+"""If less than this share of the smaller of two masks lies within the other, a part began on something else than the
 part before ends with. One of them may well have lost a side of the object."""
 
 
@@ -45,7 +45,7 @@ class Tracked:
     Attributes:
         begun: The video.
         jobs: Its parts, as they were tracked last.
-        again: Numbers of those that were tracked a second time.
+        again: Numbers of the parts that were tracked again.
         seconds: What tracking the parts took.
     """
 
@@ -77,7 +77,7 @@ class Joined:
     Attributes:
         begun: The video.
         looks: Frames to be refined again, by parts.
-        about: What ``run.json`` says of the parts.
+        about: The section ``split`` of ``run.json``.
         seconds: What each step took, by name.
     """
 
@@ -88,10 +88,10 @@ class Joined:
 
 
 def join(tell: Tell, tracked: Tracked) -> Again | Refused | Joined:
-    """Make one run of the parts, up to where all frames are refined again.
+    """Merge the parts into one run, up to the refinement of all frames.
 
     Raises:
-        Tracking3dError: If something cannot be read or written; what was finished until then is kept.
+        Tracking3dError: If something cannot be read or written; the frames finished until then are saved.
     """
     begun, clock = tracked.begun, time.monotonic()
     video = begun.video
@@ -130,7 +130,7 @@ class Ending:
     """A video whose frames are all estimated, to be drawn.
 
     Attributes:
-        merged: The run; its ``seconds`` tell what all steps took.
+        merged: The run; its ``seconds`` are those of all steps.
         precomputed: What the last steps of its final refinement come to.
     """
 
@@ -142,11 +142,11 @@ def end(tell: Tell, ending: Ending) -> None:
     """Draw what is estimated, and write what is made at the end; the parts are removed.
 
     Args:
-        tell: Is given the estimates that are drawn.
+        tell: Called with the estimates that are drawn.
         ending: All that is known.
 
     Raises:
-        Tracking3dError: If something cannot be read or written; what was finished until then is kept.
+        Tracking3dError: If something cannot be read or written; the frames finished until then are saved.
     """
     begun = ending.joined.begun
     video, config = begun.video, begun.config
@@ -209,7 +209,7 @@ def _owned_ranges(begun: Begun) -> list[range]:
 
 
 def _begin_writing(begun: Begun, opened: OpenTracking, whole: MergedMap) -> RunWriter:
-    """The writer of the merged run, with all that a run knows of itself before its first frame."""
+    """The writer of the merged run, with the header of a run before its first frame."""
     video, source, [one] = begun.video, opened.source, opened.objects
     header = RunHeader(
         config=begun.config.model_dump(mode="json"),

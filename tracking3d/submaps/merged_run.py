@@ -1,4 +1,4 @@
-"""The run folder of the whole video, made of those of its parts: that of a run which was stopped before its end.
+"""The run folder of the whole video, merged from those of its parts: a run stopped before its final refinement.
 
 Whatever happens from there on, ``resume`` finishes it as it does any stopped run.
 """
@@ -35,7 +35,7 @@ class PartRun:
     Attributes:
         part: Which frames it has.
         folder: Its run folder.
-        kept: Its state.
+        kept: Its saved state.
         records: Its causal estimates, by the first part's lens.
         similarity: From its object to that of the merged run.
     """
@@ -53,7 +53,7 @@ def write_merged_run(
     """Write the estimates of all parts and the state after them.
 
     Args:
-        writer: Of the folder, just begun; it is ended.
+        writer: The new writer of the folder; it is closed.
         session: That has the merged object, refined; see `write_causal_mesh` for the object before that.
         parts: All of them.
         owned: Indices of the frames that each part estimates for.
@@ -97,12 +97,12 @@ def write_causal_mesh(folder: Path, session: Session) -> None:
 
 
 def take_second_answers(folder: Path, session: Session, made: Sequence[Path], seconds: float) -> None:
-    """Put the second estimates of all parts where the run looks for what it has refined again.
+    """Move the refined estimates of all parts to the place where the run expects its refined estimates.
 
     Args:
         folder: The merged run's.
         session: With the merged object.
-        made: Folders of the parts' second estimates, in order of time; they are emptied.
+        made: Folders of the parts' refined estimates, in order of time; they are emptied.
         seconds: Wall time of the refinement so far.
 
     Raises:
@@ -146,5 +146,5 @@ def _copy_masks(source: Path, target: Path, indices: Sequence[int]) -> None:
             for index in indices:
                 with suppress(
                     FileNotFoundError
-                ):  # where the mask tracker gave none, or no probabilities are kept
+                ):  # if the mask tracker gave none, or no probabilities are saved
                     shutil.copyfile(path_of(source, index), path_of(target, index))

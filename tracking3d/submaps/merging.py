@@ -1,4 +1,4 @@
-"""The parts of a video as one object: how each lies in the first, and what they know together."""
+"""Merging the submaps of a video into one map, in the coordinates of the first."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ from tracking3d.submaps.similarity import fit_similarity
 from tracking3d.submaps.state_merging import merge_states
 
 MAX_COST_RATIO = 1.75
-"""How many times what the parts' keyframes cost by themselves they may cost together; see `keyframe_cost`."""
+"""Largest ratio of the cost of the keyframes after merging to their cost before; see `keyframe_cost`."""
 _FEWEST_KEYFRAMES = 3
 _SAME_LENS = math.log(1.05)
 
 
 @dataclass(frozen=True, eq=False)
 class MergedMap:
-    """All parts as one.
+    """The merged map of all parts.
 
     Attributes:
-        runs: The parts, with how each lies in the merged object.
+        runs: The parts, each with its similarity to the merged object.
         session: The state of a session that has seen all of them.
-        camera: Of the causal estimates.
-        alignments: What is known of each alignment, for the record.
-        cost_ratio: How many times what they cost by themselves the keyframes cost together.
+        camera: The camera of the causal estimates.
+        alignments: A description of each alignment, for ``run.json``.
+        cost_ratio: Cost of the keyframes after merging, divided by their cost in their own parts.
     """
 
     runs: Sequence[PartRun]
@@ -57,10 +57,10 @@ class MergedMap:
 
 
 def merge_submaps(session: Session, config: PipelineConfig, plan: Plan, folder: Path) -> MergedMap:
-    """Join the parts that are tracked.
+    """Merge the tracked parts.
 
     Args:
-        session: For the whole video, which has seen nothing yet.
+        session: A new session for the whole video.
         config: The pipeline.
         plan: The parts.
         folder: The run folder.
@@ -83,10 +83,10 @@ def merge_submaps(session: Session, config: PipelineConfig, plan: Plan, folder: 
     if not tried:
         raise DisagreementError(f"{refused[0]}{_of_lenses(lenses)}") from refused[0]
     best = min(tried, key=lambda one: one.cost_ratio)
-    runs, updated = best.runs, best.belief
+    runs, updated = best.runs, best.merged
     settled = [
         replace(run, similarity=_refine_alignment(updated.object_map, own.object_map, similarity))
-        for run, own, similarity in zip(runs, best.beliefs, best.similarities, strict=True)
+        for run, own, similarity in zip(runs, best.states, best.similarities, strict=True)
     ]
     first, last = runs[0].kept.session, max(record.index for run in runs for record in run.records)
     first_pose, presented, _, anew = first["steering"]
@@ -107,18 +107,18 @@ def merge_submaps(session: Session, config: PipelineConfig, plan: Plan, folder: 
 
 @dataclass(frozen=True, eq=False)
 class _Try:
-    """The parts merged by one lens; runs and beliefs are those that it makes of them."""
+    """The parts merged with one focal length, with their runs and states converted to it."""
 
     runs: Sequence[PartRun]
-    beliefs: Sequence[SolverState]
+    states: Sequence[SolverState]
     alignments: Sequence[SubmapAlignment]
     similarities: Sequence[Similarity]
-    belief: SolverState
+    merged: SolverState
     cost_ratio: float
 
 
 def _lenses(states: Sequence[SolverState]) -> list[Camera]:
-    """The cameras of the parts, those that are about the same once: where nobody gave the lens, each solved its own."""
+    """The different cameras of the parts: if the focal length is not given, each part estimated its own."""
     lenses: list[Camera] = []
     for state in states:
         if all(abs(math.log(state.camera.fy / other.fy)) > _SAME_LENS for other in lenses):
@@ -127,13 +127,13 @@ def _lenses(states: Sequence[SolverState]) -> list[Camera]:
 
 
 def _of_lenses(lenses: Sequence[Camera]) -> str:
-    """What is to be said of lenses that differ: parts that are given one have the better chance to agree."""
+    """Advice if the focal lengths differ: parts with a given one agree more often."""
     if len(lenses) < 2:
         return ""
     degrees = sorted(one.fov for one in lenses)
     return (
-        f"; each part solved the lens again (vertical fields of view of {degrees[0]:.0f} to {degrees[-1]:.0f} degrees), "
-        "so that saying what it is (--fov or --intrinsics) may mend that"
+        f"; each part estimated its own focal length (vertical fields of view of {degrees[0]:.0f} to {degrees[-1]:.0f} degrees), "
+        "giving it by --fov or --intrinsics may help"
     )
 
 
@@ -165,25 +165,25 @@ def merge_submap_states(
     encoder: FeatureEncoder,
     before: Sequence[SolverState] | None = None,
 ) -> tuple[SolverState, float]:
-    """What the parts know as one, and how many times as much their keyframes cost so; see
+    """Merge the states of the parts; also returns the cost ratio of their keyframes; see
     `tracking3d.submaps.state_merging.merge_states`.
 
     Args:
-        states: Of the parts, all by one lens.
+        states: States of the parts, all with one camera.
         similarities: From each part's object to the first one's.
-        config: Of the solver.
-        encoder: Of the features.
-        before: The parts as they were solved, each by its own lens, which tell what they cost by themselves.
+        config: The solver's configuration.
+        encoder: The feature encoder.
+        before: The parts' own states, each with its own camera, for their cost before merging.
 
     Raises:
-        DisagreementError: If together they explain what was seen far worse than each by itself.
+        DisagreementError: If the merged map explains the keyframes far worse than the parts do.
     """
     own = float(np.mean([keyframe_cost(state.object_map) for state in before or states]))
     state = merge_states(states, similarities, config, encoder)
     together = keyframe_cost(state.object_map)
     if together > MAX_COST_RATIO * own:
         raise DisagreementError(
-            f"one object explains what they show {together / own:.1f} times as badly as one each does"
+            f"one object explains their keyframes {together / own:.1f} times as badly as one object each"
         )
     return state, together / own
 
@@ -191,7 +191,7 @@ def merge_submap_states(
 def _read_submaps(
     session: Session, config: PipelineConfig, plan: Plan, folder: Path
 ) -> tuple[list[PartRun], list[SolverState]]:
-    """The parts with what each knows, by its own lens."""
+    """The parts with their states, each with its own camera."""
     runs: list[PartRun] = []
     states: list[SolverState] = []
     for part in plan.parts:
@@ -200,7 +200,7 @@ def _read_submaps(
         state = kept.session["solver"]
         if state.pending is not None:
             why = state.waiting_reason or "the object did not move enough in it"
-            raise DisagreementError(f"the shape was never told in part {part.number + 1} ({why})")
+            raise DisagreementError(f"the shape could not be initialized in part {part.number + 1} ({why})")
         records = RunReader(own, refined=False).frames
         states.append(state)
         runs.append(PartRun(part, own, kept, records, Similarity.identity()))
@@ -215,7 +215,7 @@ def _align_pair(number: int, states: Sequence[SolverState], runs: Sequence[PartR
 
 
 def _refine_alignment(object_map: ObjectMap, own: ObjectMap, similarity: Similarity) -> Similarity:
-    """How a part lies in the merged object after the refinement moved its keyframes."""
+    """The similarity of a part to the merged object after the refinement moved its keyframes."""
     after = {view.index: view.pose for view in object_map.keyframes}
     before = {view.index: view.pose for view in transform_map(own, similarity).keyframes}
     common = sorted(before.keys() & after.keys())
@@ -232,7 +232,7 @@ def _refine_alignment(object_map: ObjectMap, own: ObjectMap, similarity: Similar
 
 
 def own_points(object_map: ObjectMap) -> np.ndarray:
-    """``(V, 3)`` vertices of a map: what holds a small change of coordinates to where the object is."""
+    """``(V, 3)`` vertices of a map, which constrain a small change of coordinates to the object."""
     return np.asarray(object_map.vertices.double().cpu().numpy())
 
 

@@ -35,7 +35,7 @@ from tracking3d.video.selection import parse_selection
 
 @dataclass(frozen=True, eq=False)
 class Settling:
-    """Second estimates of all parts, to be put together.
+    """Refined estimates of all parts, to be merged.
 
     Attributes:
         looks: The frames that were looked at, by parts, in order of time.
@@ -48,7 +48,7 @@ class Settling:
 
 @dataclass(frozen=True, eq=False)
 class Placing:
-    """Frames of one part, to get their poses of the end.
+    """Frames of one part, to get their final poses.
 
     Attributes:
         job: The frames.
@@ -77,7 +77,7 @@ class Weighing:
 
 
 def solve_together(tell: Tell, job: Settling) -> GlobalAdjustment:
-    """Put the refined estimates of all parts into the run, and adjust poses, lens and surface by all of them.
+    """Write the refined estimates of all parts into the run, and adjust poses, lens and surface by all of them.
 
     Raises:
         Tracking3dError: If something cannot be read or written.
@@ -146,7 +146,7 @@ def weigh(tell: Tell, job: Weighing) -> dict[int, bytes]:
 
 
 def _decisions(job: Weighing, estimates: RefinedEstimates, own: range) -> Iterator[Decision]:
-    """Those of a part's frames, and of the frames before and after that tell their motion."""
+    """Estimates of a part's frames, and of the frames before and after, for their motion."""
     last = RefinementSteps(estimates, job.look, job.masks)
     reach = 2 * REACH * own.step
     whole = parse_selection(job.job.whole)

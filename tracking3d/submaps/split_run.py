@@ -1,4 +1,4 @@
-"""A long video in parts: look ahead, cut, track side by side, join, look again side by side, and end as one run."""
+"""A long video in parts: preview, cut, track in parallel, merge, refine in parallel, and finish as one run."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def record_in_parts(
 
     Args:
         source: A video file, or a folder or pattern of images.
-        config: The pipeline; of the solver ``online``, with its final refinement.
+        config: The pipeline, with the solver ``online`` and its final refinement.
         folder: The run folder.
         prompts: What the object is in the first frame.
         length: Of a part, in seconds or frames, see `tracking3d.submaps.cuts.parse_length`.
@@ -51,13 +51,13 @@ def record_in_parts(
         selection: ``START:STOP:STEP`` of the frames.
         command: For the record.
         overwrite: Replace a run that is in the folder.
-        resume: Go on with what is there.
-        listener: Is told of every estimate, the first ones and those of the refinement.
+        resume: Continue the run that is there.
+        listener: Called for every estimate, causal and refined.
         map_jobs: What takes the place of `run_in_processes` with so many workers.
 
     Raises:
         InputError: If the video cannot be split, or what is there is of something else.
-        Tracking3dError: What was finished until then is kept, for ``resume``.
+        Tracking3dError: The frames finished until then are saved, for ``resume``.
     """
     video = LongVideo(
         str(source), config, folder, prompts, length, workers, selection, command, overwrite, resume

@@ -1,4 +1,4 @@
-"""A long video as steps: calls of functions in workers, some of them side by side, each list after the one before."""
+"""A long video as steps: calls of functions in workers, some of them in parallel, each list after the one before."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Step:
         function: Called as ``function(tell, argument)``; ``tell`` takes the record of every frame that is estimated.
         argument: What it is called with; it can be pickled, as can what is returned.
         label: What it is called, for who looks on.
-        frames: How many estimates it gives; 0 where that is not known.
+        frames: Number of estimates it gives; 0 if unknown.
     """
 
     function: Callable[[Any, Any], Any]
@@ -53,7 +53,7 @@ def steps_of(begun: Begun) -> Steps:
     ]
     while True:
         taken = time.monotonic() - clock
-        [found] = yield [Step(join, Tracked(begun, tuple(jobs), tuple(again), taken), "joining its parts")]
+        [found] = yield [Step(join, Tracked(begun, tuple(jobs), tuple(again), taken), "merging its parts")]
         if not isinstance(found, Again):
             break
         jobs[found.number] = found.job
@@ -85,7 +85,7 @@ def steps_to_the_end(joined: Joined) -> Generator[list[Step], list[Any], None]:
 def _last_looks(
     joined: Joined,
 ) -> Generator[list[Step], list[Any], tuple[PrecomputedRefinement, dict[str, float]]]:
-    """What becomes of the frames, and the seconds of each step."""
+    """The split section of ``run.json``."""
     looks, of, clock = joined.looks, len(joined.looks), time.monotonic()
     refined = joined.seconds["refine"] + joined.seconds["second_look"]
     [look] = yield [Step(solve_together, Settling(looks, refined), "what its frames say together")]

@@ -1,4 +1,4 @@
-"""The parts of a video as runs: tracked to the end of their first pass, and refined again against the whole object.
+"""The parts of a video as runs: tracked in a first pass, and refined against the merged object.
 
 What is here runs in processes of its own.
 """
@@ -44,7 +44,7 @@ class PartJob:
         folder: The part's run folder.
         prompts: What the object is in its first frame.
         command: For the record.
-        resume: Go on with what is there.
+        resume: Continue the run that is there.
         first_pass_only: Stop when every frame has its causal estimate.
     """
 
@@ -75,7 +75,7 @@ def track_part(tell: Tell, job: PartJob) -> None:
 
 
 def is_tracked(folder: Path, source: FrameSource) -> bool:
-    """Whether a part has all its causal estimates, and the state to go on from."""
+    """Whether a part has all its causal estimates and its checkpoint."""
     if not ((folder / layout.RUN).is_file() and layout.has_state(folder)):
         return False
     run = RunReader(folder, refined=False)
@@ -84,7 +84,7 @@ def is_tracked(folder: Path, source: FrameSource) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Revisit:
-    """Frames of the merged run, to be estimated against the whole object.
+    """Frames of the merged run, to be refined against the merged object.
 
     Attributes:
         source: The video.
@@ -93,7 +93,7 @@ class Revisit:
         config: The pipeline.
         folder: The merged run's.
         prompts: What the object is in the video's first frame.
-        out: Folder that gets ``masks/`` and ``frames.jsonl`` of the second estimates.
+        out: Folder that gets ``masks/`` and ``frames.jsonl`` of the refined estimates.
     """
 
     source: str
@@ -106,7 +106,7 @@ class Revisit:
 
 
 def refine_submap(tell: Tell, job: Revisit) -> int:
-    """Estimate for some frames once more, in order of time; ``tell`` is given each estimate's record.
+    """Refine some frames, in order of time; ``tell`` is given each estimate's record.
 
     Returns:
         How many have a second estimate.
