@@ -36,7 +36,6 @@ class Checkpoint:
         folder: The run folder.
         classes: See `TreeFolder`.
         device: See `TreeFolder`.
-
         milestones: Number of rollback points that may be saved, see `tracking3d.checkpoint.milestones`.
 
     Raises:
