@@ -19,7 +19,7 @@ _COLOURS = {"longest": "#1b7837", "first": "#2166ac", "random": "#b2182b"}
 def compared(
     work: Any, fleet: Fleet, splitting: Splitting | None, seed: int = 0
 ) -> dict[str, ScheduleOutcome]:
-    """Every order with whole videos and, where ``splitting`` says how, with long ones cut; by a name in words."""
+    """Every order with whole videos and, if ``splitting`` is given, with long ones cut; by a name in words."""
     outcomes = {}
     for order in ORDERS:
         outcomes[NAMES[order]] = simulate(work, fleet, order, None, seed)

@@ -41,7 +41,7 @@ class Version:
 
     Attributes:
         tree: Its checkout.
-        runs: Where its run folders go.
+        runs: Folder of its run folders.
         keep: Whether a finished run in there is taken as it is.
     """
 
@@ -53,7 +53,7 @@ class Version:
         """Run ``tracking3d`` of this version.
 
         Raises:
-            SystemExit: If it fails; with what it said.
+            SystemExit: If it fails; with its error output.
         """
         words = [sys.executable, "-m", "tracking3d", *map(str, arguments)]
         ended = subprocess.run(

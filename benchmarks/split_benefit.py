@@ -39,9 +39,9 @@ class SplitMeasurement:
         rotation_mean: Mean rotation error in degrees, refined estimates; causal ones are left out.
         rotation_median: The median.
         tracked: Share of the frames.
-        stages: Seconds of what a split run does, by name; empty of a whole one.
+        stages: Seconds of the steps of a split run, by name; empty for a whole one.
         parts: How many.
-        reason: Why parts were not merged; empty where they were.
+        reason: Why parts were not merged; empty if they were.
     """
 
     seconds: float
@@ -98,14 +98,14 @@ def measure_split(
     """Track the video whole and in parts; a run that is finished in ``folder`` is not done again.
 
     Args:
-        config: The pipeline; the true camera is told.
+        config: The pipeline; the true camera is given.
         folder: For video and runs.
-        frames: Of the video.
+        frames: Number of frames of the video.
         length: Frames of a part.
         workers: Parts at a time.
         masks: ``truth``, with noise on the outlines, or ``tracker``.
         size: Width and height.
-        told: Is given what is done now.
+        told: Called with the present step, in words.
 
     Raises:
         InputError: If ``masks`` is neither.

@@ -20,11 +20,11 @@ class RunFigures:
 
     Attributes:
         seconds: Of one processor a frame, both passes.
-        decoding: Of these, reading the frame, both times.
-        seconds_once: Beside the frames: the start, solving everything once more, mesh, texture, pictures.
-        bytes_read: Of the video, a frame.
+        decoding: Seconds of these for reading the frame, both times.
+        seconds_once: Seconds of the start, the global refinement, mesh, texture and images.
+        bytes_read: Bytes of the video, a frame.
         bytes_written: Of masks, lines and overlay, a frame.
-        bytes_once: Of the rest of the run folder.
+        bytes_once: Bytes of the rest of the run folder.
         memory: Most bytes that the process held.
     """
 
@@ -124,7 +124,7 @@ def cost_of(
     Args:
         hours: Of video.
         figures: Of one run.
-        machine: One of those that do it.
+        machine: One of the machines.
         fps: Frames a second of the videos.
         minutes: Mean length of a video.
 

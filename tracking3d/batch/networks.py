@@ -26,7 +26,7 @@ class SharedNetwork:
 
 
 def share_networks(engine: Engine, jobs: Iterable[VideoJob]) -> tuple[SharedNetwork, ...]:
-    """Hand the networks that the jobs name to the engine, where its workers may be on other machines.
+    """Share the networks that the jobs name through the engine, if its workers may be on other machines.
 
     Networks that are given by the path of a file are not sent: every machine must have them there.
     """

@@ -66,11 +66,11 @@ class Tasks:
         return Task(video, begin_in_parts, arguments, log_file(self._out, job))
 
     def video(self, task: int) -> int:
-        """The number of the video that a task is of."""
+        """The number of a task's video."""
         return self._long[task].video if task in self._long else task
 
     def label(self, task: int) -> str:
-        """What a step is called; empty of the first."""
+        """The name of a step; empty for the first."""
         return self._labels.get(task, "")
 
     def further(self, ended: Ended) -> list[Task]:

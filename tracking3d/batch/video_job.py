@@ -16,7 +16,7 @@ class VideoJob:
     """What one worker does in one go: a video is decoded once, however many objects are tracked in it.
 
     Attributes:
-        name: Where its run folder is, within that of the batch.
+        name: Its run folder within that of the batch.
         video: Video file, folder or pattern of images.
         config: The pipeline.
         box: Objects by their box in the first frame, as ``tracking3d run --box`` has them.
@@ -47,7 +47,7 @@ class VideoJob:
 
     @property
     def in_parts(self) -> bool:
-        """Whether it is cut where it is long: parts are merged of one object that is given in the first frame."""
+        """Whether it may be cut: only parts of one object that is prompted in the first frame can be merged."""
         whole = self.sequence is not None or self.start_frame is not None or self.correct or self.objects > 1
         return bool(self.split) and not whole
 
@@ -58,7 +58,7 @@ class VideoJob:
 
     @cached_property
     def key(self) -> str:
-        """What tells its results from those of another video, prompt or setting."""
+        """A key of its video, prompt and settings."""
         told: dict[str, Any] = {
             "video": self.video,
             "config": self.config.model_dump(mode="json"),

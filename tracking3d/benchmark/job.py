@@ -48,7 +48,7 @@ class Job:
 
     Attributes:
         layout: Name of a dataset's layout, or the YAML file of one.
-        root: Where the dataset lies.
+        root: Folder of the dataset.
         sequence: The sequence's name.
         variant: How to run it.
         out: The folder for everything of this benchmark.
@@ -67,7 +67,7 @@ class Job:
 
     @cached_property
     def config(self) -> PipelineConfig:
-        """The pipeline, with the camera that the dataset tells a tracker of unless the configuration says one."""
+        """The pipeline, with the camera that the dataset gives to a tracker unless the configuration has one."""
         config = self.variant.config
         camera = self.truth.given_camera or self.truth.camera
         if (
@@ -102,7 +102,7 @@ class Job:
 
     @property
     def folder(self) -> Path:
-        """Where the run and its scores lie."""
+        """Folder of the run and its scores."""
         return self.out / "runs" / Path(self.layout).stem / self.sequence / self.run_key[:16]
 
     def finished(self) -> dict[str, Any] | None:
@@ -161,7 +161,7 @@ def run_job(job: Job) -> dict[str, Any]:
 
 
 def memory_growth(held: Sequence[float]) -> float | None:
-    """How much more was held at most in the second half of the frames than in the first; None of fewer than two."""
+    """Growth of the peak memory from the first half of the frames to the second; None for fewer than two."""
     half = len(held) // 2
     return max(held[half:]) - max(held[:half]) if half else None
 
@@ -194,7 +194,7 @@ def _record(job: Job, run: Path, listener: Listener) -> None:
     try:
         record(source, config, run, overwrite=True, listener=listener)
     finally:
-        if masks.is_relative_to(job.folder):  # the run keeps its own copy of them
+        if masks.is_relative_to(job.folder):  # the run has its own copy of them
             shutil.rmtree(masks, ignore_errors=True)
 
 

@@ -35,10 +35,10 @@ class LiveReport:
         played: Number of frames that were played.
         taken: How many of them were tracked.
         dropped: How many were dropped to keep up.
-        first_lag: Seconds of the first frame, which waits for all that is made at the start.
+        first_lag: Seconds of the first frame, which waits for the one-time work at the start.
         worst_lag, median_lag: Seconds over the frames after the first `WARM_UP`; None if there are none.
         end_lag: Seconds of the last frame: a pipeline that falls behind ends with the worst.
-        answers_per_second: Over the same frames as `worst_lag`.
+        answers_per_second: Estimates a second over the same frames as `worst_lag`.
         longest_gap: The most frames that were dropped in a row after the first `WARM_UP`.
         seconds_per_frame: Mean time of a frame in the session, over the same frames.
         stages: The same stage by stage; nothing is decoded or written.

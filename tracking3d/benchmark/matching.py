@@ -40,7 +40,7 @@ _TEXTURE = 0.006  # change of grey a pixel, in the direction of least change, ov
 _CANDIDATES = 8  # crops of which the one with most texture is taken
 _ROTATION, _ZOOM, _PERSPECTIVE = np.radians(20.0), 1.25, 0.25
 _SHIFT = (
-    0.25  # of the crop's side; in every warp, or features that tell where in the image they lie would do well
+    0.25  # of the crop's side; in every warp, since features that encode the image position would do well without
 )
 _GAMMA, _SHADING, _CAST, _NOISE = 1.4, 0.5, 0.15, 0.02
 
@@ -53,7 +53,7 @@ class MatchingPair:
         image: ``(3, S, S)`` RGB in [0, 1].
         warped: ``(3, S, S)`` RGB in [0, 1].
         points: ``(N, 2)`` x and y of textured pixels of ``image``, whole numbers.
-        truth: ``(N, 2)`` where they are in ``warped``, in pixels.
+        truth: ``(N, 2)`` their positions in ``warped``, in pixels.
     """
 
     image: Tensor
@@ -68,7 +68,7 @@ class MatchingScores:
 
     Attributes:
         everywhere: Searched over the whole warped image.
-        nearby: Searched within `RADIUS` of the truth.
+        nearby: Share if searched within `RADIUS` of the truth.
         points: How many points were searched for.
     """
 

@@ -19,7 +19,7 @@ class NoisyFrames:
 
     Attributes:
         source: The frames as they are.
-        seed: Of the noise; every frame has its own, the same whenever it is read.
+        seed: Seed of the noise; every frame has its own, the same whenever it is read.
     """
 
     source: FrameSource

@@ -1,4 +1,4 @@
-"""How well points are followed through finished runs, beside methods without a model."""
+"""Accuracy of point tracks through finished runs, compared with methods without a model."""
 
 from __future__ import annotations
 
@@ -66,11 +66,11 @@ class MeasuredRun:
 
     Attributes:
         sequence: Its sequence.
-        masks: Where its initial masks came from.
+        masks: The source of its initial masks.
         refined: Whether its refined estimates were taken.
         rows: By method.
         inside: Share of the errors inside twice the uncertainty.
-        errors: Of the corrected points.
+        errors: Errors of the corrected points.
         seconds_landmarks: For opening the frames and finding landmarks, once a run.
     """
 
@@ -109,7 +109,7 @@ def finished_jobs(folder: Path) -> list[tuple[Job, Path]]:
 
 
 def measure_run(job: Job, folder: Path, refined: bool = True, beside: bool = False) -> MeasuredRun:
-    """Ask for every true point where it is first seen, and score what is said after that.
+    """Query every true point in the frame that first shows it, and score the later positions.
 
     Args:
         job: A finished job.

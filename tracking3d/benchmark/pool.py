@@ -36,7 +36,7 @@ class JobOutcome:
 
 
 Listener = Callable[[JobOutcome], None]
-"""Is told of every job as it is done."""
+"""Called for every job when it is done."""
 
 
 def run_jobs(
@@ -48,12 +48,12 @@ def run_jobs(
     """Run all jobs, ``processes`` at a time; the outcomes are in the order of the jobs.
 
     Jobs that depend on the same things, as when two rows of a table are one setting, are done once. Ctrl-C stops
-    the workers; what was finished is kept and found again by the next call.
+    the workers; finished jobs are saved and found again by the next call.
 
     Args:
         jobs: What to run.
         processes: Workers.
-        listener: Is told of every outcome.
+        listener: Called for every outcome.
         address: Of a Ray cluster that runs them, which must see the same files; this machine if None.
     """
     outcomes: dict[int, JobOutcome] = {}

@@ -1,4 +1,4 @@
-"""The scores of one variant on many sequences: kept as JSON, averaged, printed."""
+"""The scores of one variant on many sequences: saved as JSON, averaged, printed."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class ResultSet:
         dataset: Name of the dataset.
         scores: Measures by sequence; None for a sequence that failed.
         errors: Why sequences failed.
-        about: Everything else that is kept: configuration, masks, versions, code, date.
+        about: Everything else that is saved: configuration, masks, versions, code, date.
         causal: Measures of the causal estimates, of the sequences that have refined ones too; `scores` are then those
             of the refined ones.
     """
@@ -65,7 +65,7 @@ class ResultSet:
     causal: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     def split(self) -> list[ResultSet]:
-        """The causal estimates and the refined ones as two result sets; one where nothing was refined."""
+        """The causal estimates and the refined ones as two result sets; one if nothing was refined."""
         if not self.causal:
             return [self]
         causal = replace(
@@ -79,7 +79,7 @@ class ResultSet:
         return {name: float(value) for name, value in known.items() if value is not None}
 
     def mean(self, measure: str) -> float | None:
-        """Mean of a measure over the sequences where it is known; each sequence counts once."""
+        """Mean of a measure over the sequences that have it; each sequence counts once."""
         values = list(self.values(measure).values())
         return float(np.mean(values)) if values else None
 

@@ -1,6 +1,6 @@
 """The table ``online``: the solvers `paper` and `online` side by side, by sequence, in one run on one machine.
 
-A column is a solver with its features; where a run holds refined estimates, its causal and its refined estimates are two.
+A column is a solver with its features; if a run has refined estimates, its causal and its refined estimates are two.
 Rotation errors are aligned and every frame counts, see `tracking3d.evaluation.pose_scores`. A mean is over the
 sequences for which every column has the figure, each counting once.
 """
@@ -55,7 +55,7 @@ MEASURES = {
     "peak_memory_mb": "most memory, MB",
     "memory_growth_mb": "growth of memory, MB",
 }
-"""Measures of the table, and what it calls them."""
+"""Measures of the table, and their names in it."""
 
 _NOTE = (
     "Rotation errors are aligned by one rotation and all frames count: one called lost with the error of its pose, "
@@ -145,7 +145,7 @@ def fill(
         out: Folder of the benchmark.
         patterns: Only solvers with features that match any of them, such as ``*RGB``; all if there is none.
         processes: Jobs at a time.
-        listener: Is told of every job.
+        listener: Called for every job.
         address: Of a Ray cluster that runs them; this machine if None.
 
     Raises:

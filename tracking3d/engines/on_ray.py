@@ -220,7 +220,7 @@ class _Mailbox:
 
 
 def _call_remotely(mailbox: Any, task: Task, threads: int, folder: str) -> tuple[Any, Fault | None]:
-    """What a worker of Ray does: one task, in the folder of the command where the machine has it."""
+    """Run one task in a Ray worker, in the folder of the command if the machine has it."""
     ray = _ray()
     if Path(folder).is_dir():
         os.chdir(folder)

@@ -322,8 +322,8 @@ class Session:
     def refine(self) -> None:
         """Refine the whole model with the observations of the whole video.
 
-        A focal length that nobody gave may be solved too: ``camera`` is then another one, for the refined estimates.
-        ``step`` is over then: ``revisit`` takes the frames again, and ``result`` gives the final object.
+        The focal length may be estimated too, if it is not given: ``camera`` is then that of the refined estimates.
+        ``step`` must not be called afterwards: ``refine_frame`` refines each frame, and ``result`` gives the final object.
 
         Raises:
             RuntimeError: If the solver cannot, see ``can_refine``.

@@ -146,7 +146,7 @@ def check_asked(
     Args:
         tracks: By the mesh.
         camera: Of the frames.
-        estimated: ``(N,)`` which pixels will have one; those on the mesh if left out.
+        answered: ``(N,)`` which pixels will have one; those on the mesh if left out.
         otherwise: What else can be done about the others.
 
     Returns:

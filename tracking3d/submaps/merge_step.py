@@ -71,7 +71,7 @@ class Refused:
 
 
 @dataclass(frozen=True, eq=False)
-class Joined:
+class MergedSubmaps:
     """A video whose parts are one run, but for its second estimates.
 
     Attributes:
@@ -87,7 +87,7 @@ class Joined:
     seconds: Mapping[str, float] = field(default_factory=dict)
 
 
-def join(tell: Tell, tracked: Tracked) -> Again | Refused | Joined:
+def join(tell: Tell, tracked: Tracked) -> Again | Refused | MergedSubmaps:
     """Merge the parts into one run, up to the refinement of all frames.
 
     Raises:
@@ -122,7 +122,7 @@ def join(tell: Tell, tracked: Tracked) -> Again | Refused | Joined:
     write_merged_run(writer, session, whole.runs, owned, sum(seconds.values()) + time.monotonic() - clock)
     seconds["refine"] = time.monotonic() - clock
     note_in_run(video.folder, {"split": {**about, "seconds": seconds}})
-    return Joined(begun, _revisits(begun, owned), about, seconds)
+    return MergedSubmaps(begun, _revisits(begun, owned), about, seconds)
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +134,7 @@ class Ending:
         precomputed: What the last steps of its final refinement come to.
     """
 
-    joined: Joined
+    merged: MergedSubmaps
     precomputed: PrecomputedRefinement
 
 
@@ -148,9 +148,9 @@ def end(tell: Tell, ending: Ending) -> None:
     Raises:
         Tracking3dError: If something cannot be read or written; the frames finished until then are saved.
     """
-    begun = ending.joined.begun
+    begun = ending.merged.begun
     video, config = begun.video, begun.config
-    about = {**ending.joined.about, "seconds": dict(ending.joined.seconds)}
+    about = {**ending.merged.about, "seconds": dict(ending.merged.seconds)}
     note_in_run(video.folder, {"split": about})
     options = RecordOptions(video.command, video.selection, resume=True)
     with open_tracking(_request(begun)) as opened, ExitStack() as writers:

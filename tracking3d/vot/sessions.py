@@ -13,7 +13,7 @@ from tracking3d.frames import Frame, Image, Prompt
 from tracking3d.pipeline.track import Session, validate_image
 
 PRESET_VARIABLE = "TRACKING3D_PRESET"
-"""Environment variable with the name of the preset where none is given."""
+"""Environment variable with the name of the preset if none is given."""
 
 
 class ObjectSessions:

@@ -64,7 +64,7 @@ class VotTracker:
         """Begin a sequence.
 
         Args:
-            frame: The image's path, or an image ``(H, W, 3)`` RGB; by channel where there are several.
+            frame: The image's path, or an image ``(H, W, 3)`` RGB; by channel if there are several.
             new: Region and properties of each object; see `tracking3d.vot.regions.prompt_of`.
             properties: Not used.
 
@@ -80,7 +80,7 @@ class VotTracker:
     def update(
         self, frame: Any, new: Sequence[Status] | Status = (), properties: Mapping[str, Any] | None = None
     ) -> list[Status]:
-        """Go on to the next frame, in which objects may be new; see `init`."""
+        """Track the next frame, in which objects may be new; see `init`."""
         with _report_to_toolkit():
             objects = [new] if isinstance(new, tuple) and new else new
             prompts = [partial(prompt_of, region) for region, _ in objects]
