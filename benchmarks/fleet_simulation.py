@@ -278,4 +278,6 @@ def _check(work: Sequence[float] | NDArray[np.float64], fleet: Fleet, splitting:
         and splitting.look_ahead >= 0
         and 0 <= splitting.join < 1
     ):
-        raise InputError("The work of parts must be positive, and the shares of preview and merging from 0 to below 1.")
+        raise InputError(
+            "The work of parts must be positive, and the shares of preview and merging from 0 to below 1."
+        )

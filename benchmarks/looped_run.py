@@ -221,7 +221,7 @@ def trends(samples: list[Sample], round_length: int) -> dict[str, Trend]:
 
 
 def _without_object(images: NDArray[np.uint8], masks: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """The background ``(H, W, 3)``: taken from frames in which the object does not cover it, painted over if it always does."""
+    """The background ``(H, W, 3)``: from frames in which the object does not cover it, else painted over."""
     covered: NDArray[np.bool_] = np.logical_and.reduce(masks)
     always = cv2.dilate(covered.astype(np.uint8), np.ones((5, 5), np.uint8))
     free = np.where(masks[..., None], np.nan, images.astype(np.float32))

@@ -203,7 +203,7 @@ def test_the_box_is_that_of_init_json_or_else_of_the_first_mask(clip):
 def test_the_key_of_an_earlier_version_is_refused(clip):
     file = clip / "camera.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | {"told": False}))
-    with pytest.raises(InputError, match="an earlier version of tracking3d.* rename it to given"):
+    with pytest.raises(InputError, match=r"an earlier version of tracking3d.* rename it to given"):
         read_truth(clip)
 
 

@@ -173,7 +173,9 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_end(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("owner", "name", "call"), [(Session, "step", 4), (Session, "refine_frame", 3)], ids=["tracked", "refined"]
+    ("owner", "name", "call"),
+    [(Session, "step", 4), (Session, "refine_frame", 3)],
+    ids=["tracked", "refined"],
 )
 def test_the_state_of_the_online_solver_is_kept_whole(
     clip, images, whole, tmp_path, monkeypatch, online, owner, name, call
@@ -417,7 +419,9 @@ def test_a_run_whose_state_is_gone_is_refused(clip, images, tmp_path, monkeypatc
 def test_a_run_of_an_earlier_format_is_not_resumed(clip, images, tmp_path, monkeypatch):
     stopped(monkeypatch, clip, images, tmp_path / "run", Session, "step", 4)
     set_format(tmp_path / "run", 1)
-    with pytest.raises(InputError, match="an earlier version of tracking3d .* run it again with --overwrite"):
+    with pytest.raises(
+        InputError, match=r"an earlier version of tracking3d .* run it again with --overwrite"
+    ):
         record(open_source(str(images)), settings(), tmp_path / "run", mask=clip.masks[0], resume=True)
 
 

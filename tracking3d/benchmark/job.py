@@ -140,8 +140,8 @@ class Job:
 def run_job(job: Job) -> dict[str, Any]:
     """Track, unless the run is there, and score; the scores are written too.
 
-    Those of the final estimates are by name of the measure. Where there are refined estimates, ``causal`` holds the scores
-    of the causal ones, else None.
+    Those of the final estimates are by name of the measure. Where there are refined estimates, ``causal`` holds the
+    scores of the causal ones, else None.
 
     Raises:
         Tracking3dError: If the sequence cannot be read, tracked or scored.

@@ -39,9 +39,7 @@ _MARGIN = 4  # pixels at the border that are neither query nor truth
 _TEXTURE = 0.006  # change of grey a pixel, in the direction of least change, over 9 x 9 pixels
 _CANDIDATES = 8  # crops of which the one with most texture is taken
 _ROTATION, _ZOOM, _PERSPECTIVE = np.radians(20.0), 1.25, 0.25
-_SHIFT = (
-    0.25  # of the crop's side; in every warp, since features that encode the image position would do well without
-)
+_SHIFT = 0.25  # of the crop's side; in every warp, since features that encode the image position would do well without
 _GAMMA, _SHADING, _CAST, _NOISE = 1.4, 0.5, 0.15, 0.02
 
 

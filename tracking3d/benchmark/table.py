@@ -91,7 +91,8 @@ def fill(
     listener: Listener = lambda outcome: None,
     address: str | None = None,
 ) -> Filled:
-    """Make the runs of a table and compare them with the paper's figures; every result set is written to ``out/results``.
+    """Make the runs of a table and compare them with the paper's figures; every result set is written to
+    ``out/results``.
 
     Args:
         table: Which one.

@@ -1,7 +1,7 @@
 """Rollback points: saved states of earlier frames, from which a correction of a frame continues.
 
-A rollback point is the state's text as it was after a frame; the files that it names stay. Its arrays are mostly those of the states
-around it, so that few of them, spread evenly over the run, cost little.
+A rollback point is the state's text as it was after a frame; the files that it names stay. Its arrays are mostly those
+of the states around it, so that few of them, spread evenly over the run, cost little.
 """
 
 from __future__ import annotations
@@ -119,8 +119,8 @@ def keep_milestones_only(folder: Path, most_bytes: int) -> None:
 
     Args:
         folder: The run folder.
-        most_bytes: Their largest size, before compression. Every second rollback point goes until the rest is no larger; the last one
-            stays longest.
+        most_bytes: Their largest size, before compression. Every second rollback point goes until the rest is no
+            larger; the last one stays longest.
 
     Raises:
         OSError: If a file cannot be removed.

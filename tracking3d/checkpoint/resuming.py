@@ -110,7 +110,7 @@ def earlier_run(
         )
     if what := next(_differences(run.description, config, selection, given), None):
         raise InputError(
-f"The run {folder} cannot be resumed with other settings or another source: {what}; "
+            f"The run {folder} cannot be resumed with other settings or another source: {what}; "
             f"use the same settings and source, or run it again with {layout.OVERWRITE}."
         )
     if changed := _changed(run.description, given):

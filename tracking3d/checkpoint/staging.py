@@ -61,8 +61,8 @@ def stage_correction(
     answered = roll_back(folder, stage, changed)
     if answered is None:
         _log.warning(
-            "No checkpoint before frame %d is saved in %s, so that all frames are computed again; frames before the correction "
-            "get the estimates that they had.",
+            "No checkpoint before frame %d is saved in %s, so that all frames are computed again; frames before the
+            correction " "get the estimates that they had.",
             min(changed),
             folder,
         )

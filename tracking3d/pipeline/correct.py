@@ -34,9 +34,9 @@ def correct_run(
 ) -> None:
     """Correct the object in frames of a run, and compute again what depends on it, with the run's own settings.
 
-    Frames before the correction keep their causal estimates; those after it are estimated again, from the last checkpoint
-    before it that the run has saved, and then the final refinement takes all of them. This is done in a copy within the
-    run folder, which takes the run's place when it is finished.
+    Frames before the correction keep their causal estimates; those after it are estimated again, from the last
+    checkpoint before it that the run has saved, and then the final refinement takes all of them. This is done in a
+    copy within the run folder, which takes the run's place when it is finished.
 
     Args:
         folder: The run folder of one object.

@@ -57,10 +57,10 @@ def track(
             over, but not the first.
         box: The object in the first frame, ``(x, y, width, height)`` in pixels.
         mask: The object in the first frame, ``(H, W)`` bool.
-        points: The object in the first frame by ``(N, 3)`` points: x, y in pixels, and 1 on it or 0 on the background. One of
-            box, mask and points is given, or none if the tracker knows its masks (``precomputed``).
-        start_frame: Index of the frame in which the object is given, instead of the first. Estimates then come from there
-            to the end, and after them backwards to the beginning. Only if the source can be read again.
+        points: The object in the first frame by ``(N, 3)`` points: x, y in pixels, and 1 on it or 0 on the background.
+            One of box, mask and points is given, or none if the tracker knows its masks (``precomputed``).
+        start_frame: Index of the frame in which the object is given, instead of the first. Estimates then come from
+            there to the end, and after them backwards to the beginning. Only if the source can be read again.
         corrections: Prompts in later frames: the mask tracker is re-anchored there, and the mask is trusted.
         config: The pipeline, or a YAML file of one; the default preset if None.
         skip_damaged: If the first frame cannot be decoded, apply the prompt to the first frame that can.

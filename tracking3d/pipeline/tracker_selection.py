@@ -64,8 +64,8 @@ CANDIDATES = (
         _U2 | _NANO | {"every": 5},
     ),
     TrackerCandidate("onnx", "U2Netp in CSR-DCF's box", 0.888, 1.00, _U2_FILES, _U2),
-    # Estimates to the masks of both, which correct them, have a mean IoU of .880 with csrt and .883 with flow on 24 fresh
-    # clips, and of .891 and .874 on five real ones; flow takes half of the time.
+    # Estimates to the masks of both, which correct them, have a mean IoU of .880 with csrt and .883 with flow on 24
+    # fresh clips, and of .891 and .874 on five real ones; flow takes half of the time.
     TrackerCandidate("csrt", "csrt, which needs no network", 0.857, 0.06),
     TrackerCandidate("flow", "flow, which needs neither network nor correlation filter", 0.789, 0.05),
 )  # fmt: skip
@@ -110,7 +110,7 @@ def choose_tracker(
         seconds = _time_per_frame(candidate, first, prompt) if candidate.networks else candidate.seconds
         if seconds is not None and (seconds <= budget or not candidate.networks):
             choice = PluginChoice(name=candidate.name, **candidate.options)
-            why = f"{candidate.what}: mean IoU {candidate.iou:.2f} on the clips that it was measured on, {seconds:.2f} s a frame"
+            why = f"{candidate.what}: mean IoU {candidate.iou:.2f} on the measured clips, {seconds:.2f} s a frame"
             why += " here" if candidate.networks else ""
             if passed:
                 why += f"; within {budget:.2g} s a frame, which rules out {passed[0]}"

@@ -33,8 +33,8 @@ class Tracking(Iterator[FrameEstimate]):
     Nothing is computed before the first of both. ``for`` gives each estimate as soon as it is there; ``async for`` does
     so while a thread of its own computes, so that the event loop is not blocked.
 
-    If only the estimates are iterated over, they are not saved, and memory depends on the object and not on the length of the
-    video. If ``refine=`` or ``model=`` was given, or `result` is called first, they are saved in a
+    If only the estimates are iterated over, they are not saved, and memory depends on the object and not on the length
+    of the video. If ``refine=`` or ``model=`` was given, or `result` is called first, they are saved in a
     temporary run folder, which lives as long as the result.
     """
 

@@ -84,7 +84,7 @@ def parse_length(text: str, fps: float | None) -> int:
         frames = value * fps
     if frames < _FEWEST_FRAMES:
         raise InputError(
-            f"{SPLIT}{text} makes parts of {frames:.0f} frames; a part needs {_FEWEST_FRAMES} at least to initialize the "
+            f"{SPLIT}{text} makes parts of {frames:.0f} frames; a part needs at least {_FEWEST_FRAMES} to model the "
             "object's shape."
         )
     return round(min(frames, 2**53))

@@ -132,7 +132,8 @@ def _of_lenses(lenses: Sequence[Camera]) -> str:
         return ""
     degrees = sorted(one.fov for one in lenses)
     return (
-        f"; each part estimated its own focal length (vertical fields of view of {degrees[0]:.0f} to {degrees[-1]:.0f} degrees), "
+        f"; each part estimated its own focal length (vertical fields of view of {degrees[0]:.0f} to "
+        f"{degrees[-1]:.0f} degrees), "
         "giving it by --fov or --intrinsics may help"
     )
 
