@@ -58,7 +58,7 @@ class Asked:
         frames: How many frames each has.
         size: Width and height of the frames.
         workers: Numbers of workers, a pass each.
-        address: Of a Ray cluster; processes of this machine if None.
+        address: Address of a Ray cluster; processes of this machine if None.
         faults: How many of the clips to track again, with the most workers and with faults; none if 0.
         report: Whether runs get reports, as they do by default.
         minutes: After so long no further video is begun.
@@ -115,7 +115,7 @@ def demonstrate(
     Args:
         config: The pipeline.
         folder: Gets clips and results; passes that are there are replaced.
-        asked: Of how many clips, and how.
+        asked: The clips and settings of the passes.
         said: Called with messages on progress and the result of each pass.
 
     Returns:

@@ -1,4 +1,4 @@
-"""What the simulation of a fleet shows, as a table and a picture."""
+"""The results of a simulated fleet, as a table and a plot."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def plot_outcomes(outcomes: Mapping[str, ScheduleOutcome], workers: int, path: P
 
     Args:
         outcomes: From `compared`.
-        workers: Of the fleet.
+        workers: Number of workers of the fleet.
         path: What to write, see `tracking3d.speed.plot.check_plot`.
 
     Raises:

@@ -19,9 +19,9 @@ class Load:
 
     Attributes:
         memory: Megabytes in memory, those that processes share counted in each.
-        own_memory: Of this process.
+        own_memory: Memory of this process in megabytes.
         descriptors: Open files of all of them.
-        own_descriptors: Of this process.
+        own_descriptors: Open files of this process.
         processes: How many there are.
         shared_memory: Megabytes of files in the system's folder for shared memory, of all programs.
         unfinished: Megabytes on disk of unfinished runs.

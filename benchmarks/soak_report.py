@@ -1,4 +1,4 @@
-"""What a long run showed, as a table and as a picture."""
+"""The results of a long run, as a table and a plot."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def looped(count: int, there: int) -> NDArray[np.int64]:
 def write_looped(
     folder: Path, spec: SyntheticSpec, count: int
 ) -> tuple[Path, SyntheticClip, NDArray[np.int64]]:
-    """The frames and masks of a long video in ``folder``, each picture stored once.
+    """The frames and masks of a long video in ``folder``, each image stored once.
 
     Raises:
         OutputError: If it cannot be written.

@@ -98,7 +98,7 @@ def read_progress(out: str) -> BatchProgress:
     """How far a batch is.
 
     Raises:
-        InputError: If the folder is none of a batch, or what is there is damaged.
+        InputError: If the folder is none of a batch, or a file there is damaged.
     """
     content = read(join_path(out, PROGRESS))
     if content is None:

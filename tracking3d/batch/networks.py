@@ -47,7 +47,7 @@ def share_networks(engine: Engine, jobs: Iterable[VideoJob]) -> tuple[SharedNetw
 
 
 def keep_networks(networks: Iterable[SharedNetwork]) -> None:
-    """Put the networks that this machine lacks into its cache, where the plug-ins look for them.
+    """Put the networks that this machine lacks into its cache, in which the plug-ins look for them.
 
     Raises:
         OutputError: If the cache cannot be written.

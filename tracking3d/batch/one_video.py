@@ -75,7 +75,7 @@ def track_video(
     report: bool,
     networks: tuple[SharedNetwork, ...] = (),
 ) -> dict[str, Any]:
-    """Track one video; see `tracking3d.batch.summary.write_marker` for what is returned.
+    """Track one video; returns the same as `tracking3d.batch.summary.write_marker`.
 
     A video that was begun before is resumed from its last finished frame, however it was stopped.
 
@@ -125,7 +125,7 @@ def local_work_folder(job: VideoJob, out: str, networks: tuple[SharedNetwork, ..
 def put_away(
     job: VideoJob, out: str, work: Path, runs: Sequence[Path], report: bool, attempts: int, note: str = ""
 ) -> dict[str, Any]:
-    """Put what is whole into its place; see `tracking3d.batch.summary.write_marker` for what is returned.
+    """Move a complete run into its place; returns the same as `tracking3d.batch.summary.write_marker`.
 
     Args:
         job: The video.

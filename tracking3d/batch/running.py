@@ -131,7 +131,7 @@ class Batch:
             self._end(job, event)
 
     def write(self, state: str = "running", *, now: bool = False) -> None:
-        """Write what is due; at the end (``now``) everything.
+        """Write the files that are due; at the end (``now``) all.
 
         Raises:
             OutputError: At the end, if a file cannot be written; before, this is only logged.

@@ -41,7 +41,7 @@ def begin_in_parts(
         out: The folder of the batch.
         command: The command line, for the record.
         report: Whether to write a report.
-        workers: Of the batch, for the record.
+        workers: Number of workers of the batch, for the record.
         networks: What the machine may lack.
 
     Raises:

@@ -36,7 +36,7 @@ class Tasks:
         out: The folder of the batch.
         command: The command line, for the record.
         report: Whether runs get reports.
-        workers: Of the batch, for the record.
+        workers: Number of workers of the batch, for the record.
         networks: What machines may lack.
     """
 

@@ -140,7 +140,7 @@ class Job:
 def run_job(job: Job) -> dict[str, Any]:
     """Track, unless the run is there, and score; the scores are written too.
 
-    Those of the final estimates are by name of the measure. Where there are refined estimates, ``causal`` holds the
+    Those of the final estimates are by name of the measure. If there are refined estimates, ``causal`` holds the
     scores of the causal ones, else None.
 
     Raises:

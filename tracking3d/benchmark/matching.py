@@ -2,7 +2,7 @@
 
 The same place must have the same features, wherever it has moved and whatever the light does. An image is warped
 by a known homography and changed by a shading ramp, gamma, a colour cast and noise. For points of the image the
-nearest neighbour by cosine is searched among all pixels of the warped one; it counts where it lies within 3 px of
+nearest neighbour by cosine is searched among all pixels of the warped one; it counts if it lies within 3 px of
 the truth. A search everywhere asks whether features are distinctive, one near the truth whether they are precise.
 """
 
@@ -84,7 +84,7 @@ def make_pairs(images: Sequence[Image], seed: int = 0, size: int = 256) -> list[
 
     Args:
         images: ``(H, W, 3)`` uint8 RGB of any size; large ones are reduced to at most twice ``size`` first.
-        seed: Of crops, warps, light, noise and points.
+        seed: Seed of crops, warps, light, noise and points.
         size: Side S of the crops in pixels.
 
     Returns:

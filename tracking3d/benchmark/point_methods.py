@@ -1,4 +1,4 @@
-"""Ways to follow points through a run's frames, to be compared: ours, and what is without a model.
+"""Ways to follow points through a run's frames, to be compared: ours, and methods without a model.
 
 All take the pixels of one frame and give positions ``(T, N, 2)``, NaN if there is none, and visibility ``(T, N)``.
 """

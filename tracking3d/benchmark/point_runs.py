@@ -212,7 +212,7 @@ def _score(
 
 
 def returns(visible: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """``(N, T)`` where a point is seen after it was hidden for `LONG` frames or more in a row.
+    """``(N, T)`` whether a point is seen after it was hidden for `LONG` frames or more in a row.
 
     It counts from its return to when it is next hidden for as long.
 

@@ -1,4 +1,4 @@
-"""Jobs in workers: one that crashes costs itself only, and what is finished is not done again."""
+"""Jobs in workers: one that crashes costs itself only, and finished jobs are not repeated."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def run_jobs(
         jobs: What to run.
         processes: Workers.
         listener: Called for every outcome.
-        address: Of a Ray cluster that runs them, which must see the same files; this machine if None.
+        address: Address of a Ray cluster that runs them, which must see the same files; this machine if None.
     """
     outcomes: dict[int, JobOutcome] = {}
     equal: dict[Path, list[int]] = {}

@@ -146,7 +146,7 @@ def fill(
         patterns: Only solvers with features that match any of them, such as ``*RGB``; all if there is none.
         processes: Jobs at a time.
         listener: Called for every job.
-        address: Of a Ray cluster that runs them; this machine if None.
+        address: Address of a Ray cluster that runs them; this machine if None.
 
     Raises:
         InputError: If a pattern matches nothing.

@@ -257,5 +257,5 @@ def _means(found: Sequence[Spread]) -> tuple[list[str], list[list[str]]]:
 
 
 def _fine(value: float, measure: str) -> str:
-    """Degrees with two digits: differences are what is shown here."""
+    """Degrees with two digits, as differences are shown here."""
     return f"{value:.2f}" if measure.endswith("_deg") else figure(value, measure)

@@ -1,4 +1,4 @@
-"""Filling a table of the paper, and writing it as Markdown, CSV, JSON and a picture."""
+"""Filling a table of the paper, and writing it as Markdown, CSV, JSON and an image."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def fill(
         processes: Jobs at a time.
         initial: Folders of initial masks by tracker, in lower case.
         listener: Called for every job.
-        address: Of a Ray cluster that runs them; this machine if None.
+        address: Address of a Ray cluster that runs them; this machine if None.
     """
     plan = table.plan(base, dataset.synthetic, initial or {})
     chosen = _choose_sequences(table, dataset)

@@ -146,7 +146,7 @@ LOSSES: dict[str, dict[str, Any]] = {
     "no L_T": {"solver__weights__total_variation": 0.0},
     "L_T as in the paper": {"solver__weights__total_variation": 0.001},
 }
-"""Settings that switch a loss off, by row. `distance` is relative to `silhouette`, so that its own share is kept."""
+"""Settings that switch a loss off, by row. `distance` is relative to `silhouette`, so that its own share stays."""
 
 
 def _ablation_start(base: Variant, synthetic: bool, initial: Mapping[str, Path]) -> Variant | str:

@@ -42,7 +42,7 @@ def speed_table(speeds: Sequence[TrackSpeed]) -> Table:
 
 
 def stage_table(speeds: Sequence[TrackSpeed]) -> Table:
-    """Mean milliseconds a frame of every stage, and its share; what is done beside the frames counts too."""
+    """Mean milliseconds a frame of every stage, and its share; one-time work counts too."""
     table = Table(box=None, pad_edge=False)
     table.add_column("mean of a frame, ms")
     for speed in speeds:

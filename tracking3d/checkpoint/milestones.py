@@ -40,7 +40,7 @@ class Milestone:
 
     @property
     def bytes(self) -> int:
-        """Of its text; arrays are shared."""
+        """Bytes of its text; arrays are shared."""
         return self.path.stat().st_size
 
 

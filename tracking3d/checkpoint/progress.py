@@ -45,7 +45,7 @@ class JournalEntry:
         index: The frame's index in the source.
         picture: Checksum of its image, see `checksum`.
         score: Score of its initial mask; reason: of the same.
-        corrected: Whether the estimate was handed back to the mask tracker.
+        corrected: Whether the estimate was fed back to the mask tracker.
         failure: Which plug-in failed at it, and why; empty if none did.
     """
 
@@ -120,6 +120,6 @@ def check_picture(kept: SavedState, frame: Frame | SkippedFrame) -> None:
         )
     if taken is not None and taken.picture != checksum(frame.image):
         raise InputError(
-            f"{frame.name or f'frame {frame.index}'} shows another picture than when it was estimated; a run goes "
+            f"{frame.name or f'frame {frame.index}'} shows another image than when it was estimated; a run goes "
             "on with the same source only."
         )

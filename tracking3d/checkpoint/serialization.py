@@ -64,7 +64,7 @@ class TreeFolder:
     """Arrays of the trees that are written one after the other, in a folder.
 
     Args:
-        folder: Where array files lie; it exists.
+        folder: Existing folder of the array files.
         classes: Dataclasses and enumerations that a tree may hold.
         device: The device of the tensors when a tree is read.
     """

@@ -61,8 +61,8 @@ def stage_correction(
     answered = roll_back(folder, stage, changed)
     if answered is None:
         _log.warning(
-            "No checkpoint before frame %d is saved in %s, so that all frames are computed again; frames before the
-            correction " "get the estimates that they had.",
+            "No checkpoint before frame %d is saved in %s, so that all frames are computed again; frames before "
+            "the correction get the estimates that they had.",
             min(changed),
             folder,
         )
@@ -99,7 +99,7 @@ def take_over(folder: Path) -> None:
 
 
 def _goes_on(stage: Path, config: Mapping[str, Any], selection: str | None, given: Mapping[str, Any]) -> bool:
-    """Whether the same correction was begun before, and stopped."""
+    """Whether the same correction was started before, and stopped."""
     try:
         return layout.has_state(stage) and earlier_run(stage, config, selection, given) == "stopped"
     except (InputError, OutputError):

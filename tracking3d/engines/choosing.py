@@ -16,7 +16,7 @@ def open_engine(
     """Ray if an address is given, else processes of this machine; running tasks are stopped at the end.
 
     Args:
-        address: Of a Ray cluster, see `tracking3d.engines.on_ray.open_ray`.
+        address: Address of a Ray cluster, see `tracking3d.engines.on_ray.open_ray`.
         workers: Tasks at a time; as many as there are cores for if None.
         needs: What each takes.
 

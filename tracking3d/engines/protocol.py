@@ -138,5 +138,5 @@ class Engine(Protocol):
         ...
 
     def stop(self) -> None:
-        """End every task that runs: ask each to keep what is done, and kill it if it does not come to that."""
+        """End every running task: ask each to save its finished frames, and kill it if it does not."""
         ...

@@ -64,7 +64,7 @@ def last_words(log: Path | None) -> str:
 
 
 def interruptible() -> None:
-    """From here on SIGTERM lets the task keep what is done, and Ctrl-C is for the process that hands out tasks."""
+    """From here on SIGTERM lets the task save its finished frames, and Ctrl-C only stops the process that assigns tasks."""
 
     def stop(number: int, frame: FrameType | None) -> None:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)

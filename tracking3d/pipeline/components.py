@@ -39,7 +39,7 @@ def build_solver(
 
     Args:
         config: The pipeline.
-        camera: Of the full frame.
+        camera: The camera of the full frame.
         encoder: The feature encoder.
         known: See `tracking3d.pipeline.known_object.load_known_object`.
     """

@@ -37,7 +37,7 @@ class FinalRefinement:
 
     Args:
         tracked: The object; its session is refined, see `Session.refine`.
-        writer: Of the run.
+        writer: The writer of the run.
         estimates: Writes the refined estimates.
         state: How far the run is.
         work: Writes in another thread while the next frame is solved.

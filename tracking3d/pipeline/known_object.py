@@ -186,7 +186,7 @@ def _side(faces: int) -> int:
 def _texture(
     mesh: trimesh.Trimesh, faces: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64] | None, NDArray[np.uint8] | None]:
-    """Texture coordinates ``(F, 3, 2)``, v down, and the picture ``(H, W, 3)``; None if there is no such."""
+    """Texture coordinates ``(F, 3, 2)``, v down, and the image ``(H, W, 3)``; None if there is none."""
     material = getattr(mesh.visual, "material", None)
     uvs = getattr(mesh.visual, "uv", None)
     image = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)

@@ -12,7 +12,7 @@ In short::
     recording.refinement.adjust_all()                # poses, surface and lens by all frames together
     for frame in frames:                             # third pass: what masks have in common
         recording.refinement.collect_mask(frame)
-    for frame in frames:                             # last pass: masks and pictures
+    for frame in frames:                             # last pass: masks and images
         recording.refinement.draw(frame)
 """
 
@@ -96,7 +96,7 @@ def run_passes(
     """Run all passes. A recording that fails is ended; the others continue.
 
     Args:
-        source: Where the frames come from.
+        source: The source of the frames.
         frames: Its frames, begun already.
         recordings: One for each object.
         listener: Is called with every frame of every object.
@@ -135,7 +135,7 @@ def run_refinement(source: FrameSource, active: ActiveRecordings) -> None:
     """All frames have causal estimates: run the final refinement, if it is asked for and possible, and draw.
 
     Args:
-        source: Where the frames come from.
+        source: The source of the frames.
         active: The recordings.
     """
     objects = len(active)

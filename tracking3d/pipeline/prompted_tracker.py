@@ -24,7 +24,7 @@ class PromptedTracker:
     """A mask tracker and the prompts that it starts from.
 
     Frames that come from before the first one are tracked backwards from it: the tracker is then started once more
-    on the first frame. If a frame has a prompt of its own, the tracker is set on that: re-anchored where it can be
+    on the first frame. If a frame has a prompt of its own, the tracker is set on that: re-anchored if it can be
     and still is on the object, since what it has learnt is worth keeping; else started again.
 
     Without a prompt, a tracker that knows no mask by itself waits until the object is prompted: the solver,

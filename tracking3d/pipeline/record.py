@@ -129,7 +129,7 @@ def record_objects(
 ) -> list[RunReader]:
     """Track several objects through ``source`` in one pass; each has a run folder of its own within ``folder``.
 
-    An object that fails is ended and the others go on; the first failure is raised at the end.
+    An object that fails is ended and the others continue; the first failure is raised at the end.
 
     Args:
         source: The frames.

@@ -244,7 +244,7 @@ class ObjectRecorder:
         return None
 
     def finish(self) -> None:
-        """Write what is made at the end."""
+        """Write the final files."""
         model, largest = self._session.result(), self._session.config.object.max_texture_size
         if self.refinement is not None:
             self.refinement.draw_rest()
@@ -261,7 +261,7 @@ class ObjectRecorder:
         self._writer.finish(_model_so_far(self._session), "interrupted")
 
     def give_up(self, error: BaseException) -> None:
-        """Keep what is finished when ``error`` ends the run, and let ``error`` say so."""
+        """Save the finished frames when ``error`` ends the run, and add this to ``error``."""
         self._work.end()
         failed = isinstance(error, Exception)
         folder = self._writer.folder

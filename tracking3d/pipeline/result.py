@@ -243,14 +243,14 @@ class TrackingResult:
             to: Name of the format.
             out: The file or folder to write.
             options: What else is asked.
-            overwrite: Replace what is there.
+            overwrite: Replace an existing run.
 
         Raises:
             InputError: If there is no such format, or nothing to write in it.
             OutputError: If it cannot be written.
         """
         if out is None:
-            raise InputError("out= is None; say where to write, since the run's own folder is temporary.")
+            raise InputError("out= is None; give a path, since the run's own folder is temporary.")
         if not self.run.refined:
             options = replace(options or ExportOptions(), answers="causal")
         return export_run(self.run.folder, to, out, options=options, overwrite=overwrite)

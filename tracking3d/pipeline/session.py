@@ -45,7 +45,7 @@ class Session:
 
     Args:
         config: The pipeline.
-        prompt: The object in the first frame; None takes the mask tracker's own first mask, or finds what is known.
+        prompt: The object in the first frame; None takes the mask tracker's own first mask, or finds the known object.
         intrinsics: fx, fy, cx, cy that the source knows of, in pixels; the configuration wins over them.
         intrinsics_origin: Where they come from, in words.
         encoder: A feature encoder that several sessions share, see `build_encoder`; one of its own if None.
@@ -54,7 +54,7 @@ class Session:
         config: The pipeline.
         renderer: What renders, and why, see `tracking3d.rendering.backend.choose_backend`.
         initial_mask: The solver's input for the latest frame: the mask tracker's estimate, or its replacement.
-        corrected: Whether the latest estimate was handed back to the mask tracker.
+        corrected: Whether the latest estimate was fed back to the mask tracker.
         coming: The frame of the next ``step``, if it is known: the mask tracker may begin with it.
         refining: What ``refine`` took.
 

@@ -53,7 +53,7 @@ def track(
     Args:
         frames: What `open_source` opens by a path; ``(N, H, W, 3)`` uint8 RGB; a tensor ``(N, 3, H, W)`` or ``(N, H, W,
             3)`` of uint8 or of floats in [0, 1]; a ``cv2.VideoCapture``; a `FrameSource`; or any iterable of such
-            images, pictures of Pillow, paths of images and `Frame` objects. Frames that could not be read are passed
+            images, images of Pillow, paths of images and `Frame` objects. Frames that could not be read are passed
             over, but not the first.
         box: The object in the first frame, ``(x, y, width, height)`` in pixels.
         mask: The object in the first frame, ``(H, W)`` bool.
@@ -103,7 +103,7 @@ def track_objects(
     """Track several objects through frames that are gone through once; see `track`.
 
     An object whose plug-in has failed for good, see ``runtime.on_plugin_failure``, is estimated as lost from then on;
-    the others go on.
+    the others continue.
 
     Args:
         frames: See `track`.

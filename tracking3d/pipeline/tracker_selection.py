@@ -19,7 +19,7 @@ AUTO = "auto"
 AFFORDABLE = 900.0
 """Seconds that the masks of a whole video may take."""
 UNHURRIED, LIVE = 1.0, 0.1
-"""Seconds that one frame's mask may take where the number of frames is unknown, and of a camera."""
+"""Seconds that one frame's mask may take if the number of frames is unknown, or of a camera."""
 _CARRIED = 0.05
 """Seconds in which a mask is carried on to a frame that the network is not asked about."""
 

@@ -144,8 +144,8 @@ def check_asked(
     """Check that the query pixels can be tracked.
 
     Args:
-        tracks: By the mesh.
-        camera: Of the frames.
+        tracks: The tracks by the mesh.
+        camera: The camera of the frames.
         answered: ``(N,)`` which pixels will have one; those on the mesh if left out.
         otherwise: What else can be done about the others.
 

@@ -36,7 +36,7 @@ class RunHeader:
         seed: Seed of everything random.
         fps: Frames per second of the source, if known.
         command: The command line, if there was one.
-        source_notes: What the source did to its pictures, in clauses.
+        source_notes: How the source processed its images, in clauses.
         selection: The ``START:STOP:STEP`` that the source was opened with.
         renderer: What renders, and why.
         given: The identity of source and prompt, see `tracking3d.checkpoint.resuming.prompt_record`.

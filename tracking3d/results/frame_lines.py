@@ -83,7 +83,7 @@ class FrameLines:
                 raise
 
     def truncate(self) -> None:
-        """Cut off what a stopped run had begun to write after its last finished frame."""
+        """Cut off the lines that a stopped run wrote after its last finished frame."""
         if self._kept is not None:
             self._file.truncate(self._kept)
             self._kept = None

@@ -86,12 +86,12 @@ _OF_STATE = re.compile(r"\d{8,}\.npz|milestone_\d{6,}\.json")
 
 
 def mask_path(folder: Path, index: int) -> Path:
-    """Where the estimated mask of frame ``index`` lies: in the run folder, or in `CAUSAL` or `REFINING` within it."""
+    """Path of the estimated mask of frame ``index``: in the run folder, or in `CAUSAL` or `REFINING` within it."""
     return folder / MASKS / f"{index:06d}.png"
 
 
 def initial_mask_path(folder: Path, index: int) -> Path:
-    """Where the mask tracker's mask of frame ``index`` lies."""
+    """Path of the mask tracker's mask of frame ``index``."""
     return folder / INITIAL_MASKS / f"{index:06d}.png"
 
 
@@ -125,7 +125,7 @@ def _is_object(folder: Path) -> bool:
 
 
 def partial_path(path: Path) -> Path:
-    """Where ``path`` is written before it is renamed into place."""
+    """Temporary path of a file, before it is renamed to ``path``."""
     return path.with_name(f".{path.name}.part")
 
 
@@ -157,7 +157,7 @@ def correction_files(folder: Path) -> list[Path]:
 
 
 def probability_path(folder: Path, index: int) -> Path:
-    """Where the object's probability in frame ``index`` lies: in the run folder, or in `REFINING` within it."""
+    """Path of the object's probability in frame ``index``: in the run folder, or in `REFINING` within it."""
     return folder / PROBABILITIES / f"{index:06d}.png"
 
 

@@ -137,7 +137,7 @@ def glb_file(
 def split_mesh(model: ObjectModel, material: trimesh.visual.material.Material) -> trimesh.Trimesh:
     """The model with one texture coordinate a vertex: vertices are doubled only at the seams of the atlas.
 
-    Corners are one vertex where they share their place, in single precision as a GLB holds it, and their texture
+    Corners are one vertex if they share their position, in single precision as a GLB holds it, and their texture
     coordinate up to rounding.
     Faces keep their order. Texture coordinates have trimesh's origin, the lower left. Normals are those of
     the unsplit mesh, so that the seam does not show.

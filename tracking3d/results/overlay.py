@@ -56,7 +56,7 @@ class OverlaySize:
 
 @dataclass(frozen=True, eq=False)
 class ObjectAxes:
-    """Where the axes are drawn, in object coordinates.
+    """Position of the axes, in object coordinates.
 
     Attributes:
         origin: ``(3,)``.

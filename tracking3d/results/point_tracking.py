@@ -118,7 +118,7 @@ def open_scene(
 ) -> RunScene:
     """Read the frames of a run and put its surface and poses right by them.
 
-    What is found is written to ``landmarks.npz`` beside the mesh, and taken from there the next time. Where the folder
+    The result is written to ``landmarks.npz`` beside the mesh, and read from there the next time. If the folder
     cannot be written it is computed again each time.
 
     Args:

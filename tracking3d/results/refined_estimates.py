@@ -81,7 +81,7 @@ class RefinedEstimates:
         """Give a refined estimate another mask, as `put` does; causal ones stand.
 
         Args:
-            index: Of the frame.
+            index: Index of the frame.
             mask: ``(H, W)``.
             probability: ``(H, W)`` of the object; None if it is written already.
 

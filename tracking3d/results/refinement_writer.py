@@ -41,7 +41,7 @@ class RefinementWriter(RefinedEstimates):
 
     Attributes:
         pictures: Overlay and crops of the second pass.
-        together: What it took to solve everything once more, before the frames.
+        together: Times of the global refinement of the map, before the frames.
 
     Raises:
         OutputError: If the folder cannot be written.

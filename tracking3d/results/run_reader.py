@@ -161,7 +161,7 @@ class RunReader:
         return frozenset(record.index for record in self.frames if record.refined)
 
     def mask_path(self, index: int) -> Path:
-        """Where the estimated mask of frame ``index`` lies."""
+        """Path of the estimated mask of frame ``index``."""
         causal = layout.mask_path(self.folder / layout.CAUSAL, index)
         if index in self._refined_frames or not causal.is_file():
             return layout.mask_path(self.folder, index)
@@ -199,7 +199,7 @@ class RunReader:
 
     @property
     def mesh_folder(self) -> Path:
-        """Where the mesh that belongs to the estimates lies, if there is one; see `load_mesh` and `load_model`."""
+        """Folder of the mesh that belongs to the estimates, if there is one; see `load_mesh` and `load_model`."""
         causal = self.folder / layout.CAUSAL
         of_causal = not self._refined_frames and (causal / layout.OBJ).is_file()
         return causal if of_causal else self.folder

@@ -139,7 +139,7 @@ class RunWriter:
         Raises:
             OutputError: If it cannot be written; what was written before stays whole.
         """
-        started = time.perf_counter() - self._drawing  # of the picture before, drawn when its line was safe
+        started = time.perf_counter() - self._drawing  # of the image before, drawn when its line was safe
         for revised in estimate.revised:
             self._record(revised, "", revision=True)
         record = self._record(estimate, frame.name, revision=False, started=started)

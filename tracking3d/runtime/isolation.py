@@ -38,7 +38,7 @@ class RandomState:
         return cls(random.getstate(), np.random.get_state(), torch.get_rng_state(), cuda)
 
     def same(self, other: RandomState) -> bool:
-        """Whether what is drawn next is the same."""
+        """Whether the next random numbers are the same."""
         return (
             self.of_python == other.of_python
             and self.of_numpy[2:] == other.of_numpy[2:]

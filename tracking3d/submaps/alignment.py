@@ -74,7 +74,7 @@ def check_agreement(fit: SimilarityFit, radius: float) -> None:
 
     Args:
         fit: Similarity of their poses.
-        radius: Of the first's object, in its unit.
+        radius: Radius of the first's object, in its unit.
 
     Raises:
         DisagreementError: If not.

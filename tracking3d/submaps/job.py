@@ -27,7 +27,7 @@ class LongVideo:
         config: The pipeline, with the solver ``online`` and its final refinement.
         folder: The run folder.
         prompts: What the object is in the first frame.
-        length: Of a part, in seconds or frames, see `parse_length`.
+        length: Length of a part, in seconds or frames, see `parse_length`.
         workers: Processes at a time, for the record.
         selection: ``START:STOP:STEP`` of the frames.
         command: For the record.

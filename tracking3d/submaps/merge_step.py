@@ -139,7 +139,7 @@ class Ending:
 
 
 def end(tell: Tell, ending: Ending) -> None:
-    """Draw what is estimated, and write what is made at the end; the parts are removed.
+    """Draw the estimates, and write the final files; the parts are removed.
 
     Args:
         tell: Called with the estimates that are drawn.

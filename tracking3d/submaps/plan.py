@@ -49,7 +49,7 @@ def selection_of(whole: range, start: int, stop: int) -> str:
 
 
 def part_folder(folder: Path, part: Part) -> Path:
-    """Where a part's run lies."""
+    """The run folder of a part."""
     return folder / PARTS / f"part_{part.number}"
 
 

@@ -56,7 +56,7 @@ def begin(tell: Tell, video: LongVideo) -> Begun | SplitResult:
     """Cut a video, unless it is one part, or done; ``tell`` is given the estimates if it is tracked here.
 
     Raises:
-        InputError: If the video cannot be split, or what is there is of something else.
+        InputError: If the video cannot be split, or the folder holds another run.
         Tracking3dError: The frames finished until then are saved.
     """
     folder, resume = video.folder, video.resume

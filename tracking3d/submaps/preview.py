@@ -1,4 +1,4 @@
-"""A cheap look through a video before it is cut: a mask tracker alone, on small pictures, not every frame."""
+"""A preview of a video before it is cut: a mask tracker alone, on small images, not every frame."""
 
 from __future__ import annotations
 

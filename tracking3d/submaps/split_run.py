@@ -46,7 +46,7 @@ def record_in_parts(
         config: The pipeline, with the solver ``online`` and its final refinement.
         folder: The run folder.
         prompts: What the object is in the first frame.
-        length: Of a part, in seconds or frames, see `tracking3d.submaps.cuts.parse_length`.
+        length: Length of a part, in seconds or frames, see `tracking3d.submaps.cuts.parse_length`.
         workers: Processes at a time.
         selection: ``START:STOP:STEP`` of the frames.
         command: For the record.
@@ -56,7 +56,7 @@ def record_in_parts(
         map_jobs: What takes the place of `run_in_processes` with so many workers.
 
     Raises:
-        InputError: If the video cannot be split, or what is there is of something else.
+        InputError: If the video cannot be split, or the folder holds another run.
         Tracking3dError: The frames finished until then are saved, for ``resume``.
     """
     video = LongVideo(
