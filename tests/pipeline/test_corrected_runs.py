@@ -320,7 +320,7 @@ def test_a_run_of_an_earlier_format_is_not_corrected(clip, images, tmp_path):
     set_format(folder, 1)
     before = contents(folder)
     with pytest.raises(
-        InputError, match=r"an earlier version of tracking3d .* run it again with --overwrite"
+        InputError, match=r"an earlier version of tracking3d .* run it again with overwrite=True"
     ):
         correct_run(folder, told(clip))
     assert contents(folder) == before

@@ -420,7 +420,7 @@ def test_a_run_of_an_earlier_format_is_not_resumed(clip, images, tmp_path, monke
     stopped(monkeypatch, clip, images, tmp_path / "run", Session, "step", 4)
     set_format(tmp_path / "run", 1)
     with pytest.raises(
-        InputError, match=r"an earlier version of tracking3d .* run it again with --overwrite"
+        InputError, match=r"an earlier version of tracking3d .* run it again with overwrite=True"
     ):
         record(open_source(str(images)), settings(), tmp_path / "run", mask=clip.masks[0], resume=True)
 

@@ -210,7 +210,7 @@ def test_a_run_of_an_earlier_format_is_refused_and_can_be_replaced(tmp_path, tur
     write_run(tmp_path, turning_sphere)
     set_format(tmp_path, 1)
     with pytest.raises(
-        InputError, match=r"an earlier version of tracking3d \(format 1\); run it again with --overwrite"
+        InputError, match=r"an earlier version of tracking3d \(format 1\); run it again with overwrite=True"
     ):
         RunReader(tmp_path)
     with pytest.raises(OutputError, match="already holds a run"):

@@ -49,7 +49,7 @@ def solved() -> tuple[SolverState, dict[int, np.ndarray]]:
         estimate = session.step(Frame(index, image))
         for answer in (*estimate.revised, estimate):
             poses[answer.index] = answer.T_cam_obj
-    state = session.kept()["solver"]
+    state = session.state_dict()["solver"]
     assert state.pending is None
     return state, poses
 

@@ -63,7 +63,7 @@ class SavedState:
 
     Attributes:
         progress: Its progress.
-        session: The session's state, see `tracking3d.pipeline.session.Session.kept`.
+        session: The session's state, see `tracking3d.pipeline.session.Session.state_dict`.
         taken: The frames that were taken, by index.
         skipped: Those that were not.
     """

@@ -64,7 +64,7 @@ def last_words(log: Path | None) -> str:
 
 
 def interruptible() -> None:
-    """From here on SIGTERM lets the task save its finished frames, and Ctrl-C only stops the process that assigns tasks."""
+    """From here on SIGTERM lets the task save its finished frames, and Ctrl-C is left to the master process."""
 
     def stop(number: int, frame: FrameType | None) -> None:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)

@@ -71,7 +71,7 @@ class ActiveRecordings:
         except Exception as error:
             self._active.remove(recording)
             with suppress(Exception):  # the first error is reported
-                self.tell(recording.written())
+                self.tell(recording.wait_until_written())
             recording.give_up(error)
             self.errors.append(error)
 
@@ -111,7 +111,7 @@ def run_passes(
         for recording in recordings if source.repeatable else ():
             threads.enter_context(recording.writing_beside())
         try:
-            waits = any(one.takes for one in active)
+            waits = any(one.needs_first_pass for one in active)
             for frame, coming in read_with_next(source, frames) if waits else ():
                 shared = with_share(frame, len(recordings)) if isinstance(frame, Frame) else frame
                 for recording in active:
@@ -143,7 +143,7 @@ def run_refinement(source: FrameSource, active: ActiveRecordings) -> None:
         for recording in active:
             with active.guard(recording):
                 recording.begin_refinement(source)
-        for frame in read_again(source) if any(one.looks_again for one in active) else ():
+        for frame in read_again(source) if any(one.needs_second_pass for one in active) else ():
             for recording in active:
                 with active.guard(recording):
                     active.tell(recording.take_again(with_share(frame, objects)))
@@ -177,4 +177,4 @@ def _finish_writing(active: ActiveRecordings) -> None:
     """Wait until everything is written that is written in other threads."""
     for recording in active:
         with active.guard(recording):
-            active.tell(recording.written())
+            active.tell(recording.wait_until_written())

@@ -77,12 +77,12 @@ class ObjectRecorder:
         finally:
             self._work.end()
 
-    def written(self) -> Any:
+    def wait_until_written(self) -> Any:
         """Wait until all estimates are written; returns the last one for the listener."""
         return self._work.wait()
 
     @property
-    def takes(self) -> bool:
+    def needs_first_pass(self) -> bool:
         """Whether the frames are to come for the first time, or for the mask tracker to see them again."""
         return not self._state.before.refining
 
@@ -101,7 +101,7 @@ class ObjectRecorder:
         if isinstance(frame, Frame):
             self._unmet.discard(frame.index)
         if self._state.kept and self._state.has(frame.index):
-            return self._take_kept(self._state.kept, frame)
+            return self._replay_saved(self._state.kept, frame)
         if isinstance(frame, SkippedFrame):
             return self._work.do(partial(self._skip, frame))
         if not isinstance(coming, Frame) or self._state.has(coming.index):
@@ -121,7 +121,7 @@ class ObjectRecorder:
                 self._session.corrected,
                 self._session.failure_at(frame.index),
             )
-            kept = self._session.kept()
+            kept = self._session.state_dict()
         return self._work.do(partial(self._write, estimate, frame, taken, kept))
 
     def _skip(self, frame: SkippedFrame) -> SkippedFrame:
@@ -146,11 +146,13 @@ class ObjectRecorder:
             self._state.save(session, taken, revised, last=frame.index, **so_far)
         return record
 
-    def _take_kept(self, kept: SavedState, frame: Frame | SkippedFrame) -> FrameRecord | SkippedFrame | None:
+    def _replay_saved(
+        self, kept: SavedState, frame: Frame | SkippedFrame
+    ) -> FrameRecord | SkippedFrame | None:
         """Draw a frame that has its estimate, and show it to a mask tracker that cannot be resumed otherwise."""
         if isinstance(frame, SkippedFrame) and frame.index not in kept.taken:
             return frame
-        if frame.index not in kept.taken or not self.takes:
+        if frame.index not in kept.taken or not self.needs_first_pass:
             return None
         check_picture(kept, frame)
         assert isinstance(frame, Frame)
@@ -186,7 +188,7 @@ class ObjectRecorder:
             _log.warning(
                 "Frame %d, which was to be corrected, is not among the frames that could be read.", index
             )
-        estimates = self._refined(source)
+        estimates = self._open_refinement(source)
         if estimates is not None:
             estimates.together = self._session.refining
             self._writer.refine_camera(self._session.camera)
@@ -200,9 +202,9 @@ class ObjectRecorder:
                 self.precomputed,
             )
         elif self._redraw:
-            self._writer.begin_drawing_anew()
+            self._writer.begin_drawing_again()
 
-    def _refined(self, source: FrameSource) -> RefinementWriter | None:
+    def _open_refinement(self, source: FrameSource) -> RefinementWriter | None:
         """Refine everything, unless the stopped run has done so; None if there is no refinement."""
         before = self._state.before
         if before.refining:
@@ -214,7 +216,7 @@ class ObjectRecorder:
         if not self._refines:
             return None
         if not self._session.can_refine or not source.repeatable:
-            self._writer.leave_out_refinement(
+            self._writer.skip_refinement(
                 f"{source.name} cannot be read a second time"
                 if self._session.can_refine
                 else f"the solver {self._session.config.solver.name} gives causal estimates only"
@@ -224,7 +226,7 @@ class ObjectRecorder:
         estimates = self._writer.begin_refinement(self._causal_model)
         self._session.refine()
         self._state.save(
-            self._session.kept(),
+            self._session.state_dict(),
             refining=True,
             seconds=self._writer.seconds,
             refinement_seconds=estimates.seconds,
@@ -232,7 +234,7 @@ class ObjectRecorder:
         return estimates
 
     @property
-    def looks_again(self) -> bool:
+    def needs_second_pass(self) -> bool:
         """Whether the frames are to come once more, in order of time."""
         return self.refinement is not None or self._redraw
 

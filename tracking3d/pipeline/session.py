@@ -126,13 +126,13 @@ class Session:
         check_frame(frame)
         try:
             with self._settings.in_force(), measure("solve") as watch:
-                estimate = self._start(frame) if self._solver is None else self._go_on(frame, prompt)
+                estimate = self._start(frame) if self._solver is None else self._track(frame, prompt)
         except PluginFailure as error:
             raise error.at(frame.label) from error.__cause__
         return add_times(estimate, watch, frame)
 
     def _start(self, frame: Frame) -> FrameEstimate:
-        solver = self._begun(frame)
+        solver = self._build_solver(frame)
         if self._prompt is not None:
             check_prompt_fits(self._prompt, frame)
         mask = self._tracker.start(frame)
@@ -140,10 +140,10 @@ class Session:
         self._solver, self.initial_mask = solver, mask
         self._last_pose = self._first_pose = estimate.T_cam_obj
         if self._tracker.waits:
-            self._hand_back(frame, estimate)
+            self._feed_back(frame, estimate)
         return estimate
 
-    def _begun(self, first: Frame) -> Solver[Any]:
+    def _build_solver(self, first: Frame) -> Solver[Any]:
         """The solver for a video that begins with ``first``; the camera is set for it, too."""
         height, width = first.size
         self._camera = select_camera(self.config, width, height, *self._intrinsics)
@@ -154,11 +154,11 @@ class Session:
 
     @property
     def state_classes(self) -> tuple[type, ...]:
-        """The classes of what `kept` gives, beside arrays, tensors and plain values."""
+        """The classes of what `state_dict` gives, beside arrays, tensors and plain values."""
         own: tuple[type, ...] = getattr(SOLVERS[self.config.solver.name], "state_classes", ())
         return (Camera, Lens, MaskEstimate, FrameOrder, RandomState, StageTimes, *own)
 
-    def kept(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, Any]:
         """The state that another session needs to continue after the latest frame, see `resume`; it is immutable."""
         return {
             "solver": self._state,
@@ -173,20 +173,20 @@ class Session:
         }
 
     def resume(self, first: Frame, kept: Mapping[str, Any], failures: Mapping[int, str]) -> None:
-        """Restore a saved session (`kept`), instead of starting on a first frame.
+        """Restore a saved session (`state_dict`), instead of starting on a first frame.
 
         If `replays`, pass the frames up to the one after which it was saved to `replay` before the next
         ``step``.
 
         Args:
             first: The first frame.
-            kept: The value of `kept`.
+            kept: The value of `state_dict`.
             failures: Which plug-ins failed in which frames.
 
         Raises:
             PluginError: If the mask tracker cannot be restored.
         """
-        self._solver = self._begun(first)
+        self._solver = self._build_solver(first)
         self._state, self._camera = kept["solver"], kept["camera"]
         self.initial_mask, self._last_pose = kept["initial_mask"], kept["last_pose"]
         self._refined, self._failures = kept["refined"], dict(failures)
@@ -226,14 +226,14 @@ class Session:
                 raise error.at(frame.label) from error.__cause__
         return estimate
 
-    def _go_on(self, frame: Frame, prompt: Prompt | None) -> FrameEstimate:
+    def _track(self, frame: Frame, prompt: Prompt | None) -> FrameEstimate:
         if frame.size != (self.camera.height, self.camera.width):
             raise InputError(
                 f"{frame.label} has {pixels(frame.size)} pixels but the first frame "
                 f"{pixels((self.camera.height, self.camera.width))}; all frames must have one size."
             )
         failures = []
-        self.corrected, solver = False, self._facing(frame)
+        self.corrected, solver = False, self._solver_for(frame)
         try:
             mask = self._tracker.step(frame, prompt)
             self._tracker.announce(self.coming)
@@ -255,7 +255,7 @@ class Session:
             self._first_pose = answer.T_cam_obj if answer.index == self._presented.first else self._first_pose
         if prompt is None:
             try:
-                self._hand_back(frame, estimate)
+                self._feed_back(frame, estimate)
             except PluginFailure as error:
                 failures.append(self._tolerate(error))
         if failures:
@@ -263,14 +263,14 @@ class Session:
         revised = tuple(self._with_failure(earlier) for earlier in estimate.revised)
         return self._with_failure(replace(estimate, revised=revised))
 
-    def _hand_back(self, frame: Frame, estimate: FrameEstimate) -> None:
+    def _feed_back(self, frame: Frame, estimate: FrameEstimate) -> None:
         """Re-anchor the mask tracker to a reliable estimate unlike its own, or to the first one if it waits."""
         corrected = self.config.solver.tracker_feedback and self._tracker.can_correct and corrects(estimate)
         if corrected or (self._tracker.waits and estimate.status is not Status.LOST):
             self.corrected = True
             self._tracker.correct(frame, estimate.mask)
 
-    def _facing(self, frame: Frame) -> Solver[Any]:
+    def _solver_for(self, frame: Frame) -> Solver[Any]:
         """The solver, restarted backwards if this frame is the first one before the prompt frame."""
         solver, first = self._solver, self._first
         assert solver is not None and first is not None

@@ -92,7 +92,7 @@ class RunWriter:
                 for inner in (layout.MASKS, layout.INITIAL_MASKS):
                     (self.folder / inner).mkdir(exist_ok=True)
             if resume is not None:
-                self._go_on(resume)
+                self._continue(resume)
             self._write_description()
         except BaseException:
             self._lines.discard()
@@ -117,7 +117,7 @@ class RunWriter:
             self._pictures.add_kept(frame, record, mask, initial)
         return record
 
-    def begin_drawing_anew(self) -> None:
+    def begin_drawing_again(self) -> None:
         """All frames are estimated: from here on `draw_again` draws them, in the order in which they come.
 
         Raises:
@@ -156,7 +156,7 @@ class RunWriter:
         if time.monotonic() - self._described >= SKIPS_EVERY:
             self._write_description()
 
-    def leave_out_refinement(self, reason: str) -> None:
+    def skip_refinement(self, reason: str) -> None:
         """Record that there is no final refinement though one was asked for, and why."""
         self._description["refinement"] = description.refinement("skipped", reason)
         self._write_description()
@@ -268,7 +268,7 @@ class RunWriter:
             return all(mask is None or not mask.any() for mask in (kept, given))
         return np.array_equal(kept, given)
 
-    def _go_on(self, so_far: WrittenSoFar) -> None:
+    def _continue(self, so_far: WrittenSoFar) -> None:
         """Continue the run that is there."""
         earlier = RunReader(self.folder).description
         self._lines.go_on(so_far.lines)

@@ -84,7 +84,7 @@ def write_merged_run(
     for one in skipped:
         checkpoint.note(one)
     last = records[-1].index if records else -1
-    checkpoint.save(RunProgress(last, size, refining=True, seconds=seconds), session.kept())
+    checkpoint.save(RunProgress(last, size, refining=True, seconds=seconds), session.state_dict())
 
 
 def write_causal_mesh(folder: Path, session: Session) -> None:

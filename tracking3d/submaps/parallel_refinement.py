@@ -106,7 +106,7 @@ def adjust_poses(tell: Tell, job: Placing) -> list[FrameRecord]:
     """
     estimates = _estimates(job.job.folder, job.look.camera)
     last = RefinementSteps(estimates, job.look)
-    return [last.adjusted(frame) for frame in _frames(job.job.source, job.job.selection, estimates)]
+    return [last.adjust(frame) for frame in _frames(job.job.source, job.job.selection, estimates)]
 
 
 def put_together(tell: Tell, job: Weighing) -> VideoSegmenter:
@@ -153,7 +153,7 @@ def _decisions(job: Weighing, estimates: RefinedEstimates, own: range) -> Iterat
     start, stop = max(own.start - reach, whole.start), min(own.stop + reach, whole.stop)
     for frame in _frames(job.job.source, f"{start}:{stop}:{own.step}", estimates):
         yield from last.decide(frame)
-    yield from last.rest()
+    yield from last.decide_rest()
 
 
 def _estimates(folder: Path, camera: Camera) -> RefinedEstimates:
