@@ -176,11 +176,11 @@ def track_looped(
     samples: list[Sample] = []
     before = time.perf_counter()
 
-    def measure(answer: FrameRecord | SkippedFrame) -> None:
+    def measure(record: FrameRecord | SkippedFrame) -> None:
         nonlocal before
         now, (memory, _) = time.perf_counter(), resident_memory()
-        status = str(answer.status) if isinstance(answer, FrameRecord) else "skipped"
-        samples.append(Sample(answer.index, now - before, memory, _open_descriptors(), status))
+        status = str(record.status) if isinstance(record, FrameRecord) else "skipped"
+        samples.append(Sample(record.index, now - before, memory, _open_descriptors(), status))
         before = time.perf_counter()
 
     solver = config.solver.model_copy(update={"final_refine": False})

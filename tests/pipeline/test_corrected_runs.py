@@ -329,7 +329,7 @@ def test_a_run_of_an_earlier_format_is_not_corrected(clip, images, tmp_path):
 def test_what_cannot_be_corrected_is_refused_in_a_sentence(clip, images, tmp_path):
     folder = run(clip, images, tmp_path / "run")
     before = contents(folder)
-    with pytest.raises(InputError, match="there is no frame 99"):
+    with pytest.raises(InputError, match="frame 99 is not among the tracked frames"):
         correct_run(folder, [Correction(99, box=(1, 1, 5, 5))])
     with pytest.raises(InputError, match="lies outside frame 6"):
         correct_run(folder, [Correction(6, box=(900, 1, 5, 5))])

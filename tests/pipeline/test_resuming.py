@@ -384,7 +384,7 @@ def test_a_picture_that_has_changed_since_is_refused(clip, images, whole, tmp_pa
     for file in images.iterdir():
         (other / file.name).write_bytes(file.read_bytes())
     write_image(other / "002.png", clip.images[0])
-    with pytest.raises(InputError, match=r"002\.png shows another picture than when it was answered"):
+    with pytest.raises(InputError, match=r"002\.png shows another image than when it was estimated"):
         record(open_source(str(other)), settings(), tmp_path / "run", mask=clip.masks[0], resume=True)
     record(open_source(str(images)), settings(), tmp_path / "run", mask=clip.masks[0], resume=True)
     assert_alike(tmp_path / "run", whole["stand_in"])
@@ -412,7 +412,7 @@ def test_a_run_whose_state_is_gone_is_refused(clip, images, tmp_path, monkeypatc
         with pytest.raises(InputError, match=r"damaged|another version"):
             record(open_source(str(images)), settings(), tmp_path / "run", mask=clip.masks[0], resume=True)
     state.unlink()
-    with pytest.raises(InputError, match="its state was not kept; start anew"):
+    with pytest.raises(InputError, match="its state was not saved; run it again"):
         record(open_source(str(images)), settings(), tmp_path / "run", mask=clip.masks[0], resume=True)
 
 

@@ -76,8 +76,8 @@ def _of_sequence(dataset: Dataset, name: str, config: PipelineConfig) -> VideoJo
         return replace(job, fault=f"{name} has no box in its first frame; a mask tracker cannot start.")
     camera, given = truth.given_camera or truth.camera, config.camera
     if camera is not None and truth.camera_told and given.intrinsics is None and given.fov is None:
-        told = given.model_copy(update={"intrinsics": (camera.fx, camera.fy, camera.cx, camera.cy)})
-        config = config.model_copy(update={"camera": told})
+        settings = given.model_copy(update={"intrinsics": (camera.fx, camera.fy, camera.cx, camera.cy)})
+        config = config.model_copy(update={"camera": settings})
     box = () if truth.box is None else (",".join(f"{value:.17g}" for value in truth.box),)
     size = sum(file.stat().st_size for file in truth.frames[:1]) * len(truth.frames)
     return replace(job, config=config, box=box, size=size)

@@ -141,11 +141,11 @@ def put_away(
     """
     if report:
         write_reports(runs)
-    told = write_marker(work / RUN, job, attempts, runs, note)
+    marker = write_marker(work / RUN, job, attempts, runs, note)
     _put_into_place(work / RUN, join_path(out, job.name))
     send_log(out, job)
     _forget(work)
-    return told
+    return marker
 
 
 def _track(tell: Tell, job: VideoJob, run: Path, command: str) -> None:
@@ -164,14 +164,14 @@ def _track(tell: Tell, job: VideoJob, run: Path, command: str) -> None:
 
 def counting(tell: Tell, of: int | None, **about: Any) -> Callable[[FrameRecord | SkippedFrame], None]:
     """A listener that reports the number of estimates from time to time, at first zero."""
-    answers, last, process = 0, 0.0, os.getpid()
+    done, last, process = 0, 0.0, os.getpid()
 
     def listener(frame: FrameRecord | SkippedFrame) -> None:
-        nonlocal answers, last
-        answers += 1
+        nonlocal done, last
+        done += 1
         if time.monotonic() - last > _TELL:
             last = time.monotonic()
-            tell({"frames": answers, "of": of, "process": process, **about})
+            tell({"frames": done, "of": of, "process": process, **about})
 
     tell({"frames": 0, "of": of, "process": process, **about})
     return listener

@@ -202,9 +202,9 @@ class Batch:
             # here.
             elsewhere = local(self._out) is None and not fault.crashed
             has_log = send_log(self._out, job) or elsewhere
-            told = f"{LOGS}/{job.name}.log" if has_log else ""
+            log = f"{LOGS}/{job.name}.log" if has_log else ""
             self.failures[job.name] = Failure(
-                job.name, job.video, fault.reason, ended.attempts, fault.crashed, told
+                job.name, job.video, fault.reason, ended.attempts, fault.crashed, log
             )
             self._count()
         self._say("again" if ended.again else "failed", job, about)

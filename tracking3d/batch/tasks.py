@@ -21,7 +21,7 @@ class _Long:
 
     video: int
     steps: Steps | None = None
-    answers: dict[int, Any] = field(default_factory=dict)
+    results: dict[int, Any] = field(default_factory=dict)
     waiting: set[int] = field(default_factory=set)
     whole: int = 1
     again: int = 0
@@ -85,18 +85,18 @@ class Tasks:
         if long.steps is None:
             long.steps, long.whole = steps_of(ended.value), 2 * ended.value.count
             return self._tasks(long, next(long.steps))
-        long.answers[ended.number] = ended.value
+        long.results[ended.number] = ended.value
         if long.waiting:
             return []
-        answers = [long.answers[number] for number in sorted(long.answers)]
+        results = [long.results[number] for number in sorted(long.results)]
         try:
-            return self._tasks(long, long.steps.send(answers))
+            return self._tasks(long, long.steps.send(results))
         except StopIteration as stop:
             arguments = (self._jobs[long.video], self._out, self._report, stop.value, long.again)
             return [self._task(long, settle_in_parts, arguments, "its report")]
 
     def _tasks(self, long: _Long, steps: Sequence[Step]) -> list[Task]:
-        long.answers.clear()
+        long.results.clear()
         job = self._jobs[long.video]
         return [
             self._task(long, step_in_parts, (job, self._out, step, long.whole, self._networks), step.label)

@@ -59,7 +59,7 @@ class VideoJob:
     @cached_property
     def key(self) -> str:
         """A key of its video, prompt and settings."""
-        told: dict[str, Any] = {
+        identity: dict[str, Any] = {
             "video": self.video,
             "config": self.config.model_dump(mode="json"),
             "objects": [self.box, self.mask, self.points],
@@ -69,5 +69,5 @@ class VideoJob:
             "sequence": self.sequence,
         }
         if self.split:
-            told["split"] = self.split
-        return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]
+            identity["split"] = self.split
+        return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:16]

@@ -77,8 +77,10 @@ class Job:
             or config.camera.fov is not None
         ):
             return config
-        told = config.camera.model_copy(update={"intrinsics": (camera.fx, camera.fy, camera.cx, camera.cy)})
-        return config.model_copy(update={"camera": told})
+        settings = config.camera.model_copy(
+            update={"intrinsics": (camera.fx, camera.fy, camera.cx, camera.cy)}
+        )
+        return config.model_copy(update={"camera": settings})
 
     @cached_property
     def run_key(self) -> str:

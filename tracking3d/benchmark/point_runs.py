@@ -132,7 +132,7 @@ def measure_run(job: Job, folder: Path, refined: bool = True, beside: bool = Fal
     scene = open_scene(run, source)
     seconds = time.perf_counter() - start
 
-    told: list[PointErrors] = []
+    per_frame: list[PointErrors] = []
 
     def corrected(frame: int, xy: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         rows = [row for row, one in enumerate(run.frames) if one.index == frame]
@@ -148,7 +148,7 @@ def measure_run(job: Job, folder: Path, refined: bool = True, beside: bool = Fal
         mine = np.flatnonzero(queries[:, 0] == frame)
         truly = (visible & after)[mine][:, indices].T & np.isfinite(found.uncertainty)
         error = np.linalg.norm(found.positions - tracks[mine][:, indices].transpose(1, 0, 2), axis=2)
-        told.append(
+        per_frame.append(
             PointErrors(error[truly], found.uncertainty[truly], found.measured[truly], found.features[truly])
         )
         return positions, seen
@@ -159,7 +159,7 @@ def measure_run(job: Job, folder: Path, refined: bool = True, beside: bool = Fal
     rows = {
         name: _score(method, queries, tracks, visible, after, _size(job)) for name, method in methods.items()
     }
-    errors = _together(told)
+    errors = _together(per_frame)
     inside = float(np.mean(errors.error <= 2 * errors.uncertainty)) if len(errors.error) else None
     return MeasuredRun(job.sequence, job.variant.masks, refined, rows, inside, errors, seconds)
 

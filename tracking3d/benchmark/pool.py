@@ -83,7 +83,7 @@ def run_jobs(
                 JobOutcome(jobs[number], result.scores, result.error, cached=result.scores is not None),
             )
 
-    def told(event: Event) -> None:
+    def handle(event: Event) -> None:
         if isinstance(event, Began):
             began[event.number] = time.monotonic()
         elif isinstance(event, Ended):
@@ -105,7 +105,7 @@ def run_jobs(
     ]
     if tasks:
         with open_engine(address, processes) as engine:
-            map_tasks(engine, tasks, listener=told)
+            map_tasks(engine, tasks, listener=handle)
     return [outcomes[number] for number in range(len(jobs))]
 
 

@@ -152,10 +152,10 @@ def _parse_speed(name: str, folder: Path, wall: float, processor: float | None) 
     for record in read_records(folder / layout.FRAMES):
         if not record.refined and not record.revision:
             first.setdefault(record.index, record)
-    answers = list(first.values())
-    if not answers:
+    records = list(first.values())
+    if not records:
         raise InputError(f"{name} has estimated no frame; see {folder}.")
-    times = [record.stages or StageTimes(solve=record.seconds) for record in answers]
+    times = [record.stages or StageTimes(solve=record.seconds) for record in records]
     whole = [one.whole for one in times]
     refinement = run.get("refinement") or {}
     again = float(refinement.get("seconds") or 0.0) if refinement.get("state") == "finished" else 0.0
@@ -163,14 +163,14 @@ def _parse_speed(name: str, folder: Path, wall: float, processor: float | None) 
     rest = causal - whole[0]
     return TrackSpeed(
         name=name,
-        frames=len(answers),
+        frames=len(records),
         wall=wall,
         processor=processor,
         first_answer=max(wall - causal - again, 0.0) + whole[0],
-        frames_per_second=(len(answers) - 1) / rest if len(answers) > 1 and rest > 0 else None,
+        frames_per_second=(len(records) - 1) / rest if len(records) > 1 and rest > 0 else None,
         delays=tuple(float(np.percentile(whole, share)) for share in PERCENTILES),
         stages=sum(times, StageTimes()) * (1 / len(times)),
-        refinement=again / len(answers) if again else None,
+        refinement=again / len(records) if again else None,
         peak_memory=run.get("peak_memory_mb"),
         over_time=tuple(tuple(getattr(one, stage) for stage in STAGES) for one in times),
     )

@@ -120,6 +120,6 @@ def check_picture(kept: SavedState, frame: Frame | SkippedFrame) -> None:
         )
     if taken is not None and taken.picture != checksum(frame.image):
         raise InputError(
-            f"{frame.name or f'frame {frame.index}'} shows another image than when it was estimated; a run goes "
-            "on with the same source only."
+            f"{frame.name or f'frame {frame.index}'} shows another image than when it was estimated; a run is "
+            "resumed with the same source only."
         )

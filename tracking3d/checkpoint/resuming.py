@@ -114,8 +114,8 @@ def earlier_run(
             f"use the same settings and source, or run it again with {layout.OVERWRITE}."
         )
     if changed := _changed(run.description, given):
-        answered = {record.index for record in run.frames}
-        if finished or changed & answered:
+        estimated = {record.index for record in run.frames}
+        if finished or changed & estimated:
             return "outdated"
     return "finished" if finished else "stopped"
 

@@ -76,10 +76,10 @@ def _copy_run(folder: Path, stage: Path, milestones: list[Milestone], journal: b
         link_or_copy(milestones[-1].path, stage / layout.STATE / layout.STATE_FILE)
     description = {**run.description, "state": "interrupted", "refinement": None}
     corrections = (run.description.get("prompt") or {}).get("corrections") or []
-    answered = {record.index for record in records}
+    estimated = {record.index for record in records}
     description["prompt"] = {
         **(run.description.get("prompt") or {}),
-        "corrections": [one for one in corrections if one["frame"] in answered],
+        "corrections": [one for one in corrections if one["frame"] in estimated],
     }
     write_atomic(stage / layout.RUN, json.dumps(jsonable(description)).encode() + b"\n")
 

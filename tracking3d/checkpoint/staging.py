@@ -58,8 +58,8 @@ def stage_correction(
         return stage, "stopped"
     remove_run(stage)
     changed = changed_frames(folder, given)
-    answered = roll_back(folder, stage, changed)
-    if answered is None:
+    estimated = roll_back(folder, stage, changed)
+    if estimated is None:
         _log.warning(
             "No checkpoint before frame %d is saved in %s, so that all frames are computed again; frames before "
             "the correction get the estimates that they had.",

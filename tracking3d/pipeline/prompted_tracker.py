@@ -86,18 +86,18 @@ class PromptedTracker:
 
     def _correct_by(self, frame: Frame, prompt: Prompt) -> MaskEstimate:
         other = self._new()
-        told = other.init(frame, prompt)
+        estimate = other.init(frame, prompt)
         try:
             own = self._tracker.step(frame).found
         except PluginFailure:
             own = None
-        mask = told.found
+        mask = estimate.found
         common = None if mask is None else mask_iou_or_none(mask, own)
         if mask is not None and self.can_correct and common is not None and common >= STRAYED:
             self._tracker.correct(frame, mask)
         else:
             self._tracker, self.anew = other, True
-        return told
+        return estimate
 
     @property
     def can_correct(self) -> bool:

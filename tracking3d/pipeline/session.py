@@ -251,8 +251,8 @@ class Session:
             failures.append(self._tolerate(error))
             estimate = lost_estimate(frame, mask, self._last_pose)
         self._last_pose, self._camera = estimate.T_cam_obj, estimate.camera or self._camera
-        for answer in (*estimate.revised, estimate):
-            self._first_pose = answer.T_cam_obj if answer.index == self._presented.first else self._first_pose
+        for one in (*estimate.revised, estimate):
+            self._first_pose = one.T_cam_obj if one.index == self._presented.first else self._first_pose
         if prompt is None:
             try:
                 self._feed_back(frame, estimate)

@@ -104,8 +104,8 @@ def join(tell: Tell, tracked: Tracked) -> Again | Refused | MergedSubmaps:
     except DisagreementError as error:
         _log.warning("The parts could not be merged: %s.", error)
         return Refused(str(error))
-    seconds = {"look_ahead": begun.plan.seconds, "parts": tracked.seconds}
-    seconds["join"], clock = time.monotonic() - clock, time.monotonic()
+    seconds = {"preview": begun.plan.seconds, "parts": tracked.seconds}
+    seconds["merge"], clock = time.monotonic() - clock, time.monotonic()
     about = {
         "workers": video.workers,
         "parts": [[run.part.start, run.part.stop] for run in whole.runs],

@@ -96,7 +96,7 @@ def write_causal_mesh(folder: Path, session: Session) -> None:
     export_mesh(folder, session.result())
 
 
-def take_second_answers(folder: Path, session: Session, made: Sequence[Path], seconds: float) -> None:
+def move_refined_estimates(folder: Path, session: Session, made: Sequence[Path], seconds: float) -> None:
     """Move the refined estimates of all parts to the place where the run expects its refined estimates.
 
     Args:

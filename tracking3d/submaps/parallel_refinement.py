@@ -27,7 +27,7 @@ from tracking3d.results.refined_estimates import RefinedEstimates
 from tracking3d.runtime.concurrency import read_ahead
 from tracking3d.segmentation.temporal_neighbours import REACH
 from tracking3d.segmentation.whole_video import VideoSegmenter
-from tracking3d.submaps.merged_run import take_second_answers
+from tracking3d.submaps.merged_run import move_refined_estimates
 from tracking3d.submaps.submap_runs import Revisit, Tell, resume_submap
 from tracking3d.video import open_source
 from tracking3d.video.selection import parse_selection
@@ -85,7 +85,7 @@ def solve_together(tell: Tell, job: Settling) -> GlobalAdjustment:
     first = job.looks[0]
     kept, session = resume_submap(first)
     if kept.progress.last_refined < kept.progress.last:  # not in their places yet
-        take_second_answers(first.folder, session, [look.out for look in job.looks], job.seconds)
+        move_refined_estimates(first.folder, session, [look.out for look in job.looks], job.seconds)
     estimates = _estimates(first.folder, session.camera)
     most = session.config.object.adjustment_views
     last = RefinementSteps(

@@ -70,7 +70,7 @@ def steps_of(begun: Begun) -> Steps:
         Step(refine_submap, look, f"refinement pass {number} of {of}", _frames(look))
         for number, look in enumerate(looks, 1)
     ]
-    seconds = {**found.seconds, "second_look": time.monotonic() - clock}
+    seconds = {**found.seconds, "refinement_pass": time.monotonic() - clock}
     yield from steps_to_the_end(replace(found, seconds=seconds))
     return SplitResult((begun.video.folder,), of)
 
@@ -87,7 +87,7 @@ def _refine_in_parallel(
 ) -> Generator[list[Step], list[Any], tuple[PrecomputedRefinement, dict[str, float]]]:
     """The final refinement of the parts: its last steps, and the seconds of each."""
     looks, of, clock = merged.looks, len(merged.looks), time.monotonic()
-    refined = merged.seconds["refine"] + merged.seconds["second_look"]
+    refined = merged.seconds["refine"] + merged.seconds["refinement_pass"]
     [look] = yield [Step(solve_together, Settling(looks, refined), "global adjustment")]
     settled = time.monotonic()
     placed = yield [

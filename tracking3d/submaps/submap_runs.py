@@ -109,7 +109,7 @@ def refine_submap(tell: Tell, job: Revisit) -> int:
     """Refine some frames, in order of time; ``tell`` is given each estimate's record.
 
     Returns:
-        How many have a second estimate.
+        Number of refined estimates.
 
     Raises:
         Tracking3dError: If a plug-in fails that may not, or something cannot be read or written.
@@ -118,18 +118,18 @@ def refine_submap(tell: Tell, job: Revisit) -> int:
     causal = {one.index: one for one in RunReader(job.folder, refined=False).frames}
     with writing(job.out):
         (job.out / layout.MASKS).mkdir(parents=True, exist_ok=True)
-    answered = 0
+    count = 0
     with (job.out / layout.FRAMES).open("wb") as lines:
         for frame in read_timed(open_source(job.source, job.selection)):
             if not isinstance(frame, Frame) or frame.index not in causal:
                 continue
-            record_ = _second_answer(session, job, kept, frame, causal[frame.index])
+            record_ = _refine_estimate(session, job, kept, frame, causal[frame.index])
             if record_ is not None:
                 with writing(job.out):
                     lines.write(record_.to_json().encode() + b"\n")
-                answered += 1
+                count += 1
             tell(record_ or causal[frame.index])
-    return answered
+    return count
 
 
 def resume_submap(job: Revisit) -> tuple[SavedState, Session]:
@@ -147,7 +147,7 @@ def resume_submap(job: Revisit) -> tuple[SavedState, Session]:
     return kept, session
 
 
-def _second_answer(
+def _refine_estimate(
     session: Session, job: Revisit, kept: SavedState, frame: Frame, causal: FrameRecord
 ) -> FrameRecord | None:
     """The record of a frame's second estimate, its mask written; None lets the first stand."""
