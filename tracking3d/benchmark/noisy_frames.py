@@ -1,4 +1,4 @@
-"""Frames that differ by next to nothing: what a method estimates for them should differ as little."""
+"""Frames that differ by next to nothing: the estimates of a method should differ as little."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far estimates for the same video part: on other processors, by another renderer, with next to no noise.
+"""How much estimates for the same video differ: on other processors, by another renderer, with next to no noise.
 
 What rounding or one grey level changes is not known better than that: a spread is the least that any figure of the
 same sequences is uncertain by.

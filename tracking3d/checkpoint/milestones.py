@@ -91,7 +91,7 @@ class Milestones:
             self._drop([one for one in self._kept if one.taken % self._gap])
 
     def forget_after(self, taken: int) -> None:
-        """Remove those of after so many frames: an estimate from before them is another one now.
+        """Remove those after so many frames, since an earlier estimate has changed.
 
         Raises:
             OSError: If one cannot be removed.

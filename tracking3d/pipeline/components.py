@@ -1,4 +1,4 @@
-"""What a session is built of: solvers by name, the feature encoder, the device; and what its estimates took."""
+"""The components of a session: solvers by name, the feature encoder, the device; and the times of its estimates."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ class Sighting:
         position: Position of the frame among the selected ones, from 0.
         area: Pixels of the mask, at the common resolution of all sightings; 0 if there is none.
         touches_border: Whether the mask comes up to the image's border.
-        score: How far the mask is reliable, in [0, 1].
+        score: Confidence of the mask, in [0, 1].
         mask: ``(H, W)`` bool at that resolution; None if it is not kept.
     """
 
@@ -52,7 +52,7 @@ class Part:
         start: Position of its first frame.
         stop: One past its last.
         owns_from: Position of the first frame whose estimate the merged run takes from it: frames that the part before
-            tracked as well are estimated by that one, whose model is the older.
+            tracked as well keep the estimates of that one, whose model has seen more.
     """
 
     number: int

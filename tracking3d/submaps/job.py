@@ -73,7 +73,7 @@ class SplitResult:
 
 
 def refuse_what_cannot_be_joined(config: PipelineConfig) -> None:
-    """Parts are merged in the final refinement of one solver.
+    """Check that the pipeline can merge parts, which the final refinement of one solver does.
 
     Raises:
         InputError: If the configuration is without it.

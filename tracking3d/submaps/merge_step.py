@@ -202,7 +202,7 @@ def _find_running(tracked: Tracked) -> Again | None:
 
 
 def _owned_ranges(begun: Begun) -> list[range]:
-    """Indices of the frames that each part estimates for."""
+    """Indices of the frames whose estimates are taken from each part."""
     whole = begun.video.frames(begun.count)
     starts = [part.owns_from for part in begun.plan.parts]
     return [whole[start:stop] for start, stop in zip(starts, [*starts[1:], len(whole)], strict=True)]

@@ -54,9 +54,9 @@ def write_merged_run(
 
     Args:
         writer: The new writer of the folder; it is closed.
-        session: That has the merged object, refined; see `write_causal_mesh` for the object before that.
+        session: The session with the merged, refined object; see `write_causal_mesh` for the object before that.
         parts: All of them.
-        owned: Indices of the frames that each part estimates for.
+        owned: Indices of the frames whose estimates are taken from each part.
         seconds: Wall time so far.
 
     Raises:
@@ -100,8 +100,8 @@ def move_refined_estimates(folder: Path, session: Session, made: Sequence[Path],
     """Move the refined estimates of all parts to the place where the run expects its refined estimates.
 
     Args:
-        folder: The merged run's.
-        session: With the merged object.
+        folder: The folder of the merged run.
+        session: The session with the merged object.
         made: Folders of the parts' refined estimates, in order of time; they are emptied.
         seconds: Wall time of the refinement so far.
 

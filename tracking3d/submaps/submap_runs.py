@@ -91,7 +91,7 @@ class Revisit:
         whole: All selected frames of it, ``START:STOP:STEP``, or None.
         selection: The frames that are looked at.
         config: The pipeline.
-        folder: The merged run's.
+        folder: The folder of the merged run.
         prompts: What the object is in the video's first frame.
         out: Folder that gets ``masks/`` and ``frames.jsonl`` of the refined estimates.
     """
