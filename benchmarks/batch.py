@@ -36,7 +36,7 @@ Minutes = Annotated[
     float | None,
     typer.Option(
         min=0.01,
-        help="Stop after so long with what is finished by then, as after Ctrl-C.",
+        help="Stop after so long with the videos finished by then, as after Ctrl-C.",
         show_default=False,
     ),
 ]

@@ -40,7 +40,7 @@ from tracking3d.video import VideoWriter, open_source
 DISTINCT = 20
 """Clips that differ; of more videos every such clip is there several times."""
 QUICK = ("object.frequency=4", f"camera.fov={SyntheticSpec().fov:g}")
-"""Settings with which most of the time is not the solver's, who otherwise looks for shape and lens first of all."""
+"""Settings with which most of the time is not spent in the initialization of shape and focal length."""
 SINGLE = 3
 """Clips that are tracked without a batch, too."""
 DAMAGED, ABORTING, FILLING = "damaged", "aborting", "filling"
@@ -58,8 +58,8 @@ class Asked:
         frames: How many frames each has.
         size: Width and height of the frames.
         workers: Numbers of workers, a pass each.
-        address: Of a Ray cluster; processes of this machine if None.
-        faults: How many of the clips to go through once more, with the most workers and with faults; none if 0.
+        address: Address of a Ray cluster; processes of this machine if None.
+        faults: How many of the clips to track again, with the most workers and with faults; none if 0.
         report: Whether runs get reports, as they do by default.
         minutes: After so long no further video is begun.
     """
@@ -84,10 +84,10 @@ class Pass:
         seconds: From the first video to the last.
         finished: Videos that are whole.
         failed: Why others are not, by name.
-        frames_per_second: Of all workers together.
-        different: How far poses are from those of the first pass at most, over videos that both have finished.
+        frames_per_second: Frames a second of all workers together.
+        different: Largest difference of poses from those of the first pass, over videos that both have finished.
         again: Videos that were tried again.
-        load: The most that it took of the machine.
+        load: The peak load of the machine.
         growth: How much more that was in the last quarter than after the first, by kind.
         stopped: Whether it was ended early.
     """
@@ -115,7 +115,7 @@ def demonstrate(
     Args:
         config: The pipeline.
         folder: Gets clips and results; passes that are there are replaced.
-        asked: Of how many clips, and how.
+        asked: The clips and settings of the passes.
         said: Called with messages on progress and the result of each pass.
 
     Returns:
@@ -152,7 +152,7 @@ def demonstrate(
 def make_clips(
     folder: Path, videos: int, frames: int, config: PipelineConfig, size: tuple[int, int] = (200, 160)
 ) -> list[VideoJob]:
-    """Make clips of solids that turn, unless they are there, and say where the object is in each."""
+    """Make clips of solids that turn, unless they are there, with the prompt of each."""
     folder.mkdir(parents=True, exist_ok=True)
     jobs = []
     for number in range(videos):
@@ -199,7 +199,7 @@ def _with_faults(jobs: Sequence[VideoJob], folder: Path, disk: bool) -> list[Vid
         replace(like, name=DAMAGED, video=str(broken.absolute())),
         replace(like, name=ABORTING, config=tracked_by(ABORTING)),
     ]
-    if disk:  # a worker of Ray goes on to other videos, which would find it full too
+    if disk:  # a worker of Ray continues with other videos, which would find it full too
         more.append(replace(like, name=FILLING, config=tracked_by(FILLING)))
     return [*jobs, *more]
 
@@ -322,7 +322,7 @@ def _most(samples: Sequence[Load]) -> dict[str, float]:
 
 
 def _growth(samples: Sequence[Load]) -> dict[str, float]:
-    """Of each kind, the mean of the last quarter less that of the second one."""
+    """For each kind, the mean of the last quarter less that of the second one."""
     quarter = int(_SETTLED * len(samples))
     if not quarter:
         return {}
@@ -366,7 +366,7 @@ def format_passes(passes: Sequence[Pass]) -> Table:
 
 
 def load_in_words(one: Pass) -> Iterator[str]:
-    """What a pass took of the machine at most, and how much it grew; nothing if that was not measured."""
+    """Peak load of the machine in a pass, and its growth; nothing if that was not measured."""
     if most := one.load:
         yield (
             f"{one.label}: at most {most['memory']:.0f} MB in {most['processes']:.0f} processes "

@@ -42,7 +42,7 @@ class _Faulty(CsrtTracker, ABC):
         return super().init(frame, prompt)
 
     def step(self, frame: Frame) -> MaskEstimate:
-        """See `CsrtTracker.step`; ends badly where it is time for that."""
+        """See `CsrtTracker.step`; fails when it is time for that."""
         self._seen += 1
         if self._seen == _FRAME:
             self._fail()

@@ -1,4 +1,4 @@
-"""What the simulation of a fleet shows, as a table and a picture."""
+"""The results of a simulated fleet, as a table and a plot."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _COLOURS = {"longest": "#1b7837", "first": "#2166ac", "random": "#b2182b"}
 def compared(
     work: Any, fleet: Fleet, splitting: Splitting | None, seed: int = 0
 ) -> dict[str, ScheduleOutcome]:
-    """Every order with whole videos and, where ``splitting`` says how, with long ones cut; by a name in words."""
+    """Every order with whole videos and, if ``splitting`` is given, with long ones cut; by a name in words."""
     outcomes = {}
     for order in ORDERS:
         outcomes[NAMES[order]] = simulate(work, fleet, order, None, seed)
@@ -66,7 +66,7 @@ def plot_outcomes(outcomes: Mapping[str, ScheduleOutcome], workers: int, path: P
 
     Args:
         outcomes: From `compared`.
-        workers: Of the fleet.
+        workers: Number of workers of the fleet.
         path: What to write, see `tracking3d.speed.plot.check_plot`.
 
     Raises:

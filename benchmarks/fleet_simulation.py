@@ -2,7 +2,7 @@
 
 Videos are tasks of known length in seconds of work on a usual worker. A worker that is free takes the next task by the
 order; a part's end makes its video's join ready once all of its parts have ended. Workers are lost at random and
-replaced; what they worked on goes on elsewhere from the last frame that was kept, or from the start. Everything is
+replaced; their tasks continue elsewhere from the last saved frame, or from the start. Everything is
 drawn from one seed.
 """
 
@@ -34,8 +34,8 @@ class Fleet:
         slow: Share of them that are slow.
         slowness: How many times as long those take.
         losses: Times that a worker is lost in an hour of its work.
-        replaced: Seconds until another stands in its place.
-        resumes: Whether what a lost worker had done is kept.
+        replaced: Seconds until another one replaces it.
+        resumes: Whether the work of a lost worker is saved.
         retries: Times that a task is tried again before it is given up.
     """
 
@@ -54,9 +54,9 @@ class Splitting:
 
     Attributes:
         seconds: Work of a part.
-        look_ahead: What the look ahead takes, before the parts.
+        look_ahead: Work of the preview, before the parts.
         overlap: Work of the frames that two parts share.
-        join: What is done by one worker when the parts have ended.
+        join: Work of merging by one worker, after the parts.
     """
 
     seconds: float
@@ -71,7 +71,7 @@ class ScheduleOutcome:
 
     Attributes:
         makespan: Seconds until the last video was done.
-        ends: ``(N,)`` when each video was; nan where it was given up.
+        ends: ``(N,)`` when each video was; nan if it was given up.
         busy: Share of the workers' time, until the end, that was work.
         wasted: Seconds of work that were done twice.
         attempts: Tasks that were begun.
@@ -103,7 +103,7 @@ class _Task:
     rank: tuple[float, ...]
     video: int = field(compare=False)
     work: float = field(compare=False)
-    stage: int = field(compare=False)  # 0 a whole video or a look ahead, 1 a part, 2 a join
+    stage: int = field(compare=False)  # 0 a whole video or a preview, 1 a part, 2 a join
     tries: int = field(compare=False, default=0)
 
 
@@ -129,7 +129,7 @@ def simulate(
         fleet: What works.
         order: Which ready task is taken first.
         splitting: How those of at least two parts' work are cut; None cuts none.
-        seed: Of what is random.
+        seed: Seed of the random numbers.
 
     Raises:
         InputError: If a number makes no sense.
@@ -194,7 +194,7 @@ class _Simulation:
         )
 
     def add(self, video: int, work: float, stage: int, tries: int = 0) -> None:
-        """A task is ready. What a video goes on with comes before videos that have not begun."""
+        """A task is ready. Later tasks of a video come before videos that have not begun."""
         by = (-self.work[video], self.place[video]) if self.longest else (self.place[video],)
         heapq.heappush(self.ready, _Task((-stage if not self.longest else 0, *by), video, work, stage, tries))
 
@@ -206,7 +206,7 @@ class _Simulation:
         return share * float(self.work[video])
 
     def _attempt(self, now: float, worker: int, task: _Task) -> tuple[float, _Task | None]:
-        """When a worker ends with a task, and what is left of it where the worker is lost."""
+        """When a worker ends with a task, and the work left if the worker is lost."""
         self.attempts += 1
         needed = task.work / self.speed[worker]
         rate = self.fleet.losses / 3600
@@ -278,4 +278,6 @@ def _check(work: Sequence[float] | NDArray[np.float64], fleet: Fleet, splitting:
         and splitting.look_ahead >= 0
         and 0 <= splitting.join < 1
     ):
-        raise InputError("Parts have some work, and the shares of looking and joining are from 0 to below 1.")
+        raise InputError(
+            "The work of parts must be positive, and the shares of preview and merging from 0 to below 1."
+        )

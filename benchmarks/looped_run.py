@@ -46,7 +46,7 @@ class Sample:
         seconds: From the frame before to this one.
         memory: Megabytes of the process.
         descriptors: Open files of the process.
-        status: Of the answer.
+        status: Status of the estimate.
     """
 
     index: int
@@ -82,7 +82,7 @@ class SoakReport:
         frames: Number of frames.
         rounds: How often the object left and returned.
         counts: Frames by status.
-        trends: By what was measured: ``memory``, ``descriptors``, ``seconds``; empty where too short.
+        trends: By measure: ``memory``, ``descriptors``, ``seconds``; empty if the run is too short.
         samples: Every frame.
     """
 
@@ -157,7 +157,7 @@ def track_looped(
     hours: float | None = None,
     size: tuple[int, int] = (160, 120),
 ) -> SoakReport:
-    """Track the looped clip and measure after every frame; Ctrl-C ends it with what was measured until then.
+    """Track the looped clip and measure after every frame; Ctrl-C ends it with the measures until then.
 
     Args:
         config: The pipeline; its final refinement is left out.
@@ -176,11 +176,11 @@ def track_looped(
     samples: list[Sample] = []
     before = time.perf_counter()
 
-    def measure(answer: FrameRecord | SkippedFrame) -> None:
+    def measure(record: FrameRecord | SkippedFrame) -> None:
         nonlocal before
         now, (memory, _) = time.perf_counter(), resident_memory()
-        status = str(answer.status) if isinstance(answer, FrameRecord) else "skipped"
-        samples.append(Sample(answer.index, now - before, memory, _open_descriptors(), status))
+        status = str(record.status) if isinstance(record, FrameRecord) else "skipped"
+        samples.append(Sample(record.index, now - before, memory, _open_descriptors(), status))
         before = time.perf_counter()
 
     solver = config.solver.model_copy(update={"final_refine": False})
@@ -198,7 +198,7 @@ def track_looped(
 
 
 def trends(samples: list[Sample], round_length: int) -> dict[str, Trend]:
-    """How each measure went from frame `SETTLED` on; nothing where there are not two rounds from there."""
+    """How each measure went from frame `SETTLED` on; nothing if there are not two rounds from there."""
     settled = samples[SETTLED:]
     if len(settled) < 2 * round_length:
         return {}
@@ -221,7 +221,7 @@ def trends(samples: list[Sample], round_length: int) -> dict[str, Trend]:
 
 
 def _without_object(images: NDArray[np.uint8], masks: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """The background ``(H, W, 3)``: seen where the object is not, painted over where it always is."""
+    """The background ``(H, W, 3)``: from frames in which the object does not cover it, else painted over."""
     covered: NDArray[np.bool_] = np.logical_and.reduce(masks)
     always = cv2.dilate(covered.astype(np.uint8), np.ones((5, 5), np.uint8))
     free = np.where(masks[..., None], np.nan, images.astype(np.float32))

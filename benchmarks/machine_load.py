@@ -19,12 +19,12 @@ class Load:
 
     Attributes:
         memory: Megabytes in memory, those that processes share counted in each.
-        own_memory: Of this process.
+        own_memory: Memory of this process in megabytes.
         descriptors: Open files of all of them.
-        own_descriptors: Of this process.
+        own_descriptors: Open files of this process.
         processes: How many there are.
         shared_memory: Megabytes of files in the system's folder for shared memory, of all programs.
-        unfinished: Megabytes on disk of what is not whole yet.
+        unfinished: Megabytes on disk of unfinished runs.
     """
 
     memory: float
@@ -38,11 +38,11 @@ class Load:
 
 @contextmanager
 def measured_load(every: float = 1.0, unfinished: Path | None = None) -> Iterator[list[Load]]:
-    """Measure again and again while something goes on; the list that is given grows.
+    """Measure repeatedly during the body; the list that is given grows.
 
     Args:
         every: Seconds between two samples.
-        unfinished: Folder of what is not whole yet, if its size is wanted.
+        unfinished: Folder of unfinished runs, if its size is wanted.
     """
     samples: list[Load] = []
     over = threading.Event()

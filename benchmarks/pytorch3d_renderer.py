@@ -1,6 +1,6 @@
-"""The same picture by PyTorch3D (Ravi et al., 2020), for comparison where that package is installed.
+"""The same image by PyTorch3D (Ravi et al., 2020), for comparison if that package is installed.
 
-Written against its documented interface. Where the package is absent, as in this project's own tests, it cannot be
+Written against its documented interface. If the package is absent, as in this project's own tests, it cannot be
 tried: the tests call it with a stand-in of that interface. Check the first figures of an installation with
 ``RenderScene.loss``, which has to agree with that of ``render`` to about a per cent.
 
@@ -23,7 +23,7 @@ ABSENT = "it is not installed"
 
 
 def why_no_pytorch3d(device: torch.device) -> str:
-    """Why PyTorch3D cannot render on a device; `ABSENT` where it is not installed, empty where it can."""
+    """Why PyTorch3D cannot render on a device; `ABSENT` if it is not installed, empty if it can."""
     try:
         import pytorch3d  # noqa: F401
 

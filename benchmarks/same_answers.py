@@ -41,7 +41,7 @@ class Version:
 
     Attributes:
         tree: Its checkout.
-        runs: Where its run folders go.
+        runs: Folder of its run folders.
         keep: Whether a finished run in there is taken as it is.
     """
 
@@ -53,7 +53,7 @@ class Version:
         """Run ``tracking3d`` of this version.
 
         Raises:
-            SystemExit: If it fails; with what it said.
+            SystemExit: If it fails; with its error output.
         """
         words = [sys.executable, "-m", "tracking3d", *map(str, arguments)]
         ended = subprocess.run(
@@ -166,7 +166,7 @@ def compare(before: Path, after: Path) -> Difference:
 
 
 def read_poses(run: Path, refined: bool) -> dict[int, np.ndarray]:
-    """The last pose of each frame among refined or causal ones; without an entry where there is no pose."""
+    """The last pose of each frame among refined or causal ones; without an entry if there is no pose."""
     found: dict[int, np.ndarray] = {}
     for line in (run / "frames.jsonl").read_text().splitlines():
         row = json.loads(line)
@@ -191,7 +191,7 @@ def array_difference(before: np.ndarray, after: np.ndarray) -> float:
 
 
 def mask_difference(before: Path, after: Path, remarks: list[str]) -> tuple[int, int]:
-    """How many pixels of how many masks differ; what is missing is added to the remarks."""
+    """How many pixels of how many masks differ; missing masks are added to the remarks."""
     pixels = count = 0
     for folder in MASKS:
         names = [{file.name for file in (run / folder).glob("*.png")} for run in (before, after)]

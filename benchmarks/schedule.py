@@ -31,9 +31,11 @@ def schedule(
     retries: Annotated[int, typer.Option(min=0, help="Times that a task is tried again.")] = 3,
     resume: Annotated[
         bool,
-        typer.Option("--resume/--restart", help="Whether what lost workers did is kept.", show_default=False),
+        typer.Option(
+            "--resume/--restart", help="Whether the work of lost workers is saved.", show_default=False
+        ),
     ] = True,
-    seed: Annotated[int, typer.Option(min=0, help="Of what is random.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random numbers.")] = 0,
     plot: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draw it into an .svg, .png or .pdf.")
     ] = None,

@@ -17,7 +17,7 @@ from tracking3d.cli.options import ConfigFile, Overrides, Preset
 def soak(
     frames: Annotated[int, typer.Option(min=1, help="How many frames.")] = 10_000,
     hours: Annotated[
-        float | None, typer.Option(min=0.001, help="Go on for so long, instead of so many frames.")
+        float | None, typer.Option(min=0.001, help="Run for so long, instead of so many frames.")
     ] = None,
     width: Annotated[
         int, typer.Option(min=64, max=4096, help="Width of the frames; the height is 3/4.")

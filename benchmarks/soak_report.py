@@ -1,4 +1,4 @@
-"""What a long run showed, as a table and as a picture."""
+"""The results of a long run, as a table and a plot."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def format_soak(report: SoakReport) -> Table:
 
 
 def plot_soak(report: SoakReport, path: Path) -> None:
-    """Draw what was measured over the frames.
+    """Plot the measures over the frames.
 
     Raises:
         OutputError: If the file cannot be written.

@@ -36,12 +36,12 @@ class SplitMeasurement:
 
     Attributes:
         seconds: Wall time.
-        rotation_mean: Mean rotation error in degrees, refined answers; causal ones are left out.
+        rotation_mean: Mean rotation error in degrees, refined estimates; causal ones are left out.
         rotation_median: The median.
         tracked: Share of the frames.
-        stages: Seconds of what a split run does, by name; empty of a whole one.
+        stages: Seconds of the steps of a split run, by name; empty for a whole one.
         parts: How many.
-        reason: Why parts were not joined; empty where they were.
+        reason: Why parts were not merged; empty if they were.
     """
 
     seconds: float
@@ -63,7 +63,7 @@ def looped(count: int, there: int) -> NDArray[np.int64]:
 def write_looped(
     folder: Path, spec: SyntheticSpec, count: int
 ) -> tuple[Path, SyntheticClip, NDArray[np.int64]]:
-    """The frames and masks of a long video in ``folder``, each picture stored once.
+    """The frames and masks of a long video in ``folder``, each image stored once.
 
     Raises:
         OutputError: If it cannot be written.
@@ -98,14 +98,14 @@ def measure_split(
     """Track the video whole and in parts; a run that is finished in ``folder`` is not done again.
 
     Args:
-        config: The pipeline; the true camera is told.
+        config: The pipeline; the true camera is given.
         folder: For video and runs.
-        frames: Of the video.
+        frames: Number of frames of the video.
         length: Frames of a part.
         workers: Parts at a time.
         masks: ``truth``, with noise on the outlines, or ``tracker``.
         size: Width and height.
-        told: Is given what is done now.
+        told: Called with the present step, in words.
 
     Raises:
         InputError: If ``masks`` is neither.
@@ -147,7 +147,7 @@ def measure_split(
 
 def _measured(folder: Path, T_true: NDArray[np.float64]) -> SplitMeasurement:
     taken = json.loads((folder / _TAKEN).read_text(encoding="utf-8"))
-    if not (folder / layout.RUN).is_file():  # the parts were not joined
+    if not (folder / layout.RUN).is_file():  # the parts were not merged
         return SplitMeasurement(taken["seconds"], np.nan, np.nan, np.nan, {}, taken["parts"], taken["reason"])
     run = RunReader(folder)
     R = np.stack([one.T_cam_obj[:3, :3] for one in run.frames])
@@ -176,5 +176,5 @@ def format_split(measured: dict[str, SplitMeasurement]) -> Table:
         table.add_row(f"  {stage}", *(f"{one.stages.get(stage, 0):.1f}" for one in measured.values()))
     for one in measured.values():
         if one.reason:
-            table.add_row("not joined", "", one.reason)
+            table.add_row("not merged", "", one.reason)
     return table

@@ -19,12 +19,12 @@ class RunFigures:
     """What one run took.
 
     Attributes:
-        seconds: Of one processor a frame, both passes.
-        decoding: Of these, reading the frame, both times.
-        seconds_once: Beside the frames: the start, solving everything once more, mesh, texture, pictures.
-        bytes_read: Of the video, a frame.
-        bytes_written: Of masks, lines and overlay, a frame.
-        bytes_once: Of the rest of the run folder.
+        seconds: Seconds of one processor a frame, both passes.
+        decoding: Seconds of these for reading the frame, both times.
+        seconds_once: Seconds of the start, the global refinement, mesh, texture and images.
+        bytes_read: Bytes of the video, a frame.
+        bytes_written: Bytes of masks, lines and overlay, a frame.
+        bytes_once: Bytes of the rest of the run folder.
         memory: Most bytes that the process held.
     """
 
@@ -59,7 +59,7 @@ class Cost:
     """What some hours of video cost.
 
     Attributes:
-        processor_hours: Of work.
+        processor_hours: Hours of processor time.
         written: Bytes of run folders.
         read: Bytes of video.
         workers: On one machine, at a time.
@@ -122,9 +122,9 @@ def cost_of(
     """What so many hours of video cost.
 
     Args:
-        hours: Of video.
-        figures: Of one run.
-        machine: One of those that do it.
+        hours: Hours of video.
+        figures: Figures of one run.
+        machine: One of the machines.
         fps: Frames a second of the videos.
         minutes: Mean length of a video.
 

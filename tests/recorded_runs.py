@@ -62,6 +62,12 @@ def model() -> ObjectModel:
     return ObjectModel(ball.vertices, ball.faces, uvs, texture, weight, np.zeros((16, 16, 3), np.float32))
 
 
+def set_format(folder: Path, version: int) -> None:
+    """Make a run folder one of another format version."""
+    path = folder / "run.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"format_version": version}))
+
+
 def write_frames(folder: Path, count: int) -> Path:
     """The pictures as files."""
     folder.mkdir(parents=True, exist_ok=True)

@@ -138,7 +138,7 @@ def test_parts_of_a_long_video_are_tracked_by_all_workers_and_joined(tmp_path):
     assert began["part 1 of 2"] != began["part 2 of 2"]
     assert began["second look 1 of 2"] != began["second look 2 of 2"]
     run = RunReader(tmp_path / "out/long")
-    assert run.state == "finished" and len(run.frames) == 50 and run.description["split"]["joints"]
+    assert run.state == "finished" and len(run.frames) == 50 and run.description["split"]["alignments"]
     R = np.stack([one.T_cam_obj[:3, :3] for one in run.frames])
     assert aligned_rotation_errors(R, clip.T_cam_obj[:, :3, :3]).mean() < 3
     assert not (tmp_path / "out/long/parts").exists() and not (tmp_path / "out/.work").exists()

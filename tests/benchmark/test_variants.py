@@ -68,5 +68,5 @@ def test_a_camera_that_is_not_told_is_not_in_the_configuration(clips, scripted, 
 
     assert config("narrow") is not None
     file = clips / "narrow" / "camera.json"
-    file.write_text(json.dumps(json.loads(file.read_text()) | {"told": False}))
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"given": False}))
     assert config("narrow") is None and read_truth(clips / "narrow").camera is not None

@@ -210,9 +210,9 @@ def test_in_every_frame_what_is_kept_is_the_solvers_state(tmp_path, preset, fram
     for index, image in enumerate(clip.images):
         session.step(Frame(index, image))
         taken = JournalEntry(index, checksum(image), 0.5, "so", True, "")
-        checkpoint.save(RunProgress(last=index, lines=10 * index), session.kept(), taken)
+        checkpoint.save(RunProgress(last=index, lines=10 * index), session.state_dict(), taken)
         kept = Checkpoint(tmp_path, session.state_classes).read()
-        assert_same(kept.session, session.kept())
+        assert_same(kept.session, session.state_dict())
         assert (kept.progress.last, kept.progress.lines, kept.taken[index]) == (index, 10 * index, taken)
     named = set(files(tmp_path / layout.STATE))
     text = (tmp_path / layout.STATE / layout.STATE_FILE).read_text()

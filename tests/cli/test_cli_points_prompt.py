@@ -180,8 +180,8 @@ def test_a_file_says_what_is_tracked_and_the_command_line_wins(call, clip, scrip
     assert call("run", clip, "--config", "mine.yaml", "--quiet", "--out", "one").exit_code == 0
     [(_, prompt)] = script.built
     assert prompt.points.tolist() == [[20, 20, 1], [60, 40, 0]]
-    given = json.loads(Path("one/run.json").read_text())["given"]
-    assert (given["start_frame"], [one["frame"] for one in given["corrections"]]) == (2, [4])
+    prompt = json.loads(Path("one/run.json").read_text())["prompt"]
+    assert (prompt["start_frame"], [one["frame"] for one in prompt["corrections"]]) == (2, [4])
     arguments = (
         "--box",
         "20,10,20,20",
@@ -195,8 +195,8 @@ def test_a_file_says_what_is_tracked_and_the_command_line_wins(call, clip, scrip
     )
     assert call("run", clip, "--config", "mine.yaml", *arguments).exit_code == 0
     assert script.built[1][1].points is None
-    given = json.loads(Path("two/run.json").read_text())["given"]
-    assert (given["start_frame"], [one["frame"] for one in given["corrections"]]) == (1, [3])
+    prompt = json.loads(Path("two/run.json").read_text())["prompt"]
+    assert (prompt["start_frame"], [one["frame"] for one in prompt["corrections"]]) == (1, [3])
 
 
 @pytest.mark.parametrize(

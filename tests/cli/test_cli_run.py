@@ -225,7 +225,7 @@ def test_a_run_is_corrected_with_its_own_settings(call, clip, script):
     result = call("correct", "run", "3:21,11,20,20", "--no-report")
     assert result.exit_code == 0, result.output
     description = json.loads(Path("run/run.json").read_text())
-    assert description["given"]["corrections"][0]["box"] == [21, 11, 20, 20]
+    assert description["prompt"]["corrections"][0]["box"] == [21, 11, 20, 20]
     assert (description["config"]["camera"]["fov"], description["state"]) == (30, "finished")
     assert not Path("run/.correcting").exists()
 

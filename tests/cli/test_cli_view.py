@@ -135,7 +135,7 @@ def test_run_without_an_object_picks_where_a_person_is_there(call, clip, script,
     assert call("run", clip, "--tracker", "csrt", "--out", "run").exit_code == 0
     assert asked == [(str(clip), None, "csrt", Path("run"))]
     assert [frame.index for frame in RunReader(Path("run")).frames] == [0, 1, 2, 3, 4]
-    assert RunReader(Path("run")).description["given"]["first_frame"] == 2
+    assert RunReader(Path("run")).description["prompt"]["first_frame"] == 2
     assert script.built[0][1].box == (20, 10, 20, 20)
 
 
@@ -156,7 +156,7 @@ def test_pick_starts_the_run_both_ways_from_the_frame_that_was_picked_in(call, c
         reader = RunReader(Path("run", f"object_{number}"))
         assert [frame.index for frame in reader.frames] == [0, 1, 2, 3]
         assert reader.description["selection"] == "0:4"
-        assert reader.description["given"]["first_frame"] == 1
+        assert reader.description["prompt"]["first_frame"] == 1
 
 
 def test_pick_refuses_a_folder_with_a_run_before_anything_is_drawn(call, refused, clip, script):

@@ -200,6 +200,13 @@ def test_the_box_is_that_of_init_json_or_else_of_the_first_mask(clip):
     assert read_truth(clip).box == around
 
 
+def test_the_key_of_an_earlier_version_is_refused(clip):
+    file = clip / "camera.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"told": False}))
+    with pytest.raises(InputError, match=r"an earlier version of tracking3d.* rename it to given"):
+        read_truth(clip)
+
+
 def test_the_true_camera_may_differ_from_the_one_that_a_tracker_is_told(clip):
     told = read_truth(clip).camera
     assert told is not None

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from recorded_runs import set_format
 from refining_solver import CausalSolver, StandInSolver
 from resumable_runs import assert_alike, files_of
 
@@ -132,7 +133,7 @@ def test_a_finished_run_is_computed_again_from_the_corrected_frame_on(
     correct_run(tmp_path / "run", told(clip))
     assert stepped == [6, 7]
     after = RunReader(tmp_path / "run", refined=False)
-    assert [one["frame"] for one in after.description["given"]["corrections"]] == [CORRECTED]
+    assert [one["frame"] for one in after.description["prompt"]["corrections"]] == [CORRECTED]
     for one in after.frames[:CORRECTED]:
         np.testing.assert_array_equal(one.T_cam_obj, poses[one.index])
     assert (after.initial_mask(CORRECTED) != RunReader(tmp_path / "run").initial_mask(0)).any()
@@ -217,7 +218,7 @@ def test_another_correction_than_the_one_that_was_stopped_begins_anew(
     stepped.clear()
     correct_run(tmp_path / "run", told(clip, 5))
     assert stepped == [5, 6, 7]
-    [one] = RunReader(tmp_path / "run").description["given"]["corrections"]
+    [one] = RunReader(tmp_path / "run").description["prompt"]["corrections"]
     assert one["frame"] == 5
 
 
@@ -314,10 +315,21 @@ def test_a_damaged_milestone_is_passed_over(clip, images, tmp_path, stepped):
     assert stepped == [5, 6, 7]
 
 
+def test_a_run_of_an_earlier_format_is_not_corrected(clip, images, tmp_path):
+    folder = run(clip, images, tmp_path / "run")
+    set_format(folder, 1)
+    before = contents(folder)
+    with pytest.raises(
+        InputError, match=r"an earlier version of tracking3d .* run it again with overwrite=True"
+    ):
+        correct_run(folder, told(clip))
+    assert contents(folder) == before
+
+
 def test_what_cannot_be_corrected_is_refused_in_a_sentence(clip, images, tmp_path):
     folder = run(clip, images, tmp_path / "run")
     before = contents(folder)
-    with pytest.raises(InputError, match="there is no frame 99"):
+    with pytest.raises(InputError, match="frame 99 is not among the tracked frames"):
         correct_run(folder, [Correction(99, box=(1, 1, 5, 5))])
     with pytest.raises(InputError, match="lies outside frame 6"):
         correct_run(folder, [Correction(6, box=(900, 1, 5, 5))])
@@ -326,7 +338,7 @@ def test_what_cannot_be_corrected_is_refused_in_a_sentence(clip, images, tmp_pat
     with pytest.raises(InputError, match="give it again with `tracking3d run`"):
         correct_run(folder, told(clip))
     description = json.loads((folder / layout.RUN).read_text())
-    del description["given"]
+    del description["prompt"]
     (folder / layout.RUN).write_text(json.dumps(description))
-    with pytest.raises(InputError, match="does not say what it was begun with"):
+    with pytest.raises(InputError, match="names no prompt"):
         correct_run(folder, told(clip))

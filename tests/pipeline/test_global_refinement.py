@@ -192,7 +192,7 @@ def test_the_mask_tracker_runs_once_and_its_masks_come_again_as_they_were(
 def test_run_json_tells_counts_and_seconds_of_the_refinement(clip, source, tmp_path):
     record(source, settings(), tmp_path / "run", mask=clip.masks[0])
     told = refinement_of(tmp_path / "run")
-    assert (told["state"], told["reason"], told["frames"], told["kept"]) == ("finished", "", FRAMES, 0)
+    assert (told["state"], told["reason"], told["frames"], told["kept_causal"]) == ("finished", "", FRAMES, 0)
     assert told["seconds"] > 0
     causal = told["causal"]
     assert (causal["tracked"], causal["uncertain"], causal["lost"]) == (0, FRAMES, 0)
@@ -232,14 +232,14 @@ def test_nothing_is_refined_unless_asked_for(clip, source, tmp_path):
 def test_a_solver_that_cannot_leaves_it_out_and_says_so(clip, source, tmp_path):
     record(source, settings("paper"), tmp_path / "run", mask=clip.masks[0])
     told = refinement_of(tmp_path / "run")
-    assert (told["state"], told["reason"]) == ("left out", "the solver paper gives causal answers only")
+    assert (told["state"], told["reason"]) == ("skipped", "the solver paper gives causal answers only")
     assert RunReader(tmp_path / "run").state == "finished"
 
 
 def test_frames_that_come_once_only_are_not_refined(clip, tmp_path):
     record(open_source(iter(list(clip.images))), settings(), tmp_path / "run", mask=clip.masks[0])
     told = refinement_of(tmp_path / "run")
-    assert (told["state"], told["frames"]) == ("left out", 0)
+    assert (told["state"], told["frames"]) == ("skipped", 0)
     assert "cannot be read a second time" in told["reason"]
     assert [frame.refined for frame in RunReader(tmp_path / "run").frames] == [False] * FRAMES
 
@@ -309,7 +309,7 @@ def test_what_ends_the_refinement_leaves_the_causal_answers_whole(
             np.testing.assert_array_equal(run.mask(index), expected.mask(index))
         np.testing.assert_array_equal(run.mesh().vertices, expected.mesh().vertices)
     told = refinement_of(tmp_path / "run")
-    assert (told["state"], told["frames"], told["kept"]) == (state, 0, FRAMES)
+    assert (told["state"], told["frames"], told["kept_causal"]) == (state, 0, FRAMES)
     files = {path.relative_to(tmp_path / "run") for path in (tmp_path / "run").rglob("*")}
     # What the run can be resumed from is kept beside the answers.
     there = {path.relative_to(reference) for path in reference.rglob("*")}
@@ -335,7 +335,7 @@ def test_where_a_plugin_fails_the_causal_answer_stands(clip, source, tmp_path, m
     assert run.state == "finished"
     assert [frame.refined for frame in run.frames] == [True, True, False, True, True]
     told = refinement_of(tmp_path / "run")
-    assert (told["frames"], told["kept"]) == (4, 1)
+    assert (told["frames"], told["kept_causal"]) == (4, 1)
     for reader in (run, RunReader(tmp_path / "run", refined=False)):
         np.testing.assert_array_equal(reader.mask(2), np.roll(reader.initial_mask(2), 1, axis=0))
     with pytest.raises(PluginError, match=r"failed at 002\.png"):

@@ -10,6 +10,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+from recorded_runs import set_format
 from refining_solver import CausalSolver, StandInSolver
 from resumable_runs import assert_alike, files_of
 
@@ -358,7 +359,7 @@ def test_other_settings_or_another_source_are_refused_with_the_difference(
     mask[30:34, 30:34] = False
     for what, source, config, prompt, selection in (
         ("crop.size was 32 and is 48", images, settings("crop.size=48"), {"mask": clip.masks[0]}, None),
-        ("the first picture is another one", other, settings(), {"mask": clip.masks[0]}, None),
+        ("the first image is another one", other, settings(), {"mask": clip.masks[0]}, None),
         ("the object's mask is another one", images, settings(), {"mask": mask}, None),
         ("the object's box was .* and is", images, settings(), {"box": (10.0, 10.0, 30.0, 30.0)}, None),
         ("selection of frames was None and is 0:5", images, settings(), {"mask": clip.masks[0]}, "0:5"),
@@ -383,7 +384,7 @@ def test_a_picture_that_has_changed_since_is_refused(clip, images, whole, tmp_pa
     for file in images.iterdir():
         (other / file.name).write_bytes(file.read_bytes())
     write_image(other / "002.png", clip.images[0])
-    with pytest.raises(InputError, match=r"002\.png shows another picture than when it was answered"):
+    with pytest.raises(InputError, match=r"002\.png shows another image than when it was estimated"):
         record(open_source(str(other)), settings(), tmp_path / "run", mask=clip.masks[0], resume=True)
     record(open_source(str(images)), settings(), tmp_path / "run", mask=clip.masks[0], resume=True)
     assert_alike(tmp_path / "run", whole["stand_in"])
@@ -406,12 +407,21 @@ def test_a_run_whose_state_is_gone_is_refused(clip, images, tmp_path, monkeypatc
     stopped(monkeypatch, clip, images, tmp_path / "run", Session, "step", 4)
     state = tmp_path / "run" / layout.STATE / layout.STATE_FILE
     kept = state.read_bytes()
-    for damage in (kept[:100], b"[]", kept.replace(b'"version": 1', b'"version": 99')):
+    for damage in (kept[:100], b"[]", kept.replace(b'"version": 2', b'"version": 1')):
         state.write_bytes(damage)
         with pytest.raises(InputError, match=r"damaged|another version"):
             record(open_source(str(images)), settings(), tmp_path / "run", mask=clip.masks[0], resume=True)
     state.unlink()
-    with pytest.raises(InputError, match="its state was not kept; start anew"):
+    with pytest.raises(InputError, match="its state was not saved; run it again"):
+        record(open_source(str(images)), settings(), tmp_path / "run", mask=clip.masks[0], resume=True)
+
+
+def test_a_run_of_an_earlier_format_is_not_resumed(clip, images, tmp_path, monkeypatch):
+    stopped(monkeypatch, clip, images, tmp_path / "run", Session, "step", 4)
+    set_format(tmp_path / "run", 1)
+    with pytest.raises(
+        InputError, match=r"an earlier version of tracking3d .* run it again with overwrite=True"
+    ):
         record(open_source(str(images)), settings(), tmp_path / "run", mask=clip.masks[0], resume=True)
 
 

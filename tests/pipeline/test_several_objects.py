@@ -288,5 +288,5 @@ def test_frames_that_a_live_source_dropped_are_recorded(images, tmp_path):
     assert answered[0] == 0
     assert sorted([*answered, *(one["index"] for one in dropped)]) == list(range(100))
     assert run.description["counts"]["skipped"] == len(dropped) > 0
-    assert run.description["refinement"]["state"] == "left out"
+    assert run.description["refinement"]["state"] == "skipped"
     assert json.loads((tmp_path / "run" / "run.json").read_text())["state"] == "finished"

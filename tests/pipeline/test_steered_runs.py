@@ -182,8 +182,8 @@ def both(clip, images, tmp_path_factory) -> dict[str, Path]:
 def test_a_run_folder_has_the_frames_in_order(clip, both):
     reader = RunReader(both["refined"])
     assert [frame.index for frame in reader.frames] == list(range(FRAMES))
-    assert reader.description["given"]["start_frame"] == START
-    assert reader.description["given"]["first_frame"] == START
+    assert reader.description["prompt"]["start_frame"] == START
+    assert reader.description["prompt"]["first_frame"] == START
     assert reader.description["refinement"]["frames"] == FRAMES
     written = [line.index for line in read_records(both["causal"] / layout.FRAMES) if not line.revision]
     assert written == [3, 4, 5, 6, 2, 1, 0]
@@ -300,7 +300,7 @@ def test_from_a_correction_on_the_object_is_what_it_says(clip, images, tmp_path)
         else:
             assert iou(mask, clip.masks[index]) > 0.85
     assert (after.initial_mask(CORRECTED) == clip.masks[CORRECTED]).all()
-    [told] = after.description["given"]["corrections"]
+    [told] = after.description["prompt"]["corrections"]
     assert (told["frame"], told["box"], told["points"]) == (CORRECTED, None, None)
 
 
@@ -382,7 +382,7 @@ def test_each_object_has_its_own_corrections(clip, images, tmp_path):
         boxes=[(x, y, width, height), (0, 0, 12, 12)],
         corrections=[Correction(CORRECTED, mask=clip.masks[CORRECTED], object=1)],
     )
-    told = [RunReader(tmp_path / "run" / f"object_{n}").description["given"]["corrections"] for n in (0, 1)]
+    told = [RunReader(tmp_path / "run" / f"object_{n}").description["prompt"]["corrections"] for n in (0, 1)]
     assert [len(one) for one in told] == [0, 1]
     second = RunReader(tmp_path / "run" / "object_1")
     assert (second.initial_mask(CORRECTED) == clip.masks[CORRECTED]).all()

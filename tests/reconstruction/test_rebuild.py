@@ -38,7 +38,7 @@ def written(folder: Path, yaws=YAWS, **changes) -> Path:
         frames.append(Frame(index, image, index / 30, f"{index:03d}.png"))
         one = FrameEstimate(index, index / 30, pose(yaw), mask, mask, Status.TRACKED, "", 0.9)
         estimates.append(replace(one, **changes))
-    given = {"first_frame": 0, "first_picture": checksum(frames[0].image)}
+    given = {"first_frame": 0, "first_image_crc": checksum(frames[0].image)}
     run = folder / "run"
     header = RunHeader(
         config={}, camera=CAMERA, source=str(images), seed=0, fps=None, command=None, given=given

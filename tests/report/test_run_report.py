@@ -176,8 +176,8 @@ def test_doubts_tell_guessed_poses_from_those_of_frames_in_which_nothing_is_know
         ({"state": "failed", "error": "the disk was full"}, "The run is failed: the disk was full."),
         ({"skipped": [{"index": 3, "reason": "damaged"}]}, "1 frame was skipped"),
         (
-            {"refinement": {"state": "left out", "reason": "a camera cannot be read a second time"}},
-            "The final refinement is left out (a camera cannot be read a second time)",
+            {"refinement": {"state": "skipped", "reason": "a camera cannot be read a second time"}},
+            "The final refinement is skipped (a camera cannot be read a second time)",
         ),
     ],
 )

@@ -12,10 +12,13 @@ import av
 import numpy as np
 import pytest
 from forked import forked_script
+from recorded_runs import set_format
 
 from tracking3d.errors import InputError, OutputError
 from tracking3d.estimation.estimate import Status
 from tracking3d.frames import SkippedFrame
+from tracking3d.results import layout
+from tracking3d.results.overwrite import clear_run_folder
 from tracking3d.results.run_reader import RunReader
 
 
@@ -201,6 +204,19 @@ def test_what_is_not_a_run_folder_is_said_in_one_sentence(tmp_path, text, messag
     with pytest.raises(InputError, match=message) as error:
         RunReader(tmp_path)
     assert "\n" not in str(error.value)
+
+
+def test_a_run_of_an_earlier_format_is_refused_and_can_be_replaced(tmp_path, turning_sphere, write_run):
+    write_run(tmp_path, turning_sphere)
+    set_format(tmp_path, 1)
+    with pytest.raises(
+        InputError, match=r"an earlier version of tracking3d \(format 1\); run it again with overwrite=True"
+    ):
+        RunReader(tmp_path)
+    with pytest.raises(OutputError, match="already holds a run"):
+        clear_run_folder(tmp_path, overwrite=False)
+    clear_run_folder(tmp_path, overwrite=True)
+    assert not (tmp_path / layout.OBJ).exists()
 
 
 def test_a_folder_that_does_not_exist_is_no_run(tmp_path):

@@ -113,7 +113,7 @@ def test_a_surface_that_was_mostly_never_seen_is_noted(turning_sphere):
     share = unseen_share(mostly)
     assert 0.6 < share < 0.85
     assert describe_camera_and_model({"assumed": False, "origin": ""}, mostly) == [
-        f"{100 * share:.0f} % of the mesh's surface was never seen; what is there is a guess"
+        f"{100 * share:.0f} % of the mesh's surface was never seen; its shape there is a guess"
     ]
 
 
@@ -132,6 +132,6 @@ def test_a_variable_frame_rate_is_a_note_but_not_of_a_camera():
     records = timed(0, 40, 80, 200)  # every second frame
     [note] = notes_of_times(records)
     assert note.startswith("frame intervals vary from 20 to 60 ms (variable frame rate)")
-    run = {"source_notes": ["toned"], "camera": {"assumed": False, "origin": ""}, "given": {"frames": 4}}
+    run = {"source_notes": ["toned"], "camera": {"assumed": False, "origin": ""}, "prompt": {"frames": 4}}
     assert notes_of_run(run, None, records) == ["toned", note]
-    assert notes_of_run(run | {"given": {"frames": None}}, None, records) == ["toned"]
+    assert notes_of_run(run | {"prompt": {"frames": None}}, None, records) == ["toned"]

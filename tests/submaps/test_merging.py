@@ -49,7 +49,7 @@ def solved() -> tuple[SolverState, dict[int, np.ndarray]]:
         estimate = session.step(Frame(index, image))
         for answer in (*estimate.revised, estimate):
             poses[answer.index] = answer.T_cam_obj
-    state = session.kept()["solver"]
+    state = session.state_dict()["solver"]
     assert state.pending is None
     return state, poses
 
@@ -167,10 +167,10 @@ def test_beliefs_are_joined_into_one_that_explains_both(solved):
         state, object_map=transform_map(replace(state.object_map, keyframes=later), inverse(TURN))
     )
     config = settings()
-    whole, dearer = merge_submap_states(
+    whole, cost_ratio = merge_submap_states(
         [state, second], [Similarity.identity(), TURN], config.solver, build_encoder(config)
     )
-    assert dearer < 1.05
+    assert cost_ratio < 1.05
     assert len(whole.object_map.keyframes) == 2 * len(state.object_map.keyframes)
     first = {view.index: view.pose.matrix().numpy() for view in whole.object_map.keyframes}
     for view in state.object_map.keyframes:  # what shows the same has the same pose
@@ -186,7 +186,7 @@ def test_parts_joined_at_a_wrong_angle_explain_worse_what_they_show(solved, monk
     )
     second = replace(state, object_map=replace(state.object_map, keyframes=later))
     config = settings()
-    monkeypatch.setattr(merging, "MOST_DEARER", 1.1)
+    monkeypatch.setattr(merging, "MAX_COST_RATIO", 1.1)
     merge_submap_states([state, second], [Similarity.identity()] * 2, config.solver, build_encoder(config))
     for axis in "xy":
         wrong = Similarity(Rotation.from_euler(axis, 180, degrees=True).as_matrix(), 1.0, np.zeros(3))

@@ -20,7 +20,7 @@ from tracking3d.results import layout
 from tracking3d.results.files import write_image, write_mask
 from tracking3d.results.run_reader import RunReader
 from tracking3d.submaps.job import LongVideo
-from tracking3d.submaps.merge_step import Joined
+from tracking3d.submaps.merge_step import MergedSubmaps
 from tracking3d.submaps.plan import Plan
 from tracking3d.submaps.plan_step import Begun
 from tracking3d.submaps.steps import Step, steps_to_the_end
@@ -77,7 +77,7 @@ def ended_in_parts(frames: Path, config: PipelineConfig, folder: Path, cut: int)
         Revisit(str(frames), None, selection, config, folder, PromptSet(), folder / "not needed any more")
         for selection in (f"0:{cut}:1", f"{cut}:{FRAMES}:1")
     )
-    return taken(steps_to_the_end(Joined(begun, looks, {}, {"refine": 1.0, "second_look": 1.0})))
+    return taken(steps_to_the_end(MergedSubmaps(begun, looks, {}, {"refine": 1.0, "refinement_pass": 1.0})))
 
 
 def taken(steps: Generator[list[Step], list[Any], Any]) -> list[list[Step]]:

@@ -188,9 +188,9 @@ def test_a_video_in_two_parts_is_one_run_as_good_as_a_whole_one(workers, clip, t
     assert aligned_rotation_errors(R, clip.T_cam_obj[:, :3, :3]).mean() < 4
     split, whole = (RunReader(tmp_path / name).description for name in ("split", "whole"))
     assert split["counts"]["frames"] == whole["counts"]["frames"]
-    assert split["given"] == whole["given"]
+    assert split["prompt"] == whole["prompt"]
     assert split["refinement"]["frames"] == LONG
-    assert split["split"]["joints"][0]["frames"] >= 5
+    assert split["split"]["alignments"][0]["frames"] >= 5
     assert files_of(tmp_path / "split") == files_of(tmp_path / "whole")
     assert len(load_model(tmp_path / "split").vertices) == len(load_model(tmp_path / "whole").vertices)
     record_in_parts(

@@ -38,7 +38,7 @@ def described(run):
     path = run / layout.RUN
     told = json.loads(path.read_text())
     told["config"] = load_config().model_dump(mode="json")
-    told["given"] = {"first_frame": 0, "box": [30, 20, 36, 24], "mask": None, "points": None}
+    told["prompt"] = {"first_frame": 0, "box": [30, 20, 36, 24], "mask": None, "points": None}
     path.write_text(json.dumps(told))
     return run
 
@@ -139,7 +139,7 @@ def test_a_link_is_offered_for_frames_that_can_be_corrected_only(correction):
 @pytest.mark.parametrize(
     ("change", "why"),
     [
-        ({"given": None}, "earlier version"),
+        ({"prompt": None}, "names no prompt"),
         ({"config": {"tracker": {"name": "precomputed"}}}, "masks of the run are precomputed"),
     ],
 )

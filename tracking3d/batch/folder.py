@@ -30,7 +30,7 @@ class Failure:
         reason: Why, in a sentence.
         attempts: How often it was begun.
         crashed: Whether its process ended.
-        log: What was printed.
+        log: Path of its log.
     """
 
     run: str
@@ -48,15 +48,15 @@ class BatchProgress:
     Attributes:
         state: ``running``, ``finished`` or ``interrupted``.
         total: Videos.
-        finished: Of them, those that are whole.
+        finished: Number of finished videos.
         failed: Those that came to nothing.
-        before: Those of the finished ones that were so before the command began.
+        before: Finished videos that were so before the command began.
         running: By worker: the video, how many frames of how many, since when, at which attempt.
-        engine: Where the work is done.
+        engine: The engine that runs them, in words.
         workers: How many videos at a time.
         began: When, in seconds since 1970.
         updated: When this was written.
-        seconds_to_go: About how long it will take; None if that cannot be said yet.
+        seconds_to_go: About how long it will take; None if unknown yet.
     """
 
     state: str
@@ -73,7 +73,7 @@ class BatchProgress:
 
     @property
     def state_in_words(self) -> str:
-        """The state; of a batch that has not said anything for long, that too."""
+        """The state; with a remark if the batch has not reported for long."""
         silent = time.time() - self.updated
         if self.state == "running" and silent > _SILENT:
             return f"running, but without progress for {silent / 60:.0f} minutes"
@@ -98,7 +98,7 @@ def read_progress(out: str) -> BatchProgress:
     """How far a batch is.
 
     Raises:
-        InputError: If the folder is none of a batch, or what is there is damaged.
+        InputError: If the folder is none of a batch, or a file there is damaged.
     """
     content = read(join_path(out, PROGRESS))
     if content is None:
@@ -115,7 +115,7 @@ def read_progress(out: str) -> BatchProgress:
 
 
 def write_tables(out: str, rows: Sequence[Mapping[str, Any]], failures: Iterable[Failure]) -> None:
-    """Replace the tables by those of now, each whole: CSV, and Parquet too where pyarrow is installed.
+    """Replace the tables, each as a whole: CSV, and Parquet too if pyarrow is installed.
 
     Raises:
         OutputError: If one cannot be written; it is then as it was.

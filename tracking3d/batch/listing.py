@@ -41,7 +41,7 @@ def list_jobs(place: str, configure: Configure, split: str = "") -> list[VideoJo
     Args:
         place: What the user named.
         configure: Builds the pipeline of a row.
-        split: Length of the parts that long videos are cut into, where a row does not say; empty for none.
+        split: Length of the parts that long videos are cut into, if a row does not give one; empty for none.
 
     Raises:
         InputError: If there is nothing, a table cannot be read, or two videos would have one name.
@@ -60,7 +60,7 @@ def list_jobs(place: str, configure: Configure, split: str = "") -> list[VideoJo
 
 
 def dataset_jobs(dataset: Dataset, config: PipelineConfig) -> list[VideoJob]:
-    """The sequences of a dataset, each from the box and through the camera that it tells a tracker of."""
+    """The sequences of a dataset, each with the box and the camera that it gives to a tracker."""
     return [_of_sequence(dataset, name, config) for name in dataset.sequences]
 
 
@@ -76,8 +76,8 @@ def _of_sequence(dataset: Dataset, name: str, config: PipelineConfig) -> VideoJo
         return replace(job, fault=f"{name} has no box in its first frame; a mask tracker cannot start.")
     camera, given = truth.given_camera or truth.camera, config.camera
     if camera is not None and truth.camera_told and given.intrinsics is None and given.fov is None:
-        told = given.model_copy(update={"intrinsics": (camera.fx, camera.fy, camera.cx, camera.cy)})
-        config = config.model_copy(update={"camera": told})
+        settings = given.model_copy(update={"intrinsics": (camera.fx, camera.fy, camera.cx, camera.cy)})
+        config = config.model_copy(update={"camera": settings})
     box = () if truth.box is None else (",".join(f"{value:.17g}" for value in truth.box),)
     size = sum(file.stat().st_size for file in truth.frames[:1]) * len(truth.frames)
     return replace(job, config=config, box=box, size=size)

@@ -26,7 +26,7 @@ class SharedNetwork:
 
 
 def share_networks(engine: Engine, jobs: Iterable[VideoJob]) -> tuple[SharedNetwork, ...]:
-    """Hand the networks that the jobs name to the engine, where its workers may be on other machines.
+    """Share the networks that the jobs name through the engine, if its workers may be on other machines.
 
     Networks that are given by the path of a file are not sent: every machine must have them there.
     """
@@ -47,7 +47,7 @@ def share_networks(engine: Engine, jobs: Iterable[VideoJob]) -> tuple[SharedNetw
 
 
 def keep_networks(networks: Iterable[SharedNetwork]) -> None:
-    """Put the networks that this machine lacks into its cache, where the plug-ins look for them.
+    """Put the networks that this machine lacks into its cache, in which the plug-ins look for them.
 
     Raises:
         OutputError: If the cache cannot be written.

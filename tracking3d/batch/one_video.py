@@ -47,9 +47,9 @@ _TELL = 1.0  # seconds between two words about how far it is
 
 
 def work_folder(out: str, job: VideoJob) -> Path:
-    """Where a video is worked on; another one for every setting, since a run goes on with its own only.
+    """The work folder of a video; another one for every setting, since a run resumes only with its own.
 
-    Beside the results where they are on this machine, so that a worker elsewhere that sees the same files can go on;
+    Beside the results if they are on this machine, so that a worker elsewhere that sees the same files can resume;
     else in the machine's own folder for temporary files.
     """
     base = local(out)
@@ -75,12 +75,12 @@ def track_video(
     report: bool,
     networks: tuple[SharedNetwork, ...] = (),
 ) -> dict[str, Any]:
-    """Track one video; see `tracking3d.batch.summary.write_marker` for what is returned.
+    """Track one video; returns the same as `tracking3d.batch.summary.write_marker`.
 
-    A video that was begun before and stopped in whatever way goes on from its last finished frame.
+    A video that was begun before is resumed from its last finished frame, however it was stopped.
 
     Args:
-        tell: Is given a mapping of ``frames``, how many estimates there are, and ``of`` how many, where known.
+        tell: Called with a mapping: ``frames``, the number of estimates, and ``of`` how many, if known.
         job: The video.
         out: The folder of the batch.
         command: The command line, for the record.
@@ -88,7 +88,7 @@ def track_video(
         networks: What the machine may lack.
 
     Raises:
-        Tracking3dError: If it cannot be tracked; what is finished is kept for another time.
+        Tracking3dError: If it cannot be tracked; finished frames are kept for the next attempt.
     """
     with local_work_folder(job, out, networks) as work:
         attempts = count_attempt(work)
@@ -99,7 +99,7 @@ def track_video(
 
 @contextmanager
 def local_work_folder(job: VideoJob, out: str, networks: tuple[SharedNetwork, ...] = ()) -> Iterator[Path]:
-    """The folder that a video is worked on in; what went wrong within leaves there what can be gone on from.
+    """The work folder of a video; after an error it keeps what can be resumed.
 
     Args:
         job: The video.
@@ -117,7 +117,7 @@ def local_work_folder(job: VideoJob, out: str, networks: tuple[SharedNetwork, ..
         yield work
     except BaseException as error:
         send_log(out, job)
-        if isinstance(error, InputError) and not (work / RUN).exists():  # nothing was begun that could go on
+        if isinstance(error, InputError) and not (work / RUN).exists():  # there is nothing to resume
             _forget(work)
         raise
 
@@ -125,7 +125,7 @@ def local_work_folder(job: VideoJob, out: str, networks: tuple[SharedNetwork, ..
 def put_away(
     job: VideoJob, out: str, work: Path, runs: Sequence[Path], report: bool, attempts: int, note: str = ""
 ) -> dict[str, Any]:
-    """Put what is whole into its place; see `tracking3d.batch.summary.write_marker` for what is returned.
+    """Move a complete run into its place; returns the same as `tracking3d.batch.summary.write_marker`.
 
     Args:
         job: The video.
@@ -134,18 +134,18 @@ def put_away(
         runs: The run folders in there.
         report: Whether to write a report of each.
         attempts: How often the video was begun.
-        note: What else is to be said of it.
+        note: A further remark.
 
     Raises:
         OutputError: If something cannot be written.
     """
     if report:
         write_reports(runs)
-    told = write_marker(work / RUN, job, attempts, runs, note)
+    marker = write_marker(work / RUN, job, attempts, runs, note)
     _put_into_place(work / RUN, join_path(out, job.name))
     send_log(out, job)
     _forget(work)
-    return told
+    return marker
 
 
 def _track(tell: Tell, job: VideoJob, run: Path, command: str) -> None:
@@ -164,14 +164,14 @@ def _track(tell: Tell, job: VideoJob, run: Path, command: str) -> None:
 
 def counting(tell: Tell, of: int | None, **about: Any) -> Callable[[FrameRecord | SkippedFrame], None]:
     """A listener that reports the number of estimates from time to time, at first zero."""
-    answers, last, process = 0, 0.0, os.getpid()
+    done, last, process = 0, 0.0, os.getpid()
 
     def listener(frame: FrameRecord | SkippedFrame) -> None:
-        nonlocal answers, last
-        answers += 1
+        nonlocal done, last
+        done += 1
         if time.monotonic() - last > _TELL:
             last = time.monotonic()
-            tell({"frames": answers, "of": of, "process": process, **about})
+            tell({"frames": done, "of": of, "process": process, **about})
 
     tell({"frames": 0, "of": of, "process": process, **about})
     return listener
@@ -211,7 +211,7 @@ def fetch_inputs(job: VideoJob, folder: Path) -> VideoJob:
 
 
 def _put_into_place(run: Path, place: str) -> None:
-    """Make a whole run folder appear where it belongs, in place of one that is there."""
+    """Move a complete run folder into its place, replacing one that is there."""
     target = local(place)
     if target is None:
         remove(place)
@@ -243,7 +243,7 @@ def count_attempt(work: Path) -> int:
 
 
 def count_earlier_attempts(work: Path) -> int:
-    """How often a video has been begun; what a full disk has left of the note counts as nothing."""
+    """How often a video has been begun; 0 if a full disk has truncated the note."""
     with suppress(OSError, ValueError):
         return int((work / _ATTEMPTS).read_text())
     return 0

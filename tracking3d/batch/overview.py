@@ -27,7 +27,7 @@ def write_overview(
     Args:
         out: The folder of the batch.
         progress: How far it is.
-        rows: Of the table of results.
+        rows: Rows of the table of results.
         pictures: JPEG in base64 by run.
         failures: Videos that came to nothing.
         report: Whether the runs have reports.

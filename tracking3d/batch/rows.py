@@ -51,7 +51,7 @@ Texts = Annotated[tuple[str, ...], BeforeValidator(_texts)]
 
 
 class VideoRow(Section):
-    """What is said of one video; everything but the video may be left out."""
+    """The row of one video; all but the video is optional."""
 
     video: str
     name: str | None = None
@@ -82,7 +82,7 @@ def read_row(values: Mapping[str, Any], where: str) -> VideoRow:
 
     Args:
         values: By the column's name.
-        where: What sentences call the row.
+        where: Name of the row in messages.
 
     Raises:
         InputError: If a column is unknown, or a value cannot be one.

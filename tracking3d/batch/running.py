@@ -52,12 +52,12 @@ Listener = Callable[[Happening], None]
 
 
 class Batch:
-    """What is known of a batch while it goes on.
+    """The state of a running batch.
 
     Args:
         out: Its folder.
         jobs: All videos.
-        engine: Where they are tracked.
+        engine: The engine that runs them.
         report: Whether runs get reports.
         listener: Called with events.
 
@@ -85,7 +85,7 @@ class Batch:
         )
 
     def find_finished(self, overwrite: bool) -> list[int]:
-        """Take in what an earlier command has finished; the numbers of the jobs that are still to be done."""
+        """Read the results of an earlier command; returns the numbers of the remaining jobs."""
         places = [join_path(self._out, job.name, MARKER) for job in self._jobs]
         contents = {} if overwrite else read_many(places)
         left = []
@@ -107,12 +107,12 @@ class Batch:
         return left
 
     def tasks(self, left: Sequence[int], tasks: Tasks) -> list[Task]:
-        """The first tasks of all videos that are still to be done, large ones first."""
+        """The first tasks of all remaining videos, large ones first."""
         self._tasks = tasks
         return [tasks.first(number) for number in sorted(left, key=lambda number: -self._jobs[number].size)]
 
     def report_outcome(self, event: Event) -> None:
-        """Take in what an engine tells."""
+        """Handle an event of the engine."""
         assert self._tasks is not None
         job = self._jobs[self._tasks.video(event.number)]
         if isinstance(event, Began):
@@ -131,10 +131,10 @@ class Batch:
             self._end(job, event)
 
     def write(self, state: str = "running", *, now: bool = False) -> None:
-        """Write what is due; at the end (``now``) everything.
+        """Write the files that are due; at the end (``now``) all.
 
         Raises:
-            OutputError: At the end, if something cannot be written; before, that is only said.
+            OutputError: At the end, if a file cannot be written; before, this is only logged.
         """
         self._count(state)
         steps: list[tuple[str, float, Callable[[], object]]] = [
@@ -169,7 +169,7 @@ class Batch:
         return rows, sorted(self.failures.values(), key=lambda one: one.run)
 
     def say_all(self) -> None:
-        """Tell the listener how far all is."""
+        """Report the progress of the batch to the listener."""
         self._listener(Happening("batch", "", {}, self.progress))
 
     def _why_taken(self, job: VideoJob, marker: Mapping[str, Any] | None) -> str:
@@ -202,9 +202,9 @@ class Batch:
             # here.
             elsewhere = local(self._out) is None and not fault.crashed
             has_log = send_log(self._out, job) or elsewhere
-            told = f"{LOGS}/{job.name}.log" if has_log else ""
+            log = f"{LOGS}/{job.name}.log" if has_log else ""
             self.failures[job.name] = Failure(
-                job.name, job.video, fault.reason, ended.attempts, fault.crashed, told
+                job.name, job.video, fault.reason, ended.attempts, fault.crashed, log
             )
             self._count()
         self._say("again" if ended.again else "failed", job, about)
@@ -258,13 +258,13 @@ def run_batch(
 ) -> BatchProgress:
     """Track all videos; how far it came.
 
-    What an earlier command has finished is left alone, and what it has begun goes on from its last finished frame.
+    Videos that an earlier command has finished stay, and those it has begun are resumed from their last finished frame.
     The largest videos are begun first, so that none is left alone at the end.
 
     Args:
         jobs: The videos.
         out: The folder of the batch.
-        engine: Where they are tracked.
+        engine: The engine that runs them.
         retries: How often a video that came to nothing is tried again.
         overwrite: Track all videos again, and replace their run folders.
         report: Write a report of each run.
@@ -274,7 +274,7 @@ def run_batch(
 
     Raises:
         OutputError: If the folder is in use by another batch, or cannot be written.
-        KeyboardInterrupt: After Ctrl-C; what is done is kept, and the same call goes on.
+        KeyboardInterrupt: After Ctrl-C; finished frames are saved, and the same call resumes.
     """
     with _alone(out):
         batch = Batch(out, jobs, engine, report, listener)
@@ -299,7 +299,7 @@ def run_batch(
                 batch.write("interrupted", now=True)
             raise
         if (folder := local(out)) is not None:
-            with suppress(OSError):  # where something is left to go on from, it stays
+            with suppress(OSError):  # stays if there is something to resume
                 (folder / WORK).rmdir()
         batch.write("finished", now=True)
         batch.say_all()

@@ -52,7 +52,7 @@ def videos_of(place: str) -> list[tuple[VideoRow, int]]:
 
 
 def _videos_among(names: Iterable[str]) -> list[str]:
-    """Files that are called as videos are, and folders of images that something is said of."""
+    """Files with the suffix of a video, and folders of images with a sidecar file."""
     every = set(names)
     hidden = {name for name in every if any(part.startswith(".") for part in name.split("/"))}
     files = {name for name in every - hidden if PurePosixPath(name).suffix.lower() in VIDEOS}
@@ -69,7 +69,7 @@ def _ends() -> tuple[str, ...]:
 
 
 def _with_prompt(video: str, beside: set[str]) -> VideoRow:
-    """The row that the files beside a video make; one without a prompt where there is none."""
+    """The row of a video from its sidecar files; without a prompt if there is none."""
     stems = [video, video.removesuffix(PurePosixPath(base(video)).suffix)]
     for stem in stems:
         if (file := stem + JSON) in beside:

@@ -18,7 +18,7 @@ _FILE = "file://"
 
 
 def local(place: str) -> Path | None:
-    """The path of this machine that is meant; None if the place is elsewhere."""
+    """The local path of a place; None if it is on other storage."""
     if place.startswith(_FILE):
         return Path(place.removeprefix(_FILE))
     return None if "://" in place else Path(place).expanduser()
@@ -75,7 +75,7 @@ def read(place: str) -> bytes | None:
 
 
 def read_many(places: Sequence[str]) -> dict[str, bytes]:
-    """What those of the files hold that are there; elsewhere they are asked for together.
+    """Read the files that exist; on other storage they are read together.
 
     Raises:
         InputError: If one cannot be read.
@@ -107,7 +107,7 @@ def write(place: str, content: bytes) -> None:
 
 
 def names_in(folder: str, *, everything: bool = False) -> dict[str, int]:
-    """Names of what is in a folder, those in folders within it with their path, and the bytes of each.
+    """Names of the files in a folder and its subfolders, with their path, and the bytes of each.
 
     Args:
         folder: The folder.

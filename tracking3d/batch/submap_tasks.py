@@ -41,11 +41,11 @@ def begin_in_parts(
         out: The folder of the batch.
         command: The command line, for the record.
         report: Whether to write a report.
-        workers: Of the batch, for the record.
+        workers: Number of workers of the batch, for the record.
         networks: What the machine may lack.
 
     Raises:
-        Tracking3dError: If it cannot be cut or tracked; what is finished is kept for another time.
+        Tracking3dError: If it cannot be cut or tracked; finished frames are kept for the next attempt.
     """
     with local_work_folder(job, out, networks) as work:
         attempts = count_attempt(work)
@@ -71,7 +71,7 @@ def step_in_parts(
         networks: What the machine may lack.
 
     Raises:
-        Tracking3dError: If it fails; what is finished is kept for another time.
+        Tracking3dError: If it fails; finished frames are kept for the next attempt.
     """
 
     def with_share(content: dict[str, Any]) -> None:
@@ -87,7 +87,7 @@ def settle_in_parts(
     """Put what became of a video into its place.
 
     Args:
-        tell: Is not used.
+        tell: Not used.
         job: The video.
         out: The folder of the batch.
         report: Whether to write reports.
@@ -122,4 +122,4 @@ def _video(job: VideoJob, work: Path, command: str, workers: int) -> LongVideo:
 
 
 def _note(ended: SplitResult) -> str:
-    return f"its {ended.parts} parts could not be joined: {ended.reason}" if len(ended.folders) > 1 else ""
+    return f"its {ended.parts} parts could not be merged: {ended.reason}" if len(ended.folders) > 1 else ""

@@ -59,7 +59,7 @@ def row_of(run: RunReader, name: str, job: VideoJob, attempts: int = 1, note: st
         name: What it is called in the batch.
         job: What it is of.
         attempts: How often the video was begun.
-        note: What else is to be said of it.
+        note: A further remark.
     """
     about = run.description
     counts, (per_frame, _) = about["counts"], time_per_frame(about)
@@ -97,14 +97,14 @@ def thumbnail(run: RunReader) -> str:
 def write_marker(
     folder: Path, job: VideoJob, attempts: int = 1, runs: Sequence[Path] = (), note: str = ""
 ) -> dict[str, Any]:
-    """Write what the batch needs to know of a finished video into its folder; returns that.
+    """Write the summary of a finished video into its folder, and return it.
 
     Args:
         folder: The video's.
         job: The video.
         attempts: How often it was begun.
         runs: The run folders within it; those of its objects if left out.
-        note: What else is to be said of each.
+        note: A further remark on each.
 
     Raises:
         OutputError: If it cannot be written.

@@ -21,7 +21,7 @@ class _Long:
 
     video: int
     steps: Steps | None = None
-    answers: dict[int, Any] = field(default_factory=dict)
+    results: dict[int, Any] = field(default_factory=dict)
     waiting: set[int] = field(default_factory=set)
     whole: int = 1
     again: int = 0
@@ -36,7 +36,7 @@ class Tasks:
         out: The folder of the batch.
         command: The command line, for the record.
         report: Whether runs get reports.
-        workers: Of the batch, for the record.
+        workers: Number of workers of the batch, for the record.
         networks: What machines may lack.
     """
 
@@ -66,11 +66,11 @@ class Tasks:
         return Task(video, begin_in_parts, arguments, log_file(self._out, job))
 
     def video(self, task: int) -> int:
-        """The number of the video that a task is of."""
+        """The number of a task's video."""
         return self._long[task].video if task in self._long else task
 
     def label(self, task: int) -> str:
-        """What a step is called; empty of the first."""
+        """The name of a step; empty for the first."""
         return self._labels.get(task, "")
 
     def further(self, ended: Ended) -> list[Task]:
@@ -85,18 +85,18 @@ class Tasks:
         if long.steps is None:
             long.steps, long.whole = steps_of(ended.value), 2 * ended.value.count
             return self._tasks(long, next(long.steps))
-        long.answers[ended.number] = ended.value
+        long.results[ended.number] = ended.value
         if long.waiting:
             return []
-        answers = [long.answers[number] for number in sorted(long.answers)]
+        results = [long.results[number] for number in sorted(long.results)]
         try:
-            return self._tasks(long, long.steps.send(answers))
+            return self._tasks(long, long.steps.send(results))
         except StopIteration as stop:
             arguments = (self._jobs[long.video], self._out, self._report, stop.value, long.again)
             return [self._task(long, settle_in_parts, arguments, "its report")]
 
     def _tasks(self, long: _Long, steps: Sequence[Step]) -> list[Task]:
-        long.answers.clear()
+        long.results.clear()
         job = self._jobs[long.video]
         return [
             self._task(long, step_in_parts, (job, self._out, step, long.whole, self._networks), step.label)
@@ -111,5 +111,5 @@ class Tasks:
 
 
 def is_finished_video(ended: Ended) -> bool:
-    """Whether a video is finished with a task; steps of long ones answer with other things than its rows."""
+    """Whether a video is finished with a task; steps of long ones estimate with other things than its rows."""
     return isinstance(ended.value, Mapping) and "rows" in ended.value

@@ -16,7 +16,7 @@ class VideoJob:
     """What one worker does in one go: a video is decoded once, however many objects are tracked in it.
 
     Attributes:
-        name: Where its run folder is, within that of the batch.
+        name: Its run folder within that of the batch.
         video: Video file, folder or pattern of images.
         config: The pipeline.
         box: Objects by their box in the first frame, as ``tracking3d run --box`` has them.
@@ -26,7 +26,7 @@ class VideoJob:
         start_frame: The frame in which the objects are given; None for the first.
         frames: ``START:STOP:STEP``.
         sequence: Layout, folder and name of a sequence of a dataset, whose images are then the video.
-        size: Bytes of the video, where known: large ones are begun first.
+        size: Bytes of the video, if known: large ones are begun first.
         fault: Why it cannot be done, if known beforehand.
         split: Length of the parts that it is cut into, see `tracking3d.submaps.cuts.parse_length`; empty for none.
     """
@@ -47,7 +47,7 @@ class VideoJob:
 
     @property
     def in_parts(self) -> bool:
-        """Whether it is cut where it is long: parts are joined of one object that is given in the first frame."""
+        """Whether it may be cut: only parts of one object that is prompted in the first frame can be merged."""
         whole = self.sequence is not None or self.start_frame is not None or self.correct or self.objects > 1
         return bool(self.split) and not whole
 
@@ -58,8 +58,8 @@ class VideoJob:
 
     @cached_property
     def key(self) -> str:
-        """What tells its results from those of another video, prompt or setting."""
-        told: dict[str, Any] = {
+        """A key of its video, prompt and settings."""
+        identity: dict[str, Any] = {
             "video": self.video,
             "config": self.config.model_dump(mode="json"),
             "objects": [self.box, self.mask, self.points],
@@ -69,5 +69,5 @@ class VideoJob:
             "sequence": self.sequence,
         }
         if self.split:
-            told["split"] = self.split
-        return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]
+            identity["split"] = self.split
+        return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:16]

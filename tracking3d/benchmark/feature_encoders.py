@@ -33,7 +33,7 @@ class MeasuredEncoder:
         stride: Input pixels per feature pixel.
         milliseconds: Median time of one image.
         scores: With all channels.
-        reduced: With the reduced number of channels, where that was asked for.
+        reduced: With the reduced number of channels, if that was requested.
     """
 
     channels: int

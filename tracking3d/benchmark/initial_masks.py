@@ -20,15 +20,15 @@ SEED = 0
 
 
 def masks_for(source: str, truth: Truth, folder: Path) -> Path:
-    """The folder of masks for one sequence, made in ``folder`` where it is not there already.
+    """The folder of masks for one sequence, made in ``folder`` if it is not there already.
 
-    Trackers see what can be seen: all but ``initial`` masks are made from those of the visible part where it is known.
+    Trackers see what can be seen: all but ``initial`` masks are made from those of the visible part if it is known.
 
     Args:
         source: ``truth``, ``initial``, ``degraded:IOU``, ``noise:PIXELS``, ``hand``, or a folder with a folder of
             masks for every sequence.
         truth: The sequence.
-        folder: Where to write masks.
+        folder: Folder for the masks.
 
     Raises:
         InputError: If the sequence has no such masks.

@@ -1,4 +1,4 @@
-"""How far a mean over sequences would move with other sequences of the kind.
+"""The uncertainty of a mean over sequences, from the choice of sequences.
 
 The sequences are the sample; the interval is the percentile bootstrap over them (Efron, "Bootstrap methods: another
 look at the jackknife", 1979).
@@ -16,7 +16,7 @@ RESAMPLES = 9999
 def interval(values: np.ndarray, seed: int = 0) -> tuple[float | None, float | None]:
     """Percentile bootstrap interval of the mean of ``values`` ``(N,)`` at `LEVEL`.
 
-    None for fewer than two values, and where one is not finite.
+    None for fewer than two values, and if one is not finite.
     """
     if len(values) < 2 or not np.isfinite(values).all():
         return None, None

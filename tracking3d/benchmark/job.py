@@ -48,7 +48,7 @@ class Job:
 
     Attributes:
         layout: Name of a dataset's layout, or the YAML file of one.
-        root: Where the dataset lies.
+        root: Folder of the dataset.
         sequence: The sequence's name.
         variant: How to run it.
         out: The folder for everything of this benchmark.
@@ -67,7 +67,7 @@ class Job:
 
     @cached_property
     def config(self) -> PipelineConfig:
-        """The pipeline, with the camera that the dataset tells a tracker of unless the configuration says one."""
+        """The pipeline, with the camera that the dataset gives to a tracker unless the configuration has one."""
         config = self.variant.config
         camera = self.truth.given_camera or self.truth.camera
         if (
@@ -77,8 +77,10 @@ class Job:
             or config.camera.fov is not None
         ):
             return config
-        told = config.camera.model_copy(update={"intrinsics": (camera.fx, camera.fy, camera.cx, camera.cy)})
-        return config.model_copy(update={"camera": told})
+        settings = config.camera.model_copy(
+            update={"intrinsics": (camera.fx, camera.fy, camera.cx, camera.cy)}
+        )
+        return config.model_copy(update={"camera": settings})
 
     @cached_property
     def run_key(self) -> str:
@@ -102,7 +104,7 @@ class Job:
 
     @property
     def folder(self) -> Path:
-        """Where the run and its scores lie."""
+        """Folder of the run and its scores."""
         return self.out / "runs" / Path(self.layout).stem / self.sequence / self.run_key[:16]
 
     def finished(self) -> dict[str, Any] | None:
@@ -140,8 +142,8 @@ class Job:
 def run_job(job: Job) -> dict[str, Any]:
     """Track, unless the run is there, and score; the scores are written too.
 
-    Those of the final answers are by name of the measure. Where there are refined answers, ``causal`` holds the scores
-    of the causal ones, else None.
+    Those of the final estimates are by name of the measure. If there are refined estimates, ``causal`` holds the
+    scores of the causal ones, else None.
 
     Raises:
         Tracking3dError: If the sequence cannot be read, tracked or scored.
@@ -161,7 +163,7 @@ def run_job(job: Job) -> dict[str, Any]:
 
 
 def memory_growth(held: Sequence[float]) -> float | None:
-    """How much more was held at most in the second half of the frames than in the first; None of fewer than two."""
+    """Growth of the peak memory from the first half of the frames to the second; None for fewer than two."""
     half = len(held) // 2
     return max(held[half:]) - max(held[:half]) if half else None
 
@@ -194,7 +196,7 @@ def _record(job: Job, run: Path, listener: Listener) -> None:
     try:
         record(source, config, run, overwrite=True, listener=listener)
     finally:
-        if masks.is_relative_to(job.folder):  # the run keeps its own copy of them
+        if masks.is_relative_to(job.folder):  # the run has its own copy of them
             shutil.rmtree(masks, ignore_errors=True)
 
 

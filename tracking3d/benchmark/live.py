@@ -1,4 +1,4 @@
-"""Does a pipeline keep up with a camera? A clip is played at a camera's rate, and answers are timed as they come."""
+"""Does a pipeline keep up with a camera? A clip is played at a camera's rate, and estimates are timed as they come."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ from tracking3d.video.image_file import read_image
 from tracking3d.video.latest_frames import newest
 
 WARM_UP = 10
-"""Answers that the figures of a settled session leave out: compilers and caches are warm only then."""
+"""Estimates that the figures of a settled session leave out: compilers and caches are warm only then."""
 
 
 @dataclass(frozen=True)
 class LiveReport:
     """What came of a clip that was played.
 
-    A frame's lag is the time from its arrival to its answer.
+    A frame's lag is the time from its arrival to its estimate.
 
     Attributes:
         rate: Frames a second that were played.
         played: Number of frames that were played.
         taken: How many of them were tracked.
         dropped: How many were dropped to keep up.
-        first_lag: Seconds of the first frame, which waits for all that is made at the start.
-        worst_lag, median_lag: Seconds over the frames after the first `WARM_UP`; None where there are none.
+        first_lag: Seconds of the first frame, which waits for the one-time work at the start.
+        worst_lag, median_lag: Seconds over the frames after the first `WARM_UP`; None if there are none.
         end_lag: Seconds of the last frame: a pipeline that falls behind ends with the worst.
-        answers_per_second: Over the same frames as `worst_lag`.
+        answers_per_second: Estimates a second over the same frames as `worst_lag`.
         longest_gap: The most frames that were dropped in a row after the first `WARM_UP`.
         seconds_per_frame: Mean time of a frame in the session, over the same frames.
         stages: The same stage by stage; nothing is decoded or written.
@@ -116,7 +116,7 @@ def format_live(report: LiveReport) -> Table:
         ("frames played", f"{report.played} at {report.rate:g} Hz"),
         ("tracked", str(report.taken)),
         ("dropped to keep up", str(report.dropped)),
-        ("answers a second, once settled", _text(report.answers_per_second, 1, "")),
+        ("estimates a second, once settled", _text(report.answers_per_second, 1, "")),
         ("most dropped in a row, once settled", str(report.longest_gap)),
         ("lag of the first frame", _text(report.first_lag, 2, " s")),
         ("lag, median", _text(report.median_lag, 3, " s")),

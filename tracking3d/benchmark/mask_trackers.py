@@ -1,6 +1,6 @@
 """Mask trackers by themselves: how good their masks are, how long they take, what their scores are worth.
 
-No pose is estimated. Masks are compared with what is seen of the object, where the data know it, since a mask
+No pose is estimated. Masks are compared with the visible part of the object, if the data have it, since a mask
 tracker sees no more.
 """
 
@@ -44,7 +44,7 @@ FLOW_CUES: Mapping[str, Mapping[str, Any]] = {
     "no smoother": {"smoother": False},
     "no witness": {"witness": "none"},
 }
-"""What switches each cue of the tracker ``flow`` off."""
+"""The options that switch each cue of the tracker ``flow`` off."""
 
 
 @dataclass(frozen=True)
@@ -71,8 +71,8 @@ class TrackedFrame:
 
     Attributes:
         index: Its index in the sequence.
-        iou: Of the tracker's mask and the true one; no mask is an empty one.
-        boundary_f: Of the same; NaN where only a box is known.
+        iou: IoU of the tracker's mask and the true one; no mask is an empty one.
+        boundary_f: Boundary F of the same; NaN if only a box is known.
         score: The tracker's own.
     """
 
@@ -101,7 +101,7 @@ class TrackerMeasurement:
     error: str = ""
 
     def figures(self) -> dict[str, float | int | None]:
-        """The measures by name; None where there is nothing to measure.
+        """The measures by name; None if there is nothing to measure.
 
         ``iou_mean``, ``boundary_f_mean``, ``share_under_half`` (of frames with an IoU under 0.5),
         ``milliseconds`` (median of a frame), ``auc_50`` and ``auc_70`` (area under the ROC curve of the score as
@@ -136,7 +136,7 @@ def measure_trackers(
         dataset: The sequences.
         start: Whether trackers start from the first frame's box or from its true mask.
         most_frames: Only so many frames of each sequence.
-        listener: Is told of every result as it is there.
+        listener: Called for every result.
     """
     results = []
     for contestant in contestants:
@@ -184,10 +184,10 @@ def overall(results: Sequence[TrackerMeasurement]) -> dict[str, dict[str, float 
 def track_masks(
     choice: PluginChoice, truth: Truth, start: Start = "box"
 ) -> Iterator[tuple[Frame, MaskEstimate, float]]:
-    """Send a sequence through a mask tracker; yields each frame, the answer and the seconds it took.
+    """Send a sequence through a mask tracker; yields each frame, the estimate and the seconds it took.
 
     Raises:
-        InputError: If the sequence cannot be read or does not tell where the object is at first.
+        InputError: If the sequence cannot be read or has no prompt.
         PluginError: If the tracker is unknown, its options are not its own, or it fails.
     """
     tracker = GuardedTracker(build_plugin(TRACKERS, choice), plugin_label(TRACKERS, choice.name))
@@ -240,7 +240,7 @@ class _MaskInMemory:
 
 
 def _compare(frame: Frame, estimate: MaskEstimate, truth: Truth) -> list[TrackedFrame]:
-    """The frame's figures; none where the truth is not known."""
+    """The frame's figures; none if the ground truth is unknown."""
     masks = {} if estimate.binary is None else {frame.index: _MaskInMemory(estimate.binary)}
     here = range(frame.index, frame.index + 1)
     compared = compare_masks(Answers(truth.frames[0].parent, here, frozenset(here), masks=masks), truth)

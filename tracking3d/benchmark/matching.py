@@ -2,7 +2,7 @@
 
 The same place must have the same features, wherever it has moved and whatever the light does. An image is warped
 by a known homography and changed by a shading ramp, gamma, a colour cast and noise. For points of the image the
-nearest neighbour by cosine is searched among all pixels of the warped one; it counts where it lies within 3 px of
+nearest neighbour by cosine is searched among all pixels of the warped one; it counts if it lies within 3 px of
 the truth. A search everywhere asks whether features are distinctive, one near the truth whether they are precise.
 """
 
@@ -39,9 +39,7 @@ _MARGIN = 4  # pixels at the border that are neither query nor truth
 _TEXTURE = 0.006  # change of grey a pixel, in the direction of least change, over 9 x 9 pixels
 _CANDIDATES = 8  # crops of which the one with most texture is taken
 _ROTATION, _ZOOM, _PERSPECTIVE = np.radians(20.0), 1.25, 0.25
-_SHIFT = (
-    0.25  # of the crop's side; in every warp, or features that tell where in the image they lie would do well
-)
+_SHIFT = 0.25  # of the crop's side; in every warp, since features that encode the image position would do well without
 _GAMMA, _SHADING, _CAST, _NOISE = 1.4, 0.5, 0.15, 0.02
 
 
@@ -53,7 +51,7 @@ class MatchingPair:
         image: ``(3, S, S)`` RGB in [0, 1].
         warped: ``(3, S, S)`` RGB in [0, 1].
         points: ``(N, 2)`` x and y of textured pixels of ``image``, whole numbers.
-        truth: ``(N, 2)`` where they are in ``warped``, in pixels.
+        truth: ``(N, 2)`` their positions in ``warped``, in pixels.
     """
 
     image: Tensor
@@ -68,7 +66,7 @@ class MatchingScores:
 
     Attributes:
         everywhere: Searched over the whole warped image.
-        nearby: Searched within `RADIUS` of the truth.
+        nearby: Share if searched within `RADIUS` of the truth.
         points: How many points were searched for.
     """
 
@@ -86,7 +84,7 @@ def make_pairs(images: Sequence[Image], seed: int = 0, size: int = 256) -> list[
 
     Args:
         images: ``(H, W, 3)`` uint8 RGB of any size; large ones are reduced to at most twice ``size`` first.
-        seed: Of crops, warps, light, noise and points.
+        seed: Seed of crops, warps, light, noise and points.
         size: Side S of the crops in pixels.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Frames that differ by next to nothing: what a method answers for them should differ as little."""
+"""Frames that differ by next to nothing: the estimates of a method should differ as little."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class NoisyFrames:
 
     Attributes:
         source: The frames as they are.
-        seed: Of the noise; every frame has its own, the same whenever it is read.
+        seed: Seed of the noise; every frame has its own, the same whenever it is read.
     """
 
     source: FrameSource

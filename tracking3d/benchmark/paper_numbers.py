@@ -14,7 +14,7 @@ class Published:
 
     Attributes:
         value: IoU, or average recall in Table 5.
-        gain: Over the initial masks, in percent, where printed.
+        gain: Gain over the initial masks, in percent, if printed.
     """
 
     value: float

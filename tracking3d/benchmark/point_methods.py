@@ -1,6 +1,6 @@
-"""Ways to follow points through a run's frames, to be compared: ours, and what is without a model.
+"""Ways to follow points through a run's frames, to be compared: ours, and methods without a model.
 
-All take the pixels of one frame and give positions ``(T, N, 2)``, NaN where there is none, and visibility ``(T, N)``.
+All take the pixels of one frame and give positions ``(T, N, 2)``, NaN if there is none, and visibility ``(T, N)``.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How well points are followed through finished runs, beside methods without a model."""
+"""Accuracy of point tracks through finished runs, compared with methods without a model."""
 
 from __future__ import annotations
 
@@ -66,11 +66,11 @@ class MeasuredRun:
 
     Attributes:
         sequence: Its sequence.
-        masks: Where its initial masks came from.
-        refined: Whether its refined answers were taken.
+        masks: The source of its initial masks.
+        refined: Whether its refined estimates were taken.
         rows: By method.
         inside: Share of the errors inside twice the uncertainty.
-        errors: Of the corrected points.
+        errors: Errors of the corrected points.
         seconds_landmarks: For opening the frames and finding landmarks, once a run.
     """
 
@@ -109,12 +109,12 @@ def finished_jobs(folder: Path) -> list[tuple[Job, Path]]:
 
 
 def measure_run(job: Job, folder: Path, refined: bool = True, beside: bool = False) -> MeasuredRun:
-    """Ask for every true point where it is first seen, and score what is said after that.
+    """Query every true point in the frame that first shows it, and score the later positions.
 
     Args:
         job: A finished job.
         folder: Its run folder.
-        refined: Take the refined answers, else the causal ones.
+        refined: Take the refined estimates, else the causal ones.
         beside: Score the other methods too.
 
     Raises:
@@ -132,7 +132,7 @@ def measure_run(job: Job, folder: Path, refined: bool = True, beside: bool = Fal
     scene = open_scene(run, source)
     seconds = time.perf_counter() - start
 
-    told: list[PointErrors] = []
+    per_frame: list[PointErrors] = []
 
     def corrected(frame: int, xy: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         rows = [row for row, one in enumerate(run.frames) if one.index == frame]
@@ -148,7 +148,7 @@ def measure_run(job: Job, folder: Path, refined: bool = True, beside: bool = Fal
         mine = np.flatnonzero(queries[:, 0] == frame)
         truly = (visible & after)[mine][:, indices].T & np.isfinite(found.uncertainty)
         error = np.linalg.norm(found.positions - tracks[mine][:, indices].transpose(1, 0, 2), axis=2)
-        told.append(
+        per_frame.append(
             PointErrors(error[truly], found.uncertainty[truly], found.measured[truly], found.features[truly])
         )
         return positions, seen
@@ -159,7 +159,7 @@ def measure_run(job: Job, folder: Path, refined: bool = True, beside: bool = Fal
     rows = {
         name: _score(method, queries, tracks, visible, after, _size(job)) for name, method in methods.items()
     }
-    errors = _together(told)
+    errors = _together(per_frame)
     inside = float(np.mean(errors.error <= 2 * errors.uncertainty)) if len(errors.error) else None
     return MeasuredRun(job.sequence, job.variant.masks, refined, rows, inside, errors, seconds)
 
@@ -212,7 +212,7 @@ def _score(
 
 
 def returns(visible: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """``(N, T)`` where a point is seen after it was hidden for `LONG` frames or more in a row.
+    """``(N, T)`` whether a point is seen after it was hidden for `LONG` frames or more in a row.
 
     It counts from its return to when it is next hidden for as long.
 

@@ -16,7 +16,7 @@ _MEASURES = ("delta", "occlusion", "jaccard", "returned")
 
 
 def point_report(runs: Sequence[MeasuredRun]) -> dict[str, Any]:
-    """Means over the sequences with their intervals, by masks, answers and method, and every run by itself."""
+    """Means over the sequences with their intervals, by masks, estimates and method, and every run by itself."""
     groups = []
     for masks, refined in dict.fromkeys((run.masks, run.refined) for run in runs):
         chosen = [run for run in runs if (run.masks, run.refined) == (masks, refined)]

@@ -1,4 +1,4 @@
-"""Jobs in workers: one that crashes costs itself only, and what is finished is not done again."""
+"""Jobs in workers: one that crashes costs itself only, and finished jobs are not repeated."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class JobOutcome:
 
 
 Listener = Callable[[JobOutcome], None]
-"""Is told of every job as it is done."""
+"""Called for every job when it is done."""
 
 
 def run_jobs(
@@ -48,13 +48,13 @@ def run_jobs(
     """Run all jobs, ``processes`` at a time; the outcomes are in the order of the jobs.
 
     Jobs that depend on the same things, as when two rows of a table are one setting, are done once. Ctrl-C stops
-    the workers; what was finished is kept and found again by the next call.
+    the workers; finished jobs are saved and found again by the next call.
 
     Args:
         jobs: What to run.
         processes: Workers.
-        listener: Is told of every outcome.
-        address: Of a Ray cluster that runs them, which must see the same files; this machine if None.
+        listener: Called for every outcome.
+        address: Address of a Ray cluster that runs them, which must see the same files; this machine if None.
     """
     outcomes: dict[int, JobOutcome] = {}
     equal: dict[Path, list[int]] = {}
@@ -83,7 +83,7 @@ def run_jobs(
                 JobOutcome(jobs[number], result.scores, result.error, cached=result.scores is not None),
             )
 
-    def told(event: Event) -> None:
+    def handle(event: Event) -> None:
         if isinstance(event, Began):
             began[event.number] = time.monotonic()
         elif isinstance(event, Ended):
@@ -105,7 +105,7 @@ def run_jobs(
     ]
     if tasks:
         with open_engine(address, processes) as engine:
-            map_tasks(engine, tasks, listener=told)
+            map_tasks(engine, tasks, listener=handle)
     return [outcomes[number] for number in range(len(jobs))]
 
 

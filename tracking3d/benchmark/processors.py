@@ -1,4 +1,4 @@
-"""The same computation as other processors would do it: which kernels a process is told to use, and whether it can.
+"""The same computation as on other processors: the kernels that a process is set to use, and whether it can.
 
 OpenBLAS (NumPy, SciPy) and ATen (torch) choose their kernels by the processor, and environment variables make them
 choose those of another one: https://github.com/OpenMathLib/OpenBLAS#setting-the-processor-architecture and
@@ -41,7 +41,7 @@ class Kernels:
     """What a process computes with.
 
     Attributes:
-        openblas: The processor whose kernels NumPy's OpenBLAS takes; empty where NumPy has another library.
+        openblas: The processor whose kernels NumPy's OpenBLAS takes; empty if NumPy has another library.
         aten: The instructions whose kernels torch takes.
     """
 
@@ -50,7 +50,7 @@ class Kernels:
 
 
 def detect_kernels(environment: Mapping[str, str]) -> Kernels | None:
-    """What a process with these environment variables computes with; None where this processor cannot run it."""
+    """What a process with these environment variables computes with; None if this processor cannot run it."""
     found = subprocess.run(
         [sys.executable, "-c", _PROBE],
         env={**os.environ, "OPENBLAS_VERBOSE": "2", **environment},

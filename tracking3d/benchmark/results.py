@@ -1,4 +1,4 @@
-"""The scores of one variant on many sequences: kept as JSON, averaged, printed."""
+"""The scores of one variant on many sequences: saved as JSON, averaged, printed."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ class ResultSet:
         dataset: Name of the dataset.
         scores: Measures by sequence; None for a sequence that failed.
         errors: Why sequences failed.
-        about: Everything else that is kept: configuration, masks, versions, code, date.
-        causal: Measures of the causal answers, of the sequences that have refined ones too; `scores` are then those
+        about: Everything else that is saved: configuration, masks, versions, code, date.
+        causal: Measures of the causal estimates, of the sequences that have refined ones too; `scores` are then those
             of the refined ones.
     """
 
@@ -65,7 +65,7 @@ class ResultSet:
     causal: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     def split(self) -> list[ResultSet]:
-        """The causal answers and the refined ones as two result sets; one where nothing was refined."""
+        """The causal estimates and the refined ones as two result sets; one if nothing was refined."""
         if not self.causal:
             return [self]
         causal = replace(
@@ -74,17 +74,17 @@ class ResultSet:
         return [causal, replace(self, label=f"{self.label}, refined", causal={})]
 
     def values(self, measure: str) -> dict[str, float]:
-        """A measure by sequence, where it is known."""
+        """A measure by sequence, if it is known."""
         known = {name: (scores or {}).get(measure) for name, scores in self.scores.items()}
         return {name: float(value) for name, value in known.items() if value is not None}
 
     def mean(self, measure: str) -> float | None:
-        """Mean of a measure over the sequences where it is known; each sequence counts once."""
+        """Mean of a measure over the sequences that have it; each sequence counts once."""
         values = list(self.values(measure).values())
         return float(np.mean(values)) if values else None
 
     def interval(self, measure: str) -> tuple[float, float] | None:
-        """Bootstrap interval of `mean` over the sequences; None where fewer than two are known."""
+        """Bootstrap interval of `mean` over the sequences; None if fewer than two are known."""
         low, high = interval(np.array(list(self.values(measure).values())))
         return None if low is None or high is None else (low, high)
 

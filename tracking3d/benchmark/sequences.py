@@ -25,7 +25,7 @@ class Dataset:
         name: What results call it.
         version: Version of a synthetic suite; None for others.
         layout: Name of the layout, or the YAML file of one.
-        root: Where it lies.
+        root: Folder of the dataset.
         sequences: Names of the sequences.
     """
 
@@ -70,10 +70,10 @@ def open_dataset(
     Args:
         name: One of `SUITES`; ``fresh-SEED``; ``real`` for a folder of clips in our own layout; the name of a
             dataset's layout; or a YAML file of one.
-        data: Where it lies; a synthetic suite's default is ``out/data/NAME``.
+        data: Folder of the dataset; a synthetic suite's default is ``out/data/NAME``.
         out: Folder of the benchmark.
         jobs: Processes that make a suite.
-        listener: Is told of every sequence of a suite as it is made.
+        listener: Called for every sequence of a suite when it is made.
         specs: The sequences of a suite that is none of these but called ``name``.
 
     Raises:
@@ -84,7 +84,7 @@ def open_dataset(
         made = make_suite(name, folder, specs=specs, jobs=jobs, listener=listener)
         return Dataset(name, SUITE_VERSION, "clip", folder, tuple(path.name for path in made))
     if data is None:
-        raise InputError(f"Say where the dataset {name} lies: --data DIR.")
+        raise InputError(f"Give the folder of the dataset {name}: --data DIR.")
     layout = "clip" if name == REAL else name
     sequences = tuple(list_sequences(load_layout(layout), data))
     if not sequences:

@@ -1,6 +1,6 @@
 """The table ``online``: the solvers `paper` and `online` side by side, by sequence, in one run on one machine.
 
-A column is a solver with its features; where a run holds refined answers, its causal and its refined answers are two.
+A column is a solver with its features; if a run has refined estimates, its causal and its refined estimates are two.
 Rotation errors are aligned and every frame counts, see `tracking3d.evaluation.pose_scores`. A mean is over the
 sequences for which every column has the figure, each counting once.
 """
@@ -38,7 +38,7 @@ MEASURES = {
     "iou_initial_mean": "IoU of the initial masks",
     "iou_mean": "IoU",
     "iou_gain_percent": "IoU gain %",
-    "share_own_masks": "share of answers that are not the initial mask",
+    "share_own_masks": "share of estimates that are not the initial mask",
     "share_worse_than_initial": "share of frames worse than the initial mask",
     "rotation_error_median_deg": "rotation error, median °",
     "rotation_error_mean_deg": "rotation error, mean °",
@@ -55,12 +55,12 @@ MEASURES = {
     "peak_memory_mb": "most memory, MB",
     "memory_growth_mb": "growth of memory, MB",
 }
-"""Measures of the table, and what it calls them."""
+"""Measures of the table, and their names in it."""
 
 _NOTE = (
     "Rotation errors are aligned by one rotation and all frames count: one called lost with the error of its pose, "
     "and as wrong for the share under 5°; one without a pose as 180°. Means are over the sequences for which every "
-    "column has the figure. Seconds of refined answers hold those of the causal ones."
+    "column has the figure. Seconds of refined estimates hold those of the causal ones."
 )
 
 
@@ -73,7 +73,7 @@ class SideBySide:
         caption: What it shows, on which data, with which settings.
         columns: Their names.
         sequences: Their names.
-        figures: By measure, column and sequence, where known.
+        figures: By measure, column and sequence, if known.
         notes: Why something is missing.
     """
 
@@ -145,8 +145,8 @@ def fill(
         out: Folder of the benchmark.
         patterns: Only solvers with features that match any of them, such as ``*RGB``; all if there is none.
         processes: Jobs at a time.
-        listener: Is told of every job.
-        address: Of a Ray cluster that runs them; this machine if None.
+        listener: Called for every job.
+        address: Address of a Ray cluster that runs them; this machine if None.
 
     Raises:
         InputError: If a pattern matches nothing.
@@ -170,7 +170,7 @@ def fill(
 
 
 def tabulate_results(results: Sequence[ResultSet], caption: str, notes: Sequence[str] = ()) -> SideBySide:
-    """Result sets of the same data as columns; one with refined answers makes two."""
+    """Result sets of the same data as columns; one with refined estimates makes two."""
     columns = [half for one in results for half in one.split()]
     failed = [f"{one.label} failed on {', '.join(one.errors)}." for one in results if one.errors]
     sequences = dict.fromkeys(name for one in columns for name in one.scores)

@@ -1,4 +1,4 @@
-"""How far answers for the same video part: on other processors, by another renderer, with next to no noise.
+"""How much estimates for the same video differ: on other processors, by another renderer, with next to no noise.
 
 What rounding or one grey level changes is not known better than that: a spread is the least that any figure of the
 same sequences is uncertain by.
@@ -40,7 +40,7 @@ MEASURES = {
 """Measures that are printed: what tables call them, and whether more is better."""
 
 LOST_DEGREES = 20.0
-"""Median rotation error from which a sequence counts as lost, as it does where half of its frames are called so."""
+"""Median rotation error from which a sequence counts as lost, as it does if half of its frames are lost."""
 
 
 @dataclass(frozen=True)
@@ -119,10 +119,10 @@ def run_spread(
         out: Folder of the benchmark.
         patterns: Only variants that match any of them, beside the one as it is; all if there is none.
         processes: Jobs at a time.
-        listener: Is told of every job.
+        listener: Called for every job.
 
     Raises:
-        InputError: If a pattern matches nothing, or the masks of ``base`` cannot be meant.
+        InputError: If a pattern matches nothing, or the source of masks of ``base`` does not exist.
     """
     variants, left_out = plan(base)
     for pattern in patterns:
@@ -210,8 +210,8 @@ def describe_flips(results: Sequence[ResultSet]) -> str:
     flipped = flips(results)
     if not flipped:
         return "No sequence is tracked under one variant and lost under another."
-    told = (f"{name} (lost {', '.join(labels)})" for name, labels in flipped.items())
-    return f"Tracked under one variant and lost under another: {'; '.join(told)}."
+    lines = (f"{name} (lost {', '.join(labels)})" for name, labels in flipped.items())
+    return f"Tracked under one variant and lost under another: {'; '.join(lines)}."
 
 
 def write_spreads(
@@ -257,5 +257,5 @@ def _means(found: Sequence[Spread]) -> tuple[list[str], list[list[str]]]:
 
 
 def _fine(value: float, measure: str) -> str:
-    """Degrees with two digits: differences are what is shown here."""
+    """Degrees with two digits, as differences are shown here."""
     return f"{value:.2f}" if measure.endswith("_deg") else figure(value, measure)

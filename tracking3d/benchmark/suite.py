@@ -22,11 +22,11 @@ def run_suite(
 ) -> list[ResultSet]:
     """Run every variant on every sequence; one result set a variant, in their order.
 
-    What is finished is kept in ``out`` and not done again while configuration, masks, frames and code are the same.
+    Finished runs are saved in ``out`` and not repeated while configuration, masks, frames and code are the same.
     A sequence that fails is named in the result set. With the ``address`` of a Ray cluster the jobs run there.
 
     Raises:
-        InputError: If a variant's masks cannot be meant.
+        InputError: If a variant's source of masks does not exist.
     """
     for variant in variants:
         check_masks(variant.masks)

@@ -1,4 +1,4 @@
-"""Filling a table of the paper, and writing it as Markdown, CSV, JSON and a picture."""
+"""Filling a table of the paper, and writing it as Markdown, CSV, JSON and an image."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class Line:
-    """A filled row: the paper's figures and those measured here; None where there is none.
+    """A filled row: the paper's figures and those measured here; None if there is none.
 
     Attributes:
         label: The row's name.
@@ -47,10 +47,10 @@ class Line:
         paper_gain_percent: The paper's gain over the initial masks.
         here: The same measure here.
         gain_percent: Gain of the mean IoU over that of the initial masks here.
-        rotation_error_mean_deg: Mean rotation error, where the poses are known.
+        rotation_error_mean_deg: Mean rotation error, if the poses are known.
         seconds_per_frame: Mean wall time.
         sequences: Number of sequences that the figures here are the mean of.
-        improved: Number of those whose mean IoU is above that of their initial masks; None where none is compared.
+        improved: Number of those whose mean IoU is above that of their initial masks; None if none is compared.
         note: Why something is missing.
     """
 
@@ -91,7 +91,8 @@ def fill(
     listener: Listener = lambda outcome: None,
     address: str | None = None,
 ) -> Filled:
-    """Run what a table needs and put it beside the paper's figures; every result set is written to ``out/results``.
+    """Make the runs of a table and compare them with the paper's figures; every result set is written to
+    ``out/results``.
 
     Args:
         table: Which one.
@@ -100,8 +101,8 @@ def fill(
         out: Folder of the benchmark.
         processes: Jobs at a time.
         initial: Folders of initial masks by tracker, in lower case.
-        listener: Is told of every job.
-        address: Of a Ray cluster that runs them; this machine if None.
+        listener: Called for every job.
+        address: Address of a Ray cluster that runs them; this machine if None.
     """
     plan = table.plan(base, dataset.synthetic, initial or {})
     chosen = _choose_sequences(table, dataset)
@@ -133,7 +134,7 @@ def _choose_sequences(table: Table, dataset: Dataset) -> Dataset:
 def _lines(
     row: TableRow, table: Table, plan: Mapping[str, Variant | str], results: Mapping[str, ResultSet]
 ) -> list[Line]:
-    """A row's line; two, causal and refined, where its run has both answers and the row shows answers."""
+    """A row's line; two, causal and refined, if its run has both estimates and the row shows estimates."""
     result = results.get(row.plan)
     if result is None or row.initial or not result.causal:
         return [_line(row, table, plan, results)]

@@ -1,6 +1,6 @@
-"""The paper's Tables 1 to 5 and its figure on keyframes, and what is run to stand beside them.
+"""The paper's Tables 1 to 5 and its figure on keyframes, and the runs that are compared with them.
 
-Where the real dataset is absent, the rows run on a synthetic suite: each initial tracker is then the true masks
+If the real dataset is absent, the rows run on a synthetic suite: each initial tracker is then the true masks
 degraded to the mean IoU that the paper gives for it.
 """
 
@@ -22,7 +22,7 @@ Plan = dict[str, "Variant | str"]
 """What is run, by name; a text says why it cannot be."""
 
 DEEP = "s2dnet"
-"""The feature encoder that stands for the paper's S2DNet."""
+"""The feature encoder used for the paper's S2DNet."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class TableRow:
     Attributes:
         label: Its name.
         paper: What the paper prints there, if anything.
-        plan: Name in the plan of what is run for it; empty where the paper stands alone.
-        initial: Whether it shows the initial masks of that run, not its answers.
+        plan: Name of its run in the plan; empty if there are only the paper's figures.
+        initial: Whether it shows the initial masks of that run, not its estimates.
     """
 
     label: str
@@ -49,7 +49,7 @@ class Table:
     Attributes:
         name: Its name on the command line.
         title: What it is.
-        source: Where it stands in the paper.
+        source: Its place in the paper.
         dataset: Layout of the real dataset.
         rows: Its rows.
         plan: What is run: from the settings to start with, whether the data are synthetic, and folders of initial
@@ -88,7 +88,7 @@ class Table:
 
 
 def _start_from(base: Variant, label: str, iou: float, synthetic: bool, given: Path | None) -> Variant | str:
-    """``base`` from the masks of the tracker ``label``: its own where given, their likeness on synthetic data."""
+    """``base`` from the masks of the tracker ``label``: its own if given, similar ones on synthetic data."""
     if given is not None:
         return base.with_changes(label, masks=str(given))
     if synthetic:
@@ -146,7 +146,7 @@ LOSSES: dict[str, dict[str, Any]] = {
     "no L_T": {"solver__weights__total_variation": 0.0},
     "L_T as in the paper": {"solver__weights__total_variation": 0.001},
 }
-"""Settings that switch a loss off, by row. `distance` is relative to `silhouette`, so that its own share is kept."""
+"""Settings that switch a loss off, by row. `distance` is relative to `silhouette`, so that its own share stays."""
 
 
 def _ablation_start(base: Variant, synthetic: bool, initial: Mapping[str, Path]) -> Variant | str:

@@ -1,6 +1,6 @@
 """How fast a clip is tracked, end to end: this version, the paper's preset and an earlier version, one after the other.
 
-Each is a command of its own, ``tracking3d run``, in a process of its own; what is told is read from its run folder and
+Each is a command of its own, ``tracking3d run``, in a process of its own; the figures are read from its run folder and
 from what the system says of the process. So an earlier version is measured as this one is, whatever it is like inside.
 """
 
@@ -52,15 +52,15 @@ class TrackSpeed:
     """What one run took.
 
     Attributes:
-        name: Of the contender.
-        frames: Frames with a causal answer.
+        name: Name of the contender.
+        frames: Frames with a causal estimate.
         wall: Seconds of the whole command, start of the process and imports included.
-        processor: Seconds of all processors for it; None where the system does not say.
-        first_answer: Seconds from the command to the first answer: start of the process, imports, and that frame.
-        frames_per_second: Causal answers a second of wall time, from the first to the last.
-        delays: Seconds from when a frame is asked for to when its answer is written: percentiles as `PERCENTILES`.
+        processor: Seconds of all processors for it; None if the system does not say.
+        first_answer: Seconds from the command to the first estimate: start of the process, imports, and that frame.
+        frames_per_second: Causal estimates a second of wall time, from the first to the last.
+        delays: Seconds from when a frame is asked for to when its estimate is written: percentiles as `PERCENTILES`.
         stages: Mean seconds a frame.
-        refinement: Seconds a frame of the final refinement; None where there is none.
+        refinement: Seconds a frame of the final refinement; None if there is none.
         peak_memory: Megabytes.
         over_time: ``(N, stages)`` seconds of every frame, in the order of `STAGES`.
     """
@@ -92,7 +92,7 @@ def measure(
         contenders: Who takes part.
         folder: For run folders.
         repeats: How often.
-        listener: Is told what is done.
+        listener: Called with the present step.
 
     Raises:
         InputError: If the clip has no box in its first frame, or a run fails; in its own words.
@@ -122,14 +122,14 @@ def _run(truth: Truth, contender: Contender, folder: Path, frames: int | None) -
     done = _python(contender, "tracking3d", *command)
     wall, after = time.perf_counter() - started, _processor()
     if done.returncode:
-        said = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
+        said = (done.stderr.strip().splitlines() or ["no error output"])[-1]
         raise InputError(f"{contender.name} cannot track {truth.name}: {said}")
     spent = None if before is None or after is None else after - before
     return _parse_speed(contender.name, folder, wall, spent)
 
 
 def _compile_ahead(contender: Contender) -> None:
-    """Compile its kernels, where its version can: a few frames do not come to all of them."""
+    """Compile its kernels, if its version can: a few frames do not use all of them."""
     _python(contender, "tracking3d.speed.kernels_ahead")
 
 
@@ -145,17 +145,17 @@ def _python(contender: Contender, module: str, *words: str) -> subprocess.Comple
 
 
 def _parse_speed(name: str, folder: Path, wall: float, processor: float | None) -> TrackSpeed:
-    """What a run folder tells of its run."""
+    """The figures in a run folder."""
     reader = RunReader(folder)
     run = reader.description
     first: dict[int, FrameRecord] = {}
     for record in read_records(folder / layout.FRAMES):
         if not record.refined and not record.revision:
             first.setdefault(record.index, record)
-    answers = list(first.values())
-    if not answers:
-        raise InputError(f"{name} has answered no frame; see {folder}.")
-    times = [record.stages or StageTimes(solve=record.seconds) for record in answers]
+    records = list(first.values())
+    if not records:
+        raise InputError(f"{name} has estimated no frame; see {folder}.")
+    times = [record.stages or StageTimes(solve=record.seconds) for record in records]
     whole = [one.whole for one in times]
     refinement = run.get("refinement") or {}
     again = float(refinement.get("seconds") or 0.0) if refinement.get("state") == "finished" else 0.0
@@ -163,14 +163,14 @@ def _parse_speed(name: str, folder: Path, wall: float, processor: float | None) 
     rest = causal - whole[0]
     return TrackSpeed(
         name=name,
-        frames=len(answers),
+        frames=len(records),
         wall=wall,
         processor=processor,
         first_answer=max(wall - causal - again, 0.0) + whole[0],
-        frames_per_second=(len(answers) - 1) / rest if len(answers) > 1 and rest > 0 else None,
+        frames_per_second=(len(records) - 1) / rest if len(records) > 1 and rest > 0 else None,
         delays=tuple(float(np.percentile(whole, share)) for share in PERCENTILES),
         stages=sum(times, StageTimes()) * (1 / len(times)),
-        refinement=again / len(answers) if again else None,
+        refinement=again / len(records) if again else None,
         peak_memory=run.get("peak_memory_mb"),
         over_time=tuple(tuple(getattr(one, stage) for stage in STAGES) for one in times),
     )
@@ -191,7 +191,7 @@ def check_out(tag: str, folder: Path) -> Path:
             f"--against {tag} needs git, which cannot be run: {error.strerror or error}."
         ) from error
     if done.returncode:
-        said = (done.stderr.decode(errors="replace").strip().splitlines() or ["git said nothing"])[-1]
+        said = (done.stderr.decode(errors="replace").strip().splitlines() or ["no output of git"])[-1]
         raise InputError(
             f"--against {tag} is no version that can be had from the git checkout {root}: {said}."
         )

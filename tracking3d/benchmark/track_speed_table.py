@@ -25,7 +25,7 @@ def speed_table(speeds: Sequence[TrackSpeed]) -> Table:
     rows: list[tuple[str, list[str]]] = [
         ("frames", [str(one.frames) for one in speeds]),
         ("frames a second, after the first", [_number(one.frames_per_second, 2) for one in speeds]),
-        ("first answer, s", [_number(one.first_answer, 1) for one in speeds]),
+        ("first estimate, s", [_number(one.first_answer, 1) for one in speeds]),
         ("whole command, s", [_number(one.wall, 1) for one in speeds]),
         ("  of all processors, s", [_number(one.processor, 1) for one in speeds]),
         *(
@@ -42,7 +42,7 @@ def speed_table(speeds: Sequence[TrackSpeed]) -> Table:
 
 
 def stage_table(speeds: Sequence[TrackSpeed]) -> Table:
-    """Mean milliseconds a frame of every stage, and its share; what is done beside the frames counts too."""
+    """Mean milliseconds a frame of every stage, and its share; one-time work counts too."""
     table = Table(box=None, pad_edge=False)
     table.add_column("mean of a frame, ms")
     for speed in speeds:

@@ -1,4 +1,4 @@
-"""What is tried on every sequence: a configuration and where the initial masks come from."""
+"""A variant that is run on every sequence: a configuration and a source of initial masks."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Variant(BaseModel):
 
     @property
     def disturbance(self) -> tuple[Any, ...]:
-        """What a run depends on beside configuration and masks; empty where that is nothing."""
+        """What else a run depends on besides configuration and masks; empty if nothing."""
         return (self.environment, self.grey_noise) if self.environment or self.grey_noise is not None else ()
 
     def with_changes(self, label: str, *, masks: str | None = None, **settings: Any) -> Variant:
@@ -91,7 +91,7 @@ def noise_pixels(masks: str) -> float:
 
 
 def check_masks(masks: str) -> None:
-    """Make sure that a source of masks can be meant.
+    """Check that a source of masks exists.
 
     Raises:
         InputError: If it is none of the words, and no folder.

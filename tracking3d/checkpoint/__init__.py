@@ -1,1 +1,1 @@
-"""The state of a run between two frames, kept beside its answers so that a stopped run can go on."""
+"""The state of a run between two frames, saved beside its estimates so that a stopped run can be resumed."""

@@ -1,4 +1,4 @@
-"""The state of a run on disk: one JSON file that is replaced whole, and what it names beside it.
+"""The checkpoint of a run on disk: one JSON file that is replaced whole, and the files that it names.
 
 After a kill at any moment it is the state of one finished frame: arrays and the journal are written first, and a file
 that the state names is removed only once another state has taken its place.
@@ -24,19 +24,19 @@ from tracking3d.frames import SkippedFrame
 from tracking3d.results import layout
 from tracking3d.results.files import read_mask, write_atomic, write_mask, writing
 
-VERSION = 1
+VERSION = 2
 MOST_KEPT = 200 * 10**6
-"""Bytes that milestones may take in the folder of a run that is finished."""
+"""Bytes that rollback points may take in the folder of a run that is finished."""
 
 
 class Checkpoint:
-    """Keeps the state of one run, in `layout.STATE` of its folder.
+    """Saves the state of one run, in `layout.STATE` of its folder.
 
     Args:
         folder: The run folder.
         classes: See `TreeFolder`.
         device: See `TreeFolder`.
-        milestones: How many states of earlier frames may be kept, see `tracking3d.checkpoint.milestones`.
+        milestones: Number of rollback points that may be saved, see `tracking3d.checkpoint.milestones`.
 
     Raises:
         OutputError: If the folder cannot be written.
@@ -50,12 +50,12 @@ class Checkpoint:
             self._folder.mkdir(exist_ok=True)
         self._trees = TreeFolder(self._folder, classes, device)
         self._milestones = Milestones(self._folder, milestones)
-        self._taken: dict[int, int] = {}  # how many frames were taken when each of them was
+        self._taken: dict[int, int] = {}  # number of frames taken up to each of them
         self._journal = 0
         self._waiting = b""
 
     def note(self, frame: SkippedFrame | JournalEntry) -> None:
-        """Remember a frame that was not taken, or whose state is of no use; it is kept with the next state."""
+        """Note a frame that was skipped, or whose state is not saved; it is written with the next state."""
         self._waiting += journal_line(frame)
 
     def save(
@@ -65,17 +65,17 @@ class Checkpoint:
         taken: JournalEntry | None = None,
         revised: Iterable[int] = (),
     ) -> None:
-        """Keep the state after a frame.
+        """Save the state after a frame.
 
         Args:
-            progress: Where the run stands.
+            progress: Progress of the run.
             session: The session's state.
-            taken: The frame, where it was taken for the first time.
-            revised: Earlier frames whose answers are others since it: no correction can go on from between.
+            taken: The frame, if it was taken for the first time.
+            revised: Earlier frames whose estimates it changed: no correction can continue from between.
 
         Raises:
             OutputError: If it cannot be written; the state before is then still there.
-            UnkeptError: If the session holds what cannot be kept.
+            NotSerializableError: If the session holds an object that cannot be saved.
         """
         lines = self._waiting + (journal_line(taken) if taken else b"")
         with writing(self._folder):
@@ -99,17 +99,18 @@ class Checkpoint:
             self._trees.tidy(self._milestones.arrays)
 
     def read(self) -> SavedState:
-        """What was kept last.
+        """Read the last saved state.
 
         Raises:
-            InputError: If it is damaged, or of another version.
+            InputError: If it is damaged, or was written by another version.
         """
         path = self._folder / layout.STATE_FILE
         try:
             state = json.loads(path.read_bytes())
             if state["version"] != VERSION:
                 raise InputError(
-                    f"{path} was written by another version of tracking3d; start anew with {layout.OVERWRITE}."
+                    f"{path} was written by another version of tracking3d (format {state['version']}); "
+                    f"run it again with {layout.OVERWRITE}."
                 )
             self._journal = int(state["journal"])
             journal = self._folder / layout.JOURNAL
@@ -122,7 +123,7 @@ class Checkpoint:
                 RunProgress(**state["progress"]), self._trees.read(state["session"]), taken, skipped
             )
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(f"{path} is damaged ({error}); start anew with {layout.OVERWRITE}.") from error
+            raise InputError(f"{path} is damaged ({error}); run it again with {layout.OVERWRITE}.") from error
         return kept
 
     def clear_strangers(self) -> None:
@@ -136,7 +137,7 @@ class Checkpoint:
             self._trees.clear_strangers(self._milestones.arrays)
 
     def keep_correction(self, index: int, mask: NDArray[np.bool_]) -> None:
-        """Keep the mask ``(H, W)`` that was handed back to the mask tracker in frame ``index``.
+        """Save the mask ``(H, W)`` that was fed back to the mask tracker in frame ``index``.
 
         Raises:
             OutputError: If it cannot be written.
@@ -147,18 +148,18 @@ class Checkpoint:
         write_mask(path, mask)
 
     def correction(self, index: int) -> NDArray[np.bool_]:
-        """That mask again.
+        """Read that mask.
 
         Raises:
             InputError: If it is missing or damaged.
         """
         mask = read_mask(path := layout.mask_path(self._folder, index))
         if mask is None:
-            raise InputError(f"{path} is missing or damaged; start anew with {layout.OVERWRITE}.")
+            raise InputError(f"{path} is missing or damaged; run it again with {layout.OVERWRITE}.")
         return mask
 
     def finish(self) -> None:
-        """The run is finished: keep its milestones only, see `finish_state`.
+        """Keep only the rollback points of the finished run, see `finish_state`.
 
         Raises:
             OutputError: If something cannot be removed.
@@ -166,7 +167,7 @@ class Checkpoint:
         finish_state(self._folder.parent)
 
     def remove(self) -> None:
-        """Remove what was kept.
+        """Remove the checkpoint.
 
         Raises:
             OutputError: If it cannot be removed.
@@ -175,7 +176,7 @@ class Checkpoint:
 
 
 def finish_state(folder: Path, most: int | None = None) -> None:
-    """Leave of the state of a finished run what a correction goes on from, where that is not too large.
+    """Reduce the checkpoint of a finished run to its rollback points, if these are not too large.
 
     Args:
         folder: The run folder.
@@ -190,14 +191,14 @@ def finish_state(folder: Path, most: int | None = None) -> None:
 
 
 def remove_state(folder: Path) -> None:
-    """Remove the state that is kept in a run folder, if there is one.
+    """Remove the checkpoint in a run folder, if there is one.
 
     Raises:
         OutputError: If it cannot be removed.
     """
     inner = folder / layout.STATE
     with writing(inner):
-        # The state first: without it nobody looks for the rest.
+        # The state first: without it the rest is not read.
         files = sorted(layout.state_files(folder), key=lambda path: path.name != layout.STATE_FILE)
         for path in files:
             path.unlink(missing_ok=True)

@@ -1,7 +1,7 @@
-"""States of earlier frames that are kept beside the latest, for a correction of a frame to go on from.
+"""Rollback points: saved states of earlier frames, from which a correction of a frame continues.
 
-A milestone is the state's text as it was after a frame; what it names stays. Its arrays are mostly those of the states
-around it, so that few of them, spread evenly over the run, cost little.
+A rollback point is the state's text as it was after a frame; the files that it names stay. Its arrays are mostly those
+of the states around it, so that few of them, spread evenly over the run, cost little.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Milestone:
 
     @property
     def bytes(self) -> int:
-        """Of its text; arrays are shared."""
+        """Bytes of its text; arrays are shared."""
         return self.path.stat().st_size
 
 
@@ -48,7 +48,7 @@ class Milestones:
     """Those of one run, at most so many, spread evenly over its frames.
 
     Args:
-        folder: Where the state lies.
+        folder: The folder of the state.
         most: How many there may be; 0 for none.
     """
 
@@ -58,7 +58,7 @@ class Milestones:
         self._gap = _FIRST_GAP
 
     def read(self, taken: int) -> None:
-        """Take those that are there, of a run that goes on after so many frames; later ones are removed."""
+        """Read those of a run that is resumed after so many frames; later ones are removed."""
         self._kept = milestones_in(self._folder)
         self.forget_after(taken)
         self._gap = math.gcd(*(one.taken for one in self._kept)) or _FIRST_GAP
@@ -69,7 +69,7 @@ class Milestones:
         return frozenset().union(*(one.arrays for one in self._kept))
 
     def due(self, taken: int) -> bool:
-        """Whether the state after so many frames is to be kept."""
+        """Whether the state after so many frames is to be saved."""
         return self._most > 0 and taken % self._gap == 0
 
     def keep(self, state: Path, taken: int, arrays: frozenset[str]) -> None:
@@ -91,7 +91,7 @@ class Milestones:
             self._drop([one for one in self._kept if one.taken % self._gap])
 
     def forget_after(self, taken: int) -> None:
-        """Remove those of after so many frames: an answer from before them is another one now.
+        """Remove those after so many frames, since an earlier estimate has changed.
 
         Raises:
             OSError: If one cannot be removed.
@@ -105,7 +105,7 @@ class Milestones:
 
 
 def milestones_in(folder: Path) -> list[Milestone]:
-    """The milestones in the folder of a state, the earliest first."""
+    """The rollback points in the folder of a state, the earliest first."""
     found = []
     for path in sorted(folder.glob("milestone_*.json")) if folder.is_dir() else ():
         if name := _NAME.fullmatch(path.name):
@@ -115,12 +115,12 @@ def milestones_in(folder: Path) -> list[Milestone]:
 
 
 def keep_milestones_only(folder: Path, most_bytes: int) -> None:
-    """Leave of the state in a run folder what its milestones need, and of these no more than take so many bytes.
+    """Reduce the checkpoint in a run folder to its rollback points, and these to so many bytes.
 
     Args:
         folder: The run folder.
-        most_bytes: Before they are compressed. Every second milestone goes until the rest is no larger; the last one
-            stays longest.
+        most_bytes: Their largest size, before compression. Every second rollback point goes until the rest is no
+            larger; the last one stays longest.
 
     Raises:
         OSError: If a file cannot be removed.
@@ -146,7 +146,7 @@ def keep_milestones_only(folder: Path, most_bytes: int) -> None:
 
 
 def link_or_copy(source: Path, target: Path) -> None:
-    """Give a file that is never written over a second name, or where that cannot be, copy it.
+    """Hard-link a file that is never overwritten; copy it if that is not possible.
 
     Raises:
         OSError: If it cannot be written.
@@ -159,7 +159,7 @@ def link_or_copy(source: Path, target: Path) -> None:
 
 
 def _compress(path: Path) -> None:
-    """Write an array file anew, a third as large; while the run goes on there is no time for that."""
+    """Write an array file again, compressed to a third; during the run there is no time for that."""
     with zipfile.ZipFile(path) as file:
         if all(one.compress_type == zipfile.ZIP_DEFLATED for one in file.infolist()):
             return

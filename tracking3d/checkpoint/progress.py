@@ -16,14 +16,14 @@ from tracking3d.frames import Frame, SkippedFrame
 
 @dataclass(frozen=True)
 class RunProgress:
-    """Where a run stands.
+    """Progress of a run.
 
     Attributes:
-        last: Index of the last frame that has its causal answer; -1 before the first.
+        last: Index of the last frame that has its causal estimate; -1 before the first.
         lines: Bytes of ``frames.jsonl`` up to there.
         refining: Whether everything was solved once more.
-        last_refined: Index of the last frame that was looked at again; -1 before the first.
-        refined_lines: Bytes of the second answers up to there.
+        last_refined: Index of the last frame that was refined; -1 before the first.
+        refined_lines: Bytes of the refined estimates up to there.
         seconds: Wall time of the run up to there, pauses left out.
         refinement_seconds: The same of the final refinement.
     """
@@ -39,14 +39,14 @@ class RunProgress:
 
 @dataclass(frozen=True)
 class JournalEntry:
-    """What the journal says of a frame that was tracked, beside what ``frames.jsonl`` says of it.
+    """The journal's record of a tracked frame, with what ``frames.jsonl`` does not hold.
 
     Attributes:
         index: The frame's index in the source.
         picture: Checksum of its image, see `checksum`.
-        score: Of its initial mask; reason: of the same.
-        corrected: Whether the answer was handed back to the mask tracker.
-        failure: Which plug-in failed at it, and why; empty where none did.
+        score: Score of its initial mask; reason: of the same.
+        corrected: Whether the estimate was fed back to the mask tracker.
+        failure: Which plug-in failed at it, and why; empty if none did.
     """
 
     index: int
@@ -62,8 +62,8 @@ class SavedState:
     """A run that was stopped.
 
     Attributes:
-        progress: Where it stands.
-        session: The session's state, see `tracking3d.pipeline.session.Session.kept`.
+        progress: Its progress.
+        session: The session's state, see `tracking3d.pipeline.session.Session.state_dict`.
         taken: The frames that were taken, by index.
         skipped: Those that were not.
     """
@@ -75,7 +75,7 @@ class SavedState:
 
 
 def checksum(image: NDArray[np.uint8]) -> int:
-    """A number that tells one image from another."""
+    """The CRC-32 of an image."""
     return zlib.crc32(np.ascontiguousarray(image).reshape(-1).data)
 
 
@@ -108,7 +108,7 @@ def read_journal(text: bytes) -> tuple[dict[int, JournalEntry], tuple[SkippedFra
 
 
 def check_picture(kept: SavedState, frame: Frame | SkippedFrame) -> None:
-    """Make sure that a frame is the one that was answered before the run was stopped.
+    """Make sure that a frame is the one that was estimated before the run was stopped.
 
     Raises:
         InputError: If it is not.
@@ -120,6 +120,6 @@ def check_picture(kept: SavedState, frame: Frame | SkippedFrame) -> None:
         )
     if taken is not None and taken.picture != checksum(frame.image):
         raise InputError(
-            f"{frame.name or f'frame {frame.index}'} shows another picture than when it was answered; a run goes "
-            "on with the same source only."
+            f"{frame.name or f'frame {frame.index}'} shows another image than when it was estimated; a run is "
+            "resumed with the same source only."
         )

@@ -1,4 +1,4 @@
-"""Whether a run folder holds a run that can go on, and with what is asked for now."""
+"""Whether a run folder holds a run that can be continued with the present request."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from tracking3d.results.records import jsonable
 from tracking3d.results.run_reader import RunReader
 
 Earlier = Literal["none", "stopped", "finished", "outdated"]
-"""What is in a run folder: nothing that could be resumed, a run that was stopped, one that is done, or one in which a
-frame that is answered is now corrected."""
+"""The run in a folder: nothing that could be resumed, a run that was stopped, one that is finished, or one in which an
+estimated frame is now corrected."""
 
 
 def prompt_record(
@@ -31,14 +31,14 @@ def prompt_record(
     start_frame: int | None = None,
     corrections: Iterable[Correction] = (),
 ) -> dict[str, Any]:
-    """What tells a source and the object in it apart from others, for ``run.json``.
+    """The identity of a source and the object in it, for ``run.json``.
 
     Args:
         first: The first frame.
         prompt: The object in it.
-        count: Number of frames, where known.
-        start_frame: The frame from which it is tracked both ways; None where frames come in order of time.
-        corrections: What was said of the object in later frames.
+        count: Number of frames, if known.
+        start_frame: The frame from which it is tracked both ways; None if frames come in order of time.
+        corrections: Prompts in later frames.
     """
     height, width = first.size
     mask = None if prompt is None or prompt.mask is None else checksum(prompt.mask.astype("uint8"))
@@ -49,7 +49,7 @@ def prompt_record(
         "width": width,
         "height": height,
         "first_frame": first.index,
-        "first_picture": checksum(first.image),
+        "first_image_crc": checksum(first.image),
         "box": None if prompt is None else [float(value) for value in prompt.box],
         "mask": mask,
         "points": None if prompt is None or prompt.points is None else prompt.points.tolist(),
@@ -57,7 +57,7 @@ def prompt_record(
 
 
 def _correction_record(correction: Correction) -> dict[str, Any]:
-    """A correction as ``run.json`` has it."""
+    """A correction for ``run.json``."""
     mask, points = correction.mask, correction.points
     return {
         "frame": correction.frame,
@@ -73,18 +73,18 @@ _NAMES = {
     "width": "width of the frames",
     "height": "height of the frames",
     "first_frame": "index of the first frame",
-    "first_picture": "first picture",
+    "first_image_crc": "first image",
     "box": "object's box",
     "mask": "object's mask",
     "points": "object's points",
 }
-_CHECKSUMS = ("first_picture", "mask")
+_CHECKSUMS = ("first_image_crc", "mask")
 
 
 def earlier_run(
     folder: Path, config: Mapping[str, Any], selection: str | None, given: Mapping[str, Any]
 ) -> Earlier:
-    """What is in a run folder, as far as a run of these settings and this source can go on with it.
+    """The run in a folder, as far as a run of these settings and this source can continue it.
 
     Args:
         folder: The run folder.
@@ -93,8 +93,8 @@ def earlier_run(
         given: See `prompt_record`.
 
     Raises:
-        InputError: If the run there is of other settings or another source, or its state was not kept.
-        OutputError: If it goes on at this moment.
+        InputError: If the run there has other settings or another source, or its state was not saved.
+        OutputError: If it is running at this moment.
     """
     if not (folder / layout.RUN).is_file():
         return "none"
@@ -103,25 +103,25 @@ def earlier_run(
         raise OutputError(f"{folder} is in use by another run; wait for it or choose another {layout.OUT}.")
     finished = run.state == "finished"
     if not finished and not layout.has_state(folder):
-        if len(run.frames) <= 1:  # stopped before the first state was kept
+        if len(run.frames) <= 1:  # stopped before the first state was saved
             return "none"
         raise InputError(
-            f"The run {folder} cannot be resumed: its state was not kept; start anew with {layout.OVERWRITE}."
+            f"The run {folder} cannot be resumed: its state was not saved; run it again with {layout.OVERWRITE}."
         )
     if what := next(_differences(run.description, config, selection, given), None):
         raise InputError(
             f"The run {folder} cannot be resumed with other settings or another source: {what}; "
-            f"give what it was begun with, or start anew with {layout.OVERWRITE}."
+            f"use the same settings and source, or run it again with {layout.OVERWRITE}."
         )
     if changed := _changed(run.description, given):
-        answered = {record.index for record in run.frames}
-        if finished or changed & answered:
+        estimated = {record.index for record in run.frames}
+        if finished or changed & estimated:
             return "outdated"
     return "finished" if finished else "stopped"
 
 
 def changed_frames(folder: Path, given: Mapping[str, Any]) -> set[int]:
-    """The frames of the run in a folder that are corrected now and were not, or otherwise.
+    """The frames of the run in a folder whose correction is new or differs.
 
     Raises:
         InputError: If the run is damaged.
@@ -130,8 +130,8 @@ def changed_frames(folder: Path, given: Mapping[str, Any]) -> set[int]:
 
 
 def _changed(before: Mapping[str, Any], given: Mapping[str, Any]) -> set[int]:
-    """Frames that are corrected now and were not, or otherwise."""
-    then, now = _by_frame(before.get("given") or {}), _by_frame(given)
+    """Frames whose correction is new or differs."""
+    then, now = _by_frame(before.get("prompt") or {}), _by_frame(given)
     return {frame for frame in now if then.get(frame) != now[frame]}
 
 
@@ -142,16 +142,16 @@ def _by_frame(given: Mapping[str, Any]) -> dict[int, Any]:
 def _differences(
     before: Mapping[str, Any], config: Mapping[str, Any], selection: str | None, given: Mapping[str, Any]
 ) -> Iterator[str]:
-    """What is not as it was, in words."""
+    """The differences, in words."""
     if before.get("selection") != selection:
         yield f"the selection of frames was {before.get('selection')} and is {selection}"
     then, now = _flat(_complete(before["config"])), _flat(jsonable(config))
     for key in sorted(then.keys() | now.keys()):
         if then.get(key) != now.get(key):
             yield f"{key} was {then.get(key)} and is {now.get(key)}"
-    earlier = before.get("given") or {}
+    earlier = before.get("prompt") or {}
     if gone := sorted(_by_frame(earlier).keys() - _by_frame(given).keys()):
-        yield f"it was corrected in {_frames(gone)}, which is not asked for now"
+        yield f"it was corrected in {_frames(gone)}, which is not requested now"
     for key, name in _NAMES.items():
         if earlier.get(key) != given[key]:
             was = "is another one" if key in _CHECKSUMS else f"was {earlier.get(key)} and is {given[key]}"
@@ -159,10 +159,10 @@ def _differences(
 
 
 def _complete(config: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The configuration with the defaults of keys that an older version did not know."""
+    """The configuration, with the defaults of keys that were added since."""
     try:
         return PipelineConfig.model_validate(config).model_dump(mode="json")
-    except ValidationError:  # of a newer one, or by hand: what differs is told
+    except ValidationError:  # newer, or edited by hand: the differences are reported
         return config
 
 

@@ -1,4 +1,4 @@
-"""A run as it was before a frame, as a run folder of its own that goes on from there."""
+"""A run rolled back to before a frame, as a run folder of its own that continues from there."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from tracking3d.results.run_reader import RunReader, read_records
 
 
 def roll_back(folder: Path, stage: Path, changed: Collection[int]) -> int | None:
-    """Make of an empty folder the run as it was, stopped, before the first of some frames was taken.
+    """Copy a run, rolled back to before the first of some frames, into an empty folder, as a stopped run.
 
     Args:
         folder: The run; nothing of it is changed.
-        stage: Gets the earlier run: its last milestone of before then, and the answers that there were.
+        stage: Gets the earlier run: its last rollback point before then, and its estimates.
         changed: Indices of those frames.
 
     Returns:
-        How many frames are answered in it; None where no state of before then was kept, and nothing was made.
+        Number of frames estimated in it; None if no earlier state was saved, and nothing was copied.
 
     Raises:
         OutputError: If it cannot be written.
@@ -39,7 +39,7 @@ def roll_back(folder: Path, stage: Path, changed: Collection[int]) -> int | None
             journal = (inner / layout.JOURNAL).read_bytes()[: state["journal"]]
             taken, _ = read_journal(journal)
             lines = int(state["progress"]["lines"])
-        except (OSError, ValueError, KeyError, TypeError):  # damaged: an earlier one does it too
+        except (OSError, ValueError, KeyError, TypeError):  # damaged: try an earlier one
             taken, journal, lines = {}, b"", -1
         if lines >= 0 and not taken.keys() & set(changed):
             _copy_run(folder, stage, milestones, journal, lines)
@@ -74,18 +74,18 @@ def _copy_run(folder: Path, stage: Path, milestones: list[Milestone], journal: b
             link_or_copy(one.path, stage / layout.STATE / one.path.name)
         (stage / layout.STATE / layout.JOURNAL).write_bytes(journal)
         link_or_copy(milestones[-1].path, stage / layout.STATE / layout.STATE_FILE)
-    told = {**run.description, "state": "interrupted", "refinement": None}
-    corrections = (run.description.get("given") or {}).get("corrections") or []
-    answered = {record.index for record in records}
-    told["given"] = {
-        **(run.description.get("given") or {}),
-        "corrections": [one for one in corrections if one["frame"] in answered],
+    description = {**run.description, "state": "interrupted", "refinement": None}
+    corrections = (run.description.get("prompt") or {}).get("corrections") or []
+    estimated = {record.index for record in records}
+    description["prompt"] = {
+        **(run.description.get("prompt") or {}),
+        "corrections": [one for one in corrections if one["frame"] in estimated],
     }
-    write_atomic(stage / layout.RUN, json.dumps(jsonable(told)).encode() + b"\n")
+    write_atomic(stage / layout.RUN, json.dumps(jsonable(description)).encode() + b"\n")
 
 
 def remove_run(folder: Path) -> None:
-    """Remove the files of a run, and what of its folders is empty then; others stay.
+    """Remove the files of a run, and its folders if they are empty then; others stay.
 
     Raises:
         OutputError: If one cannot be removed.
@@ -109,14 +109,12 @@ def remove_empty(folder: Path) -> None:
 
 
 def prompt_record_in(run: RunReader) -> dict[str, Any]:
-    """What ``run.json`` tells of source and object, see `tracking3d.checkpoint.resuming.prompt_record`.
+    """The prompt in ``run.json``, see `tracking3d.checkpoint.resuming.prompt_record`.
 
     Raises:
-        InputError: If it does not, as one of an earlier version.
+        InputError: If it has none.
     """
-    given = run.description.get("given")
-    if not isinstance(given, dict):
-        raise InputError(
-            f"The run {run.folder} does not say what it was begun with; make it anew, with the correction."
-        )
-    return given
+    prompt = run.description.get("prompt")
+    if not isinstance(prompt, dict):
+        raise InputError(f"The run {run.folder} names no prompt; run the video again, with the correction.")
+    return prompt

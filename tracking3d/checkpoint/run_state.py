@@ -1,4 +1,4 @@
-"""How far a run is: kept on disk after each step, as long as the session's state can be kept."""
+"""Progress of a run: saved on disk after each step, as long as the session's state can be saved."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ class RunState:
     """The state of one run, and of the stopped run that it resumes.
 
     Args:
-        checkpoint: Where it is kept; None if that is of no use, since the source cannot be read again.
+        checkpoint: The checkpoint; None if it is of no use, since the source cannot be read again.
         kept: The state of the stopped run; None if there is none.
 
     Attributes:
-        checkpoint: As given; None from the moment that the state turns out to be one that cannot be kept.
+        checkpoint: As given; None once the state turns out not to be serializable.
         kept: As given.
         before: How far the stopped run was.
         progress: How far the run is now.

@@ -1,4 +1,4 @@
-"""Trees of dataclasses, arrays and plain values as JSON text; what is large lies in files of its own, each once.
+"""Trees of dataclasses, arrays and plain values as JSON text; large arrays lie in files of their own, each once.
 
 A solver's state is a tree of frozen dataclasses. From one frame to the next most of it is the same object, not only
 the same value: such a part is neither encoded nor written again. Nothing is pickled, and a class is only built if it
@@ -30,7 +30,7 @@ SUFFIX = ".npz"
 
 
 class NotSerializableError(TypeError):
-    """A value that no tree can hold."""
+    """A value cannot be saved in a tree."""
 
 
 @dataclass(eq=False)
@@ -40,7 +40,7 @@ class _Part:
     Attributes:
         value: The object, held so that its identity is not given to another one.
         text: Its JSON.
-        file: The file that it lies in, where it has one.
+        file: Its file, if it has one.
         parts: Objects within it.
     """
 
@@ -50,7 +50,7 @@ class _Part:
     parts: list[_Part] = field(default_factory=list)
 
     def within(self) -> Iterator[_Part]:
-        """This one and all within it, each once or, where one part names it twice, twice."""
+        """This node and all within it, each once, or twice if one node names it twice."""
         waiting, seen = [self], {id(self)}
         while waiting:
             part = waiting.pop()
@@ -64,9 +64,9 @@ class TreeFolder:
     """Arrays of the trees that are written one after the other, in a folder.
 
     Args:
-        folder: Where array files lie; it exists.
+        folder: Existing folder of the array files.
         classes: Dataclasses and enumerations that a tree may hold.
-        device: Where tensors are put when a tree is read.
+        device: The device of the tensors when a tree is read.
     """
 
     def __init__(self, folder: Path, classes: tuple[type, ...], device: str = "cpu") -> None:
@@ -83,7 +83,7 @@ class TreeFolder:
         """The tree as JSON text; arrays that are not in a file yet are written.
 
         Raises:
-            UnkeptError: If something in it cannot be kept.
+            NotSerializableError: If a value in it cannot be saved.
             OSError: If an array cannot be written.
         """
         self._root = _Part(None, "")
@@ -110,7 +110,7 @@ class TreeFolder:
         return frozenset(part.file for part in self._root.within() if part.file)
 
     def tidy(self, needed: Collection[str] = ()) -> None:
-        """Remove the files of what is not in the latest tree, but not those that are ``needed`` otherwise.
+        """Remove the files that the latest tree does not name, except those ``needed`` otherwise.
 
         A file that was needed is removed as soon as it is not.
         """
@@ -168,12 +168,12 @@ class TreeFolder:
             )
             part.text = f'{{"class": "{self._name_of(type(value))}", "fields": {{{inner}}}}}'
         else:
-            raise NotSerializableError(f"a {type(value).__name__} cannot be kept")
+            raise NotSerializableError(f"a {type(value).__name__} cannot be saved")
         return part
 
     def _name_of(self, kind: type) -> str:
         if self._classes.get(kind.__name__) is not kind:
-            raise NotSerializableError(f"a {kind.__name__} cannot be kept")
+            raise NotSerializableError(f"a {kind.__name__} cannot be saved")
         return kind.__name__
 
     def _encode_tensor(self, tensor: Tensor) -> tuple[str, str | None]:
@@ -190,7 +190,7 @@ class TreeFolder:
 
     def _encode_array(self, array: NDArray[Any]) -> tuple[str, str | None]:
         if array.dtype.kind not in "biuf":
-            raise NotSerializableError(f"an array of {array.dtype} cannot be kept")
+            raise NotSerializableError(f"an array of {array.dtype} cannot be saved")
         about: dict[str, Any] = {"array": array.dtype.str, "shape": list(array.shape)}
         if array.nbytes < INLINE:
             data = base64.b64encode(np.ascontiguousarray(array).tobytes()).decode("ascii")
@@ -267,12 +267,12 @@ class TreeFolder:
                 return flat.reshape(shape)
             found: NDArray[Any] = arrays["array"]
         if found.shape != shape or found.dtype != kind:
-            raise ValueError(f"{node['file']} holds another array than was kept")
+            raise ValueError(f"{node['file']} holds another array than was saved")
         return found
 
 
 def _only_zero_and_one(array: NDArray[Any]) -> bool:
-    """Whether a bit is enough for every value; most arrays are told from that by a few of theirs."""
+    """Whether a bit is enough for every value; a few of them already show that most arrays need more."""
     if array.dtype.kind == "b":
         return True
     few = array.reshape(-1)[:: max(array.size // 64, 1)]

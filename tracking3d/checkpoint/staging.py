@@ -30,7 +30,7 @@ def stage_correction(
     given: Mapping[str, Any],
     ends: ExitStack,
 ) -> tuple[Path, Earlier]:
-    """Where a run is computed in which an answered frame is corrected: from the last state before it, if one was kept.
+    """The folder in which a corrected run is computed: from the last state before the correction, if one was saved.
 
     Args:
         folder: The run folder.
@@ -54,15 +54,15 @@ def stage_correction(
     if not try_lock(lock.fileno()):
         raise OutputError(f"{folder} is in use by another run; wait for it.")
     if _goes_on(stage, config, selection, given):
-        _log.info("The correction that was stopped goes on.")
+        _log.info("Continuing the correction that was stopped.")
         return stage, "stopped"
     remove_run(stage)
     changed = changed_frames(folder, given)
-    answered = roll_back(folder, stage, changed)
-    if answered is None:
+    estimated = roll_back(folder, stage, changed)
+    if estimated is None:
         _log.warning(
-            "No state of before frame %d was kept in %s, so that all is computed again; frames before the correction "
-            "get the answers that they had.",
+            "No checkpoint before frame %d is saved in %s, so that all frames are computed again; frames before "
+            "the correction get the estimates that they had.",
             min(changed),
             folder,
         )
@@ -71,7 +71,7 @@ def stage_correction(
 
 
 def take_over(folder: Path) -> None:
-    """Let a corrected run that is finished take the place of the one that it corrects.
+    """Replace a run by its corrected run, if that is finished.
 
     Raises:
         OutputError: If a file cannot be moved.
@@ -80,7 +80,7 @@ def take_over(folder: Path) -> None:
     try:
         if not is_finished(stage) or is_locked(stage / layout.FRAMES):
             return
-    except InputError:  # damaged: the next correction makes it anew
+    except InputError:  # damaged: the next correction makes it again
         return
     with writing(folder):
         new = [path.relative_to(stage) for path in layout.run_files(stage)]
@@ -99,7 +99,7 @@ def take_over(folder: Path) -> None:
 
 
 def _goes_on(stage: Path, config: Mapping[str, Any], selection: str | None, given: Mapping[str, Any]) -> bool:
-    """Whether the same correction was begun before, and stopped."""
+    """Whether the same correction was started before, and stopped."""
     try:
         return layout.has_state(stage) and earlier_run(stage, config, selection, given) == "stopped"
     except (InputError, OutputError):

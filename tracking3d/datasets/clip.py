@@ -68,7 +68,7 @@ def read_truth(folder: Path) -> Truth:
         raise InputError(
             f"The clip {folder} has neither masks/ nor trusted poses in poses.json: nothing to score."
         )
-    told, true = (_camera(folder / name) for name in ("camera.json", "truth_camera.json"))
+    given, true = (_camera(folder / name) for name in ("camera.json", "truth_camera.json"))
     info = _optional(folder / "info.json")
     millimetres = _length(info.get("millimetres", millimetres), folder / "info.json", "millimetres")
     mesh = folder / "mesh.obj"
@@ -76,9 +76,9 @@ def read_truth(folder: Path) -> Truth:
         name=folder.resolve().name,
         frames=tuple(frames),
         box=_initial_box(folder, visible_masks.get(0, masks.get(0))),
-        camera=true or told,
-        given_camera=told if true else None,
-        camera_told=_optional(folder / "camera.json").get("told", True) is not False,
+        camera=true or given,
+        given_camera=given if true else None,
+        camera_told=_is_camera_given(folder / "camera.json"),
         T_cam_obj=poses,
         masks=masks or visible_masks,
         visible_masks=visible_masks if masks else {},
@@ -90,6 +90,16 @@ def read_truth(folder: Path) -> Truth:
         symmetries=symmetries_of(info.get("symmetries", []), str(folder / "info.json")),
         symmetry_axis=_symmetry_axis(info.get("symmetry_axis"), folder / "info.json"),
     )
+
+
+def _is_camera_given(file: Path) -> bool:
+    """Whether a tracker is given the camera in ``camera.json``."""
+    document = _optional(file)
+    if "told" in document:
+        raise InputError(
+            f"{file} was written by an earlier version of tracking3d: it has the key told; rename it to given."
+        )
+    return document.get("given", True) is not False
 
 
 def read_poses(file: Path, index: dict[str, int]) -> tuple[dict[int, NDArray[np.float64]], float | None]:

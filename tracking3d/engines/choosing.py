@@ -13,10 +13,10 @@ from tracking3d.engines.protocol import ONE_CORE, Engine, Needs
 def open_engine(
     address: str | None = None, workers: int | None = None, needs: Needs = ONE_CORE
 ) -> Iterator[Engine]:
-    """Ray where an address is given, else processes of this machine; what runs is stopped at the end.
+    """Ray if an address is given, else processes of this machine; running tasks are stopped at the end.
 
     Args:
-        address: Of a Ray cluster, see `tracking3d.engines.on_ray.open_ray`.
+        address: Address of a Ray cluster, see `tracking3d.engines.on_ray.open_ray`.
         workers: Tasks at a time; as many as there are cores for if None.
         needs: What each takes.
 

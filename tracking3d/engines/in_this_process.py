@@ -31,9 +31,9 @@ class InThisProcess:
         task, self._task = self._task, None
         if task is None:
             return []
-        told: list[Event] = []
-        value, fault = call(task, lambda content: told.append(Told(task.number, content)))
-        return [Began(task.number, "this process"), *told, Ended(task.number, value, fault)]
+        reports: list[Event] = []
+        value, fault = call(task, lambda content: reports.append(Told(task.number, content)))
+        return [Began(task.number, "this process"), *reports, Ended(task.number, value, fault)]
 
     def share(self, file: Path) -> None:
         """See `Engine.share`; workers see the same files."""

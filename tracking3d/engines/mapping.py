@@ -34,12 +34,12 @@ def map_tasks(
     That a task comes to nothing is an `Ended` with a fault, not an error.
 
     Args:
-        engine: Where.
+        engine: The engine that runs them.
         tasks: What; their numbers differ.
         retries: How often a task that came to nothing is tried again.
         pause: See `PAUSE`.
         listener: Called with every event; an exception that it raises ends the loop.
-        further: What is to be done after a task that has ended for good, such as the next steps of the same video;
+        further: The tasks after a task that has ended for good, such as the next steps of the same video;
             it is begun before what has not begun yet.
         meanwhile: Is called again and again, at least twice a second, whether something happens or not.
 

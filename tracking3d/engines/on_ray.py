@@ -50,7 +50,7 @@ def open_ray(address: str, workers: int | None = None, needs: Needs = ONE_CORE) 
         needs: What each takes.
 
     Raises:
-        InputError: If Ray is not installed, or nothing answers at the address.
+        InputError: If Ray is not installed, or nothing estimates at the address.
     """
     os.environ.update({name: os.environ.get(name, value) for name, value in _QUIET.items()})
     ray = _ray()
@@ -220,7 +220,7 @@ class _Mailbox:
 
 
 def _call_remotely(mailbox: Any, task: Task, threads: int, folder: str) -> tuple[Any, Fault | None]:
-    """What a worker of Ray does: one task, in the folder of the command where the machine has it."""
+    """Run one task in a Ray worker, in the folder of the command if the machine has it."""
     ray = _ray()
     if Path(folder).is_dir():
         os.chdir(folder)

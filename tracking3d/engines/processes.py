@@ -49,7 +49,7 @@ class _Running:
     worker: int
     value: object = None
     fault: Fault | None = None
-    answered: bool = False
+    has_ended: bool = False
 
 
 class ProcessEngine:
@@ -126,18 +126,18 @@ class ProcessEngine:
 
     def _listen(self, running: _Running) -> None:
         """Take in what a worker has sent."""
-        while not running.answered:
+        while not running.has_ended:
             try:
                 if not running.connection.poll():
                     return
                 kind, content = running.connection.recv()
             except (EOFError, OSError):
                 return
-            if kind == "told":
+            if kind == "report":
                 self._events.append(Told(running.task.number, content))
             else:
                 running.value, running.fault = content
-                running.answered = True
+                running.has_ended = True
 
     def _end(self, running: _Running) -> None:
         running.process.join()
@@ -146,7 +146,7 @@ class ProcessEngine:
         running.connection.close()
         del self._running[running.task.number]
         fault = running.fault
-        if not running.answered:
+        if not running.has_ended:
             how = (
                 f"was ended by signal {-code}" if code is not None and code < 0 else f"ended with code {code}"
             )
@@ -166,7 +166,7 @@ def default_workers(needs: Needs) -> int:
 
 def _handles(running: _Running) -> tuple[Any, ...]:
     """What to wait for: after its result, only the end of a process."""
-    if running.answered:
+    if running.has_ended:
         return (running.process.sentinel,)
     return running.process.sentinel, running.connection
 
@@ -194,10 +194,10 @@ def _work(connection: Connection, task: Task, threads: int, environment: dict[st
     os.chdir(folder)
     threading.Thread(target=_stop_when_alone, args=(connection,), daemon=True).start()
     try:
-        answer = call(task, lambda content: connection.send(("told", content)), threads)
+        outcome = call(task, lambda content: connection.send(("report", content)), threads)
     except KeyboardInterrupt:
         return
-    connection.send(("ended", answer))
+    connection.send(("ended", outcome))
 
 
 def _stop_when_alone(connection: Connection) -> None:

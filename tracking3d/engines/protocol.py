@@ -17,7 +17,7 @@ class Needs:
 
     Attributes:
         threads: Processor cores, and the threads that libraries get in the worker.
-        memory: Megabytes; 0 where it is not to be considered.
+        memory: Megabytes; 0 if it is not to be considered.
         gpus: Share of a GPU; for Ray, which hides GPUs from tasks that ask for none.
     """
 
@@ -34,8 +34,8 @@ class Task:
     """One call in a worker.
 
     Attributes:
-        number: Tells the tasks of one batch apart.
-        function: Of a module, called as ``function(tell, *arguments)``; its result is pickled.
+        number: Unique within a batch.
+        function: A function of a module, called as ``function(tell, *arguments)``; its result is pickled.
         arguments: Pickled too.
         log: Gets what is printed, by native code too, and the last words of a process that dies.
         environment: Variables that must be set before libraries are imported, such as those that choose kernels.
@@ -66,9 +66,9 @@ class Began:
     """A task has begun.
 
     Attributes:
-        number: Of the task.
+        number: Number of the task.
         worker: What the worker is called; a worker that is free has the name again.
-        attempt: 1, or more where it was tried before.
+        attempt: 1, or more if it was tried before.
     """
 
     number: int
@@ -78,7 +78,7 @@ class Began:
 
 @dataclass(frozen=True)
 class Told:
-    """What a task tells while it goes on."""
+    """A report of a running task."""
 
     number: int
     content: Any
@@ -89,7 +89,7 @@ class Ended:
     """A task has ended.
 
     Attributes:
-        number: Of the task.
+        number: Number of the task.
         value: What the function returned; None if it came to nothing.
         fault: Why it came to nothing; None if it did not.
         attempts: How often it was begun.
@@ -138,5 +138,5 @@ class Engine(Protocol):
         ...
 
     def stop(self) -> None:
-        """End every task that runs: ask each to keep what is done, and kill it if it does not come to that."""
+        """End every running task: ask each to save its finished frames, and kill it if it does not."""
         ...

@@ -57,14 +57,14 @@ def last_words(log: Path | None) -> str:
         lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
     except OSError:
         return ""
-    # Where Python's fault handler is on, it lists modules after what matters.
+    # If Python's fault handler is on, it lists modules after the error.
     fatal = [line for line in lines[-_DUMP:] if line.startswith("Fatal Python error")]
     said = (fatal or lines[-1:] or ["it left no message"])[0]
     return f": {said.strip()}; see {log}"
 
 
 def interruptible() -> None:
-    """From here on SIGTERM lets the task keep what is done, and Ctrl-C is for the process that hands out tasks."""
+    """From here on SIGTERM lets the task save its finished frames, and Ctrl-C is left to the master process."""
 
     def stop(number: int, frame: FrameType | None) -> None:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
@@ -103,7 +103,7 @@ def _flush() -> None:
 
 
 def _give_threads(threads: int) -> None:
-    """OpenCV and torch, where they are imported, take no more than their share of the machine."""
+    """Limit OpenCV and torch, if they are imported, to their share of the machine."""
     if cv2 := sys.modules.get("cv2"):
         cv2.setNumThreads(threads)
     if torch := sys.modules.get("torch"):

@@ -37,7 +37,7 @@ def read_selected_images(run: RunReader, source: str | None, wanted: Container[i
             f"The images of the run {run.folder} cannot be read: {str(error).rstrip('.')}; give the present "
             f"path of its video as {_SOURCE}."
         ) from error
-    first = (run.description.get("given") or {}).get("first_picture")
+    first = (run.description.get("prompt") or {}).get("first_image_crc")
     size = run.camera.height, run.camera.width
     begun = False
     for frame in opened:

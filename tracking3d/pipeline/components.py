@@ -1,4 +1,4 @@
-"""What a session is built of: solvers by name, the feature encoder, the device; and what its answers took."""
+"""The components of a session: solvers by name, the feature encoder, the device; and the times of its estimates."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def build_solver(
 
     Args:
         config: The pipeline.
-        camera: Of the full frame.
+        camera: The camera of the full frame.
         encoder: The feature encoder.
         known: See `tracking3d.pipeline.known_object.load_known_object`.
     """
@@ -108,6 +108,6 @@ def check_backward_tracking(config: PipelineConfig) -> None:
 
 
 def add_times(estimate: FrameEstimate, watch: Stopwatch, frame: Frame) -> FrameEstimate:
-    """An answer with what it took, reading the frame included."""
+    """An estimate with what it took, reading the frame included."""
     stages = watch.times + StageTimes(decode=frame.decoding)
     return replace(estimate, stages=stages, seconds=stages.whole)

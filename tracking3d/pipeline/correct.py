@@ -32,22 +32,22 @@ def correct_run(
     source: str | Path | None = None,
     listener: Callable[[FrameRecord | SkippedFrame], None] = lambda frame: None,
 ) -> None:
-    """Say what the object is in frames of a run, and compute again what depends on it, with the run's own settings.
+    """Correct the object in frames of a run, and compute again what depends on it, with the run's own settings.
 
-    Frames before the correction keep their causal answers; those after it are answered anew, from the last state of
-    before it that the run has kept, and then the final refinement takes all of them. This is done in a copy within the
-    run folder, which takes the run's place when it is finished.
+    Frames before the correction keep their causal estimates; those after it are estimated again, from the last
+    checkpoint before it that the run has saved, and then the final refinement takes all of them. This is done in a
+    copy within the run folder, which takes the run's place when it is finished.
 
     Args:
         folder: The run folder of one object.
-        corrections: What the object is; one of a frame that was corrected before replaces the earlier one.
-        source: Where the video lies now; as the run has it if left out.
-        listener: Is told of every frame, also of those that stay.
+        corrections: Prompts in later frames; one for a frame that was corrected before replaces the earlier one.
+        source: The present path of the video; that in the run if left out.
+        listener: Called for every frame, also for those that stay.
 
     Raises:
-        InputError: If a correction cannot be used, the video is not there, or the run is of an earlier version that
-            did not keep what it was begun with.
-        Tracking3dError: What ends the computation; the run is then as it was, and the same call goes on.
+        InputError: If a correction cannot be used, the video is not there, or the run was written by an
+            earlier version.
+        Tracking3dError: The computation failed; the run is unchanged, and the same call continues the correction.
     """
     folder = Path(folder)
     take_over(folder)
@@ -58,7 +58,7 @@ def correct_run(
     except ValidationError as error:
         raise InputError(
             f"The settings in {folder / 'run.json'} are of another version of tracking3d: {error.errors()[0]['msg']}; "
-            "make the run anew, with the correction."
+            "run the video again, with the correction."
         ) from error
     [new] = validate_corrections(corrections)
     together = {one.frame: one for one in _earlier(folder, given)} | new
@@ -74,7 +74,7 @@ def correct_run(
 
 
 def object_folders_of(folder: Path, corrections: Iterable[Correction]) -> dict[Path, list[Correction]]:
-    """Corrections by the run folder of the object that they are of.
+    """Corrections by the run folder of their object.
 
     Args:
         folder: A run folder, or the folder with those of several objects.

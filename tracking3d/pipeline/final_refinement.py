@@ -37,7 +37,7 @@ class FinalRefinement:
 
     Args:
         tracked: The object; its session is refined, see `Session.refine`.
-        writer: Of the run.
+        writer: The writer of the run.
         estimates: Writes the refined estimates.
         state: How far the run is.
         work: Writes in another thread while the next frame is solved.
@@ -81,10 +81,10 @@ class FinalRefinement:
         score, reason = self._initial.get(frame.index, (1.0, ""))
         initial = MaskEstimate(None if mask is None else mask.astype(np.float32), score, reason)
         estimate = estimate_again(self._session, frame, estimates.causal[frame.index], initial)
-        kept = self._session.kept() if state.checkpoint else {}
-        return self._work.do(partial(self._keep, estimate, frame, mask, kept))
+        kept = self._session.state_dict() if state.checkpoint else {}
+        return self._work.do(partial(self._write_refined, estimate, frame, mask, kept))
 
-    def _keep(
+    def _write_refined(
         self, estimate: FrameEstimate | None, frame: Frame, initial: Mask | None, session: dict[str, Any]
     ) -> FrameRecord:
         estimates = self._estimates
@@ -113,7 +113,7 @@ class FinalRefinement:
     def adjust_all(self) -> None:
         """All frames were taken again: adjust poses, surface and lens together."""
         if self._precomputed is not None:
-            self._put(self._precomputed)
+            self._write_precomputed(self._precomputed)
         else:
             with share_threads(cv2.getNumThreads()), measure("map") as watch:
                 self._last.adjust_all()
@@ -122,7 +122,7 @@ class FinalRefinement:
                 self._last.begin_masks()
         self._writer.refine_camera(self._last.look.camera)
 
-    def _put(self, precomputed: PrecomputedRefinement) -> None:
+    def _write_precomputed(self, precomputed: PrecomputedRefinement) -> None:
         """Take over poses and masks; frames are then only drawn."""
         for record in precomputed.estimates.values():
             self._estimates.put(record)
@@ -136,9 +136,9 @@ class FinalRefinement:
         return self._last.masks is not None
 
     def collect_mask(self, frame: Frame) -> None:
-        """Adjust the pose of a frame, and keep what it says of the object's masks."""
+        """Adjust the pose of a frame, and collect its evidence for the object's masks."""
         if self._last.masks is not None and frame.index in self._estimates.causal:
-            self._estimates.put(self._last.adjusted(frame))
+            self._estimates.put(self._last.adjust(frame))
             self._last.collect_mask(frame)
 
     def settle_masks(self) -> None:
@@ -159,14 +159,14 @@ class FinalRefinement:
             self._estimates.together += watch.times
             return
         if self._precomputed is None:
-            self._estimates.put(self._last.adjusted(frame))
+            self._estimates.put(self._last.adjust(frame))
         self._draw(frame, self._estimates.mask(self._estimates.estimate(frame.index)))
 
     def draw_rest(self) -> None:
         """Draw the frames that are left when there are no more to come."""
         if self._last.masks is not None:
             with measure("map") as watch:
-                decided = list(self._last.rest())
+                decided = list(self._last.decide_rest())
             self._draw_decided(decided)
             self._estimates.together += watch.times
 

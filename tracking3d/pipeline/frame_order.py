@@ -1,4 +1,4 @@
-"""The order in which a solver is shown the frames, where it is not that of time: forwards, and then backwards."""
+"""The order in which a solver gets the frames, if it is not that of time: forwards, and then backwards."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ class FrameOrder:
     """Frames numbered in the order in which they are shown.
 
     A solver takes frames for one after the other and counts the time between them by their indices. Frames from
-    before the first one come when the last one is done; they are numbered on from there, so that time goes on.
+    before the first one come when the last one is done; they are numbered on from there, so that time increases.
 
     Attributes:
-        first: Index of the frame that was shown first.
-        last: Index of the last one that was shown forwards; None while frames still are.
+        first: Index of the first frame.
+        last: Index of the last frame forwards; None until it is known.
     """
 
     first: int
@@ -30,7 +30,7 @@ class FrameOrder:
         return replace(frame, index=self.last + self.first - frame.index)
 
     def index(self, estimate: FrameEstimate) -> FrameEstimate:
-        """The solver's answer, and those that it revises, under their frames' own indices."""
+        """The solver's estimate, and those that it revises, under their frames' own indices."""
         if self.last is None:
             return estimate
         revised = tuple(map(self.index, estimate.revised))

@@ -28,14 +28,14 @@ _OBJECT = argument("object=", "--object ")
 _ADVICE = "give the folder of an earlier run, or a mesh file such as GLB, OBJ, PLY or STL"
 _MOST_FACES = 100_000  # each is projected for every pose that is tried
 _LARGEST_TEXTURE, _SMALLEST_TEXTURE = 2048, 256
-_TEXELS_OF_A_FACE = 10  # along a side of its cell, where a mesh has no atlas that can be used
+_TEXELS_OF_A_FACE = 10  # along a side of its cell, for meshes without a usable atlas
 _GREY = 165
 
 _log = logging.getLogger(__name__)
 
 
 def load_known_object(config: PipelineConfig) -> KnownObject | None:
-    """The object that a configuration names; None where none is known before the video.
+    """The object that a configuration names; None if none is known before the video.
 
     Raises:
         InputError: If it cannot be used, or not with this solver.
@@ -77,9 +77,9 @@ def select_camera(
     intrinsics: tuple[float, float, float, float] | None,
     origin: str,
 ) -> Camera:
-    """The camera of a video: where nothing is said of its lens, that of the run which knows the object.
+    """The camera of a video: if its lens is not given, that of the run with the object.
 
-    That only where both have pictures of one size, and the run's lens was given or solved, not assumed.
+    This holds only if both have images of the same size, and the run's lens was given or solved, not assumed.
 
     Raises:
         InputError: See `tracking3d.config.camera.choose_camera`.
@@ -91,7 +91,7 @@ def select_camera(
     earlier = RunReader(Path(path)).camera
     if not earlier.known or (earlier.width, earlier.height) != (width, height):
         return camera
-    origin = f"that of the run {path}, which knows the object ({earlier.origin})"
+    origin = f"that of the run {path}, with the object ({earlier.origin})"
     return replace(earlier, origin=origin, assumed=False)
 
 
@@ -159,7 +159,7 @@ def _model_of(mesh: trimesh.Trimesh) -> ObjectModel:
 def _orient_outward(
     mesh: trimesh.Trimesh,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
-    """One vertex where several lie, for a border is drawn as an outline; and faces that all look outward.
+    """Merge vertices at the same place, as a border is drawn as an outline, and turn all faces outward.
 
     Returns:
         Vertices ``(V, 3)`` and faces ``(F, 3)``, which of the mesh's faces these are, and whether each is turned round.
@@ -186,7 +186,7 @@ def _side(faces: int) -> int:
 def _texture(
     mesh: trimesh.Trimesh, faces: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64] | None, NDArray[np.uint8] | None]:
-    """Texture coordinates ``(F, 3, 2)``, v down, and the picture ``(H, W, 3)``; None where there is no such."""
+    """Texture coordinates ``(F, 3, 2)``, v down, and the image ``(H, W, 3)``; None if there is none."""
     material = getattr(mesh.visual, "material", None)
     uvs = getattr(mesh.visual, "uv", None)
     image = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
@@ -197,7 +197,7 @@ def _texture(
 
 
 def _colours(mesh: trimesh.Trimesh, faces: NDArray[np.int64]) -> NDArray[np.float64] | None:
-    """``(F, 3, 3)`` in [0, 255] of the faces' corners; None where the file has none, or one for all."""
+    """``(F, 3, 3)`` in [0, 255] of the faces' corners; None if the file has none, or one for all."""
     if not isinstance(mesh.visual, trimesh.visual.ColorVisuals) or mesh.visual.kind not in ("vertex", "face"):
         return None
     colours = np.asarray(mesh.visual.vertex_colors, np.float64)[:, :3]

@@ -12,7 +12,7 @@ In short::
     recording.refinement.adjust_all()                # poses, surface and lens by all frames together
     for frame in frames:                             # third pass: what masks have in common
         recording.refinement.collect_mask(frame)
-    for frame in frames:                             # last pass: masks and pictures
+    for frame in frames:                             # last pass: masks and images
         recording.refinement.draw(frame)
 """
 
@@ -65,13 +65,13 @@ class ActiveRecordings:
 
     @contextmanager
     def guard(self, recording: ObjectRecorder) -> Iterator[None]:
-        """If something fails within, this recording ends and the others go on."""
+        """If the body raises, this recording ends and the others continue."""
         try:
             yield
         except Exception as error:
             self._active.remove(recording)
-            with suppress(Exception):  # the first error is the one to tell
-                self.tell(recording.written())
+            with suppress(Exception):  # the first error is reported
+                self.tell(recording.wait_until_written())
             recording.give_up(error)
             self.errors.append(error)
 
@@ -81,7 +81,7 @@ class ActiveRecordings:
             recording.give_up(error)
 
     def tell(self, done: FrameRecord | SkippedFrame | None) -> None:
-        """Call the listener, if there is something to tell."""
+        """Call the listener, if there is a new frame."""
         if done:
             self._listener(done)
 
@@ -93,10 +93,10 @@ def run_passes(
     listener: Listener,
     first_pass_only: bool = False,
 ) -> None:
-    """Run all passes. A recording that fails is ended; the others go on.
+    """Run all passes. A recording that fails is ended; the others continue.
 
     Args:
-        source: Where the frames come from.
+        source: The source of the frames.
         frames: Its frames, begun already.
         recordings: One for each object.
         listener: Is called with every frame of every object.
@@ -111,7 +111,7 @@ def run_passes(
         for recording in recordings if source.repeatable else ():
             threads.enter_context(recording.writing_beside())
         try:
-            waits = any(one.takes for one in active)
+            waits = any(one.needs_first_pass for one in active)
             for frame, coming in read_with_next(source, frames) if waits else ():
                 shared = with_share(frame, len(recordings)) if isinstance(frame, Frame) else frame
                 for recording in active:
@@ -135,7 +135,7 @@ def run_refinement(source: FrameSource, active: ActiveRecordings) -> None:
     """All frames have causal estimates: run the final refinement, if it is asked for and possible, and draw.
 
     Args:
-        source: Where the frames come from.
+        source: The source of the frames.
         active: The recordings.
     """
     objects = len(active)
@@ -143,7 +143,7 @@ def run_refinement(source: FrameSource, active: ActiveRecordings) -> None:
         for recording in active:
             with active.guard(recording):
                 recording.begin_refinement(source)
-        for frame in read_again(source) if any(one.looks_again for one in active) else ():
+        for frame in read_again(source) if any(one.needs_second_pass for one in active) else ():
             for recording in active:
                 with active.guard(recording):
                     active.tell(recording.take_again(with_share(frame, objects)))
@@ -177,4 +177,4 @@ def _finish_writing(active: ActiveRecordings) -> None:
     """Wait until everything is written that is written in other threads."""
     for recording in active:
         with active.guard(recording):
-            active.tell(recording.written())
+            active.tell(recording.wait_until_written())

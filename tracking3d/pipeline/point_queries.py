@@ -1,4 +1,4 @@
-"""Points that are followed while an object is tracked: what was asked, and what each frame's answer says of them."""
+"""Points that are followed while an object is tracked: the queries, and their positions in each frame's estimate."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def validate_queries(follow: Any) -> Array | None:
 
 
 class PointFollowing:
-    """Follows points through the frames of a session as they are answered.
+    """Follows points through the frames of a session as they are estimated.
 
     Args:
         queries: See `validate_queries`.
@@ -69,7 +69,7 @@ class PointFollowing:
         self._surface: tuple[Array, NDArray[np.int64]] | None = None
 
     def step(self, session: Session, frame: Frame, estimate: FrameEstimate) -> FrameEstimate:
-        """The answer with its points; those that it revises get theirs anew as far back as views are kept.
+        """The estimate with its points; those that it revises get theirs again as far back as views are stored.
 
         Raises:
             InputError: If a point is asked for outside the frame.

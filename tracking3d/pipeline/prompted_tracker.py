@@ -1,4 +1,4 @@
-"""The mask tracker of one object, started where its prompt is, and anew wherever the object is told anew."""
+"""The mask tracker of one object, started at its prompt, and again in every frame with a later prompt."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from tracking3d.plugins.guard import GuardedTracker, PluginFailure
 from tracking3d.results.records import mask_iou_or_none
 from tracking3d.trackers.crops import box_of
 
-_NOTHING = MaskEstimate(None, 0.0, "nobody has said yet where the object is")
+_NOTHING = MaskEstimate(None, 0.0, "the object has not been prompted yet")
 
 STRAYED = 0.5
-"""IoU of the tracker's own answer and what the user says, below which it is on something else and forgets all."""
+"""If the IoU of the tracker's own mask and the prompt is below this, it tracks something else and is restarted."""
 
 
 class PromptedTracker:
     """A mask tracker and the prompts that it starts from.
 
     Frames that come from before the first one are tracked backwards from it: the tracker is then started once more
-    on the first frame. Where a frame has a prompt of its own, the tracker is set on that: re-anchored where it can be
-    and still is on the object, since what it has learnt is worth keeping; else started anew.
+    on the first frame. If a frame has a prompt of its own, the tracker is set on that: re-anchored if it can be
+    and still is on the object, since what it has learnt is worth keeping; else started again.
 
-    Without a prompt, a tracker that knows no mask by itself waits until somebody says where the object is: the solver,
-    that has found it, by `correct`, or the user. Until then it answers nothing.
+    Without a prompt, a tracker that knows no mask by itself waits until the object is prompted: the solver,
+    that has found it, by `correct`, or the user. Until then it estimates nothing.
 
     Args:
         choice: The tracker of the configuration.
@@ -46,7 +46,7 @@ class PromptedTracker:
         self.anew = False
         """Whether it was started more than once, or not on the first frame's prompt."""
         self.waits = prompt is None and choice.name != "precomputed"
-        """Whether it has not been told yet where the object is."""
+        """Whether the object has not been prompted yet."""
 
     def start(self, frame: Frame) -> MaskEstimate:
         """Start on the first frame.
@@ -58,7 +58,7 @@ class PromptedTracker:
         return _NOTHING if self.waits else self._tracker.init(frame, self._first_prompt)
 
     def step(self, frame: Frame, prompt: Prompt | None = None) -> MaskEstimate:
-        """Answer for the next frame; with a prompt, which says what the object is in it, by that.
+        """Estimate for the next frame; with a prompt, which says what the object is in it, by that.
 
         Raises:
             PluginError: If the tracker fails.
@@ -86,18 +86,18 @@ class PromptedTracker:
 
     def _correct_by(self, frame: Frame, prompt: Prompt) -> MaskEstimate:
         other = self._new()
-        told = other.init(frame, prompt)
+        estimate = other.init(frame, prompt)
         try:
             own = self._tracker.step(frame).found
         except PluginFailure:
             own = None
-        mask = told.found
+        mask = estimate.found
         common = None if mask is None else mask_iou_or_none(mask, own)
         if mask is not None and self.can_correct and common is not None and common >= STRAYED:
             self._tracker.correct(frame, mask)
         else:
             self._tracker, self.anew = other, True
-        return told
+        return estimate
 
     @property
     def can_correct(self) -> bool:
@@ -118,11 +118,11 @@ class PromptedTracker:
 
     @property
     def can_resume(self) -> bool:
-        """Whether its memory can be kept; that of one that was started twice is not told by one first frame."""
+        """Whether its memory can be saved; not if it was started twice, as one first frame does not describe that."""
         return self._tracker.can_resume and not (self.anew or self.waits)
 
     def state(self) -> Any:
-        """Its memory; None where it cannot tell.
+        """Its memory; None if it cannot be saved.
 
         Raises:
             PluginError: If the tracker fails.

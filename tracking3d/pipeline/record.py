@@ -48,7 +48,7 @@ class RecordOptions:
         overwrite: Replace a run that is in the folder.
         resume: Continue the run that is in the folder from its last finished frame, or begin one if there is none. A
             finished run stays as it is. If a frame that has an estimate is corrected now, what depends on it is
-            computed again from the last state kept before it, in a copy within the folder; until that is finished, the
+            computed again from the last checkpoint before it, in a copy within the folder; until that is finished, the
             run stays as it is.
         first_pass_only: Stop when every frame has its causal estimate; ``resume`` continues from there.
     """
@@ -90,9 +90,9 @@ def record(
         points: The object in the first frame by ``(N, 3)`` points: x, y in pixels, and 1 on the object or 0 on the
             background. None of the three is needed if ``object.model`` says which object it is.
         start_frame: Index of the frame in which the object is given, instead of the first. The object is tracked from
-            there to the end, and then backwards to the beginning with what was learnt. The source must be one that can
+            there to the end, and then backwards to the beginning with the same model. The source must be one that can
             be read again.
-        corrections: What the object is in later frames: there the mask tracker is set to it, and the mask is trusted.
+        corrections: Prompts in later frames: the mask tracker is re-anchored there, and the mask is trusted.
         skip_damaged: If the first frame cannot be decoded, apply the prompt to the first frame that can.
         overwrite: Replace a run that is in the folder.
         resume: Continue the run that is in the folder; see `RecordOptions`.
@@ -103,7 +103,7 @@ def record(
 
     Raises:
         InputError: If the run in the folder has other settings or another source; the difference is named.
-        Tracking3dError: What was finished until then is kept in the folder, as it is on Ctrl-C.
+        Tracking3dError: The frames finished until then stay in the folder, as on Ctrl-C.
     """
     prompts = PromptSet.of_one(box, mask, points, start_frame)
     request = request_tracking(source, config, prompts, corrections, skip_damaged)
@@ -129,7 +129,7 @@ def record_objects(
 ) -> list[RunReader]:
     """Track several objects through ``source`` in one pass; each has a run folder of its own within ``folder``.
 
-    An object that fails is ended and the others go on; the first failure is raised at the end.
+    An object that fails is ended and the others continue; the first failure is raised at the end.
 
     Args:
         source: The frames.
@@ -139,7 +139,7 @@ def record_objects(
         masks: More objects, after those of the boxes.
         points: More objects, after those of the masks.
         start_frame: The frame in which the objects are given.
-        corrections: What an object is in later frames; `Correction.object` says which, in the order of the objects.
+        corrections: Prompts in later frames; `Correction.object` is the number of the object.
         skip_damaged: If the first frame cannot be decoded, apply the prompts to the first frame that can.
         overwrite: Replace runs that are in those folders.
         resume: Continue the runs that are in those folders; those that are finished stay as they are.
@@ -150,7 +150,7 @@ def record_objects(
 
     Raises:
         InputError: If a run in those folders has other settings or another source; the difference is named.
-        Tracking3dError: What was finished until then is kept in the folders, as it is on Ctrl-C.
+        Tracking3dError: The frames finished until then stay in the folders, as on Ctrl-C.
     """
     prompts = PromptSet(boxes, masks, points, start_frame, as_lists=True)
     request = request_tracking(source, config, prompts, corrections, skip_damaged)
@@ -177,7 +177,7 @@ def record_tracking(
 
     Raises:
         InputError: If a run in those folders has other settings or another source; the difference is named.
-        Tracking3dError: What was finished until then is kept in the folders, as it is on Ctrl-C.
+        Tracking3dError: The frames finished until then stay in the folders, as on Ctrl-C.
     """
     folder, prompts = validate_folder(folder), request.prompts
     folders = object_folders(folder, len(prompts)) if prompts.as_lists else [folder]
@@ -212,7 +212,7 @@ def begin_recording(
         folder: The object's run folder.
         options: How it is written.
         writers: Closes the run folder at the end.
-        temporary: Whether the folder is removed in the end: no state is kept, and errors do not name the folder.
+        temporary: Whether the folder is removed in the end: no state is saved, and errors do not name the folder.
 
     Raises:
         OutputError: If the folder is in use, holds a run already, or cannot be written.

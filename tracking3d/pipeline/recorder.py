@@ -77,31 +77,31 @@ class ObjectRecorder:
         finally:
             self._work.end()
 
-    def written(self) -> Any:
-        """Wait until all estimates are written; what is to be told of the last one."""
+    def wait_until_written(self) -> Any:
+        """Wait until all estimates are written; returns the last one for the listener."""
         return self._work.wait()
 
     @property
-    def takes(self) -> bool:
+    def needs_first_pass(self) -> bool:
         """Whether the frames are to come for the first time, or for the mask tracker to see them again."""
         return not self._state.before.refining
 
     def take(
         self, frame: Frame | SkippedFrame, coming: Frame | SkippedFrame | None = None
     ) -> FrameRecord | SkippedFrame | None:
-        """Estimate the object in the next frame and write the estimate; what a stopped run has estimated stands.
+        """Estimate the object in the next frame and write the estimate; estimates of a resumed run stay.
 
         Args:
             frame: The frame.
             coming: The one that will be taken next, if it is known.
 
         Returns:
-            What is to be told: of this frame, or of the one before while `writing_beside`.
+            The frame for the listener: this one, or the one before while `writing_beside`.
         """
         if isinstance(frame, Frame):
             self._unmet.discard(frame.index)
         if self._state.kept and self._state.has(frame.index):
-            return self._take_kept(self._state.kept, frame)
+            return self._replay_saved(self._state.kept, frame)
         if isinstance(frame, SkippedFrame):
             return self._work.do(partial(self._skip, frame))
         if not isinstance(coming, Frame) or self._state.has(coming.index):
@@ -121,7 +121,7 @@ class ObjectRecorder:
                 self._session.corrected,
                 self._session.failure_at(frame.index),
             )
-            kept = self._session.kept()
+            kept = self._session.state_dict()
         return self._work.do(partial(self._write, estimate, frame, taken, kept))
 
     def _skip(self, frame: SkippedFrame) -> SkippedFrame:
@@ -146,11 +146,13 @@ class ObjectRecorder:
             self._state.save(session, taken, revised, last=frame.index, **so_far)
         return record
 
-    def _take_kept(self, kept: SavedState, frame: Frame | SkippedFrame) -> FrameRecord | SkippedFrame | None:
+    def _replay_saved(
+        self, kept: SavedState, frame: Frame | SkippedFrame
+    ) -> FrameRecord | SkippedFrame | None:
         """Draw a frame that has its estimate, and show it to a mask tracker that cannot be resumed otherwise."""
         if isinstance(frame, SkippedFrame) and frame.index not in kept.taken:
             return frame
-        if frame.index not in kept.taken or not self.takes:
+        if frame.index not in kept.taken or not self.needs_first_pass:
             return None
         check_picture(kept, frame)
         assert isinstance(frame, Frame)
@@ -186,7 +188,7 @@ class ObjectRecorder:
             _log.warning(
                 "Frame %d, which was to be corrected, is not among the frames that could be read.", index
             )
-        estimates = self._refined(source)
+        estimates = self._open_refinement(source)
         if estimates is not None:
             estimates.together = self._session.refining
             self._writer.refine_camera(self._session.camera)
@@ -200,9 +202,9 @@ class ObjectRecorder:
                 self.precomputed,
             )
         elif self._redraw:
-            self._writer.begin_drawing_anew()
+            self._writer.begin_drawing_again()
 
-    def _refined(self, source: FrameSource) -> RefinementWriter | None:
+    def _open_refinement(self, source: FrameSource) -> RefinementWriter | None:
         """Refine everything, unless the stopped run has done so; None if there is no refinement."""
         before = self._state.before
         if before.refining:
@@ -214,17 +216,17 @@ class ObjectRecorder:
         if not self._refines:
             return None
         if not self._session.can_refine or not source.repeatable:
-            self._writer.leave_out_refinement(
+            self._writer.skip_refinement(
                 f"{source.name} cannot be read a second time"
                 if self._session.can_refine
-                else f"the solver {self._session.config.solver.name} gives causal answers only"
+                else f"the solver {self._session.config.solver.name} gives causal estimates only"
             )
             return None
         self._causal_model = self._session.result()
         estimates = self._writer.begin_refinement(self._causal_model)
         self._session.refine()
         self._state.save(
-            self._session.kept(),
+            self._session.state_dict(),
             refining=True,
             seconds=self._writer.seconds,
             refinement_seconds=estimates.seconds,
@@ -232,7 +234,7 @@ class ObjectRecorder:
         return estimates
 
     @property
-    def looks_again(self) -> bool:
+    def needs_second_pass(self) -> bool:
         """Whether the frames are to come once more, in order of time."""
         return self.refinement is not None or self._redraw
 
@@ -244,7 +246,7 @@ class ObjectRecorder:
         return None
 
     def finish(self) -> None:
-        """Write what is made at the end."""
+        """Write the final files."""
         model, largest = self._session.result(), self._session.config.object.max_texture_size
         if self.refinement is not None:
             self.refinement.draw_rest()
@@ -261,18 +263,18 @@ class ObjectRecorder:
         self._writer.finish(_model_so_far(self._session), "interrupted")
 
     def give_up(self, error: BaseException) -> None:
-        """Keep what is finished when ``error`` ends the run, and let ``error`` say so."""
+        """Save the finished frames when ``error`` ends the run, and add this to ``error``."""
         self._work.end()
         failed = isinstance(error, Exception)
         folder = self._writer.folder
         if self._causal_model is not None and not self._temporary:
             error.add_note(
-                f"The final refinement was not finished; the causal answers are whole in {folder}."
+                f"The final refinement was not finished; the causal estimates are whole in {folder}."
             )
         elif self._answered and not self._temporary:
-            error.add_note(f"What was finished until then is kept in {folder}.")
+            error.add_note(f"The frames finished until then are in {folder}.")
         model = self._causal_model or _model_so_far(self._session)
-        with suppress(OutputError):  # the first error is the one to tell
+        with suppress(OutputError):  # the first error is reported
             self._writer.finish(model, "failed" if failed else "interrupted", str(error) or None)
 
 

@@ -36,7 +36,7 @@ from tracking3d.segmentation.frame_window import Answered
 from tracking3d.segmentation.whole_video import SegmentedMask, VideoSegmenter
 
 Decision = tuple[Frame, SegmentedMask | None]
-"""A frame whose turn has come, and its mask; None if the mask that it has stands."""
+"""A frame that is due, and its mask; None if its present mask stays."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class PrecomputedRefinement:
 def estimate_again(
     session: Session, frame: Frame, causal: FrameRecord, initial: MaskEstimate
 ) -> FrameEstimate | None:
-    """Estimate the object in a frame again, with the final model; None if a plug-in fails and the run may go on.
+    """Estimate the object in a frame again, with the final model; None if a plug-in fails and the run may continue.
 
     Args:
         session: Has refined everything, see `Session.refine`.
@@ -117,7 +117,7 @@ class RefinementSteps:
         self.look.settle()
         return self.look.camera
 
-    def adjusted(self, frame: Frame) -> FrameRecord:
+    def adjust(self, frame: Frame) -> FrameRecord:
         """The estimate of a frame with its adjusted pose; a causal one as it is."""
         record = self._estimates.estimate(frame.index)
         if not record.refined:
@@ -133,10 +133,10 @@ class RefinementSteps:
         self.masks = VideoSegmenter(pinhole, self.look.vertices_of_landmarks, self.look.faces, known)
 
     def collect_mask(self, frame: Frame) -> None:
-        """Keep what a frame says of the object, if its pose and mask are reliable; its pose is adjusted already."""
+        """Collect a frame's evidence for the mask, if its pose and mask are reliable; its pose is adjusted already."""
         assert self.masks is not None
         if self.masks.wants(frame.index):
-            self.masks.see(self._answered(frame))
+            self.masks.see(self._segmentation_input(frame))
 
     def settle_masks(self) -> None:
         """All frames were collected: put together what their masks have in common."""
@@ -147,14 +147,14 @@ class RefinementSteps:
         """Take the next frame, in order of time; gives those whose turn has come."""
         assert self.masks is not None
         self._waiting[frame.index] = frame
-        yield from map(self._decision, self.masks.decide(self._answered(frame)))
+        yield from map(self._make_decision, self.masks.decide(self._segmentation_input(frame)))
 
-    def rest(self) -> Iterator[Decision]:
+    def decide_rest(self) -> Iterator[Decision]:
         """Give the frames that are left when there are no more."""
         assert self.masks is not None
-        yield from map(self._decision, self.masks.rest())
+        yield from map(self._make_decision, self.masks.rest())
 
-    def _answered(self, frame: Frame) -> Answered:
+    def _segmentation_input(self, frame: Frame) -> Answered:
         """A frame as `Hindsight` takes it: through a camera without lens distortion."""
         camera, record = self.look.camera, self._estimates.estimate(frame.index)
         mask, initial = self._estimates.mask(record), self._estimates.initial_mask(frame.index)
@@ -167,7 +167,7 @@ class RefinementSteps:
             record.confidence,
         )
 
-    def _decision(self, found: tuple[int, SegmentedMask | None]) -> Decision:
+    def _make_decision(self, found: tuple[int, SegmentedMask | None]) -> Decision:
         index, decided = found
         frame = self._waiting.pop(index)
         if decided is None or index in self._fixed or not self._estimates.estimate(index).refined:

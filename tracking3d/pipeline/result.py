@@ -1,4 +1,4 @@
-"""What came of a tracking, as arrays and as a run folder that can be kept."""
+"""The result of a tracking, as arrays and as a run folder that can be saved."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class TemporaryRun:
 
     Attributes:
         folder: The run folder.
-        about_shape: What came of making the shape anew, in a sentence; empty where that was not done.
+        about_shape: Outcome of the shape reconstruction, in a sentence; empty if it was not requested.
     """
 
     def __init__(self) -> None:
@@ -47,7 +47,7 @@ class TemporaryRun:
 
 
 class MaskSequence(Sequence[NDArray[np.bool_]]):
-    """The answers' masks in the order of the frames, each read when it is asked for; ``np.asarray`` reads all.
+    """The estimates' masks in the order of the frames, each read on access; ``np.asarray`` reads all.
 
     Args:
         run: The run.
@@ -76,9 +76,9 @@ class MaskSequence(Sequence[NDArray[np.bool_]]):
 
 
 class TrackingResult:
-    """All answers of a tracking and the object: what a run folder of the command line holds.
+    """All estimates of a tracking and the object: what a run folder of the command line holds.
 
-    Rows of everything are the frames that were answered, in order of time. Lengths are in the run's own unit, see
+    Rows of everything are the frames that were estimated, in order of time. Lengths are in the run's own unit, see
     docs/conventions.md.
 
     Attributes:
@@ -96,22 +96,22 @@ class TrackingResult:
         self.run = RunReader(kept.folder, refined=refined)
 
     def __len__(self) -> int:
-        """How many frames were answered."""
+        """How many frames were estimated."""
         return len(self.frames)
 
     @property
     def frames(self) -> list[FrameRecord]:
-        """Everything that is known of each frame."""
+        """The record of each frame."""
         return self.run.frames
 
     @property
     def refined(self) -> bool:
-        """Whether there was a final refinement and these are its answers."""
+        """Whether there was a final refinement and these are its estimates."""
         return any(record.refined for record in self.frames)
 
     @property
     def causal(self) -> TrackingResult:
-        """The answers as they were before the final refinement."""
+        """The estimates as they were before the final refinement."""
         return TrackingResult(self._kept, self._source, self._queries, refined=False)
 
     @property
@@ -121,7 +121,7 @@ class TrackingResult:
 
     @property
     def poses(self) -> NDArray[np.float64]:
-        """``(N, 4, 4)`` ``T_cam_obj``; where the object is lost the last pose that was known, see `statuses`."""
+        """``(N, 4, 4)`` ``T_cam_obj``; the last known pose if the object is lost, see `statuses`."""
         return np.array([record.T_cam_obj for record in self.frames]).reshape(-1, 4, 4)
 
     @property
@@ -131,7 +131,7 @@ class TrackingResult:
 
     @property
     def statuses(self) -> tuple[Status, ...]:
-        """Of each frame whether it is tracked, uncertain or lost."""
+        """Status of each frame: tracked, uncertain or lost."""
         return tuple(record.status for record in self.frames)
 
     @property
@@ -141,7 +141,7 @@ class TrackingResult:
 
     @property
     def timings(self) -> tuple[StageTimes | None, ...]:
-        """Of each frame what it took, stage by stage, in seconds; the refinement's own is ``run.refinement_stages``."""
+        """Seconds of each frame by stage; the refinement's own is ``run.refinement_stages``."""
         return tuple(record.stages for record in self.frames)
 
     @property
@@ -172,32 +172,32 @@ class TrackingResult:
     def tracks(self) -> tuple[PointTracks, ...]:
         """The points that ``follow=`` asked for, through all frames: one set for each frame that points are asked in.
 
-        They are found by the whole video, unlike the ``points`` of the answers one by one.
+        They rest on the whole video, unlike the ``points`` of the single estimates.
 
         Raises:
-            InputError: If a frame that points are asked in was not answered, or the object is lost there.
+            InputError: If a frame that points are asked in was not estimated, or the object is lost there.
         """
         if self._queries is None:
             return ()
-        first = (self.run.description.get("given") or {}).get("first_frame", 0)
+        first = (self.run.description.get("prompt") or {}).get("first_frame", 0)
         frames = np.where(self._queries[:, 0] < 0, first, self._queries[:, 0]).astype(int)
         return tuple(
             self.track_points(int(frame), self._queries[frames == frame, 1:]) for frame in np.unique(frames)
         )
 
     def track_points(self, frame: int, xy: ArrayLike, *, beside_object: bool = False) -> PointTracks:
-        """Where the points under some pixels of one frame are in all frames.
+        """Track the points under some pixels of one frame through all frames.
 
-        By mesh, poses and images; where the frames come once only, by mesh and poses.
+        By mesh, poses and images; by mesh and poses if the frames can be read once only.
 
         Args:
             frame: Index of the frame that ``xy`` is in.
             xy: ``(N, 2)`` pixels.
-            beside_object: Follow pixels beside the object too, in the images alone; else they have no answer.
+            beside_object: Follow background pixels too, in the images alone; else they have no estimate.
 
         Raises:
             InputError: If there is no such frame or model, the object is lost in it, ``xy`` are no points, or points
-                beside the object are asked for where the frames come once only.
+                beside the object are asked for although the frames can be read once only.
         """
         if not self._source.repeatable:
             if beside_object:
@@ -206,7 +206,7 @@ class TrackingResult:
                     "list of images to track()."
                 )
             return track_points(self.run, frame, xy)
-        track_points(self.run, frame, xy)  # bad questions are told before the frames are read
+        track_points(self.run, frame, xy)  # bad questions are given before the frames are read
         return self._scene.track(frame, xy, beside_object)
 
     @cached_property
@@ -214,10 +214,10 @@ class TrackingResult:
         return open_scene(self.run, self._source)
 
     def save(self, folder: Path | str, *, overwrite: bool = False) -> RunReader:
-        """Keep everything as a run folder, which every command of the command line takes.
+        """Save everything as a run folder, which every command of the command line takes.
 
         Args:
-            folder: Where.
+            folder: The new run folder.
             overwrite: Replace a run that is there.
 
         Returns:
@@ -243,14 +243,14 @@ class TrackingResult:
             to: Name of the format.
             out: The file or folder to write.
             options: What else is asked.
-            overwrite: Replace what is there.
+            overwrite: Replace an existing run.
 
         Raises:
             InputError: If there is no such format, or nothing to write in it.
             OutputError: If it cannot be written.
         """
         if out is None:
-            raise InputError("out= is None; say where to write, since the run's own folder is temporary.")
+            raise InputError("out= is None; give a path, since the run's own folder is temporary.")
         if not self.run.refined:
             options = replace(options or ExportOptions(), answers="causal")
         return export_run(self.run.folder, to, out, options=options, overwrite=overwrite)

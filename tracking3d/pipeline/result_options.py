@@ -1,4 +1,4 @@
-"""What the result of a tracking is to be, where the caller says so beside the configuration."""
+"""The caller's options for the result of a tracking, beside the configuration."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from tracking3d.reconstruction.rebuild import check_packages
 from tracking3d.video.source import FrameSource
 
 ModelChoice = Literal["none", "fast", "fine"]
-"""What is made of the object at the end."""
+"""The final mesh of the object."""
 
 
 def config_of_result(
     config: PipelineConfig, source: FrameSource, refine: bool | None, model: ModelChoice | None
 ) -> PipelineConfig:
-    """The configuration with what the caller says of the result.
+    """The configuration with the caller's options for the result.
 
     Args:
         config: The pipeline.
         source: The frames.
         refine: Whether everything is solved once more; None as configured.
-        model: What is made of the object at the end; None as configured.
+        model: The final mesh; None as configured.
 
     Raises:
         InputError: If that is not possible with this solver or these frames, or a package is missing.
@@ -38,7 +38,7 @@ def config_of_result(
         solver = solver.model_copy(update={"final_refine": refine})
     if refine and not hasattr(SOLVERS[solver.name], "refine"):
         raise InputError(
-            f"refine=True: the solver {solver.name} gives causal answers only; choose solver.name online."
+            f"refine=True: the solver {solver.name} gives causal estimates only; choose solver.name online."
         )
     if refine and not source.repeatable:
         raise InputError(
@@ -46,20 +46,20 @@ def config_of_result(
         )
     if model in ("fast", "fine") and shape.model is not None:
         raise InputError(
-            f"model='{model}' makes the object's {'shape' if model == 'fine' else 'texture'} anew, and what is known "
+            f"model='{model}' makes the object's {'shape' if model == 'fine' else 'texture'} again, and what is known "
             "of one is held; leave it out."
         )
     if model == "fine":
         if not source.repeatable:
             raise InputError(
-                f"model='fine' makes the shape anew from all frames, and {source.name} comes once only; give a list "
+                f"model='fine' makes the shape again from all frames, and {source.name} comes once only; give a list "
                 "or path, or leave it out."
             )
         check_packages()
     if model == "fast":
         if not solver.final_refine or not source.repeatable:
             raise InputError(
-                f"model='fast' takes the texture from the frames as they are answered a second time, which "
+                f"model='fast' takes the texture from the frames as they are estimated a second time, which "
                 f"{'they are not without the final refinement' if source.repeatable else f'{source.name} cannot'}; "
                 "leave it out."
             )

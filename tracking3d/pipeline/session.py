@@ -45,7 +45,7 @@ class Session:
 
     Args:
         config: The pipeline.
-        prompt: The object in the first frame; None takes the mask tracker's own first mask, or finds what is known.
+        prompt: The object in the first frame; None takes the mask tracker's own first mask, or finds the known object.
         intrinsics: fx, fy, cx, cy that the source knows of, in pixels; the configuration wins over them.
         intrinsics_origin: Where they come from, in words.
         encoder: A feature encoder that several sessions share, see `build_encoder`; one of its own if None.
@@ -53,9 +53,9 @@ class Session:
     Attributes:
         config: The pipeline.
         renderer: What renders, and why, see `tracking3d.rendering.backend.choose_backend`.
-        initial_mask: What the solver was given for the latest frame: the mask tracker's answer, or what stands in.
-        corrected: Whether the latest answer was handed back to the mask tracker.
-        coming: The frame of the ``step`` after the next, where it is there: the mask tracker may begin with it.
+        initial_mask: The solver's input for the latest frame: the mask tracker's estimate, or its replacement.
+        corrected: Whether the latest estimate was fed back to the mask tracker.
+        coming: The frame of the next ``step``, if it is known: the mask tracker may begin with it.
         refining: What ``refine`` took.
 
     Raises:
@@ -111,14 +111,14 @@ class Session:
 
         Args:
             frame: The frame.
-            prompt: What the object is in this frame, where somebody has said so: the mask tracker is set on
+            prompt: The object in this frame, if it is corrected here: the mask tracker is re-anchored to
                 it, and the solver trusts the mask that it makes. Not for the first frame.
 
         Raises:
             InputError: If this is no `Frame` of uint8 RGB, the first one has no object, another size than the first, or
                 the solver cannot track backwards.
             PluginError: If a plug-in fails: in the first frame, or with ``runtime.on_plugin_failure`` ``stop`` in
-                any. With ``continue`` a later frame is answered with what there is, and ``failure`` says why.
+                any. With ``continue`` a later frame is estimated with what there is, and ``failure`` says why.
             RuntimeError: After ``refine``.
         """
         if self._refined:
@@ -126,13 +126,13 @@ class Session:
         check_frame(frame)
         try:
             with self._settings.in_force(), measure("solve") as watch:
-                estimate = self._start(frame) if self._solver is None else self._go_on(frame, prompt)
+                estimate = self._start(frame) if self._solver is None else self._track(frame, prompt)
         except PluginFailure as error:
             raise error.at(frame.label) from error.__cause__
         return add_times(estimate, watch, frame)
 
     def _start(self, frame: Frame) -> FrameEstimate:
-        solver = self._begun(frame)
+        solver = self._build_solver(frame)
         if self._prompt is not None:
             check_prompt_fits(self._prompt, frame)
         mask = self._tracker.start(frame)
@@ -140,10 +140,10 @@ class Session:
         self._solver, self.initial_mask = solver, mask
         self._last_pose = self._first_pose = estimate.T_cam_obj
         if self._tracker.waits:
-            self._hand_back(frame, estimate)
+            self._feed_back(frame, estimate)
         return estimate
 
-    def _begun(self, first: Frame) -> Solver[Any]:
+    def _build_solver(self, first: Frame) -> Solver[Any]:
         """The solver for a video that begins with ``first``; the camera is set for it, too."""
         height, width = first.size
         self._camera = select_camera(self.config, width, height, *self._intrinsics)
@@ -154,12 +154,12 @@ class Session:
 
     @property
     def state_classes(self) -> tuple[type, ...]:
-        """The classes of what `kept` gives, beside arrays, tensors and plain values."""
+        """The classes of what `state_dict` gives, beside arrays, tensors and plain values."""
         own: tuple[type, ...] = getattr(SOLVERS[self.config.solver.name], "state_classes", ())
         return (Camera, Lens, MaskEstimate, FrameOrder, RandomState, StageTimes, *own)
 
-    def kept(self) -> dict[str, Any]:
-        """All that another session needs to go on after the latest frame, see `resume`; its parts never change."""
+    def state_dict(self) -> dict[str, Any]:
+        """The state that another session needs to continue after the latest frame, see `resume`; it is immutable."""
         return {
             "solver": self._state,
             "camera": self._camera,
@@ -173,25 +173,24 @@ class Session:
         }
 
     def resume(self, first: Frame, kept: Mapping[str, Any], failures: Mapping[int, str]) -> None:
-        """Be the session that was `kept`, instead of starting on a first frame.
+        """Restore a saved session (`state_dict`), instead of starting on a first frame.
 
-        Where `replays`, the frames up to the one after which it was kept are to come to `replay` before the next
+        If `replays`, pass the frames up to the one after which it was saved to `replay` before the next
         ``step``.
 
         Args:
             first: The first frame.
-            kept: What `kept` gave.
+            kept: The value of `state_dict`.
             failures: Which plug-ins failed in which frames.
 
         Raises:
-            PluginError: If the mask tracker cannot go on.
+            PluginError: If the mask tracker cannot be restored.
         """
-        self._solver = self._begun(first)
+        self._solver = self._build_solver(first)
         self._state, self._camera = kept["solver"], kept["camera"]
         self.initial_mask, self._last_pose = kept["initial_mask"], kept["last_pose"]
         self._refined, self._failures = kept["refined"], dict(failures)
-        if steering := kept.get("steering"):  # an older version kept none
-            self._first_pose, self._presented, self._latest, self._tracker.anew = steering
+        self._first_pose, self._presented, self._latest, self._tracker.anew = kept["steering"]
         self.refining, self._settings.random = kept["refining"], kept["random"]
         if self._tracker.can_resume and not self._refined:
             with self._settings.in_force():
@@ -205,16 +204,16 @@ class Session:
     def replay(
         self, frame: Frame, first: bool, correction: NDArray[np.bool_] | None, prompt: Prompt | None = None
     ) -> MaskEstimate | None:
-        """Take the mask tracker alone through a frame that is answered already.
+        """Take the mask tracker alone through a frame that is estimated already.
 
         Args:
             frame: The frame.
             first: Whether it is the first one.
-            correction: ``(H, W)`` what was handed back to the tracker after it, if anything was.
+            correction: ``(H, W)`` the feedback to the tracker after it, if any.
             prompt: What ``step`` was given with it.
 
         Returns:
-            The tracker's answer; None where it fails.
+            The tracker's estimate; None if it fails.
         """
         estimate = None
         try:
@@ -227,14 +226,14 @@ class Session:
                 raise error.at(frame.label) from error.__cause__
         return estimate
 
-    def _go_on(self, frame: Frame, prompt: Prompt | None) -> FrameEstimate:
+    def _track(self, frame: Frame, prompt: Prompt | None) -> FrameEstimate:
         if frame.size != (self.camera.height, self.camera.width):
             raise InputError(
                 f"{frame.label} has {pixels(frame.size)} pixels but the first frame "
                 f"{pixels((self.camera.height, self.camera.width))}; all frames must have one size."
             )
         failures = []
-        self.corrected, solver = False, self._facing(frame)
+        self.corrected, solver = False, self._solver_for(frame)
         try:
             mask = self._tracker.step(frame, prompt)
             self._tracker.announce(self.coming)
@@ -252,11 +251,11 @@ class Session:
             failures.append(self._tolerate(error))
             estimate = lost_estimate(frame, mask, self._last_pose)
         self._last_pose, self._camera = estimate.T_cam_obj, estimate.camera or self._camera
-        for answer in (*estimate.revised, estimate):
-            self._first_pose = answer.T_cam_obj if answer.index == self._presented.first else self._first_pose
+        for one in (*estimate.revised, estimate):
+            self._first_pose = one.T_cam_obj if one.index == self._presented.first else self._first_pose
         if prompt is None:
             try:
-                self._hand_back(frame, estimate)
+                self._feed_back(frame, estimate)
             except PluginFailure as error:
                 failures.append(self._tolerate(error))
         if failures:
@@ -264,15 +263,15 @@ class Session:
         revised = tuple(self._with_failure(earlier) for earlier in estimate.revised)
         return self._with_failure(replace(estimate, revised=revised))
 
-    def _hand_back(self, frame: Frame, estimate: FrameEstimate) -> None:
-        """Set the mask tracker on an answer that is sure and unlike its own; on the first one, where it waits."""
+    def _feed_back(self, frame: Frame, estimate: FrameEstimate) -> None:
+        """Re-anchor the mask tracker to a reliable estimate unlike its own, or to the first one if it waits."""
         corrected = self.config.solver.tracker_feedback and self._tracker.can_correct and corrects(estimate)
         if corrected or (self._tracker.waits and estimate.status is not Status.LOST):
             self.corrected = True
             self._tracker.correct(frame, estimate.mask)
 
-    def _facing(self, frame: Frame) -> Solver[Any]:
-        """The solver, turned back to the first frame where this one is the first from before it."""
+    def _solver_for(self, frame: Frame) -> Solver[Any]:
+        """The solver, restarted backwards if this frame is the first one before the prompt frame."""
         solver, first = self._solver, self._first
         assert solver is not None and first is not None
         if self._presented.last is None:
@@ -286,17 +285,17 @@ class Session:
         return solver
 
     def _tolerate(self, error: PluginFailure) -> str:
-        """Why a plug-in failed, where the run goes on in spite of it."""
+        """Why a plug-in failed, if the run continues in spite of it."""
         if self.config.runtime.on_plugin_failure == "stop":
             raise error
         return error.reason
 
     def failure_at(self, index: int) -> str:
-        """Which plug-in failed at frame ``index``, and why; empty where none did."""
+        """Which plug-in failed at frame ``index``, and why; empty if none did."""
         return self._failures.get(index, "")
 
     def _with_failure(self, estimate: FrameEstimate) -> FrameEstimate:
-        """The answer for a frame in which plug-ins failed says so, and is not relied on."""
+        """The estimate for a frame in which plug-ins failed says so, and is not relied on."""
         failure = self._failures.get(estimate.index)
         if failure is None:
             return estimate
@@ -321,10 +320,11 @@ class Session:
         return isinstance(self._solver, RefiningSolver)
 
     def refine(self) -> None:
-        """Solve everything once more over what is known of the whole video.
+        """Refine the whole model with the observations of the whole video.
 
-        A focal length that nobody gave may be solved too: ``camera`` is then another one, for the refined answers.
-        ``step`` is over then: ``refine_frame`` takes the frames again, and ``result`` gives the final object.
+        The focal length may be estimated too, if it is not given: ``camera`` is then that of the refined estimates.
+        ``step`` must not be called afterwards: ``refine_frame`` refines each frame, and ``result`` gives the final
+        object.
 
         Raises:
             RuntimeError: If the solver cannot, see ``can_refine``.
@@ -336,15 +336,15 @@ class Session:
         self._refined = True
 
     def refine_frame(self, frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]) -> FrameEstimate:
-        """Answer for a frame once more, against the final object. Frames come in order of time.
+        """Estimate for a frame once more, against the final object. Frames come in order of time.
 
         Args:
             frame: The frame.
             mask: Its initial mask as it was, see ``initial_mask``.
-            T_cam_obj: ``(4, 4)`` the causal answer.
+            T_cam_obj: ``(4, 4)`` the causal estimate.
 
         Raises:
-            PluginError: If a plug-in fails; the causal answer then stands, and the next frame may be asked for.
+            PluginError: If a plug-in fails; the causal estimate then stands, and the next frame may be asked for.
             RuntimeError: Before ``refine``.
         """
         solver = self._refining()

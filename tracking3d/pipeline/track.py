@@ -1,4 +1,4 @@
-"""The pipeline as functions: frames go in, answers come out.
+"""The pipeline as functions: frames go in, estimates come out.
 
 >>> for estimate in track(frames, box=(x, y, w, h)):  # doctest: +SKIP
 ...     print(estimate.index, estimate.status, estimate.T_cam_obj)
@@ -48,32 +48,32 @@ def track(
     model: ModelChoice | None = None,
     object: str | Path | None = None,
 ) -> Tracking:
-    """Track an object through frames; answers come as the frames do, memory is bounded by the keyframes.
+    """Track an object through frames; estimates come as the frames do, memory is bounded by the keyframes.
 
     Args:
         frames: What `open_source` opens by a path; ``(N, H, W, 3)`` uint8 RGB; a tensor ``(N, 3, H, W)`` or ``(N, H, W,
             3)`` of uint8 or of floats in [0, 1]; a ``cv2.VideoCapture``; a `FrameSource`; or any iterable of such
-            images, pictures of Pillow, paths of images and `Frame` objects. Frames that could not be read are passed
+            images, images of Pillow, paths of images and `Frame` objects. Frames that could not be read are passed
             over, but not the first.
         box: The object in the first frame, ``(x, y, width, height)`` in pixels.
         mask: The object in the first frame, ``(H, W)`` bool.
-        points: The object in the first frame by ``(N, 3)`` points: x, y in pixels, and 1 on it or 0 beside it. One of
-            box, mask and points is given, or none where the tracker knows its masks (``precomputed``).
-        start_frame: Index of the frame in which the object is given, instead of the first. Answers then come from there
-            to the end, and after them backwards to the beginning. Only where frames can be gone through again.
-        corrections: What the object is in later frames: there the mask tracker is set on it, and the mask is trusted.
+        points: The object in the first frame by ``(N, 3)`` points: x, y in pixels, and 1 on it or 0 on the background.
+            One of box, mask and points is given, or none if the tracker knows its masks (``precomputed``).
+        start_frame: Index of the frame in which the object is given, instead of the first. Estimates then come from
+            there to the end, and after them backwards to the beginning. Only if the source can be read again.
+        corrections: Prompts in later frames: the mask tracker is re-anchored there, and the mask is trusted.
         config: The pipeline, or a YAML file of one; the default preset if None.
-        skip_damaged: Where the first frame could not be read, take the box or mask for the first one that could.
+        skip_damaged: If the first frame cannot be decoded, apply the prompt to the first frame that can.
         follow: Surface points to follow: ``(N, 2)`` pixels of the frame in which the object is given, or ``(N, 3)`` of
-            frame, x, y. Each answer says in ``points`` where they are, by the frames until then; the result in
+            frame, x, y. Each estimate says in ``points`` where they are, by the frames until then; the result in
             ``tracks``, by the whole video.
         refine: Whether the `Tracking.result` looks at the whole video once more; None leaves that to the configuration,
             as the command line does.
-        model: What is made of the object for the result: ``none`` leaves what was learnt on the way, ``fast`` takes the
-            texture from the video at its resolution, ``fine`` then makes the shape anew too from all frames, and keeps
+        model: The final mesh: ``none`` keeps the online texture, ``fast`` takes the
+            texture from the video at its resolution, ``fine`` then makes the shape again too from all frames, and keeps
             it if it explains them better; None leaves that to the configuration.
         object: The folder of an earlier run, or a mesh file: the object is that one. It is then found without a box,
-            or with one, answers are in its coordinates and unit, and its shape and colours are held.
+            or with one, estimates are in its coordinates and unit, and its shape and colours are held.
 
     Returns:
         An iterator of one estimate a frame, whose `Tracking.result` is all of it.
@@ -102,8 +102,8 @@ def track_objects(
 ) -> Iterator[tuple[FrameEstimate, ...]]:
     """Track several objects through frames that are gone through once; see `track`.
 
-    An object whose plug-in has failed for good, see ``runtime.on_plugin_failure``, is answered as lost from then on;
-    the others go on.
+    An object whose plug-in has failed for good, see ``runtime.on_plugin_failure``, is estimated as lost from then on;
+    the others continue.
 
     Args:
         frames: See `track`.
@@ -111,7 +111,7 @@ def track_objects(
         masks: More objects, after those of the boxes, each ``(H, W)`` bool.
         points: More objects, after those of the masks, each by points.
         start_frame: The frame in which the objects are given.
-        corrections: What an object is in later frames; `Correction.object` says which, in the order of the objects.
+        corrections: Prompts in later frames; `Correction.object` is the number of the object.
         config: The pipeline of every object, or a YAML file of one; the default preset if None.
         skip_damaged: See `track`.
 

@@ -19,7 +19,7 @@ AUTO = "auto"
 AFFORDABLE = 900.0
 """Seconds that the masks of a whole video may take."""
 UNHURRIED, LIVE = 1.0, 0.1
-"""Seconds that one frame's mask may take where the number of frames is unknown, and of a camera."""
+"""Seconds that one frame's mask may take if the number of frames is unknown, or of a camera."""
 _CARRIED = 0.05
 """Seconds in which a mask is carried on to a frame that the network is not asked about."""
 
@@ -64,8 +64,8 @@ CANDIDATES = (
         _U2 | _NANO | {"every": 5},
     ),
     TrackerCandidate("onnx", "U2Netp in CSR-DCF's box", 0.888, 1.00, _U2_FILES, _U2),
-    # Answers to the masks of both, which correct them, have a mean IoU of .880 with csrt and .883 with flow on 24 fresh
-    # clips, and of .891 and .874 on five real ones; flow takes half of the time.
+    # Estimates to the masks of both, which correct them, have a mean IoU of .880 with csrt and .883 with flow on 24
+    # fresh clips, and of .891 and .874 on five real ones; flow takes half of the time.
     TrackerCandidate("csrt", "csrt, which needs no network", 0.857, 0.06),
     TrackerCandidate("flow", "flow, which needs neither network nor correlation filter", 0.789, 0.05),
 )  # fmt: skip
@@ -95,10 +95,10 @@ def choose_tracker(
 
     Args:
         config: The pipeline; with another tracker than ``auto`` it is given back with an empty text.
-        frames: How many there are, where that is known.
+        frames: Number of frames, if it is known.
         live: Whether they do not wait.
         first: The first frame, on which trackers with networks are timed.
-        prompt: The object in it; None where nobody has said where it is.
+        prompt: The object in it; None if it is not prompted.
     """
     if config.tracker.name != AUTO:
         return config, ""
@@ -110,7 +110,7 @@ def choose_tracker(
         seconds = _time_per_frame(candidate, first, prompt) if candidate.networks else candidate.seconds
         if seconds is not None and (seconds <= budget or not candidate.networks):
             choice = PluginChoice(name=candidate.name, **candidate.options)
-            why = f"{candidate.what}: mean IoU {candidate.iou:.2f} where it was measured, {seconds:.2f} s a frame"
+            why = f"{candidate.what}: mean IoU {candidate.iou:.2f} on the measured clips, {seconds:.2f} s a frame"
             why += " here" if candidate.networks else ""
             if passed:
                 why += f"; within {budget:.2g} s a frame, which rules out {passed[0]}"
@@ -122,7 +122,7 @@ def choose_tracker(
 
 
 def _is_usable() -> Iterator[TrackerCandidate]:
-    """The candidates whose networks are in the cache, whole; ``csrt`` where this OpenCV has its correlation filter."""
+    """The candidates whose networks are in the cache, whole; ``csrt`` if this OpenCV has its correlation filter."""
     from tracking3d.trackers.csrt import CsrtTracker
 
     known = known_networks()
@@ -138,9 +138,9 @@ def _is_usable() -> Iterator[TrackerCandidate]:
 
 
 def _time_per_frame(candidate: TrackerCandidate, first: Frame, prompt: Prompt) -> float | None:
-    """Seconds that a frame takes here; None where the tracker cannot be used.
+    """Seconds that a frame takes here; None if the tracker cannot be used.
 
-    The same frame is shown twice. Where a network sees every k-th frame only, it is the share of one in k.
+    The same frame is shown twice. If a network sees every k-th frame only, the time is divided by k.
     """
     every = candidate.options.get("every", 1)
     choice = PluginChoice(name=candidate.name, **{**candidate.options, "every": 1})

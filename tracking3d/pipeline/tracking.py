@@ -1,4 +1,4 @@
-"""Tracking one object as a caller of the library has it: answers one after the other, and all of them in the end."""
+"""Tracking one object from the library: estimates one after the other, and all of them at the end."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ _T = TypeVar("_T")
 
 
 class Tracking(Iterator[FrameEstimate]):
-    """An object on its way through a video: iterate over it for one answer a frame, or ask for the `result` of all.
+    """An object on its way through a video: iterate over it for one estimate a frame, or ask for the `result` of all.
 
-    Nothing is computed before the first of both. ``for`` gives each answer as soon as it is there; ``async for`` does
-    so while a thread of its own computes, so that the event loop goes on meanwhile.
+    Nothing is computed before the first of both. ``for`` gives each estimate as soon as it is there; ``async for`` does
+    so while a thread of its own computes, so that the event loop is not blocked.
 
-    Where only the answers are taken, they are not kept, and memory depends on the object and not on the length of the
-    video. Where ``refine=`` or ``model=`` was given, or `result` is what is asked for first, they are kept in a
+    If only the estimates are iterated over, they are not saved, and memory depends on the object and not on the length
+    of the video. If ``refine=`` or ``model=`` was given, or `result` is called first, they are saved in a
     temporary run folder, which lives as long as the result.
     """
 
@@ -47,14 +47,14 @@ class Tracking(Iterator[FrameEstimate]):
         self._result: TrackingResult | None = None
 
     def __next__(self) -> FrameEstimate:
-        """The answer for the next frame."""
+        """The estimate for the next frame."""
         return next(self._begun(self._keeps))
 
     def result(self) -> TrackingResult:
-        """All answers and the model: what the command line writes. Goes through the frames that are left.
+        """All estimates and the model: what the command line writes. Goes through the frames that are left.
 
         Raises:
-            InputError: If answers were taken already and are not kept; if there is no frame.
+            InputError: If estimates were taken already and were not saved; if there is no frame.
             Tracking3dError: As in iterating.
         """
         if self._result is None:
@@ -62,8 +62,8 @@ class Tracking(Iterator[FrameEstimate]):
                 pass
             if self._kept is None:
                 raise InputError(
-                    "The answers that were taken one by one are not kept; ask for result() first, or give refine= or "
-                    "model= where both are wanted."
+                    "The estimates that were taken one by one were not saved; call result() first, or give refine= or "
+                    "model= to have both."
                 )
             self._result = TrackingResult(self._kept, self._request.source, self._queries)
         return self._result
@@ -71,7 +71,7 @@ class Tracking(Iterator[FrameEstimate]):
     async def result_async(self) -> TrackingResult:
         """The `result`, computed in a thread of its own.
 
-        Where the task is cancelled, the frame in work is finished, and then the source is closed.
+        If the task is cancelled, the frame in work is finished, and then the source is closed.
         """
         self._begun(True)
         async with _Worker(self) as worker:
@@ -80,7 +80,7 @@ class Tracking(Iterator[FrameEstimate]):
             return await worker.of(self.result)
 
     def __aiter__(self) -> AsyncIterator[FrameEstimate]:
-        """Answers from a thread; the next frame is taken when the next answer is asked for."""
+        """Estimates from a thread; the next frame is taken when the next estimate is asked for."""
         return self._in_thread()
 
     async def _in_thread(self) -> AsyncIterator[FrameEstimate]:
@@ -89,7 +89,7 @@ class Tracking(Iterator[FrameEstimate]):
                 yield estimate
 
     def close(self) -> None:
-        """Stop, and let go of the source; what was kept until then stays."""
+        """Stop, and close the source; saved estimates stay."""
         if self._answers is None:
             self._answers = _no_frame_error()
         self._answers.close()
@@ -117,7 +117,7 @@ class Tracking(Iterator[FrameEstimate]):
 
 
 class _Worker:
-    """A thread that goes through the answers of a tracking; leaving it waits for the frame in work, and closes."""
+    """A thread that goes through the estimates of a tracking; leaving it waits for the frame in work, and closes."""
 
     def __init__(self, tracking: Tracking) -> None:
         self._tracking = tracking
@@ -136,7 +136,7 @@ class _Worker:
         return asyncio.get_running_loop().run_in_executor(self._thread, function)
 
     async def all(self) -> AsyncIterator[FrameEstimate]:
-        """The answers that are left."""
+        """The estimates that are left."""
         while (estimate := await self.of(lambda: next(self._tracking, None))) is not None:
             yield estimate
 
@@ -149,7 +149,7 @@ def track_frames(
     Args:
         request: What is to be tracked.
         run: Keeps everything about the only object; after the last frame the run is finished as any run is. If None,
-            nothing is kept, and an object whose plug-in has failed is estimated as lost from then on.
+            nothing is saved, and an object whose plug-in has failed is estimated as lost from then on.
 
     Yields:
         Each frame that can be decoded, the objects, and the estimate of each object.

@@ -1,4 +1,4 @@
-"""Validation of what a caller of the library or the command line gives; messages name the argument."""
+"""Validation of the arguments of the library and the command line; messages name the argument."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def check_session(config: Any, prompt: Any, intrinsics: Any) -> None:
     """Check the arguments of `tracking3d.Session`.
 
     Raises:
-        InputError: One of them cannot be used.
+        InputError: If one of them cannot be used.
     """
     if not isinstance(config, PipelineConfig):
         raise InputError(f"config= is {a_kind(config)}; give a PipelineConfig, see load_config.")

@@ -73,7 +73,7 @@ def validate_points(points: Any, name: str = POINTS) -> NDArray[np.float32]:
 
 
 def _validate(points: Any, said: str) -> NDArray[np.float32]:
-    """The same; ``said`` is how messages name the given value."""
+    """The same; ``said`` names the given value in messages."""
     wanted = "give (x, y, 1) for each point on the object and (x, y, 0) for each on the background"
     try:
         if isinstance(points, str | bytes | Mapping):

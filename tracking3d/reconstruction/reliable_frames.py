@@ -33,7 +33,7 @@ def reliable_frames(run: RunReader, source: str | FrameSource | None) -> Iterato
         video = open_source(video, run.description.get("selection"))
     name = video.name
     records = {record.index: record for record in run.frames}
-    given = run.description.get("given") or {}
+    prompt = run.description.get("prompt") or {}
     for frame in video:
         record = records.get(frame.index)
         if not isinstance(frame, Frame) or record is None:
@@ -44,7 +44,9 @@ def reliable_frames(run: RunReader, source: str | FrameSource | None) -> Iterato
                 f"{name} has frames of {pixels(frame.size)} pixels but the run {run.folder} of "
                 f"{pixels(expected)}; give its video by --source."
             )
-        if frame.index == given.get("first_frame") and checksum(frame.image) != given.get("first_picture"):
+        if frame.index == prompt.get("first_frame") and checksum(frame.image) != prompt.get(
+            "first_image_crc"
+        ):
             raise InputError(
                 f"{name} does not begin as the video of the run {run.folder} did; give that by --source."
             )

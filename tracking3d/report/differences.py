@@ -288,13 +288,14 @@ def _notes(runs: list[RunReader], names: list[str], differences: list[Difference
                 f"{names[0]} has estimates for {len(first.frames)} frames and {name} for {len(run.frames)}; "
                 f"they are compared in the {len(one.indices)} frames that both have."
             )
-        given = [
-            told if isinstance(told := each.description.get("given"), dict) else {} for each in (first, run)
+        prompts = [
+            prompt if isinstance(prompt := each.description.get("prompt"), dict) else {}
+            for each in (first, run)
         ]
-        (start, start_too), (picture, picture_too) = (
-            [about.get(key) for about in given] for key in ("first_frame", "first_picture")
+        (start, other_start), (crc, other_crc) = (
+            [prompt.get(key) for prompt in prompts] for key in ("first_frame", "first_image_crc")
         )
-        if start == start_too and None not in (picture, picture_too) and picture != picture_too:
+        if start == other_start and None not in (crc, other_crc) and crc != other_crc:
             notes.append(
                 f"The first images of {names[0]} and {name} differ; make sure that both runs are of one video."
             )

@@ -10,15 +10,15 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.lens import COUNTS, Lens
 
 
-def camera_from_record(told: Mapping[str, Any]) -> Camera:
+def camera_from_record(record: Mapping[str, Any]) -> Camera:
     """The camera that ``dataclasses.asdict`` made a mapping of.
 
     Raises:
         TypeError: If a key is missing or unknown.
         ValueError: If the lens is none that can be; says why.
     """
-    lens = told.get("lens")
-    return Camera(**{**told, "lens": None if lens is None else _read_lens(lens, told)})
+    lens = record.get("lens")
+    return Camera(**{**record, "lens": None if lens is None else _read_lens(lens, record)})
 
 
 def _read_lens(lens: Any, camera: Mapping[str, Any]) -> Lens:

@@ -22,7 +22,7 @@ COLUMNS = 6
 CROPS = 12
 MOST = 2 * CROPS
 VIEWS = COLUMNS - 2
-"""Of the model."""
+"""Views of the model."""
 _MARGIN = 0.35  # of the object's longer side, around it
 _LETTERS = 11
 
@@ -41,7 +41,7 @@ class Thumbnail:
 class Thumbnails:
     """At most `MOST` crops, evenly spread over a clip whose length is not known beforehand.
 
-    Every ``step``-th frame is kept; when there are too many, every other one goes and the step doubles.
+    Every ``step``-th frame is kept; when there are too many, every other one is dropped and the step doubles.
     """
 
     def __init__(self) -> None:

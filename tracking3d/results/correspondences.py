@@ -44,17 +44,17 @@ class PointTracks:
     """N surface points in T frames.
 
     Attributes:
-        query_frame: Index of the frame the points were asked in.
+        query_frame: Index of the frame that the points were queried in.
         query: ``(N, 2)`` the pixels asked for, x and y.
         frames: ``(T,)`` int64 frame indices.
         positions: ``(T, N, 2)`` pixels; NaN for a point that is not followed or is behind the camera.
-        visible: ``(T, N)`` bool; of points on the surface never where the frame is lost or its mask empty.
+        visible: ``(T, N)`` bool; for points on the surface false if the frame is lost or its mask empty.
         on_object: ``(N,)`` bool: whether the pixel lies on the object: on its mesh, or on its mask where points
             that the mesh does not cover are followed.
         face: ``(N,)`` int64 face of the mesh, -1 off the object.
         barycentric: ``(N, 3)`` weights of the face's corners, NaN off the object.
         points: ``(N, 3)`` in object coordinates, NaN off the object.
-        uncertainty: ``(T, N)`` pixels; twice as much holds some 19 of 20 errors. NaN where nothing is known of it.
+        uncertainty: ``(T, N)`` pixels; twice this bounds about 19 of 20 errors. NaN if unknown.
         measured: ``(T, N)`` bool: whether the image had a say.
         kind: ``(N,)`` text, by what each is followed; see `PointKind`.
     """
@@ -144,8 +144,8 @@ def check_asked(
     """Check that the query pixels can be tracked.
 
     Args:
-        tracks: By the mesh.
-        camera: Of the frames.
+        tracks: The tracks by the mesh.
+        camera: The camera of the frames.
         answered: ``(N,)`` which pixels will have one; those on the mesh if left out.
         otherwise: What else can be done about the others.
 

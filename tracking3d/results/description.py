@@ -27,20 +27,20 @@ MOST_FAILURES = 20
 
 @dataclass(frozen=True, eq=False)
 class RunHeader:
-    """What is known of a run before its first frame.
+    """The facts of a run before its first frame.
 
     Attributes:
         config: The configuration as used.
         camera: The camera of the full frame.
-        source: What was tracked, in words.
+        source: The tracked video, in words.
         seed: Seed of everything random.
         fps: Frames per second of the source, if known.
         command: The command line, if there was one.
-        source_notes: What the source did to its pictures, in clauses.
+        source_notes: How the source processed its images, in clauses.
         selection: The ``START:STOP:STEP`` that the source was opened with.
         renderer: What renders, and why.
-        given: What tells source and object apart from others, see `tracking3d.checkpoint.resuming.prompt_record`.
-        tracker_choice: Why the mask tracker ``auto`` stood for that of ``config``; None if the user named it.
+        given: The identity of source and prompt, see `tracking3d.checkpoint.resuming.prompt_record`.
+        tracker_choice: Why ``auto`` chose the mask tracker of ``config``; None if the user named it.
     """
 
     config: dict[str, Any]
@@ -69,7 +69,7 @@ def description_at_start(header: RunHeader) -> dict[str, Any]:
         "resumed": [],
         "source": header.source,
         "selection": header.selection,
-        "given": header.given,
+        "prompt": header.given,
         "fps": header.fps,
         "command": header.command,
         "source_notes": list(header.source_notes),
@@ -93,21 +93,21 @@ def refinement(
     seconds: float = 0.0,
     together: StageTimes | None = None,
 ) -> dict[str, Any]:
-    """What came of a final refinement.
+    """The outcome of a final refinement.
 
     Args:
-        state: ``running``, ``finished``, ``interrupted``, ``failed`` or ``left out``.
+        state: ``running``, ``finished``, ``interrupted``, ``failed`` or ``skipped``.
         reason: Why it has that state, in words.
         causal: The causal estimate for every frame.
         refined: The refined estimates.
         seconds: Wall time it took.
-        together: What it took to solve everything once more, before the frames.
+        together: Times of the global refinement of the map, before the frames.
     """
     return {
         "state": state,
         "reason": reason,
         "frames": len(refined),
-        "kept": len(causal) - len(refined),
+        "kept_causal": len(causal) - len(refined),
         "seconds": seconds,
         "stages": _plain(stages_of(refined), together),
         "causal": {**_by_status(causal), "iou_initial_mean": _mean_iou(causal)},
@@ -159,13 +159,13 @@ def summary(
 
 
 def stages_of(records: Sequence[FrameRecord]) -> StageTimes | None:
-    """What all records together took, stage by stage; None if it is not known of one."""
+    """Times of all records together, stage by stage; None if one has none."""
     stages = [record.stages for record in records if record.stages is not None]
     return sum(stages, StageTimes()) if len(stages) == len(records) else None
 
 
 def time_per_frame(run: Mapping[str, Any]) -> tuple[float | None, StageTimes | None]:
-    """Mean time of a frame of a run that is over, that of the final refinement included, and its stages.
+    """Mean time of a frame of a run that is over, with the final refinement, and its stages.
 
     Args:
         run: Its ``run.json``.
@@ -206,7 +206,7 @@ def _mean_iou(records: Sequence[FrameRecord]) -> float | None:
 
 
 def versions() -> dict[str, str | None]:
-    """Versions of what a result depends on."""
+    """Versions of the packages that a result depends on."""
     packages = {name: _version(name) for name in ("tracking3d", "torch", "kornia", "numba", "numpy")}
     return packages | {
         "opencv": cv2.__version__,

@@ -31,7 +31,7 @@ def writing(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         if error.errno in _FULL:
-            what = f"The disk is full at {path}; free some space (finished frames are kept)."
+            what = f"The disk is full at {path}; free some space (finished frames are saved)."
         elif error.errno in _FORBIDDEN:
             what = f"{path} is not writable; choose another {OUT}."
         elif error.errno in _NOT_A_FOLDER:
@@ -60,7 +60,7 @@ def write_atomic(path: Path, data: bytes) -> None:
 def write_reserved(path: Path, data: bytes, reserve: int) -> None:
     """Write text as `write_atomic` does, with ``reserve`` spaces or more after it.
 
-    Where the disk is full it goes over the old file, in whose reserve it has room: it can always be said how a run
+    If the disk is full, it overwrites the old file, in whose reserve it has room: it can always be said how a run
     ended.
 
     Raises:

@@ -61,7 +61,7 @@ class FrameLines:
         self._file.truncate(0)
 
     def go_on(self, kept: int) -> None:
-        """Go on behind ``kept`` bytes; what follows them stays until something is written in its place."""
+        """Continue behind ``kept`` bytes; later lines stay until others are written in their place."""
         self._kept = kept
 
     def append(self, records: Sequence[FrameRecord]) -> None:
@@ -83,17 +83,17 @@ class FrameLines:
                 raise
 
     def truncate(self) -> None:
-        """Cut off what a stopped run had begun to write after its last finished frame."""
+        """Cut off the lines that a stopped run wrote after its last finished frame."""
         if self._kept is not None:
             self._file.truncate(self._kept)
             self._kept = None
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._file.close()
 
     def discard(self) -> None:
-        """Let go of the file, and remove it if it was made here."""
+        """Close the file, and remove it if it was made here."""
         self.close()
         if self._new:
             self._path.unlink()

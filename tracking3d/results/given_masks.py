@@ -40,10 +40,10 @@ def keep_given_masks(
 
 
 def read_given_mask(folder: Path, index: int) -> NDArray[np.bool_]:
-    """The mask ``(H, W)`` that was given of a frame.
+    """The mask ``(H, W)`` that was given for a frame.
 
     Raises:
-        InputError: If it is not there, as of an earlier version, or damaged.
+        InputError: If it is missing or damaged.
     """
     mask = read_mask(path := layout.prompt_path(folder, index))
     if mask is None:

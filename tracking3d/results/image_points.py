@@ -30,8 +30,8 @@ class ImagePoints:
     Attributes:
         followed: Positions in pixels of the frames; points in space of those that are tied to the surface.
         tied: ``(N,)`` bool: which were found to lie on the surface in some frame.
-        face: ``(N,)`` face of the scene's mesh that they lie on there; -1 of those that never were.
-        barycentric: ``(N, 3)`` weights of its corners; NaN of those that never were.
+        face: ``(N,)`` face of the scene's mesh that they lie on there; -1 for points that never were.
+        barycentric: ``(N, 3)`` weights of its corners; NaN for points that never were.
     """
 
     followed: Followed
@@ -41,7 +41,7 @@ class ImagePoints:
 
 
 def read_run_images(run: RunReader, source: FrameSource) -> list[Picture | None]:
-    """The frames of a run, in the order of its records; None where there is no image.
+    """The frames of a run, in the order of its records; None if there is no image.
 
     Args:
         run: The run.
@@ -118,7 +118,7 @@ def with_image_points(
     Args:
         tracks: Those of N points; is written to.
         chosen: ``(M,)`` which of them.
-        points: What is known of these.
+        points: Their state.
         on_object: ``(M,)`` which of them lie on the object's mask.
     """
     found = points.followed

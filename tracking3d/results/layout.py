@@ -6,7 +6,7 @@
     frames.jsonl        one line a frame, flushed; a better estimate for an earlier frame is a further line
     masks/              the estimates, 0/255 PNG at full resolution, named by frame index
     initial_masks/      what the mask tracker gave
-    probabilities/      the object's in every pixel of the estimates, where that was asked for
+    probabilities/      object probabilities of the estimated masks, if requested
     overlay.mp4         the video with outlines and axes
     contact_sheet.png   the run at a glance
     report.html         the run to look at, in one file
@@ -14,11 +14,11 @@
     mesh.obj, mesh.mtl, texture.png, mesh.glb, features.npz
     landmarks.npz       surface and poses as points were followed by, once they were
     causal/             masks and mesh as they were before the final refinement
-    online/             the mesh of the online map, where its shape was rebuilt
+    online/             the mesh of the online map, if its shape was rebuilt
     .refining/          what the final refinement has made so far, until it has ended
-    .state/             what a stopped run goes on from; when it is finished, what a correction goes on from
-    prompts/            the masks that were given of the object, named by frame index
-    .correcting/        a run folder: the run as it is corrected, until that is finished
+    .state/             checkpoint of a stopped run; in a finished run, checkpoints for corrections
+    prompts/            the given masks of the object, named by frame index
+    .correcting/        a run folder: the corrected run, until it is finished
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from pathlib import Path
 from tracking3d.errors import OutputError, argument
 
 FORMAT = "tracking3d-run"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 RUN = "run.json"
 FRAMES = "frames.jsonl"
@@ -43,7 +43,7 @@ STATE = ".state"
 PROMPTS = "prompts"
 CORRECTING = ".correcting"
 DRAWN = ".drawn.png"
-"""A mask drawn in the viewer, kept until its correction has started."""
+"""A mask drawn in the viewer, saved until its correction has started."""
 STATE_FILE = "state.json"
 JOURNAL = "journal.jsonl"
 OVERLAY = "overlay.mp4"
@@ -86,12 +86,12 @@ _OF_STATE = re.compile(r"\d{8,}\.npz|milestone_\d{6,}\.json")
 
 
 def mask_path(folder: Path, index: int) -> Path:
-    """Where the estimated mask of frame ``index`` lies: in the run folder, or in `CAUSAL` or `REFINING` within it."""
+    """Path of the estimated mask of frame ``index``: in the run folder, or in `CAUSAL` or `REFINING` within it."""
     return folder / MASKS / f"{index:06d}.png"
 
 
 def initial_mask_path(folder: Path, index: int) -> Path:
-    """Where the mask tracker's mask of frame ``index`` lies."""
+    """Path of the mask tracker's mask of frame ``index``."""
     return folder / INITIAL_MASKS / f"{index:06d}.png"
 
 
@@ -125,7 +125,7 @@ def _is_object(folder: Path) -> bool:
 
 
 def partial_path(path: Path) -> Path:
-    """Where ``path`` is written before it is renamed into place."""
+    """Temporary path of a file, before it is renamed to ``path``."""
     return path.with_name(f".{path.name}.part")
 
 
@@ -157,17 +157,17 @@ def correction_files(folder: Path) -> list[Path]:
 
 
 def probability_path(folder: Path, index: int) -> Path:
-    """Where the object's probability in frame ``index`` lies: in the run folder, or in `REFINING` within it."""
+    """Path of the object's probability in frame ``index``: in the run folder, or in `REFINING` within it."""
     return folder / PROBABILITIES / f"{index:06d}.png"
 
 
 def prompt_path(folder: Path, index: int) -> Path:
-    """Where the mask lies that was given of the object in frame ``index``."""
+    """Path of the given mask of the object in frame ``index``."""
     return folder / PROMPTS / f"{index:06d}.png"
 
 
 def has_state(folder: Path) -> bool:
-    """Whether the state of a stopped run is kept in its folder."""
+    """Whether a run folder has the checkpoint of a stopped run."""
     return (folder / STATE / STATE_FILE).is_file()
 
 

@@ -82,7 +82,7 @@ def obj_files(model: ObjectModel, header: str, texture: _Texture | None = None) 
     Args:
         model: The object.
         header: Which coordinates these are, for who opens the file.
-        texture: Its texture, where it is encoded already.
+        texture: Its texture, if it is encoded already.
     """
     simple = trimesh.visual.material.SimpleMaterial(
         texture or _Texture(model),
@@ -113,7 +113,7 @@ def glb_file(
     Args:
         model: The object.
         finish: Changes the glTF tree once this module is done with it; see trimesh's ``tree_postprocessor``.
-        texture: Its texture, where it is encoded already.
+        texture: Its texture, if it is encoded already.
         more: Further arguments of trimesh's ``export_glb``.
     """
     pbr = trimesh.visual.material.PBRMaterial(
@@ -135,9 +135,9 @@ def glb_file(
 
 
 def split_mesh(model: ObjectModel, material: trimesh.visual.material.Material) -> trimesh.Trimesh:
-    """The model with one texture coordinate a vertex: vertices are doubled only where the atlas has its seam.
+    """The model with one texture coordinate a vertex: vertices are doubled only at the seams of the atlas.
 
-    Corners are one vertex where they share their place, in single precision as a GLB holds it, and their texture
+    Corners are one vertex if they share their position, in single precision as a GLB holds it, and their texture
     coordinate up to rounding.
     Faces keep their order. Texture coordinates have trimesh's origin, the lower left. Normals are those of
     the unsplit mesh, so that the seam does not show.

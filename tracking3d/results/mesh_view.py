@@ -18,7 +18,7 @@ from tracking3d.rendering.visibility import rasterize
 
 _BACKGROUND = 40.0
 _UNSEEN = 165.0
-_AMBIENT, _AMBIENT_UNSEEN = 0.45, 0.75  # what was never seen stays pale where it turns away
+_AMBIENT, _AMBIENT_UNSEEN = 0.45, 0.75  # unseen surface stays pale even if it faces away
 _DISTANCE = 4.0  # of the camera, in radii of the object
 _FILL = 0.8  # of the picture's side
 

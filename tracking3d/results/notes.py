@@ -1,4 +1,4 @@
-"""Notes for readers of a run, in sentences: what was assumed, and what was never seen."""
+"""Notes for readers of a run, in sentences: assumptions, and surface that was never seen."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def notes_of_run(run: dict[str, Any], model: ObjectModel | None, records: Sequen
         records: The estimate for every frame, in order.
     """
     # A camera is not expected to deliver frames evenly; it has no number of frames either.
-    counted = (run.get("given") or {}).get("frames") is not None
+    counted = (run.get("prompt") or {}).get("frames") is not None
     return [
         *run["source_notes"],
         *(notes_of_times(records) if counted else ()),
@@ -37,7 +37,7 @@ def notes_of_run(run: dict[str, Any], model: ObjectModel | None, records: Sequen
 
 
 def describe_camera_and_model(camera: dict[str, Any], model: ObjectModel | None) -> list[str]:
-    """What is known of lens and model.
+    """Notes on lens and model.
 
     Args:
         camera: As ``run.json`` has it.
@@ -46,10 +46,10 @@ def describe_camera_and_model(camera: dict[str, Any], model: ObjectModel | None)
     notes = []
     if camera["assumed"]:
         solved = camera["origin"].startswith("solved")
-        told = (
+        advice = (
             "the final refinement estimated it" if solved else "give --fov or --intrinsics if depth matters"
         )
-        notes.append(f"no focal length was given: {camera['origin']}; {told}")
+        notes.append(f"no focal length was given: {camera['origin']}; {advice}")
     unseen = unseen_share(model) if model is not None else 0.0
     if unseen > MOSTLY:
         notes.append(f"{100 * unseen:.0f} % of the mesh's surface was never seen; its shape there is a guess")

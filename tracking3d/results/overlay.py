@@ -1,8 +1,8 @@
 """The overlay: one frame with its estimates drawn in.
 
 The picture has the outline of the initial mask (thin, orange) and of the estimate (thicker, cyan), the object's
-axes (x red, y green, z blue) and below it a status bar. Axes are drawn where the pose is trusted: in frames that
-are tracked, and where they begin on the object.
+axes (x red, y green, z blue) and below it a status bar. Axes are drawn if the pose is trusted: in frames that
+are tracked, and if they begin on the object.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class OverlaySize:
 
 @dataclass(frozen=True, eq=False)
 class ObjectAxes:
-    """Where the axes are drawn, in object coordinates.
+    """Position of the axes, in object coordinates.
 
     Attributes:
         origin: ``(3,)``.

@@ -7,7 +7,7 @@ from pathlib import Path
 from tracking3d.errors import InputError, OutputError
 from tracking3d.results import layout
 from tracking3d.results.files import writing
-from tracking3d.results.run_reader import RunReader
+from tracking3d.results.run_reader import FormatError, RunReader
 
 
 def clear_run_folder(folder: Path, overwrite: bool) -> None:
@@ -25,13 +25,15 @@ def clear_run_folder(folder: Path, overwrite: bool) -> None:
     if not there:
         return
     try:
-        earlier = RunReader(folder)
+        has_frames = bool(RunReader(folder).frames)
+    except FormatError:  # complete, but not readable by this version
+        has_frames = True
     except InputError as error:
         raise OutputError(
             f"{folder} is not a readable run folder, but holds {there[0].relative_to(folder)}, which a run "
             f"would replace; choose another {layout.OUT}."
         ) from error
-    if earlier.frames and not overwrite:
+    if has_frames and not overwrite:
         raise OutputError(
             f"{folder} already holds a run; choose another {layout.OUT} or pass {layout.OVERWRITE}."
         )

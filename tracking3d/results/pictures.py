@@ -55,7 +55,7 @@ class Pictures:
         mask: NDArray[np.bool_] | None,
         initial: NDArray[np.bool_] | None,
     ) -> None:
-        """Draw the next frame from what was kept of its estimate.
+        """Draw the next frame from its saved estimate.
 
         Args:
             frame: The frame.

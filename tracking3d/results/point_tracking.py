@@ -1,6 +1,6 @@
 """Points of a run tracked with its video; see `tracking3d.points`.
 
-Surface and poses that the video has put right are kept in the run folder, so that they are found once.
+Surface and poses that were adjusted to the video are saved in the run folder, so that they are computed once.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from tracking3d.results.run_source import open_run_source
 from tracking3d.video import FrameSource
 
 _DAMAGED = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
-_VERSION = 1  # of what is kept; another one is computed again
+_VERSION = 1  # of the saved file; another one is computed again
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,13 +118,13 @@ def open_scene(
 ) -> RunScene:
     """Read the frames of a run and put its surface and poses right by them.
 
-    What is found is written to ``landmarks.npz`` beside the mesh, and taken from there the next time. Where the folder
+    The result is written to ``landmarks.npz`` beside the mesh, and read from there the next time. If the folder
     cannot be written it is computed again each time.
 
     Args:
         run: A run with a mesh.
         source: Its frames; those that the run names if left out.
-        rounds: See `refine_scene`; 0 leaves surface and poses as the run has them, and nothing is kept.
+        rounds: See `refine_scene`; 0 leaves surface and poses as the run has them, and nothing is saved.
         after_round: See `refine_scene`.
 
     Raises:
@@ -140,7 +140,7 @@ def open_scene(
             images[frame.index] = _view(run, record, frame.image, vertices, faces)
     if not images:
         raise InputError(
-            f"The video has no frame of the run {run.folder}; say by --source which one it was made on."
+            f"The video has no frame of the run {run.folder}; give the video of the run by --source."
         )
     scene = LandmarkScene([images.get(one.index) for one in run.frames], vertices, faces)
     pictures = cache(partial(read_run_images, run, source)) if getattr(source, "repeatable", True) else None
@@ -175,7 +175,7 @@ def _view(
 
 
 def has_landmarks(run: RunReader) -> bool:
-    """Whether landmarks were found before that are of the poses and the mesh that the run has now.
+    """Whether saved landmarks belong to the present poses and mesh of the run.
 
     Raises:
         InputError: If the run has no mesh.
@@ -204,7 +204,7 @@ def _key(run: RunReader, vertices: NDArray[np.float64], rounds: int) -> str:
 
 
 def _read_scene(file: Path, key: str, scene: LandmarkScene) -> LandmarkScene | None:
-    """The scene with surface and poses as they were kept, if they are of the same run."""
+    """The scene with the saved surface and poses, if they are of the same run."""
     try:
         with np.load(file, allow_pickle=False) as kept:
             if str(kept["key"]) != key:

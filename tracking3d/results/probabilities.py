@@ -13,7 +13,7 @@ from tracking3d.results.files import write_image, writing
 
 
 def write_probability(folder: Path, index: int, probability: NDArray[np.float32] | None) -> None:
-    """Write it ``(H, W)`` beside the masks of a folder; None takes away what an earlier estimate had.
+    """Write it ``(H, W)`` beside the masks of a folder; None removes that of an earlier estimate.
 
     Raises:
         OutputError: If it cannot be written.
@@ -37,7 +37,7 @@ def read_probability(folder: Path, index: int) -> NDArray[np.float32] | None:
 
 
 def take_over_probability(aside: Path, folder: Path, index: int) -> None:
-    """Let the refined estimate's take the place of the causal one's, in a run that has them.
+    """Replace the causal estimate's probability by the refined one's, in a run that has them.
 
     Raises:
         OSError: If it cannot be moved.

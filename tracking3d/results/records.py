@@ -44,13 +44,13 @@ _MOST = 2**53  # the largest count that every reader of JSON knows exactly
 
 @dataclass(frozen=True, eq=False)
 class FrameRecord:
-    """What the run folder keeps of one frame, its masks aside.
+    """The record of one frame in the run folder, without its masks.
 
     Attributes:
         index: The frame's index in the source.
-        time: Seconds since the start of the video, where known.
+        time: Seconds since the start of the video, if known.
         name: What messages call the frame.
-        T_cam_obj: ``(4, 4)`` float64 from object to camera; NaN where the estimate had no number.
+        T_cam_obj: ``(4, 4)`` float64 from object to camera; NaN if the estimate was not a number.
         status: The estimator's judgement.
         reason: Why, in words.
         confidence: In [0, 1].
@@ -62,12 +62,12 @@ class FrameRecord:
         area: Pixels of the estimated mask.
         revision: Whether this replaces an earlier estimate.
         failure: Which plug-in failed at this frame, and why; empty if none did.
-        hypothesis: Which start of the pose won, in a word or two; empty if there was no choice.
+        hypothesis: The pose hypothesis that won, in a word or two; empty if there was only one.
         refined: Whether this is the estimate of the final refinement, not the causal one.
-        stages: The same time stage by stage; None if unknown, as in runs of older versions.
+        stages: The same time stage by stage; None in revisions.
         mask_source: Where the estimated mask comes from; None if unknown.
         camera: fx, fy, cx, cy of the camera that the pose is of; None if it is the run's.
-        diagnostics: What else tells how far the pose is to be trusted, by name; NaN if it was not a number.
+        diagnostics: The other numbers behind status and confidence, by name; NaN if it was not a number.
     """
 
     index: int
@@ -215,7 +215,7 @@ def jsonable(value: Any) -> Any:
 
 
 def read_stages(value: Any) -> StageTimes:
-    """Stage times from JSON; NaN where a time is null.
+    """Stage times from JSON; NaN if a time is null.
 
     Raises:
         ValueError: If it is none.

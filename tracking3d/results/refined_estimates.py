@@ -1,4 +1,4 @@
-"""The estimates of a run in its final refinement: refined ones are kept aside until all are there."""
+"""The estimates of a run in its final refinement: refined ones are saved separately until all are there."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class RefinedEstimates:
     def put(self, record: FrameRecord) -> None:
         """Replace a refined estimate, see `put_right`; causal ones stand.
 
-        It is not kept for a run that is stopped here and resumed later: that computes it again.
+        It is not saved for a run that is stopped here and resumed later: that computes it again.
         """
         if record.index in self._records:
             self._records[record.index] = record
@@ -81,7 +81,7 @@ class RefinedEstimates:
         """Give a refined estimate another mask, as `put` does; causal ones stand.
 
         Args:
-            index: Of the frame.
+            index: Index of the frame.
             mask: ``(H, W)``.
             probability: ``(H, W)`` of the object; None if it is written already.
 

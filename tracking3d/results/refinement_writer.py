@@ -1,4 +1,4 @@
-"""The refined estimates of a run: kept aside until all are there, then put in the place of the causal ones.
+"""The refined estimates of a run: saved separately until all are there, then they replace the causal ones.
 
 Until then the run folder holds the causal estimates whole, whatever ends the refinement.
 """
@@ -29,19 +29,19 @@ from tracking3d.runtime.stage_times import StageTimes, measure
 
 
 class RefinementWriter(RefinedEstimates):
-    """Writes the answers of the final refinement of one run.
+    """Writes the estimates of the final refinement of one run.
 
     Args:
         folder: The run folder.
         camera: The camera of the full frame.
         fps: Speed of the overlay video.
         causal: The causal estimate for every frame.
-        kept: Bytes of estimates that were kept when the run was stopped.
+        kept: Bytes of estimates that were saved when the run was stopped.
         seconds: Wall time that they took.
 
     Attributes:
         pictures: Overlay and crops of the second pass.
-        together: What it took to solve everything once more, before the frames.
+        together: Times of the global refinement of the map, before the frames.
 
     Raises:
         OutputError: If the folder cannot be written.
@@ -140,7 +140,7 @@ class RefinementWriter(RefinedEstimates):
                 place = layout.mask_path(self._folder, record.index)
                 place.replace(layout.mask_path(causal, record.index))
                 if (decided := self._decided.get(record.index)) is not None:
-                    write_atomic(place, decided)  # what it was decided from stays aside till the end
+                    write_atomic(place, decided)  # the mask that it was decided from stays until the end
                 else:
                     layout.mask_path(self._aside, record.index).replace(place)
             for name in layout.MESH_FILES:
@@ -155,7 +155,7 @@ class RefinementWriter(RefinedEstimates):
                 (self._aside / layout.OVERLAY).replace(self._folder / layout.OVERLAY)
 
     def give_up(self, keep: bool) -> None:
-        """The causal estimates are as they were; what was made is kept for another try, or removed.
+        """Leave the causal estimates unchanged; the refined ones stay for another try, or are removed.
 
         Raises:
             OutputError: If it cannot be done.
@@ -184,8 +184,8 @@ def adjusted_record(
 
     Args:
         estimate: As it was.
-        T_cam_obj: ``(4, 4)``, of the camera of the end.
-        assessment: How far it is trusted in the end; as before, if left out.
+        T_cam_obj: ``(4, 4)``, for the final camera.
+        assessment: Its final status and confidence; unchanged if left out.
         evidence: What that comes from, added to the diagnostics.
     """
     diagnostics = estimate.diagnostics | dict(evidence or {})
@@ -198,7 +198,7 @@ def adjusted_record(
 
 
 def clear_refinement(folder: Path) -> None:
-    """Remove what the final refinement of a run has made aside, if there is any.
+    """Remove the separate files of the final refinement of a run, if there are any.
 
     Raises:
         OutputError: If it cannot be removed.
@@ -213,7 +213,7 @@ def clear_refinement(folder: Path) -> None:
 
 
 def _undo_taking_over(folder: Path) -> None:
-    """Restore the causal estimates and set the refined masks aside, also after a kill in between."""
+    """Restore the causal estimates and move the refined masks away, also after a kill in between."""
     causal, aside = folder / layout.CAUSAL, folder / layout.REFINING
     if not causal.is_dir():
         return

@@ -45,15 +45,20 @@ _KINDS: dict[str, Any] = {
 _RUN = argument("the folder that `record` wrote", "the --out folder of a `tracking3d run`")
 
 
+class FormatError(InputError):
+    """A run folder was written by a version of tracking3d with another format."""
+
+
 class RunReader:
-    """A run folder as it was when each part was first asked for.
+    """A run folder as it was when each part was first read.
 
     Args:
         folder: The run folder. refined: Whether frames, masks and mesh are those of the final refinement, if there is
         one; else all are causal.
 
     Raises:
-        InputError: If it is not a run folder, or one of a newer version.
+        InputError: If it is not a run folder.
+        FormatError: If it was written by an earlier or a later version.
     """
 
     def __init__(self, folder: Path, refined: bool = True) -> None:
@@ -100,14 +105,14 @@ class RunReader:
 
     @property
     def refinement_stages(self) -> StageTimes | None:
-        """What the final refinement took, stage by stage; None if unknown.
+        """Times of the final refinement, stage by stage; None if unknown.
 
         Raises:
             InputError: If it is damaged.
         """
-        told = (self.description.get("refinement") or {}).get("stages")
+        stages = (self.description.get("refinement") or {}).get("stages")
         try:
-            return None if told is None else read_stages(told)
+            return None if stages is None else read_stages(stages)
         except ValueError as error:
             raise InputError(
                 f"{self.folder / layout.RUN} is damaged: stages of the refinement, {error}; restore it."
@@ -156,7 +161,7 @@ class RunReader:
         return frozenset(record.index for record in self.frames if record.refined)
 
     def mask_path(self, index: int) -> Path:
-        """Where the estimated mask of frame ``index`` lies."""
+        """Path of the estimated mask of frame ``index``."""
         causal = layout.mask_path(self.folder / layout.CAUSAL, index)
         if index in self._refined_frames or not causal.is_file():
             return layout.mask_path(self.folder, index)
@@ -194,7 +199,7 @@ class RunReader:
 
     @property
     def mesh_folder(self) -> Path:
-        """Where the mesh that belongs to the estimates lies, if there is one; see `load_mesh` and `load_model`."""
+        """Folder of the mesh that belongs to the estimates, if there is one; see `load_mesh` and `load_model`."""
         causal = self.folder / layout.CAUSAL
         of_causal = not self._refined_frames and (causal / layout.OBJ).is_file()
         return causal if of_causal else self.folder
@@ -259,8 +264,8 @@ def _camera_fault(camera: Camera) -> str:
         number = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _FARTHEST
         if not number or (name in ("fx", "fy") and not value > 0):
             return f"{name} is {value!r:.40}"
-    told = isinstance(camera.origin, str) and isinstance(camera.assumed, bool)
-    return "" if told else f"origin is {camera.origin!r:.40}, assumed {camera.assumed!r:.40}"
+    described = isinstance(camera.origin, str) and isinstance(camera.assumed, bool)
+    return "" if described else f"origin is {camera.origin!r:.40}, assumed {camera.assumed!r:.40}"
 
 
 def _read_description(folder: Path) -> dict[str, Any]:
@@ -277,12 +282,17 @@ def _read_description(folder: Path) -> dict[str, Any]:
     version = description.get("format_version")
     if not isinstance(version, int):
         raise InputError(f"{path} is damaged: it holds no format version.")
-    for name, kind in _KINDS.items():
-        if name in description and not isinstance(description[name], kind):
-            raise InputError(f"{path} is damaged: {name} is {description[name]!r:.40}; restore it.")
     if version > layout.FORMAT_VERSION:
-        raise InputError(
+        raise FormatError(
             f"The run {folder} has format version {version}, newer than the "
             f"{layout.FORMAT_VERSION} that this tracking3d reads; update tracking3d."
         )
+    if version < layout.FORMAT_VERSION:
+        raise FormatError(
+            f"The run {folder} was written by an earlier version of tracking3d (format {version}); "
+            f"run it again with {layout.OVERWRITE}."
+        )
+    for name, kind in _KINDS.items():
+        if name in description and not isinstance(description[name], kind):
+            raise InputError(f"{path} is damaged: {name} is {description[name]!r:.40}; restore it.")
     return description

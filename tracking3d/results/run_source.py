@@ -14,7 +14,7 @@ def open_run_source(run: RunReader, source: str | Path | None = None) -> FrameSo
 
     Args:
         run: The run.
-        source: Where it lies now; as the run has it if left out, from the present folder or from those above the run's.
+        source: Its present path; if left out that in the run, from the present folder or from those above the run's.
 
     Raises:
         InputError: If it is not there.

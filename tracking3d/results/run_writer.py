@@ -1,4 +1,4 @@
-"""Writing a run folder while the run goes on, so that a kill loses at most the current frame.
+"""Writing a run folder during the run, so that a kill loses at most the current frame.
 
 A frame's masks are renamed into place before its line is appended to ``frames.jsonl``: the line says that the
 frame is there. The writer holds a lock on ``frames.jsonl``, which the system drops with the process.
@@ -43,7 +43,7 @@ FinalState = Literal["finished", "interrupted", "failed"]
 SKIPS_EVERY = 1.0
 """Seconds between two writes of ``run.json`` for skipped frames; the last ones are written at the end."""
 RESERVE = 2048  # bytes that ``run.json`` has to spare for saying, on a full disk, how the run ended
-_STAYS = {"created", "refinement", "split", "tracker_choice"}  # of a run that goes on
+_STAYS = {"created", "refinement", "split", "tracker_choice"}  # of a run that is continued
 DEFAULT_FPS = 10.0
 """Frame rate of the overlay video if the source has none, such as a folder of images."""
 
@@ -55,9 +55,9 @@ class RunWriter:
 
     Args:
         folder: The run folder; made with its parents.
-        header: What is known of the run before its first frame.
+        header: The facts of the run before its first frame.
         overwrite: Replace a run that is there. Only files a run writes are removed, only from a run folder.
-        resume: Go on with the run that is there, of which so much is kept. What is behind that in ``frames.jsonl``
+        resume: Continue the run that is there, of which so much is saved. What is behind that in ``frames.jsonl``
             stays until something is written in its place.
 
     Raises:
@@ -92,7 +92,7 @@ class RunWriter:
                 for inner in (layout.MASKS, layout.INITIAL_MASKS):
                     (self.folder / inner).mkdir(exist_ok=True)
             if resume is not None:
-                self._go_on(resume)
+                self._continue(resume)
             self._write_description()
         except BaseException:
             self._lines.discard()
@@ -117,8 +117,8 @@ class RunWriter:
             self._pictures.add_kept(frame, record, mask, initial)
         return record
 
-    def begin_drawing_anew(self) -> None:
-        """All frames are answered: from here on `draw_again` draws them, in the order in which they come.
+    def begin_drawing_again(self) -> None:
+        """All frames are estimated: from here on `draw_again` draws them, in the order in which they come.
 
         Raises:
             OutputError: If the video that was drawn so far cannot be finished.
@@ -134,12 +134,12 @@ class RunWriter:
         a final refinement redraws them.
 
         Returns:
-            What was recorded of ``estimate``.
+            The record of ``estimate``.
 
         Raises:
             OutputError: If it cannot be written; what was written before stays whole.
         """
-        started = time.perf_counter() - self._drawing  # of the picture before, drawn when its line was safe
+        started = time.perf_counter() - self._drawing  # of the image before, drawn when its line was safe
         for revised in estimate.revised:
             self._record(revised, "", revision=True)
         record = self._record(estimate, frame.name, revision=False, started=started)
@@ -156,9 +156,9 @@ class RunWriter:
         if time.monotonic() - self._described >= SKIPS_EVERY:
             self._write_description()
 
-    def leave_out_refinement(self, reason: str) -> None:
+    def skip_refinement(self, reason: str) -> None:
         """Record that there is no final refinement though one was asked for, and why."""
-        self._description["refinement"] = description.refinement("left out", reason)
+        self._description["refinement"] = description.refinement("skipped", reason)
         self._write_description()
 
     def begin_refinement(
@@ -168,7 +168,7 @@ class RunWriter:
 
         Args:
             model: The object as it is now; its mesh is written. None if that was done before the run was stopped.
-            kept: Bytes of refined estimates that were kept then.
+            kept: Bytes of refined estimates that were saved before.
             seconds: Wall time that they took.
 
         Raises:
@@ -199,7 +199,7 @@ class RunWriter:
             self._write_description()
 
     def end_refinement(self) -> None:
-        """Put the refined estimates in the place of the causal ones, which go to ``causal/``.
+        """Replace the causal estimates by the refined ones; the causal ones go to ``causal/``.
 
         Raises:
             OutputError: If it cannot be done.
@@ -211,9 +211,9 @@ class RunWriter:
         self._pictures, self._refinement = self._refinement.pictures, None
 
     def finish(self, model: ObjectModel | None, state: FinalState, error: str | None = None) -> None:
-        """Write what is made at the end and the final state, and let go of the folder.
+        """Write the final files and the final state, and release the folder.
 
-        Everything that can be written is, whatever fails beside it. A second call does nothing.
+        All files that can be written are, even if others fail. A second call does nothing.
 
         Args:
             model: The object, or None if there is none.
@@ -262,14 +262,14 @@ class RunWriter:
             self.finish(None, ended, str(error) if isinstance(error, Exception) else None)
 
     def is_initial_mask(self, frame: Frame, estimate: MaskEstimate) -> bool:
-        """Whether a mask tracker's estimate for a frame is the one that is kept of it."""
+        """Whether a mask tracker's estimate for a frame is the one that is saved."""
         kept, given = read_mask(layout.initial_mask_path(self.folder, frame.index)), estimate.binary
         if kept is None or given is None:
             return all(mask is None or not mask.any() for mask in (kept, given))
         return np.array_equal(kept, given)
 
-    def _go_on(self, so_far: WrittenSoFar) -> None:
-        """Be the writer of the run that is there."""
+    def _continue(self, so_far: WrittenSoFar) -> None:
+        """Continue the run that is there."""
         earlier = RunReader(self.folder).description
         self._lines.go_on(so_far.lines)
         known = latest(read_records(self.folder / layout.FRAMES, so_far.lines), refined=False)
@@ -307,7 +307,7 @@ class RunWriter:
         self._written = dict(self._description)
 
     def _give_up_refinement(self, state: FinalState, error: str | None) -> None:
-        """Where a refinement did not come to its end."""
+        """Handle a refinement that did not finish."""
         if self._refinement is not None:
             self._refinement.give_up(keep=layout.has_state(self.folder))
             self._description["refinement"] = self._refinement.describe(state, error or "")

@@ -1,7 +1,7 @@
-"""What is done beside the frames, in threads of its own: reading those that come, and keeping what is answered.
+"""Work in background threads: reading the next frames, and writing the estimates.
 
-One thread reads a few frames ahead; every recording has one that writes, one answer behind at most. Reading and
-writing change no answer, so that these are the same on every run, however busy the machine is. Frames that do not
+One thread reads a few frames ahead; every recording has one that writes, one estimate behind at most. Reading and
+writing change no estimate, so that these are the same on every run, however busy the machine is. Frames that do not
 depend on each other are done several at a time, their results in order. What goes wrong in such a thread is raised
 where its result is asked for.
 """
@@ -56,7 +56,7 @@ class OrderedExecutor:
     """Jobs that do not depend on each other, done several at a time; what they give comes in their order.
 
     Args:
-        most: How many at a time; one is done where it is given.
+        most: Jobs at a time; a single one runs in the caller's thread.
     """
 
     def __init__(self, most: int) -> None:
@@ -80,7 +80,7 @@ class OrderedExecutor:
             yield self._waiting.popleft().result()
 
     def rest(self) -> Iterator[Any]:
-        """What the last jobs give, and an end of the threads."""
+        """The results of the last jobs; the threads end."""
         while self._waiting:
             yield self._waiting.popleft().result()
         if self._threads is not None:
@@ -89,7 +89,7 @@ class OrderedExecutor:
 
 
 class BackgroundWriter:
-    """Jobs that are done one after the other, each while the caller prepares the next; or where they are given.
+    """Jobs that are done one after the other, each while the caller prepares the next; or in the caller's thread.
 
     Attributes:
         threaded: Whether jobs are done in another thread from here on.
@@ -104,7 +104,7 @@ class BackgroundWriter:
         """Begin a job when the one before is done.
 
         Returns:
-            What the job before gave, or this one where there is no other thread; None where there is nothing yet.
+            The result of the job before, or of this one if there is no other thread; None if there is none yet.
 
         Raises:
             Exception: What the job before, or this one, ended with; the job is then not begun.
@@ -118,7 +118,7 @@ class BackgroundWriter:
         return cast("T | None", before)
 
     def wait(self) -> object:
-        """Wait for the job in work; what it gave, or None where there is none.
+        """Wait for the job in work; what it gave, or None if there is none.
 
         Raises:
             Exception: What it ended with.
@@ -127,7 +127,7 @@ class BackgroundWriter:
         return None if running is None else running.result()
 
     def end(self) -> None:
-        """Wait for the job in work, whatever becomes of it, and let go of the thread."""
+        """Wait for the running job, even if it fails, and end the thread."""
         self.threaded = False
         with suppress(Exception):
             self.wait()

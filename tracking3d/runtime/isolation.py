@@ -38,7 +38,7 @@ class RandomState:
         return cls(random.getstate(), np.random.get_state(), torch.get_rng_state(), cuda)
 
     def same(self, other: RandomState) -> bool:
-        """Whether what is drawn next is the same."""
+        """Whether the next random numbers are the same."""
         return (
             self.of_python == other.of_python
             and self.of_numpy[2:] == other.of_numpy[2:]
@@ -60,15 +60,15 @@ class IsolatedRuntime:
     """Threads and random numbers of one session.
 
     The pipeline itself draws from generators of its own; the process's are seeded for plug-ins. Between the
-    session's calls everything is the caller's, whose own random numbers do not change a session's answers.
+    session's calls everything is the caller's, whose own random numbers do not change a session's estimates.
 
     Args:
         renderer: What renders, see `tracking3d.rendering.prepare_backend`.
-        device: Where.
+        device: The device that is computed on.
         seed: Seed of everything random.
 
     Attributes:
-        random: Where its random numbers are; None before the first. The same object as long as none is drawn.
+        random: State of its random generators; None before the first use. The same object as long as none is drawn.
     """
 
     def __init__(self, renderer: Mapping[str, str | int], device: str, seed: int) -> None:
@@ -79,7 +79,7 @@ class IsolatedRuntime:
     def in_force(self) -> Iterator[None]:
         """The session's settings within, the caller's afterwards.
 
-        OpenCV's generator can be seeded but not read; the caller's goes on from a seed that was drawn from it.
+        OpenCV's generator can be seeded but not read; that of the caller continues from a seed drawn from it.
         """
         with threads_kept(), preserve_process(self._device):
             give_threads(self._renderer)

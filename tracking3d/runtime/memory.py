@@ -22,7 +22,7 @@ def resident_memory() -> tuple[float, float]:
 
 
 def forget_peak() -> None:
-    """Reset the highest resident set size to the present one, where the system can do that (Linux)."""
+    """Reset the highest resident set size to the present one, if the system supports it (Linux)."""
     with contextlib.suppress(OSError):
         _CLEAR_PEAK.write_text("5", encoding="ascii")
 

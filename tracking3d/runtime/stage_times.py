@@ -19,12 +19,12 @@ class StageTimes:
     """Seconds of wall time by stage.
 
     Attributes:
-        decode: Reading the frame; its share, where several objects are tracked through it.
+        decode: Reading the frame; its share, if several objects are tracked.
         track: The mask tracker, corrections included.
         encode: The feature encoder.
         solve: The pose, and whatever belongs to no other stage.
         map: Learning shape and texture from keyframes.
-        write: Masks of the run folder, and the picture of the frame before: that is drawn when its answer is safe.
+        write: Masks of the run folder, and the picture of the frame before: that is drawn when its estimate is safe.
     """
 
     decode: float = 0.0
@@ -83,7 +83,7 @@ _running: ContextVar[Stopwatch | None] = ContextVar("tracking3d_stopwatch", defa
 
 @contextmanager
 def measure(stage: str) -> Iterator[Stopwatch]:
-    """Time what is done within; it belongs to ``stage`` where it does not say otherwise.
+    """Time the body; its time counts for ``stage`` unless it says otherwise.
 
     Yields:
         The stopwatch, whose ``times`` are complete afterwards.

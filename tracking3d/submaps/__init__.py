@@ -1,1 +1,1 @@
-"""Long videos in parts: cut where the object is well seen, tracked side by side, joined into one object and one run."""
+"""Long videos in parts: cut at frames that show the object well, tracked in parallel, merged into one run."""

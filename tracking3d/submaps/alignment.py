@@ -1,4 +1,4 @@
-"""Whether two parts of a video, tracked without knowing of each other, tell of one object, and how it lies in both."""
+"""Alignment of two parts of a video that were tracked independently, and whether they agree on one object."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ _MOST_TRANSLATION_ERROR = 0.5  # in radii
 
 
 class DisagreementError(Exception):
-    """Two parts cannot be joined; the text says why, as the end of a sentence."""
+    """Two parts cannot be merged; the text says why, as the end of a sentence."""
 
 
 @dataclass(frozen=True, eq=False)
 class SubmapAlignment:
-    """How the second of two parts lies in the first.
+    """The similarity from the second of two parts to the first.
 
     Attributes:
-        fit: Of their poses, and of landmarks where both know some.
-        frames: How many were compared.
-        landmarks: How many were.
+        fit: Similarity of their poses, and of landmarks if both have some.
+        frames: Number of compared frames.
+        landmarks: Number of compared landmarks.
     """
 
     fit: SimilarityFit
@@ -49,7 +49,7 @@ class SubmapAlignment:
 def common_poses(
     first: Sequence[FrameRecord], second: Sequence[FrameRecord]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Poses ``(F, 4, 4)`` of the frames that both have tracked; where those are too few, of all that neither lost."""
+    """Poses ``(F, 4, 4)`` of the frames that both have tracked; if those are too few, of all that neither lost."""
     for trusted in (_is_tracked, _is_there):
         own = {one.index: one.T_cam_obj for one in first if trusted(one)}
         other = {one.index: one.T_cam_obj for one in second if trusted(one)}
@@ -70,11 +70,11 @@ def _is_there(record: FrameRecord) -> bool:
 
 
 def check_agreement(fit: SimilarityFit, radius: float) -> None:
-    """Make sure that two parts can be joined.
+    """Make sure that two parts can be merged.
 
     Args:
-        fit: Of their poses.
-        radius: Of the first's object, in its unit.
+        fit: Similarity of their poses.
+        radius: Radius of the first's object, in its unit.
 
     Raises:
         DisagreementError: If not.
@@ -84,37 +84,37 @@ def check_agreement(fit: SimilarityFit, radius: float) -> None:
         raise DisagreementError(
             f"only {frames} frames of their overlap were tracked by both; {FEWEST_FRAMES} are needed"
         )
-    # Where nothing moves, rounding decides whether the size is above 0.
+    # If nothing moves, rounding decides whether the size is above 0.
     if not similarity.scale > 0 and fit.scale_error <= _MOST_SCALE_ERROR:
-        raise DisagreementError("their overlap gives no size of one in that of the other")
+        raise DisagreementError("their overlap does not determine the scale between them")
     angle, wrong = float(np.median(fit.angles)), float(np.mean(fit.angles > _WRONG))
     if angle > MOST_DEGREES or wrong > _MOST_WRONG:
         raise DisagreementError(
             f"their rotations disagree, by {angle:.0f} degrees in the median of the overlap and by more than "
-            f"{_WRONG:.0f} in {wrong:.0%} of it, as where an object looks alike from several sides"
+            f"{_WRONG:.0f} in {wrong:.0%} of it, as for an object that looks alike from several sides"
         )
     distance = float(np.median(fit.distances)) / radius
     if distance > _MOST_DISTANCE:
         raise DisagreementError(f"they have the object in places {distance:.2f} of its radius apart")
     if fit.scale_error > _MOST_SCALE_ERROR or fit.translation_error > _MOST_TRANSLATION_ERROR * radius:
         raise DisagreementError(
-            "the object hardly moves in their overlap, which leaves open how large one is beside the other"
+            "the object hardly moves in their overlap, which leaves the scale between them open"
         )
 
 
 def align_submaps(
     first: SolverState, second: SolverState, of_first: Sequence[FrameRecord], of_second: Sequence[FrameRecord]
 ) -> SubmapAlignment:
-    """How the second part lies in the first.
+    """The similarity from the second part to the first.
 
     Args:
         first: What the first part knows in the end.
         second: What the second does, by the first's camera.
-        of_first: The first's answers.
+        of_first: The first's estimates.
         of_second: The second's, by the first's camera.
 
     Raises:
-        DisagreementError: If they cannot be joined.
+        DisagreementError: If they cannot be merged.
     """
     radius = first.object_map.radius
     T_first, T_second = common_poses(of_first, of_second)
@@ -139,7 +139,7 @@ def align_submaps(
 def by_lens(
     state: SolverState, records: Sequence[FrameRecord], camera: Camera
 ) -> tuple[SolverState, list[FrameRecord]]:
-    """A part's knowledge and answers as another lens would have them."""
+    """A part's knowledge and estimates as another lens would have them."""
     lens = (camera.fx, camera.fy, camera.cx, camera.cy)
     seen = []
     for record in records:

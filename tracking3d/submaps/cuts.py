@@ -1,4 +1,4 @@
-"""Where a long video is cut: at frames that show the object well, near to where the parts would be of one length."""
+"""Cuts of a long video: at frames that show the object well, and so that the parts have about the same length."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ _SLACK = 0.25  # of a part's length, that a cut may be moved to either side
 _OVERLAP = 0.25  # of a part's length
 _LEAST_OVERLAP, _MOST_OVERLAP = 12, 90  # frames
 _FEWEST_FRAMES = 24
-"""Frames of a part: it has to tell the object's shape by itself."""
+"""Frames of a part: it has to initialize the object's shape by itself."""
 _GOOD = 0.25
 _DISTANCE = 0.2  # what a cut at the end of its window is worth less than one in the middle
-_CHANGE = 2.0  # what a change of the mask's area from one look to the next takes off, per natural logarithm
+_CHANGE = 2.0  # what a change of the mask's area from one preview frame to the next subtracts, per natural logarithm
 
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """What a cheap look at a frame shows of the object.
+    """The object in a frame of the preview.
 
     Attributes:
-        position: Of the frame among the selected ones, from 0.
-        area: Pixels of the mask, at whatever resolution all sightings share; 0 where there is none.
+        position: Position of the frame among the selected ones, from 0.
+        area: Pixels of the mask, at the common resolution of all sightings; 0 if there is none.
         touches_border: Whether the mask comes up to the image's border.
-        score: How far the mask is believed, in [0, 1].
-        mask: ``(H, W)`` bool at that resolution; None where it is not kept.
+        score: Confidence of the mask, in [0, 1].
+        mask: ``(H, W)`` bool at that resolution; None if it is not kept.
     """
 
     position: int
@@ -51,8 +51,8 @@ class Part:
         number: From 0.
         start: Position of its first frame.
         stop: One past its last.
-        owns_from: Position of the first frame that the joined run has its answer of: frames that the part before
-            tracked as well are answered by that one, whose model is the older.
+        owns_from: Position of the first frame whose estimate the merged run takes from it: frames that the part before
+            tracked as well keep the estimates of that one, whose model has seen more.
     """
 
     number: int
@@ -65,7 +65,7 @@ def parse_length(text: str, fps: float | None) -> int:
     """Frames of a part, from seconds (``90``) or frames (``900f``).
 
     Raises:
-        InputError: If it is neither, not positive, or in seconds where the source has no rate.
+        InputError: If it is neither, not positive, or in seconds if the source has no frame rate.
     """
     match = re.fullmatch(r"\s*([-+]?[\d.]+(?:e[-+]?\d+)?)\s*(f|s)?\s*", text, re.IGNORECASE | re.ASCII)
     try:
@@ -84,14 +84,14 @@ def parse_length(text: str, fps: float | None) -> int:
         frames = value * fps
     if frames < _FEWEST_FRAMES:
         raise InputError(
-            f"{SPLIT}{text} makes parts of {frames:.0f} frames; a part needs {_FEWEST_FRAMES} at least to tell the "
+            f"{SPLIT}{text} makes parts of {frames:.0f} frames; a part needs at least {_FEWEST_FRAMES} to model the "
             "object's shape."
         )
     return round(min(frames, 2**53))
 
 
 def windows(count: int, length: int) -> list[range]:
-    """Positions among which each cut may be, one window a cut; none where the video is one part.
+    """Positions among which each cut may be, one window for each cut; none if the video is one part.
 
     Parts are as near to ``length`` as ``count`` frames in equal parts can be; a rest of less than half of it is no
     part of its own.
@@ -104,7 +104,7 @@ def windows(count: int, length: int) -> list[range]:
 
 
 def cuts_in(sightings: Sequence[Sighting], allowed: Sequence[range]) -> list[Sighting]:
-    """The sighting at which each cut is made; fewer than windows where a window shows the object well nowhere."""
+    """The sighting at which each cut is made; fewer than windows if the object is not seen well in one."""
     chosen = []
     for window in allowed:
         inside = [one for one in sightings if one.position in window]

@@ -23,7 +23,7 @@ def run_in_processes(
     workers: int,
     told: Callable[[Any], None] = lambda content: None,
 ) -> list[Result]:
-    """What a function of a module makes of each job, in the order of the jobs.
+    """Results of a module's function for each job, in the order of the jobs.
 
     One worker is this process. Ctrl-C and a failure stop the others; what they had finished is theirs to keep.
 
@@ -31,7 +31,7 @@ def run_in_processes(
         function: Called as ``function(tell, job)``.
         jobs: What can be pickled.
         workers: Processes at a time.
-        told: Is given what the functions tell, in this process.
+        told: Called in this process with everything that the functions report.
 
     Raises:
         Tracking3dError: The first that a job raised, or that its process crashed.
@@ -52,7 +52,7 @@ def run_in_processes(
 
 @dataclass(frozen=True)
 class _Raised:
-    """An error in a sentence, as the answer of a process: engines tell of errors by their words only."""
+    """An error in a sentence, as the result of a process: engines report errors by their text only."""
 
     error: Tracking3dError
 
@@ -71,7 +71,7 @@ def _raise(event: Ended) -> None:
         return
     if event.fault.crashed:
         raise Tracking3dError(
-            "A process that tracked a part of the video ended without a word, as where memory runs out "
-            f"({event.fault.reason.rstrip('.')}); the same command with --resume goes on."
+            "A process that tracked a part of the video died without an error, as if memory ran out "
+            f"({event.fault.reason.rstrip('.')}); continue with the same command and --resume."
         )
-    raise Tracking3dError(f"A part of the video came to nothing: {event.fault.reason}")
+    raise Tracking3dError(f"A part of the video failed: {event.fault.reason}")

@@ -24,15 +24,15 @@ class LongVideo:
 
     Attributes:
         source: A video file, or a folder or pattern of images.
-        config: The pipeline; of the solver ``online``, with its final refinement.
+        config: The pipeline, with the solver ``online`` and its final refinement.
         folder: The run folder.
         prompts: What the object is in the first frame.
-        length: Of a part, in seconds or frames, see `parse_length`.
+        length: Length of a part, in seconds or frames, see `parse_length`.
         workers: Processes at a time, for the record.
         selection: ``START:STOP:STEP`` of the frames.
         command: For the record.
         overwrite: Replace a run that is in the folder.
-        resume: Go on with what is there.
+        resume: Continue the run that is there.
     """
 
     source: str
@@ -62,9 +62,9 @@ class SplitResult:
     """What became of a video that was to be split.
 
     Attributes:
-        folders: Its run folder, or those of its parts where they could not be joined.
+        folders: Its run folder, or those of its parts if they could not be merged.
         parts: How many there were.
-        reason: Why they could not be joined, or why it was not cut; empty where it was.
+        reason: Why they could not be merged, or why it was not cut; empty if they were.
     """
 
     folders: tuple[Path, ...]
@@ -73,14 +73,14 @@ class SplitResult:
 
 
 def refuse_what_cannot_be_joined(config: PipelineConfig) -> None:
-    """Parts are joined in the final refinement of one solver.
+    """Check that the pipeline can merge parts, which the final refinement of one solver does.
 
     Raises:
         InputError: If the configuration is without it.
     """
     if not isinstance(config.solver, OnlineConfig) or not config.solver.final_refine:
         raise InputError(
-            "Parts of a video are joined in the final refinement of the solver online; leave out --split, or what "
+            "Parts of a video are merged in the final refinement of the solver online; leave out --split, or what "
             "chooses otherwise (solver.name, solver.final_refine, --quality draft)."
         )
 
@@ -96,5 +96,5 @@ def frames_of_part(source: FrameSource, config: PipelineConfig, length: str) -> 
         raise InputError(f"{source.name} comes once only and cannot be split; leave out --split.")
     frames = parse_length(length, source.fps)
     if source.count is None:
-        raise InputError(f"{source.name} does not tell how many frames it has; leave out --split.")
+        raise InputError(f"{source.name} does not know its number of frames; leave out --split.")
     return frames

@@ -34,18 +34,18 @@ from tracking3d.video import open_source
 
 _log = logging.getLogger(__name__)
 _SAME_OBJECT = 0.5
-"""Share of the smaller one of two masks that lies within the other, below which a part began on something else than the
+"""If less than this share of the smaller of two masks lies within the other, a part began on something else than the
 part before ends with. One of them may well have lost a side of the object."""
 
 
 @dataclass(frozen=True, eq=False)
 class Tracked:
-    """A video whose parts have their causal answers.
+    """A video whose parts have their causal estimates.
 
     Attributes:
         begun: The video.
         jobs: Its parts, as they were tracked last.
-        again: Numbers of those that were tracked a second time.
+        again: Numbers of the parts that were tracked again.
         seconds: What tracking the parts took.
     """
 
@@ -65,19 +65,19 @@ class Again:
 
 @dataclass(frozen=True)
 class Refused:
-    """Why parts cannot be joined."""
+    """Why parts cannot be merged."""
 
     reason: str
 
 
 @dataclass(frozen=True, eq=False)
-class Joined:
-    """A video whose parts are one run, but for its second answers.
+class MergedSubmaps:
+    """A video whose parts are one run, but for its second estimates.
 
     Attributes:
         begun: The video.
-        looks: Frames to be looked at again, by parts.
-        about: What ``run.json`` says of the parts.
+        looks: Frames to be refined again, by parts.
+        about: The section ``split`` of ``run.json``.
         seconds: What each step took, by name.
     """
 
@@ -87,11 +87,11 @@ class Joined:
     seconds: Mapping[str, float] = field(default_factory=dict)
 
 
-def join(tell: Tell, tracked: Tracked) -> Again | Refused | Joined:
-    """Make one run of the parts, up to where all frames are looked at again.
+def join(tell: Tell, tracked: Tracked) -> Again | Refused | MergedSubmaps:
+    """Merge the parts into one run, up to the refinement of all frames.
 
     Raises:
-        Tracking3dError: If something cannot be read or written; what was finished until then is kept.
+        Tracking3dError: If something cannot be read or written; the frames finished until then are saved.
     """
     begun, clock = tracked.begun, time.monotonic()
     video = begun.video
@@ -102,17 +102,17 @@ def join(tell: Tell, tracked: Tracked) -> Again | Refused | Joined:
     try:
         whole = merge_submaps(session, begun.config, begun.plan, video.folder)
     except DisagreementError as error:
-        _log.warning("The parts could not be joined: %s.", error)
+        _log.warning("The parts could not be merged: %s.", error)
         return Refused(str(error))
-    seconds = {"look_ahead": begun.plan.seconds, "parts": tracked.seconds}
-    seconds["join"], clock = time.monotonic() - clock, time.monotonic()
+    seconds = {"preview": begun.plan.seconds, "parts": tracked.seconds}
+    seconds["merge"], clock = time.monotonic() - clock, time.monotonic()
     about = {
         "workers": video.workers,
         "parts": [[run.part.start, run.part.stop] for run in whole.runs],
-        "looked_at": begun.plan.looked_at,
-        "tracked_again": list(tracked.again),
-        "joints": whole.joints,
-        "dearer": whole.dearer,
+        "preview_frames": begun.plan.preview_frames,
+        "retracked": list(tracked.again),
+        "alignments": whole.alignments,
+        "cost_ratio": whole.cost_ratio,
     }
     writer = _begin_writing(begun, opened, whole)
     owned = _owned_ranges(begun)
@@ -122,35 +122,35 @@ def join(tell: Tell, tracked: Tracked) -> Again | Refused | Joined:
     write_merged_run(writer, session, whole.runs, owned, sum(seconds.values()) + time.monotonic() - clock)
     seconds["refine"] = time.monotonic() - clock
     note_in_run(video.folder, {"split": {**about, "seconds": seconds}})
-    return Joined(begun, _revisits(begun, owned), about, seconds)
+    return MergedSubmaps(begun, _revisits(begun, owned), about, seconds)
 
 
 @dataclass(frozen=True, eq=False)
 class Ending:
-    """A video whose frames are all answered, to be drawn.
+    """A video whose frames are all estimated, to be drawn.
 
     Attributes:
-        joined: The run; its ``seconds`` tell what all steps took.
+        merged: The run; its ``seconds`` are those of all steps.
         precomputed: What the last steps of its final refinement come to.
     """
 
-    joined: Joined
+    merged: MergedSubmaps
     precomputed: PrecomputedRefinement
 
 
 def end(tell: Tell, ending: Ending) -> None:
-    """Draw what is answered, and write what is made at the end; the parts are removed.
+    """Draw the estimates, and write the final files; the parts are removed.
 
     Args:
-        tell: Is given the answers that are drawn.
+        tell: Called with the estimates that are drawn.
         ending: All that is known.
 
     Raises:
-        Tracking3dError: If something cannot be read or written; what was finished until then is kept.
+        Tracking3dError: If something cannot be read or written; the frames finished until then are saved.
     """
-    begun = ending.joined.begun
+    begun = ending.merged.begun
     video, config = begun.video, begun.config
-    about = {**ending.joined.about, "seconds": dict(ending.joined.seconds)}
+    about = {**ending.merged.about, "seconds": dict(ending.merged.seconds)}
     note_in_run(video.folder, {"split": about})
     options = RecordOptions(video.command, video.selection, resume=True)
     with open_tracking(_request(begun)) as opened, ExitStack() as writers:
@@ -202,14 +202,14 @@ def _find_running(tracked: Tracked) -> Again | None:
 
 
 def _owned_ranges(begun: Begun) -> list[range]:
-    """Indices of the frames that each part answers for."""
+    """Indices of the frames whose estimates are taken from each part."""
     whole = begun.video.frames(begun.count)
     starts = [part.owns_from for part in begun.plan.parts]
     return [whole[start:stop] for start, stop in zip(starts, [*starts[1:], len(whole)], strict=True)]
 
 
 def _begin_writing(begun: Begun, opened: OpenTracking, whole: MergedMap) -> RunWriter:
-    """The writer of the joined run, with all that a run knows of itself before its first frame."""
+    """The writer of the merged run, with the header of a run before its first frame."""
     video, source, [one] = begun.video, opened.source, opened.objects
     header = RunHeader(
         config=begun.config.model_dump(mode="json"),

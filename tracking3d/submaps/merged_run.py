@@ -1,4 +1,4 @@
-"""The run folder of the whole video, made of those of its parts: that of a run which was stopped before its end.
+"""The run folder of the whole video, merged from those of its parts: a run stopped before its final refinement.
 
 Whatever happens from there on, ``resume`` finishes it as it does any stopped run.
 """
@@ -35,9 +35,9 @@ class PartRun:
     Attributes:
         part: Which frames it has.
         folder: Its run folder.
-        kept: Its state.
-        records: Its causal answers, by the first part's lens.
-        similarity: From its object to that of the joined run.
+        kept: Its saved state.
+        records: Its causal estimates, by the first part's lens.
+        similarity: From its object to that of the merged run.
     """
 
     part: Part
@@ -50,13 +50,13 @@ class PartRun:
 def write_merged_run(
     writer: RunWriter, session: Session, parts: Sequence[PartRun], owned: Sequence[range], seconds: float
 ) -> None:
-    """Write the answers of all parts and the state after them.
+    """Write the estimates of all parts and the state after them.
 
     Args:
-        writer: Of the folder, just begun; it is ended.
-        session: That has the joined object, refined; see `write_causal_mesh` for the object before that.
+        writer: The new writer of the folder; it is closed.
+        session: The session with the merged, refined object; see `write_causal_mesh` for the object before that.
         parts: All of them.
-        owned: Indices of the frames that each part answers for.
+        owned: Indices of the frames whose estimates are taken from each part.
         seconds: Wall time so far.
 
     Raises:
@@ -84,7 +84,7 @@ def write_merged_run(
     for one in skipped:
         checkpoint.note(one)
     last = records[-1].index if records else -1
-    checkpoint.save(RunProgress(last, size, refining=True, seconds=seconds), session.kept())
+    checkpoint.save(RunProgress(last, size, refining=True, seconds=seconds), session.state_dict())
 
 
 def write_causal_mesh(folder: Path, session: Session) -> None:
@@ -96,13 +96,13 @@ def write_causal_mesh(folder: Path, session: Session) -> None:
     export_mesh(folder, session.result())
 
 
-def take_second_answers(folder: Path, session: Session, made: Sequence[Path], seconds: float) -> None:
-    """Put the second answers of all parts where the run looks for what it has looked at again.
+def move_refined_estimates(folder: Path, session: Session, made: Sequence[Path], seconds: float) -> None:
+    """Move the refined estimates of all parts to the place where the run expects its refined estimates.
 
     Args:
-        folder: The joined run's.
-        session: With the joined object.
-        made: Folders of the parts' second answers, in order of time; they are emptied.
+        folder: The folder of the merged run.
+        session: The session with the merged object.
+        made: Folders of the parts' refined estimates, in order of time; they are emptied.
         seconds: Wall time of the refinement so far.
 
     Raises:
@@ -146,5 +146,5 @@ def _copy_masks(source: Path, target: Path, indices: Sequence[int]) -> None:
             for index in indices:
                 with suppress(
                     FileNotFoundError
-                ):  # where the mask tracker gave none, or no probabilities are kept
+                ):  # if the mask tracker gave none, or no probabilities are saved
                     shutil.copyfile(path_of(source, index), path_of(target, index))

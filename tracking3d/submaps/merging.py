@@ -1,4 +1,4 @@
-"""The parts of a video as one object: how each lies in the first, and what they know together."""
+"""Merging the submaps of a video into one map, in the coordinates of the first."""
 
 from __future__ import annotations
 
@@ -31,42 +31,42 @@ from tracking3d.submaps.plan import Plan, part_folder
 from tracking3d.submaps.similarity import fit_similarity
 from tracking3d.submaps.state_merging import merge_states
 
-MOST_DEARER = 1.75
-"""How many times what the parts' keyframes cost by themselves they may cost together; see `keyframe_cost`."""
+MAX_COST_RATIO = 1.75
+"""Largest ratio of the cost of the keyframes after merging to their cost before; see `keyframe_cost`."""
 _FEWEST_KEYFRAMES = 3
 _SAME_LENS = math.log(1.05)
 
 
 @dataclass(frozen=True, eq=False)
 class MergedMap:
-    """All parts as one.
+    """The merged map of all parts.
 
     Attributes:
-        runs: The parts, with how each lies in the joined object.
+        runs: The parts, each with its similarity to the merged object.
         session: The state of a session that has seen all of them.
-        camera: Of the causal answers.
-        joints: What is known of each joint, for the record.
-        dearer: How many times what they cost by themselves the keyframes cost together.
+        camera: The camera of the causal estimates.
+        alignments: A description of each alignment, for ``run.json``.
+        cost_ratio: Cost of the keyframes after merging, divided by their cost in their own parts.
     """
 
     runs: Sequence[PartRun]
     session: Mapping[str, Any]
     camera: Camera
-    joints: Sequence[Mapping[str, Any]]
-    dearer: float
+    alignments: Sequence[Mapping[str, Any]]
+    cost_ratio: float
 
 
 def merge_submaps(session: Session, config: PipelineConfig, plan: Plan, folder: Path) -> MergedMap:
-    """Join the parts that are tracked.
+    """Merge the tracked parts.
 
     Args:
-        session: For the whole video, which has seen nothing yet.
+        session: A new session for the whole video.
         config: The pipeline.
         plan: The parts.
         folder: The run folder.
 
     Raises:
-        DisagreementError: If they cannot be joined.
+        DisagreementError: If they cannot be merged.
         InputError: If a part's folder is damaged.
     """
     assert isinstance(config.solver, OnlineConfig)
@@ -82,11 +82,11 @@ def merge_submaps(session: Session, config: PipelineConfig, plan: Plan, folder: 
             refused.append(error)
     if not tried:
         raise DisagreementError(f"{refused[0]}{_of_lenses(lenses)}") from refused[0]
-    best = min(tried, key=lambda one: one.dearer)
-    runs, updated = best.runs, best.belief
+    best = min(tried, key=lambda one: one.cost_ratio)
+    runs, updated = best.runs, best.merged
     settled = [
         replace(run, similarity=_refine_alignment(updated.object_map, own.object_map, similarity))
-        for run, own, similarity in zip(runs, best.beliefs, best.similarities, strict=True)
+        for run, own, similarity in zip(runs, best.states, best.similarities, strict=True)
     ]
     first, last = runs[0].kept.session, max(record.index for run in runs for record in run.records)
     first_pose, presented, _, anew = first["steering"]
@@ -96,23 +96,29 @@ def merge_submaps(session: Session, config: PipelineConfig, plan: Plan, folder: 
         "camera": updated.camera,
         "steering": (first_pose, FrameOrder(presented.first), last, anew),
     }
-    return MergedMap(settled, state, updated.camera, [_describe(joint) for joint in best.joints], best.dearer)
+    return MergedMap(
+        settled,
+        state,
+        updated.camera,
+        [_describe(alignment) for alignment in best.alignments],
+        best.cost_ratio,
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class _Try:
-    """The parts joined by one lens; runs and beliefs are those that it makes of them."""
+    """The parts merged with one focal length, with their runs and states converted to it."""
 
     runs: Sequence[PartRun]
-    beliefs: Sequence[SolverState]
-    joints: Sequence[SubmapAlignment]
+    states: Sequence[SolverState]
+    alignments: Sequence[SubmapAlignment]
     similarities: Sequence[Similarity]
-    belief: SolverState
-    dearer: float
+    merged: SolverState
+    cost_ratio: float
 
 
 def _lenses(states: Sequence[SolverState]) -> list[Camera]:
-    """The cameras of the parts, those that are about the same once: where nobody gave the lens, each solved its own."""
+    """The different cameras of the parts: if the focal length is not given, each part estimated its own."""
     lenses: list[Camera] = []
     for state in states:
         if all(abs(math.log(state.camera.fy / other.fy)) > _SAME_LENS for other in lenses):
@@ -121,13 +127,14 @@ def _lenses(states: Sequence[SolverState]) -> list[Camera]:
 
 
 def _of_lenses(lenses: Sequence[Camera]) -> str:
-    """What is to be said of lenses that differ: parts that are told one have the better chance to agree."""
+    """Advice if the focal lengths differ: parts with a given one agree more often."""
     if len(lenses) < 2:
         return ""
     degrees = sorted(one.fov for one in lenses)
     return (
-        f"; each part solved the lens anew (vertical fields of view of {degrees[0]:.0f} to {degrees[-1]:.0f} degrees), "
-        "so that saying what it is (--fov or --intrinsics) may mend that"
+        f"; each part estimated its own focal length (vertical fields of view of {degrees[0]:.0f} to "
+        f"{degrees[-1]:.0f} degrees), "
+        "giving it by --fov or --intrinsics may help"
     )
 
 
@@ -141,15 +148,15 @@ def _try_alignment(
     seen = [by_lens(state, run.records, camera) for state, run in zip(states, runs, strict=True)]
     by_it = [state for state, _ in seen]
     own = [replace(run, records=records) for run, (_, records) in zip(runs, seen, strict=True)]
-    joints = [
-        _joint(number, by_it[number - 1 : number + 1], own[number - 1 : number + 1])
+    alignments = [
+        _align_pair(number, by_it[number - 1 : number + 1], own[number - 1 : number + 1])
         for number in range(1, len(own))
     ]
     similarities = [Similarity.identity()]
-    for joint in joints:
-        similarities.append(similarities[-1].after(joint.fit.similarity))
-    state, dearer = merge_submap_states(by_it, similarities, config, encoder, states)
-    return _Try(own, by_it, joints, similarities, state, dearer)
+    for alignment in alignments:
+        similarities.append(similarities[-1].after(alignment.fit.similarity))
+    state, cost_ratio = merge_submap_states(by_it, similarities, config, encoder, states)
+    return _Try(own, by_it, alignments, similarities, state, cost_ratio)
 
 
 def merge_submap_states(
@@ -159,25 +166,25 @@ def merge_submap_states(
     encoder: FeatureEncoder,
     before: Sequence[SolverState] | None = None,
 ) -> tuple[SolverState, float]:
-    """What the parts know as one, and how many times as much their keyframes cost so; see
+    """Merge the states of the parts; also returns the cost ratio of their keyframes; see
     `tracking3d.submaps.state_merging.merge_states`.
 
     Args:
-        states: Of the parts, all by one lens.
+        states: States of the parts, all with one camera.
         similarities: From each part's object to the first one's.
-        config: Of the solver.
-        encoder: Of the features.
-        before: The parts as they were solved, each by its own lens, which tell what they cost by themselves.
+        config: The solver's configuration.
+        encoder: The feature encoder.
+        before: The parts' own states, each with its own camera, for their cost before merging.
 
     Raises:
-        DisagreementError: If together they explain what was seen far worse than each by itself.
+        DisagreementError: If the merged map explains the keyframes far worse than the parts do.
     """
     own = float(np.mean([keyframe_cost(state.object_map) for state in before or states]))
     state = merge_states(states, similarities, config, encoder)
     together = keyframe_cost(state.object_map)
-    if together > MOST_DEARER * own:
+    if together > MAX_COST_RATIO * own:
         raise DisagreementError(
-            f"one object explains what they show {together / own:.1f} times as badly as one each does"
+            f"one object explains their keyframes {together / own:.1f} times as badly as one object each"
         )
     return state, together / own
 
@@ -185,7 +192,7 @@ def merge_submap_states(
 def _read_submaps(
     session: Session, config: PipelineConfig, plan: Plan, folder: Path
 ) -> tuple[list[PartRun], list[SolverState]]:
-    """The parts with what each knows, by its own lens."""
+    """The parts with their states, each with its own camera."""
     runs: list[PartRun] = []
     states: list[SolverState] = []
     for part in plan.parts:
@@ -194,14 +201,14 @@ def _read_submaps(
         state = kept.session["solver"]
         if state.pending is not None:
             why = state.waiting_reason or "the object did not move enough in it"
-            raise DisagreementError(f"the shape was never told in part {part.number + 1} ({why})")
+            raise DisagreementError(f"the shape could not be initialized in part {part.number + 1} ({why})")
         records = RunReader(own, refined=False).frames
         states.append(state)
         runs.append(PartRun(part, own, kept, records, Similarity.identity()))
     return runs, states
 
 
-def _joint(number: int, states: Sequence[SolverState], runs: Sequence[PartRun]) -> SubmapAlignment:
+def _align_pair(number: int, states: Sequence[SolverState], runs: Sequence[PartRun]) -> SubmapAlignment:
     try:
         return align_submaps(states[0], states[1], runs[0].records, runs[1].records)
     except DisagreementError as error:
@@ -209,7 +216,7 @@ def _joint(number: int, states: Sequence[SolverState], runs: Sequence[PartRun]) 
 
 
 def _refine_alignment(object_map: ObjectMap, own: ObjectMap, similarity: Similarity) -> Similarity:
-    """How a part lies in the joined object after the refinement moved its keyframes."""
+    """The similarity of a part to the merged object after the refinement moved its keyframes."""
     after = {view.index: view.pose for view in object_map.keyframes}
     before = {view.index: view.pose for view in transform_map(own, similarity).keyframes}
     common = sorted(before.keys() & after.keys())
@@ -226,15 +233,15 @@ def _refine_alignment(object_map: ObjectMap, own: ObjectMap, similarity: Similar
 
 
 def own_points(object_map: ObjectMap) -> np.ndarray:
-    """``(V, 3)`` vertices of a map: what holds a small change of coordinates to where the object is."""
+    """``(V, 3)`` vertices of a map, which constrain a small change of coordinates to the object."""
     return np.asarray(object_map.vertices.double().cpu().numpy())
 
 
-def _describe(joint: SubmapAlignment) -> dict[str, Any]:
-    fit = joint.fit
+def _describe(alignment: SubmapAlignment) -> dict[str, Any]:
+    fit = alignment.fit
     return {
-        "frames": joint.frames,
-        "landmarks": joint.landmarks,
+        "frames": alignment.frames,
+        "landmarks": alignment.landmarks,
         "degrees": float(np.median(fit.angles)),
         "distance": float(np.median(fit.distances)),
         "scale": fit.similarity.scale,

@@ -1,4 +1,4 @@
-"""The last steps of a joined run's final refinement, taken by several processes: adjustment, then poses, then masks.
+"""The last steps of a merged run's final refinement, taken by several processes: adjustment, then poses, then masks.
 
 Each process takes its range of frames through `tracking3d.pipeline.refinement_steps.RefinementSteps`. The adjustment,
 and what masks have in common, are computed once, for all frames; what they say of a frame depends only on frames a few
@@ -27,7 +27,7 @@ from tracking3d.results.refined_estimates import RefinedEstimates
 from tracking3d.runtime.concurrency import read_ahead
 from tracking3d.segmentation.temporal_neighbours import REACH
 from tracking3d.segmentation.whole_video import VideoSegmenter
-from tracking3d.submaps.merged_run import take_second_answers
+from tracking3d.submaps.merged_run import move_refined_estimates
 from tracking3d.submaps.submap_runs import Revisit, Tell, resume_submap
 from tracking3d.video import open_source
 from tracking3d.video.selection import parse_selection
@@ -35,7 +35,7 @@ from tracking3d.video.selection import parse_selection
 
 @dataclass(frozen=True, eq=False)
 class Settling:
-    """Second answers of all parts, to be put together.
+    """Refined estimates of all parts, to be merged.
 
     Attributes:
         looks: The frames that were looked at, by parts, in order of time.
@@ -48,7 +48,7 @@ class Settling:
 
 @dataclass(frozen=True, eq=False)
 class Placing:
-    """Frames of one part, to get their poses of the end.
+    """Frames of one part, to get their final poses.
 
     Attributes:
         job: The frames.
@@ -77,7 +77,7 @@ class Weighing:
 
 
 def solve_together(tell: Tell, job: Settling) -> GlobalAdjustment:
-    """Put the refined estimates of all parts into the run, and adjust poses, lens and surface by all of them.
+    """Write the refined estimates of all parts into the run, and adjust poses, lens and surface by all of them.
 
     Raises:
         Tracking3dError: If something cannot be read or written.
@@ -85,7 +85,7 @@ def solve_together(tell: Tell, job: Settling) -> GlobalAdjustment:
     first = job.looks[0]
     kept, session = resume_submap(first)
     if kept.progress.last_refined < kept.progress.last:  # not in their places yet
-        take_second_answers(first.folder, session, [look.out for look in job.looks], job.seconds)
+        move_refined_estimates(first.folder, session, [look.out for look in job.looks], job.seconds)
     estimates = _estimates(first.folder, session.camera)
     most = session.config.object.adjustment_views
     last = RefinementSteps(
@@ -106,7 +106,7 @@ def adjust_poses(tell: Tell, job: Placing) -> list[FrameRecord]:
     """
     estimates = _estimates(job.job.folder, job.look.camera)
     last = RefinementSteps(estimates, job.look)
-    return [last.adjusted(frame) for frame in _frames(job.job.source, job.job.selection, estimates)]
+    return [last.adjust(frame) for frame in _frames(job.job.source, job.job.selection, estimates)]
 
 
 def put_together(tell: Tell, job: Weighing) -> VideoSegmenter:
@@ -146,14 +146,14 @@ def weigh(tell: Tell, job: Weighing) -> dict[int, bytes]:
 
 
 def _decisions(job: Weighing, estimates: RefinedEstimates, own: range) -> Iterator[Decision]:
-    """Those of a part's frames, and of the frames before and after that tell their motion."""
+    """Estimates of a part's frames, and of the frames before and after, for their motion."""
     last = RefinementSteps(estimates, job.look, job.masks)
     reach = 2 * REACH * own.step
     whole = parse_selection(job.job.whole)
     start, stop = max(own.start - reach, whole.start), min(own.stop + reach, whole.stop)
     for frame in _frames(job.job.source, f"{start}:{stop}:{own.step}", estimates):
         yield from last.decide(frame)
-    yield from last.rest()
+    yield from last.decide_rest()
 
 
 def _estimates(folder: Path, camera: Camera) -> RefinedEstimates:

@@ -1,4 +1,4 @@
-"""What a split run is made of: where it is cut and what the object is there, kept so that it can go on."""
+"""The plan of a split run: its cuts and the object's masks there, saved so that the run can be resumed."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ _PLAN = "plan.json"
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Where a video is cut.
+    """The parts of a video.
 
     Attributes:
         parts: The parts, at least one.
-        seconds: What the look ahead took.
-        looked_at: Frames that it looked at.
+        seconds: Time of the preview.
+        preview_frames: Number of frames in the preview.
     """
 
     parts: Sequence[Part]
     seconds: float = 0.0
-    looked_at: int = 0
+    preview_frames: int = 0
 
 
 def selection_of(whole: range, start: int, stop: int) -> str:
@@ -49,12 +49,12 @@ def selection_of(whole: range, start: int, stop: int) -> str:
 
 
 def part_folder(folder: Path, part: Part) -> Path:
-    """Where a part's run lies."""
+    """The run folder of a part."""
     return folder / PARTS / f"part_{part.number}"
 
 
 def prompts_at(folder: Path, part: Part, prompts: PromptSet, precomputed: bool) -> PromptSet:
-    """What the object is in a part's first frame."""
+    """The prompt in a part's first frame."""
     if part.number == 0 or precomputed:
         return prompts
     return PromptSet.of_one(mask=_cut_mask(folder, part))
@@ -71,20 +71,20 @@ def make_plan(
     prompt: Prompt | None,
     selection: str | None,
 ) -> Plan:
-    """Look ahead and cut; the plan is kept in ``folder`` with the masks to begin from.
+    """Preview the video and cut it; the plan is saved in ``folder`` with the prompts of the parts.
 
     Args:
         source: The video.
         config: The pipeline.
-        folder: That of the run.
+        folder: The run folder.
         count: Selected frames.
         length: Frames of a part.
         first: The first frame.
         prompt: The object in it.
-        selection: Which frames were asked for.
+        selection: ``START:STOP:STEP`` of the selected frames.
 
     Raises:
-        Tracking3dError: If the object cannot be looked for, or something cannot be written.
+        Tracking3dError: If the object cannot be tracked, or a file cannot be written.
     """
     began = time.monotonic()
     allowed = windows(count, length)
@@ -112,7 +112,7 @@ def read_plan(
     prompt: Prompt | None,
     selection: str | None,
 ) -> Plan | None:
-    """The plan that was kept; None where there is none. See `make_plan`.
+    """The saved plan; None if there is none. See `make_plan`.
 
     Raises:
         InputError: If it was made for something else, or is damaged.
@@ -126,12 +126,12 @@ def read_plan(
         parts = [Part(**part) for part in plan.pop("parts")]
         found = Plan(parts, **plan)
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-        raise InputError(f"{path} is damaged ({error}); start anew with {layout.OVERWRITE}.") from error
+        raise InputError(f"{path} is damaged ({error}); run it again with {layout.OVERWRITE}.") from error
     asked = jsonable(_planned_settings(config, selection, count, length, first, prompt))
     if different := sorted(key for key in asked if kept.get(key) != asked[key]):
         raise InputError(
-            f"The parts in {folder} were begun with another {' and '.join(different)}; give what they were begun with, "
-            f"or start anew with {layout.OVERWRITE}."
+            f"The parts in {folder} were tracked with another {' and '.join(different)}; use the same, "
+            f"or run again with {layout.OVERWRITE}."
         )
     return found
 
@@ -142,13 +142,13 @@ def has_plan(folder: Path) -> bool:
 
 
 def remove_parts(folder: Path) -> None:
-    """Remove the parts of a run, where there are some."""
+    """Remove the parts of a run, if there are some."""
     if has_plan(folder):
         shutil.rmtree(folder / PARTS, ignore_errors=True)
 
 
 def put_cut_mask(folder: Path, part: Part, mask: Any) -> None:
-    """Keep the object's mask ``(H, W)`` in a part's first frame.
+    """Save the object's mask ``(H, W)`` in a part's first frame.
 
     Raises:
         OutputError: If it cannot be written.
@@ -160,7 +160,7 @@ def _cut_mask(folder: Path, part: Part) -> Any:
     path = folder / PARTS / f"cut_{part.number}.png"
     mask = read_mask(path)
     if mask is None:
-        raise InputError(f"{path} is missing or damaged; start anew with {layout.OVERWRITE}.")
+        raise InputError(f"{path} is missing or damaged; run it again with {layout.OVERWRITE}.")
     return mask
 
 

@@ -1,4 +1,4 @@
-"""The first step of a long video: look ahead and cut; or track it whole, where it is one part or was joined before."""
+"""The first step of a long video: preview and cut; or track it whole, if it is one part or could not be merged."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tracking3d.submaps.submap_runs import PartJob
 from tracking3d.video import open_source
 
 BEFORE = "that was found when they were tracked"
-"""The reason of parts that an earlier command could not join."""
+"""The reason for parts that an earlier command could not merge."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,9 +38,9 @@ class Begun:
     Attributes:
         video: What is tracked.
         config: The pipeline with the mask tracker that was chosen.
-        choice: Why it is that one; None where the user named it.
+        choice: Why it is that one; None if the user named it.
         count: Frames that were asked for.
-        plan: Where it is cut.
+        plan: The plan of its parts.
         jobs: Its parts.
     """
 
@@ -53,11 +53,11 @@ class Begun:
 
 
 def begin(tell: Tell, video: LongVideo) -> Begun | SplitResult:
-    """Cut a video, unless it is one part, or done; ``tell`` is given the answers where it is tracked here.
+    """Cut a video, unless it is one part, or done; ``tell`` is given the estimates if it is tracked here.
 
     Raises:
-        InputError: If the video cannot be split, or what is there is of something else.
-        Tracking3dError: What was finished until then is kept.
+        InputError: If the video cannot be split, or the folder holds another run.
+        Tracking3dError: The frames finished until then are saved.
     """
     folder, resume = video.folder, video.resume
     opened = open_source(video.source, video.selection)
@@ -69,7 +69,7 @@ def begin(tell: Tell, video: LongVideo) -> Begun | SplitResult:
     if not windows(count, frames):
         record_tracking(request, folder, options, tell)
         return SplitResult((folder,), 1, f"{opened.name} has {count} frames, which is one part")
-    if resume and (layout.has_state(folder) or is_there(folder)):  # joined already
+    if resume and (layout.has_state(folder) or is_there(folder)):  # merged already
         record_tracking(request, folder, options, tell)
         remove_parts(folder)
         return SplitResult((folder,), 1)
@@ -87,7 +87,7 @@ def begin(tell: Tell, video: LongVideo) -> Begun | SplitResult:
     if len(plan.parts) == 1:
         remove_parts(folder)
         record_tracking(request, folder, options, tell)
-        return SplitResult((folder,), 1, "no frame near to where it was to be cut shows the object well")
+        return SplitResult((folder,), 1, "no frame near the planned cut shows the object well")
     jobs = _part_jobs(video, config, count, plan, resume=kept is not None)
     if kept is not None and all(is_finished(job.folder) for job in jobs):
         return SplitResult(tuple(job.folder for job in jobs), len(jobs), BEFORE)

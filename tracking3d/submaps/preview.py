@@ -1,4 +1,4 @@
-"""A cheap look through a video before it is cut: a mask tracker alone, on small pictures, not every frame."""
+"""A preview of a video before it is cut: a mask tracker alone, on small images, not every frame."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ _LOOKING = PluginChoice(name="flow", segmentation_size=128)
 
 
 def tracker_for_looking(own: PluginChoice) -> PluginChoice:
-    """The mask tracker of the look: masks that are there already cost nothing, else a small one."""
+    """The mask tracker of the preview: precomputed masks cost nothing; else a fast tracker."""
     return own if own.name == "precomputed" else _LOOKING
 
 
 def stride_of(fps: float | None) -> int:
-    """Every which frame is looked at; every second one where nothing is known of the rate."""
+    """Step of the preview in frames; 2 if the frame rate is unknown."""
     return 2 if fps is None else min(max(int(fps / _RATE), 1), _MOST_STRIDE)
 
 
@@ -43,9 +43,9 @@ def preview_video(
 
     Args:
         source: The frames.
-        prompt: The object in the first of them; None where the tracker knows.
+        prompt: The object in the first of them; None if the tracker knows.
         tracker: See `tracker_for_looking`.
-        allowed: Positions among which cuts may be; only there are masks kept.
+        allowed: Allowed positions of cuts; masks are kept only there.
 
     Raises:
         PluginError: If the tracker cannot start.
@@ -69,7 +69,7 @@ def preview_video(
         except PluginError as error:
             if looking is None or not found:
                 raise
-            _log.warning("The look ahead ends at %s: %s", frame.label, error)
+            _log.warning("The preview ends at %s: %s", frame.label, error)
             break
         mask = estimate.found
         inside = any(position in window for window in allowed)
@@ -78,7 +78,7 @@ def preview_video(
 
 
 def full_size(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
-    """A mask of the look at the frames' size ``(height, width)``."""
+    """A mask of the preview at the frames' size ``(height, width)``."""
     if mask.shape == size:
         return mask
     wide = cv2.resize(mask.astype(np.float32), (size[1], size[0]), interpolation=cv2.INTER_CUBIC)

@@ -32,7 +32,7 @@ _FLOOR = 1e-3  # of the median distance, so that no single row takes all the wei
 
 @dataclass(frozen=True, eq=False)
 class SimilarityFit:
-    """A similarity and how well it is told.
+    """A similarity and its uncertainty.
 
     Attributes:
         similarity: The similarity.
@@ -52,7 +52,7 @@ class SimilarityFit:
 def fit_similarity(
     T_cam_first: Array, T_cam_second: Array, x_first: Array | None = None, x_second: Array | None = None
 ) -> SimilarityFit:
-    """The similarity that explains two runs' poses of the same frames best.
+    """Fit the similarity that explains two runs' poses of the same frames best.
 
     Args:
         T_cam_first: ``(F, 4, 4)`` poses of the first object.

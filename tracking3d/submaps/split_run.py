@@ -1,4 +1,4 @@
-"""A long video in parts: look ahead, cut, track side by side, join, look again side by side, and end as one run."""
+"""A long video in parts: preview, cut, track in parallel, merge, refine in parallel, and finish as one run."""
 
 from __future__ import annotations
 
@@ -38,26 +38,26 @@ def record_in_parts(
 ) -> SplitResult:
     """Track a long video in parts, side by side, and write one run folder; see the module.
 
-    Parts that cannot be joined are finished each by itself, in folders within ``folder``. What there is only one of is
+    Parts that cannot be merged are finished each by itself, in folders within ``folder``. What there is only one of is
     done in this process.
 
     Args:
         source: A video file, or a folder or pattern of images.
-        config: The pipeline; of the solver ``online``, with its final refinement.
+        config: The pipeline, with the solver ``online`` and its final refinement.
         folder: The run folder.
         prompts: What the object is in the first frame.
-        length: Of a part, in seconds or frames, see `tracking3d.submaps.cuts.parse_length`.
+        length: Length of a part, in seconds or frames, see `tracking3d.submaps.cuts.parse_length`.
         workers: Processes at a time.
         selection: ``START:STOP:STEP`` of the frames.
         command: For the record.
         overwrite: Replace a run that is in the folder.
-        resume: Go on with what is there.
-        listener: Is told of every answer, the first ones and those of the refinement.
+        resume: Continue the run that is there.
+        listener: Called for every estimate, causal and refined.
         map_jobs: What takes the place of `run_in_processes` with so many workers.
 
     Raises:
-        InputError: If the video cannot be split, or what is there is of something else.
-        Tracking3dError: What was finished until then is kept, for ``resume``.
+        InputError: If the video cannot be split, or the folder holds another run.
+        Tracking3dError: The frames finished until then are saved, for ``resume``.
     """
     video = LongVideo(
         str(source), config, folder, prompts, length, workers, selection, command, overwrite, resume
@@ -83,7 +83,7 @@ def take_step(tell: Callable[[Any], None], step: Step) -> Any:
 
 
 def _once(listener: Listener) -> Listener:
-    """Frames of two parts, and answers that are only drawn again, are told once."""
+    """Frames of two parts, and estimates that are only drawn again, are given once."""
     told: set[tuple[int, bool]] = set()
 
     def tell(frame: FrameRecord | SkippedFrame) -> None:

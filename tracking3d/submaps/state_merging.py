@@ -36,7 +36,7 @@ def in_space(
 ) -> ObjectMap:
     """A map whose features are of its ``own`` space, with those of another map's: turned, or encoded once more.
 
-    Where a space keeps all channels nothing was lost, and what is exact is also cheaper.
+    If a feature space keeps all channels, nothing was lost, and the exact way is also cheaper.
     """
 
     def encoded(observation: Observation) -> Observation:
@@ -63,10 +63,10 @@ def merge_states(states: Sequence[SolverState], similarities: Sequence[Similarit
     """What several parts know as one belief, poses, landmarks and shape refined together.
 
     Args:
-        states: Of the parts, each of one camera, see `through_lens`, and each past its start.
+        states: States of the parts, each of one camera, see `through_lens`, and each initialized.
         similarities: From each part's object to the first one's.
-        config: Of the solver.
-        encoder: Of the features.
+        config: The solver's configuration.
+        encoder: The feature encoder.
     """
     first, camera = states[0], states[0].camera
     object_map = first.object_map

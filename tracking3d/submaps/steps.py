@@ -1,4 +1,4 @@
-"""A long video as steps: calls of functions in workers, some of them side by side, each list after the one before."""
+"""A long video as steps: calls of functions in workers, some of them in parallel, each list after the one before."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 from tracking3d.pipeline.refinement_steps import PrecomputedRefinement
 from tracking3d.submaps.job import SplitResult
-from tracking3d.submaps.merge_step import Again, Ending, Joined, Refused, Tracked, end, join
+from tracking3d.submaps.merge_step import Again, Ending, MergedSubmaps, Refused, Tracked, end, join
 from tracking3d.submaps.parallel_refinement import (
     Placing,
     Settling,
@@ -28,10 +28,10 @@ class Step:
     """One call in a worker.
 
     Attributes:
-        function: Called as ``function(tell, argument)``; ``tell`` takes the record of every frame that is answered.
+        function: Called as ``function(tell, argument)``; ``tell`` takes the record of every frame that is estimated.
         argument: What it is called with; it can be pickled, as can what is returned.
         label: What it is called, for who looks on.
-        frames: How many answers it gives; 0 where that is not known.
+        frames: Number of estimates it gives; 0 if unknown.
     """
 
     function: Callable[[Any, Any], Any]
@@ -53,7 +53,7 @@ def steps_of(begun: Begun) -> Steps:
     ]
     while True:
         taken = time.monotonic() - clock
-        [found] = yield [Step(join, Tracked(begun, tuple(jobs), tuple(again), taken), "joining its parts")]
+        [found] = yield [Step(join, Tracked(begun, tuple(jobs), tuple(again), taken), "merging its parts")]
         if not isinstance(found, Again):
             break
         jobs[found.number] = found.job
@@ -63,32 +63,32 @@ def steps_of(begun: Begun) -> Steps:
         whole = [replace(job, resume=True, first_pass_only=False) for job in jobs]
         yield [Step(track_part, job, f"end of part {number} of {of}") for number, job in enumerate(whole, 1)]
         return SplitResult(tuple(job.folder for job in jobs), of, found.reason)
-    assert isinstance(found, Joined)
+    assert isinstance(found, MergedSubmaps)
     clock = time.monotonic()
     looks = found.looks
     yield [
-        Step(refine_submap, look, f"second look {number} of {of}", _frames(look))
+        Step(refine_submap, look, f"refinement pass {number} of {of}", _frames(look))
         for number, look in enumerate(looks, 1)
     ]
-    seconds = {**found.seconds, "second_look": time.monotonic() - clock}
+    seconds = {**found.seconds, "refinement_pass": time.monotonic() - clock}
     yield from steps_to_the_end(replace(found, seconds=seconds))
     return SplitResult((begun.video.folder,), of)
 
 
-def steps_to_the_end(joined: Joined) -> Generator[list[Step], list[Any], None]:
-    """What is left to be done when all frames of a joined run were looked at again."""
-    precomputed, seconds = yield from _last_looks(joined)
-    joined = replace(joined, seconds={**joined.seconds, **seconds})
-    yield [Step(end, Ending(joined, precomputed), "its end")]
+def steps_to_the_end(merged: MergedSubmaps) -> Generator[list[Step], list[Any], None]:
+    """The steps after all frames of a merged run have been refined."""
+    precomputed, seconds = yield from _refine_in_parallel(merged)
+    merged = replace(merged, seconds={**merged.seconds, **seconds})
+    yield [Step(end, Ending(merged, precomputed), "writing its results")]
 
 
-def _last_looks(
-    joined: Joined,
+def _refine_in_parallel(
+    merged: MergedSubmaps,
 ) -> Generator[list[Step], list[Any], tuple[PrecomputedRefinement, dict[str, float]]]:
-    """What becomes of the frames, and the seconds of each step."""
-    looks, of, clock = joined.looks, len(joined.looks), time.monotonic()
-    refined = joined.seconds["refine"] + joined.seconds["second_look"]
-    [look] = yield [Step(solve_together, Settling(looks, refined), "what its frames say together")]
+    """The final refinement of the parts: its last steps, and the seconds of each."""
+    looks, of, clock = merged.looks, len(merged.looks), time.monotonic()
+    refined = merged.seconds["refine"] + merged.seconds["refinement_pass"]
+    [look] = yield [Step(solve_together, Settling(looks, refined), "global adjustment")]
     settled = time.monotonic()
     placed = yield [
         Step(adjust_poses, Placing(job, look), f"poses {number} of {of}")
@@ -96,11 +96,11 @@ def _last_looks(
     ]
     estimates = {record.index: record for part in placed for record in part}
     seconds = {"settle": settled - clock, "poses": time.monotonic() - settled}
-    if not joined.begun.config.object.refine_masks:
+    if not merged.begun.config.object.refine_masks:
         return PrecomputedRefinement(look, estimates, {}), seconds
     clock = time.monotonic()
     weighing = Weighing(looks[0], estimates, look)
-    [masks] = yield [Step(put_together, weighing, "what its masks say together")]
+    [masks] = yield [Step(put_together, weighing, "collecting its masks")]
     decided = yield [
         Step(weigh, replace(weighing, job=job, masks=masks), f"masks {number} of {of}")
         for number, job in enumerate(looks, 1)

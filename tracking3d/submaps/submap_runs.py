@@ -1,4 +1,4 @@
-"""The parts of a video as runs: tracked to the end of their first pass, and looked at again against the whole object.
+"""The parts of a video as runs: tracked in a first pass, and refined against the merged object.
 
 What is here runs in processes of its own.
 """
@@ -44,8 +44,8 @@ class PartJob:
         folder: The part's run folder.
         prompts: What the object is in its first frame.
         command: For the record.
-        resume: Go on with what is there.
-        first_pass_only: Stop when every frame has its causal answer.
+        resume: Continue the run that is there.
+        first_pass_only: Stop when every frame has its causal estimate.
     """
 
     source: str
@@ -75,7 +75,7 @@ def track_part(tell: Tell, job: PartJob) -> None:
 
 
 def is_tracked(folder: Path, source: FrameSource) -> bool:
-    """Whether a part has all its causal answers, and the state to go on from."""
+    """Whether a part has all its causal estimates and its checkpoint."""
     if not ((folder / layout.RUN).is_file() and layout.has_state(folder)):
         return False
     run = RunReader(folder, refined=False)
@@ -84,16 +84,16 @@ def is_tracked(folder: Path, source: FrameSource) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Revisit:
-    """Frames of the joined run, to be answered against the whole object.
+    """Frames of the merged run, to be refined against the merged object.
 
     Attributes:
         source: The video.
         whole: All selected frames of it, ``START:STOP:STEP``, or None.
         selection: The frames that are looked at.
         config: The pipeline.
-        folder: The joined run's.
+        folder: The folder of the merged run.
         prompts: What the object is in the video's first frame.
-        out: Folder that gets ``masks/`` and ``frames.jsonl`` of the second answers.
+        out: Folder that gets ``masks/`` and ``frames.jsonl`` of the refined estimates.
     """
 
     source: str
@@ -106,10 +106,10 @@ class Revisit:
 
 
 def refine_submap(tell: Tell, job: Revisit) -> int:
-    """Answer for some frames once more, in order of time; ``tell`` is given each answer's record.
+    """Refine some frames, in order of time; ``tell`` is given each estimate's record.
 
     Returns:
-        How many have a second answer.
+        Number of refined estimates.
 
     Raises:
         Tracking3dError: If a plug-in fails that may not, or something cannot be read or written.
@@ -118,22 +118,22 @@ def refine_submap(tell: Tell, job: Revisit) -> int:
     causal = {one.index: one for one in RunReader(job.folder, refined=False).frames}
     with writing(job.out):
         (job.out / layout.MASKS).mkdir(parents=True, exist_ok=True)
-    answered = 0
+    count = 0
     with (job.out / layout.FRAMES).open("wb") as lines:
         for frame in read_timed(open_source(job.source, job.selection)):
             if not isinstance(frame, Frame) or frame.index not in causal:
                 continue
-            record_ = _second_answer(session, job, kept, frame, causal[frame.index])
+            record_ = _refine_estimate(session, job, kept, frame, causal[frame.index])
             if record_ is not None:
                 with writing(job.out):
                     lines.write(record_.to_json().encode() + b"\n")
-                answered += 1
+                count += 1
             tell(record_ or causal[frame.index])
-    return answered
+    return count
 
 
 def resume_submap(job: Revisit) -> tuple[SavedState, Session]:
-    """The state of the joined run, and a session that has its object.
+    """The state of the merged run, and a session that has its object.
 
     Raises:
         Tracking3dError: If it cannot be read.
@@ -147,10 +147,10 @@ def resume_submap(job: Revisit) -> tuple[SavedState, Session]:
     return kept, session
 
 
-def _second_answer(
+def _refine_estimate(
     session: Session, job: Revisit, kept: SavedState, frame: Frame, causal: FrameRecord
 ) -> FrameRecord | None:
-    """The record of a frame's second answer, its mask written; None lets the first stand."""
+    """The record of a frame's second estimate, its mask written; None lets the first stand."""
     mask = read_mask(layout.initial_mask_path(job.folder, frame.index))
     taken = kept.taken[frame.index]
     initial = MaskEstimate(None if mask is None else mask.astype(np.float32), taken.score, taken.reason)

@@ -147,7 +147,7 @@ def _documents(scene: Scene, box: list[int], scale: float) -> dict[str, dict[str
         "init.json": {"frame": 0, "bbox_xywh": box, "mask": "masks/000000.png"},
     }
     if not spec.camera_told:
-        documents["camera.json"] |= {"told": False, "note": "true, but not given to a tracker"}
+        documents["camera.json"] |= {"given": False, "note": "true, but not given to a tracker"}
     if scene.given_camera != scene.camera:
         documents["camera.json"]["note"] = "wrong on purpose; the true camera is in truth_camera.json"
         documents["truth_camera.json"] = {**_intrinsics(scene.camera), "depth_scale": scale}

@@ -58,13 +58,13 @@ class RunCorrection:
     @property
     def why_not(self) -> str:
         """Why the run cannot be corrected here, in a sentence; empty if it can."""
-        run, given = self.run, self.run.description.get("given")
+        run, prompt = self.run, self.run.description.get("prompt")
         if run.going_on:
             return "The run is not finished; it can be corrected afterwards."
         if self._images is None:
             return "The video of the run was not found; open the viewer with --source."
-        if not isinstance(given, dict) or "first_frame" not in given:
-            return "The run is from an earlier version, which did not store its prompt."
+        if not isinstance(prompt, dict) or "first_frame" not in prompt:
+            return "The run.json of the run names no prompt; run the video again."
         if not getattr(self._images, "repeatable", True):
             return "The run is from a camera, whose frames were not stored."
         tracker = run.description.get("config", {}).get("tracker")
@@ -76,7 +76,7 @@ class RunCorrection:
         """Why this frame of a run that can be corrected cannot be, in a sentence; empty if it can."""
         if index not in self.run.frames:
             return f"The run has no estimate for frame {index}."
-        if index == self.run.description["given"]["first_frame"]:
+        if index == self.run.description["prompt"]["first_frame"]:
             return f"The object was given in frame {index}; correct another frame, or run again with a better prompt."
         return ""
 

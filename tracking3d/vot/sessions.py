@@ -13,7 +13,7 @@ from tracking3d.frames import Frame, Image, Prompt
 from tracking3d.pipeline.track import Session, validate_image
 
 PRESET_VARIABLE = "TRACKING3D_PRESET"
-"""Environment variable with the name of the preset where none is given."""
+"""Environment variable with the name of the preset if none is given."""
 
 
 class ObjectSessions:
@@ -36,7 +36,7 @@ class ObjectSessions:
             new: Say what each new object is, given the frame.
 
         Returns:
-            An answer for each object, in the order in which they came.
+            An estimate for each object, in the order in which they came.
 
         Raises:
             Tracking3dError: If the image or a prompt cannot be used.

@@ -26,7 +26,7 @@ _COLOUR = ("color", "visible", "rgb")
 
 
 class VotTracker:
-    """Follows any number of objects. Each answer is a mask or rectangle and its ``confidence`` in [0, 1].
+    """Follows any number of objects. Each estimate is a mask or rectangle and its ``confidence`` in [0, 1].
 
     Written against ``vot.tracker.python`` of vot-toolkit 0.9.0. All arguments are strings, since ``arg_`` lines of
     ``trackers.ini`` are.
@@ -35,7 +35,7 @@ class VotTracker:
         config: A YAML file of the pipeline.
         preset: Name of a preset; by default that in ``TRACKING3D_PRESET``, or else the default one.
         overrides: ``section.key=value`` items with spaces between.
-        region: What is answered: ``mask`` or ``rectangle``.
+        region: What is estimated: ``mask`` or ``rectangle``.
 
     Raises:
         RuntimeError: If one of them cannot be used. Other errors than the built-in ones would leave the toolkit
@@ -64,7 +64,7 @@ class VotTracker:
         """Begin a sequence.
 
         Args:
-            frame: The image's path, or an image ``(H, W, 3)`` RGB; by channel where there are several.
+            frame: The image's path, or an image ``(H, W, 3)`` RGB; by channel if there are several.
             new: Region and properties of each object; see `tracking3d.vot.regions.prompt_of`.
             properties: Not used.
 
@@ -80,7 +80,7 @@ class VotTracker:
     def update(
         self, frame: Any, new: Sequence[Status] | Status = (), properties: Mapping[str, Any] | None = None
     ) -> list[Status]:
-        """Go on to the next frame, in which objects may be new; see `init`."""
+        """Track the next frame, in which objects may be new; see `init`."""
         with _report_to_toolkit():
             objects = [new] if isinstance(new, tuple) and new else new
             prompts = [partial(prompt_of, region) for region, _ in objects]

@@ -20,7 +20,7 @@ from tracking3d.vot.sessions import ObjectSessions, configuration
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Serve the toolkit until it says goodbye; it is told what goes wrong."""
+    """Serve the toolkit until it disconnects; errors are reported to it."""
     parser = argparse.ArgumentParser(prog="python -m tracking3d.vot.trax_server", description=__doc__)
     parser.add_argument("--config", help="a YAML file of the pipeline")
     parser.add_argument("--preset", help="name of a preset; by default that in TRACKING3D_PRESET")
