@@ -10,7 +10,7 @@ import math
 
 from tracking3d.estimation.assessment import Assessment
 from tracking3d.estimation.estimate import Status
-from tracking3d.points.landmark_adjustment import Support
+from tracking3d.points.landmark_adjustment import LandmarkSupport
 from tracking3d.results.records import FrameRecord
 
 BELIEVED = 0.5
@@ -25,7 +25,7 @@ _TERMS = {  # weight, and the range that was seen
 }
 
 
-def assess_estimate(estimate: FrameRecord, support: Support) -> tuple[Assessment, dict[str, float]]:
+def assess_estimate(estimate: FrameRecord, support: LandmarkSupport) -> tuple[Assessment, dict[str, float]]:
     """The assessment of a refined estimate, and what it comes from, for the estimate's ``diagnostics``."""
     assessment = judge_with_landmarks(
         Assessment(estimate.status, estimate.reason, estimate.confidence), support
@@ -38,7 +38,7 @@ def assess_estimate(estimate: FrameRecord, support: Support) -> tuple[Assessment
     }
 
 
-def judge_with_landmarks(rendering: Assessment, support: Support) -> Assessment:
+def judge_with_landmarks(rendering: Assessment, support: LandmarkSupport) -> Assessment:
     """The assessment of a frame by its rendering and its landmarks; a lost frame stays lost.
 
     A logistic regression of whether the answer is right, that is, within 10 degrees and above an IoU of 0.7. Fitted by
@@ -67,7 +67,7 @@ def judge_with_landmarks(rendering: Assessment, support: Support) -> Assessment:
     return Assessment(Status.UNCERTAIN, reason, confidence)
 
 
-def refined_confidence_features(rendering: float, support: Support) -> dict[str, float]:
+def refined_confidence_features(rendering: float, support: LandmarkSupport) -> dict[str, float]:
     """The evidence that a confidence is made of, by name.
 
     Args:

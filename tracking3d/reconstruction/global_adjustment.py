@@ -20,7 +20,7 @@ from tracking3d.estimation.online.features.klt import grey
 from tracking3d.estimation.online.features.texture_strength import PLAIN, texture_strength
 from tracking3d.frames import Image
 from tracking3d.geometry.camera import Camera
-from tracking3d.points.landmark_adjustment import LandmarkScene, Support, fit_outlines, refine_scene
+from tracking3d.points.landmark_adjustment import LandmarkScene, LandmarkSupport, fit_outlines, refine_scene
 from tracking3d.points.resection import resect
 from tracking3d.points.view import SurfaceView, open_view
 from tracking3d.reconstruction.views import TextureView
@@ -98,7 +98,7 @@ class GlobalAdjustment:
 
     def pose(
         self, record: FrameRecord, image: Image, mask: NDArray[np.bool_]
-    ) -> tuple[_Pose, Support | None]:
+    ) -> tuple[_Pose, LandmarkSupport | None]:
         """The pose ``(4, 4)`` of any frame after `settle`, and what landmarks say of it; None where nothing does.
 
         Args:
@@ -128,7 +128,7 @@ class GlobalAdjustment:
         resected, share = resect(scene, view, around)
         there = [scene.support[at] for at in around if at in scene.support]
         followed = max((one.followed for one in there), default=0)
-        return resected.T_cam_obj, self._told(Support(followed, round(share * followed)))
+        return resected.T_cam_obj, self._told(LandmarkSupport(followed, round(share * followed)))
 
     def moved(self, model: ObjectModel) -> ObjectModel:
         """The model with the surface that was found."""
@@ -139,7 +139,7 @@ class GlobalAdjustment:
         factor = self.camera.fx / self._lens
         return replace(view, K=view.K @ np.diag([factor, factor, 1.0]), T_cam_obj=record.T_cam_obj)
 
-    def _told(self, support: Support | None) -> Support | None:
+    def _told(self, support: LandmarkSupport | None) -> LandmarkSupport | None:
         """What landmarks say, with whether they can tell anything on this object."""
         return support and replace(support, telling=float(np.median(self._strengths)) >= PLAIN)
 
