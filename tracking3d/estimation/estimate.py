@@ -151,7 +151,7 @@ def lost_estimate(frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float6
     )
 
 
-def mark_plugin_failure(estimate: FrameEstimate, failure: str) -> FrameEstimate:
+def mark_failed(estimate: FrameEstimate, failure: str) -> FrameEstimate:
     """The estimate of a frame in which a plug-in failed: at most uncertain, with half the confidence.
 
     Args:
