@@ -57,7 +57,7 @@ def _of_points(image: Image, drawn: DrawnObject) -> NDArray[np.uint8]:
 
 
 def _in_box(image: Image, drawn: DrawnObject, box: Box) -> NDArray[np.uint8]:
-    """The object in a box, by points on it and beside it."""
+    """The object in a box, by points on it and on the background."""
     height, width = image.shape[:2]
     scale = _SIZE / max(height, width)
     small = cv2.resize(

@@ -30,8 +30,8 @@ class Picked:
     Attributes:
         frame: Index of the frame that it was picked in, which the run begins with.
         objects: What was drawn.
-        boxes: One ``(x, y, width, height)`` for each object, where boxes say it all, else none.
-        masks: One ``(H, W)`` bool for each object, where they do not, else none.
+        boxes: One ``(x, y, width, height)`` for each object, if boxes are enough, else none.
+        masks: One ``(H, W)`` bool for each object, if they are not, else none.
     """
 
     frame: int

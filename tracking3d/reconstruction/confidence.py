@@ -16,7 +16,7 @@ from tracking3d.results.records import FrameRecord
 BELIEVED = 0.5
 """Confidence from which a frame is `tracked`."""
 _EVEN, _NEARLY_ALL = 0.5, 0.95
-"""Shares of the followed landmarks that agree, between which belief grows: where poses are wrong, what is followed is
+"""Shares of the followed landmarks that agree, between which belief grows: if poses are wrong, what is followed is
 often something else, such as the background, and much of it fits no pose."""
 _INTERCEPT = -0.8803
 _TERMS = {  # weight, and the range that was seen
@@ -41,7 +41,7 @@ def assess_estimate(estimate: FrameRecord, support: LandmarkSupport) -> tuple[As
 def judge_with_landmarks(rendering: Assessment, support: LandmarkSupport) -> Assessment:
     """The assessment of a frame by its rendering and its landmarks; a lost frame stays lost.
 
-    A logistic regression of whether the answer is right, that is, within 10 degrees and above an IoU of 0.7. Fitted by
+    A logistic regression of whether the estimate is right, that is, within 10 degrees and above IoU 0.7. Fitted by
     ``training/confidence.py --refined`` on the suites ``fresh`` of seeds 605, 606, 607, 609 and 610, with true masks
     and those of `csrt` and `flow`; docs/benchmark.md has what it is worth on another. How many landmarks agree, and
     whether the object is plain, adds nothing to the share that does.

@@ -31,7 +31,7 @@ class Grid:
         Args:
             points: What it has to hold.
             cells: Along the longest side of the points' box.
-            margin: Beside that box on every side, relative to its longest side.
+            margin: Free space around that box on every side, relative to its longest side.
         """
         low, high = points.min(0), points.max(0)
         longest = float((high - low).max())

@@ -32,7 +32,7 @@ COLOUR, OUTLINE = 0.1, 2.0
 OUTLINE_WEIGHT = 0.3
 _STEPS = 6
 _ENOUGH = 1e-4
-_FARTHEST = 5.0  # degrees a pose may turn; a view that wants more is not to be believed
+_FARTHEST = 5.0  # degrees a pose may turn; a view that turns farther is rejected
 
 
 def coloured_surface(
@@ -75,7 +75,7 @@ def refine_views(surface: Surface, views: Sequence[ShapeView]) -> list[ShapeView
 
 
 def _fit_pose(surface: Surface, view: ShapeView) -> NDArray[np.float64]:
-    """``(4, 4)`` the pose that fits best, the one at hand where none fits better or it runs away."""
+    """``(4, 4)`` the pose that fits best, the present one if none fits better or it runs away."""
     mask = torch.from_numpy(view.mask)
     target = PoseTarget(
         torch.from_numpy(view.K).float(),

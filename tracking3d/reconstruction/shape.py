@@ -1,7 +1,7 @@
-"""The shape of an object of any topology, from all frames that are believed.
+"""The shape of an object of any topology, from all reliable frames.
 
 Silhouettes bound it, matched patches say how deep it is, and the mesh of the online map holds it where neither knows;
-everything is fused in a volume. Poses are taken as they are: landmarks told them to a tenth of a degree, which no
+everything is fused in a volume. Poses are taken as they are: landmarks determine them to a tenth of a degree, which no
 fit to a surface that is still rough can better. Every eighth frame is kept out; only if the new shape explains those
 better than the old one does it take its place.
 """
@@ -56,9 +56,9 @@ class ReconstructedShape:
     """What came of it.
 
     Attributes:
-        vertices: ``(V, 3)``; faces: ``(F, 3)``: closed and oriented; None where the old shape stays.
+        vertices: ``(V, 3)``; faces: ``(F, 3)``: closed and oriented; None if the old shape stays.
         sentence: What was found, or why the old shape stays.
-        old: How the old shape explains the frames that were left out; None where it was not asked.
+        old: How the old shape explains the frames that were left out; None if it was not asked.
         new: How the new one does.
     """
 

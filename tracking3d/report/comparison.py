@@ -57,7 +57,7 @@ def write_comparison(comparison: RunComparison, path: Path) -> None:
 
 
 def _pairs(comparison: RunComparison) -> list[tuple[str, list[dict[str, str] | None]]]:
-    """Of every run its row in the table of every two, where there are more than two."""
+    """The row of every run in the table of pairs, if there are more than two runs."""
     if len(comparison.runs) < 3:
         return []
     rows = []
@@ -75,7 +75,7 @@ def _pairs(comparison: RunComparison) -> list[tuple[str, list[dict[str, str] | N
 
 
 def _frames(comparison: RunComparison) -> list[int]:
-    """Every frame that any run has answered: what the plots go over."""
+    """Every frame with an estimate of any run: what the plots go over."""
     return sorted({record.index for run in comparison.runs for record in run.frames})
 
 
@@ -118,7 +118,7 @@ def _strips(comparison: RunComparison) -> list[dict[str, Any]]:
 
 
 def _pictures(comparison: RunComparison) -> list[dict[str, Any]]:
-    """Of each frame that differs most, the overlays of all runs around the object, and in what they differ."""
+    """For each frame that differs most, the overlays of all runs around the object, and in what they differ."""
     size = OverlaySize.of(comparison.runs[0].camera)
     shown: list[dict[str, Any]] = [
         {"index": index, "pictures": [], "differs": _differs(comparison, index)} for index in comparison.worst
@@ -138,7 +138,7 @@ def _pictures(comparison: RunComparison) -> list[dict[str, Any]]:
 
 
 def _around(comparison: RunComparison, index: int, size: OverlaySize) -> tuple[slice, slice]:
-    """Rows and columns of the overlay around the masks of all runs; all of it where there is none."""
+    """Rows and columns of the overlay around the masks of all runs; all of it if there is none."""
     masks = [mask for run in comparison.runs if (mask := read_mask(run.mask_path(index))) is not None]
     boxes = [cv2.boundingRect(mask.astype(np.uint8)) for mask in masks if mask.any()]
     if not boxes:

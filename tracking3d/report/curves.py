@@ -15,7 +15,7 @@ from tracking3d.estimation.estimate import Status
 WIDTH, HEIGHT = 1000.0, 100.0
 """The picture's own units: it is stretched to the page."""
 MOST_POINTS = 2000
-"""Of a curve; of more frames every n-th is drawn."""
+"""Points of a curve; if there are more frames, every n-th is drawn."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def curve(
     Args:
         title: What it is.
         values: ``(N,)``; not finite if there is none.
-        unit: Written behind the figures, with a space before it where it needs one.
+        unit: Written behind the figures, with a space before it if it needs one.
         limits: Figures at the lower and the upper edge; the least and the greatest if None.
         digits: After the decimal point.
 
@@ -140,7 +140,7 @@ def stretches(indices: Sequence[int], statuses: Sequence[str], reasons: Sequence
     Figures within a reason do not part them, nor do the reasons of frames that are tracked.
 
     Args:
-        indices: Of the frames in the source.
+        indices: Indices of the frames in the source.
         statuses: One a frame.
         reasons: One a frame.
     """

@@ -70,7 +70,7 @@ class RunComparison:
         runs: The runs; the first one is what the others are held against.
         names: What to call them; no two alike.
         settings: By name, the value in each run as text, of those that differ; None if a run has none such.
-        differences: Of each run but the first.
+        differences: Differences of each run but the first.
         worst: Indices of the frames that differ most, in order of time.
         notes: What to know, in sentences.
         iou_between: ``(R, R)`` mean IoU of the masks of every two runs; NaN if there is none.
@@ -130,7 +130,7 @@ def compare_runs(folders: Sequence[Path], against: Path | None = None) -> RunCom
     Poses are compared after the similarity that fits best, since object frame and unit of a run are its own.
 
     Args:
-        folders: Two run folders or more; one is enough where ``against`` is another.
+        folders: Two run folders or more; one is enough if ``against`` is another.
         against: The run that the others are held against, among them or not; the first if None.
 
     Raises:

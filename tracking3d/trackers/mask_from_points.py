@@ -74,7 +74,7 @@ def mask_from_points(image: Image, points: Points) -> NDArray[np.float32]:
 def _seeds(
     pixels: NDArray, kinds: NDArray, shape: tuple[int, ...]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """What the points are sure of: the object, and what is none of it. Where both are near, the nearer point counts."""
+    """What the points are sure of: the object, and what is none of it. If both are near, the nearer point counts."""
     rows, columns = np.mgrid[: shape[0], : shape[1]] + 0.5
     gaps = []
     for kind in (1, 0):

@@ -40,7 +40,7 @@ class RunCorrection:
     Args:
         run: The run.
         images: Its frames.
-        source: The video, where it is not where the run found it.
+        source: The video, if it is not where the run found it.
         access: Where the page listens, and whom it serves.
     """
 

@@ -32,7 +32,7 @@ def list_streaks(runs: Sequence[FollowedRun]) -> str:
 
 
 def describe_frame(run: FollowedRun, record: FrameRecord | None, colour: Colour | None = None) -> str:
-    """One run's answer for a frame in a line of HTML, after the colour of its curve."""
+    """One run's estimate of a frame in a line of HTML, after the colour of its curve."""
     name = html.escape(run.name)
     if colour is not None:
         name = f'<span style="color:{hexadecimal(colour)}">▬</span> {name}'

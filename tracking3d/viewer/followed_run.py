@@ -70,7 +70,7 @@ class FollowedRun:
         self._model_time = 0.0
         self.reader = RunReader(self.folder)
         self.description = self.reader.description
-        self.reader.camera  # noqa: B018 (a damaged one is told of before anything is shown)
+        self.reader.camera  # noqa: B018 (a damaged one is reported before anything is shown)
 
     @property
     def camera(self) -> Camera:

@@ -71,11 +71,11 @@ def seen_texels(
 
     Args:
         values: ``(C, H, W)``; valid: ``(H, W)``; K: ``(3, 3)``, see `tracking3d.rendering.seen_texels`.
-        drawn: ``(H, W)`` depth of the mesh, infinite beside it.
+        drawn: ``(H, W)`` depth of the mesh, infinite where it does not cover the pixel.
         corners: ``(F, 3, 3)`` of the faces, in camera coordinates.
         normals: ``(F, 3)``; facing: ``(F,)`` bool, which of them may be seen.
         texels: Flat indices ``(M,)``, faces ``(M,)`` and barycentric coordinates ``(M, 3)``.
-        grazing: Smallest cosine of the viewing angle that is believed.
+        grazing: Smallest accepted cosine of the viewing angle.
         tolerance: By how much something may be nearer at a cosine of 1.
     """
     texel, face, barycentric = texels
