@@ -109,8 +109,8 @@ class PickingSession:
         """
         frames = sorted({one.frame for one in drawing.objects})
         if len(frames) > 1:
-            told = " and ".join(str(index) for index in frames)
-            raise InputError(f"The objects are drawn on frames {told}; draw all of them on one frame.")
+            drawn_on = " and ".join(str(index) for index in frames)
+            raise InputError(f"The objects are drawn on frames {drawn_on}; draw all of them on one frame.")
         if len(drawing.objects) > 1 and self.config.tracker.name == "precomputed":
             raise InputError("The tracker precomputed has masks of one object; pick one object.")
         frame = self._frame(frames[0])

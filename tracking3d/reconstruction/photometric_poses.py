@@ -56,9 +56,9 @@ def coloured_surface(
         valid = torch.from_numpy(np.clip((view.depth_inside - 1) / 2, 0, 1))
         seen = seen + back_project(_picture(view), valid, points, corners, texels, R, t, K)
     # Between the cells texels continue the nearest one on a face: samples at a face's edge mix with them.
-    beside = np.ones((size, size), np.bool_)
-    beside.flat[texels.texel.numpy()] = False
-    row, column = distance_transform_edt(beside, return_distances=False, return_indices=True)
+    uncovered = np.ones((size, size), np.bool_)
+    uncovered.flat[texels.texel.numpy()] = False
+    row, column = distance_transform_edt(uncovered, return_distances=False, return_indices=True)
     texture = seen.mean()[:, row, column].contiguous()
     known = (seen.weight > 0)[row, column][None].float()
     return Surface(points, corners, uvs, texture, known)

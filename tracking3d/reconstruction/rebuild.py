@@ -101,15 +101,15 @@ def rebuild_shape(
     online = _online_model(run)
     shapes: list[ShapeView] = []
     left_out: list[ShapeView] = []
-    believed = 0
+    count = 0
     views: tuple[TextureView, ...] = ()
     for frame, record in reliable_frames(run, source):
         seen = _views_of_frame(run, frame, record)
         if seen is None:
             continue
         views = keep_best_views(views, seen[1], most)
-        (left_out if is_held_out(believed) else shapes).append(seen[0])
-        believed += 1
+        (left_out if is_held_out(count) else shapes).append(seen[0])
+        count += 1
         if len(shapes) > 4 * MOST:  # memory does not grow with the video
             shapes = spread_by_rotation(shapes, 0.5, 2 * MOST)
         if len(left_out) > 2 * MOST_LEFT_OUT:
@@ -152,23 +152,23 @@ def score_run(folder: Path, source: str | None = None, largest: int = 2048) -> H
     used: list[ShapeView] = []
     left_out: list[tuple[ShapeView, TextureView]] = []
     views: tuple[TextureView, ...] = ()
-    believed = 0
+    count = 0
     for frame, record in reliable_frames(run, source):
         if (seen := _views_of_frame(run, frame, record)) is None:
             continue
-        if is_held_out(believed):
+        if is_held_out(count):
             left_out.append(seen)
         else:
             used.append(seen[0])
             views = keep_best_views(views, seen[1], _TEXTURE_VIEWS)
-        believed += 1
+        count += 1
         if len(used) > 2 * MOST:
             used = spread_by_rotation(used, 0.5, MOST)
         if len(left_out) > MOST_LEFT_OUT:
             left_out = left_out[::2]
     if not left_out:
         raise InputError(
-            f"Only {believed} frames of the run {folder} are reliable; none can be held out to test its model."
+            f"Only {count} frames of the run {folder} are reliable; none can be held out to test its model."
         )
     return held_out_scores(bake_texture(model, views, largest), used, left_out)
 

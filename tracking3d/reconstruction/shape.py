@@ -99,13 +99,13 @@ def reconstruct_shape(
     )
     old = score_held_out(vertices, faces, used, left_out)
     new = score_held_out(new_vertices, new_faces, used, left_out)
-    told = (
+    comparison = (
         f"silhouettes of {len(left_out)} frames that were left out agree by {new.iou:.3f} instead of {old.iou:.3f}, "
         f"colours differ by {new.colour:.3f} instead of {old.colour:.3f}"
     )
     if not new.better_than(old):
-        return _keep_mesh(f"the new one is no better ({told})", old, new)
-    return ReconstructedShape(new_vertices, new_faces, told, old, new)
+        return _keep_mesh(f"the new one is no better ({comparison})", old, new)
+    return ReconstructedShape(new_vertices, new_faces, comparison, old, new)
 
 
 def _volume(start: trimesh.Trimesh, views: Sequence[ShapeView]) -> tuple[Grid, FloatArray]:

@@ -65,11 +65,11 @@ def _pairs(comparison: RunComparison) -> list[tuple[str, list[dict[str, str] | N
         cells: list[dict[str, str] | None] = []
         for column in range(len(comparison.names)):
             iou, turn = comparison.iou_between[row, column], comparison.rotation_between[row, column]
-            told = {
+            cell = {
                 "iou": f"{iou:.3f}" if np.isfinite(iou) else "–",
                 "rotation": f"{turn:.1f}°" if np.isfinite(turn) else "–",
             }
-            cells.append(None if row == column else told)
+            cells.append(None if row == column else cell)
         rows.append((name, cells))
     return rows
 
@@ -109,10 +109,10 @@ def _strips(comparison: RunComparison) -> list[dict[str, Any]]:
     frames, strips = _frames(comparison), []
     for name, run in zip(comparison.names, comparison.runs, strict=True):
         status = {record.index: record.status.value for record in run.frames}
-        told = [status.get(index, "no estimate") for index in frames]
-        counts = ", ".join(f"{told.count(kind)} {kind}" for kind in dict.fromkeys(told))
+        statuses = [status.get(index, "no estimate") for index in frames]
+        counts = ", ".join(f"{statuses.count(kind)} {kind}" for kind in dict.fromkeys(statuses))
         strips.append(
-            {"name": name, "stretches": stretches(frames, told, [""] * len(told)), "summary": counts}
+            {"name": name, "stretches": stretches(frames, statuses, [""] * len(statuses)), "summary": counts}
         )
     return strips
 
@@ -152,7 +152,7 @@ def _around(comparison: RunComparison, index: int, size: OverlaySize) -> tuple[s
 
 
 def _differs(comparison: RunComparison, index: int) -> str:
-    told = []
+    sentences = []
     for one in comparison.differences:
         for place in np.flatnonzero(one.indices == index):
             parts = [
@@ -164,5 +164,5 @@ def _differs(comparison: RunComparison, index: int) -> str:
                 )
                 if np.isfinite(value[place])
             ]
-            told.append(f"{one.name}: {', '.join(parts) or 'nothing to compare'}")
-    return "; ".join(told)
+            sentences.append(f"{one.name}: {', '.join(parts) or 'nothing to compare'}")
+    return "; ".join(sentences)

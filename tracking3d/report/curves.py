@@ -61,15 +61,15 @@ def curve(
     if high - low < 10.0**-digits:  # nothing to see but noise, which would fill the picture
         low, high = low - 10.0**-digits, high + 10.0**-digits
 
-    def told(value: float) -> str:
+    def text(value: float) -> str:
         return f"{value:.{digits}f}{unit}"
 
     return Curve(
         title=title,
         path=path_of((y - low) / (high - low)),
-        low=told(low),
-        high=told(high),
-        summary=f"{title}: from {told(known.min())} to {told(known.max())}, {told(known[-1])} at the end",
+        low=text(low),
+        high=text(high),
+        summary=f"{title}: from {text(known.min())} to {text(known.max())}, {text(known[-1])} at the end",
     )
 
 

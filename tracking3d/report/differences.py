@@ -88,7 +88,7 @@ class RunComparison:
 
     def as_json(self) -> dict[str, Any]:
         """All of it in JSON's types, frame by frame too."""
-        told: dict[str, Any] = jsonable(
+        summary: dict[str, Any] = jsonable(
             {
                 "runs": [
                     {"name": name, "folder": run.folder, "state": run.state, **run_figures(run)}
@@ -121,7 +121,7 @@ class RunComparison:
                 "notes": self.notes,
             }
         )
-        return told
+        return summary
 
 
 def compare_runs(folders: Sequence[Path], against: Path | None = None) -> RunComparison:
@@ -155,7 +155,7 @@ def compare_runs(folders: Sequence[Path], against: Path | None = None) -> RunCom
     return RunComparison(
         runs=runs,
         names=names,
-        settings={key: told for key, told in values.items() if len(set(told)) > 1},
+        settings={key: each for key, each in values.items() if len(set(each)) > 1},
         differences=differences,
         worst=worst_frames(differences),
         notes=_notes(runs, names, differences),
@@ -289,7 +289,7 @@ def _notes(runs: list[RunReader], names: list[str], differences: list[Difference
                 f"they are compared in the {len(one.indices)} frames that both have."
             )
         given = [
-            told if isinstance(told := each.description.get("given"), dict) else {} for each in (first, run)
+            value if isinstance(value := each.description.get("given"), dict) else {} for each in (first, run)
         ]
         (start, start_too), (picture, picture_too) = (
             [about.get(key) for about in given] for key in ("first_frame", "first_picture")

@@ -122,6 +122,10 @@ def stage_times(run: RunReader) -> tuple[StageTimes | None, StageTimes]:
 def corrected_frames(run: RunReader) -> list[int]:
     """Indices of the corrected frames."""
     given = run.description.get("given")
-    told = given.get("corrections") if isinstance(given, dict) else None
-    indices = [one.get("frame") for one in told if isinstance(one, dict)] if isinstance(told, list) else []
+    corrections = given.get("corrections") if isinstance(given, dict) else None
+    indices = (
+        [one.get("frame") for one in corrections if isinstance(one, dict)]
+        if isinstance(corrections, list)
+        else []
+    )
     return sorted(index for index in indices if isinstance(index, int))
