@@ -138,10 +138,10 @@ def _seen_texels(frame, faces, texels, grazing, tolerance, seen):
             continue
         column, row = math.floor(u), math.floor(v)
         right, down = u - np.float32(column), v - np.float32(row)
-        believed = cosine * cosine * _sample(valid, column, row, right, down)
-        if not believed > 0:
+        quality = cosine * cosine * _sample(valid, column, row, right, down)
+        if not quality > 0:
             continue
-        index[found], weight[found] = texel[one], believed
+        index[found], weight[found] = texel[one], quality
         for channel in range(len(values)):
             shown[channel, found] = _sample(values[channel], column, row, right, down)
         found += 1
