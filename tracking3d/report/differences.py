@@ -151,7 +151,7 @@ def compare_runs(folders: Sequence[Path], against: Path | None = None) -> RunCom
     configs = [flat(run.config) for run in runs]
     keys = dict.fromkeys(key for config in configs for key in config)
     values = {key: [config.get(key) for config in configs] for key in keys}
-    values["frames that were asked for"] = [run.description.get("selection") or "all" for run in runs]
+    values["selected frames"] = [run.description.get("selection") or "all" for run in runs]
     return RunComparison(
         runs=runs,
         names=names,
