@@ -1,4 +1,4 @@
-"""The shape of the end by configuration: made anew where it is asked for, and never at the cost of the run."""
+"""The final shape by configuration: reconstructed if it is asked for, and never at the cost of the run."""
 
 from __future__ import annotations
 
