@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 from functools import reduce
+from operator import or_
 from pathlib import Path
-from typing import Any, Union, get_args
+from typing import Any, get_args
 
 import pytest
 import yaml
@@ -67,7 +68,7 @@ def field_named(model: Any, key: str) -> Any:
     models = [one for one in (model, *get_args(model)) if hasattr(one, "model_fields")]
     found = [one.model_fields[key].annotation for one in models if key in one.model_fields]
     assert found, f"{model} has no {key}"
-    return Union[tuple(found)]
+    return reduce(or_, found)
 
 
 @pytest.mark.parametrize("preset", [name for name in list_presets() if name != "paper"])
