@@ -67,7 +67,7 @@ def track(images: Path, folder: Path, mask, log: Path, quick: bool) -> None:
         SOLVERS["online"] = StandInSolver
     with log.open("a") as lines:
         lines.write(json.dumps(["begin", 0]) + "\n")
-    for name in ("step", "revisit"):
+    for name in ("step", "refine_frame"):
         method = getattr(Session, name)
 
         def told(self, frame, *given, method=method, name=name):
@@ -125,7 +125,7 @@ def assert_little_was_done_twice(log: Path, kills: int) -> None:
     Answers are kept by another thread while the next frame is solved. So where a kill comes in the middle of a
     frame, the one before may not be kept yet, but the one before that is.
     """
-    order = [["step", n] for n in range(FRAMES)] + [["revisit", n] for n in range(FRAMES)]
+    order = [["step", n] for n in range(FRAMES)] + [["refine_frame", n] for n in range(FRAMES)]
     begun, again, allowed = -1, 0, False
     for line in log.read_text().splitlines():
         what = json.loads(line)

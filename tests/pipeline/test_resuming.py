@@ -125,7 +125,7 @@ MOMENTS = {
     "before its state is kept": (Checkpoint, "save", 3),
     "before the first state": (Checkpoint, "save", 0),
     "while all is solved once more": (Session, "refine", 0),
-    "in a second answer": (Session, "revisit", 2),
+    "in a second answer": (Session, "refine_frame", 2),
     "before the second state is kept": (Checkpoint, "save", FRAMES + 3),
     "while masks are taken over": (FrameLines, "append", FRAMES),
     "while the mesh is written": (run_writer.RunWriter, "_finish", 0),
@@ -145,7 +145,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_end(
                 pytest.skip("there is no such moment: the end is not written")
         stopped(patch, clip, images, folder, *MOMENTS[moment])
     answered = []
-    for name in ("step", "revisit"):
+    for name in ("step", "refine_frame"):
         method = getattr(Session, name)
 
         def told(self, frame, *given, method=method, name=name):
@@ -155,7 +155,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_end(
         monkeypatch.setattr(Session, name, told)
     record(open_source(str(images)), settings(), folder, mask=clip.masks[0], resume=True)
     assert_alike(folder, whole["stand_in"])
-    expected = [("step", n) for n in range(FRAMES)] + [("revisit", n) for n in range(FRAMES)]
+    expected = [("step", n) for n in range(FRAMES)] + [("refine_frame", n) for n in range(FRAMES)]
     begun = {
         "in a later frame": 3,
         "before its state is kept": 3,
@@ -172,7 +172,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_end(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("owner", "name", "call"), [(Session, "step", 4), (Session, "revisit", 3)], ids=["tracked", "refined"]
+    ("owner", "name", "call"), [(Session, "step", 4), (Session, "refine_frame", 3)], ids=["tracked", "refined"]
 )
 def test_the_state_of_the_online_solver_is_kept_whole(
     clip, images, whole, tmp_path, monkeypatch, online, owner, name, call

@@ -229,7 +229,7 @@ def test_an_object_that_fails_in_the_second_pass_keeps_its_causal_answers(source
             raise ZeroDivisionError("division by zero")
         return revisit(self, state, frame, mask, T_cam_obj)
 
-    monkeypatch.setattr(StandInSolver, "revisit", failing)
+    monkeypatch.setattr(StandInSolver, "refine_frame", failing)
     with pytest.raises(ZeroDivisionError):
         record_objects(source, settings("solver.final_refine=true"), tmp_path / "run", boxes=[LEFT, RIGHT])
     first, second = (RunReader(tmp_path / "run" / f"object_{number}") for number in (0, 1))

@@ -58,7 +58,7 @@ def solver(monkeypatch):
 
     monkeypatch.setattr(CausalSolver, "step", causal(step))
     monkeypatch.setattr(CausalSolver, "init", causal(init))
-    monkeypatch.setattr(StandInSolver, "revisit", refined)
+    monkeypatch.setattr(StandInSolver, "refine_frame", refined)
     monkeypatch.setitem(SOLVERS, "online", StandInSolver)
 
 

@@ -61,7 +61,7 @@ class RefiningSolver(Protocol, Generic[State]):
     """A solver that can look at a whole video once more, when it has ended."""
 
     def refine(self, state: State) -> State:
-        """Solve everything once more over all keyframes; the state is then for ``revisit`` and ``result`` only."""
+        """Solve everything once more over all keyframes; the state is then for ``refine_frame`` and ``result`` only."""
         ...
 
     def refine_frame(

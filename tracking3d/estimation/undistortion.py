@@ -86,7 +86,7 @@ class CompleteUndistortingSolver(UndistortingSolver[State]):
     def refine_frame(
         self, state: State, frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]
     ) -> tuple[State, FrameEstimate]:
-        """See `RefiningSolver.revisit`."""
+        """See `RefiningSolver.refine_frame`."""
         state, estimate = self._solver.refine_frame(state, self._frame(frame), self._mask(mask), T_cam_obj)
         return state, self._answer(estimate, mask)
 

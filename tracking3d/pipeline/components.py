@@ -97,8 +97,8 @@ def check_backward_tracking(config: PipelineConfig) -> None:
         InputError: It cannot.
     """
     name = config.solver.name
-    if not hasattr(SOLVERS[name], "turned_back"):
-        turning = " or ".join(other for other, solver in SOLVERS.items() if hasattr(solver, "turned_back"))
+    if not hasattr(SOLVERS[name], "restart_backwards"):
+        turning = " or ".join(other for other, solver in SOLVERS.items() if hasattr(solver, "restart_backwards"))
         raise InputError(
             f"Solver '{name}' cannot track backwards. Use solver.name={turning}, or start at the prompt frame with "
             "--frames N:."

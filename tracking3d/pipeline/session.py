@@ -324,7 +324,7 @@ class Session:
         """Solve everything once more over what is known of the whole video.
 
         A focal length that nobody gave may be solved too: ``camera`` is then another one, for the refined answers.
-        ``step`` is over then: ``revisit`` takes the frames again, and ``result`` gives the final object.
+        ``step`` is over then: ``refine_frame`` takes the frames again, and ``result`` gives the final object.
 
         Raises:
             RuntimeError: If the solver cannot, see ``can_refine``.

@@ -29,8 +29,8 @@ def by_twins(monkeypatch):
 
     def call(function):
         with monkeypatch.context() as patch:
-            patch.setattr(AdjustmentProblem, "evaluated", bundle_adjustment.evaluate)
-            patch.setattr(AdjustmentProblem, "linearised", bundle_adjustment.linearize)
+            patch.setattr(AdjustmentProblem, "evaluate", bundle_adjustment.evaluate)
+            patch.setattr(AdjustmentProblem, "linearize", bundle_adjustment.linearize)
             patch.setattr(System, "step", bundle_adjustment.step)
             return function()
 
