@@ -12,7 +12,7 @@ from tracking3d.estimation.online.state.solver_state import SolverPhase, SolverS
 from tracking3d.frames import Frame
 from tracking3d.geometry.pose import pose_from_arrays
 
-_ELSEWHERE = 0.3
+_MIN_MASK_IOU = 0.3
 """IoU of the last pose's silhouette with a mask that is right, below which that pose is none to go on from."""
 
 
@@ -56,7 +56,7 @@ def trust_mask(state: SolverState, frame: Frame, mask: NDArray[np.bool_]) -> Sol
     """
     if state.phase is not SolverPhase.INITIALIZING:
         rendered = state.object_map.silhouette(state.last_pose[0], state.camera)
-        if np.count_nonzero(rendered & mask) < _ELSEWHERE * np.count_nonzero(rendered | mask):
+        if np.count_nonzero(rendered & mask) < _MIN_MASK_IOU * np.count_nonzero(rendered | mask):
             state = replace(state, lost_frames=max(state.lost_frames, 1))
     if not len(state.tracked_points):
         return state

@@ -23,21 +23,24 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import pose_arrays
 
 MOST_CANDIDATES = 100
-_REACH = 0.25  # how far beside the mask, relative to the root of its area
+_BAND_WIDTH = 0.25  # how far beside the mask, relative to the root of its area
 _VIEWS = 3
-_FITS, _FAILS = 1.0, 2.5  # mean residual in pixels of an object 200 pixels large
-_MOVED = 6.0  # such pixels
-_STAYS = 0.3  # of the way that the object would have carried it
+_MAX_INLIER_RESIDUAL, _MIN_OUTLIER_RESIDUAL = (
+    1.0,
+    2.5,
+)  # mean residual in pixels of an object 200 pixels large
+_MIN_MOTION = 6.0  # such pixels
+_MAX_STATIC_MOTION = 0.3  # of the way that the object would have carried it
 _SECTORS = 8  # that the surroundings are divided into
-_STILL = (
+_STATIC_SHARE = (
     0.6  # share of the candidates of a sector, and of the sectors, that fit where the scene is a still one
 )
-_FEWEST_SECTORS, _FEWEST = 5, 3  # sectors that tell, and candidates that make one tell
+_MIN_SECTORS, _MIN_CANDIDATES = 5, 3  # sectors that tell, and candidates that make one tell
 
 
 def surroundings(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """``(H, W)`` the band around a mask."""
-    reach = max(round(_REACH * float(np.sqrt(mask.sum()))), 3)
+    reach = max(round(_BAND_WIDTH * float(np.sqrt(mask.sum()))), 3)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     return (cv2.dilate(mask.astype(np.uint8), kernel) > 0) & ~mask
 
@@ -91,21 +94,23 @@ def promote_candidates(object_map: ObjectMap, camera: Camera, positions: list[in
         project_camera_points(transform_to_camera(R, t, start.points), camera.K) - pixel, axis=2
     )
     carried = np.nanmax(np.where(tracks.visible, carried, np.nan), 0) / scale
-    stays = (carried > _MOVED) & (motion < _STAYS * carried)
+    stays = (carried > _MIN_MOTION) & (motion < _MAX_STATIC_MOTION * carried)
     near = (
         np.linalg.norm(found.points - object_map.vertices.mean(0).cpu().numpy(), axis=1)
         < 1.6 * object_map.radius
     )
     enough = tracks.visible.sum(0) >= _VIEWS
-    accepted = enough & (residual < _FITS) & (motion > _MOVED) & near & ~stays
-    rejected = stays | (enough & ((residual > _FAILS) | ~near) & (motion > _MOVED))
+    accepted = enough & (residual < _MAX_INLIER_RESIDUAL) & (motion > _MIN_MOTION) & near & ~stays
+    rejected = stays | (enough & ((residual > _MIN_OUTLIER_RESIDUAL) | ~near) & (motion > _MIN_MOTION))
     rejected |= (tracks.visible.sum(0) >= 2 * _VIEWS) & ~accepted
-    told = enough & (motion > _MOVED)
-    beside = object_map.candidates_around + _by_sector(views, first, pixel, told, residual < _FITS)
+    told = enough & (motion > _MIN_MOTION)
+    beside = object_map.candidates_around + _by_sector(
+        views, first, pixel, told, residual < _MAX_INLIER_RESIDUAL
+    )
     around = np.zeros_like(accepted)
     if is_static_scene(beside):
         # They tell the pose as well as the object's own points do, but nothing of its shape or mask.
-        around, accepted = told & (residual < _FITS), np.zeros_like(accepted)
+        around, accepted = told & (residual < _MAX_INLIER_RESIDUAL), np.zeros_like(accepted)
         rejected = (told | (tracks.visible.sum(0) >= 2 * _VIEWS)) & ~around
     landmarks, candidate = object_map.landmarks.copy(), object_map.candidate.copy()
     placed = accepted | around
@@ -130,10 +135,10 @@ def is_static_scene(beside: NDArray[np.int64]) -> bool:
         beside: ``(S, 2)`` candidates in each sector around the object that could be told, and that fit its motion.
     """
     told, fit = beside.T
-    tells = told >= _FEWEST
-    if tells.sum() < _FEWEST_SECTORS:
+    tells = told >= _MIN_CANDIDATES
+    if tells.sum() < _MIN_SECTORS:
         return False
-    return bool((fit[tells] > _STILL * told[tells]).mean() > _STILL)
+    return bool((fit[tells] > _STATIC_SHARE * told[tells]).mean() > _STATIC_SHARE)
 
 
 def _by_sector(

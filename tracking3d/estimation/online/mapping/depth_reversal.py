@@ -26,28 +26,30 @@ from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, pose_from_arrays
 
-_FEWEST_LANDMARKS = 12
-_FEWEST_KEYFRAMES = 4
-_BETTER = 0.97
+_MIN_LANDMARKS = 12
+_MIN_KEYFRAMES = 4
+_MAX_COST_RATIO = 0.97
 """Share of the cost up to which the other way round is the better one. In runs that were right it was 1.02 and more at
 each of some 200 keyframes (suites ``fresh`` of seeds 501, 602 and 9303), in wrong ones .81 to 1.04."""
-_MOST_TURNED = 100.0  # degrees; what has shown more of its sides cannot be the other way round
+_MAX_ROTATION = 100.0  # degrees; what has shown more of its sides cannot be the other way round
 _ALWAYS_TRIED = 12
 """Keyframes up to which it is tried at each. Later, when there are this many more, or have turned by so much more:
 trying costs as much as bundling all keyframes, and keyframes that show the same again tell nothing new."""
 _MORE_KEYFRAMES, _MORE_TURNED = 1.25, 4.0
 _ITERATIONS = 20
-_HELD = 0.05  # what a landmark at distance 1 from its place costs: the wrong way round has bent the surface
+_LANDMARK_PRIOR = (
+    0.05  # what a landmark at distance 1 from its place costs: the wrong way round has bent the surface
+)
 _SCALE = 1.0  # pixels
 
 
 def fix_depth_reversal(state: SolverState, config: OnlineConfig) -> SolverState:
     """The belief with depth the other way round where that explains the keyframes better, else as it is."""
     object_map, views = state.object_map, state.object_map.keyframes
-    if object_map.fixed_keyframes or object_map.pointless or len(views) < _FEWEST_KEYFRAMES:
+    if object_map.fixed_keyframes or object_map.pointless or len(views) < _MIN_KEYFRAMES:
         return state
     turned = max(viewing_angle(views[0].pose, view.pose) for view in views)
-    if turned > _MOST_TURNED or not _due(state.reversal_attempt, len(views), turned):
+    if turned > _MAX_ROTATION or not _due(state.reversal_attempt, len(views), turned):
         return state
     better = _better_reversal(object_map, state.camera)
     if better is None:
@@ -83,7 +85,7 @@ def _better_reversal(object_map: ObjectMap, camera: Camera) -> tuple[Reversal, O
     views = list(object_map.keyframes)
     names = shared_landmarks(object_map, views)
     names = names[np.isfinite(object_map.landmarks[names]).all(1)]
-    if len(names) < _FEWEST_LANDMARKS:
+    if len(names) < _MIN_LANDMARKS:
         return None
     tracks, start = tracks_of(views, names), structure_of(object_map, views, names)
     T = np.stack([view.pose.matrix().numpy() for view in views])
@@ -94,11 +96,11 @@ def _better_reversal(object_map: ObjectMap, camera: Camera) -> tuple[Reversal, O
     as_it_is, found = (
         adjust(
             tracks, camera.K, one, fixed=1, scale=_SCALE, iterations=_ITERATIONS,
-            point_prior=one.points, point_prior_weight=_HELD,
+            point_prior=one.points, point_prior_weight=_LANDMARK_PRIOR,
         )
         for one in (start, other)
     )  # fmt: skip
-    if found.cost > _BETTER * as_it_is.cost:
+    if found.cost > _MAX_COST_RATIO * as_it_is.cost:
         return None
     landmarks = reversal.points(object_map.landmarks)
     landmarks[names] = found.points

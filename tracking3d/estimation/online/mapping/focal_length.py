@@ -21,11 +21,11 @@ from tracking3d.geometry.pose import Pose, pose_from_arrays
 
 CANDIDATES = (10.0, 25.0, 45.0, 65.0)
 """Vertical fields of view in degrees."""
-_AT_THE_START = (9.0, 16.0, 27.0, 65.0)  # beside the assumed one
-_CLEARLY = 0.08  # share of the cost that a lens twice as long or short has to take off; nearer ones less
-_SAME = math.log(1.05)  # focal lengths so near are one
+_INITIAL_FIELDS_OF_VIEW = (9.0, 16.0, 27.0, 65.0)  # beside the assumed one
+_MIN_GAIN = 0.08  # share of the cost that a lens twice as long or short has to take off; nearer ones less
+_SAME_FOCAL_LENGTH = math.log(1.05)  # focal lengths so near are one
 _ITERATIONS = 25
-_FEWEST = 30  # landmarks
+_MIN_LANDMARKS = 30  # landmarks
 
 
 def lens_hypotheses(camera: Camera) -> tuple[Camera, ...]:
@@ -37,7 +37,7 @@ def lens_hypotheses(camera: Camera) -> tuple[Camera, ...]:
             Camera.from_fov(camera.width, camera.height, degrees).fy / camera.fy,
             f"field of view of {degrees:g} degrees, the likeliest of those tried",
         )
-        for degrees in _AT_THE_START
+        for degrees in _INITIAL_FIELDS_OF_VIEW
     ]
     return (camera, *others)
 
@@ -66,7 +66,7 @@ def solve_lens(object_map: ObjectMap, camera: Camera) -> tuple[ObjectMap, Camera
     """
     views = list(object_map.keyframes)
     names = shared_landmarks(object_map, views)
-    if len(names) < _FEWEST:
+    if len(names) < _MIN_LANDMARKS:
         return object_map, camera
     tracks, start = tracks_of(views, names), structure_of(object_map, views, names)
     kept = adjust(tracks, camera.K, start, iterations=_ITERATIONS)
@@ -78,7 +78,10 @@ def solve_lens(object_map: ObjectMap, camera: Camera) -> tuple[ObjectMap, Camera
     tried = [one for one in tried if _is_a_lens(one.focal_factor, camera)]
     best = min(tried, key=lambda one: one.cost, default=kept)
     change = lens_change(best.focal_factor)
-    if abs(math.log(best.focal_factor)) < _SAME or best.cost > (1 - _CLEARLY * change) * kept.cost:
+    if (
+        abs(math.log(best.focal_factor)) < _SAME_FOCAL_LENGTH
+        or best.cost > (1 - _MIN_GAIN * change) * kept.cost
+    ):
         return object_map, camera
     return _with_lens(object_map, camera, names, best)
 

@@ -13,7 +13,7 @@ from tracking3d.estimation.online.state.object_map import ObjectMap
 from tracking3d.geometry.camera import Camera
 
 _PASSES = 3
-_LENS_CHARGE = 0.01
+_FOCAL_LENGTH_PENALTY = 0.01
 """Cost by which a lens twice as long or short has to explain the keyframes better than the one at hand."""
 
 
@@ -35,7 +35,7 @@ def refine_globally(object_map: ObjectMap, camera: Camera, config: OnlineConfig)
         with_lens, solved = solve_lens(object_map, camera)
         if solved != camera:
             cost, better, _ = _refine_with_lens(with_lens, solved, config)
-            tried.append((cost + _LENS_CHARGE * lens_change(solved.fy / camera.fy), better, solved))
+            tried.append((cost + _FOCAL_LENGTH_PENALTY * lens_change(solved.fy / camera.fy), better, solved))
     _, object_map, camera = min(tried, key=lambda one: one[0])
     return object_map, camera
 

@@ -18,7 +18,7 @@ from tracking3d.estimation.online.optimization.shape_fit import FitWeights
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.geometry.camera import Camera
 
-_MOST_WITHOUT_POINTS = 15
+_MAX_KEYFRAMES_WITHOUT_POINTS = 15
 
 
 def insert_points(
@@ -76,7 +76,7 @@ def refine_local_map(
         newest = replace(newest, texture=object_map.back_project(newest.observation.features, newest))
         return replace(object_map, keyframes=(*object_map.keyframes[:-1], newest))
     if object_map.pointless:
-        recent = list(range(len(object_map.keyframes)))[-_MOST_WITHOUT_POINTS:]
+        recent = list(range(len(object_map.keyframes)))[-_MAX_KEYFRAMES_WITHOUT_POINTS:]
         return refine_without_points(
             object_map, sorted({0, *recent}), FitWeights(smoothness=config.smoothness)
         )

@@ -27,11 +27,11 @@ from tracking3d.rendering import rasterize
 
 FloatArray = NDArray[np.float64]
 _SAME_PLACE = 1.5  # pixels within which a keypoint is a point that is followed
-_FEWEST_WITNESSES = 12
-_FEWEST_BUNDLED = 8
-_MOST_BUNDLED = 1500
-_FINER = 4  # times, that a surface is drawn which stays as it is
-_SEARCH = 12.0  # pixels around its projection within which a landmark may be found again
+_MIN_INLIERS = 12
+_MIN_ADJUSTED = 8
+_MAX_ADJUSTED = 1500
+_UPSAMPLING = 4  # times, that a surface is drawn which stays as it is
+_MATCH_RADIUS = 12.0  # pixels around its projection within which a landmark may be found again
 
 
 def lift_pixels(
@@ -42,7 +42,7 @@ def lift_pixels(
     The depth is that of the window's nearest drawn pixel; of a surface that is held it is drawn finer, since no
     bundle adjustment puts its points right.
     """
-    observation, finer = view.observation, _FINER if object_map.fixed_keyframes else 1
+    observation, finer = view.observation, _UPSAMPLING if object_map.fixed_keyframes else 1
     size, K = finer * observation.window.size, observation.K
     if finer > 1:
         K = K * K.new_tensor([[finer], [finer], [1.0]])
@@ -71,7 +71,7 @@ def lift_pixels(
 
 def mask_weight(mask: NDArray[np.bool_] | None, points: FollowedPoints) -> float:
     """How far a mask is believed, by the share of points on the object that lie inside it."""
-    if mask is None or len(points) < _FEWEST_WITNESSES:
+    if mask is None or len(points) < _MIN_INLIERS:
         return 1.0
     reach = max(round(0.02 * float(np.sqrt(mask.sum()))), 1)
     wide = cv2.dilate(mask.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
@@ -125,7 +125,7 @@ def with_landmarks(
         nearest = gap.argmin(1)
         label = np.where(gap[np.arange(len(gap)), nearest] < _SAME_PLACE, followed.landmark[nearest], -1)
     taken = set(followed.landmark.tolist())
-    limit = _SEARCH * max(1.0, view.observation.window.side / 200)
+    limit = _MATCH_RADIUS * max(1.0, view.observation.window.side / 200)
     for other in nearest_views(object_map.keyframes, view.pose, 4):
         pairs = match(keypoints, other.keypoints)
         pairs = pairs[label[pairs[:, 0]] < 0]
@@ -232,7 +232,7 @@ def _adjust_bundle(
 ) -> ObjectMap:
     views = [object_map.keyframes[position] for position in positions]
     names = shared_landmarks(object_map, views)
-    if len(names) < _FEWEST_BUNDLED or len(views) < 2:
+    if len(names) < _MIN_ADJUSTED or len(views) < 2:
         return object_map
     tracks, start = tracks_of(views, names), structure_of(object_map, views, names)
     places = surface_places(object_map, camera, views, names)
@@ -262,7 +262,7 @@ def shared_landmarks(object_map: ObjectMap, views: list[Keyframe]) -> NDArray[np
     names, counts = np.unique(np.concatenate([view.points.landmark for view in views]), return_counts=True)
     usable = (counts >= 2) & ~object_map.candidate[names]
     names, counts = names[usable], counts[usable]
-    return np.sort(names[np.argsort(-counts, kind="stable")[:_MOST_BUNDLED]])
+    return np.sort(names[np.argsort(-counts, kind="stable")[:_MAX_ADJUSTED]])
 
 
 def structure_of(object_map: ObjectMap, views: list[Keyframe], names: NDArray[np.int64]) -> Structure:

@@ -31,9 +31,12 @@ _APPEARANCE = 4.0  # weight of the mean loss of what the views show
 _APPEARANCE_SCALE = 0.25
 _FULL_SIZE = 128.0  # pixels of a window in which outline distances are measured, whatever its resolution
 _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-5, 1e3
-_LESS, _MORE = 2.0, 4.0  # damping after a step that helped, and after one that did not
-_ENOUGH = 1e-4  # share of the cost below which a gain is small
-_SMALL_GAINS = 3  # in a row end the search; a single one is often only a step that was damped too much
+_DAMPING_DECREASE, _DAMPING_INCREASE = (
+    2.0,
+    4.0,
+)  # damping after a step that helped, and after one that did not
+_MIN_GAIN = 1e-4  # share of the cost below which a gain is small
+_MAX_SMALL_GAINS = 3  # in a row end the search; a single one is often only a step that was damped too much
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,12 +175,12 @@ def _minimize(problem: _Problem, free: Tensor, iterations: int) -> _State:
         trial = _step(problem, state, equations, free, damping)
         if trial is not None and trial.cost < state.cost:
             gain = state.cost - trial.cost
-            state, equations, damping = trial, None, max(damping / _LESS, _LEAST_DAMPING)
-            small = small + 1 if gain < _ENOUGH * state.cost else 0
-            if small == _SMALL_GAINS:
+            state, equations, damping = trial, None, max(damping / _DAMPING_DECREASE, _LEAST_DAMPING)
+            small = small + 1 if gain < _MIN_GAIN * state.cost else 0
+            if small == _MAX_SMALL_GAINS:
                 break
         else:
-            damping *= _MORE
+            damping *= _DAMPING_INCREASE
             if damping > _MOST_DAMPING:
                 break
     return state

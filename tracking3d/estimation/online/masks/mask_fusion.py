@@ -24,10 +24,10 @@ from tracking3d.segmentation import (
 from tracking3d.segmentation.region_growing import grow_region, motion_supported_share, unlike_surroundings
 from tracking3d.trackers.crops import crop_window, inside_frame
 
-_IN_QUESTION = 0.5
+_DISPUTED = 0.5
 """See `tracking3d.segmentation.in_question`: where both outlines nearly agree, as those of exact masks do, nothing is
 missing that motion would have to tell."""
-_FINER = 2
+_UPSAMPLING = 2
 """Pixels of the evidence for each of the window, as of its image."""
 
 
@@ -73,7 +73,7 @@ def fuse_mask(
     lab, own, drawn = as_lab(image), mask_in_window(initial, window), mask_in_window(rendered, window)
     sources = pixel_features(lab, own, drawn, confidence, colours)
     odds, asked = log_odds(sources), in_question(sources)
-    told = moving() if moving is not None and asked >= _IN_QUESTION else None
+    told = moving() if moving is not None and asked >= _DISPUTED else None
     if told is not None:
         odds = grow_region(odds, own, drawn, told, unlike_surroundings(lab, own | drawn))
     support = clean_mask(snap_to_edges(image, odds, asked))
@@ -97,7 +97,7 @@ def update_colours(
 
 def upsampled_window(observation: Observation) -> tuple[Window, NDArray[np.uint8]]:
     """The window in the pixels of the evidence ``S``, and its image ``(S, S, 3)`` RGB."""
-    window = replace(observation.window, size=_FINER * observation.window.size)
+    window = replace(observation.window, size=_UPSAMPLING * observation.window.size)
     image = (255 * observation.image.permute(1, 2, 0)).round().clamp(0, 255).cpu().numpy()
     return window, np.ascontiguousarray(image.astype(np.uint8))
 

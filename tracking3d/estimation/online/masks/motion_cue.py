@@ -17,9 +17,9 @@ from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.geometry.pose import Pose
 from tracking3d.segmentation.online_motion_cue import MotionReference, online_motion_log_odds
 
-_MOST = 10  # earlier frames
-_SAME_SIDE, _AWAY = 12.0, 30.0  # degrees between viewing directions
-_WITNESSES = 20  # points that agree, with which a pose can tell a motion
+_MAX_REFERENCES = 10  # earlier frames
+_SAME_DIRECTION, _MIN_ROTATION = 12.0, 30.0  # degrees between viewing directions
+_MIN_INLIERS = 20  # points that agree, with which a pose can tell a motion
 
 
 def motion_cue_in_window(
@@ -33,7 +33,7 @@ def motion_cue_in_window(
         image: ``(H, W)`` grey.
     """
     mask = found.view.mask
-    if mask is None or found.lost or found.evidence.inliers < _WITNESSES or not state.motion_references:
+    if mask is None or found.lost or found.evidence.inliers < _MIN_INLIERS or not state.motion_references:
         return None
     object_map, pose = state.object_map, found.fit.pose
     if is_static_scene(object_map.candidates_around):
@@ -58,8 +58,9 @@ def is_seen_again(object_map: ObjectMap, pose: Pose) -> bool:
     What moves along beside it is a hand, then.
     """
     for position, view in enumerate(object_map.keyframes):
-        if viewing_angle(view.pose, pose) < _SAME_SIDE and any(
-            viewing_angle(view.pose, later.pose) > _AWAY for later in object_map.keyframes[position + 1 :]
+        if viewing_angle(view.pose, pose) < _SAME_DIRECTION and any(
+            viewing_angle(view.pose, later.pose) > _MIN_ROTATION
+            for later in object_map.keyframes[position + 1 :]
         ):
             return True
     return False
@@ -71,7 +72,7 @@ def remember_motion(
     """The belief that remembers a frame which is believed; after a loss it begins anew."""
     if found.lost:
         return replace(state, motion_references=())
-    if found.evidence.inliers < _WITNESSES:
+    if found.evidence.inliers < _MIN_INLIERS:
         return state
     seen = MotionReference.of(image, estimate.mask, estimate.T_cam_obj)
-    return replace(state, motion_references=(*state.motion_references, seen)[-_MOST:])
+    return replace(state, motion_references=(*state.motion_references, seen)[-_MAX_REFERENCES:])

@@ -15,7 +15,7 @@ import numpy as np
 from tracking3d.bundle_adjustment.reprojection import FloatArray, finite_rows
 from tracking3d.estimation.online.optimization.pnp_types import PnPFit, PoseHypothesis
 
-_FEWEST = 4
+_MIN_INLIERS = 4
 _SAMPLES = 500
 _CONFIDENCE = 0.999
 _REFINEMENTS = 2
@@ -41,14 +41,14 @@ def pose_from_points(
         seed: Of the sampling.
     """
     usable = finite_rows(points) & finite_rows(pixels)
-    if np.count_nonzero(usable) < _FEWEST:
+    if np.count_nonzero(usable) < _MIN_INLIERS:
         return None
     x, u = points[usable], pixels[usable]
     sampled = _sample_pose(x, u, K, threshold, seed)
     starts = [pose for pose in (sampled, start) if pose is not None]
     found = [_refine_on_inliers(x, u, K, R, t, threshold) for R, t in starts]
     best = max(found, key=lambda one: (one.count, -one.residual), default=None)
-    if best is None or best.count < _FEWEST:
+    if best is None or best.count < _MIN_INLIERS:
         return None
     inliers = np.zeros(len(points), bool)
     inliers[usable] = best.inliers

@@ -17,7 +17,7 @@ from tracking3d.estimation.online.tracking.pose_tracking import pixel_scale, pos
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose
 
-_KEYFRAMES = 6  # that a doubtful frame is matched with
+_MAX_KEYFRAMES = 6  # that a doubtful frame is matched with
 
 
 def match_keyframes(
@@ -34,10 +34,12 @@ def match_keyframes(
     """
     region = np.ones(image.shape, bool) if view.mask is None else view.mask
     others = nearest_views(
-        object_map.keyframes, view.pose, len(object_map.keyframes) if anywhere else _KEYFRAMES
+        object_map.keyframes, view.pose, len(object_map.keyframes) if anywhere else _MAX_KEYFRAMES
     )
     keypoints = detect(image, region)
-    return poses_from_matches(object_map, camera, keypoints, others[: 4 * _KEYFRAMES], pixel_scale(view))[:3]
+    return poses_from_matches(object_map, camera, keypoints, others[: 4 * _MAX_KEYFRAMES], pixel_scale(view))[
+        :3
+    ]
 
 
 def poses_from_matches(

@@ -30,8 +30,8 @@ ROTATION_SEARCH = "rotation_search"
 """The hypothesis of a pose that is the best of many rotations around the predicted one."""
 _GRID_ANGLES = (20.0, 40.0)
 _GRID_FINALISTS = 5
-_OFTEN = 5  # frames after a loss in which turns are tried in every one, and later in one of so many
-_PLACED = 8  # keyframes whose poses a lost object is looked for at
+_RETRY_INTERVAL = 5  # frames after a loss in which turns are tried in every one, and later in one of so many
+_MAX_ALIGNED_KEYFRAMES = 8  # keyframes whose poses a lost object is looked for at
 
 
 def aligned_keyframes(object_map: ObjectMap, camera: Camera, view: Keyframe) -> list[Pose]:
@@ -39,7 +39,7 @@ def aligned_keyframes(object_map: ObjectMap, camera: Camera, view: Keyframe) -> 
     if view.mask is None:
         return []
     count = len(object_map.keyframes)
-    chosen = np.unique(np.linspace(0, count - 1, _PLACED).round().astype(int))
+    chosen = np.unique(np.linspace(0, count - 1, _MAX_ALIGNED_KEYFRAMES).round().astype(int))
     return [align_to_mask(object_map.keyframes[position].pose, camera, view.mask) for position in chosen]
 
 
@@ -65,7 +65,7 @@ def search_rotations(surface: Surface, view: Keyframe, pose: Pose, weights: Pose
 
 def should_retry(frames: int) -> bool:
     """Whether to try once more what has not helped for so many frames: at first always, and then now and again."""
-    return frames <= _OFTEN or frames % _OFTEN == 0
+    return frames <= _RETRY_INTERVAL or frames % _RETRY_INTERVAL == 0
 
 
 Found = tuple[str, PoseFit, FollowedPoints]

@@ -17,9 +17,11 @@ from tracking3d.estimation.tracker_feedback import ELSEWHERE
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose
 
-_MOST = 1500  # keypoints of a whole frame
-_KEYFRAMES = 24  # that they are matched with
-_FEWEST = 10  # agreeing points of one keyframe; matches of something else hardly ever agree with one pose
+_MAX_KEYPOINTS = 1500  # keypoints of a whole frame
+_MAX_KEYFRAMES = 24  # that they are matched with
+_MIN_INLIERS = (
+    10  # agreeing points of one keyframe; matches of something else hardly ever agree with one pose
+)
 
 
 def relocalize_in_frame(
@@ -37,12 +39,12 @@ def relocalize_in_frame(
     if box is None or not object_map.keyframes:
         return None
     length = max(box[2], box[3])
-    keypoints = detect(image, np.ones(image.shape, bool), length=length, most=_MOST)
+    keypoints = detect(image, np.ones(image.shape, bool), length=length, most=_MAX_KEYPOINTS)
     count = len(object_map.keyframes)
-    chosen = np.unique(np.linspace(0, count - 1, min(count, _KEYFRAMES)).round().astype(int))
+    chosen = np.unique(np.linspace(0, count - 1, min(count, _MAX_KEYFRAMES)).round().astype(int))
     views = [object_map.keyframes[position] for position in chosen]
     found = poses_from_matches(object_map, camera, keypoints, views, max(1.0, length / 200))
-    return found[0] if found and len(found[0][1]) >= _FEWEST else None
+    return found[0] if found and len(found[0][1]) >= _MIN_INLIERS else None
 
 
 def overlaps_mask(silhouette: NDArray[np.bool_], mask: NDArray[np.bool_]) -> bool:

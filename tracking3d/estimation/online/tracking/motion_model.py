@@ -82,7 +82,7 @@ def advance(state: SolverState, found: PoseCandidate, pose: Pose, grey: NDArray[
     )
 
 
-_COASTS = 12  # frames
+_MAX_EXTRAPOLATION = 12  # frames
 
 
 def extrapolate_motion(trail: tuple[tuple[Pose, int], ...], index: int) -> Pose:
@@ -95,7 +95,7 @@ def extrapolate_motion(trail: tuple[tuple[Pose, int], ...], index: int) -> Pose:
     (first, begin), (last, end) = trail[0], trail[-1]
     if begin == end:
         return last
-    return extrapolate(first, last, min(index - end, _COASTS) / (end - begin))
+    return extrapolate(first, last, min(index - end, _MAX_EXTRAPOLATION) / (end - begin))
 
 
 def align_to_mask(pose: Pose, camera: Camera, mask: NDArray[np.bool_]) -> Pose:

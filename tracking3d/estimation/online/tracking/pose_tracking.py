@@ -20,11 +20,14 @@ from tracking3d.rendering import MatchedPoints, Surface
 
 ENOUGH_MATURE = 30
 """With so many landmarks of two keyframes or more, those of one alone are not asked."""
-_FEWEST_POINTS = 6  # for a pose from points
-_INLIER = 3.0  # pixels of an object 200 pixels large
-_EDGE = 8.0  # such pixels from the outline within which points slide
-_STRAY, _STRAY_YOUNG = 4.0, 16.0  # such pixels that a point may be off
-_WITNESS, _MOST_WITNESSES = 0.005, 30  # what each agreeing landmark takes off the cost, and how many do
+_MIN_INLIERS = 6  # for a pose from points
+_MAX_INLIER_ERROR = 3.0  # pixels of an object 200 pixels large
+_OUTLINE_MARGIN = 8.0  # such pixels from the outline within which points slide
+_MAX_REPROJECTION_ERROR, _MAX_REPROJECTION_ERROR_NEW = 4.0, 16.0  # such pixels that a point may be off
+_INLIER_REWARD, _MAX_REWARDED_INLIERS = (
+    0.005,
+    30,
+)  # what each agreeing landmark takes off the cost, and how many do
 
 
 def pixel_scale(view: Keyframe) -> float:
@@ -55,12 +58,12 @@ def pose_of_points(
 ) -> tuple[Pose, FollowedPoints] | None:
     """The pose that most points agree with, and those that do; for the scale see `pixel_scale`."""
     position = object_map.landmarks[points.landmark]
-    if np.isfinite(position).all(1).sum() < _FEWEST_POINTS:
+    if np.isfinite(position).all(1).sum() < _MIN_INLIERS:
         return None
     found = pose_from_points(
-        position, points.pixel.astype(np.float64), camera.K, threshold=_INLIER * scale, seed=0
+        position, points.pixel.astype(np.float64), camera.K, threshold=_MAX_INLIER_ERROR * scale, seed=0
     )
-    if found is None or found.count < _FEWEST_POINTS:
+    if found is None or found.count < _MIN_INLIERS:
         return None
     return pose_from_arrays(found.R, found.t, object_map.vertices), points.only(found.inliers)
 
@@ -76,8 +79,12 @@ def find_inliers(
     )
     young = object_map.sightings[points.landmark] < 2
     scale = pixel_scale(view)
-    in_place = np.isnan(gap) | (gap < np.where(young, _STRAY_YOUNG, _STRAY) * scale)
-    inside = is_well_inside(view.mask, object_map.silhouette(pose, camera), points.pixel, _EDGE * scale)
+    in_place = np.isnan(gap) | (
+        gap < np.where(young, _MAX_REPROJECTION_ERROR_NEW, _MAX_REPROJECTION_ERROR) * scale
+    )
+    inside = is_well_inside(
+        view.mask, object_map.silhouette(pose, camera), points.pixel, _OUTLINE_MARGIN * scale
+    )
     return points.only(in_place & (inside | object_map.candidate[points.landmark]))
 
 
@@ -92,7 +99,7 @@ def pose_evidence(
         & ~object_map.candidate[names]
     )
     gap = project_points(object_map.landmarks[names[told]], pose, camera) - view.points.pixel[told]
-    stray = np.linalg.norm(gap, axis=1) > _STRAY * pixel_scale(view)
+    stray = np.linalg.norm(gap, axis=1) > _MAX_REPROJECTION_ERROR * pixel_scale(view)
     strays = float(stray.mean()) if len(stray) else 0.0
     return PoseEvidence(
         count_inliers(object_map, agree),
@@ -105,7 +112,7 @@ def pose_evidence(
 
 def candidate_cost(fit: PoseFit, weights: PoseWeights, mask_weight: float, agreed: int) -> float:
     """What tells the best of several poses, the lowest: what each costs, less what ``agreed`` landmarks take off."""
-    return render_cost(fit, weights, mask_weight) - _WITNESS * min(agreed, _MOST_WITNESSES)
+    return render_cost(fit, weights, mask_weight) - _INLIER_REWARD * min(agreed, _MAX_REWARDED_INLIERS)
 
 
 def count_inliers(object_map: ObjectMap, points: FollowedPoints) -> int:
