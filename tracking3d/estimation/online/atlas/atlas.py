@@ -37,8 +37,8 @@ def guess_alignment(state: SolverState, begun: SolverState) -> Similarity:
     """The guessed similarity from a new map to a lost one: equal size, and the rotation extrapolated over the gap.
 
     Args:
-            state: The state with the lost map.
-            begun: The state after the second initialization.
+        state: The state with the lost map.
+        begun: The state after the second initialization.
     """
     turns = []
     for view in begun.object_map.keyframes:
@@ -72,9 +72,9 @@ def switch_map(state: SolverState, begun: SolverState, similarity: Similarity) -
     """The state that continues with the map of a second initialization; the map before it becomes inactive.
 
     Args:
-            state: The state with the lost map.
-            begun: The state after the second initialization, in its own coordinates.
-            similarity: From the new map's coordinates to the lost map's.
+        state: The state with the lost map.
+        begun: The state after the second initialization, in its own coordinates.
+        similarity: From the new map's coordinates to the lost map's.
     """
     shape = begun.object_map.shape
     rest = torch.from_numpy(similarity.points(shape.rest.double().cpu().numpy())).to(shape.rest)

@@ -34,9 +34,9 @@ def merge_maps(state: SolverState, config: OnlineConfig, views: tuple[Keyframe, 
     """The state after merging the active map with every map that some of its keyframes can be aligned to.
 
     Args:
-            state: The state between two frames; its last frame is the newest keyframe.
-            config: The solver's options.
-            views: The keyframes of the active map that are compared with the others.
+        state: The state between two frames; its last frame is the newest keyframe.
+        config: The solver's options.
+        views: The keyframes of the active map that are compared with the others.
     """
     indices = {view.index for view in views}
     for other in state.inactive_maps:

@@ -19,7 +19,9 @@ from tracking3d.geometry.pose import Pose, pose_arrays, pose_from_arrays
 from tracking3d.geometry.similarity import Similarity
 
 _COMPARED_KEYFRAMES = 4  # keyframes of the first map that each of the second is compared with
-_MAX_REPROJECTION_ERROR = 20.0  # largest distance in pixels between both projections of a shared landmark, at an object size of 200 pixels
+_MAX_REPROJECTION_ERROR = (
+    20.0  # pixels at an object size of 200 pixels, between both projections of a landmark
+)
 
 Pairs = NDArray[np.int64]
 """``(N, 2)`` indices of landmarks of the first and second map that are the same point of the object."""
@@ -53,9 +55,9 @@ def match_landmarks(first: ObjectMap, second: ObjectMap, camera: Camera) -> Pair
     """Shared landmarks: their keypoints match, and both maps project them to nearly the same pixel.
 
     Args:
-            first: A map.
-            second: Another map, in the coordinates of the first.
-            camera: The camera of both.
+        first: A map.
+        second: Another map, in the coordinates of the first.
+        camera: The camera of both.
     """
     votes: Counter[tuple[int, int]] = Counter()
     for view in second.keyframes:
@@ -83,10 +85,10 @@ def merge(first: ObjectMap, second: ObjectMap, pairs: Pairs, most: int) -> Objec
     """The keyframes and landmarks of both maps, on the first map's surface.
 
     Args:
-            first: A map.
-            second: Another map, in the coordinates of the first, with features of the same kind.
+        first: A map.
+        second: Another map, in the coordinates of the first, with features of the same kind.
         pairs: See `match_landmarks`.
-            most: The most keyframes that are kept.
+        most: The most keyframes that are kept.
     """
     names = len(first.landmarks) + np.arange(len(second.landmarks))
     names[pairs[:, 1]] = pairs[:, 0]

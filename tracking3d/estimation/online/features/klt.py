@@ -27,8 +27,8 @@ class FollowedPoints:
     """Points of the surface in one frame.
 
     Attributes:
-            landmark: ``(N,)`` int64, the index of each point's landmark.
-            pixel: ``(N, 2)`` float32 in the full frame.
+        landmark: ``(N,)`` int64, the index of each point's landmark.
+        pixel: ``(N, 2)`` float32 in the full frame.
     """
 
     landmark: NDArray[np.int64]
@@ -85,10 +85,10 @@ def follow(
         before: ``(H, W)`` grey image of the earlier frame.
         now: ``(H, W)`` grey image of the later one.
         points: In the earlier frame.
-            guess: ``(N, 2)`` expected pixels in the later image; those in the earlier one if None.
+        guess: ``(N, 2)`` expected pixels in the later image; those in the earlier one if None.
 
     Returns:
-            The points whose forward-backward error is small.
+        The points whose forward-backward error is small.
     """
     if not len(points):
         return points
@@ -112,8 +112,8 @@ def new_corners(
     Args:
         image: ``(H, W)`` grey.
         mask: ``(H, W)``.
-            taken: ``(M, 2)`` pixels of existing points.
-            most: The most corners.
+        taken: ``(M, 2)`` pixels of existing points.
+        most: The most corners.
     """
     none = np.zeros((0, 2), np.float32)
     if most <= 0 or not mask.any():

@@ -45,8 +45,8 @@ def detect(
     Args:
         image: ``(H, W)`` grey.
         mask: ``(H, W)``.
-            length: Longer side of the object in pixels, if the mask is not the object's.
-            most: The most keypoints.
+        length: Longer side of the object in pixels, if the mask is not the object's.
+        most: The most keypoints.
     """
     if not mask.any():
         return Keypoints.none()

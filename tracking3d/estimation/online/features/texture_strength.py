@@ -32,7 +32,7 @@ def texture_strength(image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> float
         mask: ``(H, W)`` of the object.
 
     Returns:
-            The strength; 0 if the mask has no interior.
+        The strength; 0 if the mask has no interior.
     """
     area = int(np.count_nonzero(mask))
     if area == 0:

@@ -27,13 +27,13 @@ class AffineMotion:
     """Points and frames under scaled orthography, with the depth still unknown.
 
     Attributes:
-            axes: ``(F, 3, 3)`` rotation of each frame that maps the points' centre onto the optical axis.
+        axes: ``(F, 3, 3)`` rotation of each frame that maps the points' centre onto the optical axis.
         centres: ``(F, 3)`` direction of the points' centre in camera coordinates, with depth 1.
         cameras: ``(F, 2, 3)``; that of frame 0 is ``[1 0 0; 0 1 0]``.
         shape: ``(N, 3)`` x, y and zeta, which is uncorrelated with x and y and as wide as they are.
-            inliers: ``(N,)`` bool.
-            relief: Root mean square in pixels of the tracks' third dimension; 0 for a plane.
-            unexplained: Root mean square in pixels of the inliers' residuals to three dimensions.
+        inliers: ``(N,)`` bool.
+        relief: Root mean square in pixels of the tracks' third dimension; 0 for a plane.
+        unexplained: Root mean square in pixels of the inliers' residuals to three dimensions.
     """
 
     axes: FloatArray
@@ -51,8 +51,8 @@ def affine_motion(pixels: FloatArray, K: FloatArray, threshold: float, seed: int
     Args:
         pixels: ``(F, N, 2)``, all finite.
         K: ``(3, 3)``.
-            threshold: Largest distance in pixels of an inlier, root mean square over the frames.
-            seed: Seed of the sampling that finds inliers.
+        threshold: Largest distance in pixels of an inlier, root mean square over the frames.
+        seed: Seed of the sampling that finds inliers.
     """
     frames, count = pixels.shape[:2]
     if frames < 2 or count < 6:

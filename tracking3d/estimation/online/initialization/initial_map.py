@@ -46,11 +46,11 @@ class InitialMap:
     """One hypothesis of the initialization.
 
     Attributes:
-            object_map: The map; its keyframes are the selected views.
-            cost: Cost of re-rendering the views, increased if the focal length is far from the assumed one.
-            bundle: Cost of the points' reprojection.
-            origin: The hypothesis that it came from.
-            camera: The camera that it was estimated with.
+        object_map: The map; its keyframes are the selected views.
+        cost: Cost of re-rendering the views, increased if the focal length is far from the assumed one.
+        bundle: Cost of the points' reprojection.
+        origin: The hypothesis that it came from.
+        camera: The camera that it was estimated with.
     """
 
     object_map: ObjectMap
@@ -70,10 +70,10 @@ def solve_start(
     """Initial maps by rising cost; empty if the points do not constrain any.
 
     Args:
-            object_map: Prototype and landmarks; its keyframes are not used.
-            cameras: Cameras of the full frame: that of the views first, then others with possible focal lengths.
-            views: The first frames; the first one's pose is fixed.
-            weights: The weights of the shape's terms.
+        object_map: Prototype and landmarks; its keyframes are not used.
+        cameras: Cameras of the full frame: that of the views first, then others with possible focal lengths.
+        views: The first frames; the first one's pose is fixed.
+        weights: The weights of the shape's terms.
         prior: See `refine_map`.
     """
     chosen = [
@@ -133,10 +133,10 @@ def initialize_without_points(
     Shape and poses are fitted together from every hypothesis of `rotation_hypotheses`; the better ones continue.
 
     Args:
-            object_map: Prototype and landmarks; its keyframes are not used.
-            camera: The camera of the full frame.
-            views: All first frames with masks; the first `_ROTATION_FRAMES` are used.
-            weights: The weights of the shape's terms.
+        object_map: Prototype and landmarks; its keyframes are not used.
+        camera: The camera of the full frame.
+        views: All first frames with masks; the first `_ROTATION_FRAMES` are used.
+        weights: The weights of the shape's terms.
     """
     near = [view for view in views if view.index - views[0].index <= _ROTATION_FRAMES]
     chosen = _spread_views(near if len(near) >= _MIN_ROTATION_VIEWS else views, _ROTATION_VIEWS)

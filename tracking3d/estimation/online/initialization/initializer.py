@@ -109,9 +109,9 @@ def try_initialize(
     """The initial map if the pending frames determine it; else None, and the motion of the next attempt.
 
     Args:
-            state: The state with the pending frames.
-            config: The solver's options.
-            ended: Whether no more frames follow, so that these must suffice.
+        state: The state with the pending frames.
+        config: The solver's options.
+        ended: Whether no more frames follow, so that these must suffice.
     """
     waiting = state.pending or ()
     views = [view for view, _ in waiting if view.mask is not None]
@@ -189,9 +189,9 @@ def _is_undecided(starts: list[InitialMap], motion: float, leaning: NDArray[np.f
     More motion helps only if the points are tracked well.
 
     Args:
-            starts: Initial maps by rising cost.
+        starts: Initial maps by rising cost.
         motion: See `image_deformation`.
-            leaning: The rotation of the best initial map in the last attempt; if it wins again, a smaller margin suffices.
+        leaning: The rotation of the best initial map in the last attempt; if it wins again, a smaller margin suffices.
     """
     if len(starts) < 2 or starts[0].bundle > _WELL_TRACKED:
         return False
