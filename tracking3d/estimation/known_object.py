@@ -64,6 +64,6 @@ class KnownObject:
         return T
 
     def answered(self, estimate: FrameEstimate) -> FrameEstimate:
-        """A solver's answer with the pose in the object's own coordinates."""
+        """A solver's estimate with the pose in the object's own coordinates."""
         earlier = tuple(self.answered(one) for one in estimate.revised)
         return replace(estimate, T_cam_obj=self.from_solver(estimate.T_cam_obj), revised=earlier)

@@ -158,8 +158,8 @@ def test_neither_pixels_nor_points_is_lost_and_says_what_disagreed():
     assert str(FEW) in verdict.reason
     assert verdict.confidence < 0.1
     # Only what disagrees is said to.
-    assert "although one fits the mask" in verdict.reason
-    assert "nor the mask" in assess_pose(fit(appearance=0.7, overlap=0.5), USUAL, PoseEvidence(FEW)).reason
+    assert "though one fits the mask" in verdict.reason
+    assert "mask IoU 0.50" in assess_pose(fit(appearance=0.7, overlap=0.5), USUAL, PoseEvidence(FEW)).reason
 
 
 def test_a_plain_object_whose_outline_fits_is_not_lost_though_its_shades_change():

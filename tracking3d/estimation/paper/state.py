@@ -74,7 +74,7 @@ class PaperState:
         return 2 * float(centred.norm(dim=1).max())
 
     def moved(self, pose: Pose, index: int) -> PaperState:
-        """The same belief one frame later."""
+        """The same state one frame later."""
         return replace(self, last=(pose, index), before=self.last if self.started else None, started=True)
 
     def back_project(self, values: Tensor, keyframe: PosedObservation) -> BackProjection:

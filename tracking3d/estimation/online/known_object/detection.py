@@ -1,4 +1,4 @@
-"""A known object in a frame of which nothing is known: by keypoints anywhere in it, by its outline where a mask is."""
+"""Detects a known object in a frame: by keypoints anywhere in it, or by its outline if there is a mask."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tracking3d.rendering import Surface
 _MAX_KEYPOINTS = 2000  # keypoints of a whole frame, at each size
 _LENGTHS = (0.25, 0.75)  # of the frame's height, that the object may have: pictures are scaled for both
 _MAX_POSES = 3  # that most keypoints agree with
-_MAX_COMBINED = 6  # drawn sides whose matches are joined, once it is known which side is seen
+_MAX_COMBINED = 6  # rendered sides whose matches are combined, once it is known which side is seen
 _MAX_REPROJECTION_ERROR = 5.0  # pixels of an object 200 pixels large within which they count
 _DIRECTIONS, _ROLLS = 160, 18  # that an outline is tried from
 _MAX_ASPECT_DIFFERENCE = 0.4  # logarithm of two boxes' ratios of width and height that are not one outline's
@@ -39,13 +39,13 @@ _VERTICES = 600  # that tell the box of an outline
 def by_keypoints(
     object_map: ObjectMap, camera: Camera, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
 ) -> list[tuple[Pose, FollowedPoints]]:
-    """Poses that keypoints agree with, and those keypoints, most agreeing first.
+    """Poses from keypoint matches, and their inliers, most inliers first.
 
     Args:
         object_map: The map.
         camera: Of the full frame.
         image: ``(H, W)`` grey.
-        mask: ``(H, W)`` where the object is looked for; None for anywhere.
+        mask: ``(H, W)`` the region that is searched; None for the whole frame.
     """
     if mask is None:
         height = image.shape[0]
@@ -77,7 +77,7 @@ def _combine_matches(
     points: FollowedPoints,
     scale: float,
 ) -> tuple[Pose, FollowedPoints]:
-    """The pose once more, by what all sides that are like the one seen say of the keypoints."""
+    """The pose again, from the matches with all sides near the one seen."""
     together = points
     for other in nearest_views(object_map.keyframes, pose, _MAX_COMBINED):
         pairs = match(keypoints, other.keypoints)
@@ -93,7 +93,7 @@ def _combine_matches(
 
 
 def by_outline(surface: Surface, camera: Camera, view: Keyframe, weights: PoseWeights) -> list[Pose]:
-    """The poses, all around, whose outlines and pixels fit a frame's mask best; there must be one.
+    """The poses, among all rotations, whose outlines and pixels fit a frame's mask best; at least one.
 
     Args:
         surface: The object.
@@ -119,7 +119,7 @@ def _cost(fit: PoseFit) -> float:
 
 
 def _align_candidates(surface: Surface, camera: Camera, mask: NDArray[np.bool_]) -> list[Pose]:
-    """Rotations all around, each put where the box of its outline is the mask's; none whose box has another form."""
+    """Rotations all around, each aligned by its outline's box with the mask's; none whose aspect ratio differs."""
     left, top, width, height = mask_box(mask)
     middle = np.array([left + (width - 1) / 2 - camera.cx, top + (height - 1) / 2 - camera.cy])
     vertices = surface.vertices.double().cpu().numpy()

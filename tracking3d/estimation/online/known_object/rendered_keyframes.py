@@ -1,7 +1,7 @@
-"""The map of an object that is known before the video begins: what it looks like from all sides, drawn.
+"""The map of an object that is known before the video begins, rendered from all sides.
 
-Every side that is drawn becomes a keyframe, whose keypoints are points of the surface; from then on the object is
-tracked as one that the solver has got to know by itself, but for its shape, which is held.
+Every rendered side becomes a keyframe whose keypoints are points of the surface; from then on the object is tracked
+like any other, except that its shape is fixed.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _FIELD_OF_VIEW = 30.0
 _FILLED = 0.85  # of the picture, by the sphere around the object
 _MAX_TEXELS = 1024  # along a side of the texture that is drawn
 _MARGIN = 3  # pixels that keypoints stay away from what was never seen
-_TEXTURE_WEIGHT = 3.0  # what the known colours count, in views of the new video that show them head-on
+_TEXTURE_WEIGHT = 3.0  # weight of the known texture, in views of the new video that show it head-on
 _FINEST_TEXELS, _TEXELS_OF_A_FACE = 512, 4.0
 
 
@@ -66,7 +66,7 @@ class RenderedSide:
 def map_of_known_object(
     known: KnownObject, config: PipelineConfig, encoder: FeatureEncoder, device: torch.device
 ) -> tuple[ObjectMap, FeatureSpace | None]:
-    """The map, and what is made of the encoder's features; None where no colours are known to tell that.
+    """The map and the feature space; None for the latter if no known colours determine it.
 
     Args:
         known: The object.

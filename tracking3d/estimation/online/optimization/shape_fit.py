@@ -25,21 +25,21 @@ FloatArray = NDArray[np.float64]
 Rows = tuple[sparse.csr_matrix, FloatArray]
 """Weighted residuals ``(N,)`` and their Jacobian ``(N, 3 V)``, by the vertices' coordinates one after another."""
 
-_GRAZING = 0.2  # cosine between ray and normal below which a face says nothing about where a landmark is
+_GRAZING = 0.2  # cosine between ray and normal below which a face does not constrain a landmark
 _BESIDE = 0.5  # how far beside its face, in barycentric coordinates, a landmark may lie
 _FLOOR = 1e-6  # added to the diagonal, as a share of its largest entry
 
 
 @dataclass(frozen=True)
 class FitWeights:
-    """What each term of the shape counts.
+    """The weights of the shape's terms.
 
     Attributes:
-        outline: Of the mean squared distance of the outlines from the masks', in pixels, over all keyframes.
+        outline: Weight of the mean squared distance of the outlines from the masks', in pixels, over all keyframes.
         outline_scale: Pixels at which an outline's distance counts half (robust).
-        landmarks: Of the mean squared distance of the landmarks from the surface, in units of its scale.
+        landmarks: Weight of the mean squared distance of the landmarks from the surface, in units of its scale.
         landmarks_scale: Object units at which a landmark's distance counts half (robust).
-        smoothness: Of the mean squared Laplacian of the offsets.
+        smoothness: Weight of the mean squared Laplacian of the offsets.
     """
 
     outline: float = 1.0
