@@ -22,8 +22,8 @@ class KnownObject:
 
     Attributes:
         name: What sentences call it.
-        model: In its own coordinates; ``texture_weight`` is 0 where its colours are not known.
-        camera: The camera that it was learnt with; None where there was none.
+        model: In its own coordinates; ``texture_weight`` is 0 if its colours are not known.
+        camera: The camera that it was learnt with; None if there was none.
     """
 
     name: str

@@ -50,7 +50,7 @@ class Support:
 
     Attributes:
         followed: How many of them were found in the view.
-        agreeing: How many of those where surface and pose put them; 0 where they were too few to be asked.
+        agreeing: How many of those where surface and pose put them; 0 if they were too few to be asked.
         telling: Whether they are points of the object's texture; on a plain one they are shades and edges, which slide
             over it as it turns, and agree with wrong poses.
     """
@@ -65,7 +65,7 @@ class LandmarkScene:
     """A rigid surface in T views.
 
     Attributes:
-        views: None where the object was not found.
+        views: None if the object was not found.
         vertices: ``(V, 3)`` in object coordinates.
         faces: ``(F, 3)``.
         focal_factor: By which the views' focal lengths are those that they were opened with.

@@ -43,7 +43,7 @@ class BundleResult:
     Attributes:
         points: ``(N, 3)`` in object coordinates.
         T_cam_obj: ``(T, 4, 4)``.
-        weight: ``(T, N)`` that the measurements had in the end: 0 where there is none.
+        weight: ``(T, N)`` that the measurements had in the end: 0 if there is none.
         focal_factor: By which all focal lengths are to be multiplied.
         cost: Mean robust loss of the measurements, by weight.
         agreeing: ``(T, N)`` bool, the measurements that the points and poses explain.
@@ -72,13 +72,13 @@ def intersect(
         points: ``(N, 3)`` in object coordinates.
         intrinsics: ``(T, 4)`` fx, fy, cx, cy of every view.
         T_cam_obj: ``(T, 4, 4)``.
-        measured: ``(T, N, 2)`` pixels; NaN where there is none.
-        deviation: ``(T, N)`` of them in pixels; infinite where there is none.
+        measured: ``(T, N, 2)`` pixels; NaN if there is none.
+        deviation: ``(T, N)`` of them in pixels; infinite if there is none.
         held: Deviation of the points' movement, in object units.
         turns: Steps.
 
     Returns:
-        The points, and the weights ``(T, N)`` that the measurements had in the end: 0 where there is none.
+        The points, and the weights ``(T, N)`` that the measurements had in the end: 0 if there is none.
     """
     from tracking3d.points.kernels.intersection import intersect as compiled
     from tracking3d.rendering.kernels.threads import share
@@ -168,7 +168,7 @@ class OtherWayRound:
 
     @property
     def is_better(self) -> bool:
-        """Whether it is to be believed."""
+        """Whether it is to be trusted."""
         return self.ratio < _BETTER
 
     @property

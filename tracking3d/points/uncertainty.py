@@ -26,7 +26,7 @@ class Evidence:
     """What is known about N points in T views.
 
     Attributes:
-        variance: ``(T, N)`` squared pixels of the measurement; infinite where there is none.
+        variance: ``(T, N)`` squared pixels of the measurement; infinite if there is none.
         spread: ``(N,)`` mean squared pixels between measurements and the landmark.
         views: ``(N,)`` in how many views the point was measured.
         slant: ``(N,)`` cosine between ray and surface where the point was asked for.

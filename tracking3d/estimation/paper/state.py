@@ -40,7 +40,7 @@ class PaperState:
         keyframes: In order of time.
         seen: RGB that former keyframes showed of each texel.
         last: Pose and index of the last frame, a lost one's included.
-        before: The same of the frame before that one; None where there is no motion to go on with.
+        before: The same of the frame before that one; None if there is no motion to go on with.
         waiting: First frames that wait for the joint start, with their answers so far; None when none waits
             any more.
         started: Whether the first frame is done.

@@ -36,7 +36,7 @@ def intersect(
         intrinsics: ``(T, 4)``.
         T_cam_obj: ``(T, 4, 4)``.
         measured: ``(N, T, 2)`` pixels.
-        certain: ``(N, T)`` one over the variance of what was measured; 0 where nothing was.
+        certain: ``(N, T)`` one over the variance of what was measured; 0 if nothing was.
         held: Deviation of the points' movement, in object units.
         outlier: Deviations at which a measurement has a quarter of its weight.
         nearest: Depth from which on points have an image.

@@ -60,10 +60,10 @@ def structure_hypotheses(
         tracks: F frames, N points; frame 0 is the first.
         K: ``(3, 3)``.
         t0: ``(3,)`` translation of frame 0, at the object's centre.
-        radius: Of the object, in its units.
+        radius: The radius of the object, in its units.
         scale: Residual in pixels at which the Cauchy loss is ``log 2``.
         keep: The most solutions.
-        seed: Of the sampling that finds outliers.
+        seed: The seed of the sampling that finds outliers.
 
     Returns:
         Structures of all frames and points. A point seen in fewer than two frames is nan; a frame that sees

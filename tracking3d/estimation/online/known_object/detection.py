@@ -43,7 +43,7 @@ def by_keypoints(
 
     Args:
         object_map: The map.
-        camera: Of the full frame.
+        camera: The camera of the full frame.
         image: ``(H, W)`` grey.
         mask: ``(H, W)`` the region that is searched; None for the whole frame.
     """
@@ -97,9 +97,9 @@ def by_outline(surface: Surface, camera: Camera, view: Keyframe, weights: PoseWe
 
     Args:
         surface: The object.
-        camera: Of the full frame.
+        camera: The camera of the full frame.
         view: The frame.
-        weights: Of the kinds of evidence.
+        weights: The weights of the kinds of evidence.
     """
     assert view.mask is not None
     poses = _align_candidates(surface, camera, view.mask)

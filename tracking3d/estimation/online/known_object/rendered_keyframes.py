@@ -141,7 +141,7 @@ def render_side(
     Args:
         shape: The object.
         colours: ``(4, T, T)`` RGB in [0, 1], and 1 where it is known, else 0.
-        pose: Of the object.
+        pose: The pose of the object.
         camera: Square.
         renderer: See `tracking3d.rendering.backend`.
     """
@@ -206,7 +206,7 @@ def _with_points(
 
 
 def _sample_surface(points: NDArray[np.float32], pixel: NDArray[np.float32]) -> NDArray[np.float64]:
-    """``(N, 3)`` of ``points`` ``(S, S, 3)`` between four pixels; nan where one of those is."""
+    """``(N, 3)`` of ``points`` ``(S, S, 3)`` between four pixels; nan if one of those is."""
     low = np.floor(pixel).astype(int).clip(0, len(points) - 2)
     (x, y), (right, down) = low.T, (pixel - low).T[..., None]
     upper = (1 - right) * points[y, x] + right * points[y, x + 1]

@@ -38,7 +38,7 @@ def pose_from_points(
         K: ``(3, 3)``.
         start: ``R`` and ``t`` of an initial pose to refine as well; the better of both poses is returned.
         threshold: Largest distance in pixels of an inlier.
-        seed: Of the sampling.
+        seed: The seed of the sampling.
     """
     usable = finite_rows(points) & finite_rows(pixels)
     if np.count_nonzero(usable) < _MIN_INLIERS:

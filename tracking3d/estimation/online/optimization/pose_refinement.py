@@ -83,7 +83,7 @@ def refine_poses(
         observation: The frame.
         starts: The initial poses.
         matched: Points with known places in the frame's window at full working resolution.
-        weights: Of the kinds of evidence.
+        weights: The weights of the kinds of evidence.
         iterations: Most steps at each resolution, each twice the one before, the last one the full working
             resolution. Zeros only evaluate the starts.
     """

@@ -2,7 +2,7 @@
 
 Gauss-Newton on three terms: the signed distances of the outline in every keyframe, the distances of the landmarks
 from the surface that is seen where they are, and the Laplacian of the offsets from the prototype. The normal
-equations are sparse; contour and attachments are found anew in every round. A landmark beside the silhouette has no
+equations are sparse; contour and attachments are found again in every round. A landmark beside the silhouette has no
 surface behind it and pulls the nearest vertex.
 """
 
@@ -57,7 +57,7 @@ class ShapeKeyframes:
         R: ``(B, 3, 3)``; t: ``(B, 3)``; of ``T_cam_obj``.
         K: ``(B, 3, 3)`` of the windows.
         distance: ``(B, S, S)`` signed distance to the mask, pixels of the window.
-        weight: ``(B,)`` how far each frame's mask is believed, in [0, 1].
+        weight: ``(B,)`` how far each frame's mask is trusted, in [0, 1].
     """
 
     R: Tensor
@@ -102,8 +102,8 @@ def fit_surface(
         laplacian: Sparse ``(V, V)``.
         views: Keyframes with their poses.
         landmarks: Points of the surface, or None.
-        weights: Of the terms.
-        rounds: How often contour and attachments are found anew.
+        weights: The weights of the terms.
+        rounds: How often contour and attachments are found again.
         renderer: See `tracking3d.rendering.backend`.
     """
     L = _scipy(laplacian)

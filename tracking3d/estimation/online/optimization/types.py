@@ -49,7 +49,7 @@ class PoseFit:
     """A pose and how well it explains the frame.
 
     Attributes:
-        pose: Of the frame.
+        pose: The pose of the frame.
         cost: What was minimized.
         appearance: Mean Cauchy loss over the covered pixels in the mask and the frame, unseen ones charged.
         outline: Mean Cauchy loss of the outline; 0 without a mask.
