@@ -1,4 +1,4 @@
-"""How far the image lies from what was expected of it, around many points at once.
+"""Aligns templates with the image around many points at once.
 
 The expected image is already warped into the view, so what is left is a shift. Forwards additive alignment
 with the gradients of the template (Hager and Belhumeur, "Efficient region tracking with parametric models of

@@ -1,4 +1,4 @@
-"""What is said of followed points when a frame is answered."""
+"""The estimates for tracked points in one frame."""
 
 from __future__ import annotations
 

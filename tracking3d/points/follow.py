@@ -1,4 +1,4 @@
-"""Where points of one view are in all views: predicted by surface and poses, corrected by the images."""
+"""Tracks the points of one view in all views: predicted by surface and poses, corrected by the images."""
 
 from __future__ import annotations
 

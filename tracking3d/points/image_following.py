@@ -1,4 +1,4 @@
-"""Points followed in the images alone, where no surface says where they go.
+"""Tracks points in the images alone, if no surface predicts their motion.
 
 Pyramidal Lucas-Kanade (Bouguet, "Pyramidal implementation of the affine Lucas Kanade feature tracker", 2001) from the
 frame before, from the last frame whose appearance still fits, and from the frame of the question; each answer has to

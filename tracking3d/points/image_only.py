@@ -1,4 +1,4 @@
-"""Points of the object that its surface does not cover yet, followed in the images until it does."""
+"""Points of the object that its surface does not cover yet, tracked in the images until it does."""
 
 from __future__ import annotations
 

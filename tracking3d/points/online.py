@@ -1,4 +1,4 @@
-"""Points followed while the views come: each is answered by those until then.
+"""Tracks points while the views arrive: each estimate uses the views up to then.
 
 As many views are kept as the templates reach back and a point in space is settled by; what is kept does not grow.
 Poses that are answered at the time are some pixels off, so that points of a grid on the object are followed beside
@@ -63,7 +63,7 @@ class CausalPoints:
         self._first: _Row | None = None
 
     def step(self, index: int, view: SurfaceView | None, radius: float) -> PointAnswers:
-        """Answer for the next frame; the first one is that of the question.
+        """The estimates for the next frame; the first one is the query frame.
 
         Args:
             index: The index of the frame.
@@ -110,7 +110,7 @@ class CausalPoints:
             row.view = redraw_surface(view, vertices, faces, T_cam_obj)
 
     def again(self, radius: float) -> dict[int, PointAnswers]:
-        """Answer for the kept frames once more, by frame; nothing unless that of the question is among them."""
+        """The estimates for the kept frames again, by frame; empty unless the query frame is among them."""
         rows, first = self._rows, self._first
         if first is None or first not in rows:
             return {}

@@ -1,4 +1,4 @@
-"""Points in space and poses that agree with where points were measured in the images.
+"""Robust bundle adjustment of points and poses by measurements in the images.
 
 Wrong tracks do not count for robust weights, and a prior holds the points at the surface that the run has found: they
 go only where the images say so, and size and place of the whole stay.
@@ -66,7 +66,7 @@ def intersect(
     held: float,
     turns: int = TURNS,
 ) -> tuple[Array, Array]:
-    """Move points to where the views say they are.
+    """Move points to where the views measure them.
 
     Args:
         points: ``(N, 3)`` in object coordinates.
@@ -105,7 +105,7 @@ def bundle(
     begun: BundleResult | None = None,
     turns: int = TURNS,
 ) -> BundleResult:
-    """Move points and poses to where the measurements agree with both.
+    """Move points and poses so that they agree with the measurements.
 
     Views that hold too few measurements keep their poses.
 
@@ -168,12 +168,12 @@ class OtherWayRound:
 
     @property
     def is_better(self) -> bool:
-        """Whether it is to be trusted."""
+        """Whether the reversed explanation is accepted."""
         return self.ratio < _BETTER
 
     @property
     def is_hopeless(self) -> bool:
-        """Whether it need not be asked for again."""
+        """Whether the reversal need not be tried again."""
         return self.ratio > _HOPELESS
 
 

@@ -1,4 +1,4 @@
-"""Points that the images followed tied to the surface, once it is known where they lie on it.
+"""Associates points tracked in the images with the surface, once it is known where they lie on it.
 
 Where a followed pixel meets the drawn surface it may be a point of it, or of something in front that no mesh covers.
 Which of the two shows as the object turns: the point of the surface goes where the images say only if it is that one.

@@ -1,4 +1,4 @@
-"""Points followed from the views that they begin in through all others, forwards and backwards in time."""
+"""Tracks points from the views that they begin in through all others, forwards and backwards in time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How many pixels a followed point is off, as far as that can be told beforehand.
+"""Predicts the error in pixels of a tracked point.
 
 The logarithm of the error is a sum of logarithms of what is known about the point; the weights were fitted on sequences
 of a seed, see ``training/point_uncertainty.py``, and tested on those of another one.

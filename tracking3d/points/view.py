@@ -1,4 +1,4 @@
-"""One frame as points are followed in it: a window of the image around the object, with the mesh drawn into it."""
+"""One frame prepared for point tracking: a window of the image around the object, with the mesh rendered into it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Points of one view carried into another one by surface and poses, and corrected there by the image.
+"""Warps points of one view into another by surface and poses, and corrects them there by the image.
 
 What the one view shows is warped into the other through the surface, so that it has the right turn and size there; how
 far the image lies beside it is the correction.

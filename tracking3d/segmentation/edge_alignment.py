@@ -1,4 +1,4 @@
-"""How well an outline lies on edges of the image, all along it."""
+"""How well an outline coincides with image edges along its length."""
 
 from __future__ import annotations
 

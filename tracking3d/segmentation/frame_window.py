@@ -1,4 +1,4 @@
-"""One frame as the evidence is asked in it: a window at the frame's own resolution, and the surface drawn into it."""
+"""One frame prepared for segmentation: a window at the frame's own resolution, and the surface rendered into it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Answered:
         index: The index of the frame.
         image: ``(H, W, 3)`` RGB.
         initial: ``(H, W)`` the mask tracker's mask.
-        answer: ``(H, W)`` the mask that was answered.
+        answer: ``(H, W)`` the estimated mask.
         T_cam_obj: ``(4, 4)``; NaN if there is no pose that is trusted.
         confidence: The confidence of the pose, in [0, 1].
     """
@@ -54,7 +54,7 @@ class FrameWindow:
         K: ``(3, 3)`` intrinsics of the window.
         T_cam_obj: ``(4, 4)``; NaN if there is no pose.
         initial: The mask tracker's mask.
-        answer: The mask that was answered.
+        answer: The estimated mask.
         drawn: The silhouette; empty without a pose.
         inverse_depth: Of the surface, carried on beyond the silhouette; 0 without a pose.
         confidence: The confidence of the pose, in [0, 1].

@@ -1,4 +1,4 @@
-"""What the sources see at a pixel, and how much each counts: a logistic regression, fitted on many sequences."""
+"""The online features of a pixel and their weights: a logistic regression, fitted on many sequences."""
 
 from __future__ import annotations
 

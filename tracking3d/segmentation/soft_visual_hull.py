@@ -1,4 +1,4 @@
-"""What the masks of all frames say together: a soft visual hull.
+"""A soft visual hull from the masks of all frames.
 
 A point of space is outside the object where enough views put it there. In each view, its distance from the mask's
 outline is taken into space by the point's depth; of these the hull has one at a low rank, so that a few wrong masks

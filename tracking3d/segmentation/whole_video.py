@@ -1,4 +1,4 @@
-"""Masks answered once more when the whole video is known: what most frames call object is object in all.
+"""Segments every frame again once the whole video is known: what most frames label as object is object in all.
 
 The frames are gone through twice. The first time, masks and poses that are trusted are put together: a hull of their
 masks, and the colours of object and surroundings. The second time each pixel is weighed, with the frames around it in
@@ -28,7 +28,7 @@ from tracking3d.segmentation.whole_video_features import PixelEvidence
 from tracking3d.segmentation.whole_video_weights import WEIGHTS
 
 MOST_VIEWS = 60
-"""Frames that are put together, spread over those that are trusted."""
+"""The most frames that are combined, spread over the reliable ones."""
 _BELIEVED = 0.5
 _ASKED = 0.4
 """How far the image smooths what is said, see `snap_to_edges`: in an even one outlines would creep."""

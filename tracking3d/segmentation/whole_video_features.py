@@ -1,4 +1,4 @@
-"""What is said of each pixel when all frames are known: shapes, colours, motion, and how far each can be trusted.
+"""The features of each pixel once all frames are known: shapes, colours, motion, and how far each can be trusted.
 
 Every source is odd: without it, or where it cannot tell, it is 0, and what speaks for the object is positive. There is
 no constant, which would say that masks are too large or too small as those of some tracker are.

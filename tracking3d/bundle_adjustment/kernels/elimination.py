@@ -1,4 +1,4 @@
-"""Kernels of a step of bundle adjustment: the points are eliminated, the poses solved, the points put back.
+"""Kernels of a bundle adjustment step: the Schur complement of the points, the poses' step, back-substitution.
 
 The products that this takes are nearly all of its work. They are taken in tiles that stay in the processor's nearest
 memory, each entry's sum in ascending order, so that neither tiles nor threads change a digit.
