@@ -36,7 +36,7 @@ def found(state, mask=None, inliers=motion_cue._MIN_INLIERS, lost=False) -> Simp
     return SimpleNamespace(
         view=view,
         lost=lost,
-        support=SimpleNamespace(inliers=inliers),
+        evidence=SimpleNamespace(inliers=inliers),
         fit=SimpleNamespace(pose=view.pose),
     )
 
