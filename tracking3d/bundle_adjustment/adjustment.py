@@ -63,7 +63,7 @@ class Structure:
         points: ``(N, 3)`` in object coordinates; nan for points that are not known.
         focal_factor: The focal lengths of K are to be multiplied by this.
         cost: Mean Cauchy loss over the observations, by weight; the points' prior is part of it.
-        residual: ``(F, N)`` distance in pixels between track and projection; nan where unseen.
+        residual: ``(F, N)`` distance in pixels between track and projection; nan if unseen.
         iterations: Steps that were tried.
         origin: In a word, where it comes from.
     """
@@ -89,7 +89,7 @@ class System:
     points_gradient: FloatArray  # (N, 3)
 
     def step(self, damping: float) -> tuple[FloatArray, FloatArray] | None:
-        """Damped step of poses ``(C,)`` and points ``(N, 3)``; None where there is none."""
+        """Damped step of poses ``(C,)`` and points ``(N, 3)``; None if there is none."""
         poses, points = _damp(self.poses, damping), _damp(self.points, damping)
         from tracking3d.bundle_adjustment.kernels import elimination
 

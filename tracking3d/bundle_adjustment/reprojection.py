@@ -1,4 +1,4 @@
-"""Where points of a posed object are seen, and how that changes when poses and points move.
+"""Reprojection of a posed object's points, and its derivatives by poses and points.
 
 A pose moves by ``d = (v, w)`` in the camera's axes: ``x_cam -> exp(w) (x_cam - t) + t + v``, so ``t`` becomes
 ``t + v`` and ``R`` becomes ``exp(w) R``. That is the step of `tracking3d.rendering.normal_equations`, with the

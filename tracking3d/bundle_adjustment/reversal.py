@@ -1,4 +1,4 @@
-"""The other explanation of the same tracks: depth reversed.
+"""Depth reversal: the other explanation of the same tracks.
 
 Seen from afar, points that turn one way and points of a shape with all depths negated that turns the other way look
 the same (Necker's cube; Koenderink and van Doorn, "Affine structure from motion", 1991). Once an estimate has taken

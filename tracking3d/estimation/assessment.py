@@ -1,4 +1,4 @@
-"""The estimator's judgement of its own answer for a frame: status, reason in words, confidence."""
+"""The solver's assessment of its own estimate for a frame: status, reason in words, confidence."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ class Status(StrEnum):
 
 
 class MaskSource(StrEnum):
-    """Where an answer's mask comes from."""
+    """The source of an estimate's mask."""
 
     RENDERED = "rendered"
     """The silhouette of the object at the frame's pose."""
@@ -56,7 +56,7 @@ the earlier one is only a guess."""
 
 @dataclass(frozen=True, eq=False)
 class FrameEstimate:
-    """The answer for one frame.
+    """The estimate for one frame.
 
     Attributes:
         index: The frame's index in the source.
@@ -64,7 +64,7 @@ class FrameEstimate:
         T_cam_obj: ``(4, 4)`` float64 rigid transform from object to camera.
         mask: ``(H, W)`` bool, full resolution: the answer. The rendered silhouette, or the initial mask where
             the frame is lost.
-        initial_mask: ``(H, W)`` bool as the mask tracker gave it, or None where it gave none.
+        initial_mask: ``(H, W)`` bool as the mask tracker gave it, or None if it gave none.
         status: See `Status`.
         reason: Why the frame has that status, in words.
         confidence: In [0, 1].
@@ -73,18 +73,18 @@ class FrameEstimate:
         iterations: Optimizer iterations spent.
         keyframe: Whether the frame became a keyframe.
         seconds: Wall time spent on the frame, all stages together.
-        stages: The same stage by stage, as far as they are over; None where nobody timed them.
-        mask_source: Where the mask comes from; None where it is not known.
+        stages: The same stage by stage, as far as they are over; None if nobody timed them.
+        mask_source: Where the mask comes from; None if it is not known.
         probability: ``(H, W)`` float32 of the object, pixel by pixel, where the mask was weighed against the image: the
             mask is where it is above a half. It orders pixels and is not calibrated. None otherwise.
-        failure: Which plug-in failed at this frame, and why, in words; empty where none did.
-        hypothesis: Which start of the pose won, in a word or two; empty where there was no choice.
+        failure: Which plug-in failed at this frame, and why, in words; empty if none did.
+        hypothesis: The winning hypothesis of the pose, in a word or two; empty if there was no choice.
         refined: Whether this is the answer of the final refinement, which looks at the whole video, and not the
             causal one.
-        revised: Better answers for earlier frames that this frame made possible; they replace those given before.
-        camera: The camera of the full frame that the pose is of. Where nobody gave the lens it changes with what is
-            known. None where the answer does not say: the camera that was known from the first frame on.
-        points: Where the points are that `tracking3d.track` was asked to follow; None where it was asked for none.
+        revised: Better estimates for earlier frames that this frame made possible; they replace those given before.
+        camera: The camera of the full frame that the pose refers to. If the focal length is not given, it changes as
+            the solver learns more. None if the estimate does not say: the camera known from the first frame on.
+        points: Where the points are that `tracking3d.track` was asked to follow; None if it was asked for none.
     """
 
     index: int
@@ -123,7 +123,7 @@ class ObjectModel:
         texture: ``(T, T, 3)`` uint8 RGB, back-projected from the video.
         texture_weight: ``(T, T)`` float32, how much each texel was seen; 0 = never.
         features: ``(T, T, C)`` float32 feature texture the poses were estimated with.
-        seen: ``(V,)`` bool, whether a frame shows a vertex; None where nobody asked, as of the online map's mesh.
+        seen: ``(V,)`` bool, whether a frame shows a vertex; None if nobody asked, as of the online map's mesh.
     """
 
     vertices: NDArray[np.float64]
@@ -136,7 +136,7 @@ class ObjectModel:
 
 
 def lost_estimate(frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float64]) -> FrameEstimate:
-    """The answer where the solver could give none: lost, with the initial mask and the pose known before."""
+    """The estimate if the solver has none: lost, with the initial mask and the last known pose."""
     initial = mask.binary if mask.binary is not None and mask.binary.any() else None
     return FrameEstimate(
         index=frame.index,

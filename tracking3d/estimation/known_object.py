@@ -22,8 +22,8 @@ class KnownObject:
 
     Attributes:
         name: What sentences call it.
-        model: In its own coordinates; ``texture_weight`` is 0 where its colours are not known.
-        camera: The camera that it was learnt with; None where there was none.
+        model: In its own coordinates; ``texture_weight`` is 0 if its colours are not known.
+        camera: The camera that it was learnt with; None if there was none.
     """
 
     name: str
@@ -64,6 +64,6 @@ class KnownObject:
         return T
 
     def answered(self, estimate: FrameEstimate) -> FrameEstimate:
-        """A solver's answer with the pose in the object's own coordinates."""
+        """A solver's estimate with the pose in the object's own coordinates."""
         earlier = tuple(self.answered(one) for one in estimate.revised)
         return replace(estimate, T_cam_obj=self.from_solver(estimate.T_cam_obj), revised=earlier)

@@ -31,7 +31,7 @@ class Observation:
         image: ``(3, 2 S, 2 S)`` RGB in [0, 1], finer than the rest: it becomes the visible texture.
         features: ``(C, S, S)``.
         valid: ``(S, S)`` 1 inside the frame, 0 beyond its border, where nothing is known.
-        mask: ``(S, S)`` rough mask in [0, 1]; all zero where there is none.
+        mask: ``(S, S)`` rough mask in [0, 1]; all zero if there is none.
         distance: ``(S, S)`` distance to the mask in NDC, zero inside it.
         has_mask: Whether the mask tracker gave a mask.
     """
@@ -197,7 +197,7 @@ def mask_distance(mask: Tensor) -> Tensor:
 
 
 def projected_box(vertices: Tensor, camera: Camera, pose: Pose) -> Box | None:
-    """Box ``(x, y, w, h)`` of the projected vertices inside the frame; None where none is or one is behind."""
+    """Box ``(x, y, w, h)`` of the projected vertices inside the frame; None if none is or one is behind."""
     x_cam = vertices @ pose.R.T + pose.translation
     if not bool((x_cam[:, 2] > 1e-3).all()):
         return None

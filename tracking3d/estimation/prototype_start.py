@@ -1,4 +1,4 @@
-"""Where the estimation starts: a prototype and a first pose whose projection fits the first mask.
+"""The initialization from the first mask: a prototype and a pose whose projection fits it.
 
 The unit is set so that the object's radius is about `RADIUS`; learning rates, Laplacian weight and tolerances
 assume it.
@@ -64,7 +64,7 @@ def mask_ellipse(mask: NDArray[np.bool_]) -> MaskEllipse:
 
 
 def first_translation(ellipse: MaskEllipse, camera: Camera) -> NDArray[np.float64]:
-    """Translation ``(3,)`` that puts an object of radius `RADIUS` where the mask is."""
+    """Translation ``(3,)`` that projects an object of radius `RADIUS` onto the mask."""
     focal = math.sqrt(camera.fx * camera.fy)
     # The outline of a sphere is seen at the angle asin(r / z), a little wider than r / z.
     tangent = ellipse.semi_axes[0] / focal

@@ -73,7 +73,7 @@ class RefiningSolver(Protocol, Generic[State]):
             state: From ``refine``, then from the last call.
             frame: The frame.
             mask: Its initial mask as it was.
-            T_cam_obj: ``(4, 4)`` the causal answer.
+            T_cam_obj: ``(4, 4)`` the causal estimate.
         """
         ...
 
@@ -91,7 +91,7 @@ class GuidedSolver(Protocol, Generic[State]):
             state: After the last frame.
             frame: The frame to go on from.
             number: The index that the last frame had.
-            T_cam_obj: ``(4, 4)`` the answer for ``frame``.
+            T_cam_obj: ``(4, 4)`` the estimate for ``frame``.
         """
         ...
 

@@ -1,4 +1,4 @@
-"""Which answers are handed back to the mask tracker, so that it goes on from them."""
+"""Decides which estimated masks are fed back to the mask tracker."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ mask for a few frames only, and a pose that is judged by a mask without it canno
 
 
 def corrects(estimate: FrameEstimate) -> bool:
-    """Whether an answer is sure enough, and unlike the initial mask enough, to be handed back to the mask tracker."""
+    """Whether an estimate is confident enough, and differs enough from the initial mask, to be fed back."""
     moving = estimate.diagnostics.get(MOTION_RATIO, 0.0) >= MOVES
     if estimate.status is not Status.TRACKED and not moving:
         return False

@@ -1,4 +1,4 @@
-"""A solver behind a lens: it sees what a pinhole camera would have taken, and answers for the pictures as they were.
+"""A solver for a distorting lens: it sees undistorted images, and its estimates are for the original ones.
 
 Everything around the solver, the mask tracker, prompts and answers, is in pixels of the pictures that were taken. Poses
 and the solver's own state are of the pinhole camera.
@@ -19,7 +19,7 @@ from tracking3d.geometry.lens import Lens
 
 
 def undistort_solver(lens: Lens | None, solver: Solver[Any]) -> Solver[Any]:
-    """The solver behind a lens; as it is where there is none."""
+    """The solver behind a lens; the solver itself if there is no distortion."""
     if lens is None:
         return solver
     complete = isinstance(solver, RefiningSolver) and isinstance(solver, GuidedSolver)
@@ -56,7 +56,7 @@ class UndistortingSolver(Generic[State]):
         return replace(mask, mask=self._lens.mask_to_pinhole(mask.mask.astype(np.float32)))
 
     def _answer(self, estimate: FrameEstimate, mask: MaskEstimate | None = None) -> FrameEstimate:
-        """An answer for the pictures as they were; what was handed in comes back as it was."""
+        """An estimate for the original images; the inputs come back unchanged."""
         initial = mask.found if mask is not None else self._seen(estimate.initial_mask)
         handed_back = estimate.mask_source is MaskSource.INITIAL and initial is not None
         answered = initial if handed_back else self._seen(estimate.mask)

@@ -1,4 +1,4 @@
-"""How far the image lies from what was expected of it, around many points at once.
+"""Aligns templates with the image around many points at once.
 
 The expected image is already warped into the view, so what is left is a shift. Forwards additive alignment
 with the gradients of the template (Hager and Belhumeur, "Efficient region tracking with parametric models of
@@ -31,7 +31,7 @@ class Alignment:
     """What N patches say.
 
     Attributes:
-        shift: ``(N, 2)`` pixels by which the image lies beside the template; 0 where there was nothing to align.
+        shift: ``(N, 2)`` pixels by which the image lies beside the template; 0 if there was nothing to align.
         covariance: ``(N, 3)`` of it, xx, xy and yy in squared pixels; infinite there.
         agreement: ``(N,)`` correlation of the two patches at the end, -1 there.
         contrast: ``(N,)`` deviation of the template's grey values, 0 there.

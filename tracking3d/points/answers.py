@@ -1,4 +1,4 @@
-"""What is said of followed points when a frame is answered."""
+"""The estimates for tracked points in one frame."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class PointAnswers:
             is lost and behind the camera. Points on the object's mask that no surface covers yet are where the images
             carry them, and their ``points`` are NaN.
         visible: ``(N,)`` bool.
-        uncertainty: ``(N,)`` pixels; twice as much is meant to hold 19 of 20 errors. NaN where there is no position.
-        points: ``(N, 3)`` in object coordinates, as they are known now; NaN where a point is not known.
+        uncertainty: ``(N,)`` pixels; twice as much is meant to hold 19 of 20 errors. NaN if there is no position.
+        points: ``(N, 3)`` in object coordinates, as they are known now; NaN if a point is not known.
         measured: ``(N,)`` bool: whether the image had a say.
     """
 

@@ -1,4 +1,4 @@
-"""Where points of one view are in all views: predicted by surface and poses, corrected by the images."""
+"""Tracks the points of one view in all views: predicted by surface and poses, corrected by the images."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Followed:
     Attributes:
         positions: ``(T, N, 2)``; NaN for points beside the object, and where there is no view.
         visible: ``(T, N)`` bool.
-        uncertainty: ``(T, N)`` pixels within twice which a position is right in some 19 of 20 cases; NaN where there is
+        uncertainty: ``(T, N)`` pixels within twice which a position is right in some 19 of 20 cases; NaN if there is
             no position.
         measured: ``(T, N)`` bool: whether the image had a say.
         points: ``(N, 3)`` in object coordinates; NaN for points beside the object.
@@ -102,7 +102,7 @@ def combine_with_images(
         chain: What the images say.
         slant: ``(N,)`` cosine between ray and surface where the points were asked for.
         gap: ``(T,)`` views from there.
-        radius: Of the object.
+        radius: The radius of the object.
     """
     variance, measured = chain.variance, chain.measured
     moved, share = _landmarks(views, points, measured, variance, _HELD * radius)

@@ -1,4 +1,4 @@
-"""Points followed in the images alone, where no surface says where they go.
+"""Tracks points in the images alone, if no surface predicts their motion.
 
 Pyramidal Lucas-Kanade (Bouguet, "Pyramidal implementation of the affine Lucas Kanade feature tracker", 2001) from the
 frame before, from the last frame whose appearance still fits, and from the frame of the question; each answer has to
@@ -96,7 +96,7 @@ class ImageFollower:
     """Follows pixels of one picture through those that come after it, or before it.
 
     Args:
-        index: Of the picture.
+        index: The index of the picture.
         picture: The one that the pixels are in.
         xy: ``(N, 2)`` pixels.
     """
@@ -124,7 +124,7 @@ class ImageFollower:
         """Answer for the next picture; on the other side of the first one it begins there again.
 
         Args:
-            index: Of the picture.
+            index: The index of the picture.
             now: The picture.
         """
         if (index - self._first) * (self._last - self._first) < 0:
@@ -195,7 +195,7 @@ def follow_in_images(pictures: Sequence[Picture | None], start: int, xy: Array) 
     """Follow pixels of one picture through all of them, forwards and backwards.
 
     Args:
-        pictures: T frames; None where there is none.
+        pictures: T frames; None if there is none.
         start: Index of the one that the pixels are in.
         xy: ``(N, 2)`` pixels.
     """
@@ -225,7 +225,7 @@ def _write(tracks: ImageTracks, row: int, estimates: ImageAnswers) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Placed:
-    """Where templates lie in a picture: pixels ``(N, 2)``, variances ``(N,)``, infinite where they are not found, and
+    """Where templates lie in a picture: pixels ``(N, 2)``, variances ``(N,)``, infinite if they are not found, and
     likeness ``(N,)``."""
 
     xy: Array

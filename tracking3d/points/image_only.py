@@ -1,4 +1,4 @@
-"""Points of the object that its surface does not cover yet, followed in the images until it does."""
+"""Points of the object that its surface does not cover yet, tracked in the images until it does."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class UncoveredPoints:
     """The points of one question that lay on the object's mask and on no surface then.
 
     Args:
-        index: Of the frame of the question.
+        index: The index of the frame of the question.
         picture: That frame.
         xy: ``(N, 2)`` pixels of all points that were asked for in it.
         on_surface: ``(N,)`` which of them the surface covers.
@@ -46,7 +46,7 @@ class UncoveredPoints:
         """The answers for a frame, with those of the images for points that the surface still does not cover.
 
         Args:
-            index: Of the frame.
+            index: The index of the frame.
             estimates: Of all points of the question, by the surface.
             on_surface: ``(N,)`` which of them it covers by now.
         """

@@ -1,4 +1,4 @@
-"""How many pixels a point that the images alone follow is off, as far as that can be told beforehand.
+"""Predicts the error in pixels of a point that is tracked by the images alone.
 
 As in `tracking3d.points.uncertainty`: the logarithm of the error is a sum of logarithms; ``training/
 image_point_uncertainty.py`` fitted the weights on clips of some seeds and tested them on those of others.

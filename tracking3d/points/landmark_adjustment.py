@@ -1,4 +1,4 @@
-"""Surface and poses put right by landmarks: points that the images follow consistently over many views.
+"""Corrects surface and poses by landmarks: points that the images track consistently over many views.
 
 Points are followed from several views through all others, bundled with the poses, and the surface is moved under
 those that are consistent. With better surface and poses the images are warped better into one another, so that
@@ -50,7 +50,7 @@ class LandmarkSupport:
 
     Attributes:
         followed: How many of them were found in the view.
-        agreeing: How many of those where surface and pose put them; 0 where they were too few to be asked.
+        agreeing: How many of those where surface and pose put them; 0 if they were too few to be asked.
         telling: Whether they are points of the object's texture; on a plain one they are shades and edges, which slide
             over it as it turns, and agree with wrong poses.
     """
@@ -65,7 +65,7 @@ class LandmarkScene:
     """A rigid surface in T views.
 
     Attributes:
-        views: None where the object was not found.
+        views: None if the object was not found.
         vertices: ``(V, 3)`` in object coordinates.
         faces: ``(F, 3)``.
         focal_factor: By which the views' focal lengths are those that they were opened with.
@@ -94,7 +94,7 @@ class LandmarkScene:
     def redrawn(
         self, vertices: Array, poses: Mapping[int, Array], focal_factor: float = 1.0
     ) -> LandmarkScene:
-        """The same views with another surface in other poses, by index of the view, through another lens."""
+        """The same views with another surface in other poses, by index of the view, with another focal length."""
         lens = np.array([focal_factor, focal_factor, 1.0, 1.0])
         views = [
             None
@@ -124,7 +124,7 @@ def refine_scene(
         scene: As a run left it.
         rounds: How many times at most.
         after_round: Is told how many are done.
-        free_focal: Whether the lens is to be put right too, since nobody knows it.
+        free_focal: Whether to estimate the focal length too, because it is not given.
     """
     done, last = 0, rounds
     while done < last:

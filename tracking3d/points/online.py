@@ -1,9 +1,9 @@
-"""Points followed while the views come: each is answered by those until then.
+"""Tracks points while the views arrive: each estimate uses the views up to then.
 
 As many views are kept as the templates reach back and a point in space is settled by; what is kept does not grow.
 Poses that are answered at the time are some pixels off, so that points of a grid on the object are followed beside
 those that were asked for, and the poses of the kept views are bundled with them. When surface or poses of the past
-become known better, the kept views are drawn and gone through anew.
+become known better, the kept views are drawn and gone through again.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _SETTLING = (
 _HELD = 0.1  # deviation of the points from the surface, in radii
 
 Known = Callable[[int], tuple[Camera, Array] | None]
-"""Camera and ``(4, 4)`` ``T_cam_obj`` of the frame with an index; None where they are not known better than before."""
+"""Camera and ``(4, 4)`` ``T_cam_obj`` of the frame with an index; None if they are not known better than before."""
 
 
 @dataclass(eq=False)
@@ -63,12 +63,12 @@ class CausalPoints:
         self._first: _Row | None = None
 
     def step(self, index: int, view: SurfaceView | None, radius: float) -> PointAnswers:
-        """Answer for the next frame; the first one is that of the question.
+        """The estimates for the next frame; the first one is the query frame.
 
         Args:
-            index: Of the frame.
-            view: Of the object in it; None where it is lost.
-            radius: Of the object.
+            index: The index of the frame.
+            view: Of the object in it; None if it is lost.
+            radius: The radius of the object.
         """
         if self._first is None and view is not None:
             self._all = np.concatenate([self.xy, _grid(view)])
@@ -110,7 +110,7 @@ class CausalPoints:
             row.view = redraw_surface(view, vertices, faces, T_cam_obj)
 
     def again(self, radius: float) -> dict[int, PointAnswers]:
-        """Answer for the kept frames once more, by frame; nothing unless that of the question is among them."""
+        """The estimates for the kept frames again, by frame; empty unless the query frame is among them."""
         rows, first = self._rows, self._first
         if first is None or first not in rows:
             return {}

@@ -1,4 +1,4 @@
-"""The surface moved along its normals until the silhouettes lie on the masks' outlines.
+"""Moves the surface along its normals until its silhouettes fit the masks' outlines.
 
 Gauss-Newton, a few steps. Each point of a silhouette's contour should lie where the distance from the mask's outline
 is zero, robustly; between the contours, and where no view has one, the displacement is smooth and small.

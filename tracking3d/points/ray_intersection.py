@@ -1,4 +1,4 @@
-"""Where the rays through pixels meet the mesh."""
+"""Intersects the rays through pixels with the mesh."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pose of one more view, from points of views whose poses are right."""
+"""The pose of one more view, from points of views whose poses are known."""
 
 from __future__ import annotations
 

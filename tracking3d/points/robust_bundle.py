@@ -1,4 +1,4 @@
-"""Points in space and poses that agree with where points were measured in the images.
+"""Robust bundle adjustment of points and poses by measurements in the images.
 
 Wrong tracks do not count for robust weights, and a prior holds the points at the surface that the run has found: they
 go only where the images say so, and size and place of the whole stay.
@@ -43,7 +43,7 @@ class BundleResult:
     Attributes:
         points: ``(N, 3)`` in object coordinates.
         T_cam_obj: ``(T, 4, 4)``.
-        weight: ``(T, N)`` that the measurements had in the end: 0 where there is none.
+        weight: ``(T, N)`` that the measurements had in the end: 0 if there is none.
         focal_factor: By which all focal lengths are to be multiplied.
         cost: Mean robust loss of the measurements, by weight.
         agreeing: ``(T, N)`` bool, the measurements that the points and poses explain.
@@ -66,19 +66,19 @@ def intersect(
     held: float,
     turns: int = TURNS,
 ) -> tuple[Array, Array]:
-    """Move points to where the views say they are.
+    """Move points to where the views measure them.
 
     Args:
         points: ``(N, 3)`` in object coordinates.
         intrinsics: ``(T, 4)`` fx, fy, cx, cy of every view.
         T_cam_obj: ``(T, 4, 4)``.
-        measured: ``(T, N, 2)`` pixels; NaN where there is none.
-        deviation: ``(T, N)`` of them in pixels; infinite where there is none.
+        measured: ``(T, N, 2)`` pixels; NaN if there is none.
+        deviation: ``(T, N)`` of them in pixels; infinite if there is none.
         held: Deviation of the points' movement, in object units.
         turns: Steps.
 
     Returns:
-        The points, and the weights ``(T, N)`` that the measurements had in the end: 0 where there is none.
+        The points, and the weights ``(T, N)`` that the measurements had in the end: 0 if there is none.
     """
     from tracking3d.points.kernels.intersection import intersect as compiled
     from tracking3d.rendering.kernels.threads import share
@@ -105,7 +105,7 @@ def bundle(
     begun: BundleResult | None = None,
     turns: int = TURNS,
 ) -> BundleResult:
-    """Move points and poses to where the measurements agree with both.
+    """Move points and poses so that they agree with the measurements.
 
     Views that hold too few measurements keep their poses.
 
@@ -168,12 +168,12 @@ class OtherWayRound:
 
     @property
     def is_better(self) -> bool:
-        """Whether it is to be believed."""
+        """Whether the reversed explanation is accepted."""
         return self.ratio < _BETTER
 
     @property
     def is_hopeless(self) -> bool:
-        """Whether it need not be asked for again."""
+        """Whether the reversal need not be tried again."""
         return self.ratio > _HOPELESS
 
 

@@ -1,4 +1,4 @@
-"""The surface moved under its landmarks."""
+"""Moves the surface with its landmarks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Points that the images followed tied to the surface, once it is known where they lie on it.
+"""Associates points tracked in the images with the surface, once it is known where they lie on it.
 
 Where a followed pixel meets the drawn surface it may be a point of it, or of something in front that no mesh covers.
 Which of the two shows as the object turns: the point of the surface goes where the images say only if it is that one.
@@ -52,7 +52,7 @@ def meetings(
 
 
 def _surface_hits(views: list[SurfaceView], xy: Array) -> Array:
-    """``(V, 3)`` points of the surface under one pixel ``(V, 2)`` of each view; NaN where it does not lie there."""
+    """``(V, 3)`` points of the surface under one pixel ``(V, 2)`` of each view; NaN if it does not lie there."""
     points = np.full((len(views), 3), np.nan)
     for row, view in enumerate(views):
         pixel = view.to_window(xy[row : row + 1])
@@ -62,7 +62,7 @@ def _surface_hits(views: list[SurfaceView], xy: Array) -> Array:
 
 
 def _best(views: list[SurfaceView], xy: Array, uncertainty: Array, met: Array, radius: float) -> int | None:
-    """Which meeting explains best where the images have the point; None where none does."""
+    """Which meeting explains best where the images have the point; None if none does."""
     on = np.flatnonzero(np.isfinite(met).all(1))
     if len(on) < _LEAST_AGREEING:
         return None

@@ -1,4 +1,4 @@
-"""Points followed from the views that they begin in through all others, forwards and backwards in time."""
+"""Tracks points from the views that they begin in through all others, forwards and backwards in time."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Chain:
     """What the images say about N points in T views, in pixels of each view.
 
     Attributes:
-        measured: ``(T, N, 2)``; NaN where the image says nothing.
+        measured: ``(T, N, 2)``; NaN if the image says nothing.
         variance: ``(T, N)`` squared pixels, that of the steps before included; infinite there, 0 at the start.
         likeness: ``(T, N)`` best likeness to a template, see `Carried`; -1 where there was none.
     """

@@ -1,4 +1,4 @@
-"""How many pixels a followed point is off, as far as that can be told beforehand.
+"""Predicts the error in pixels of a tracked point.
 
 The logarithm of the error is a sum of logarithms of what is known about the point; the weights were fitted on sequences
 of a seed, see ``training/point_uncertainty.py``, and tested on those of another one.
@@ -26,7 +26,7 @@ class Evidence:
     """What is known about N points in T views.
 
     Attributes:
-        variance: ``(T, N)`` squared pixels of the measurement; infinite where there is none.
+        variance: ``(T, N)`` squared pixels of the measurement; infinite if there is none.
         spread: ``(N,)`` mean squared pixels between measurements and the landmark.
         views: ``(N,)`` in how many views the point was measured.
         slant: ``(N,)`` cosine between ray and surface where the point was asked for.

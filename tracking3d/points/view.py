@@ -1,4 +1,4 @@
-"""One frame as points are followed in it: a window of the image around the object, with the mesh drawn into it."""
+"""One frame prepared for point tracking: a window of the image around the object, with the mesh rendered into it."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class SurfaceView:
         return np.stack([fx * seen[:, 0] / ahead + cx, fy * seen[:, 1] / ahead + cy], 1), depth
 
     def back_project(self, xy: Array, inverse_depth: NDArray[np.floating]) -> Array:
-        """Pixels ``(N, 2)`` at one over their depths ``(N,)`` as object points ``(N, 3)``; NaN where that is 0."""
+        """Pixels ``(N, 2)`` at one over their depths ``(N,)`` as object points ``(N, 3)``; NaN if that is 0."""
         depth = 1 / np.where(inverse_depth > 0, inverse_depth, np.nan).astype(np.float64)
         fx, fy, cx, cy = self.intrinsics
         seen = np.stack([(xy[:, 0] - cx) / fx * depth, (xy[:, 1] - cy) / fy * depth, depth], 1)
@@ -117,7 +117,7 @@ class SurfaceView:
 
 
 def sample(plane: Plane, xy: Array) -> Plane:
-    """``(N,)`` values of ``(h, w)`` between pixels; 0 where a pixel is not finite."""
+    """``(N,)`` values of ``(h, w)`` between pixels; 0 if a pixel is not finite."""
     finite = np.asarray(np.isfinite(xy).all(1))
     at = np.where(finite[:, None], xy, 0).astype(np.float32)
     if not len(at):
@@ -145,14 +145,14 @@ def open_view(
     Args:
         image: ``(H, W, 3)`` RGB.
         mask: ``(H, W)``.
-        camera: Of the frame.
+        camera: The camera of the frame.
         T_cam_obj: ``(4, 4)``.
         vertices: ``(V, 3)``.
         faces: ``(F, 3)``.
         longest_side: Pixels of the window; a larger one is scaled down.
 
     Returns:
-        The view, or None where the pose is no number or nothing of the object lies in the frame.
+        The view, or None if the pose is no number or nothing of the object lies in the frame.
     """
     if not np.isfinite(T_cam_obj).all():
         return None

@@ -1,4 +1,4 @@
-"""Points of one view carried into another one by surface and poses, and corrected there by the image.
+"""Warps points of one view into another by surface and poses, and corrects them there by the image.
 
 What the one view shows is warped into the other through the surface, so that it has the right turn and size there; how
 far the image lies beside it is the correction.
@@ -15,7 +15,7 @@ from tracking3d.points.view import REACH, Array, Plane, SurfaceView
 from tracking3d.rendering.visibility import NEAR
 
 LEAST_AGREEMENT = 0.7
-"""Correlation of a patch with its template from which a correction is believed."""
+"""Correlation of a patch with its template from which a correction is trusted."""
 _TELLS = 2 * NOISE  # contrast of a template that can be told from something else
 _EXPECTED = 3.0
 """Deviation in pixels of the corrections. They are taken for what the images say, and what holds them back is an error
@@ -30,9 +30,9 @@ class Carried:
     """N points in a further view.
 
     Attributes:
-        predicted: ``(N, 2)`` pixels by surface and poses; NaN where there is no surface.
-        measured: ``(N, 2)`` pixels, where the image says they are; NaN where it says nothing.
-        variance: ``(N,)`` squared pixels that the step adds to x and to y; infinite where nothing was measured.
+        predicted: ``(N, 2)`` pixels by surface and poses; NaN if there is no surface.
+        measured: ``(N, 2)`` pixels, where the image says they are; NaN if it says nothing.
+        variance: ``(N,)`` squared pixels that the step adds to x and to y; infinite if nothing was measured.
         likeness: ``(N,)`` correlation with the template, 1 where that is too plain to tell; -1 where there was none.
     """
 
@@ -46,7 +46,7 @@ class Warps:
     """Views warped into one another.
 
     Args:
-        views: In any order; None where there is none.
+        views: In any order; None if there is none.
         tolerance: How far behind a drawn surface a point may lie and be seen, in object units.
     """
 

@@ -1,4 +1,4 @@
-"""Colours of object and surroundings: those that earlier frames showed, and those on either side of an outline."""
+"""Colour models of object and background: from earlier frames, and from both sides of an outline."""
 
 from __future__ import annotations
 

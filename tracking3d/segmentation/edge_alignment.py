@@ -1,4 +1,4 @@
-"""How well an outline lies on edges of the image, all along it."""
+"""How well an outline coincides with image edges along its length."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def alignment(edges: NDArray[np.float32], distance: NDArray[np.float32]) -> tupl
         distance: ``(S, S)`` pixels to the outline, positive inside.
 
     Returns:
-        ``(S, S)`` around each pixel, within 1.5, and of the whole outline; 0 where there is no outline.
+        ``(S, S)`` around each pixel, within 1.5, and of the whole outline; 0 if there is no outline.
     """
     area = int(np.count_nonzero(distance > 0))
     if area in (0, distance.size):

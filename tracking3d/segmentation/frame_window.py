@@ -1,4 +1,4 @@
-"""One frame as the evidence is asked in it: a window at the frame's own resolution, and the surface drawn into it."""
+"""One frame prepared for segmentation: a window at the frame's own resolution, and the surface rendered into it."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ class Answered:
     """A frame and what is known of it, through a pinhole camera.
 
     Attributes:
-        index: Of the frame.
+        index: The index of the frame.
         image: ``(H, W, 3)`` RGB.
         initial: ``(H, W)`` the mask tracker's mask.
-        answer: ``(H, W)`` the mask that was answered.
-        T_cam_obj: ``(4, 4)``; NaN where there is no pose that is believed.
-        confidence: Of the pose, in [0, 1].
+        answer: ``(H, W)`` the estimated mask.
+        T_cam_obj: ``(4, 4)``; NaN if there is no pose that is trusted.
+        confidence: The confidence of the pose, in [0, 1].
     """
 
     index: int
@@ -52,12 +52,12 @@ class FrameWindow:
         window: Of the frame; all planes are ``(S, S)`` of it.
         image: ``(S, S, 3)`` RGB.
         K: ``(3, 3)`` intrinsics of the window.
-        T_cam_obj: ``(4, 4)``; NaN where there is no pose.
+        T_cam_obj: ``(4, 4)``; NaN if there is no pose.
         initial: The mask tracker's mask.
-        answer: The mask that was answered.
+        answer: The estimated mask.
         drawn: The silhouette; empty without a pose.
         inverse_depth: Of the surface, carried on beyond the silhouette; 0 without a pose.
-        confidence: Of the pose, in [0, 1].
+        confidence: The confidence of the pose, in [0, 1].
         valid: What lies in the frame.
     """
 
@@ -76,11 +76,11 @@ class FrameWindow:
     def of(
         cls, frame: Answered, camera: Camera, vertices: NDArray[np.float64], faces: NDArray[np.int64]
     ) -> Self | None:
-        """A frame seen through the window around its masks; None where both are empty.
+        """A frame seen through the window around its masks; None if both are empty.
 
         Args:
             frame: The frame.
-            camera: Of the full frame.
+            camera: The camera of the full frame.
             vertices: ``(V, 3)`` of the object.
             faces: ``(F, 3)``.
         """

@@ -52,7 +52,7 @@ def smaller(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def background_motion(
     here: NDArray[np.uint8], there: NDArray[np.uint8], object_here: Mask
 ) -> NDArray[np.float64] | None:
-    """``(3, 3)`` homography from a frame's pixels to those of the next, outside the object; None where none fits.
+    """``(3, 3)`` homography from a frame's pixels to those of the next, outside the object; None if none fits.
 
     Args:
         here: From `small_grey`.
@@ -78,7 +78,7 @@ def background_motion(
 
 
 def flow_distance(scene: FrameWindow, camera: Camera, target: Target) -> float:
-    """Median of the frame pixels by which the two motions part in the answer; 0 where it cannot be told."""
+    """Median of the frame pixels by which the two motions part in the answer; 0 if it cannot be told."""
     step = max(scene.window.size // 24, 1)
     parted = np.linalg.norm(
         _object_flow(scene, camera, target[1], step) - _background_flow(scene, target[2], step), axis=-1
@@ -92,11 +92,11 @@ def motion_cue(scene: FrameWindow, camera: Camera, targets: Sequence[Target]) ->
 
     Args:
         scene: The frame.
-        camera: Of all frames.
+        camera: The camera of all frames.
         targets: Frames before and after it; what one hides another may show.
 
     Returns:
-        By colours and by fine texture, within 2; 0 where the motions cannot be told.
+        By colours and by fine texture, within 2; 0 if the motions cannot be told.
     """
     size = scene.window.size
     costs = np.full((2, 2, size, size), np.inf, np.float32)  # of object and background; by colours and fine
@@ -124,7 +124,7 @@ def _motion_parallax(
 
     Returns:
         ``(2, S, S, 2)`` by the object's motion and by the background's, and ``(S, S)`` in [0, 1] how far that can be
-        told apart; both 0 where either leads out of the frame.
+        told apart; both 0 if either leads out of the frame.
     """
     image, T_cam_obj, H = target
     of_surface = np.column_stack(_through(scene, camera, T_cam_obj))
@@ -143,7 +143,7 @@ def motion_parallax(
     """Where pixels are in another frame.
 
     Args:
-        inverse_depth: ``(S, S)``, 0 where there is none.
+        inverse_depth: ``(S, S)``, 0 if there is none.
         of_surface: ``(3, 4)`` from ``u, v, 1, 1 / depth`` to homogeneous pixels of the other frame.
         of_background: ``(3, 3)`` from ``u, v, 1`` to those.
         image_size: ``(H, W)`` of the other frame.
@@ -166,7 +166,7 @@ def _through(scene: FrameWindow, camera: Camera, T_cam_obj: Matrix) -> tuple[Mat
 
 
 def _object_flow(scene: FrameWindow, camera: Camera, T_cam_obj: Matrix, step: int = 1) -> NDArray[np.float32]:
-    """``(S, S, 2)`` where in the other frame a pixel's surface point is; NaN where there is none."""
+    """``(S, S, 2)`` where in the other frame a pixel's surface point is; NaN if there is none."""
     inverse_depth = scene.inverse_depth[::step, ::step, None]
     through, shift = _through(scene, camera, T_cam_obj)
     moved = _carry_through(scene.window.size, through, step) + inverse_depth * shift

@@ -1,4 +1,4 @@
-"""What the sources see at a pixel, and how much each counts: a logistic regression, fitted on many sequences."""
+"""The online features of a pixel and their weights: a logistic regression, fitted on many sequences."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def pixel_features(
         lab: ``(S, S, 3)`` crop in 8-bit Lab.
         initial: ``(S, S)`` the mask tracker's mask.
         rendered: ``(S, S)`` the silhouette at the frame's pose.
-        confidence: Of the pose, in [0, 1].
+        confidence: The confidence of the pose, in [0, 1].
         colours: What earlier frames showed, or None.
     """
     shapes = []

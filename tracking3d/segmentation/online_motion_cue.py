@@ -45,7 +45,7 @@ Matrix = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class MotionReference:
-    """A frame whose pose is believed, as small as motion is looked for in it.
+    """A frame whose pose is trusted, as small as motion is looked for in it.
 
     Attributes:
         grey: ``(h, w)`` from `tracking3d.segmentation.motion_cue.smaller`.
@@ -88,12 +88,12 @@ def online_motion_log_odds(
         here: The frame; its mask is where the object is known to be.
         earlier: Frames before it, in order of time.
         window: Of the frame, ``S`` pixels wide.
-        camera: Of all frames.
+        camera: The camera of all frames.
         vertices: ``(V, 3)`` of the object.
         faces: ``(F, 3)``.
 
     Returns:
-        None where no earlier frame can tell.
+        None if no earlier frame can tell.
     """
     seen = Window(window.left, window.top, window.side, min(window.size, _LARGEST))
     drawn, inverse_depth = surface_in(seen.K(camera), here.T_cam_obj, vertices, faces, seen.size)
@@ -138,7 +138,7 @@ class _Ways:
         )
 
     def apart(self, drawn: Mask, inverse_depth: Plane) -> float:
-        """Median of the pixels by which both part on the surface; 0 where they lead out of the frame."""
+        """Median of the pixels by which both part on the surface; 0 if they lead out of the frame."""
         ways, _ = self.at(inverse_depth)
         across, down = np.moveaxis(ways[0] - ways[1], -1, 0)[:, drawn & (ways[0, ..., 0] > 0)]
         return float(np.median(np.hypot(across, down))) if across.size else 0.0
@@ -152,7 +152,7 @@ def _ways_apart(
     drawn: Mask,
     inverse_depth: Plane,
 ) -> _Ways | None:
-    """Into the latest earlier frame in which the two motions part by enough; None where they do in none.
+    """Into the latest earlier frame in which the two motions part by enough; None if they do in none.
 
     As if the background stood still it is guessed which that is, and once more when its motion is known.
     """

@@ -1,4 +1,4 @@
-"""What the masks of all frames say together: a soft visual hull.
+"""A soft visual hull from the masks of all frames.
 
 A point of space is outside the object where enough views put it there. In each view, its distance from the mask's
 outline is taken into space by the point's depth; of these the hull has one at a low rank, so that a few wrong masks
@@ -41,7 +41,7 @@ class SoftVisualHull:
         self._hulls: NDArray[np.float32] | None = None
 
     def see(self, scene: FrameWindow) -> None:
-        """Add a frame whose pose and mask are believed."""
+        """Add a frame whose pose and mask are trusted."""
         # Beyond the window nothing is the object, beyond the frame nothing is known.
         size = scene.window.size
         distance = np.clip(inside_distance(scene.answer), -size, size)
@@ -68,7 +68,7 @@ class SoftVisualHull:
         self._views = []
 
     def drawn(self, scene: FrameWindow) -> NDArray[np.float32] | None:
-        """``(R, S, S)`` pixels within (positive) or from the hulls in a frame; None where they are not known."""
+        """``(R, S, S)`` pixels within (positive) or from the hulls in a frame; None if they are not known."""
         if self._hulls is None or not np.isfinite(scene.T_cam_obj).all():
             return None
         size = scene.window.size
@@ -114,7 +114,7 @@ def sample_grid_distances(
         beyond: The distance beyond the window.
 
     Returns:
-        None where a cell is not in front of the camera.
+        None if a cell is not in front of the camera.
     """
     from tracking3d.segmentation.kernels import soft_visual_hull
 

@@ -1,4 +1,4 @@
-"""Frames in their order, each with those before and after it at which object and background part."""
+"""Frames in order of time, each with the neighbours in which object and background motion differ enough."""
 
 from __future__ import annotations
 

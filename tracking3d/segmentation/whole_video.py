@@ -1,6 +1,6 @@
-"""Masks answered once more when the whole video is known: what most frames call object is object in all.
+"""Segments every frame again once the whole video is known: what most frames label as object is object in all.
 
-The frames are gone through twice. The first time, masks and poses that are believed are put together: a hull of their
+The frames are gone through twice. The first time, masks and poses that are trusted are put together: a hull of their
 masks, and the colours of object and surroundings. The second time each pixel is weighed, with the frames around it in
 time telling which motion it has.
 """
@@ -28,7 +28,7 @@ from tracking3d.segmentation.whole_video_features import PixelEvidence
 from tracking3d.segmentation.whole_video_weights import WEIGHTS
 
 MOST_VIEWS = 60
-"""Frames that are put together, spread over those that are believed."""
+"""The most frames that are combined, spread over the reliable ones."""
 _BELIEVED = 0.5
 _ASKED = 0.4
 """How far the image smooths what is said, see `snap_to_edges`: in an even one outlines would creep."""
@@ -42,7 +42,7 @@ class SegmentedMask:
     """What came of a frame.
 
     Attributes:
-        index: Of the frame.
+        index: The index of the frame.
         mask: ``(H, W)``.
         probability: ``(H, W)`` of the object; the mask is where it is above a half.
     """
@@ -56,7 +56,7 @@ class VideoSegmenter:
     """All frames of a video, with their masks and poses.
 
     Args:
-        camera: Of the frames, without a lens.
+        camera: The camera of the frames, without a lens.
         vertices: ``(V, 3)`` of the object.
         faces: ``(F, 3)``.
         confidences: Of the frames that have a pose, by index.
@@ -106,7 +106,7 @@ class VideoSegmenter:
             frame: The next one, in the order of time.
 
         Yields:
-            Indices of earlier frames whose turn has come, with what is decided; None where the answer stands.
+            Indices of earlier frames whose turn has come, with what is decided; None if the answer stands.
         """
         self.order.add(frame)
         self._waiting.append(frame)
@@ -123,7 +123,7 @@ class VideoSegmenter:
     def said(
         self, frame: Answered, order: TemporalNeighbours | None = None
     ) -> tuple[FrameWindow, PixelEvidence] | None:
-        """What the sources say of one of the latest frames; None where it has no masks or no pose.
+        """What the sources say of one of the latest frames; None if it has no masks or no pose.
 
         Args:
             frame: The frame.

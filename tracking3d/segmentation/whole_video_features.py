@@ -1,4 +1,4 @@
-"""What is said of each pixel when all frames are known: shapes, colours, motion, and how far each can be believed.
+"""The features of each pixel once all frames are known: shapes, colours, motion, and how far each can be trusted.
 
 Every source is odd: without it, or where it cannot tell, it is 0, and what speaks for the object is positive. There is
 no constant, which would say that masks are too large or too small as those of some tracker are.
@@ -33,11 +33,11 @@ class PixelEvidence:
 
     Attributes:
         distances: ``(S, S)`` signed distances, positive inside, over the root of the area, by whose outline it is:
-            ``initial``, ``answer``, ``drawn`` and the hulls ``hull`` and ``wide hull``; absent where there is none.
+            ``initial``, ``answer``, ``drawn`` and the hulls ``hull`` and ``wide hull``; absent if there is none.
         alignments: How well each lies on edges, around each pixel ``(S, S)`` and on the whole.
         colours: ``(2, S, S)`` beside the outline, and remembered.
         motion: ``(2, S, S)``.
-        confidence: Of the pose.
+        confidence: The confidence of the pose.
     """
 
     distances: Mapping[str, Plane]
@@ -55,7 +55,7 @@ class PixelEvidence:
         Args:
             scene: The frame.
             hulls: ``(2, S, S)`` from `tracking3d.segmentation.soft_visual_hull.SoftVisualHull.drawn`, or None.
-            colours: What all frames that are believed show, or None.
+            colours: What all frames that are trusted show, or None.
             motion: From `tracking3d.segmentation.motion_cue.motion_cue`.
         """
         lab = as_lab(scene.image)
@@ -94,7 +94,7 @@ class PixelEvidence:
         return np.where(self.in_reach, total, -6.0).astype(np.float32)
 
     def _terms(self) -> Iterator[tuple[Plane, dict[str, np.float32 | Plane]]]:
-        """What is said, ``(S, S)``, and by source how far it is believed: throughout, or ``(S, S)`` of each pixel."""
+        """What is said, ``(S, S)``, and by source how far it is trusted: throughout, or ``(S, S)`` of each pixel."""
         one, confidence, doubt = np.float32(1), np.float32(self.confidence), np.float32(self._doubt())
         for name, distance in self.distances.items():
             around, whole = self.alignments[name]

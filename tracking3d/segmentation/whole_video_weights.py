@@ -1,4 +1,4 @@
-"""How much each source counts, by ``training/hindsight_masks.py``."""
+"""The weights of the whole-video features, fitted by ``training/hindsight_masks.py``."""
 
 WEIGHTS = {
     "initial, near": 0.145,

@@ -29,7 +29,7 @@ def state(monkeypatch):
     return updated
 
 
-def found(state, mask=None, inliers=motion_cue._WITNESSES, lost=False) -> SimpleNamespace:
+def found(state, mask=None, inliers=motion_cue._MIN_INLIERS, lost=False) -> SimpleNamespace:
     """The last keyframe found where it is."""
     view = state.object_map.keyframes[-1]
     view = replace(view, mask=view.mask if mask is None else mask)
@@ -48,7 +48,7 @@ def test_a_pose_that_points_agree_with_tells_what_moves_along(state):
 
 def test_others_do_not(state):
     assert motion_cue_in_window(state, found(state, lost=True), IMAGE) is None
-    assert motion_cue_in_window(state, found(state, inliers=motion_cue._WITNESSES - 1), IMAGE) is None
+    assert motion_cue_in_window(state, found(state, inliers=motion_cue._MIN_INLIERS - 1), IMAGE) is None
     assert motion_cue_in_window(replace(state, motion_references=()), found(state), IMAGE) is None
 
 
@@ -74,7 +74,7 @@ def test_of_a_side_that_comes_again_nothing_beside_is_new(state, monkeypatch):
 def test_frames_are_remembered_while_they_are_believed(state):
     estimate = known_run(FRAMES)[1][-1]
     after = remember_motion(state, estimate, found(state), IMAGE)
-    assert after.motion_references[:-1] == state.motion_references[-motion_cue._MOST + 1 :]
+    assert after.motion_references[:-1] == state.motion_references[-motion_cue._MAX_REFERENCES + 1 :]
     assert remember_motion(state, estimate, found(state, inliers=0), IMAGE) is state
     assert not remember_motion(state, estimate, found(state, lost=True), IMAGE).motion_references
 

@@ -1,4 +1,4 @@
-"""Kernels of a step of bundle adjustment: the points are eliminated, the poses solved, the points put back.
+"""Kernels of a bundle adjustment step: the Schur complement of the points, the poses' step, back-substitution.
 
 The products that this takes are nearly all of its work. They are taken in tiles that stay in the processor's nearest
 memory, each entry's sum in ascending order, so that neither tiles nor threads change a digit.
@@ -28,7 +28,7 @@ def step(
     poses_gradient: FloatArray,
     points_gradient: FloatArray,
 ) -> tuple[FloatArray, FloatArray] | None:
-    """Step of poses ``(C,)`` and points ``(N, 3)`` by damped blocks; None where there is none."""
+    """Step of poses ``(C,)`` and points ``(N, 3)`` by damped blocks; None if there is none."""
     size, many = len(poses), len(points)
     reduced, factors = poses.copy(), points.copy()
     by_points = np.empty((3 * many, size))
@@ -173,7 +173,7 @@ def _panel(matrix, first, last, columns):
 
 @kernel("boolean(float64[:,::1], float64[:,:,::1], float64[:,:,::1], float64[::1], float64[:,::1])")
 def _solve(factor, points, coupling, d_poses, d_points):
-    """Replace the gradients by the steps; False where they are not finite."""
+    """Replace the gradients by the steps; False if they are not finite."""
     solve_factorised(factor, d_poses)
     sound = True
     for i in range(len(d_poses)):

@@ -71,7 +71,7 @@ def evaluate(
     points: FloatArray,
     scale: float,
 ) -> tuple[float, FloatArray]:
-    """The sum of weighted losses, and ``(F, N)`` residuals; nan where nothing is seen."""
+    """The sum of weighted losses, and ``(F, N)`` residuals; nan if nothing is seen."""
     residual = np.empty(weight.shape)
     return float(_evaluate(_pack(pixels, weight, K, R, t, points), float(scale), residual)), residual
 

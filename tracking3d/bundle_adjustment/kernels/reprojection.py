@@ -53,7 +53,7 @@ def rotate_by(x, y, z, R, turned):
 
 @shared
 def factorize(matrix):
-    """Replace the lower triangle of a symmetric matrix by its Cholesky factor; False where there is none."""
+    """Replace the lower triangle of a symmetric matrix by its Cholesky factor; False if there is none."""
     size = len(matrix)
     for i in range(size):
         for j in range(i):

@@ -1,1 +1,1 @@
-"""The solver that joins matching with re-rendering: tracks every frame, maps when it pays."""
+"""The online solver: tracks every frame by matching and re-rendering, and extends its map if a frame adds something."""

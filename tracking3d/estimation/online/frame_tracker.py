@@ -1,4 +1,4 @@
-"""The pose of one frame, by all that can be tried: cheap starts, costly ones, and elsewhere than the mask says."""
+"""Estimates the pose of one frame: cheap hypotheses first, then costly ones, then a search of the whole frame."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ from tracking3d.geometry.pose import Pose
 
 @dataclass(frozen=True)
 class FrameTracker(SolverBase):
-    """Finds an object that is known in a frame."""
+    """Estimates the pose of an object with a map in one frame."""
 
     @property
     def online(self) -> OnlineConfig:
-        """The solver's own part of the configuration."""
+        """The options of the online solver."""
         assert isinstance(self.config.solver, OnlineConfig)
         return self.config.solver
 
     @property
     def weights(self) -> PoseWeights:
-        """Weights of a pose's terms."""
+        """The weights of a pose's cost terms."""
         weights = self.online.weights
         return PoseWeights(weights.appearance, outline=weights.outline, points=weights.points)
 
@@ -91,7 +91,7 @@ class FrameTracker(SolverBase):
     def _elsewhere(
         self, state: SolverState, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
     ) -> PoseCandidate | None:
-        """The object relocalized anywhere in the frame, away from the mask too; None if it is not found."""
+        """The object relocalized in the whole frame, also outside the mask; None if it is not found."""
         where = relocalize_in_frame(
             state.object_map, state.camera, image, (state.trajectory or (state.last_pose,))[-1][0]
         )
@@ -122,7 +122,7 @@ class FrameTracker(SolverBase):
         pose: Pose,
         followed: FollowedPoints,
     ) -> Keyframe:
-        """A frame seen from a pose, with the confidence in its mask that the points give."""
+        """A frame seen from a pose, with the mask weight that follows from the points."""
         on_object = followed.only(~state.object_map.candidate[followed.landmark])
         observation = self._observe(state, frame, mask, pose)
         return Keyframe(observation, mask, pose, followed, mask_weight=mask_weight(mask, on_object))

@@ -1,4 +1,4 @@
-"""The belief where the user steers: frames that turn back, and a mask that is known to be right."""
+"""The state under user guidance: frames in reverse order, and a mask that is known to be correct."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from tracking3d.estimation.online.state.solver_state import SolverPhase, SolverS
 from tracking3d.frames import Frame
 from tracking3d.geometry.pose import pose_from_arrays
 
-_ELSEWHERE = 0.3
-"""IoU of the last pose's silhouette with a mask that is right, below which that pose is none to go on from."""
+_MIN_MASK_IOU = 0.3
+"""IoU of the last pose's silhouette with a correct mask, below which the last pose is discarded."""
 
 
 def restart_backwards(
     state: SolverState, frame: Frame, number: int, T_cam_obj: NDArray[np.float64]
 ) -> SolverState:
-    """The belief that goes on from a frame seen long ago, with all that was learnt since.
+    """The state that continues from an earlier frame, with everything learnt since.
 
     Args:
-        state: After the last frame.
-        frame: The frame to go on from.
-        number: The index that the last frame had: the next one's comes after it.
-        T_cam_obj: ``(4, 4)`` the answer for the frame, taken where it is no keyframe.
+        state: The state after the last frame.
+        frame: The frame to continue from.
+        number: The index of the last frame; the next one's follows it.
+        T_cam_obj: ``(4, 4)`` the frame's estimate, used if the frame is no keyframe.
     """
     views = [*state.object_map.keyframes, *(view for view, _ in state.pending or ())]
     own = next((view for view in views if view.index == frame.index), None)
@@ -49,14 +49,14 @@ def restart_backwards(
 
 
 def trust_mask(state: SolverState, frame: Frame, mask: NDArray[np.bool_]) -> SolverState:
-    """The belief before a frame whose mask ``(H, W)`` is right: points that are followed out of it are no witnesses.
+    """The state before a frame whose mask ``(H, W)`` is correct: tracked points that leave the mask are dropped.
 
-    Without witnesses against it the mask counts in full. Where the last pose is elsewhere the object was lost, though
-    nobody noticed: all sides of it are looked at, where the mask is.
+    Without inliers against it the mask has full weight. If the last pose is elsewhere, the object was lost unnoticed:
+    all of its sides are then tried at the mask.
     """
     if state.phase is not SolverPhase.INITIALIZING:
         rendered = state.object_map.silhouette(state.last_pose[0], state.camera)
-        if np.count_nonzero(rendered & mask) < _ELSEWHERE * np.count_nonzero(rendered | mask):
+        if np.count_nonzero(rendered & mask) < _MIN_MASK_IOU * np.count_nonzero(rendered | mask):
             state = replace(state, lost_frames=max(state.lost_frames, 1))
     if not len(state.tracked_points):
         return state

@@ -1,4 +1,4 @@
-"""A start that solves the first few frames together, from several hypotheses of how the object turns.
+"""An initialization from the first few frames together, by several hypotheses of how the object rotates.
 
 Frame by frame against a wrong first shape the estimate locks into depth reversal or too little rotation while
 its silhouette still fits. The hypothesis that re-renders all first frames best wins.
@@ -33,7 +33,7 @@ def initialize_jointly(
     """Solve shape, texture and all poses of ``frames``; the first pose is fixed.
 
     Args:
-        state: Its shape and texture are what every hypothesis starts from.
+        state: The initial shape and texture of every hypothesis.
         frames: The first frames, with the poses found one by one: one of the hypotheses.
         config: The solver's constants; ``stop`` is taken as ``plateau``.
         tau: The encoder's convergence threshold.

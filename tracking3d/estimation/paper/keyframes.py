@@ -1,6 +1,6 @@
 """Which frames stay in the optimization (paper section 3.4, "Keyframe selection criteria").
 
-All criteria are judged anew after every joint optimization (in preset ``paper`` that is every frame), so a
+All criteria are judged again after every joint optimization (in preset ``paper`` that is every frame), so a
 keyframe can fall out.
 """
 

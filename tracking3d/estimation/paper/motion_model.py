@@ -1,4 +1,4 @@
-"""Where a new frame's pose starts."""
+"""The initial pose of a new frame."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tracking3d.rendering.visibility import NEAR
 
 
 def candidate_poses(state: PaperState, index: int, mask: NDArray[np.bool_] | None) -> list[Pose]:
-    """The last pose, constant velocity, and their rotations moved to where the mask is.
+    """The last pose, constant velocity, and their rotations moved to the mask.
 
     After a lost frame there is no velocity to go on with; the keyframes' poses are tried instead.
     """

@@ -16,14 +16,14 @@ Free = Literal["all", "pose"]
 
 @dataclass(frozen=True, eq=False)
 class Optimum:
-    """Where the optimization ended.
+    """The result of an optimization.
 
     Attributes:
-        parameters: The answer; the best state so far, or the start, if it failed numerically.
-        losses: The terms at the answer.
+        parameters: The estimate: the best state so far, or the initial one if the optimization failed numerically.
+        losses: The terms at the estimate.
         total: Their weighted sum.
         iterations: Number of evaluations.
-        reason: Empty, or why there is no usable answer.
+        reason: Empty, or why there is no usable estimate.
     """
 
     parameters: Parameters
@@ -46,7 +46,7 @@ def optimize(
 
     Args:
         problem: What to explain.
-        start: Where to start.
+        start: The initial parameters.
         iterations: Most evaluations.
         tau: Appearance loss at which the paper's rule (``stop: threshold``) ends.
         fixed: Number of leading frames whose pose does not move: the gauge.
@@ -82,7 +82,7 @@ def optimize(
             if converged or iteration == iterations:
                 return Optimum(parameters.detach(), losses.detach(), value, iteration)
         elif best is None or value < best.total:
-            # The start counts as progress once only: an unmoved pose never wins by being first.
+            # The initial parameters count as progress only once: an unmoved pose never wins by being first.
             if best is None or value < best.total - 1e-4 * abs(best.total):
                 progressed = iteration
             best = Optimum(parameters.detach(), losses.detach(), value, iteration)

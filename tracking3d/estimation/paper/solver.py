@@ -153,7 +153,7 @@ class PaperSolver(SolverBase):
     def _solve(
         self, state: PaperState, frame: Frame, mask: NDArray[np.bool_] | None, current: PosedObservation
     ) -> tuple[PaperState, FrameEstimate]:
-        """Optimize, judge, choose keyframes, answer."""
+        """Optimize, assess, select keyframes, and return the estimate."""
         first, iterations = not state.started, 0
         optimum = None
         if self.settings.pose_iterations and not first:
@@ -234,7 +234,7 @@ class PaperSolver(SolverBase):
         return is_new_view(latest, current.pose, state.object_size, self.settings.keyframes)
 
     def _with_new_texture(self, state: PaperState, current: PosedObservation) -> PaperState:
-        """Start texels that no keyframe has seen at what the new frame shows."""
+        """Initialize texels that no keyframe has seen with what the new frame shows."""
         if self.settings.texture_init == "zero":
             return state
         shown = state.back_project(current.observation.features, current)
@@ -268,7 +268,7 @@ class PaperSolver(SolverBase):
         return assess(losses["appearance"], silhouette, has_mask, self.tau, limit, optimum.reason)
 
     def _update(self, state: PaperState, frames: list[PosedObservation], optimum: Optimum) -> PaperState:
-        """Take over what was found, and choose the keyframes anew."""
+        """Take over the result, and select the keyframes again."""
         parameters = optimum.parameters
         moved = [PosedObservation(frame.observation, parameters.poses[i]) for i, frame in enumerate(frames)]
         found = replace(state, offsets=parameters.offsets, texture=parameters.texture)
@@ -294,7 +294,7 @@ class PaperSolver(SolverBase):
         optimum: Optimum,
         estimate: FrameEstimate,
     ) -> tuple[PaperState, FrameEstimate]:
-        """Keep the first frames until they are solved together, then answer them anew."""
+        """Keep the first frames until they are solved together, then estimate them again."""
         if state.waiting is None:
             return known, estimate
         count = len(state.waiting) + 1

@@ -40,7 +40,7 @@ class PaperState:
         keyframes: In order of time.
         seen: RGB that former keyframes showed of each texel.
         last: Pose and index of the last frame, a lost one's included.
-        before: The same of the frame before that one; None where there is no motion to go on with.
+        before: The same of the frame before that one; None if there is no motion to go on with.
         waiting: First frames that wait for the joint start, with their answers so far; None when none waits
             any more.
         started: Whether the first frame is done.
@@ -74,7 +74,7 @@ class PaperState:
         return 2 * float(centred.norm(dim=1).max())
 
     def moved(self, pose: Pose, index: int) -> PaperState:
-        """The same belief one frame later."""
+        """The same state one frame later."""
         return replace(self, last=(pose, index), before=self.last if self.started else None, started=True)
 
     def back_project(self, values: Tensor, keyframe: PosedObservation) -> BackProjection:

@@ -1,4 +1,4 @@
-"""Points moved to where views see them, one by one; see `tracking3d.points.robust_bundle.intersect`."""
+"""Triangulates points one by one from the views that see them; see `tracking3d.points.robust_bundle.intersect`."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def intersect(
         intrinsics: ``(T, 4)``.
         T_cam_obj: ``(T, 4, 4)``.
         measured: ``(N, T, 2)`` pixels.
-        certain: ``(N, T)`` one over the variance of what was measured; 0 where nothing was.
+        certain: ``(N, T)`` inverse variance of the measurements; 0 if there is none.
         held: Deviation of the points' movement, in object units.
         outlier: Deviations at which a measurement has a quarter of its weight.
         nearest: Depth from which on points have an image.

@@ -1,4 +1,4 @@
-"""One view as another one would see it, pixel by pixel; `tracking3d.points.warping` says what is computed."""
+"""Warps one view into another, pixel by pixel; `tracking3d.points.warping` says what is computed."""
 # mypy: disable-error-code="no-untyped-def"
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""Compiled inner loops of the evidence; each file belongs to the module of the same name one folder up."""
+"""Compiled inner loops of the segmentation; each file belongs to the module of the same name one folder up."""

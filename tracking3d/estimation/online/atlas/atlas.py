@@ -1,8 +1,8 @@
-"""An object that was lost and is seen again from a side that nobody knows: a second start, with a map of its own.
+"""The atlas: if a lost object reappears from an unknown side, the solver initializes a second map of it.
 
-How the second map lies to the first is a guess at first: the object is taken to have gone on turning as it did. While
-one of them is tracked against, the others stand aside. Where a side that one of them knows is met in the other, both
-become one. What is never joined stays as it was answered.
+The transform between the two maps is only a guess at first: the object is assumed to have kept rotating. One map is
+active, the others are inactive. If the object shows a side that both maps know, they are merged. Estimates against a
+map that is never merged stay as they are.
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import pose_arrays
 from tracking3d.geometry.similarity import Similarity
 
-_UNPROVEN = 0.05  # confidence at most while how two maps lie to each other is a guess
-_MOST_ASIDE = 4
-_REASON = (
+_MAX_UNALIGNED_CONFIDENCE = 0.05  # highest confidence while the transform between two maps is only a guess
+_MAX_INACTIVE = 4
+_UNALIGNED_REASON = (
     "re-initialized after tracking was lost; the pose relative to the earlier map is unknown until a known side is "
     "seen"
 )
 
 
 def guess_alignment(state: SolverState, begun: SolverState) -> Similarity:
-    """From a second start's coordinates to those of a lost map: as large, and turned on as it did before the loss.
+    """The guessed similarity from a new map to a lost one: equal size, and the rotation extrapolated over the gap.
 
     Args:
-        state: With the lost map.
-        begun: The second start.
+        state: The state with the lost map.
+        begun: The state after the second initialization.
     """
     turns = []
     for view in begun.object_map.keyframes:
         R_before, _ = pose_arrays(extrapolate_motion(state.trajectory, view.index))
         turns.append(R_before.T @ pose_arrays(view.pose)[0])
-    # The rotation nearest to all of them.
+    # The rotation nearest to all of the candidates.
     u, _, vt = np.linalg.svd(np.sum(turns, 0))
     R = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
     scale = _size(state.object_map) / _size(begun.object_map)
@@ -56,9 +56,9 @@ def guess_alignment(state: SolverState, begun: SolverState) -> Similarity:
 
 
 def _size(object_map: ObjectMap) -> float:
-    """How large the object is, but for a factor that is the same for all of its maps: as seen, at its distance.
+    """The object's size up to a factor common to all of its maps: its extent in the image times its distance.
 
-    What no view shows of a surface is a guess, and often far too deep or flat.
+    The parts of a surface that no keyframe shows are a guess, and often far too deep or flat.
     """
     seen = [
         float(view.pose.translation[2]) * np.sqrt(np.count_nonzero(view.mask))
@@ -69,12 +69,12 @@ def _size(object_map: ObjectMap) -> float:
 
 
 def switch_map(state: SolverState, begun: SolverState, similarity: Similarity) -> SolverState:
-    """The belief that goes on with a second start; the map of before stands aside.
+    """The state that continues with the map of a second initialization; the map before it becomes inactive.
 
     Args:
-        state: With the lost map.
-        begun: The second start, in its own coordinates.
-        similarity: From those to the lost map's.
+        state: The state with the lost map.
+        begun: The state after the second initialization, in its own coordinates.
+        similarity: From the new map's coordinates to the lost map's.
     """
     shape = begun.object_map.shape
     rest = torch.from_numpy(similarity.points(shape.rest.double().cpu().numpy())).to(shape.rest)
@@ -99,40 +99,40 @@ def switch_map(state: SolverState, begun: SolverState, similarity: Similarity) -
 
 
 def _deactivate(state: SolverState, spans: tuple[tuple[int, int], ...]) -> InactiveMap:
-    """The present map as one that stands aside."""
+    """The active map as an inactive one."""
     assert state.surface is not None
     return InactiveMap(state.object_map, state.surface, state.baseline, spans, state.unaligned)
 
 
 def _limit_maps(aside: tuple[InactiveMap, ...]) -> tuple[InactiveMap, ...]:
-    """Not more than a few maps: those with most keyframes, in the order that they were in."""
+    """At most `_MAX_INACTIVE` maps: those with the most keyframes, in their previous order."""
     fewest_first = sorted(aside, key=lambda other: len(other.object_map.keyframes))
-    dropped = fewest_first[: max(len(aside) - _MOST_ASIDE, 0)]
+    dropped = fewest_first[: max(len(aside) - _MAX_INACTIVE, 0)]
     return tuple(other for other in aside if not any(other is one for one in dropped))
 
 
 def transform_estimates(estimate: FrameEstimate, similarity: Similarity, camera: Camera) -> FrameEstimate:
-    """Answers of a second start as of the lost object."""
+    """An estimate of a second initialization in the coordinates of the lost object."""
     T = similarity.poses(estimate.T_cam_obj[None].astype(np.float64))[0].astype(estimate.T_cam_obj.dtype)
     revised = tuple(transform_estimates(one, similarity, camera) for one in estimate.revised)
     return mark_unaligned(replace(estimate, T_cam_obj=T, camera=camera, revised=revised))
 
 
 def mark_unaligned(estimate: FrameEstimate) -> FrameEstimate:
-    """An answer against a map of which it is a guess how it lies to the first: lost, whatever its mask is worth."""
+    """An estimate against a map whose transform to the first one is a guess: lost, however good its mask is."""
     if estimate.status is Status.LOST:
         return estimate
     return replace(
         estimate,
         status=Status.LOST,
-        reason=_REASON,
-        confidence=min(estimate.confidence, _UNPROVEN),
+        reason=_UNALIGNED_REASON,
+        confidence=min(estimate.confidence, _MAX_UNALIGNED_CONFIDENCE),
         diagnostics=dict(estimate.diagnostics) | {UNALIGNED_MAP: 1.0},
     )
 
 
 def activate_map(state: SolverState, other: InactiveMap, index: int) -> SolverState:
-    """The belief that goes on from frame ``index`` with a map that stood aside; the object is still lost."""
+    """The state that continues from frame ``index`` with an inactive map; the object is still lost."""
     return replace(
         _with_active_map(state, other, (*state.spans, (state.active_since, index - 1))),
         lost_frames=max(state.lost_frames, 1),
@@ -142,7 +142,7 @@ def activate_map(state: SolverState, other: InactiveMap, index: int) -> SolverSt
 
 
 def map_of_frame(state: SolverState, index: int) -> SolverState:
-    """The belief, past its last frame, with the map that answered frame ``index``."""
+    """The state after its last frame, with the map active that estimated frame ``index``."""
     if any(first <= index <= last for first, last in state.spans):
         return state
     for other in state.inactive_maps:
@@ -152,7 +152,7 @@ def map_of_frame(state: SolverState, index: int) -> SolverState:
 
 
 def activate_largest_map(state: SolverState) -> SolverState:
-    """The belief with the map of most keyframes, of two the earlier; of it the mesh is made."""
+    """The state with the map of most keyframes active, the earlier one of equals; the mesh is made from it."""
 
     def rank(object_map: ObjectMap, since: int) -> tuple[int, int]:
         return len(object_map.keyframes), -since
@@ -169,9 +169,9 @@ def activate_largest_map(state: SolverState) -> SolverState:
 def refine_inactive_map(
     other: InactiveMap, before: Camera, after: Camera, config: OnlineConfig
 ) -> InactiveMap:
-    """A map that stands aside, through the lens of the end and all its keyframes together once more.
+    """Refine all keyframes of an inactive map together, with the final focal length.
 
-    How it lies to the one that the mesh is made of is a guess, whichever of them was the first.
+    Its transform to the map that the mesh is made from is a guess, whichever of the two was first.
     """
     keyframes = other.object_map.keyframes
     if after != before:
@@ -184,7 +184,7 @@ def refine_inactive_map(
 def _with_active_map(
     state: SolverState, other: InactiveMap, spans: tuple[tuple[int, int], ...]
 ) -> SolverState:
-    """The belief with another map, and the present one, which answered ``spans``, aside."""
+    """The state with another map active; the active one, which estimated ``spans``, becomes inactive."""
     newest = other.object_map.keyframes[-1]
     return replace(
         state,

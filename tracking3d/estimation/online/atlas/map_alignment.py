@@ -25,22 +25,22 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import pose_arrays
 from tracking3d.geometry.similarity import Similarity
 
-_FEWEST_PAIRS = 6  # landmarks of both maps that say how they lie to each other
-_MOST_VIEWS = 24  # of another map that a keyframe is compared with
-_WORSE = 1.2  # times what keyframes cost, from which two maps are none
+_MIN_SHARED_LANDMARKS = 6  # fewest shared landmarks for the transform between two maps
+_MAX_COMPARED = 24  # most keyframes of another map that a keyframe is compared with
+_MAX_COST_RATIO = 1.2  # ratio of the keyframe costs up to which two maps are merged
 
 
 def merge_maps(state: SolverState, config: OnlineConfig, views: tuple[Keyframe, ...]) -> SolverState:
-    """The belief with the maps joined of which some views of the present one show how they lie to each other.
+    """The state after merging the active map with every map that some of its keyframes can be aligned to.
 
     Args:
-        state: Between two frames; its last frame is the newest keyframe.
-        config: Of the solver.
-        views: Keyframes of the present map that are compared with the others.
+        state: The state between two frames; its last frame is the newest keyframe.
+        config: The solver's options.
+        views: The keyframes of the active map that are compared with the others.
     """
     indices = {view.index for view in views}
     for other in state.inactive_maps:
-        # Joining gives landmarks new names, so that the views are other ones then.
+        # Merging renumbers the landmarks, so the views change as well.
         for view in (view for view in state.object_map.keyframes if view.index in indices):
             similarity = _estimate_alignment(state.object_map, other.object_map, state.camera, view)
             object_map = (
@@ -55,9 +55,9 @@ def merge_maps(state: SolverState, config: OnlineConfig, views: tuple[Keyframe, 
 def _estimate_alignment(
     object_map: ObjectMap, other: ObjectMap, camera: Camera, view: Keyframe
 ) -> Similarity | None:
-    """From a map's coordinates to another's, by what one view shows of both; None where it does not."""
+    """The similarity from one map to another by the landmarks that one view shows of both; None if it shows too few."""
     count = len(other.keyframes)
-    chosen = np.unique(np.linspace(0, count - 1, min(count, _MOST_VIEWS)).round().astype(int))
+    chosen = np.unique(np.linspace(0, count - 1, min(count, _MAX_COMPARED)).round().astype(int))
     compared = [other.keyframes[position] for position in chosen]
     found = poses_from_matches(other, camera, view.keypoints, compared, pixel_scale(view))
     if not found or len(found[0][1]) < ENOUGH_POINTS:
@@ -72,7 +72,7 @@ def _estimate_alignment(
         & np.isfinite(x_known).all(1)
         & np.isfinite(x_other).all(1)
     )
-    if np.count_nonzero(sound) < _FEWEST_PAIRS:
+    if np.count_nonzero(sound) < _MIN_SHARED_LANDMARKS:
         return None
     x_other, x_known = x_other[sound], x_known[sound]
     R = pose_arrays(pose)[0].T @ pose_arrays(view.pose)[0]
@@ -85,17 +85,17 @@ def _estimate_alignment(
 def _merge_pair(
     state: SolverState, other: ObjectMap, similarity: Similarity, config: OnlineConfig
 ) -> ObjectMap | None:
-    """Both maps as one, where that explains their keyframes nearly as well as two do."""
+    """Both maps as one, if that explains their keyframes nearly as well as two maps do."""
     camera, second = state.camera, transform_map(state.object_map, similarity)
     pairs = match_landmarks(other, second, camera)
-    if len(pairs) < _FEWEST_PAIRS:
+    if len(pairs) < _MIN_SHARED_LANDMARKS:
         return None
     most = max(config.max_keyframes, len(other.keyframes))
     object_map = merge(other, second, pairs, most)
     everything = list(range(len(object_map.keyframes)))
     object_map = refine_local_map(object_map, camera, everything, config, bundle_iterations=20, rounds=3)
     alone = max(keyframe_cost(other), keyframe_cost(state.object_map))
-    return object_map if keyframe_cost(object_map) < _WORSE * alone else None
+    return object_map if keyframe_cost(object_map) < _MAX_COST_RATIO * alone else None
 
 
 def _with_merged_map(

@@ -1,4 +1,4 @@
-"""Two maps of one object as one: the second in the first's coordinates, and landmarks that both know named alike."""
+"""Merges two maps of one object: the second in the first's coordinates, and shared landmarks with one index."""
 
 from __future__ import annotations
 
@@ -18,15 +18,17 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, pose_arrays, pose_from_arrays
 from tracking3d.geometry.similarity import Similarity
 
-_NEIGHBOURS = 4  # views of the first map that each of the second is compared with
-_SEARCH = 20.0  # pixels of an object 200 pixels large, between a landmark's places by the two maps
+_COMPARED_KEYFRAMES = 4  # keyframes of the first map that each of the second is compared with
+_MAX_REPROJECTION_ERROR = (
+    20.0  # pixels at an object size of 200 pixels, between both projections of a landmark
+)
 
 Pairs = NDArray[np.int64]
-"""``(N, 2)`` landmarks of the first map and of the second that are one point of the object."""
+"""``(N, 2)`` indices of landmarks of the first and second map that are the same point of the object."""
 
 
 def transform_map(object_map: ObjectMap, similarity: Similarity) -> ObjectMap:
-    """A map in the coordinates of another object."""
+    """A map in the coordinates that ``similarity`` leads to."""
     vertices = similarity.points(object_map.vertices.double().cpu().numpy())
     keyframes = [
         replace(view, pose=transform_pose(view.pose, similarity), texture=None)
@@ -41,7 +43,7 @@ def transform_map(object_map: ObjectMap, similarity: Similarity) -> ObjectMap:
 
 
 def transform_pose(pose: Pose, similarity: Similarity) -> Pose:
-    """A pose of the second object as one of the first."""
+    """A pose in the second map's coordinates as one in the first's."""
     R, t = pose_arrays(pose)
     T_cam_obj = np.eye(4)
     T_cam_obj[:3, :3], T_cam_obj[:3, 3] = R, t
@@ -50,17 +52,17 @@ def transform_pose(pose: Pose, similarity: Similarity) -> Pose:
 
 
 def match_landmarks(first: ObjectMap, second: ObjectMap, camera: Camera) -> Pairs:
-    """Landmarks that are one point: their keypoints look alike, and both maps have them at nearly one place.
+    """Shared landmarks: their keypoints match, and both maps project them to nearly the same pixel.
 
     Args:
         first: A map.
-        second: Another, in the coordinates of the first.
-        camera: Of both.
+        second: Another map, in the coordinates of the first.
+        camera: The camera of both.
     """
     votes: Counter[tuple[int, int]] = Counter()
     for view in second.keyframes:
-        limit = _SEARCH * max(1.0, view.observation.window.side / 200)
-        for other in nearest_views(first.keyframes, view.pose, _NEIGHBOURS):
+        limit = _MAX_REPROJECTION_ERROR * max(1.0, view.observation.window.side / 200)
+        for other in nearest_views(first.keyframes, view.pose, _COMPARED_KEYFRAMES):
             pairs = match(other.keypoints, view.keypoints)
             a, b = other.keypoint_landmark[pairs[:, 0]], view.keypoint_landmark[pairs[:, 1]]
             known = (a >= 0) & (b >= 0)
@@ -80,13 +82,13 @@ def match_landmarks(first: ObjectMap, second: ObjectMap, camera: Camera) -> Pair
 
 
 def merge(first: ObjectMap, second: ObjectMap, pairs: Pairs, most: int) -> ObjectMap:
-    """The keyframes and landmarks of both, on the first's surface.
+    """The keyframes and landmarks of both maps, on the first map's surface.
 
     Args:
         first: A map.
-        second: Another, in the coordinates of the first, with features of the same kind.
+        second: Another map, in the coordinates of the first, with features of the same kind.
         pairs: See `match_landmarks`.
-        most: Keyframes that are kept.
+        most: The most keyframes that are kept.
     """
     names = len(first.landmarks) + np.arange(len(second.landmarks))
     names[pairs[:, 1]] = pairs[:, 0]
@@ -104,7 +106,7 @@ def merge(first: ObjectMap, second: ObjectMap, pairs: Pairs, most: int) -> Objec
 
 
 def _relabel(view: Keyframe, names: NDArray[np.int64]) -> Keyframe:
-    """A view whose landmarks have other names; of two points that are one now, the first stays."""
+    """A view with renumbered landmarks; of two that are now the same landmark, the first is kept."""
     landmark, first = np.unique(names[view.points.landmark], return_index=True)
     points = FollowedPoints(landmark, view.points.pixel[first])
     label = np.where(view.keypoint_landmark >= 0, names[view.keypoint_landmark], -1)

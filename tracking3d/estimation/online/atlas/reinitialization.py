@@ -12,34 +12,34 @@ from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.frames import Frame
 from tracking3d.segmentation import as_lab
 
-_SAME_MASK = 0.3  # IoU of the masks of two frames, below which they are of two things
-_OTHER_COLOURS = -0.5  # mean log ratio of colours from which a mask is of something else
+_MIN_MASK_IOU = 0.3  # IoU of two frames' masks, below which they show different objects
+_MIN_COLOUR_RATIO = -0.5  # mean log ratio of the colours, below which a mask shows another object
 
 
 def masks_overlap(before: NDArray[np.bool_] | None, mask: NDArray[np.bool_]) -> bool:
-    """Whether two frames' masks ``(H, W)`` overlap, as those of one thing do."""
+    """Whether the masks ``(H, W)`` of two frames overlap enough to show the same object."""
     if before is None:
         return False
     either = int(np.count_nonzero(before | mask))
-    return int(np.count_nonzero(before & mask)) > _SAME_MASK * either
+    return int(np.count_nonzero(before & mask)) > _MIN_MASK_IOU * either
 
 
 def is_fully_visible(mask: NDArray[np.bool_]) -> bool:
-    """Whether a mask ``(H, W)`` stays off the frame's border: an object that comes in shows little of itself."""
+    """Whether a mask ``(H, W)`` does not touch the frame's border: an object that enters shows little of itself."""
     border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
     return bool(mask.any() and not border.any())
 
 
 def colours_match(state: SolverState, frame: Frame, mask: NDArray[np.bool_]) -> bool:
-    """Whether what is in a mask ``(H, W)`` has no colours that speak against the object."""
+    """Whether the colours inside a mask ``(H, W)`` do not contradict the object's colour model."""
     if state.colours is None:
         return True
     x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
     crop = slice(y, y + height), slice(x, x + width)
     ratio = state.colours.log_ratio(as_lab(np.ascontiguousarray(frame.image[crop])))
-    return float(ratio[mask[crop]].mean()) > _OTHER_COLOURS
+    return float(ratio[mask[crop]].mean()) > _MIN_COLOUR_RATIO
 
 
 def is_reliable(begun: SolverState, estimate: FrameEstimate) -> bool:
-    """Whether a second start is one that can be gone on from."""
+    """Whether a second initialization is reliable enough to continue with."""
     return not begun.object_map.pointless and estimate.confidence >= BELIEVED

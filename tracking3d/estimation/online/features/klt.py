@@ -1,4 +1,4 @@
-"""Points that are followed from frame to frame by optical flow, and new corners to follow."""
+"""Points tracked from frame to frame by optical flow (KLT), and new corners to track."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 MOST_POINTS = 250
-"""Points that a frame gets at least, where it has so many corners."""
+"""The number of points that a frame is filled up to, if it has enough corners."""
 MOST_FOLLOWED = 350
-"""Points that are followed at once."""
-_SMALLEST = 16  # pixels on either side of a mask in which corners are looked for
-_QUALITY = 0.01  # of the strongest corner, see cv2.goodFeaturesToTrack
+"""The most points that are tracked at once."""
+_MIN_MASK_SIDE = 16  # smallest width and height in pixels of a mask in which corners are detected
+_QUALITY = 0.01  # relative to the strongest corner, see cv2.goodFeaturesToTrack
 _SUBPIXEL_WINDOW = (3, 3)  # pixels on every side
-_SUBPIXEL_REACH = 2.0  # pixels that a corner may be moved by and still be in the mask
+_MAX_SUBPIXEL_SHIFT = 2.0  # largest shift in pixels of a corner by the subpixel refinement
 _SUBPIXEL_STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.03)
 _FLOW_WINDOW = (15, 15)
 _FLOW_LEVELS = 3
-_ROUND_TRIP = 0.7  # pixels that a point followed there and back may miss itself by
+_MAX_FORWARD_BACKWARD_ERROR = 0.7  # largest forward-backward error in pixels
 
 
 @dataclass(frozen=True, eq=False)
 class FollowedPoints:
-    """Points of the surface as one frame shows them.
+    """Points of the surface in one frame.
 
     Attributes:
-        landmark: ``(N,)`` int64, which landmark each is.
+        landmark: ``(N,)`` int64, the index of each point's landmark.
         pixel: ``(N, 2)`` float32 in the full frame.
     """
 
@@ -43,9 +43,9 @@ class FollowedPoints:
         return len(self.landmark)
 
     def spread_out(self, most: int, size: float) -> FollowedPoints:
-        """At most ``most``: the oldest in every square of ``size`` / 20 pixels, then others by age.
+        """At most ``most`` points: the oldest one in every square of ``size`` / 20 pixels, then others by age.
 
-        Points stand in the order of their age, the oldest first.
+        Points are sorted by age, the oldest first.
         """
         if len(self) <= most:
             return self
@@ -56,7 +56,7 @@ class FollowedPoints:
         return FollowedPoints(self.landmark[kept], self.pixel[kept])
 
     def concatenate(self, other: FollowedPoints) -> FollowedPoints:
-        """These, and those of another that are not among them."""
+        """These points, and those of another set whose landmarks are not among them."""
         new = ~np.isin(other.landmark, self.landmark)
         return FollowedPoints(
             np.concatenate([self.landmark, other.landmark[new]]),
@@ -64,7 +64,7 @@ class FollowedPoints:
         )
 
     def only(self, kept: NDArray[np.bool_]) -> FollowedPoints:
-        """Those that ``kept`` ``(N,)`` says."""
+        """The points at which ``kept`` ``(N,)`` is true."""
         return FollowedPoints(self.landmark[kept], self.pixel[kept])
 
 
@@ -79,22 +79,22 @@ def follow(
     points: FollowedPoints,
     guess: NDArray[np.float32] | None = None,
 ) -> FollowedPoints:
-    """Where points have gone, by pyramidal Lucas-Kanade flow there and back.
+    """Track points by pyramidal Lucas-Kanade flow, forward and backward.
 
     Args:
         before: ``(H, W)`` grey image of the earlier frame.
         now: ``(H, W)`` grey image of the later one.
         points: In the earlier frame.
-        guess: ``(N, 2)`` where they are expected; where they were if None.
+        guess: ``(N, 2)`` expected pixels in the later image; those in the earlier one if None.
 
     Returns:
-        Those that came back to where they had been.
+        The points whose forward-backward error is small.
     """
     if not len(points):
         return points
     there, found = _flow(before, now, points.pixel, points.pixel if guess is None else guess)
     back, found_back = _flow(now, before, there, points.pixel)
-    returned = np.linalg.norm(back - points.pixel, axis=1) < _ROUND_TRIP
+    returned = np.linalg.norm(back - points.pixel, axis=1) < _MAX_FORWARD_BACKWARD_ERROR
     height, width = now.shape
     inside = ((there >= 0) & (there <= [width - 1, height - 1])).all(1)
     kept = found & found_back & returned & inside
@@ -104,22 +104,22 @@ def follow(
 def new_corners(
     image: NDArray[np.uint8], mask: NDArray[np.bool_], taken: NDArray[np.float32], most: int
 ) -> NDArray[np.float32]:
-    """``(N, 2)`` corners inside a mask, away from its outline and from points that are there already.
+    """``(N, 2)`` corners inside a mask, away from its outline and from existing points.
 
-    Distances grow with the mask: points keep a 25th of the root of its area from each other, and a 50th from the
-    outline, which slides over the surface as the object turns.
+    Distances scale with the mask: points are at least a 25th of the root of its area apart, and a 50th from the
+    outline, which slides over the surface as the object rotates.
 
     Args:
         image: ``(H, W)`` grey.
         mask: ``(H, W)``.
-        taken: ``(M, 2)`` pixels of points that are there.
-        most: How many at most.
+        taken: ``(M, 2)`` pixels of existing points.
+        most: The most corners.
     """
     none = np.zeros((0, 2), np.float32)
     if most <= 0 or not mask.any():
         return none
     x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
-    if min(width, height) < _SMALLEST:
+    if min(width, height) < _MIN_MASK_SIDE:
         return none
     size = float(np.sqrt(mask.sum()))
     distance, margin = max(size / 25, 3.0), max(round(size / 50), 2)
@@ -133,14 +133,14 @@ def new_corners(
     if coarse is None:
         return none
     fine = cv2.cornerSubPix(crop, coarse.copy(), _SUBPIXEL_WINDOW, (-1, -1), _SUBPIXEL_STOP)
-    close = (np.abs(fine - coarse) < _SUBPIXEL_REACH).all(2, keepdims=True)
+    close = (np.abs(fine - coarse) < _MAX_SUBPIXEL_SHIFT).all(2, keepdims=True)
     return np.asarray(np.where(close, fine, coarse)[:, 0] + corner, dtype=np.float32)
 
 
 def _flow(
     before: NDArray[np.uint8], now: NDArray[np.uint8], start: NDArray[np.float32], guess: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Where points ``(N, 2)`` have gone, searched from a guess, and which of them were found."""
+    """Pixels ``(N, 2)`` of the tracked points, searched from a guess, and which points were found."""
     there, found, _ = cv2.calcOpticalFlowPyrLK(
         before, now, np.ascontiguousarray(start, np.float32), np.array(guess, np.float32),
         winSize=_FLOW_WINDOW, maxLevel=_FLOW_LEVELS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
@@ -149,6 +149,6 @@ def _flow(
 
 
 def _erode(mask: NDArray[np.bool_], margin: int) -> NDArray[np.uint8]:
-    """``mask`` without what is within ``margin`` of its outline or of the array's border."""
+    """``mask`` without the pixels within ``margin`` of its outline or of the array's border."""
     padded = np.pad(mask, 1).astype(np.uint8)
     return np.ascontiguousarray(cv2.erode(padded, np.ones((3, 3), np.uint8), iterations=margin)[1:-1, 1:-1])

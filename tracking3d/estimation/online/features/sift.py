@@ -1,4 +1,4 @@
-"""Keypoints with descriptors, for finding surface points again after large motions: SIFT inside the mask."""
+"""SIFT keypoints with descriptors inside the mask, for matching surface points across large motions."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-_MOST = 250  # keypoints of a frame
-_CONTRAST = 0.02  # half of OpenCV's: the faint texture of small objects counts
-_SIZE = 200  # pixels that the longer side of the object is scaled to, by 0.5 at least and 2 at most
-_BORDER = 8  # pixels around the object that descriptors may look at
-_RATIO = 0.8  # of the distances to the best and the second best, Lowe 2004, section 7.1
-_SAME_PLACE = 2.0  # pixels within which keypoints are one corner, seen at several scales and orientations
+_MAX_KEYPOINTS = 250  # most keypoints of a frame
+_CONTRAST = 0.02  # half of OpenCV's default, for the faint texture of small objects
+_SIZE = 200  # length in pixels to which the object's longer side is scaled, by a factor from 0.5 to 2
+_BORDER = 8  # pixels around the object that descriptors may use
+_RATIO = 0.8  # ratio of the distances to the best and the second-best match, Lowe 2004, section 7.1
+_SAME_CORNER = 2.0  # pixels within which keypoints are one corner, at several scales and orientations
 
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """Keypoints of one frame. A corner with two orientations is there twice, as either descriptor may match.
+    """Keypoints of one frame. A corner with two orientations occurs twice, since either descriptor may match.
 
     Attributes:
         pixel: ``(M, 2)`` float32 in the full frame.
@@ -38,15 +38,15 @@ class Keypoints:
 
 
 def detect(
-    image: NDArray[np.uint8], mask: NDArray[np.bool_], length: float | None = None, most: int = _MOST
+    image: NDArray[np.uint8], mask: NDArray[np.bool_], length: float | None = None, most: int = _MAX_KEYPOINTS
 ) -> Keypoints:
-    """The strongest keypoints inside a mask, of the object at one size whatever its size in the frame.
+    """The strongest keypoints inside a mask, with the object scaled to a fixed size.
 
     Args:
         image: ``(H, W)`` grey.
         mask: ``(H, W)``.
-        length: Longer side of the object in pixels, where the mask is not that of the object.
-        most: How many keypoints.
+        length: Longer side of the object in pixels, if the mask is not the object's.
+        most: The most keypoints.
     """
     if not mask.any():
         return Keypoints.none()
@@ -55,11 +55,11 @@ def detect(
     box = slice(corner[1], y + height + _BORDER), slice(corner[0], x + width + _BORDER)
     original = np.array(image[box].shape[::-1])
     scale = float(np.clip(_SIZE / (length or max(width, height)), 0.5, 2.0))
-    # Given the size and not the factor, OpenCV scales by exactly the ratio of the sizes.
+    # If the size is given instead of a factor, OpenCV scales by exactly the ratio of the sizes.
     size = np.rint(scale * original).astype(int).tolist()
     crop = cv2.resize(image[box], size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
     inside = cv2.resize(mask[box].astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-    # Without the precise upscale all places are a quarter of a pixel too far right and down.
+    # Without the precise upscale, all keypoints are a quarter of a pixel too far right and down.
     sift = cv2.SIFT.create(most, contrastThreshold=_CONTRAST, enable_precise_upscale=True)
     found, descriptor = sift.detectAndCompute(crop, inside)
     if not len(found):
@@ -70,7 +70,7 @@ def detect(
 
 
 def match(a: Keypoints, b: Keypoints) -> NDArray[np.int64]:
-    """Keypoints that are each other's nearest, and clearly so: nearer than to anything elsewhere in ``b``.
+    """Mutual nearest neighbours that pass the ratio test against keypoints elsewhere in ``b``.
 
     Returns:
         ``(K, 2)`` indices into ``a`` and ``b``, each at most once.
@@ -83,11 +83,11 @@ def match(a: Keypoints, b: Keypoints) -> NDArray[np.int64]:
     mutual = np.flatnonzero(distance.argmin(0)[best] == np.arange(len(a)))
     distance, best = distance[mutual], best[mutual]
     gap = np.abs(b.pixel[best][:, None] - b.pixel).max(2)
-    elsewhere = np.where(gap < _SAME_PLACE, np.inf, distance).min(1)
+    elsewhere = np.where(gap < _SAME_CORNER, np.inf, distance).min(1)
     clear = np.isfinite(elsewhere) & (distance[np.arange(len(best)), best] < _RATIO * elsewhere)
     return np.stack([mutual[clear], best[clear]], 1)
 
 
 def _root_sift(descriptor: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Unit vectors whose products are Hellinger's kernel (RootSIFT, Arandjelovic and Zisserman 2012)."""
+    """Unit vectors whose dot products are the Hellinger kernel (RootSIFT, Arandjelovic and Zisserman 2012)."""
     return np.asarray(np.sqrt(descriptor / descriptor.sum(1, keepdims=True).clip(1e-9)), dtype=np.float32)

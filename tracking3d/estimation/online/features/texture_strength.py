@@ -1,7 +1,7 @@
-"""Whether an object has texture of its own that points can be followed by.
+"""Whether an object has enough texture for points to be tracked.
 
-On a plain object corners are found as well: shades, highlights and edges. They slide over it as it turns, and poses
-that explain them are wrong, however well they fit.
+An untextured object has corners too: shading, highlights and edges. They slide over the surface as it rotates, and
+poses that explain them are wrong, however well they fit.
 """
 
 from __future__ import annotations
@@ -13,12 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 PLAIN = 0.7
-"""Strength below which points tell nothing: between the plain and faint prints of the suites ``fresh`` of seeds 501
-and 9101 (up to 0.66) and the others (from 0.77). Real things in real light have 3 and more."""
-_SIZE = (
-    100.0  # pixels that the object is reduced to, so that the strength is one of its look, not of the camera
-)
-_EDGE = 9  # pixels along the outline that are left out, on both sides together
+"""Strength below which points are not reliable. It lies between the plain and faint textures of the suites ``fresh`` of
+seeds 501 and 9101 (up to 0.66) and the others (from 0.77). Real objects in real light have 3 and more."""
+_SIZE = 100.0  # pixels to which the object is reduced, so that the strength does not depend on the image resolution
+_EDGE = 9  # width in pixels of the band along the outline that is left out, both sides together
 _SMOOTHING = 1.5  # pixels; noise of 4 grey levels then adds 0.3
 _BLOCK = 7
 
@@ -26,15 +24,15 @@ _BLOCK = 7
 def texture_strength(image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> float:
     """The median, inside the object, of the smaller eigenvalue of the structure tensor, in squared grey levels.
 
-    It is the measure of a good corner (Shi and Tomasi, "Good features to track", CVPR 1994): small where nothing
-    changes, and where it changes in one direction only, as along an edge.
+    It is the corner measure of Shi and Tomasi ("Good features to track", CVPR 1994): small in uniform regions, and
+    along an edge, at which the image changes in one direction only.
 
     Args:
         image: ``(H, W)`` grey.
         mask: ``(H, W)`` of the object.
 
     Returns:
-        The strength; 0 where the mask has no inside.
+        The strength; 0 if the mask has no interior.
     """
     area = int(np.count_nonzero(mask))
     if area == 0:

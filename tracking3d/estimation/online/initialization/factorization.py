@@ -1,9 +1,9 @@
-"""Affine structure from motion: poses and points without a start, up to a reversal in depth.
+"""Affine structure from motion: poses and points without an initialization, up to a reversal in depth.
 
-Each frame is first turned so that the points' centre lies on the optical axis; a small object is then seen under
+Each frame is first rotated so that the points' centre lies on the optical axis; a small object is then seen under
 scaled orthography, and its tracks span three dimensions (Tomasi and Kanade, "Shape and motion from image streams
-under orthography", IJCV 1992). In coordinates where frame 0 shows x and y as they are, three unknowns of the depth
-``z = a x + b y + c zeta`` remain. Scaled orthography gives two equations in them for every further frame: with one
+under orthography", IJCV 1992). In coordinates in which frame 0 shows x and y as they are, three unknowns of the depth
+``z = a x + b y + c zeta`` remain. Scaled orthography gives two equations in them for every further frame. With one
 such frame the amount of relief, ``c``, stays free (Koenderink and van Doorn, "Affine structure from motion", 1991),
 and its sign always does (Necker reversal).
 """
@@ -24,16 +24,16 @@ _UPGRADE_STEPS = 15
 
 @dataclass(frozen=True, eq=False)
 class AffineMotion:
-    """Points and frames under scaled orthography, before the depth is known.
+    """Points and frames under scaled orthography, with the depth still unknown.
 
     Attributes:
-        axes: ``(F, 3, 3)`` rotation of each frame that takes the points' centre to the optical axis.
+        axes: ``(F, 3, 3)`` rotation of each frame that maps the points' centre onto the optical axis.
         centres: ``(F, 3)`` direction of the points' centre in camera coordinates, with depth 1.
         cameras: ``(F, 2, 3)``; that of frame 0 is ``[1 0 0; 0 1 0]``.
         shape: ``(N, 3)`` x, y and zeta, which is uncorrelated with x and y and as wide as they are.
-        inliers: ``(N,)`` bool, the points that the others agree with.
-        relief: Root mean square in pixels of the tracks' third dimension, without which they would be a plane's.
-        unexplained: The same of what three dimensions leave of the inliers.
+        inliers: ``(N,)`` bool.
+        relief: Root mean square in pixels of the tracks' third dimension; 0 for a plane.
+        unexplained: Root mean square in pixels of the inliers' residuals to three dimensions.
     """
 
     axes: FloatArray
@@ -51,8 +51,8 @@ def affine_motion(pixels: FloatArray, K: FloatArray, threshold: float, seed: int
     Args:
         pixels: ``(F, N, 2)``, all finite.
         K: ``(3, 3)``.
-        threshold: Distance in pixels, root mean square over the frames, of a point that agrees with the others.
-        seed: Of the sampling that finds those.
+        threshold: Largest distance in pixels of an inlier, root mean square over the frames.
+        seed: Seed of the sampling that finds inliers.
     """
     frames, count = pixels.shape[:2]
     if frames < 2 or count < 6:
@@ -96,7 +96,7 @@ def affine_motion(pixels: FloatArray, K: FloatArray, threshold: float, seed: int
 
 
 def measured_relief(affine: AffineMotion) -> tuple[float, float, float] | None:
-    """``(a, b, c)`` of the depth from the linear equations of all frames, c > 0; None where noise wins."""
+    """``(a, b, c)`` of the depth from the linear equations of all frames, c > 0; None if noise dominates."""
     matrix, right = [], []
     for camera in affine.cameras[1:]:
         A, d = camera[:, :2], camera[:, 2]
@@ -116,7 +116,7 @@ def measured_relief(affine: AffineMotion) -> tuple[float, float, float] | None:
 
 
 def assumed_relief(affine: AffineMotion, c: float) -> tuple[float, float, float]:
-    """``(a, b, c)`` with a given c: the a and b under which the frames come nearest to scaled orthography."""
+    """``(a, b, c)`` with a given c: the a and b for which the frames are nearest to scaled orthography."""
     guess = np.zeros(2)
     for _ in range(_UPGRADE_STEPS):
         value = _skewness(affine, guess, c)
@@ -129,9 +129,9 @@ def assumed_relief(affine: AffineMotion, c: float) -> tuple[float, float, float]
 def metric_structure(
     affine: AffineMotion, depth: tuple[float, float, float], t0: FloatArray, z0: float
 ) -> Structure:
-    """Poses and points of a depth ``(a, b, c)``, with frame 0 at identity and ``t0`` and the points' centre at z0.
+    """Poses and points for a depth ``(a, b, c)``, with frame 0 at identity and ``t0``, and the points' centre at z0.
 
-    The reversed one has the negative of all three.
+    The depth reversal has the negative of all three.
     """
     cameras = _metric(affine, depth[:2], depth[2])
     left, values, right = np.linalg.svd(cameras, full_matrices=False)
@@ -140,7 +140,7 @@ def metric_structure(
     scales = values.mean(1)
     R = affine.axes.transpose(0, 2, 1) @ turned @ affine.axes[0]
     R = R @ R[0].T
-    # Distances along each frame's own axis; scale 1 is that of frame 0.
+    # Distances along each frame's own axis, relative to frame 0.
     along = np.linalg.norm(affine.centres, axis=1)
     centres = affine.centres * (z0 * along[0] / along / (scales / scales[0]))[:, None]
     z = affine.shape @ np.array(depth)
@@ -157,7 +157,7 @@ def _metric(affine: AffineMotion, plane: tuple[float, float] | FloatArray, c: fl
 
 
 def _skewness(affine: AffineMotion, plane: FloatArray, c: float) -> FloatArray:
-    """What keeps each frame's camera from scaled orthography, ``(2 (F - 1),)``, and a weak wish for no tilt."""
+    """Each camera's deviation from scaled orthography, ``(2 (F - 1),)``, and a weak prior for no tilt."""
     cameras = _metric(affine, plane, c)[1:]
     gram = cameras @ cameras.transpose(0, 2, 1)
     skew = np.concatenate([gram[:, 0, 0] - gram[:, 1, 1], 2 * gram[:, 0, 1]])
@@ -165,7 +165,7 @@ def _skewness(affine: AffineMotion, plane: FloatArray, c: float) -> FloatArray:
 
 
 def align_with_axis(direction: FloatArray) -> FloatArray:
-    """The least rotation ``(3, 3)`` that takes a direction to the optical axis."""
+    """The smallest rotation ``(3, 3)`` that maps a direction onto the optical axis."""
     x, y, z = direction / np.linalg.norm(direction)
     return np.array(
         [
@@ -177,7 +177,7 @@ def align_with_axis(direction: FloatArray) -> FloatArray:
 
 
 def _is_consistent(rows: FloatArray, threshold: float, seed: int) -> NDArray[np.bool_]:
-    """``(N,)`` bool: the columns near the three-dimensional plane through four of them with the most others near."""
+    """``(N,)`` bool: the inliers of the three-dimensional subspace through four columns, by RANSAC."""
     count = rows.shape[1]
     random = np.random.default_rng(seed)
     chosen = np.argsort(random.random((_SAMPLES, count)), 1)[:, :4]

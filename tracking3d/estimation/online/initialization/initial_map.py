@@ -1,4 +1,4 @@
-"""The start: shape and poses of the first frames together, from the points that were followed through them."""
+"""The initial map: shape and poses of the first frames, from the points tracked through them."""
 
 from __future__ import annotations
 
@@ -27,30 +27,30 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, pose_arrays, pose_from_arrays
 
 _VIEWS = 8
-_TURNING_FRAMES = 12  # after the first, for a start without points: a turn of 30 to 60 degrees, mostly
-_TURNING_VIEWS = 7
-_FEWEST_TURNING = 4
-_UNUSUAL_LENS = (
-    0.1  # of its cost, what a start is charged for a lens twice as long or short as the assumed one
+_ROTATION_FRAMES = (
+    12  # frames after the first for an initialization without points: mostly a rotation of 30 to 60 degrees
 )
-_MOST_LIKELY, _AS_LIKELY = (
+_ROTATION_VIEWS = 7
+_MIN_ROTATION_VIEWS = 4
+_FOCAL_LENGTH_PENALTY = 0.1  # share of the cost added to a map with twice or half the assumed focal length
+_MAX_STRUCTURES, _MAX_BUNDLE_RATIO = (
     6,
     2.0,
-)  # structures under several lenses whose shape is fitted: how many, and how costly
-# Hypotheses that go on, evaluations, half resolution.
+)  # structures of several focal lengths whose shape is fitted: the most of them, and their largest cost
+# Stages: hypotheses that continue, evaluations, half resolution.
 _STAGES = ((99, 5, True), (5, 12, True), (3, 10, False))
 
 
 @dataclass(frozen=True, eq=False)
 class InitialMap:
-    """A solved start.
+    """One hypothesis of the initialization.
 
     Attributes:
-        object_map: The map, whose keyframes are the chosen views.
-        cost: How badly it re-renders the views; more for a lens that is far from the assumed one.
-        bundle: How badly its points fit their tracks.
-        origin: Which hypothesis it came from.
-        camera: The camera that it was solved with.
+        object_map: The map; its keyframes are the selected views.
+        cost: Cost of re-rendering the views, increased if the focal length is far from the assumed one.
+        bundle: Cost of the points' reprojection.
+        origin: The hypothesis that it came from.
+        camera: The camera that it was estimated with.
     """
 
     object_map: ObjectMap
@@ -67,13 +67,13 @@ def solve_start(
     weights: FitWeights,
     prior: float,
 ) -> list[InitialMap]:
-    """Starts by rising cost; empty where the points cannot tell.
+    """Initial maps by rising cost; empty if the points do not constrain any.
 
     Args:
-        object_map: Prototype and landmarks; its keyframes are not looked at.
-        cameras: Of the full frame: the one that the views are of, and other lenses that it might have had.
-        views: The first frames, the first one's pose is kept.
-        weights: Of the shape's terms.
+        object_map: Prototype and landmarks; its keyframes are not used.
+        cameras: Cameras of the full frame: that of the views first, then others with possible focal lengths.
+        views: The first frames; the first one's pose is fixed.
+        weights: The weights of the shape's terms.
         prior: See `refine_map`.
     """
     chosen = [
@@ -101,7 +101,7 @@ def solve_start(
             for view in hypothesis.keyframes
         ]
         cost = float(np.mean([fit.cost for fit in fits])) + structure.cost
-        cost *= 1 + _UNUSUAL_LENS * abs(math.log2(camera.fy / cameras[0].fy))
+        cost *= 1 + _FOCAL_LENGTH_PENALTY * abs(math.log2(camera.fy / cameras[0].fy))
         starts.append(InitialMap(hypothesis, cost, structure.cost, structure.origin, camera))
     starts.sort(key=lambda start: start.cost)
     return starts
@@ -111,13 +111,13 @@ _Solved = tuple[Structure, Camera, list[Keyframe]]
 
 
 def _likely_structures(solved: list[_Solved]) -> list[_Solved]:
-    """Those whose points fit best; a wrong lens bends the points more than the noise does."""
+    """The structures whose points fit best; a wrong focal length distorts the points by more than the noise."""
     solved = sorted(solved, key=lambda one: one[0].cost)
-    return [one for one in solved if one[0].cost < _AS_LIKELY * solved[0][0].cost][:_MOST_LIKELY]
+    return [one for one in solved if one[0].cost < _MAX_BUNDLE_RATIO * solved[0][0].cost][:_MAX_STRUCTURES]
 
 
 def with_observations(object_map: ObjectMap, views: list[Keyframe], coarse: bool) -> ObjectMap:
-    """The map with its views as they are, or at half the resolution."""
+    """The map with its views at full or half resolution."""
     keyframes = [
         replace(posed, observation=downsample(view.observation) if coarse else view.observation, texture=None)
         for posed, view in zip(object_map.keyframes, views, strict=True)
@@ -128,18 +128,18 @@ def with_observations(object_map: ObjectMap, views: list[Keyframe], coarse: bool
 def initialize_without_points(
     object_map: ObjectMap, camera: Camera, views: list[Keyframe], weights: FitWeights
 ) -> list[InitialMap]:
-    """The best start that needs no points, from the first of the views.
+    """The best initial map by pixels and outlines alone, from the first views.
 
-    Shape and poses are fitted together from every hypothesis of `rotation_hypotheses`; the better ones go on.
+    Shape and poses are fitted together from every hypothesis of `rotation_hypotheses`; the better ones continue.
 
     Args:
-        object_map: Prototype and landmarks; its keyframes are not looked at.
-        camera: Of the full frame.
-        views: The first frames with masks, all of them: the first `_TURNING_FRAMES` are used.
-        weights: Of the shape's terms.
+        object_map: Prototype and landmarks; its keyframes are not used.
+        camera: The camera of the full frame.
+        views: All first frames with masks; the first `_ROTATION_FRAMES` are used.
+        weights: The weights of the shape's terms.
     """
-    near = [view for view in views if view.index - views[0].index <= _TURNING_FRAMES]
-    chosen = _spread_views(near if len(near) >= _FEWEST_TURNING else views, _TURNING_VIEWS)
+    near = [view for view in views if view.index - views[0].index <= _ROTATION_FRAMES]
+    chosen = _spread_views(near if len(near) >= _MIN_ROTATION_VIEWS else views, _ROTATION_VIEWS)
     modes = ShapeBasis.of(object_map.shape)
     tried = [
         (math.inf, name, replace(object_map, keyframes=_with_poses(chosen, poses)))
@@ -164,7 +164,7 @@ def initialize_without_points(
 
 
 def _spread_views(views: list[Keyframe], most: int) -> list[Keyframe]:
-    """At most so many of the views, evenly."""
+    """At most ``most`` of the views, evenly spaced."""
     places = np.linspace(0, len(views) - 1, min(most, len(views))).round().astype(int)
     return [views[place] for place in sorted(set(places.tolist()))]
 
@@ -175,7 +175,7 @@ def _with_poses(views: list[Keyframe], poses: list[Pose]) -> tuple[Keyframe, ...
 
 
 def _without_points(object_map: ObjectMap) -> ObjectMap:
-    """The map without what its keyframes show of the landmarks: they did not move with the object."""
+    """The map without its keyframes' landmark observations: those points did not move with the object."""
     nothing = np.zeros(0, np.int64)
     keyframes = tuple(
         replace(

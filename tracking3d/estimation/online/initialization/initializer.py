@@ -1,4 +1,4 @@
-"""The first frames: their points are followed and matched until the start can be solved."""
+"""Initialization: points are tracked and matched through the first frames until a map can be estimated."""
 
 from __future__ import annotations
 
@@ -29,26 +29,28 @@ from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
 from tracking3d.estimation.online.state.solver_state import SolverState
 
 MOTION = 0.03
-"""Change of form at which a start is tried first, see `image_deformation`."""
-_MORE_MOTION = 1.3  # times as much before it is tried again
-_DOUBTFUL = 0.5  # bundle cost above which the points do not tell: they are 0.8 pixels off
-_MOST = 40  # frames that wait for a better one
-_FEWEST = 4  # frames that are solved together
-_FEWEST_BY_TURNING = 13
-_WILD = 0.15  # change of form that no start explains, though the object can have turned by half a turn since
-_AGAIN = 5  # frames after which pixels and outlines are asked once more
-_LASTING = 0.4  # share of the first frame's points that are still there where they can be relied on
-_LEAST_SHARED = 0.1  # share below which nothing more will be learned of the first frame
-_SPARSE = 0.6  # of `MOST_POINTS`, below which new points are looked for
+"""Image deformation at which an initialization is first tried, see `image_deformation`."""
+_RETRY_FACTOR = 1.3  # factor by which the deformation must grow before the next attempt
+_MAX_BUNDLE_COST = 0.5  # bundle cost above which the points are not reliable: residuals of 0.8 pixels
+_MAX_PENDING = 40  # most pending frames
+_MIN_FRAMES = 4  # fewest frames of an initialization
+_MIN_FRAMES_WITHOUT_POINTS = 13
+_MAX_DEFORMATION = 0.15  # deformation that no initial map explains though it allows for half a turn
+_RETRY_INTERVAL = 5  # frames between attempts without points
+_MIN_TRACKED_SHARE = (
+    0.4  # share of the first frame's points that must be tracked to the last if they are reliable
+)
+_MIN_SHARED = 0.1  # share of the first frame's points below which further frames add nothing
+_MIN_POINT_SHARE = 0.6  # share of `MOST_POINTS`, below which new corners are detected
 _SAME_PLACE = 1.5  # pixels
-_MATCHED_WITH = 3  # frames before
-_SLIP = 3  # frames
-_LIKE_NOISE = 1.3  # times the change between neighbours that is none
-# Logarithm of two costs' ratio, times the change of form, from which the better start is believed; and where it is
+_MATCHED_FRAMES = 3  # earlier frames that each frame is matched with
+_MAX_MASK_GAP = 3  # frames; a mask tracker may miss the object for so long
+_NOISE_FACTOR = 1.3  # times the change between neighbouring frames, below which a change is noise
+# Log ratio of two costs, times the deformation, from which the better hypothesis is accepted; and the same if it is
 # the better one for the second time.
-_LEAD, _LEAD_AGAIN = 0.04, 0.02
-_MOTION_ENOUGH = 0.3  # change of form from which more of it decides nothing
-_WELL_FOLLOWED = 0.25  # bundle cost of points that go on to be
+_MIN_LEAD, _MIN_LEAD_AGAIN = 0.04, 0.02
+_DECISIVE_MOTION = 0.3  # deformation from which more motion decides nothing
+_WELL_TRACKED = 0.25  # bundle cost of points that are tracked well
 _SAME_AXIS = 0.87  # cosine of 30 degrees
 _TWO_WAYS = "the first frames can be explained in two ways, as when near and far are exchanged, until it turns further"
 _STILL = "nothing shows that the object turns: it is still, or turns about an axis of its symmetry"
@@ -57,12 +59,12 @@ _STILL = "nothing shows that the object turns: it is still, or turns about an ax
 def add_pending_frame(
     object_map: ObjectMap, earlier: tuple[Keyframe, ...], view: Keyframe, image: NDArray[np.uint8]
 ) -> tuple[ObjectMap, Keyframe]:
-    """A view whose points are followed, or found again, in it; their depth is not known yet."""
+    """A view into which points are tracked or matched; their depth is not known yet."""
     if _is_gone((*earlier, view)):
         return object_map, replace(view, points=FollowedPoints.none())
     if (inside := view.mask) is not None:
         view = replace(view, strength=texture_strength(image, inside))
-    if inside is None or len(view.points) >= _SPARSE * MOST_POINTS:
+    if inside is None or len(view.points) >= _MIN_POINT_SHARE * MOST_POINTS:
         return object_map, view
     keypoints = detect(image, inside)
     label = np.full(len(keypoints), -1, np.int64)
@@ -70,7 +72,7 @@ def add_pending_frame(
         gap = np.linalg.norm(keypoints.pixel[:, None] - view.points.pixel[None], axis=2)
         label = np.where(gap.min(1) < _SAME_PLACE, view.points.landmark[gap.argmin(1)], -1)
     taken = set(view.points.landmark.tolist())
-    for other in earlier[::-1][:_MATCHED_WITH]:
+    for other in earlier[::-1][:_MATCHED_FRAMES]:
         for here, there in match(keypoints, other.keypoints):
             name = int(other.keypoint_landmark[there])
             if label[here] < 0 <= name and name not in taken:
@@ -104,20 +106,23 @@ def add_pending_frame(
 def try_initialize(
     state: SolverState, config: OnlineConfig, ended: bool = False
 ) -> tuple[SolverState, InitialMap | None]:
-    """The start, where the waiting frames can tell; else None, and when it is tried next.
+    """The initial map if the pending frames determine it; else None, and the motion of the next attempt.
 
     Args:
-        state: With the waiting frames.
-        config: Of the solver.
-        ended: Whether no more frames come, so that these have to do.
+        state: The state with the pending frames.
+        config: The solver's options.
+        ended: Whether no more frames follow, so that these must suffice.
     """
     waiting = state.pending or ()
     views = [view for view, _ in waiting if view.mask is not None]
-    if len(views) < _FEWEST:
+    if len(views) < _MIN_FRAMES:
         return state, None
-    ended = ended or _is_gone([view for view, _ in waiting])  # what was seen until then has to do
+    ended = ended or _is_gone([view for view, _ in waiting])  # the frames until then must suffice
     if np.median([view.strength for view in views]) < PLAIN:
-        enough = len(views) >= _FEWEST_BY_TURNING and (len(views) - _FEWEST_BY_TURNING) % _AGAIN == 0
+        enough = (
+            len(views) >= _MIN_FRAMES_WITHOUT_POINTS
+            and (len(views) - _MIN_FRAMES_WITHOUT_POINTS) % _RETRY_INTERVAL == 0
+        )
         if not enough and not ended:
             return state, None
         return _start_without_points(state, views, config)
@@ -125,24 +130,33 @@ def try_initialize(
     motion = image_deformation(tracks_of(views, names[~state.object_map.candidate[names]]))
     still_there = np.isin(views[0].points.landmark, views[-1].points.landmark)
     shared = float(still_there.mean()) if len(still_there) else 0.0
-    waited = ended or len(views) >= _MOST
-    # Points that run wild show no more motion when there is more of it: then pixels and outlines are asked.
-    wild = motion > _WILD and len(views) >= _FEWEST_BY_TURNING
+    waited = ended or len(views) >= _MAX_PENDING
+    # Points that fail do not gain from more motion: pixels and outlines are used instead.
+    wild = motion > _MAX_DEFORMATION and len(views) >= _MIN_FRAMES_WITHOUT_POINTS
     due = max(state.next_attempt, MOTION)
-    if motion < due and not waited and shared > _LEAST_SHARED and not (wild and len(views) % _AGAIN == 0):
+    if (
+        motion < due
+        and not waited
+        and shared > _MIN_SHARED
+        and not (wild and len(views) % _RETRY_INTERVAL == 0)
+    ):
         return state, None
-    state = replace(state, next_attempt=motion * _MORE_MOTION)
-    may_wait = not waited and shared > _LEAST_SHARED and motion < _MOTION_ENOUGH
+    state = replace(state, next_attempt=motion * _RETRY_FACTOR)
+    may_wait = not waited and shared > _MIN_SHARED and motion < _DECISIVE_MOTION
     # Without motion any shape explains the points.
     starts = _starts_from_points(state, views, config) if motion >= MOTION else []
     if may_wait and _is_undecided(starts, motion, state.ambiguous_rotation):
         return replace(
             state, waiting_reason=_TWO_WAYS, ambiguous_frames=len(views), ambiguous_rotation=_turn(starts[0])
         ), None
-    if state.ambiguous_frames and starts and starts[0].bundle > _WELL_FOLLOWED:
+    if state.ambiguous_frames and starts and starts[0].bundle > _WELL_TRACKED:
         starts = _starts_from_points(state, views[: state.ambiguous_frames], config)
-    if not starts or starts[0].bundle > _DOUBTFUL:
-        if not waited and not wild and (shared > _LASTING or len(views) < _FEWEST_BY_TURNING):
+    if not starts or starts[0].bundle > _MAX_BUNDLE_COST:
+        if (
+            not waited
+            and not wild
+            and (shared > _MIN_TRACKED_SHARE or len(views) < _MIN_FRAMES_WITHOUT_POINTS)
+        ):
             return state, None
         state, turning = _start_without_points(state, views, config)
         if turning is None:
@@ -159,10 +173,10 @@ def _starts_from_points(state: SolverState, views: list[Keyframe], config: Onlin
 def _start_without_points(
     state: SolverState, views: list[Keyframe], config: OnlineConfig
 ) -> tuple[SolverState, InitialMap | None]:
-    """The start from pixels and outlines alone; None where nothing shows that the object turns."""
+    """The initial map from pixels and outlines alone; None if nothing shows that the object rotates."""
     waiting = state.pending or ()
     if not _has_changed(views):
-        kept = _subsample(waiting) if len(views) >= _MOST else waiting
+        kept = _subsample(waiting) if len(views) >= _MAX_PENDING else waiting
         return replace(state, pending=kept, waiting_reason=_STILL, ambiguous_frames=0), None
     return state, initialize_without_points(
         state.object_map, state.camera, views, FitWeights(smoothness=config.smoothness)
@@ -170,16 +184,16 @@ def _start_without_points(
 
 
 def _is_undecided(starts: list[InitialMap], motion: float, leaning: NDArray[np.float64] | None) -> bool:
-    """Whether another start, whose object turns otherwise, costs hardly more than the best for so little motion.
+    """Whether another initial map with a different rotation costs hardly more than the best, given so little motion.
 
-    Only points that are followed well tell more when there is more motion.
+    More motion helps only if the points are tracked well.
 
     Args:
-        starts: By rising cost.
+        starts: Initial maps by rising cost.
         motion: See `image_deformation`.
-        leaning: How the object turned in the best start when it was tried last: what wins twice needs to win by less.
+        leaning: The rotation of the best initial map in the last attempt; if it wins again, a smaller margin suffices.
     """
-    if len(starts) < 2 or starts[0].bundle > _WELL_FOLLOWED:
+    if len(starts) < 2 or starts[0].bundle > _WELL_TRACKED:
         return False
     best = _turn(starts[0])
     rivals = [start for start in starts[1:] if not _same_axis(best, _turn(start))]
@@ -187,27 +201,27 @@ def _is_undecided(starts: list[InitialMap], motion: float, leaning: NDArray[np.f
         return False
     lead = motion * math.log(rivals[0].cost / max(starts[0].cost, 1e-9))
     again = leaning is not None and _same_axis(best, leaning)
-    return lead < (_LEAD_AGAIN if again else _LEAD)
+    return lead < (_MIN_LEAD_AGAIN if again else _MIN_LEAD)
 
 
 def _turn(start: InitialMap) -> NDArray[np.float64]:
-    """``(3,)`` rotation vector from the first view of a start to the last, in camera coordinates."""
+    """``(3,)`` rotation vector from the first view of an initial map to the last, in camera coordinates."""
     first, *_, last = start.object_map.keyframes
     return Rotation.from_matrix((last.pose.R @ first.pose.R.T).cpu().numpy()).as_rotvec()
 
 
 def _same_axis(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
-    """Whether two turns are about the same axis; by how much depends on the lens and on the relief."""
+    """Whether two rotations have the same axis; their angles depend on focal length and relief."""
     return bool(a @ b >= _SAME_AXIS * np.linalg.norm(a) * np.linalg.norm(b))
 
 
 def _is_gone(views: Sequence[Keyframe]) -> bool:
-    """Whether the object is out of sight for longer than a mask tracker's slip."""
-    return len(views) > _SLIP and all(view.mask is None for view in views[-_SLIP:])
+    """Whether the object has been out of sight for longer than a mask tracker's brief failure."""
+    return len(views) > _MAX_MASK_GAP and all(view.mask is None for view in views[-_MAX_MASK_GAP:])
 
 
 def _has_changed(views: list[Keyframe]) -> bool:
-    """Whether the object looks different now: by more, inside both masks, than from one frame to the next."""
+    """Whether the object's appearance inside both masks has changed by more than between neighbouring frames."""
 
     def difference(a: Keyframe, b: Keyframe) -> float:
         both = (a.observation.mask * b.observation.mask) > 0.5
@@ -216,11 +230,11 @@ def _has_changed(views: list[Keyframe]) -> bool:
         return float((a.observation.features - b.observation.features)[:, both].abs().mean())
 
     neighbours = [difference(a, b) for a, b in pairwise(views)]
-    return difference(views[0], views[-1]) > _LIKE_NOISE * float(np.median(neighbours))
+    return difference(views[0], views[-1]) > _NOISE_FACTOR * float(np.median(neighbours))
 
 
 def _subsample(
     waiting: tuple[tuple[Keyframe, FrameEstimate], ...],
 ) -> tuple[tuple[Keyframe, FrameEstimate], ...]:
-    """Every second of the waiting frames, with the first and the last."""
+    """Every second pending frame, with the first and the last."""
     return (*waiting[:-1:2], waiting[-1])

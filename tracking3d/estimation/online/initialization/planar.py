@@ -1,8 +1,8 @@
-"""Poses of a flat object from tracks of its points: two unknowns of its plane, and every frame's pose.
+"""Poses of a planar object from tracks of its points: the plane's two unknowns and every frame's pose.
 
-Free points make a flat object bulge and its motion wrong: almost any relief explains a plane that turns a little.
-Without perspective its tilt is hardly told either (whole families of tilts and motions have the same images), so
-several answers are given.
+Free points make a planar object bulge and its motion wrong: almost any relief explains a plane that rotates a little.
+Without perspective its tilt is hardly constrained either (whole families of tilts and motions have the same images),
+so several solutions are returned.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from tracking3d.bundle_adjustment.reprojection import FloatArray
 from tracking3d.estimation.online.optimization.pnp import pose_of_tracks
 
 SLANTS = (25.0, 50.0)
-"""Degrees by which planes are tried to be tilted, in eight directions."""
+"""Degrees by which the hypothetical planes are tilted, in eight directions."""
 
 _STARTS = 4
 _SCREENED_POINTS = 40
@@ -30,8 +30,7 @@ _CONVERGED = 1e-6
 def is_planar(tracks: Tracks, K: FloatArray, threshold: float) -> bool:
     """Whether homographies take frame 0's points to every other frame, within a median distance in pixels.
 
-    So it does, too, for any object that has hardly turned. All points are seen in all frames; K says nothing here
-    but how pixels are scaled.
+    This also holds for any object that has hardly rotated. All points are seen in all frames; K only scales the pixels.
     """
     focal = np.array([K[0, 0], K[1, 1]])
     first = (tracks.pixels[0] - K[:2, 2]) / focal
@@ -81,7 +80,7 @@ def planar_structures(
 def resect_views(
     tracks: Tracks, K: FloatArray, points: FloatArray, t0: FloatArray, scale: float
 ) -> Structure:
-    """Every frame's pose from given points ``(N, 3)``, each started from the one before."""
+    """Every frame's pose from given points ``(N, 3)``, each initialized with the one before."""
     R, t = [np.eye(3)], [t0]
     for pixels in tracks.pixels[1:]:
         fit = pose_of_tracks(points, pixels, None, K, R[-1], t[-1], 3 * scale)
@@ -119,7 +118,7 @@ def _on_plane(rays: FloatArray, tilt: FloatArray, z0: float) -> FloatArray | Non
 def _fit_plane_structure(
     tracks: Tracks, K: FloatArray, rays: FloatArray, tilt: FloatArray, t0: FloatArray, z0: float, scale: float
 ) -> Structure:
-    """Poses and tilt of least cost by Levenberg-Marquardt from a start; points stay on frame 0's rays."""
+    """Poses and tilt of least cost by Levenberg-Marquardt; the points stay on frame 0's rays."""
     offset = (rays - np.median(rays, 0))[:, :2]
     points = _on_plane(rays, tilt, z0)
     assert points is not None

@@ -1,4 +1,4 @@
-"""From the poses and points of some frames to those of all: poses from points, points from poses, then both."""
+"""Registers all frames, given poses and points of some: poses from points, points from poses, then both together."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tracking3d.bundle_adjustment.reprojection import FloatArray, finite_rows
 from tracking3d.estimation.online.optimization.pnp import pose_of_tracks
 
 FEWEST = 6
-"""Points that a frame must see for a pose of its own."""
+"""The fewest points that a frame needs for a pose of its own."""
 
 _NEW_POINT_ITERATIONS = 6
 _FINAL_ITERATIONS = 25
@@ -27,7 +27,7 @@ def register_all(
     points: NDArray[np.intp],
     scale: float,
 ) -> Structure:
-    """All frames and points, refined together; a flat one stays flat."""
+    """All frames and points, refined together; a planar solution stays planar."""
     start = _extend(tracks, K, core, frames, points, scale)
     prior, weight = None, 0.0
     if core.origin == "flat":
@@ -90,7 +90,7 @@ def _with_new_points(
     new = np.flatnonzero(~known & (np.count_nonzero(seen, 0) >= 2))
     if not len(new) or not known.any():
         return structure.points
-    # On the ray of the first frame that sees it, as deep as the points known.
+    # On the ray of the first frame that sees it, at the depth of the known points.
     first = seen[:, new].argmax(0)
     R, t = structure.R[first], structure.t[first]
     centre = np.median(structure.points[known], 0)

@@ -1,4 +1,4 @@
-"""Starts without points: the object turns about an axis of the image, by some angle in all, or not at all."""
+"""Hypotheses for an initialization without points: steady rotation about an image axis, or no rotation."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
 
 TURNS = (20.0, 50.0)
-"""Degrees from the first view to the last that the hypotheses turn."""
+"""Degrees of rotation from the first view to the last."""
 DIRECTIONS = 8
 
 
@@ -39,7 +39,7 @@ def rotation_hypotheses(views: list[Keyframe], camera: Camera) -> list[tuple[str
 
 
 def _place_views(first: Keyframe, view: Keyframe, camera: Camera) -> torch.Tensor:
-    """The first translation moved to where a view's mask is."""
+    """The first translation moved so that it projects to a view's mask."""
     if first.mask is None or view.mask is None:
         return first.pose.translation
     (x0, y0), (x1, y1) = (np.argwhere(mask)[:, ::-1].mean(0) for mask in (first.mask, view.mask))

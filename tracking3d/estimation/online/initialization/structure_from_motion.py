@@ -1,9 +1,9 @@
 """Poses and points of the first frames from tracks alone: several hypotheses, because the image allows several.
 
 A small object is seen almost without perspective. Its reversal in depth (Necker) then fits nearly as well as itself,
-with two views any amount of relief does (bas-relief), and a plane turns one way or the other. So hypotheses are
-made, refined under perspective by `tracking3d.bundle_adjustment.adjustment`, and the distinct ones are kept: which of
-them is right shows when they are rendered.
+with two views any amount of relief does (bas-relief), and a plane has two rotations. So several hypotheses are refined
+under perspective by `tracking3d.bundle_adjustment.adjustment`, and the distinct ones are kept; rendering them shows
+which is correct.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from tracking3d.estimation.online.initialization.planar import is_planar, planar
 from tracking3d.estimation.online.initialization.registration import FEWEST, register_all, subset_of
 
 RELIEFS = (0.3, 0.7)
-"""Depths that are tried where views do not tell it: spread about the tilted plane over the spread in x and y."""
+"""Depths that are tried if the views do not constrain it: spread about the tilted plane over the spread in x and y."""
 
 _CORE_FRAMES, _CORE_POINTS, _SCREENING_ITERATIONS, _CORE_ITERATIONS = 8, 80, 4, 10
 _FEWEST_COMMON = 8
@@ -46,7 +46,7 @@ def structure_hypotheses(
     keep: int = 4,
     seed: int = 0,
 ) -> list[Structure]:
-    """Distinct explanations of the tracks, the cheapest first, with reversals in depth where they fit.
+    """Distinct explanations of the tracks, the cheapest first, with reversals in depth if they fit.
 
     Flat ones are tried where homographies explain the tracks. Free points then fit better because they bend to the
     noise, so flat ones come first if the noise that they leave is not much larger, counted by degrees of freedom.
@@ -60,10 +60,10 @@ def structure_hypotheses(
         tracks: F frames, N points; frame 0 is the first.
         K: ``(3, 3)``.
         t0: ``(3,)`` translation of frame 0, at the object's centre.
-        radius: Of the object, in its units.
+        radius: The radius of the object, in its units.
         scale: Residual in pixels at which the Cauchy loss is ``log 2``.
-        keep: The most answers.
-        seed: Of the sampling that finds outliers.
+        keep: The most solutions.
+        seed: The seed of the sampling that finds outliers.
 
     Returns:
         Structures of all frames and points. A point seen in fewer than two frames is nan; a frame that sees

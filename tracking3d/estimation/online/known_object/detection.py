@@ -1,4 +1,4 @@
-"""A known object in a frame of which nothing is known: by keypoints anywhere in it, by its outline where a mask is."""
+"""Detects a known object in a frame: by keypoints anywhere in it, or by its outline if there is a mask."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, from_matrix
 from tracking3d.rendering import Surface
 
-_MOST = 2000  # keypoints of a whole frame, at each size
+_MAX_KEYPOINTS = 2000  # keypoints of a whole frame, at each size
 _LENGTHS = (0.25, 0.75)  # of the frame's height, that the object may have: pictures are scaled for both
-_POSES = 3  # that most keypoints agree with
-_NEIGHBOURS = 6  # drawn sides whose matches are joined, once it is known which side is seen
-_JOINED = 5.0  # pixels of an object 200 pixels large within which they count
+_MAX_POSES = 3  # that most keypoints agree with
+_MAX_COMBINED = 6  # rendered sides whose matches are combined, once it is known which side is seen
+_MAX_REPROJECTION_ERROR = 5.0  # pixels of an object 200 pixels large within which they count
 _DIRECTIONS, _ROLLS = 160, 18  # that an outline is tried from
-_UNLIKE = 0.4  # logarithm of two boxes' ratios of width and height that are not one outline's
+_MAX_ASPECT_DIFFERENCE = 0.4  # logarithm of two boxes' ratios of width and height that are not one outline's
 _STAGES = ((120, 2), (24, 8))  # how many go on, and the steps that each then gets
 _FINALISTS = 5
 _VERTICES = 600  # that tell the box of an outline
@@ -39,33 +39,34 @@ _VERTICES = 600  # that tell the box of an outline
 def by_keypoints(
     object_map: ObjectMap, camera: Camera, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
 ) -> list[tuple[Pose, FollowedPoints]]:
-    """Poses that keypoints agree with, and those keypoints, most agreeing first.
+    """Poses from keypoint matches, and their inliers, most inliers first.
 
     Args:
         object_map: The map.
-        camera: Of the full frame.
+        camera: The camera of the full frame.
         image: ``(H, W)`` grey.
-        mask: ``(H, W)`` where the object is looked for; None for anywhere.
+        mask: ``(H, W)`` the region that is searched; None for the whole frame.
     """
     if mask is None:
         height = image.shape[0]
         everywhere = np.ones(image.shape, bool)
         found = [
-            (detect(image, everywhere, share * height, _MOST), share * height / 200) for share in _LENGTHS
+            (detect(image, everywhere, share * height, _MAX_KEYPOINTS), share * height / 200)
+            for share in _LENGTHS
         ]
     else:
         length = max(mask_box(mask)[2:])
         reach = 2 * max(round(0.05 * length), 1) + 1
         region = cv2.dilate(mask.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
-        found = [(detect(image, region, length, _MOST // 2), length / 200)]
+        found = [(detect(image, region, length, _MAX_KEYPOINTS // 2), length / 200)]
     posed = []
     for keypoints, size in found:
         scale = max(1.0, size)
         for pose, points in poses_from_matches(object_map, camera, keypoints, object_map.keyframes, scale)[
-            :_POSES
+            :_MAX_POSES
         ]:
             posed.append(_combine_matches(object_map, camera, keypoints, pose, points, scale))
-    return sorted(posed, key=lambda one: -len(one[1]))[:_POSES]
+    return sorted(posed, key=lambda one: -len(one[1]))[:_MAX_POSES]
 
 
 def _combine_matches(
@@ -76,29 +77,29 @@ def _combine_matches(
     points: FollowedPoints,
     scale: float,
 ) -> tuple[Pose, FollowedPoints]:
-    """The pose once more, by what all sides that are like the one seen say of the keypoints."""
+    """The pose again, from the matches with all sides near the one seen."""
     together = points
-    for other in nearest_views(object_map.keyframes, pose, _NEIGHBOURS):
+    for other in nearest_views(object_map.keyframes, pose, _MAX_COMBINED):
         pairs = match(keypoints, other.keypoints)
         names = other.keypoint_landmark[pairs[:, 1]]
         pairs, names = pairs[names >= 0], names[names >= 0]
         pixel = keypoints.pixel[pairs[:, 0]]
         gap = np.linalg.norm(project_points(object_map.landmarks[names], pose, camera) - pixel, axis=1)
         first = np.unique(names, return_index=True)[1]
-        near = first[gap[first] < _JOINED * scale]
+        near = first[gap[first] < _MAX_REPROJECTION_ERROR * scale]
         together = together.concatenate(FollowedPoints(names[near], pixel[near]))
     better = pose_of_points(object_map, camera, together, scale)
     return (pose, points) if better is None or len(better[1]) < len(points) else better
 
 
 def by_outline(surface: Surface, camera: Camera, view: Keyframe, weights: PoseWeights) -> list[Pose]:
-    """The poses, all around, whose outlines and pixels fit a frame's mask best; there must be one.
+    """The poses, among all rotations, whose outlines and pixels fit a frame's mask best; at least one.
 
     Args:
         surface: The object.
-        camera: Of the full frame.
+        camera: The camera of the full frame.
         view: The frame.
-        weights: Of the kinds of evidence.
+        weights: The weights of the kinds of evidence.
     """
     assert view.mask is not None
     poses = _align_candidates(surface, camera, view.mask)
@@ -118,7 +119,7 @@ def _cost(fit: PoseFit) -> float:
 
 
 def _align_candidates(surface: Surface, camera: Camera, mask: NDArray[np.bool_]) -> list[Pose]:
-    """Rotations all around, each put where the box of its outline is the mask's; none whose box has another form."""
+    """Rotations all around, each aligned by its outline's box with the mask's; none whose aspect ratio differs."""
     left, top, width, height = mask_box(mask)
     middle = np.array([left + (width - 1) / 2 - camera.cx, top + (height - 1) / 2 - camera.cy])
     vertices = surface.vertices.double().cpu().numpy()
@@ -128,7 +129,7 @@ def _align_candidates(surface: Surface, camera: Camera, mask: NDArray[np.bool_])
     placed = np.einsum("nij,vj->nvi", R[:, :2], vertices)
     low, high = placed.min(1), placed.max(1)
     form = np.maximum(high - low, 1e-6)
-    alike = np.abs(np.log(form[:, 0] / form[:, 1] * height / width)) < _UNLIKE
+    alike = np.abs(np.log(form[:, 0] / form[:, 1] * height / width)) < _MAX_ASPECT_DIFFERENCE
     depth = np.sqrt(camera.fx * form[:, 0] / width * camera.fy * form[:, 1] / height)[:, None]
     shift = depth * middle / [camera.fx, camera.fy] - 0.5 * (low + high)
     t = np.concatenate([shift, depth], 1)

@@ -1,7 +1,7 @@
-"""The map of an object that is known before the video begins: what it looks like from all sides, drawn.
+"""The map of an object that is known before the video begins, rendered from all sides.
 
-Every side that is drawn becomes a keyframe, whose keypoints are points of the surface; from then on the object is
-tracked as one that the solver has got to know by itself, but for its shape, which is held.
+Every rendered side becomes a keyframe whose keypoints are points of the surface; from then on the object is tracked
+like any other, except that its shape is fixed.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ SIDES = 42
 """Directions that the object is drawn from: neighbours are about 33 degrees apart, so no view of it is farther than
 about 20 from one of them, which keypoints bridge."""
 _PICTURE = 320  # pixels
-_FINER = 2  # times, for drawing, so that nothing is jagged
+_SUPERSAMPLING = 2  # times, for drawing, so that nothing is jagged
 _FIELD_OF_VIEW = 30.0
 _FILLED = 0.85  # of the picture, by the sphere around the object
-_MOST_TEXELS = 1024  # along a side of the texture that is drawn
-_WITHIN = 3  # pixels that keypoints stay away from what was never seen
-_TRUST = 3.0  # what the known colours count, in views of the new video that show them head-on
+_MAX_TEXELS = 1024  # along a side of the texture that is drawn
+_MARGIN = 3  # pixels that keypoints stay away from what was never seen
+_TEXTURE_WEIGHT = 3.0  # weight of the known texture, in views of the new video that show it head-on
 _FINEST_TEXELS, _TEXELS_OF_A_FACE = 512, 4.0
 
 
@@ -66,7 +66,7 @@ class RenderedSide:
 def map_of_known_object(
     known: KnownObject, config: PipelineConfig, encoder: FeatureEncoder, device: torch.device
 ) -> tuple[ObjectMap, FeatureSpace | None]:
-    """The map, and what is made of the encoder's features; None where no colours are known to tell that.
+    """The map and the feature space; None for the latter if no known colours determine it.
 
     Args:
         known: The object.
@@ -141,12 +141,16 @@ def render_side(
     Args:
         shape: The object.
         colours: ``(4, T, T)`` RGB in [0, 1], and 1 where it is known, else 0.
-        pose: Of the object.
+        pose: The pose of the object.
         camera: Square.
         renderer: See `tracking3d.rendering.backend`.
     """
-    size = _FINER * camera.width
-    fine = _FINER * camera.fx, (camera.cx + 0.5) * _FINER - 0.5, (camera.cy + 0.5) * _FINER - 0.5
+    size = _SUPERSAMPLING * camera.width
+    fine = (
+        _SUPERSAMPLING * camera.fx,
+        (camera.cx + 0.5) * _SUPERSAMPLING - 0.5,
+        (camera.cy + 0.5) * _SUPERSAMPLING - 0.5,
+    )
     K = colours.new_tensor([[fine[0], 0, fine[1]], [0, fine[0], fine[2]], [0, 0, 1]])
     screen, depth = project(shape.rest, pose.R[None], pose.translation[None], K[None])
     face_index = rasterize(screen, depth, shape.faces, (size, size), renderer).face_index
@@ -171,7 +175,11 @@ def render_side(
         return np.asarray(cv2.resize(values, side, interpolation=cv2.INTER_AREA), dtype=np.float32)
 
     # The centre of a pixel is where four finer ones meet; none of them may lie beside the object.
-    corners_of = [points[row::_FINER, column::_FINER] for row in range(_FINER) for column in range(_FINER)]
+    corners_of = [
+        points[row::_SUPERSAMPLING, column::_SUPERSAMPLING]
+        for row in range(_SUPERSAMPLING)
+        for column in range(_SUPERSAMPLING)
+    ]
     return RenderedSide(
         (255 * reduced(picture)).round().clip(0, 255).astype(np.uint8),
         reduced(covered.astype(np.float32)) > 0.5,
@@ -184,7 +192,7 @@ def _with_points(
     learnt: ObjectMap, camera: Camera, view: Keyframe, drawing: RenderedSide
 ) -> tuple[ObjectMap, Keyframe]:
     """With landmarks at a drawn side's keypoints, exactly on the surface."""
-    kernel = np.ones((2 * _WITHIN + 1, 2 * _WITHIN + 1), np.uint8)
+    kernel = np.ones((2 * _MARGIN + 1, 2 * _MARGIN + 1), np.uint8)
     inside = cv2.erode((drawing.known & drawing.mask).astype(np.uint8), kernel) > 0
     keypoints = detect(grey(drawing.image), inside)
     before = len(learnt.landmarks)
@@ -198,7 +206,7 @@ def _with_points(
 
 
 def _sample_surface(points: NDArray[np.float32], pixel: NDArray[np.float32]) -> NDArray[np.float64]:
-    """``(N, 3)`` of ``points`` ``(S, S, 3)`` between four pixels; nan where one of those is."""
+    """``(N, 3)`` of ``points`` ``(S, S, 3)`` between four pixels; nan if one of those is."""
     low = np.floor(pixel).astype(int).clip(0, len(points) - 2)
     (x, y), (right, down) = low.T, (pixel - low).T[..., None]
     upper = (1 - right) * points[y, x] + right * points[y, x + 1]
@@ -212,7 +220,7 @@ def _colours(object_map: KnownObject) -> Tensor:
     seen = (object_map.model.texture_weight > 0).astype(np.float32)
     layers = np.concatenate([texture * seen[..., None], seen[..., None]], 2)
     height, width = seen.shape
-    shrink = _MOST_TEXELS / max(height, width)
+    shrink = _MAX_TEXELS / max(height, width)
     if shrink < 1:
         size = max(round(shrink * width), 1), max(round(shrink * height), 1)
         layers = cv2.resize(layers, size, interpolation=cv2.INTER_AREA)
@@ -251,7 +259,7 @@ def _texture(
             space.project(observation.features), _trusted_texture(view, drawing), rest, learnt.shape.faces,
             learnt.texels, view.pose.R, view.pose.translation, observation.K, learnt.renderer,
         )  # fmt: skip
-    counted = _TRUST * (total.weight > 0)
+    counted = _TEXTURE_WEIGHT * (total.weight > 0)
     return BackProjection(total.mean() * counted, counted)
 
 

@@ -1,4 +1,4 @@
-"""The online solver for an object that is known: it is looked for instead of got to know, and then tracked as any."""
+"""The online solver for a known object: the object is detected instead of initialized, and then tracked as usual."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class KnownObjectSolver(OnlineSolver):
-    """Tracks what is known; answers are in the object's own coordinates and unit.
+    """Tracks a known object; estimates are in the object's own coordinates and unit.
 
-    Until the object is found in a frame, frames are answered as lost, and each is searched. From then on it is the
-    online solver, on a map whose shape is held.
+    Until the object is detected, frames are estimated as lost, and each is searched. From then on it is the online
+    solver, on a map whose shape is fixed.
 
     Attributes:
         known_object: The object.
@@ -97,7 +97,7 @@ class KnownObjectSolver(OnlineSolver):
     def restart_backwards(
         self, state: SolverState, frame: Frame, number: int, T_cam_obj: NDArray[np.float64]
     ) -> SolverState:
-        """The belief that goes on from a frame seen long ago; see `user_guidance.restart_backwards`."""
+        """The state that continues from an earlier frame; see `user_guidance.restart_backwards`."""
         turned = restart_backwards(state, frame, number, self.known_object.to_solver(T_cam_obj))
         return turned if state.trajectory else replace(turned, trajectory=())
 
@@ -110,7 +110,7 @@ class KnownObjectSolver(OnlineSolver):
     def _sought(
         self, state: SolverState, frame: Frame, mask: NDArray[np.bool_] | None
     ) -> tuple[SolverState, FrameEstimate]:
-        """Look for the object in a frame, and begin with it where it is found."""
+        """Search for the object in a frame, and initialize with it if it is found."""
         image = grey(frame.image)
         state = self._with_space(state, frame, mask)
         found = self._match_views(state, frame, image, mask)
@@ -144,7 +144,7 @@ class KnownObjectSolver(OnlineSolver):
     def _match_views(
         self, state: SolverState, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
     ) -> PoseCandidate | None:
-        """The object in a frame of which nothing else is known; None where nothing looks like it."""
+        """The object in a frame without any prior; None if no keypoints match."""
         attempts: list[PoseCandidate] = []
         for region in (mask, None) if mask is not None else (None,):
             if self.known_object.has_colours and not _is_sure(attempts):
@@ -175,7 +175,7 @@ class KnownObjectSolver(OnlineSolver):
         pose: Pose,
         points: FollowedPoints,
     ) -> PoseCandidate:
-        """What comes of a pose that was found in some way."""
+        """The pose candidate from a pose that was found in some way."""
         object_map, camera = state.object_map, state.camera
         if mask is not None and not overlaps_mask(object_map.silhouette(pose, camera), mask):
             mask = None
@@ -187,7 +187,7 @@ class KnownObjectSolver(OnlineSolver):
         return PoseCandidate(view, fit, origin, kept, support, assessment)
 
     def _with_space(self, state: SolverState, frame: Frame, mask: NDArray[np.bool_] | None) -> SolverState:
-        """The belief with the features of an object whose colours the first frame with a mask tells first."""
+        """The state with the features of an object whose colours only the first frame with a mask determines."""
         if state.feature_space is not None or mask is None or not mask.any():
             return state
         seen = self._observe(state, frame, mask, state.last_pose[0])
@@ -195,7 +195,7 @@ class KnownObjectSolver(OnlineSolver):
         return replace(state, feature_space=FeatureSpace.of(seen.features, seen.mask, channels))
 
     def _warn_of_lens(self) -> None:
-        """Tell the log where the lens is assumed though the object was learnt with another."""
+        """Log a warning if the focal length is assumed although the object was learnt with another."""
         earlier = self.known_object.camera
         if self.camera.assumed and earlier is not None and earlier.known:
             _log.warning(
@@ -211,12 +211,12 @@ def _is_sure(attempts: list[PoseCandidate]) -> bool:
 
 
 def _too_little(found: PoseCandidate) -> bool:
-    """Whether a few points alone say where it is: no mask bears them out, and they may lie in one spot."""
+    """Whether only a few points support the pose: no mask confirms it, and they may lie in one spot."""
     enough = found.evidence.inliers >= _ENOUGH_ALONE and found.fit.unseen < _MOSTLY_SEEN
     return found.view.mask is None and found.doubtful and not enough
 
 
 def _unseen(estimate: FrameEstimate, found: PoseCandidate | None = None) -> FrameEstimate:
-    """The answer while the object has not been seen, and what spoke most against what was found."""
+    """The estimate before the object has been seen, and what spoke most against the candidate."""
     why = "" if found is None or not found.view.observation.has_mask else f": {found.assessment.reason}"
     return replace(estimate, status=Status.LOST, reason=NOT_SEEN + why, confidence=0.05)

@@ -1,9 +1,9 @@
-"""Points beside the mask that move with the object: they belong to it, and say where the mask is too small.
+"""Candidate landmarks: points outside the mask that move with the object, and so show where the mask is too small.
 
-Corners around the mask are followed like the object's own. Once a few keyframes show one, it is triangulated with
-their poses: a point of the object fits them and has moved in the image; one of the background fits only while
-nothing moves. Where the object stands still and the camera moves, everything fits: then nobody is recruited, but
-candidates tell the pose.
+Corners around the mask are tracked like the object's own. Once a few keyframes show one, it is triangulated with their
+poses. A point of the object fits them and has moved in the image; one of the background fits only while nothing moves.
+If the object is still and the camera moves, everything fits: then no candidate becomes part of the object, but the
+candidates constrain the pose.
 """
 
 from __future__ import annotations
@@ -23,21 +23,25 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import pose_arrays
 
 MOST_CANDIDATES = 100
-_REACH = 0.25  # how far beside the mask, relative to the root of its area
+_BAND_WIDTH = 0.25  # width of the band around the mask, relative to the root of its area
 _VIEWS = 3
-_FITS, _FAILS = 1.0, 2.5  # mean residual in pixels of an object 200 pixels large
-_MOVED = 6.0  # such pixels
-_STAYS = 0.3  # of the way that the object would have carried it
-_SECTORS = 8  # that the surroundings are divided into
-_STILL = (
-    0.6  # share of the candidates of a sector, and of the sectors, that fit where the scene is a still one
-)
-_FEWEST_SECTORS, _FEWEST = 5, 3  # sectors that tell, and candidates that make one tell
+_MAX_INLIER_RESIDUAL, _MIN_OUTLIER_RESIDUAL = (
+    1.0,
+    2.5,
+)  # mean residual in pixels at an object size of 200 pixels
+_MIN_MOTION = 6.0  # such pixels
+_MAX_STATIC_MOTION = 0.3  # share of the motion that the object would have caused
+_SECTORS = 8  # directions into which the surroundings are divided
+_STATIC_SHARE = 0.6  # share of a sector's candidates, and of the sectors, that fit if the scene is static
+_MIN_SECTORS, _MIN_CANDIDATES = (
+    5,
+    3,
+)  # fewest sectors that can be tested, and fewest candidates of such a sector
 
 
 def surroundings(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """``(H, W)`` the band around a mask."""
-    reach = max(round(_REACH * float(np.sqrt(mask.sum()))), 3)
+    reach = max(round(_BAND_WIDTH * float(np.sqrt(mask.sum()))), 3)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     return (cv2.dilate(mask.astype(np.uint8), kernel) > 0) & ~mask
 
@@ -45,7 +49,7 @@ def surroundings(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def with_candidates(
     object_map: ObjectMap, view: Keyframe, image: NDArray[np.uint8]
 ) -> tuple[ObjectMap, Keyframe]:
-    """With corners beside a view's mask."""
+    """Add corners around a view's mask as candidate landmarks."""
     if view.mask is None:
         return object_map, view
     there = int(object_map.candidate[view.points.landmark].sum())
@@ -63,7 +67,7 @@ def with_candidates(
 
 
 def promote_candidates(object_map: ObjectMap, camera: Camera, positions: list[int]) -> ObjectMap:
-    """Take candidates over as landmarks, or drop them, where the keyframes at ``positions`` can tell."""
+    """Promote candidates to landmarks, or drop them, if the keyframes at ``positions`` show which they are."""
     views = [object_map.keyframes[position] for position in positions]
     names, counts = np.unique(np.concatenate([view.points.landmark for view in views]), return_counts=True)
     names = names[(counts >= 2) & object_map.candidate[names]]
@@ -81,31 +85,33 @@ def promote_candidates(object_map: ObjectMap, camera: Camera, positions: list[in
     found = adjust(tracks, camera.K, start, fixed=len(views), scale=scale, iterations=8)
     known_residual = np.isfinite(found.residual)
     total = np.where(known_residual, found.residual, 0.0).sum(0)
-    # A point that ends behind every camera has no residual, and fits nothing.
+    # A point that ends up behind every camera has no residual, and fits nothing.
     residual = np.divide(
         total / scale, known_residual.sum(0), out=np.full(len(names), np.inf), where=known_residual.any(0)
     )
     motion = np.nanmax(np.linalg.norm(tracks.pixels - pixel, axis=2), 0) / scale
-    # A point that stays while the object would have carried it along is none of it.
+    # A point that stays although the object would have moved it is not on the object.
     carried = np.linalg.norm(
         project_camera_points(transform_to_camera(R, t, start.points), camera.K) - pixel, axis=2
     )
     carried = np.nanmax(np.where(tracks.visible, carried, np.nan), 0) / scale
-    stays = (carried > _MOVED) & (motion < _STAYS * carried)
+    stays = (carried > _MIN_MOTION) & (motion < _MAX_STATIC_MOTION * carried)
     near = (
         np.linalg.norm(found.points - object_map.vertices.mean(0).cpu().numpy(), axis=1)
         < 1.6 * object_map.radius
     )
     enough = tracks.visible.sum(0) >= _VIEWS
-    accepted = enough & (residual < _FITS) & (motion > _MOVED) & near & ~stays
-    rejected = stays | (enough & ((residual > _FAILS) | ~near) & (motion > _MOVED))
+    accepted = enough & (residual < _MAX_INLIER_RESIDUAL) & (motion > _MIN_MOTION) & near & ~stays
+    rejected = stays | (enough & ((residual > _MIN_OUTLIER_RESIDUAL) | ~near) & (motion > _MIN_MOTION))
     rejected |= (tracks.visible.sum(0) >= 2 * _VIEWS) & ~accepted
-    told = enough & (motion > _MOVED)
-    beside = object_map.candidates_around + _by_sector(views, first, pixel, told, residual < _FITS)
+    told = enough & (motion > _MIN_MOTION)
+    beside = object_map.candidates_around + _by_sector(
+        views, first, pixel, told, residual < _MAX_INLIER_RESIDUAL
+    )
     around = np.zeros_like(accepted)
     if is_static_scene(beside):
-        # They tell the pose as well as the object's own points do, but nothing of its shape or mask.
-        around, accepted = told & (residual < _FITS), np.zeros_like(accepted)
+        # They constrain the pose as well as the object's own points do, but not its shape or mask.
+        around, accepted = told & (residual < _MAX_INLIER_RESIDUAL), np.zeros_like(accepted)
         rejected = (told | (tracks.visible.sum(0) >= 2 * _VIEWS)) & ~around
     landmarks, candidate = object_map.landmarks.copy(), object_map.candidate.copy()
     placed = accepted | around
@@ -122,18 +128,18 @@ def promote_candidates(object_map: ObjectMap, camera: Camera, positions: list[in
 
 
 def is_static_scene(beside: NDArray[np.int64]) -> bool:
-    """Whether what is all around the object moves as it does: it stands still, and the camera moves.
+    """Whether everything around the object moves with it: then the object is still, and the camera moves.
 
-    A mask that is too small has points of the object beside it on some sides, and so has one beside a hand.
+    A mask that is too small has points of the object outside it on some sides only, as has one next to a hand.
 
     Args:
-        beside: ``(S, 2)`` candidates in each sector around the object that could be told, and that fit its motion.
+        beside: ``(S, 2)`` candidates in each sector around the object: those that could be tested, and those that fit.
     """
     told, fit = beside.T
-    tells = told >= _FEWEST
-    if tells.sum() < _FEWEST_SECTORS:
+    tells = told >= _MIN_CANDIDATES
+    if tells.sum() < _MIN_SECTORS:
         return False
-    return bool((fit[tells] > _STILL * told[tells]).mean() > _STILL)
+    return bool((fit[tells] > _STATIC_SHARE * told[tells]).mean() > _STATIC_SHARE)
 
 
 def _by_sector(
@@ -143,7 +149,7 @@ def _by_sector(
     told: NDArray[np.bool_],
     fits: NDArray[np.bool_],
 ) -> NDArray[np.int64]:
-    """``(S, 2)`` candidates in each direction from the middle of the mask, that can be told and that fit."""
+    """``(S, 2)`` candidates in each direction from the mask's centre: those tested, and those that fit."""
     counts = np.zeros((_SECTORS, 2), np.int64)
     for number in np.unique(first[told]):
         mask = views[number].mask

@@ -1,6 +1,6 @@
-"""The map with depth the other way round, where its keyframes are explained better so.
+"""Reverses the map's depth if that explains its keyframes better.
 
-The start chooses between the two; where little turning tells them apart it can be the wrong one. See
+The initialization chooses between the two reversals; after a small rotation its choice can be wrong. See
 `tracking3d.bundle_adjustment.reversal`.
 """
 
@@ -26,28 +26,30 @@ from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, pose_from_arrays
 
-_FEWEST_LANDMARKS = 12
-_FEWEST_KEYFRAMES = 4
-_BETTER = 0.97
-"""Share of the cost up to which the other way round is the better one. In runs that were right it was 1.02 and more at
-each of some 200 keyframes (suites ``fresh`` of seeds 501, 602 and 9303), in wrong ones .81 to 1.04."""
-_MOST_TURNED = 100.0  # degrees; what has shown more of its sides cannot be the other way round
+_MIN_LANDMARKS = 12
+_MIN_KEYFRAMES = 4
+_MAX_COST_RATIO = 0.97
+"""Cost ratio up to which the reversal is accepted. In correct runs the ratio was 1.02 and more at each of some 200
+keyframes (suites ``fresh`` of seeds 501, 602 and 9303), in wrong ones .81 to 1.04."""
+_MAX_ROTATION = 100.0  # degrees; an object that has shown more of its sides cannot be reversed
 _ALWAYS_TRIED = 12
-"""Keyframes up to which it is tried at each. Later, when there are this many more, or have turned by so much more:
-trying costs as much as bundling all keyframes, and keyframes that show the same again tell nothing new."""
+"""Keyframes up to which a reversal is tried at each. Later it is tried after this many more, or as much more rotation:
+it costs as much as bundle adjustment of all keyframes, and similar keyframes add no evidence."""
 _MORE_KEYFRAMES, _MORE_TURNED = 1.25, 4.0
 _ITERATIONS = 20
-_HELD = 0.05  # what a landmark at distance 1 from its place costs: the wrong way round has bent the surface
+_LANDMARK_PRIOR = (
+    0.05  # cost of a landmark at distance 1 from the surface: the wrong reversal has bent the surface
+)
 _SCALE = 1.0  # pixels
 
 
 def fix_depth_reversal(state: SolverState, config: OnlineConfig) -> SolverState:
-    """The belief with depth the other way round where that explains the keyframes better, else as it is."""
+    """The state with its depth reversed if that explains the keyframes better, else unchanged."""
     object_map, views = state.object_map, state.object_map.keyframes
-    if object_map.fixed_keyframes or object_map.pointless or len(views) < _FEWEST_KEYFRAMES:
+    if object_map.fixed_keyframes or object_map.pointless or len(views) < _MIN_KEYFRAMES:
         return state
     turned = max(viewing_angle(views[0].pose, view.pose) for view in views)
-    if turned > _MOST_TURNED or not _due(state.reversal_attempt, len(views), turned):
+    if turned > _MAX_ROTATION or not _due(state.reversal_attempt, len(views), turned):
         return state
     better = _better_reversal(object_map, state.camera)
     if better is None:
@@ -70,7 +72,7 @@ def fix_depth_reversal(state: SolverState, config: OnlineConfig) -> SolverState:
 
 
 def _due(tried: tuple[int, float], keyframes: int, turned: float) -> bool:
-    """Whether enough is new since it was tried last."""
+    """Whether enough has changed since the last attempt."""
     return (
         keyframes <= _ALWAYS_TRIED
         or keyframes >= _MORE_KEYFRAMES * tried[0]
@@ -79,26 +81,26 @@ def _due(tried: tuple[int, float], keyframes: int, turned: float) -> bool:
 
 
 def _better_reversal(object_map: ObjectMap, camera: Camera) -> tuple[Reversal, ObjectMap] | None:
-    """The reversal and the map that it makes, where that explains the keyframes better."""
+    """The reversal and the map after it, if that explains the keyframes better."""
     views = list(object_map.keyframes)
     names = shared_landmarks(object_map, views)
     names = names[np.isfinite(object_map.landmarks[names]).all(1)]
-    if len(names) < _FEWEST_LANDMARKS:
+    if len(names) < _MIN_LANDMARKS:
         return None
     tracks, start = tracks_of(views, names), structure_of(object_map, views, names)
     T = np.stack([view.pose.matrix().numpy() for view in views])
-    # The first keyframe's pose never moves.
+    # The first keyframe's pose is fixed.
     reversal = reversal_of(start.points, T[0])
     T = reversal.poses(T)
     other = Structure(T[:, :3, :3], T[:, :3, 3], reversal.points(start.points))
     as_it_is, found = (
         adjust(
             tracks, camera.K, one, fixed=1, scale=_SCALE, iterations=_ITERATIONS,
-            point_prior=one.points, point_prior_weight=_HELD,
+            point_prior=one.points, point_prior_weight=_LANDMARK_PRIOR,
         )
         for one in (start, other)
     )  # fmt: skip
-    if found.cost > _BETTER * as_it_is.cost:
+    if found.cost > _MAX_COST_RATIO * as_it_is.cost:
         return None
     landmarks = reversal.points(object_map.landmarks)
     landmarks[names] = found.points

@@ -1,7 +1,7 @@
-"""The focal length, where nobody gave it: hypotheses for the start, and solved with poses and points later on.
+"""The focal length if it is not given: hypotheses for the initialization, later estimated with poses and points.
 
-A wrong lens makes the object turn too little or too much. Several lenses are tried, since the cost has a valley at
-each, and the one at hand stays unless another explains the points clearly better.
+A wrong focal length makes the object rotate too little or too much. Several are tried, since the cost has a local
+minimum near each; the current one stays unless another explains the points clearly better.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from tracking3d.geometry.pose import Pose, pose_from_arrays
 
 CANDIDATES = (10.0, 25.0, 45.0, 65.0)
 """Vertical fields of view in degrees."""
-_AT_THE_START = (9.0, 16.0, 27.0, 65.0)  # beside the assumed one
-_CLEARLY = 0.08  # share of the cost that a lens twice as long or short has to take off; nearer ones less
-_SAME = math.log(1.05)  # focal lengths so near are one
+_INITIAL_FIELDS_OF_VIEW = (9.0, 16.0, 27.0, 65.0)  # besides the assumed one
+_MIN_GAIN = 0.08  # relative gain required of twice or half the focal length; less for nearer ones
+_SAME_FOCAL_LENGTH = math.log(1.05)  # focal lengths within this ratio are the same
 _ITERATIONS = 25
-_FEWEST = 30  # landmarks
+_MIN_LANDMARKS = 30  # landmarks
 
 
 def lens_hypotheses(camera: Camera) -> tuple[Camera, ...]:
-    """The cameras that a start is solved with, the assumed one first: only it where somebody gave the lens."""
+    """The cameras of the initialization, the assumed one first; only that one if the focal length is given."""
     if not camera.assumed:
         return (camera,)
     others = [
@@ -37,13 +37,13 @@ def lens_hypotheses(camera: Camera) -> tuple[Camera, ...]:
             Camera.from_fov(camera.width, camera.height, degrees).fy / camera.fy,
             f"field of view of {degrees:g} degrees, the likeliest of those tried",
         )
-        for degrees in _AT_THE_START
+        for degrees in _INITIAL_FIELDS_OF_VIEW
     ]
     return (camera, *others)
 
 
 def with_focal_length(view: Keyframe, before: Camera, after: Camera) -> Keyframe:
-    """A view as another lens would have taken it: the image stays, the object's depth goes with the focal length."""
+    """A view as seen with another focal length: the image stays, the depth scales with the focal length."""
     factor = after.fy / before.fy
     K = view.observation.K.clone()
     K[0, 0], K[1, 1] = factor * K[0, 0], factor * K[1, 1]
@@ -53,7 +53,7 @@ def with_focal_length(view: Keyframe, before: Camera, after: Camera) -> Keyframe
 
 
 def lens_change(factor: float) -> float:
-    """How far another focal length is, in [0, 1]: 1 is twice as long or short, or more."""
+    """How far two focal lengths are apart, in [0, 1]: 1 is a factor of two or more."""
     return min(abs(math.log2(factor)), 1.0)
 
 
@@ -62,11 +62,11 @@ def solve_lens(object_map: ObjectMap, camera: Camera) -> tuple[ObjectMap, Camera
 
     Args:
         object_map: The map.
-        camera: Of the full frame, assumed.
+        camera: The camera of the full frame, with the assumed focal length.
     """
     views = list(object_map.keyframes)
     names = shared_landmarks(object_map, views)
-    if len(names) < _FEWEST:
+    if len(names) < _MIN_LANDMARKS:
         return object_map, camera
     tracks, start = tracks_of(views, names), structure_of(object_map, views, names)
     kept = adjust(tracks, camera.K, start, iterations=_ITERATIONS)
@@ -78,7 +78,10 @@ def solve_lens(object_map: ObjectMap, camera: Camera) -> tuple[ObjectMap, Camera
     tried = [one for one in tried if _is_a_lens(one.focal_factor, camera)]
     best = min(tried, key=lambda one: one.cost, default=kept)
     change = lens_change(best.focal_factor)
-    if abs(math.log(best.focal_factor)) < _SAME or best.cost > (1 - _CLEARLY * change) * kept.cost:
+    if (
+        abs(math.log(best.focal_factor)) < _SAME_FOCAL_LENGTH
+        or best.cost > (1 - _MIN_GAIN * change) * kept.cost
+    ):
         return object_map, camera
     return _with_lens(object_map, camera, names, best)
 

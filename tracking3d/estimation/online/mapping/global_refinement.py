@@ -1,4 +1,4 @@
-"""All keyframes together once more, and the lens where nobody gave it; kept only if that explains them better."""
+"""Refines all keyframes together, and the focal length if it is not given; kept only if the rendering cost falls."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from tracking3d.estimation.online.state.object_map import ObjectMap
 from tracking3d.geometry.camera import Camera
 
 _PASSES = 3
-_LENS_CHARGE = 0.01
-"""Cost by which a lens twice as long or short has to explain the keyframes better than the one at hand."""
+_FOCAL_LENGTH_PENALTY = 0.01
+"""Cost by which twice or half the focal length must explain the keyframes better than the current one."""
 
 
 def refine_globally(object_map: ObjectMap, camera: Camera, config: OnlineConfig) -> tuple[ObjectMap, Camera]:
-    """The map and the camera that re-render the keyframes best: as they are, refined, or refined with a solved lens.
+    """The map and the camera with the least rendering cost: unchanged, refined, or refined with the focal length.
 
-    Points fit better with every freedom that they are given; what is drawn does so only where it is true. Without
-    that brake a refinement can end worse than it began. A map whose shape is held stays as it is.
+    Reprojection errors fall with every additional unknown; the rendering cost falls only if the map gets better.
+    Without this check a refinement can end worse than it began. A map with a fixed shape stays unchanged.
 
     Args:
         object_map: The map.
-        camera: Of the full frame; another lens is tried where it is assumed.
-        config: Of the solver.
+        camera: The camera of the full frame; if its focal length is assumed, another one is tried.
+        config: The solver's options.
     """
     if object_map.fixed_keyframes:
         return object_map, camera
@@ -35,13 +35,13 @@ def refine_globally(object_map: ObjectMap, camera: Camera, config: OnlineConfig)
         with_lens, solved = solve_lens(object_map, camera)
         if solved != camera:
             cost, better, _ = _refine_with_lens(with_lens, solved, config)
-            tried.append((cost + _LENS_CHARGE * lens_change(solved.fy / camera.fy), better, solved))
+            tried.append((cost + _FOCAL_LENGTH_PENALTY * lens_change(solved.fy / camera.fy), better, solved))
     _, object_map, camera = min(tried, key=lambda one: one[0])
     return object_map, camera
 
 
 def keyframe_cost(object_map: ObjectMap) -> float:
-    """What the keyframes cost at their poses, in the mean: pixels, outlines, and what is missed of the masks."""
+    """The mean cost of the keyframes at their poses: pixels, outlines, and uncovered parts of the masks."""
     surface = object_map.surface()
     costs = []
     for view in object_map.keyframes:

@@ -1,4 +1,4 @@
-"""What the map keeps: a bounded number of keyframes, and the landmarks that something still refers to."""
+"""Bounds the map: a maximum number of keyframes, and only landmarks that are still referenced."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from tracking3d.geometry.pose import rotation_angle
 
 
 def cull_keyframes(keyframes: tuple[Keyframe, ...], most: int) -> tuple[Keyframe, ...]:
-    """At most so many: of the two older ones most alike the later goes; the first and the recent half stay."""
+    """At most ``most`` keyframes: the later of the two most similar older ones goes; the first and recent half stay."""
     kept = list(keyframes)
     while len(kept) > most:
         older = kept[: max(len(kept) - most // 2, 2)]
-        # Were they asked about later ones, each would go as it leaves the recent half, and nothing be kept between.
+        # Compared with later ones, each would go as it leaves the recent half, and none between would be kept.
         gaps = [
             min(
                 float(rotation_angle(older[place].pose.quaternion, other.pose.quaternion))
@@ -30,7 +30,7 @@ def cull_keyframes(keyframes: tuple[Keyframe, ...], most: int) -> tuple[Keyframe
 
 
 def prune_landmarks(object_map: ObjectMap, followed: FollowedPoints) -> tuple[ObjectMap, FollowedPoints]:
-    """Without landmarks that no keyframe shows and that are not followed; all are numbered anew."""
+    """The map without landmarks that no keyframe shows and no tracked point belongs to; the rest are renumbered."""
     used = np.zeros(len(object_map.landmarks), bool)
     used[followed.landmark] = True
     for view in object_map.keyframes:

@@ -1,4 +1,4 @@
-"""A frame's way into the map: its points become landmarks, and the map is refined with it."""
+"""Inserts a frame into the map: its points become landmarks, and the map is refined with it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tracking3d.geometry.pose import rotation_angle
 _FEW_INLIERS = 40  # inliers below which a frame becomes a keyframe for the sake of new points
 _MIN_INTERVAL = 3  # frames between two such keyframes
 _MIN_OVERLAP = 0.8  # IoU with the mask from which a frame without inliers can be a keyframe
-_MOST_WITHOUT_POINTS = 15
+_MAX_KEYFRAMES_WITHOUT_POINTS = 15
 
 
 def needs_keyframe(object_map: ObjectMap, found: PoseCandidate, config: OnlineConfig) -> bool:
@@ -42,12 +42,12 @@ def needs_keyframe(object_map: ObjectMap, found: PoseCandidate, config: OnlineCo
 def insert_points(
     object_map: ObjectMap, camera: Camera, view: Keyframe, image: NDArray[np.uint8]
 ) -> tuple[ObjectMap, Keyframe]:
-    """With landmarks at a view's keypoints and corners, and candidates beside its mask.
+    """Add landmarks at a view's keypoints and corners, and candidate landmarks around its mask.
 
     Args:
         object_map: The map.
-        camera: Of the full frame.
-        view: With its pose and the points that were followed into it.
+        camera: The camera of the full frame.
+        view: The view with its pose and the points tracked into it.
         image: ``(H, W)`` grey.
     """
     if object_map.pointless:
@@ -63,7 +63,7 @@ def insert_points(
 def insert_keyframe(
     object_map: ObjectMap, camera: Camera, view: Keyframe, image: NDArray[np.uint8], config: OnlineConfig
 ) -> tuple[ObjectMap, FollowedPoints]:
-    """The map with a view as a new keyframe, refined over a window; and the points to follow from it."""
+    """The map with a view as a new keyframe, refined over the local window, and the points to track from it."""
     object_map, view = insert_points(object_map, camera, view, image)
     drawn, filmed = (
         object_map.keyframes[: object_map.fixed_keyframes],
@@ -85,16 +85,16 @@ def refine_local_map(
     bundle_iterations: int,
     rounds: int,
 ) -> ObjectMap:
-    """Candidates taken over or dropped, then poses, landmarks and shape refined; see `refine_map`.
+    """Promote or drop candidate landmarks, then refine poses, landmarks and shape; see `refine_map`.
 
-    Of an object whose shape is held nothing is, but what the newest view shows of its texture is taken.
+    If the object's shape is fixed, only the newest view's texture is added.
     """
     if object_map.fixed_keyframes:
         newest = object_map.keyframes[-1]
         newest = replace(newest, texture=object_map.back_project(newest.observation.features, newest))
         return replace(object_map, keyframes=(*object_map.keyframes[:-1], newest))
     if object_map.pointless:
-        recent = list(range(len(object_map.keyframes)))[-_MOST_WITHOUT_POINTS:]
+        recent = list(range(len(object_map.keyframes)))[-_MAX_KEYFRAMES_WITHOUT_POINTS:]
         return refine_without_points(
             object_map, sorted({0, *recent}), FitWeights(smoothness=config.smoothness)
         )

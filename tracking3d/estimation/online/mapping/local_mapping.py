@@ -26,12 +26,12 @@ from tracking3d.rendering import project as project_vertices
 from tracking3d.rendering import rasterize
 
 FloatArray = NDArray[np.float64]
-_SAME_PLACE = 1.5  # pixels within which a keypoint is a point that is followed
-_FEWEST_WITNESSES = 12
-_FEWEST_BUNDLED = 8
-_MOST_BUNDLED = 1500
-_FINER = 4  # times, that a surface is drawn which stays as it is
-_SEARCH = 12.0  # pixels around its projection within which a landmark may be found again
+_SAME_PLACE = 1.5  # pixels within which a keypoint is the same as a tracked point
+_MIN_INLIERS = 12
+_MIN_ADJUSTED = 8
+_MAX_ADJUSTED = 1500
+_UPSAMPLING = 4  # supersampling for a surface that is fixed
+_MATCH_RADIUS = 12.0  # pixels around its projection within which a landmark is matched
 
 
 def lift_pixels(
@@ -39,10 +39,10 @@ def lift_pixels(
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Surface points ``(N, 3)`` at pixels ``(N, 2)`` of the full frame, and which pixels meet the surface.
 
-    The depth is that of the window's nearest drawn pixel; of a surface that is held it is drawn finer, since no
-    bundle adjustment puts its points right.
+    The depth is that of the window's nearest rendered pixel. A fixed surface is rendered at a higher resolution, since
+    no bundle adjustment corrects its points.
     """
-    observation, finer = view.observation, _FINER if object_map.fixed_keyframes else 1
+    observation, finer = view.observation, _UPSAMPLING if object_map.fixed_keyframes else 1
     size, K = finer * observation.window.size, observation.K
     if finer > 1:
         K = K * K.new_tensor([[finer], [finer], [1.0]])
@@ -59,7 +59,7 @@ def lift_pixels(
     in_window = (to_window(view, pixel) + 0.5) * finer - 0.5
     column, row = np.clip(np.rint(in_window), 0, size - 1).astype(int).T
     inside = (np.abs(in_window - (size - 1) / 2) <= size / 2).all(1)
-    # The deepest of the neighbours is the background; the nearest would cut corners off the outline.
+    # The deepest neighbour is the background; the nearest would cut corners off the outline.
     z = drawn[row, column]
     met = inside & np.isfinite(z)
     z = np.where(met, z, 1.0)
@@ -70,8 +70,8 @@ def lift_pixels(
 
 
 def mask_weight(mask: NDArray[np.bool_] | None, points: FollowedPoints) -> float:
-    """How far a mask is believed, by the share of points on the object that lie inside it."""
-    if mask is None or len(points) < _FEWEST_WITNESSES:
+    """How far a mask is trusted, by the share of inliers that lie inside it."""
+    if mask is None or len(points) < _MIN_INLIERS:
         return 1.0
     reach = max(round(0.02 * float(np.sqrt(mask.sum()))), 1)
     wide = cv2.dilate(mask.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
@@ -83,9 +83,9 @@ def mask_weight(mask: NDArray[np.bool_] | None, points: FollowedPoints) -> float
 def is_well_inside(
     mask: NDArray[np.bool_] | None, silhouette: NDArray[np.bool_], pixel: NDArray[np.float32], margin: float
 ) -> NDArray[np.bool_]:
-    """``(N,)`` whether pixels lie in the mask or the silhouette, and at least ``margin`` from the outline of both.
+    """``(N,)`` whether pixels lie in the mask or the silhouette, and at least ``margin`` from the outlines of both.
 
-    What lies on an occluding outline slides over the surface as the object turns.
+    Points on an occluding contour slide over the surface as the object rotates.
     """
     covered = silhouette if mask is None else mask | silhouette
     depth = cv2.distanceTransform(covered.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3)
@@ -94,7 +94,7 @@ def is_well_inside(
 
 
 def to_window(view: Keyframe, pixel: NDArray[np.float32]) -> FloatArray:
-    """``(N, 2)`` pixels of the full frame in the view's window."""
+    """``(N, 2)`` pixels of the full frame in the coordinates of the view's window."""
     window = view.observation.window
     return np.asarray((pixel.astype(np.float64) + 0.5 - [window.left, window.top]) * window.scale - 0.5)
 
@@ -109,14 +109,14 @@ def project_points(points: FloatArray, pose: Pose, camera: Camera) -> FloatArray
 def with_landmarks(
     object_map: ObjectMap, camera: Camera, view: Keyframe, keypoints: Keypoints, corners: NDArray[np.float32]
 ) -> tuple[ObjectMap, Keyframe]:
-    """Name every keypoint and corner of a view: a landmark that is followed, found again, or new.
+    """Assign every keypoint and corner of a view to a landmark: a tracked, a matched or a new one.
 
     Args:
         object_map: The map.
-        camera: Of the full frame.
-        view: With the points that were followed into it.
-        keypoints: Found in it.
-        corners: ``(N, 2)`` further pixels to make landmarks of.
+        camera: The camera of the full frame.
+        view: The view with the points tracked into it.
+        keypoints: The view's keypoints.
+        corners: ``(N, 2)`` further pixels for new landmarks.
     """
     label = np.full(len(keypoints), -1, np.int64)
     followed = view.points
@@ -125,7 +125,7 @@ def with_landmarks(
         nearest = gap.argmin(1)
         label = np.where(gap[np.arange(len(gap)), nearest] < _SAME_PLACE, followed.landmark[nearest], -1)
     taken = set(followed.landmark.tolist())
-    limit = _SEARCH * max(1.0, view.observation.window.side / 200)
+    limit = _MATCH_RADIUS * max(1.0, view.observation.window.side / 200)
     for other in nearest_views(object_map.keyframes, view.pose, 4):
         pairs = match(keypoints, other.keypoints)
         pairs = pairs[label[pairs[:, 0]] < 0]
@@ -139,7 +139,7 @@ def with_landmarks(
                 label[position] = name
                 taken.add(int(name))
     fresh = np.flatnonzero(label < 0)
-    # Two keypoints at one place are one landmark.
+    # Two keypoints at one pixel are one landmark.
     pixels = np.concatenate([keypoints.pixel[fresh], corners])
     points, met = (
         lift_pixels(object_map, camera, view, pixels)
@@ -168,7 +168,7 @@ def with_landmarks(
 
 
 def nearest_views(keyframes: tuple[Keyframe, ...], pose: Pose, most: int) -> list[Keyframe]:
-    """The keyframes whose viewing direction of the object is nearest to a pose's."""
+    """The keyframes whose viewing directions of the object are nearest to a pose's."""
     if not keyframes:
         return []
     angles = [viewing_angle(view.pose, pose) for view in keyframes]
@@ -176,7 +176,7 @@ def nearest_views(keyframes: tuple[Keyframe, ...], pose: Pose, most: int) -> lis
 
 
 def viewing_angle(a: Pose, b: Pose) -> float:
-    """Degrees between the directions in which two poses show the object."""
+    """Degrees between two poses' viewing directions of the object."""
     directions = []
     for pose in (a, b):
         R, t = pose_arrays(pose)
@@ -186,7 +186,7 @@ def viewing_angle(a: Pose, b: Pose) -> float:
 
 
 def window_of(count: int, most: int) -> list[int]:
-    """Positions of the keyframes that are refined together: the first, half recent, half spread over the older."""
+    """Positions of the keyframes refined together: the first, half recent ones, half spread over the older ones."""
     if count <= most:
         return list(range(count))
     recent = list(range(count - most // 2, count))
@@ -205,18 +205,18 @@ def refine_map(
     bundle_iterations: int = 10,
     rounds: int = 1,
 ) -> ObjectMap:
-    """Poses and landmarks by bundle adjustment, then the shape by outlines and landmarks, then the texture.
+    """Refine poses and landmarks by bundle adjustment, then the shape by outlines and landmarks, then the texture.
 
     Args:
         object_map: The map.
-        camera: Of the full frame.
-        positions: Which keyframes take part, rising; the first one does not move.
-        weights: Of the shape's terms.
-        prior: What a landmark at distance 1 from the surface costs, see
+        camera: The camera of the full frame.
+        positions: Positions of the keyframes to refine, ascending; the first one's pose is fixed.
+        weights: The weights of the shape's terms.
+        prior: Cost of a landmark at distance 1 from the surface, see
             `tracking3d.bundle_adjustment.adjustment.adjust`.
-        scale: Pixels, of the robust loss.
-        bundle_iterations: Of the bundle adjustment.
-        rounds: Of the shape.
+        scale: Scale in pixels of the robust loss.
+        bundle_iterations: Iterations of the bundle adjustment.
+        rounds: Rounds of the shape fit.
     """
     object_map = _adjust_bundle(object_map, camera, positions, prior, scale, bundle_iterations)
     object_map = fit_shape(object_map, positions, weights, rounds)
@@ -232,7 +232,7 @@ def _adjust_bundle(
 ) -> ObjectMap:
     views = [object_map.keyframes[position] for position in positions]
     names = shared_landmarks(object_map, views)
-    if len(names) < _FEWEST_BUNDLED or len(views) < 2:
+    if len(names) < _MIN_ADJUSTED or len(views) < 2:
         return object_map
     tracks, start = tracks_of(views, names), structure_of(object_map, views, names)
     places = surface_places(object_map, camera, views, names)
@@ -258,15 +258,15 @@ def _adjust_bundle(
 
 
 def shared_landmarks(object_map: ObjectMap, views: list[Keyframe]) -> NDArray[np.int64]:
-    """Landmarks that two of the views or more show, rising; those that most show hold the poses together."""
+    """Landmarks that at least two of the views show, ascending; those that most views show constrain the poses."""
     names, counts = np.unique(np.concatenate([view.points.landmark for view in views]), return_counts=True)
     usable = (counts >= 2) & ~object_map.candidate[names]
     names, counts = names[usable], counts[usable]
-    return np.sort(names[np.argsort(-counts, kind="stable")[:_MOST_BUNDLED]])
+    return np.sort(names[np.argsort(-counts, kind="stable")[:_MAX_ADJUSTED]])
 
 
 def structure_of(object_map: ObjectMap, views: list[Keyframe], names: NDArray[np.int64]) -> Structure:
-    """The views' poses and the named landmarks as they stand."""
+    """The views' current poses and the given landmarks' current positions."""
     poses = [pose_arrays(view.pose) for view in views]
     return Structure(
         np.array([R for R, _ in poses]), np.array([t for _, t in poses]), object_map.landmarks[names]
@@ -276,7 +276,7 @@ def structure_of(object_map: ObjectMap, views: list[Keyframe], names: NDArray[np
 def surface_places(
     object_map: ObjectMap, camera: Camera, views: list[Keyframe], names: NDArray[np.int64]
 ) -> FloatArray:
-    """``(N, 3)`` where the surface is at the pixel of each landmark's first view; nan where there is none."""
+    """``(N, 3)`` surface points at the pixel of each landmark's first view; nan if there is none."""
     places = np.full((len(names), 3), np.nan)
     for view in views:
         open_ = np.isnan(places[:, 0]) & np.isin(names, view.points.landmark)
@@ -290,7 +290,7 @@ def surface_places(
 
 
 def tracks_of(views: list[Keyframe], names: NDArray[np.int64]) -> Tracks:
-    """Where the views show the named landmarks (rising)."""
+    """Pixels of the given landmarks (ascending) in the views."""
     pixels = np.full((len(views), len(names), 2), np.nan)
     for row, view in enumerate(views):
         place = np.searchsorted(names, view.points.landmark)
@@ -301,7 +301,7 @@ def tracks_of(views: list[Keyframe], names: NDArray[np.int64]) -> Tracks:
 
 
 def fit_shape(object_map: ObjectMap, positions: list[int], weights: FitWeights, rounds: int) -> ObjectMap:
-    """The vertices anew, by the outlines of the keyframes at these positions and the landmarks they show."""
+    """Refit the vertices to the outlines of the keyframes at these positions and to the landmarks they show."""
     if not rounds:
         return object_map
     views = [object_map.keyframes[position] for position in positions]

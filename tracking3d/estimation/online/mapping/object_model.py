@@ -1,4 +1,4 @@
-"""The map as the object that is handed out: one textured mesh."""
+"""The map as the resulting object: one textured mesh."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Shape and poses of some views together, where no points can be followed.
+"""Joint adjustment of shape and poses of some views, for objects without points.
 
-Levenberg-Marquardt on what the views show of the same faces (`face_equations`), on the outlines' signed distances, and
-on the Laplacian of the shape's offsets. The shape moves in the lowest modes of its Laplacian, so that all unknowns
-together make one small dense system. The first pose stays.
+Levenberg-Marquardt on the photometric differences of shared faces (`face_equations`), on the outlines' signed
+distances, and on the Laplacian of the shape's offsets. The shape moves in the lowest modes of its Laplacian, so that
+all unknowns form one small dense system. The first pose is fixed.
 """
 
 from __future__ import annotations
@@ -27,25 +27,28 @@ from tracking3d.rendering import Contour, Rendering, find_contour, render
 from tracking3d.rendering.contour import contour_slopes
 from tracking3d.rendering.normal_equations import screen_motion
 
-_APPEARANCE = 4.0  # weight of the mean loss of what the views show
+_APPEARANCE = 4.0  # weight of the mean photometric loss
 _APPEARANCE_SCALE = 0.25
 _FULL_SIZE = 128.0  # pixels of a window in which outline distances are measured, whatever its resolution
 _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-5, 1e3
-_LESS, _MORE = 2.0, 4.0  # damping after a step that helped, and after one that did not
-_ENOUGH = 1e-4  # share of the cost below which a gain is small
-_SMALL_GAINS = 3  # in a row end the search; a single one is often only a step that was damped too much
+_DAMPING_DECREASE, _DAMPING_INCREASE = (
+    2.0,
+    4.0,
+)  # factors of the damping after a successful step and after a rejected one
+_MIN_GAIN = 1e-4  # share of the cost below which a gain is small
+_MAX_SMALL_GAINS = 3  # in a row end the search; a single one often means only that the damping was too high
 
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """What does not change during a fit.
+    """The constants of one fit.
 
     Attributes:
         object_map: The map that is fitted; modes, weights: As given.
         K: ``(B, 3, 3)`` of the windows.
         layers: See `layers_of`.
         distance: ``(B, S, S)`` to the masks' outlines, pixels of the window.
-        mask_weight: ``(B,)`` how far each mask is believed.
+        mask_weight: ``(B,)`` how far each mask is trusted.
     """
 
     object_map: ObjectMap
@@ -63,19 +66,19 @@ class _Problem:
 
     @property
     def shape_unknowns(self) -> int:
-        """How many unknowns the shape has; six for each pose and three for each channel's light follow."""
+        """The number of shape unknowns; six for each pose and three for each channel's light follow."""
         return 3 * len(self.modes.bending)
 
     @property
     def unknowns(self) -> int:
-        """How many there are."""
+        """The number of all unknowns."""
         channels = (self.layers.shape[1] - 1) // 3
         return self.shape_unknowns + 6 * len(self.K) + 3 * channels
 
 
 @dataclass(frozen=True, eq=False)
 class _Outlines:
-    """The outlines as they are drawn: distances from the masks' in pixels, their slopes, weights, and the cost."""
+    """The rendered outlines: distances from the masks' in pixels, gradients, weights, and the cost."""
 
     contour: Contour
     residual: Tensor
@@ -86,7 +89,7 @@ class _Outlines:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Vertices and poses, what they show, and its cost."""
+    """Vertices and poses, their rendering, and its cost."""
 
     vertices: Tensor
     poses: Pose
@@ -106,13 +109,13 @@ class _Equations:
 def fit_jointly(
     object_map: ObjectMap, modes: ShapeBasis, weights: FitWeights, iterations: int
 ) -> tuple[ObjectMap, float]:
-    """The map with vertices and keyframe poses, the first one's aside, that explain its keyframes better; their cost.
+    """The map with vertices and keyframe poses, except the first, that explain its keyframes better; their cost.
 
     Args:
-        object_map: The map; its keyframes' observations may be halved. Landmarks are not looked at.
-        modes: In which the shape moves.
-        weights: Of outline and smoothness.
-        iterations: Most evaluations after the first.
+        object_map: The map; its keyframes' observations may be halved. Landmarks are not used.
+        modes: The basis of the shape's offsets.
+        weights: The weights of outline and smoothness.
+        iterations: The most evaluations after the first.
     """
     problem = _problem(object_map, modes, weights)
     free = torch.ones(problem.unknowns, dtype=torch.bool)
@@ -127,13 +130,13 @@ def fit_jointly(
 def refine_without_points(
     object_map: ObjectMap, positions: list[int], weights: FitWeights, iterations: int = 6
 ) -> ObjectMap:
-    """A map whose shape and keyframes at ``positions`` fit together, from pixels and outlines alone.
+    """Fit shape and keyframes at ``positions`` together, from pixels and outlines alone.
 
     Args:
         object_map: The map.
-        positions: Which keyframes take part, rising; the first one does not move.
-        weights: Of outline and smoothness.
-        iterations: Most evaluations.
+        positions: Positions of the keyframes to refine, ascending; the first one's pose is fixed.
+        weights: The weights of outline and smoothness.
+        iterations: The most evaluations.
     """
     if len(positions) < 2:
         return object_map
@@ -172,12 +175,12 @@ def _minimize(problem: _Problem, free: Tensor, iterations: int) -> _State:
         trial = _step(problem, state, equations, free, damping)
         if trial is not None and trial.cost < state.cost:
             gain = state.cost - trial.cost
-            state, equations, damping = trial, None, max(damping / _LESS, _LEAST_DAMPING)
-            small = small + 1 if gain < _ENOUGH * state.cost else 0
-            if small == _SMALL_GAINS:
+            state, equations, damping = trial, None, max(damping / _DAMPING_DECREASE, _LEAST_DAMPING)
+            small = small + 1 if gain < _MIN_GAIN * state.cost else 0
+            if small == _MAX_SMALL_GAINS:
                 break
         else:
-            damping *= _MORE
+            damping *= _DAMPING_INCREASE
             if damping > _MOST_DAMPING:
                 break
     return state
@@ -186,8 +189,8 @@ def _minimize(problem: _Problem, free: Tensor, iterations: int) -> _State:
 def _step(
     problem: _Problem, state: _State, equations: _Equations, free: Tensor, damping: float
 ) -> _State | None:
-    """The state after one step; None where there is none."""
-    # The light is fitted anew at every state: its part of the step is only what the others must allow for.
+    """The state after one step; None if there is none."""
+    # The light is fitted again at every state: its part of the step is only what the others must allow for.
     free = free.clone()
     free[problem.shape_unknowns + 6 * len(problem.K) :] = True
     matrix = equations.matrix[free][:, free]
@@ -207,7 +210,7 @@ def _step(
 
 
 def _evaluate(problem: _Problem, vertices: Tensor, poses: Pose) -> _State:
-    """What vertices and poses show, and its cost."""
+    """The rendering of vertices and poses, and its cost."""
     object_map = problem.object_map
     drawn = render(
         vertices, object_map.shape.faces, object_map.shape.face_uvs, vertices.new_zeros(1, 8, 8), poses.R,
@@ -237,7 +240,7 @@ def _linearize(problem: _Problem, state: _State) -> _Equations:
 
 
 def _bending(problem: _Problem, vertices: Tensor) -> tuple[Tensor, Tensor]:
-    """What bending costs in each mode ``(M, 1)``, and how far the shape is bent in it ``(M, 3)``."""
+    """The bending energy of each mode ``(M, 1)``, and the shape's coefficient in it ``(M, 3)``."""
     modes = problem.modes
     stiffness = problem.weights.smoothness / len(vertices) * modes.bending[:, None]
     return stiffness, modes.vectors.T @ (vertices - problem.object_map.shape.rest).double()

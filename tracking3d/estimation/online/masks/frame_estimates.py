@@ -1,4 +1,4 @@
-"""What the solver answers for a frame."""
+"""The solver's estimate for a frame."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ WAITING = "the object has not moved enough yet to tell its shape"
 def initial_estimate(
     frame: Frame, mask: NDArray[np.bool_] | None, pose: Pose, camera: Camera
 ) -> FrameEstimate:
-    """The answer while nothing is known: the initial mask."""
+    """The estimate before the initialization: the initial mask."""
     return FrameEstimate(
         index=frame.index,
         time=frame.time,
@@ -40,7 +40,7 @@ def initial_estimate(
 
 
 def learn_colours(state: SolverState, estimate: FrameEstimate, found: PoseCandidate) -> SolverState:
-    """The belief with what a frame that is believed shows of the colours."""
+    """The state with the colour models updated by a reliable frame."""
     if found.doubtful or found.view.mask is None:
         return state
     return replace(state, colours=update_colours(state.colours, found.view.observation, estimate.mask))
@@ -52,12 +52,12 @@ def make_estimate(
     found: PoseCandidate,
     moving: Callable[[], NDArray[np.float32] | None] | None = None,
 ) -> FrameEstimate:
-    """The answer with a pose, its judgement and the mask that the image shows; of a lost frame, the initial mask.
+    """The estimate from a pose, its assessment and the fused mask; if the object is lost, the initial mask.
 
     Args:
         state: Map, camera and colours.
-        estimate: What does not depend on the pose.
-        found: What was found in the frame.
+        estimate: The fields that do not depend on the pose.
+        found: The frame's pose candidate.
         moving: See `fuse_mask`.
     """
     view, fit, assessment = found.view, found.fit, found.assessment

@@ -1,4 +1,4 @@
-"""The mask that a frame is answered with: what the image shows between the silhouette and the initial mask."""
+"""The mask of a frame's estimate: the silhouette and the initial mask, fused by the evidence of the image."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ from tracking3d.segmentation import (
 from tracking3d.segmentation.region_growing import grow_region, motion_supported_share, unlike_surroundings
 from tracking3d.trackers.crops import crop_window, inside_frame
 
-_IN_QUESTION = 0.5
-"""See `tracking3d.segmentation.in_question`: where both outlines nearly agree, as those of exact masks do, nothing is
-missing that motion would have to tell."""
-_FINER = 2
-"""Pixels of the evidence for each of the window, as of its image."""
+_DISPUTED = 0.5
+"""See `tracking3d.segmentation.in_question`: if both outlines nearly agree, as exact masks do, nothing is missing that
+motion could add."""
+_UPSAMPLING = 2
+"""Pixels of the fusion window for each pixel of the observation's window, per side."""
 
 
 @dataclass(frozen=True, eq=False)
 class FusedMask:
-    """The mask that a frame is answered with.
+    """The mask of a frame's estimate.
 
     Attributes:
         mask: ``(H, W)``.
-        source: Where it comes from.
-        probability: ``(H, W)`` of the object: the mask is where it is above a half. None where nothing was weighed.
-        moving: Share of the mask by which it differs from the initial one where motion says so.
+        source: Its source.
+        probability: ``(H, W)`` of the object; the mask is where it exceeds a half. None if the masks were not fused.
+        moving: Share of the mask that differs from the initial one because of the motion cue.
     """
 
     mask: NDArray[np.bool_]
@@ -56,16 +56,16 @@ def fuse_mask(
     colours: ColourModels | None,
     moving: Callable[[], NDArray[np.float32] | None] | None = None,
 ) -> FusedMask:
-    """The mask that the evidence is for.
+    """Fuse the silhouette and the initial mask by the evidence of the image.
 
     Args:
         rendered: ``(H, W)`` the silhouette at the frame's pose.
         initial: ``(H, W)`` the mask tracker's, or None.
         observation: The frame.
-        confidence: Of the pose.
-        colours: What earlier frames showed, or None.
-        moving: Gives what moves as the object does in the window of `upsampled_window`, ``(S, S)``, or None where that
-            is not known; asked where the image has to be.
+        confidence: The pose's confidence.
+        colours: The colours in earlier frames, or None.
+        moving: Computes the motion cue in the window of `upsampled_window`, ``(S, S)``, or None if it is unknown;
+            called only if it is needed.
     """
     if initial is None:
         return FusedMask(rendered, MaskSource.RENDERED)
@@ -73,16 +73,16 @@ def fuse_mask(
     lab, own, drawn = as_lab(image), mask_in_window(initial, window), mask_in_window(rendered, window)
     sources = pixel_features(lab, own, drawn, confidence, colours)
     odds, asked = log_odds(sources), in_question(sources)
-    told = moving() if moving is not None and asked >= _IN_QUESTION else None
+    told = moving() if moving is not None and asked >= _DISPUTED else None
     if told is not None:
         odds = grow_region(odds, own, drawn, told, unlike_surroundings(lab, own | drawn))
     support = clean_mask(snap_to_edges(image, odds, asked))
     support[~inside_frame(initial.shape, window)] = -1
     share = 0.0 if told is None else motion_supported_share(support > 0, own, told)
-    # The window is the initial mask's: beyond it the silhouette alone says where the object is.
+    # The window is the initial mask's: beyond it the silhouette alone defines the object.
     full = paste_window(support, window, np.where(rendered, 1.0, -1.0).astype(np.float32))
     mask = full > 0
-    if not mask.any():  # a mask of nothing says that the evidence is for neither
+    if not mask.any():  # an empty mask means that the evidence supports neither
         return FusedMask(initial, MaskSource.INITIAL)
     return FusedMask(mask, MaskSource.FUSED, 0.5 + 0.5 * full, share)
 
@@ -90,20 +90,20 @@ def fuse_mask(
 def update_colours(
     colours: ColourModels | None, observation: Observation, mask: NDArray[np.bool_]
 ) -> ColourModels | None:
-    """What is known of the colours after a frame with ``mask`` ``(H, W)``."""
+    """The colour models after a frame with ``mask`` ``(H, W)``."""
     window, image = upsampled_window(observation)
     return ColourModels.of(as_lab(image), mask_in_window(mask, window), colours)
 
 
 def upsampled_window(observation: Observation) -> tuple[Window, NDArray[np.uint8]]:
-    """The window in the pixels of the evidence ``S``, and its image ``(S, S, 3)`` RGB."""
-    window = replace(observation.window, size=_FINER * observation.window.size)
+    """The window upsampled to side ``S``, and its image ``(S, S, 3)`` RGB."""
+    window = replace(observation.window, size=_UPSAMPLING * observation.window.size)
     image = (255 * observation.image.permute(1, 2, 0)).round().clamp(0, 255).cpu().numpy()
     return window, np.ascontiguousarray(image.astype(np.uint8))
 
 
 def mask_in_window(mask: NDArray[np.bool_], window: Window) -> NDArray[np.bool_]:
-    """``(S, S)`` what a window shows of a mask ``(H, W)``."""
-    # What is beyond the frame is not the object, although `crop_window` repeats the border.
+    """``(S, S)`` a mask ``(H, W)`` cropped to a window."""
+    # Pixels beyond the frame are not the object, although `crop_window` repeats the border.
     seen = crop_window(mask.astype(np.float32), window) > 0.5
     return np.asarray(seen & inside_frame(mask.shape, window))

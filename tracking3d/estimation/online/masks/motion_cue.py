@@ -1,4 +1,4 @@
-"""What moves along with the object beside its mask: the frame at hand against those before it."""
+"""The motion cue: what moves with the object next to its mask, by comparing the frame with earlier ones."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from tracking3d.estimation.online.state.solver_state import SolverState
 from tracking3d.geometry.pose import Pose
 from tracking3d.segmentation.online_motion_cue import MotionReference, online_motion_log_odds
 
-_MOST = 10  # earlier frames
-_SAME_SIDE, _AWAY = 12.0, 30.0  # degrees between viewing directions
-_WITNESSES = 20  # points that agree, with which a pose can tell a motion
+_MAX_REFERENCES = 10  # most earlier frames
+_SAME_DIRECTION, _MIN_ROTATION = 12.0, 30.0  # degrees between viewing directions
+_MIN_INLIERS = 20  # fewest inliers of a pose whose motion is used
 
 
 def motion_cue_in_window(
     state: SolverState, found: PoseCandidate, image: NDArray[np.uint8]
 ) -> NDArray[np.float32] | None:
-    """``(S, S)`` what moves along in the window of `upsampled_window`; None where that cannot be told.
+    """``(S, S)`` the motion cue in the window of `upsampled_window`; None if it cannot be determined.
 
     Args:
-        state: Before the frame.
-        found: In the frame.
+        state: The state before the frame.
+        found: The frame's pose candidate.
         image: ``(H, W)`` grey.
     """
     mask = found.view.mask
-    if mask is None or found.lost or found.evidence.inliers < _WITNESSES or not state.motion_references:
+    if mask is None or found.lost or found.evidence.inliers < _MIN_INLIERS or not state.motion_references:
         return None
     object_map, pose = state.object_map, found.fit.pose
     if is_static_scene(object_map.candidates_around):
         return None
     taken = mask | object_map.silhouette(pose, state.camera)
-    if taken[[0, -1]].any() or taken[:, [0, -1]].any():  # what is cut off by the frame's border is leaving
+    if taken[[0, -1]].any() or taken[:, [0, -1]].any():  # an object cut off by the frame's border is leaving
         return None
     here = MotionReference.of(image, taken, pose.matrix().numpy())
     vertices = object_map.vertices.double().cpu().numpy()
@@ -53,13 +53,14 @@ def motion_cue_in_window(
 
 
 def is_seen_again(object_map: ObjectMap, pose: Pose) -> bool:
-    """Whether a keyframe shows this side, and the object has turned away since: nothing of it is new.
+    """Whether a keyframe shows this side and the object has rotated away since, so that no part of it is new.
 
-    What moves along beside it is a hand, then.
+    What moves with the object next to its mask is then a hand.
     """
     for position, view in enumerate(object_map.keyframes):
-        if viewing_angle(view.pose, pose) < _SAME_SIDE and any(
-            viewing_angle(view.pose, later.pose) > _AWAY for later in object_map.keyframes[position + 1 :]
+        if viewing_angle(view.pose, pose) < _SAME_DIRECTION and any(
+            viewing_angle(view.pose, later.pose) > _MIN_ROTATION
+            for later in object_map.keyframes[position + 1 :]
         ):
             return True
     return False
@@ -68,10 +69,10 @@ def is_seen_again(object_map: ObjectMap, pose: Pose) -> bool:
 def remember_motion(
     state: SolverState, estimate: FrameEstimate, found: PoseCandidate, image: NDArray[np.uint8]
 ) -> SolverState:
-    """The belief that remembers a frame which is believed; after a loss it begins anew."""
+    """The state that remembers a reliable frame; after a loss the memory starts empty."""
     if found.lost:
         return replace(state, motion_references=())
-    if found.evidence.inliers < _WITNESSES:
+    if found.evidence.inliers < _MIN_INLIERS:
         return state
     seen = MotionReference.of(image, estimate.mask, estimate.T_cam_obj)
-    return replace(state, motion_references=(*state.motion_references, seen)[-_MOST:])
+    return replace(state, motion_references=(*state.motion_references, seen)[-_MAX_REFERENCES:])

@@ -1,4 +1,4 @@
-"""How firmly a frame holds a pose against turning, and about which axis it holds it least."""
+"""How well a frame constrains a pose's rotation, and about which axis it does so least."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from numpy.typing import NDArray
 from tracking3d.estimation.online.optimization.types import PoseFit
 
 TURN = 10.0
-"""Degrees of the turn whose cost is told."""
+"""Degrees of the rotation whose cost is computed."""
 
 
 def least_constrained_axis(fit: PoseFit) -> tuple[float, NDArray[np.float64]]:
-    """What turning the object costs about the axis that is held least, and that axis ``(3,)`` in the camera's axes.
+    """The cost of rotating the object about its least constrained axis, and that axis ``(3,)`` in camera axes.
 
-    By the normal equations: the object may move as it likes to make up for the turn. A solid of revolution without
-    texture turns about its axis for nothing, whatever its outline says of the rest.
+    By the normal equations: translation and the other rotations may compensate. A solid of revolution without texture
+    rotates about its axis at no cost, whatever its outline says otherwise.
 
     Returns:
-        The cost of `TURN` degrees, in units of `PoseFit.cost`; 0 where nothing holds it.
+        The cost of a rotation by `TURN` degrees, in units of `PoseFit.cost`; 0 if nothing constrains it.
     """
     information = fit.information.double().cpu().numpy()
     moves, coupling, turns = information[:3, :3], information[:3, 3:], information[3:, 3:]

@@ -1,7 +1,7 @@
-"""The pose of a known object from places where its surface points are seen, with and without a start.
+"""The pose of a known object from the pixels of its surface points (PnP), with and without an initial pose.
 
-Sampling is OpenCV's USAC over minimal sets of three points with local optimisation; its answer depends on the seed
-alone, whatever OpenCV's global generator holds. What it finds, and a start if there is one, is refined under the
+Sampling is OpenCV's USAC over minimal sets of three points with local optimization; its result depends only on the
+seed, not on OpenCV's global generator. The sampled pose, and the initial pose if there is one, are refined under the
 Cauchy loss.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 from tracking3d.bundle_adjustment.reprojection import FloatArray, finite_rows
 from tracking3d.estimation.online.optimization.pnp_types import PnPFit, PoseHypothesis
 
-_FEWEST = 4
+_MIN_INLIERS = 4
 _SAMPLES = 500
 _CONFIDENCE = 0.999
 _REFINEMENTS = 2
@@ -30,25 +30,25 @@ def pose_from_points(
     threshold: float,
     seed: int,
 ) -> PoseHypothesis | None:
-    """The pose that most points agree with; None if fewer than four do.
+    """The pose with most inliers; None if there are fewer than four.
 
     Args:
         points: ``(N, 3)`` in object coordinates.
         pixels: ``(N, 2)`` where they are seen. Rows that are not finite here or in ``points`` are never inliers.
         K: ``(3, 3)``.
-        start: ``R`` and ``t`` of a pose to refine beside what sampling finds; the better one is the answer.
+        start: ``R`` and ``t`` of an initial pose to refine as well; the better of both poses is returned.
         threshold: Largest distance in pixels of an inlier.
-        seed: Of the sampling.
+        seed: The seed of the sampling.
     """
     usable = finite_rows(points) & finite_rows(pixels)
-    if np.count_nonzero(usable) < _FEWEST:
+    if np.count_nonzero(usable) < _MIN_INLIERS:
         return None
     x, u = points[usable], pixels[usable]
     sampled = _sample_pose(x, u, K, threshold, seed)
     starts = [pose for pose in (sampled, start) if pose is not None]
     found = [_refine_on_inliers(x, u, K, R, t, threshold) for R, t in starts]
     best = max(found, key=lambda one: (one.count, -one.residual), default=None)
-    if best is None or best.count < _FEWEST:
+    if best is None or best.count < _MIN_INLIERS:
         return None
     inliers = np.zeros(len(points), bool)
     inliers[usable] = best.inliers
@@ -65,7 +65,7 @@ def pose_of_tracks(
     scale: float,
     iterations: int = 10,
 ) -> PnPFit:
-    """The pose of least robust reprojection error near a start; never worse than the start.
+    """The pose of least robust reprojection error near an initial pose; never worse than it.
 
     Args:
         points: ``(N, 3)`` in object coordinates; rows that are not finite do not count.
@@ -73,7 +73,7 @@ def pose_of_tracks(
         weight: ``(N,)``; all the same if None.
         K: ``(3, 3)``.
         R: ``(3, 3)`` and
-        t: ``(3,)`` of the start.
+        t: ``(3,)`` of the initial pose.
         scale: Residual in pixels at which the loss is ``log 2``.
         iterations: The most steps that are tried.
     """

@@ -15,7 +15,7 @@ CONVERGED = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class PoseHypothesis:
-    """One pose and who agrees with it.
+    """One pose and its inliers.
 
     Attributes:
         R: ``(3, 3)`` and
@@ -31,7 +31,7 @@ class PoseHypothesis:
 
     @property
     def count(self) -> int:
-        """How many points agree."""
+        """The number of inliers."""
         return int(np.count_nonzero(self.inliers))
 
 
@@ -56,7 +56,7 @@ class PointEquations:
 
 @dataclass(frozen=True, eq=False)
 class PnPFit:
-    """A pose refined from a start.
+    """A pose refined from an initial pose.
 
     Attributes:
         R: ``(3, 3)`` and

@@ -1,4 +1,4 @@
-"""Poses of one frame against a known object: Levenberg-Marquardt on pixels, outline and matched points together.
+"""Refines poses of one frame against the map: Levenberg-Marquardt on appearance, outline and matched points together.
 
 The cost is a weighted sum of three means of Cauchy losses. Covered pixels whose texture no keyframe has seen pull
 nowhere; each is charged, so that the object does not turn to where nothing contradicts it.
@@ -34,7 +34,7 @@ _DEFAULT_WEIGHTS = PoseWeights()
 
 @dataclass(frozen=True, eq=False)
 class _Evidence:
-    """What poses are fitted to at one resolution.
+    """The evidence that poses are fitted to, at one resolution.
 
     Attributes:
         observation: The frame at this resolution.
@@ -76,14 +76,14 @@ def refine_poses(
     weights: PoseWeights = _DEFAULT_WEIGHTS,
     iterations: tuple[int, ...] = (4, 5),
 ) -> list[PoseFit]:
-    """Fit one frame's pose from several starts, coarse to fine, each as if it were alone.
+    """Fit one frame's pose from several initial poses, coarse to fine, each independently.
 
     Args:
         surface: The object.
         observation: The frame.
-        starts: Where to start.
+        starts: The initial poses.
         matched: Points with known places in the frame's window at full working resolution.
-        weights: Of the kinds of evidence.
+        weights: The weights of the kinds of evidence.
         iterations: Most steps at each resolution, each twice the one before, the last one the full working
             resolution. Zeros only evaluate the starts.
     """

@@ -3,7 +3,7 @@
 A face's value in a view is its own colour, the same in all views, and what the light adds, which is linear in the
 normal in the camera's axes: the lamp stays where it is while the object turns. The own colour is eliminated: it is the
 robust mean over the views. Every residual then moves with all views that see the face. A texture held fixed within a
-step would hold the surface where it is, and the step would be far too short. The light is fitted anew for every shape.
+step would hold the surface where it is, and the step would be far too short. The light is fitted again for every shape.
 """
 
 from __future__ import annotations

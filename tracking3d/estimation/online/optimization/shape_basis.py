@@ -79,7 +79,7 @@ def project_on_basis(shown: FaceEquations, modes: ShapeBasis, faces: Tensor) -> 
 
     Args:
         shown: In the corners of faces and G further unknowns.
-        modes: Of the shape.
+        modes: The modes of the shape.
         faces: ``(F, 3)`` of the shape.
     """
     corner = faces[shown.faces]

@@ -2,7 +2,7 @@
 
 Gauss-Newton on three terms: the signed distances of the outline in every keyframe, the distances of the landmarks
 from the surface that is seen where they are, and the Laplacian of the offsets from the prototype. The normal
-equations are sparse; contour and attachments are found anew in every round. A landmark beside the silhouette has no
+equations are sparse; contour and attachments are found again in every round. A landmark beside the silhouette has no
 surface behind it and pulls the nearest vertex.
 """
 
@@ -25,21 +25,21 @@ FloatArray = NDArray[np.float64]
 Rows = tuple[sparse.csr_matrix, FloatArray]
 """Weighted residuals ``(N,)`` and their Jacobian ``(N, 3 V)``, by the vertices' coordinates one after another."""
 
-_GRAZING = 0.2  # cosine between ray and normal below which a face says nothing about where a landmark is
+_GRAZING = 0.2  # cosine between ray and normal below which a face does not constrain a landmark
 _BESIDE = 0.5  # how far beside its face, in barycentric coordinates, a landmark may lie
 _FLOOR = 1e-6  # added to the diagonal, as a share of its largest entry
 
 
 @dataclass(frozen=True)
 class FitWeights:
-    """What each term of the shape counts.
+    """The weights of the shape's terms.
 
     Attributes:
-        outline: Of the mean squared distance of the outlines from the masks', in pixels, over all keyframes.
+        outline: Weight of the mean squared distance of the outlines from the masks', in pixels, over all keyframes.
         outline_scale: Pixels at which an outline's distance counts half (robust).
-        landmarks: Of the mean squared distance of the landmarks from the surface, in units of its scale.
+        landmarks: Weight of the mean squared distance of the landmarks from the surface, in units of its scale.
         landmarks_scale: Object units at which a landmark's distance counts half (robust).
-        smoothness: Of the mean squared Laplacian of the offsets.
+        smoothness: Weight of the mean squared Laplacian of the offsets.
     """
 
     outline: float = 1.0
@@ -57,7 +57,7 @@ class ShapeKeyframes:
         R: ``(B, 3, 3)``; t: ``(B, 3)``; of ``T_cam_obj``.
         K: ``(B, 3, 3)`` of the windows.
         distance: ``(B, S, S)`` signed distance to the mask, pixels of the window.
-        weight: ``(B,)`` how far each frame's mask is believed, in [0, 1].
+        weight: ``(B,)`` how far each frame's mask is trusted, in [0, 1].
     """
 
     R: Tensor
@@ -102,8 +102,8 @@ def fit_surface(
         laplacian: Sparse ``(V, V)``.
         views: Keyframes with their poses.
         landmarks: Points of the surface, or None.
-        weights: Of the terms.
-        rounds: How often contour and attachments are found anew.
+        weights: The weights of the terms.
+        rounds: How often contour and attachments are found again.
         renderer: See `tracking3d.rendering.backend`.
     """
     L = _scipy(laplacian)

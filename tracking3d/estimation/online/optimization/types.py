@@ -23,16 +23,16 @@ NOTHING_SEEN = 1.0
 
 @dataclass(frozen=True)
 class PoseWeights:
-    """What each kind of evidence counts, and where its robust loss turns over.
+    """The weights of the cost terms, and the scales of their robust losses.
 
     Attributes:
-        appearance: Of the mean over the covered pixels in the mask and the frame.
+        appearance: Weight of the mean over the covered pixels in the mask and the frame.
         appearance_scale: Difference of features at which the loss is ``log 2``.
-        outline: Of the mean along the outline.
+        outline: Weight of the mean along the outline.
         outline_scale: Pixels at full working resolution at which the loss is ``log 2``.
-        points: Of the mean over the matched points.
+        points: Weight of the mean over the matched points.
         points_scale: Pixels at full working resolution at which the loss is ``log 2``.
-        unseen: What a covered pixel of unseen texture costs, in place of its loss.
+        unseen: Cost of a covered pixel of unseen texture, in place of its loss.
     """
 
     appearance: float = 1.0
@@ -49,7 +49,7 @@ class PoseFit:
     """A pose and how well it explains the frame.
 
     Attributes:
-        pose: Of the frame.
+        pose: The pose of the frame.
         cost: What was minimized.
         appearance: Mean Cauchy loss over the covered pixels in the mask and the frame, unseen ones charged.
         outline: Mean Cauchy loss of the outline; 0 without a mask.
@@ -77,7 +77,7 @@ class EvaluatedPoses:
 
     Attributes:
         spent: Evaluations that led to them, int64.
-        moved: Whether they are elsewhere than where they started, bool.
+        moved: Whether they differ from the initial poses, bool.
     """
 
     R: FloatArray

@@ -17,38 +17,40 @@ from tracking3d.estimation.online.tracking.pose_tracking import pixel_scale, pos
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose
 
-_KEYFRAMES = 6  # that a doubtful frame is matched with
+_MAX_KEYFRAMES = 6  # most keyframes that a doubtful frame is matched with
 
 
 def match_keyframes(
     object_map: ObjectMap, camera: Camera, view: Keyframe, image: NDArray[np.uint8], anywhere: bool
 ) -> list[tuple[Pose, FollowedPoints]]:
-    """Poses from keypoints that are matched with keyframes, most agreeing points first.
+    """Poses from keypoints matched with keyframes, most inliers first.
 
     Args:
         object_map: The map.
-        camera: Of the full frame.
+        camera: The camera of the full frame.
         view: The frame, with the best pose so far.
         image: ``(H, W)`` grey.
-        anywhere: Ask more keyframes than those with the nearest viewing direction.
+        anywhere: Whether to match more keyframes than those with the nearest viewing directions.
     """
     region = np.ones(image.shape, bool) if view.mask is None else view.mask
     others = nearest_views(
-        object_map.keyframes, view.pose, len(object_map.keyframes) if anywhere else _KEYFRAMES
+        object_map.keyframes, view.pose, len(object_map.keyframes) if anywhere else _MAX_KEYFRAMES
     )
     keypoints = detect(image, region)
-    return poses_from_matches(object_map, camera, keypoints, others[: 4 * _KEYFRAMES], pixel_scale(view))[:3]
+    return poses_from_matches(object_map, camera, keypoints, others[: 4 * _MAX_KEYFRAMES], pixel_scale(view))[
+        :3
+    ]
 
 
 def poses_from_matches(
     object_map: ObjectMap, camera: Camera, keypoints: Keypoints, others: Sequence[Keyframe], scale: float
 ) -> list[tuple[Pose, FollowedPoints]]:
-    """Poses by the matches with one keyframe each, most agreeing points first.
+    """Poses from the matches with one keyframe each, most inliers first.
 
     Args:
         object_map: The map.
-        camera: Of the full frame.
-        keypoints: Of a frame.
+        camera: The camera of the full frame.
+        keypoints: The frame's keypoints.
         others: The keyframes.
         scale: See `pixel_scale`.
     """

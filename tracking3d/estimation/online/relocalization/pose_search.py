@@ -1,4 +1,4 @@
-"""A pose without a prediction: keyframe matches and a grid of rotations compete by what re-renders the frame."""
+"""A pose without a prediction: matched keyframes and a grid of rotations, compared by how they re-render the frame."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
 from tracking3d.rendering import Surface
 
 ROTATION_SEARCH = "rotation_search"
-"""The hypothesis of a pose that is the best of many rotations around the predicted one."""
+"""The name of the hypothesis that is the best of many rotations around the predicted pose."""
 _GRID_ANGLES = (20.0, 40.0)
 _GRID_FINALISTS = 5
-_OFTEN = 5  # frames after a loss in which turns are tried in every one, and later in one of so many
-_PLACED = 8  # keyframes whose poses a lost object is looked for at
+_RETRY_INTERVAL = 5  # frames after a loss with a search in each; later, only every so many frames
+_MAX_ALIGNED_KEYFRAMES = 8  # most keyframes whose poses are tried for a lost object
 
 
 def aligned_keyframes(object_map: ObjectMap, camera: Camera, view: Keyframe) -> list[Pose]:
-    """The poses of keyframes, moved in front of the camera to where the mask is."""
+    """The poses of keyframes, shifted parallel to the image plane to where the mask is."""
     if view.mask is None:
         return []
     count = len(object_map.keyframes)
-    chosen = np.unique(np.linspace(0, count - 1, _PLACED).round().astype(int))
+    chosen = np.unique(np.linspace(0, count - 1, _MAX_ALIGNED_KEYFRAMES).round().astype(int))
     return [align_to_mask(object_map.keyframes[position].pose, camera, view.mask) for position in chosen]
 
 
@@ -64,12 +64,12 @@ def search_rotations(surface: Surface, view: Keyframe, pose: Pose, weights: Pose
 
 
 def should_retry(frames: int) -> bool:
-    """Whether to try once more what has not helped for so many frames: at first always, and then now and again."""
-    return frames <= _OFTEN or frames % _OFTEN == 0
+    """Whether to repeat a search that has failed for so many frames: always at first, then at intervals."""
+    return frames <= _RETRY_INTERVAL or frames % _RETRY_INTERVAL == 0
 
 
 Found = tuple[str, PoseFit, FollowedPoints]
-"""Which start won, the pose, and the points that agree with it."""
+"""The best hypothesis' name, its pose, and its inliers."""
 
 
 def relocalize(
@@ -82,17 +82,17 @@ def relocalize(
     weights: PoseWeights,
     lost_for: int,
 ) -> Found:
-    """The best of what was found so far and of the costly hypotheses, by what re-renders the frame.
+    """The best of the candidate so far and the costly hypotheses, by how they re-render the frame.
 
     Args:
-        object_map: The map; surface: its surface.
-        camera: Of the full frame.
+        object_map: The map; surface: Its surface.
+        camera: The camera of the full frame.
         view: The frame.
         image: ``(H, W)`` grey.
-        best: What was found so far.
-        weights: Of the kinds of evidence.
-        lost_for: How many frames the object has been lost before this one: if it was, all sides of it are looked at,
-            wherever it was before, but the longer the less often.
+        best: The best candidate so far.
+        weights: The weights of the cost terms.
+        lost_for: For how many frames the object had been lost before this one. If it was lost, all of its sides are
+            tried, whatever the last pose was, but less often the longer it has been lost.
     """
     lost = lost_for > 0
 

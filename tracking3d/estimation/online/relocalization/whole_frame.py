@@ -1,6 +1,6 @@
-"""A lost object somewhere else in the frame: keypoints of the whole frame, matched with the keyframes'.
+"""Relocalization of a lost object in the whole frame, by keypoints matched with the keyframes'.
 
-What a mask tracker clings to after the object has left, or is hidden, says nothing of where it is seen again.
+After the object has left or is occluded, a mask tracker's mask says nothing about where it reappears.
 """
 
 from __future__ import annotations
@@ -17,35 +17,35 @@ from tracking3d.estimation.tracker_feedback import ELSEWHERE
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose
 
-_MOST = 1500  # keypoints of a whole frame
-_KEYFRAMES = 24  # that they are matched with
-_FEWEST = 10  # agreeing points of one keyframe; matches of something else hardly ever agree with one pose
+_MAX_KEYPOINTS = 1500  # most keypoints of a whole frame
+_MAX_KEYFRAMES = 24  # most keyframes that they are matched with
+_MIN_INLIERS = 10  # fewest inliers of one keyframe; matches with another object hardly ever have as many
 
 
 def relocalize_in_frame(
     object_map: ObjectMap, camera: Camera, image: NDArray[np.uint8], last: Pose
 ) -> tuple[Pose, FollowedPoints] | None:
-    """The pose that most keypoints of the frame agree with, and those points; None where too few agree.
+    """The pose with most inliers among the frame's keypoints, and the inliers; None if there are too few.
 
     Args:
         object_map: The map.
-        camera: Of the full frame.
+        camera: The camera of the full frame.
         image: ``(H, W)`` grey.
-        last: A pose of the object while it was seen; its size there is about that at which it is looked for.
+        last: A pose from before the loss; the object is searched at about its size there.
     """
     box = projected_box(object_map.vertices, camera, last)
     if box is None or not object_map.keyframes:
         return None
     length = max(box[2], box[3])
-    keypoints = detect(image, np.ones(image.shape, bool), length=length, most=_MOST)
+    keypoints = detect(image, np.ones(image.shape, bool), length=length, most=_MAX_KEYPOINTS)
     count = len(object_map.keyframes)
-    chosen = np.unique(np.linspace(0, count - 1, min(count, _KEYFRAMES)).round().astype(int))
+    chosen = np.unique(np.linspace(0, count - 1, min(count, _MAX_KEYFRAMES)).round().astype(int))
     views = [object_map.keyframes[position] for position in chosen]
     found = poses_from_matches(object_map, camera, keypoints, views, max(1.0, length / 200))
-    return found[0] if found and len(found[0][1]) >= _FEWEST else None
+    return found[0] if found and len(found[0][1]) >= _MIN_INLIERS else None
 
 
 def overlaps_mask(silhouette: NDArray[np.bool_], mask: NDArray[np.bool_]) -> bool:
-    """Whether a mask is where the object was sighted: then it counts there as it does anywhere."""
+    """Whether a mask overlaps the relocalized object: then it counts as any other mask does."""
     either = int(np.count_nonzero(silhouette | mask))
     return int(np.count_nonzero(silhouette & mask)) > ELSEWHERE * either

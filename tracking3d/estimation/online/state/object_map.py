@@ -22,17 +22,17 @@ from tracking3d.rendering import BackProjection, Surface, TexelMap, back_project
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
-    """A frame with its pose and what it shows of the landmarks.
+    """A frame with its pose and its landmark observations.
 
     Attributes:
         observation: Its window.
         mask: ``(H, W)`` initial mask in the full frame, or None.
-        pose: As it stands.
-        points: Landmarks and where the frame shows them.
-        keypoints: For matching; ``keypoint_landmark`` ``(M,)`` says which landmark each is.
-        texture: What the frame shows of the feature texture, as last computed; None before.
-        mask_weight: How far the mask is believed, in [0, 1].
-        strength: Of the texture inside the mask, as far as it was asked for; see `texture_strength`.
+        pose: The current pose.
+        points: Landmarks and their pixels in the frame.
+        keypoints: For matching; ``keypoint_landmark`` ``(M,)`` is the index of each one's landmark.
+        texture: The frame's back-projected feature texture, as last computed; None before.
+        mask_weight: How far the mask is trusted, in [0, 1].
+        strength: Texture strength inside the mask, if it was computed; see `texture_strength`.
     """
 
     observation: Observation
@@ -53,22 +53,21 @@ class Keyframe:
 
 @dataclass(frozen=True, eq=False)
 class ObjectMap:
-    """What is known of the object.
+    """The map of the object.
 
     Attributes:
-        shape: The fixed part.
+        shape: The topology and prototype, which never change.
         texels: Where each texel lies on the surface.
         vertices: ``(V, 3)``.
         landmarks: ``(N, 3)`` float64 surface points in object coordinates.
-        keyframes: In order of time; the first one's pose never moves.
-        candidate: ``(N,)`` found beside the mask, and not yet known to be on the object.
-        pointless: Whether the object has no points that can be followed: it is known by pixels and outlines alone.
+        keyframes: In order of time; the first one's pose is fixed.
+        candidate: ``(N,)`` whether a landmark was found outside the mask and is not yet known to be on the object.
+        pointless: Whether the object has no points that can be tracked: only pixels and outlines constrain it.
         renderer: Which renderer, see `tracking3d.rendering.backend`.
-        candidates_around: ``(8, 2)`` candidates in each direction from the object that could be told, and that move as
-            it does.
-        fixed_keyframes: How many of the first keyframes are drawn ones of an object that was known before, whose shape
-            is held and of whose surface every point counts as often seen; 0 where the object is got to know in the
-            video.
+        candidates_around: ``(8, 2)`` candidate landmarks in each direction from the object: those that could be tested,
+            and those that move with it.
+        fixed_keyframes: How many of the first keyframes are rendered from an object that was known before. Its shape is
+            fixed, and its surface points count as seen often. 0 if the map is built from the video.
     """
 
     shape: Shape
@@ -96,7 +95,7 @@ class ObjectMap:
         return float((self.vertices - self.vertices.mean(0)).norm(dim=1).max())
 
     def back_project(self, values: Tensor, view: Keyframe) -> BackProjection:
-        """What a view shows of the texture; ``values`` is ``(C, H, W)`` over its window."""
+        """The view's texture back-projection; ``values`` is ``(C, H, W)`` over its window."""
         observation = view.observation
         scale = values.shape[-1] / observation.window.size
         K = observation.K.clone()
@@ -113,7 +112,7 @@ class ObjectMap:
         )  # fmt: skip
 
     def surface(self) -> Surface:
-        """Shape and texture for fitting poses; the texture is the mean of what the keyframes show."""
+        """Shape and texture for fitting poses; the texture is the mean over the keyframes."""
         size = self.texels.size
         channels = self.keyframes[0].observation.features.shape[0]
         total = BackProjection(

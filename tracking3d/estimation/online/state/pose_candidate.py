@@ -1,4 +1,4 @@
-"""A frame with the best pose that was found for it, and how far that is believed."""
+"""The best pose found for a frame, and its confidence."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from tracking3d.estimation.online.state.object_map import Keyframe
 
 @dataclass(frozen=True, eq=False)
 class PoseCandidate:
-    """What came of looking for the object in a frame.
+    """The result of estimating the object's pose in a frame.
 
     Attributes:
         view: The frame.
-        fit: Its pose.
-        hypothesis: Which start of the pose won.
-        points: Those that agree with it.
-        evidence: What speaks for the pose beside its losses.
-        assessment: Of the pose.
+        fit: The pose and its losses.
+        hypothesis: The name of the winning hypothesis.
+        points: The pose's inliers.
+        evidence: The evidence for the pose apart from its losses.
+        assessment: The pose's assessment.
     """
 
     view: Keyframe
@@ -34,16 +34,16 @@ class PoseCandidate:
 
     @property
     def lost(self) -> bool:
-        """Whether the pose is not believed."""
+        """Whether the pose is rejected."""
         return self.assessment.status is Status.LOST
 
     @property
     def doubtful(self) -> bool:
-        """Whether it is lost, or hardly believed."""
+        """Whether the object is lost or the confidence is low."""
         return self.assessment.confidence < BELIEVED
 
     def better_than(self, other: PoseCandidate) -> bool:
-        """Whether more points agree with it and the pixels fit better; any pose is better than none."""
+        """Whether it has more inliers and a lower rendering cost; any pose is better than none."""
         return other.lost or (
             self.evidence.inliers > other.evidence.inliers and self.fit.appearance < other.fit.appearance
         )

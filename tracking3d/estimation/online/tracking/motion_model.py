@@ -1,4 +1,4 @@
-"""Where an object should be in the next frame, by how it has moved; and the belief as it moves on."""
+"""The motion model: predicts an object's pose in the next frame from its earlier motion."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, extrapolate, rotation_angle
 
 _BRIEF, _NEAR = 5, 30.0
-"""Frames of a loss, and degrees, within which motion still tells a side that was never seen: a thin view of a card."""
+"""Lost frames, and degrees, within which the motion model supports a side that was never seen, as a card's edge."""
 
 
 def pose_predictions(state: SolverState, index: int, mask: NDArray[np.bool_] | None) -> dict[str, Pose]:
-    """Poses to start from in frame ``index``, by name, the likeliest first.
+    """Predicted poses for frame ``index`` by name, the likeliest first.
 
     Args:
-        state: Before the frame.
-        index: Of the frame.
-        mask: ``(H, W)`` its initial mask, or None: of an object that was lost it says where it is again.
+        state: The state before the frame.
+        index: The frame's index.
+        mask: ``(H, W)`` its initial mask, or None; it places an object that was lost.
     """
     last, last_index = state.last_pose
     if state.phase is SolverPhase.LOST and state.trajectory:
@@ -48,7 +48,7 @@ def pose_predictions(state: SolverState, index: int, mask: NDArray[np.bool_] | N
 
 
 def predict_points(state: SolverState, pose: Pose) -> NDArray[np.float32] | None:
-    """``(N, 2)`` pixels where the points that are followed should be at a pose; None where there are none."""
+    """``(N, 2)`` predicted pixels of the tracked points at a pose; None if there are none."""
     if not len(state.tracked_points):
         return None
     position = state.object_map.landmarks[state.tracked_points.landmark]
@@ -57,7 +57,7 @@ def predict_points(state: SolverState, pose: Pose) -> NDArray[np.float32] | None
 
 
 def is_consistent_with_motion(state: SolverState, pose: Pose, index: int) -> bool:
-    """Whether the motion from before a loss leads to a pose: only a while, and only near where it goes on."""
+    """Whether a pose agrees with the motion before a loss: only for a short loss, and near the extrapolated pose."""
     if not state.trajectory or index - state.trajectory[-1][1] > _BRIEF + 1:
         return False
     away = float(rotation_angle(extrapolate_motion(state.trajectory, index).quaternion, pose.quaternion))
@@ -65,12 +65,12 @@ def is_consistent_with_motion(state: SolverState, pose: Pose, index: int) -> boo
 
 
 def advance(state: SolverState, found: PoseCandidate, pose: Pose, grey: NDArray[np.uint8]) -> SolverState:
-    """The belief one frame later, with how long the object has been lost or hardly believed.
+    """The state one frame later, with the counts of lost and doubtful frames updated.
 
     Args:
-        state: Before the frame.
-        found: What was found in it.
-        pose: That it is answered with.
+        state: The state before the frame.
+        found: The frame's pose candidate.
+        pose: The pose that is estimated for it.
         grey: ``(H, W)`` the frame.
     """
     searched_for = state.lost_frames + 1 if found.view.mask is not None else max(state.lost_frames, 1)
@@ -82,24 +82,24 @@ def advance(state: SolverState, found: PoseCandidate, pose: Pose, grey: NDArray[
     )
 
 
-_COASTS = 12  # frames
+_MAX_EXTRAPOLATION = 12  # frames
 
 
 def extrapolate_motion(trail: tuple[tuple[Pose, int], ...], index: int) -> Pose:
-    """Where an object is that is not seen: moving on as it did, for a while.
+    """The pose of an object that is not seen: its motion is extrapolated for at most `_MAX_EXTRAPOLATION` frames.
 
     Args:
-        trail: Believed poses and their frame indices, in order of time; at least one.
-        index: Of the frame.
+        trail: Reliable poses and their frame indices, in order of time; at least one.
+        index: The frame's index.
     """
     (first, begin), (last, end) = trail[0], trail[-1]
     if begin == end:
         return last
-    return extrapolate(first, last, min(index - end, _COASTS) / (end - begin))
+    return extrapolate(first, last, min(index - end, _MAX_EXTRAPOLATION) / (end - begin))
 
 
 def align_to_mask(pose: Pose, camera: Camera, mask: NDArray[np.bool_]) -> Pose:
-    """A pose moved in front of the camera, at its depth, to where a mask ``(H, W)`` is."""
+    """A pose shifted parallel to the image plane, so that the object's centre projects into a mask ``(H, W)``."""
     x1, y1 = np.argwhere(mask)[:, ::-1].mean(0)
     x, y, z = pose.translation.tolist()
     shift = [(x1 - camera.cx) / camera.fx * z - x, (y1 - camera.cy) / camera.fy * z - y, 0.0]

@@ -1,4 +1,4 @@
-"""The pose of one frame against the map: cheap starts first, costly ones only where those look wrong."""
+"""The pose of one frame against the map: cheap hypotheses first, costly ones only if those look wrong."""
 
 from __future__ import annotations
 
@@ -19,16 +19,22 @@ from tracking3d.geometry.pose import Pose, pose_from_arrays
 from tracking3d.rendering import MatchedPoints, Surface
 
 ENOUGH_MATURE = 30
-"""With so many landmarks of two keyframes or more, those of one alone are not asked."""
-_FEWEST_POINTS = 6  # for a pose from points
-_INLIER = 3.0  # pixels of an object 200 pixels large
-_EDGE = 8.0  # such pixels from the outline within which points slide
-_STRAY, _STRAY_YOUNG = 4.0, 16.0  # such pixels that a point may be off
-_WITNESS, _MOST_WITNESSES = 0.005, 30  # what each agreeing landmark takes off the cost, and how many do
+"""If so many landmarks were seen by two keyframes or more, landmarks seen by only one are not used."""
+_MIN_INLIERS = 6  # fewest points of a pose by PnP
+_MAX_INLIER_ERROR = 3.0  # largest reprojection error of an inlier, in pixels at an object size of 200 pixels
+_OUTLINE_MARGIN = 8.0  # such pixels from the outline within which points slide over the surface
+_MAX_REPROJECTION_ERROR, _MAX_REPROJECTION_ERROR_NEW = (
+    4.0,
+    16.0,
+)  # such pixels, beyond which a point is an outlier
+_INLIER_REWARD, _MAX_REWARDED_INLIERS = (
+    0.005,
+    30,
+)  # taken off the cost for each inlier, and for how many at most
 
 
 def pixel_scale(view: Keyframe) -> float:
-    """How much larger than 200 pixels a view's window is; at least 1. Tolerances in pixels go with it."""
+    """A view's window size relative to 200 pixels, at least 1. Tolerances in pixels scale with it."""
     return max(1.0, view.observation.window.side / 200)
 
 
@@ -40,7 +46,7 @@ def fit_pose(
     points: FollowedPoints,
     weights: PoseWeights,
 ) -> tuple[str, PoseFit]:
-    """The best start, and the pose refined from it."""
+    """The best initial pose, and the pose refined from it."""
     weights = replace(weights, outline=weights.outline * view.mask_weight)
     matched = _matched_points(object_map, surface, view, points)
     name = next(iter(starts))
@@ -53,14 +59,14 @@ def fit_pose(
 def pose_of_points(
     object_map: ObjectMap, camera: Camera, points: FollowedPoints, scale: float
 ) -> tuple[Pose, FollowedPoints] | None:
-    """The pose that most points agree with, and those that do; for the scale see `pixel_scale`."""
+    """The pose with most inliers by PnP, and the inliers; for the scale see `pixel_scale`."""
     position = object_map.landmarks[points.landmark]
-    if np.isfinite(position).all(1).sum() < _FEWEST_POINTS:
+    if np.isfinite(position).all(1).sum() < _MIN_INLIERS:
         return None
     found = pose_from_points(
-        position, points.pixel.astype(np.float64), camera.K, threshold=_INLIER * scale, seed=0
+        position, points.pixel.astype(np.float64), camera.K, threshold=_MAX_INLIER_ERROR * scale, seed=0
     )
-    if found is None or found.count < _FEWEST_POINTS:
+    if found is None or found.count < _MIN_INLIERS:
         return None
     return pose_from_arrays(found.R, found.t, object_map.vertices), points.only(found.inliers)
 
@@ -68,7 +74,7 @@ def pose_of_points(
 def find_inliers(
     object_map: ObjectMap, camera: Camera, pose: Pose, points: FollowedPoints, view: Keyframe
 ) -> FollowedPoints:
-    """Points that are where a pose says and not on the outline; of candidates neither is asked."""
+    """Points whose reprojection error is small and that lie off the outline; candidate landmarks are not used."""
     if not len(points):
         return points
     gap = np.linalg.norm(
@@ -76,15 +82,19 @@ def find_inliers(
     )
     young = object_map.sightings[points.landmark] < 2
     scale = pixel_scale(view)
-    in_place = np.isnan(gap) | (gap < np.where(young, _STRAY_YOUNG, _STRAY) * scale)
-    inside = is_well_inside(view.mask, object_map.silhouette(pose, camera), points.pixel, _EDGE * scale)
+    in_place = np.isnan(gap) | (
+        gap < np.where(young, _MAX_REPROJECTION_ERROR_NEW, _MAX_REPROJECTION_ERROR) * scale
+    )
+    inside = is_well_inside(
+        view.mask, object_map.silhouette(pose, camera), points.pixel, _OUTLINE_MARGIN * scale
+    )
     return points.only(in_place & (inside | object_map.candidate[points.landmark]))
 
 
 def pose_evidence(
     object_map: ObjectMap, camera: Camera, pose: Pose, agree: FollowedPoints, view: Keyframe
 ) -> PoseEvidence:
-    """What speaks for a pose beside its losses; ``agree`` are the points that do."""
+    """The evidence for a pose apart from its losses; ``agree`` are its inliers."""
     names = view.points.landmark
     told = (
         np.isfinite(object_map.landmarks[names]).all(1)
@@ -92,7 +102,7 @@ def pose_evidence(
         & ~object_map.candidate[names]
     )
     gap = project_points(object_map.landmarks[names[told]], pose, camera) - view.points.pixel[told]
-    stray = np.linalg.norm(gap, axis=1) > _STRAY * pixel_scale(view)
+    stray = np.linalg.norm(gap, axis=1) > _MAX_REPROJECTION_ERROR * pixel_scale(view)
     strays = float(stray.mean()) if len(stray) else 0.0
     return PoseEvidence(
         count_inliers(object_map, agree),
@@ -104,12 +114,12 @@ def pose_evidence(
 
 
 def candidate_cost(fit: PoseFit, weights: PoseWeights, mask_weight: float, agreed: int) -> float:
-    """What tells the best of several poses, the lowest: what each costs, less what ``agreed`` landmarks take off."""
-    return render_cost(fit, weights, mask_weight) - _WITNESS * min(agreed, _MOST_WITNESSES)
+    """The cost by which pose candidates are compared: a pose's cost, less a reward for ``agreed`` inliers."""
+    return render_cost(fit, weights, mask_weight) - _INLIER_REWARD * min(agreed, _MAX_REWARDED_INLIERS)
 
 
 def count_inliers(object_map: ObjectMap, points: FollowedPoints) -> int:
-    """How many of the points are landmarks that two keyframes have seen."""
+    """How many of the points are landmarks that at least two keyframes have seen."""
     return int((object_map.sightings[points.landmark] >= 2).sum())
 
 
@@ -118,7 +128,7 @@ def _matched_points(
 ) -> MatchedPoints:
     position = object_map.landmarks[points.landmark]
     sound = np.isfinite(position).all(1)
-    # A landmark seen once lies where the shape was believed to be: with others at hand it is no witness.
+    # A landmark seen once lies on the estimated surface: it is no independent evidence if there are others.
     mature = sound & (object_map.sightings[points.landmark] >= 2)
     if mature.sum() >= ENOUGH_MATURE:
         sound = mature

@@ -154,7 +154,7 @@ def _minimize(surface, target, matches, scales, weights, steps, poses, first, la
 
 @shared
 def _step(matrix, gradient, damping, system, step):
-    """Write the step (v, w) to the damped model's minimum; zero where there is none."""
+    """Write the step (v, w) to the damped model's minimum; zero if there is none."""
     largest = 0.0
     for row in range(6):
         largest = max(largest, matrix[row, row])
