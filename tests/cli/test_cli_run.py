@@ -134,7 +134,7 @@ def test_final_refinement_is_switched_by_its_option(call, clip, script, tmp_path
 
 def test_why_there_is_no_final_refinement_is_on_the_screen(call, clip, script):
     result = call("run", clip, *BOX, "--final-refine", "--set", "solver.name=paper")
-    assert "the solver paper gives causal answers only" in result.stdout
+    assert "the solver paper gives causal estimates only" in result.stdout
 
 
 def test_undecodable_frame_is_skipped_and_recorded(call, clip, script):

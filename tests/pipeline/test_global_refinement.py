@@ -167,7 +167,7 @@ def test_masks_are_weighed_once_more_and_the_causal_ones_stand(clip, source, tmp
         assert before.mask_source is not MaskSource.FUSED
         assert before.area == np.count_nonzero(causal.mask(frame.index))
     assert any(frame.mask_source is MaskSource.FUSED for frame in final.frames)
-    assert final.config["object"]["evidence"]
+    assert final.config["object"]["refine_masks"]
 
 
 def test_the_mask_tracker_runs_once_and_its_masks_come_again_as_they_were(
@@ -232,7 +232,7 @@ def test_nothing_is_refined_unless_asked_for(clip, source, tmp_path):
 def test_a_solver_that_cannot_leaves_it_out_and_says_so(clip, source, tmp_path):
     record(source, settings("paper"), tmp_path / "run", mask=clip.masks[0])
     told = refinement_of(tmp_path / "run")
-    assert (told["state"], told["reason"]) == ("skipped", "the solver paper gives causal answers only")
+    assert (told["state"], told["reason"]) == ("skipped", "the solver paper gives causal estimates only")
     assert RunReader(tmp_path / "run").state == "finished"
 
 
@@ -299,7 +299,7 @@ def test_what_ends_the_refinement_leaves_the_causal_answers_whole(
         record(source, settings(), tmp_path / "run", mask=clip.masks[0])
     [note] = caught.value.__notes__
     assert note == (
-        f"The final refinement was not finished; the causal answers are whole in {tmp_path / 'run'}."
+        f"The final refinement was not finished; the causal estimates are whole in {tmp_path / 'run'}."
     )
     for refined in (True, False):
         run, expected = RunReader(tmp_path / "run", refined), RunReader(reference)
