@@ -10,67 +10,52 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "tracking3d"
 LONGEST_MODULE = 360
+LONGEST_FUNCTION = 80
+MOST_PARAMETERS = 12
+
+LOOSE_MODULES = {"__init__", "__main__", "errors", "frames"}
+"""All that the root holds besides rooms: what everybody raises and what travels through all rooms."""
 
 # Who lives on which floor; a module may import from lower floors and from its own room only.
 # Rooms of one floor may use each other, but never in circles.
 FLOORS = [
-    {
-        "calibration",
-        "config",
-        "engines",
-        "errors",
-        "features",
-        "frames",
-        "geometry",
-        "networks",
-        "process_memory",
-        "side_by_side",
-        "stages",
-        "web",
-    },
-    {"bundle_adjustment", "evidence", "rendering", "trackers", "video"},
-    {"corrections", "estimation", "plugins", "point_prompts", "points", "prompts", "testing"},
-    {
-        "arguments",
-        "checkpoint",
-        "corrected_run",
-        "final_refinement",
-        "frame_reading",
-        "given_frames",
-        "images",
-        "last_passes",
-        "mask_tracking",
-        "modules",
-        "object_files",
-        "object_recording",
-        "open_tracking",
-        "passes",
-        "parts",
-        "point_following",
-        "presented",
-        "process_settings",
-        "reconstruction",
-        "recording",
-        "result_choice",
-        "results",
-        "session",
-        "tracker_choice",
-    },
-    {"datasets"},
-    {"evaluation", "export", "picker", "report", "speed", "splitting", "synthesis", "viewer"},
-    {"pipeline", "tracking", "tracking_result"},
+    {"engines", "errors", "frames", "web"},
+    {"bundle_adjustment", "calibration", "config", "geometry", "points", "rendering", "runtime"},
+    {"features", "networks", "plugins", "prompts", "segmentation", "trackers", "video"},
+    {"estimation", "modules", "testing"},
+    {"checkpoint", "datasets", "results"},
+    {"evaluation", "export", "picker", "reconstruction", "report", "speed", "synthesis", "viewer"},
+    {"pipeline", "submaps"},
     {"benchmark"},
     {"batch"},
     {"cli", "vot", "__main__"},
 ]
 """``tracking3d/__init__.py`` is the front door: it imports from anywhere, and nobody imports from it."""
 
+ONLINE = PACKAGE / "estimation" / "online"
+ONLINE_FLOORS = [
+    {"features"},
+    {"optimization"},
+    {"state"},
+    {"mapping"},
+    {"initialization"},
+    {"tracking"},
+    {"masks"},
+    {"relocalization"},
+    {"atlas"},
+    {"frame_tracker"},
+    {"user_guidance"},
+    {"solver"},
+    {"known_object"},
+]
+"""The rooms of the solver ``online``, from the ground: each imports from itself and from lower floors only."""
 
-def floor(room: str) -> int:
-    for height, rooms in enumerate(FLOORS):
+
+def floor(room: str, floors: list[set[str]] = FLOORS) -> int:
+    for height, rooms in enumerate(floors):
         if room in rooms:
             return height
-    raise AssertionError(f"tracking3d.{room} has no floor yet: give it one in {Path(__file__).name}")
+    raise AssertionError(f"The room {room} has no floor yet: give it one in {Path(__file__).name}")
 
 
 @cache
@@ -80,6 +65,19 @@ def modules() -> list[Path]:
 
 def room_of(path: Path) -> str:
     return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def online_imports() -> list[tuple[Path, str, str]]:
+    """For each import between rooms of the solver ``online``: the module, its room and the room that it imports."""
+    home = module_name(ONLINE).split(".")
+    found = []
+    for path in sorted(ONLINE.rglob("*.py")):
+        own = path.relative_to(ONLINE).parts[0].removesuffix(".py")
+        for name in imported_modules(path):
+            parts = name.split(".")
+            if parts[: len(home)] == home and len(parts) > len(home) and parts[len(home)] != own:
+                found.append((path, own, parts[len(home)]))
+    return found
 
 
 def module_name(path: Path) -> str:
@@ -105,6 +103,19 @@ def imported_modules(path: Path) -> set[str]:
     return {name for name in names if name.split(".")[0] == "tracking3d"}
 
 
+def test_the_root_holds_rooms_and_what_everybody_shares():
+    assert {path.stem for path in PACKAGE.glob("*.py")} == LOOSE_MODULES
+
+
+def test_every_floor_holds_rooms_that_exist():
+    rooms = {path.name for path in PACKAGE.iterdir() if (path / "__init__.py").is_file()}
+    assert set().union(*FLOORS) == rooms | LOOSE_MODULES - {"__init__"}
+    online = {
+        path.stem for path in ONLINE.iterdir() if path.suffix == ".py" or (path / "__init__.py").is_file()
+    }
+    assert set().union(*ONLINE_FLOORS) == online - {"__init__"}
+
+
 def test_a_module_imports_from_below_only():
     above = []
     for path in modules():
@@ -115,6 +126,17 @@ def test_a_module_imports_from_below_only():
                 continue  # a name of the front door, such as the version
             if room != own and floor(room) > floor(own):
                 above.append(f"{path} (floor {floor(own) + 1}) imports {name} from above")
+    assert not above
+
+
+def test_a_room_of_the_online_solver_imports_from_below_only():
+    imports = online_imports()
+    assert imports
+    above = [
+        f"{path} imports {room} from above"
+        for path, own, room in imports
+        if floor(room, ONLINE_FLOORS) >= floor(own, ONLINE_FLOORS)
+    ]
     assert not above
 
 
@@ -155,10 +177,9 @@ def test_one_name_is_one_class():
             if isinstance(node, ast.ClassDef):
                 protocol = any(ast.unparse(base).startswith("Protocol") for base in node.bases)
                 homes.setdefault(node.name, []).append(protocol)
-    twice = {
+    assert not [
         name for name, protocols in homes.items() if len(protocols) > 1 and sorted(protocols) != [False, True]
-    }
-    assert twice <= {"Support", "Task"}  # resolved by the renames of HOUSE.md
+    ]
 
 
 @pytest.mark.parametrize("room", ["geometry", "rendering"])
@@ -168,10 +189,10 @@ def test_geometry_and_rendering_know_nothing_of_video_or_tracking(room):
         assert {name.split(".")[1] for name in imported_modules(path)} <= allowed, path
 
 
-def test_pixels_are_weighed_without_solvers_and_runs():
-    for path in (PACKAGE / "evidence").rglob("*.py"):
+def test_segmentation_does_without_solvers_and_runs():
+    for path in (PACKAGE / "segmentation").rglob("*.py"):
         rooms = {name.split(".")[1] for name in imported_modules(path)}
-        assert rooms <= {"evidence", "frames", "geometry", "rendering", "side_by_side", "trackers"}, path
+        assert rooms <= {"frames", "geometry", "rendering", "runtime", "segmentation", "trackers"}, path
 
 
 def test_points_are_followed_by_surface_and_images_alone():
@@ -212,6 +233,42 @@ def test_no_module_is_longer_than_a_reader_keeps_in_mind():
 def test_half_of_the_modules_are_short():
     found = sorted(lengths().values())
     assert found[len(found) // 2] <= 150
+
+
+def test_functions_are_short_and_take_few_parameters():
+    """A command of the CLI may take more parameters: each is one of its options."""
+    checked, faults = 0, []
+    for path in modules():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                continue
+            checked += 1
+            lines = (node.end_lineno or node.lineno) - node.lineno + 1
+            arguments = node.args
+            parameters = len(arguments.posonlyargs) + len(arguments.args) + len(arguments.kwonlyargs)
+            if lines > LONGEST_FUNCTION:
+                faults.append(f"{path}: {node.name} has {lines} lines")
+            if parameters > MOST_PARAMETERS and f"{module_name(path)}.{node.name}" not in commands():
+                faults.append(f"{path}: {node.name} has {parameters} parameters")
+    assert checked
+    assert not faults
+
+
+@cache
+def commands() -> set[str]:
+    """Full names of the functions that the CLI registers: ``app.command(...)(module.function)``."""
+    found = set()
+    for path in (PACKAGE / "cli").rglob("__init__.py"):
+        imported = {name.rpartition(".")[2]: name for name in imported_modules(path)}
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            match node:
+                case ast.Call(
+                    func=ast.Call(func=ast.Attribute(attr="command")),
+                    args=[ast.Attribute(value=ast.Name(id=module), attr=function)],
+                ) if module in imported:
+                    found.add(f"{imported[module]}.{function}")
+    assert found
+    return found
 
 
 @cache

@@ -35,7 +35,7 @@ from tracking3d.evaluation.confidence_fit import (
 from tracking3d.evaluation.confidence_scores import right_frames
 from tracking3d.evaluation.mask_scores import compare_masks
 from tracking3d.evaluation.pose_scores import pair_poses, rotation_errors
-from tracking3d.points.landmark_adjustment import Support
+from tracking3d.points.landmark_adjustment import LandmarkSupport
 from tracking3d.reconstruction.confidence import refined_confidence_features as supported_by
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
@@ -99,7 +99,7 @@ def _of_landmarks(record: FrameRecord) -> dict[str, float]:
         int(record.diagnostics["landmark_matches"]),
         int(record.diagnostics["landmark_inliers"]),
     )
-    support = Support(followed, agreeing, bool(record.diagnostics.get("textured", 1.0)))
+    support = LandmarkSupport(followed, agreeing, bool(record.diagnostics.get("textured", 1.0)))
     return supported_by(record.diagnostics.get("confidence_before", record.confidence), support)
 
 

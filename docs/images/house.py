@@ -1,7 +1,8 @@
-"""Makes the picture of CONTRIBUTING.md: the rooms of the package by floor, and who imports whom.
+"""Makes two pictures for CONTRIBUTING.md: rooms by floor, and which imports which.
 
-It is drawn from the table and the imports that tests/test_architecture.py checks. Of two ways to a room only the longer
-one is drawn: who imports a room that imports `errors` too has no line to `errors` of his own.
+The first shows the rooms of the package, the second those of its online solver. Both are drawn from the tables and the
+imports that tests/test_architecture.py checks. Only the longest path between two rooms is drawn: a room has no line to
+`errors` if it imports another room that imports `errors`.
 
 $ python docs/images/house.py
 """
@@ -15,12 +16,14 @@ from types import ModuleType
 
 ROOT = Path(__file__).resolve().parents[2]
 PICTURE = Path(__file__).with_suffix(".svg")
+ONLINE_PICTURE = Path(__file__).with_name("house_online.svg")
 
-WIDTH, MARGIN, GAP = 1180, 16, 14
+WIDTH, ONLINE_WIDTH = 1180, 620
+MARGIN, GAP = 16, 14
 ROOM_HEIGHT, FLOOR_GAP, PADDING = 30, 46, 11
 LETTER = 7.4
 ACROSS = 9
-"""Rooms beside each other; a floor with more has two rows, as even as can be."""
+"""Rooms side by side; a floor with more has two rows, as even as can be."""
 COLOURS = ("#2b7a78", "#3a6ea5", "#6a4c93", "#b5651d", "#8a6d1f", "#a23b72", "#5b6f2a", "#444f5a")
 
 STYLE = """
@@ -52,8 +55,16 @@ def imports(rules: ModuleType) -> dict[str, set[str]]:
     return used
 
 
-def longest_ways(used: dict[str, set[str]]) -> list[tuple[str, str]]:
-    """Who imports whom, without those that are reached by way of another room."""
+def online_imports(rules: ModuleType) -> dict[str, set[str]]:
+    """For each room of the online solver, the other rooms of it that it imports."""
+    used: dict[str, set[str]] = {room: set() for room in set().union(*rules.ONLINE_FLOORS)}
+    for _, own, other in rules.online_imports():
+        used[own].add(other)
+    return used
+
+
+def longest_paths(used: dict[str, set[str]]) -> list[tuple[str, str]]:
+    """Pairs of a room and one that it imports, without those that another of its imports leads to."""
     reached: dict[str, set[str]] = {}
 
     def below(room: str) -> set[str]:
@@ -80,36 +91,63 @@ def rows(floors: list[set[str]]) -> Iterator[tuple[int, list[str]]]:
 
 
 def picture() -> str:
-    """The house as SVG."""
+    """The rooms of the package as SVG."""
     rules = architecture()
+    title = "The rooms of tracking3d by floor: lines lead down to what a room imports"
+    return draw(rules.FLOORS, longest_paths(imports(rules)), WIDTH, title)
+
+
+def online_picture() -> str:
+    """The rooms of the online solver as SVG."""
+    rules = architecture()
+    title = "The rooms of the online solver: lines lead down to what a room imports"
+    used = online_imports(rules)
+    return draw(levels(used), longest_paths(used), ONLINE_WIDTH, title)
+
+
+def levels(used: dict[str, set[str]]) -> list[set[str]]:
+    """Rooms by the length of the longest path of imports below them, from the ground: each as low as it can be."""
+    heights: dict[str, int] = {}
+
+    def height(room: str) -> int:
+        if room not in heights:
+            heights[room] = 1 + max(map(height, used[room]), default=-1)
+        return heights[room]
+
+    return [{room for room in used if height(room) == at} for at in range(1 + max(map(height, used)))]
+
+
+def draw(floors: list[set[str]], paths: list[tuple[str, str]], width: int, title: str) -> str:
+    """SVG of rooms by floor, from the ground, with lines from rooms to those that they import."""
     places: dict[str, tuple[float, float, float]] = {}
     drawn: list[str] = []
     y, last = float(MARGIN), -1
-    for height, rooms in rows(rules.FLOORS):
+    for height, rooms in rows(floors):
         if height != last and last >= 0:
             y += FLOOR_GAP - GAP
         if height != last:
             drawn.append(f'<text class="floor" x="{MARGIN}" y="{y + 20:g}">{height + 1}</text>')
         last = height
         widths = [len(room) * LETTER + 2 * PADDING for room in rooms]
-        free = WIDTH - 2 * MARGIN - 30 - sum(widths)
+        free = width - 2 * MARGIN - 30 - sum(widths)
         gap = free / (len(rooms) + 1)
         x = MARGIN + 30 + gap
-        for room, width in zip(rooms, widths, strict=True):
-            places[room] = (x, y, width)
+        for room, wide in zip(rooms, widths, strict=True):
+            places[room] = (x, y, wide)
             drawn.append(
-                f'<rect x="{x:.1f}" y="{y:g}" width="{width:.1f}" height="{ROOM_HEIGHT}" '
+                f'<rect x="{x:.1f}" y="{y:g}" width="{wide:.1f}" height="{ROOM_HEIGHT}" '
                 f'fill="{COLOURS[height % len(COLOURS)]}"/>'
-                f'<text x="{x + width / 2:.1f}" y="{y + 20:g}">{room}</text>'
+                f'<text x="{x + wide / 2:.1f}" y="{y + 20:g}">{room}</text>'
             )
-            x += width + gap
+            x += wide + gap
         y += ROOM_HEIGHT + GAP
-    lines = [line(places[room], places[other]) for room, other in longest_ways(imports(rules))]
+    lines = [line(places[room], places[other]) for room, other in paths]
     head = (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {y:g}" width="{WIDTH}" height="{y:g}">'
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {y:g}" width="{width}" height="{y:g}">'
     )
-    title = "<title>The rooms of tracking3d by floor: lines lead down to what a room imports</title>"
-    return "\n".join([head, title, f"<style>{STYLE}</style>", *lines, *drawn, "</svg>", ""])
+    return "\n".join(
+        [head, f"<title>{title}</title>", f"<style>{STYLE}</style>", *lines, *drawn, "</svg>", ""]
+    )
 
 
 def line(start: tuple[float, float, float], end: tuple[float, float, float]) -> str:
@@ -126,3 +164,4 @@ def line(start: tuple[float, float, float], end: tuple[float, float, float]) -> 
 
 if __name__ == "__main__":
     PICTURE.write_text(picture(), encoding="utf-8")
+    ONLINE_PICTURE.write_text(online_picture(), encoding="utf-8")

@@ -57,7 +57,7 @@ def table():
 
 @pytest.mark.usefixtures("both")
 def test_the_columns_differ_by_solver_and_features_and_the_paper_has_nothing_that_came_later():
-    base = BASE.with_changes("x", solver__final_refine=True, solver__correct_tracker=True)
+    base = BASE.with_changes("x", solver__final_refine=True, solver__tracker_feedback=True)
     variants = plan(base)
     assert list(variants) == ["paper, RGB", "paper, S2DNet", "online, RGB", "online, S2DNet"]
     found = {

@@ -98,11 +98,11 @@ def test_compare_prints_tables_json_and_a_page(call, clip, script):
         call("run", clip, *BOX, "--size", size, "--out", f"run{size}", "--no-report")
     result = call("compare", "run64", "run96", "--out", "differ.html")
     assert result.exit_code == 0, result.output
-    for word in ("window.size", "64", "96", "mask IoU, mean", "1.000", "tracked", "solve", "differ.html"):
+    for word in ("crop.size", "64", "96", "mask IoU, mean", "1.000", "tracked", "solve", "differ.html"):
         assert word in result.stdout
     assert "Settings that differ" in Path("differ.html").read_text(encoding="utf-8")
     told = json.loads(call("compare", "run64", "run96", "--json").stdout)
-    assert told["settings"] == {"window.size": ["64", "96"]}
+    assert told["settings"] == {"crop.size": ["64", "96"]}
     assert told["differences"][0]["by_frame"]["iou"] == [1.0] * 5
 
 

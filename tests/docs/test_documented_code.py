@@ -26,20 +26,20 @@ def test_python_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatch):
     for block in blocks(page, "python"):
         exec(compile(block, f"{label(page)}, a block", "exec"), program)
     if page.name == "README.md":
-        check_that_the_object_is_tracked(program["answers"], program["clip"])
+        check_that_the_object_is_tracked(program["estimates"], program["clip"])
     if page.name == "library.md":
         assert program["run"].state == "finished"
         assert len(program["poses"]) == len(program["frames"]) == len(program["run"].frames)
         assert program["tracks"].on_object.all()
 
 
-def check_that_the_object_is_tracked(answers: dict[int, FrameEstimate], clip: SyntheticClip):
-    assert list(answers) == list(range(len(clip.images)))
-    assert {answer.status for answer in answers.values()} == {Status.TRACKED}
+def check_that_the_object_is_tracked(estimates: dict[int, FrameEstimate], clip: SyntheticClip):
+    assert list(estimates) == list(range(len(clip.images)))
+    assert {estimate.status for estimate in estimates.values()} == {Status.TRACKED}
     last = len(clip.images) - 1
     turned, truly_turned = (
         Rotation.from_matrix(poses[last][:3, :3] @ poses[0][:3, :3].T)
-        for poses in ([answers[index].T_cam_obj for index in sorted(answers)], clip.T_cam_obj)
+        for poses in ([estimates[index].T_cam_obj for index in sorted(estimates)], clip.T_cam_obj)
     )
     assert np.degrees(truly_turned.magnitude()) > 20
     assert np.degrees((turned.inv() * truly_turned).magnitude()) < 8

@@ -51,7 +51,7 @@ def test_terms_of_one_frame_by_name():
     terms = LOSSES.of_frame(1)
     assert terms == pytest.approx(
         {
-            "features": 0.3,
+            "appearance": 0.3,
             "silhouette": 0.4,
             "distance": 0.03,
             "motion": 0.5,

@@ -1,4 +1,4 @@
-"""The picture of the house in CONTRIBUTING.md is that of the present imports."""
+"""The pictures of the rooms in CONTRIBUTING.md show the present imports."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def picture(house) -> str:
 
 def test_the_picture_is_up_to_date(house, picture):
     drawn = house.PICTURE.read_text(encoding="utf-8")
-    assert drawn == picture, "draw it anew: python docs/images/house.py"
+    assert drawn == picture, "draw it again: python docs/images/house.py"
 
 
 def test_every_room_is_in_it(house, picture):
@@ -35,6 +35,18 @@ def test_every_room_is_in_it(house, picture):
     assert rooms <= set(re.findall(r">([a-z_]+)</text>", picture))
 
 
-def test_only_the_longest_ways_are_drawn(house):
+def test_the_picture_of_the_online_solver_is_up_to_date_and_has_every_room(house):
+    drawn = house.ONLINE_PICTURE.read_text(encoding="utf-8")
+    assert drawn == house.online_picture(), "draw it again: python docs/images/house.py"
+    rooms = set().union(*house.architecture().ONLINE_FLOORS)
+    assert rooms <= set(re.findall(r">([a-z_]+)</text>", drawn))
+
+
+def test_only_the_longest_paths_are_drawn(house):
     used = {"cli": {"results", "errors"}, "results": {"errors", "frames"}, "errors": set(), "frames": set()}
-    assert house.longest_ways(used) == [("cli", "results"), ("results", "errors"), ("results", "frames")]
+    assert house.longest_paths(used) == [("cli", "results"), ("results", "errors"), ("results", "frames")]
+
+
+def test_levels_put_each_room_as_low_as_its_imports_allow(house):
+    used = {"cli": {"results", "errors"}, "results": {"errors"}, "web": {"errors"}, "errors": set()}
+    assert house.levels(used) == [{"errors"}, {"results", "web"}, {"cli"}]

@@ -1,4 +1,4 @@
-"""The shape of the end by configuration: made anew where it is asked for, and never at the cost of the run."""
+"""The final shape by configuration: reconstructed if it is asked for, and never at the cost of the run."""
 
 from __future__ import annotations
 
@@ -60,4 +60,4 @@ def test_nothing_is_done_where_nothing_is_asked(run, monkeypatch):
 def test_the_best_quality_asks_for_it_and_what_is_known_is_held():
     assert load_config(quality="best").object.shape == "fine"
     assert load_config(quality="good").object.shape == "fast"
-    assert ObjectConfig(model="mug.obj", shape="fine").shape == "online"
+    assert ObjectConfig(model="mug.obj", shape="fine").shape == "fast"

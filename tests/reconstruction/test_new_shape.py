@@ -1,4 +1,4 @@
-"""A shape made anew replaces the old one only where it explains frames better that it has not seen."""
+"""A reconstructed shape replaces the old one only if it explains frames better that it has not seen."""
 
 from __future__ import annotations
 

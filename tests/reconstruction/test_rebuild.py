@@ -148,7 +148,7 @@ def test_the_model_is_judged_by_a_frame_that_its_texture_has_not_seen(tmp_path):
 def test_what_models_are_judged_by_has_to_be_there(tmp_path):
     run = written(tmp_path)
     for options, words in [
-        ([], "none can be left out"),
+        ([], "none can be held out"),
         (["--truth", str(tmp_path), "--truth", str(tmp_path)], "--truth is given 2 times for 1 runs"),
     ]:
         result = CliRunner().invoke(app, ["evaluate", "model", str(run), *options])

@@ -78,7 +78,7 @@ def test_the_refined_mesh_has_the_texture_of_the_video(tmp_path):
     "override", ["object.texture_views=0", "solver.final_refine=false", "object.max_texture_size=64"]
 )
 def test_settings_leave_it_out_or_bound_it(tmp_path, override):
-    assert len(recorded(tmp_path, override).texture) == (64 if "largest" in override else 16)
+    assert len(recorded(tmp_path, override).texture) == (64 if "max_texture_size" in override else 16)
 
 
 def test_frames_that_are_not_believed_have_no_say(tmp_path, monkeypatch):

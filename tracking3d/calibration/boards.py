@@ -14,7 +14,7 @@ from tracking3d.errors import InputError
 Kind = Literal["charuco", "chessboard"]
 KINDS: tuple[Kind, ...] = ("charuco", "chessboard")
 DICTIONARY = cv2.aruco.DICT_5X5_250
-"""Of the markers of a ChArUco board."""
+"""Dictionary of the markers of a ChArUco board."""
 MARKER = 0.75
 """Side of a marker in squares."""
 LARGEST = 25

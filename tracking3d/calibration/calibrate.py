@@ -16,7 +16,7 @@ from tracking3d.frames import Frame, SkippedFrame
 from tracking3d.geometry.lens import COUNTS, Model
 
 LEAST_CORNERS = 8
-"""Of one view."""
+"""Corners of one view."""
 LEAST_VIEWS = 6
 MOST_VIEWS = 40
 """Maximum number of views; of more, those that differ most are used."""

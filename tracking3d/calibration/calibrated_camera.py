@@ -50,7 +50,7 @@ class CalibratedCamera:
 
 
 def as_coefficients(model: Model, values: tuple[float, ...], what: str) -> tuple[float, ...]:
-    """As many coefficients as a model has; none where all are 0.
+    """As many coefficients as a model has; none if all are 0.
 
     Args:
         model: The model.

@@ -10,7 +10,7 @@ from tracking3d.errors import InputError
 from tracking3d.geometry.lens import Model
 
 _CENTRE = 0.5
-"""Of the top-left pixel in COLMAP's coordinates."""
+"""Coordinates of the top-left pixel in COLMAP's coordinates."""
 
 # COLMAP: how many focal lengths, the model, and which of OpenCV's coefficients the others are.
 _COLMAP: dict[str, tuple[int, Model, Callable[..., tuple[float, ...]]]] = {

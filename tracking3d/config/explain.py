@@ -61,8 +61,8 @@ def describe_validation_error(error: ValidationError, model: type[BaseModel], no
     problems = error.errors(include_url=False)
     unknown = [p["loc"] for p in problems if p["type"] == "extra_forbidden"]
     if unknown:
-        beside = [loc[-1] for loc in unknown if loc[:-1] == unknown[0][:-1]]
-        return unknown_key(unknown[0], model, noun, beside)
+        unknown_names = [loc[-1] for loc in unknown if loc[:-1] == unknown[0][:-1]]
+        return unknown_key(unknown[0], model, noun, unknown_names)
     problem = problems[0]
     path, message, given = _reach(model, problem["loc"]).path, problem["msg"], format_value(problem["input"])
     match problem["type"]:
@@ -85,7 +85,7 @@ def unknown_key(
     loc: Sequence[int | str],
     model: type[BaseModel],
     noun: str = "setting",
-    beside: Sequence[int | str] = (),
+    unknown_names: Sequence[int | str] = (),
 ) -> str:
     """Explain that a key does not exist, and which one is meant: a sibling, or the same name in another section.
 
@@ -93,11 +93,11 @@ def unknown_key(
         loc: Path of the key.
         model: The model that was validated.
         noun: Word for a key of this model.
-        beside: All unknown keys of that section, if the name of the section chooses its settings.
+        unknown_names: All unknown keys of that section, if the name of the section chooses its settings.
     """
     *above, key = map(str, loc)
     section = _reach(model, above)
-    if misplaced := section.of_another_choice([str(name) for name in beside] or [key], noun):
+    if misplaced := section.of_another_choice([str(name) for name in unknown_names] or [key], noun):
         return misplaced
     prefix = f"{section.path}." if section.path else ""
     siblings = list(section.model.model_fields)

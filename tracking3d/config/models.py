@@ -157,7 +157,7 @@ class ObjectConfig(Section):
     @model_validator(mode="before")
     @classmethod
     def _is_held_where_known(cls, value: Any) -> Any:
-        if isinstance(value, dict) and value.get("known") is not None:
+        if isinstance(value, dict) and value.get("model") is not None:
             return {**value, "adjustment_views": 0, "texture_views": 0, "shape": "fast"}
         return value
 

@@ -39,9 +39,9 @@ class Answers:
         lost: Frames that the method called lost.
         confidence: In [0, 1] by frame index.
         seconds: Wall time by frame index.
-        stages: The same stage by stage, where it was recorded.
+        stages: The same stage by stage, if it was recorded.
         mask_sources: Origin of each estimated mask, if recorded.
-        peak_memory_mb: Most memory held, in 10^6 bytes, where recorded.
+        peak_memory_mb: Most memory held, in 10^6 bytes, if recorded.
         memory_growth_mb: How much more was held at most in the second half of the frames than in the first.
         mesh: Reads the estimated shape in object coordinates.
         points: Follows points.

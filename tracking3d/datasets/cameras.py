@@ -69,7 +69,7 @@ def read_dataset_intrinsics(file: Path, form: Literal["json", "text"], size: tup
             ``cx``, ``cy``, and perhaps ``width`` and ``height``. Or text with 4 numbers, or with 9 or more of which
             the first 9 are K row by row.
         form: Which of both.
-        size: ``(width, height)`` of the frames, where the file does not tell.
+        size: ``(width, height)`` of the frames, if the file does not say.
 
     Raises:
         InputError: If it is not such a file; see `camera_from_matrix`.

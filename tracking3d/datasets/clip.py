@@ -107,11 +107,11 @@ def read_poses(file: Path, index: dict[str, int]) -> tuple[dict[int, NDArray[np.
 
     Args:
         file: There are no poses if it does not exist.
-        index: Of each frame by its name.
+        index: Index of each frame by its name.
 
     Returns:
         The trusted poses ``(4, 4)`` by frame index, NaN where the file gives no R or no t, and the length of their unit
-        in millimetres, where known.
+        in millimetres, if known.
 
     Raises:
         InputError: If the file is not of that kind, or a trusted pose is not rigid.

@@ -168,7 +168,7 @@ class DatasetLayout(Section):
         description="How files are matched to frames: by the last number in their names, by name, or by order.",
     )
     every: int = Field(1, ge=1, description="With order: file n belongs to frame n times this.")
-    masks: MaskLayout | None = Field(None, description="The whole object where known.")
+    masks: MaskLayout | None = Field(None, description="The whole object if known.")
     visible_masks: MaskLayout | None = Field(None, description="What is seen of it.")
     initial_masks: MaskLayout | None = Field(None, description="Rough masks, a tracker's input.")
     regions: Regions | None = None

@@ -16,11 +16,11 @@ from tracking3d.errors import InputError
 from tracking3d.video.selection import natural_order
 
 VOID = 255
-"""Label of pixels that belong to no object, where there are other labels (DAVIS)."""
+"""Label of pixels that belong to no object, if there are other labels (DAVIS)."""
 
 
 def find_sequence(layout: DatasetLayout, root: Path, name: str) -> Place:
-    """The sequence called ``name``, and its object where it is called ``sequence/object``.
+    """The sequence called ``name``, and its object if it is called ``sequence/object``.
 
     Raises:
         InputError: If there is none.
@@ -81,7 +81,7 @@ def sequence_names(layout: DatasetLayout, root: Path) -> list[str]:
 
 
 def object_names(layout: DatasetLayout, place: Place) -> list[str]:
-    """Names of the objects of one sequence; none where it has one without a name.
+    """Names of the objects of one sequence; none if it has one without a name.
 
     Raises:
         InputError: If a file that lists objects is missing or damaged.

@@ -64,7 +64,7 @@ def read_labels(path: Path, colour: bool = False) -> NDArray:
         ``(H, W)`` palette indices or grey values, or ``(H, W, 3)`` uint8 RGB.
 
     Raises:
-        InputError: If it is no readable image, or has colours where labels are numbers.
+        InputError: If it is no readable image, or has colours although labels are numbers.
     """
     try:
         with Pillow.open(path, formats=["PNG", "BMP", "TIFF", "GIF", "JPEG", "PPM"]) as image:

@@ -34,7 +34,7 @@ class Place:
 
     @property
     def object_number(self) -> int:
-        """The object as a number; 1 where the sequence has only one and no name for it.
+        """The object as a number; 1 if the sequence has only one and no name for it.
 
         Raises:
             InputError: If its name is not a number.

@@ -18,7 +18,7 @@ from tracking3d.video.image_sequence import images_among
 
 
 def list_sequences(layout: DatasetLayout, root: Path) -> list[str]:
-    """Names of a data set's sequences in order; ``sequence/object`` where a sequence has several objects.
+    """Names of a data set's sequences in order; ``sequence/object`` if a sequence has several objects.
 
     Raises:
         InputError: If the folder or its sequences are missing, or a file that lists objects is damaged.

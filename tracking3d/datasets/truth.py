@@ -127,19 +127,19 @@ class Truth:
         name: What tables call it.
         frames: The images in order.
         box: The object in frame 0 as ``(x, y, width, height)``, where a tracker starts from one.
-        camera: Of all frames, where known.
+        camera: Camera of all frames, if known.
         given_camera: The camera given to a tracker, if it is not the true one.
         camera_told: Whether a tracker is given a camera.
         T_cam_obj: ``(4, 4)`` pose by frame index; only those that are known and trusted. The rotation or the
-            translation is NaN where only the other is known.
+            translation is NaN if only the other is known.
         masks: The object's mask by frame index, the part behind other things included if the data know it.
         visible_masks: Only the part that is seen; where it differs from `masks` and is known.
-        boxes: The object's box by frame index where it has no mask.
+        boxes: The object's box by frame index if it has no mask.
         depth: By frame index.
         mesh: The true shape in object coordinates.
         points: Surface points and where they are seen.
         initial_masks: Rough masks that come with the clip, by frame index; a tracker's input.
-        millimetres: Length of the unit of the poses in millimetres, where known.
+        millimetres: Length of the unit of the poses in millimetres, if known.
         symmetries: ``(S, 4, 4)`` object transforms that leave the object as it is, the identity among them.
         symmetry_axis: ``(3,)`` unit direction in object coordinates: turned about it by any angle, the object is as
             it was. None without such an axis.

@@ -6,7 +6,7 @@ Conventions: OpenCV camera axes (x right, y down, z forward), ``T_cam_obj`` maps
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
@@ -148,4 +148,20 @@ def lost_estimate(frame: Frame, mask: MaskEstimate, T_cam_obj: NDArray[np.float6
         reason="",
         confidence=0.0,
         mask_source=MaskSource.as_initial(initial),
+    )
+
+
+def mark_failed(estimate: FrameEstimate, failure: str) -> FrameEstimate:
+    """The estimate of a frame in which a plug-in failed: at most uncertain, with half the confidence.
+
+    Args:
+        estimate: The estimate.
+        failure: Which plug-in failed, and why.
+    """
+    return replace(
+        estimate,
+        status=Status.UNCERTAIN if estimate.status is Status.TRACKED else estimate.status,
+        reason="; ".join(filter(None, (failure, estimate.reason))),
+        confidence=estimate.confidence / 2,
+        failure=failure,
     )

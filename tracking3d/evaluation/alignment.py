@@ -29,7 +29,7 @@ SAMPLES = 100
 
 _REFINED = 5
 _STEPS = 100
-_RANK = 1e-6  # a direction whose singular value is this small beside the largest is not determined
+_RANK = 1e-6  # a direction whose singular value is this small relative to the largest is not determined
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +82,8 @@ def align_object_frame(
     Args:
         T_est: ``(N, 4, 4)`` finite estimates.
         T_true: ``(N, 4, 4)``.
-        diameter: Of the object in the truth's unit. Without it the limit is a tenth of the median true distance.
-        seed: Of the choice of frames.
+        diameter: Diameter of the object in the truth's unit. Without it the limit is a tenth of the median distance.
+        seed: Seed of the choice of frames.
 
     Raises:
         ValueError: If there is no frame, the shapes differ, a value is not finite, or the diameter is not positive.
@@ -140,8 +140,8 @@ def translation_errors(
     Args:
         T_est: ``(N, 4, 4)`` estimates as they are.
         T_true: ``(N, 4, 4)``.
-        alignment: Of these poses.
-        diameter: Of the object in the truth's unit. None measures in median true depths of these frames instead.
+        alignment: Alignment of these poses.
+        diameter: Diameter of the object in the truth's unit. None measures in median true depths of these frames.
 
     Raises:
         ValueError: If the shapes differ, a value is not finite, or the unit is not positive.

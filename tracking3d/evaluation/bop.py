@@ -35,7 +35,7 @@ class AverageRecall:
     """Share of right poses, averaged over the thresholds (and over the misalignment tolerances of VSD).
 
     Attributes:
-        vsd, mssd, mspd: Of each error; None if it could not be computed.
+        vsd, mssd, mspd: Recall of each error; None if it could not be computed.
     """
 
     vsd: float | None
@@ -63,7 +63,7 @@ def average_recall(
         vsd_errors: ``(N, 10)`` by tolerance, of `tracking3d.evaluation.vsd`; None if there is no depth.
         mssd_errors: ``(N,)`` in the unit of ``diameter``.
         mspd_errors: ``(N,)`` pixels.
-        diameter: Of the model.
+        diameter: Diameter of the model.
         image_width: Pixels.
 
     Raises:

@@ -1,7 +1,7 @@
 """DAVIS: region similarity J, boundary accuracy F and the statistics of a sequence.
 
 As ``davis2017-evaluation`` computes them (Perazzi et al., "A benchmark dataset and evaluation methodology for video
-object segmentation", CVPR 2016; Pont-Tuset et al., "The 2017 DAVIS challenge"). Void pixels, where a data set has
+object segmentation", CVPR 2016; Pont-Tuset et al., "The 2017 DAVIS challenge"). Void pixels, if a data set has
 them, are taken out of both masks before.
 """
 
@@ -29,7 +29,7 @@ class SequenceStatistics:
     """What DAVIS reports of the values of one object in one sequence.
 
     Attributes:
-        mean: Of all frames.
+        mean: Mean of all frames.
         recall: Share of frames above 0.5.
         decay: Mean of the first quarter of the frames minus that of the last.
     """

@@ -1,7 +1,7 @@
 """Fit of the confidence: logistic regression of correctness on a few features known without ground truth.
 
 Cox, "The regression analysis of binary sequences", 1958. A number counts between the bounds that it was seen within,
-so that no outlier decides, and where it is missing a constant stands for it. The result is a small table.
+so that no outlier decides, and if it is missing, a constant stands for it. The result is a small table.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ BOUNDS = 2.0, 98.0
 """Percentiles of the evidence beyond which it counts no further."""
 
 PENALTY = 1.0
-"""Weight of half the squared coefficients, of evidence of unit variance, beside the sum of the log losses."""
+"""Weight of half the squared coefficients, of evidence of unit variance, next to the sum of the log losses."""
 
 _BOUNDS_OF_SIGN: dict[int, tuple[float | None, float | None]] = {1: (0.0, None), -1: (None, 0.0)}
 
@@ -30,7 +30,7 @@ class Term:
     """What one number adds to the log odds.
 
     Attributes:
-        name: Of the evidence.
+        name: Name of the evidence.
         weight: Its coefficient.
         low, high: It is clipped to them.
         missing: What is added if unknown.

@@ -33,7 +33,7 @@ class ConfidenceScores:
     Attributes:
         confidence_calibration_error: Expected calibration error of the confidence; None without confidences.
         confidence_auc: Probability that a right frame has a higher confidence than a wrong one, ties for a half; None
-            where all are right or all wrong.
+            if all are right or all wrong.
         lost_precision: Share of the frames called lost that truly are; None if none was called so.
         lost_recall: Share of the truly lost frames that were called so; None if there is none.
         frames_truly_lost: Number of truly lost frames.
@@ -57,7 +57,7 @@ def right_frames(
     """Whether each frame whose truth is known is right; the given frame aside.
 
     Args:
-        answers: The method's.
+        answers: The method's results.
         rotation: Rotation error in degrees by frame.
         masks: Estimated and true masks, by frame.
     """
@@ -73,7 +73,7 @@ def score_confidence(
     """Judge the self-assessment.
 
     Args:
-        answers: The method's.
+        answers: The method's results.
         rotation: Rotation error in degrees by frame.
         masks: Estimated and true masks, by frame.
     """

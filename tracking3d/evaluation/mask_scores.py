@@ -26,7 +26,7 @@ _EQUAL = 1e-9
 class MaskScores:
     """Masks over the frames with a true mask or box, except the one that the method was given.
 
-    All are None if there is no such frame. Where only boxes are known, the box around a mask is compared, and
+    All are None if there is no such frame. If only boxes are known, the box around a mask is compared, and
     there is no boundary.
 
     Attributes:
@@ -62,10 +62,10 @@ class FrameMasks:
     In a frame with an estimate, no mask is an empty one; in one without, everything is 0.
 
     Attributes:
-        iou: Of the estimate.
-        iou_initial: Of the mask tracker's mask.
-        boundary_f: Of the estimate.
-        boundary_f_initial: Of the mask tracker's mask.
+        iou: IoU of the estimate.
+        iou_initial: IoU of the mask tracker's mask.
+        boundary_f: Boundary F of the estimate.
+        boundary_f_initial: Boundary F of the mask tracker's mask.
         visible: Whether the truth shows the object at all.
     """
 
@@ -134,7 +134,7 @@ def _compare(answers: Answers, truth: Truth, index: int) -> FrameMasks:
                 "run."
             )
     ious = [0.0 if mask is None else mask_iou(mask, true) for mask in masks]
-    if truth.boxes:  # true masks beside boxes are empty ones: they tell nothing of boundaries
+    if truth.boxes:  # true masks next to boxes are empty: they say nothing about boundaries
         return FrameMasks(ious[0], ious[1], np.nan, np.nan, bool(true.any()))
     boundaries = [0.0 if mask is None else boundary_f(mask, true) for mask in masks]
     return FrameMasks(ious[0], ious[1], boundaries[0], boundaries[1], bool(true.any()))

@@ -45,7 +45,7 @@ def rotation_alignment(R_est: Rotations, R_true: Rotations) -> NDArray[np.float6
     starts = [offsets[int(n)] for n in spread]
     costs = np.array([_magnitudes(start, offsets).sum() for start in starts])
     best = [starts[n] for n in np.argsort(costs, kind="stable")[:_REFINED]]
-    # A start is kept as it is too: refinement only comes near the minimum where that is one of the frames.
+    # A start is kept as it is too: refinement only comes near the minimum if that is one of the frames.
     candidates = best + [_weiszfeld(start, offsets) for start in best]
     return min(candidates, key=lambda A: _magnitudes(A, offsets).sum()).as_matrix()
 

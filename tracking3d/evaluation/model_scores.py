@@ -23,23 +23,23 @@ SAMPLES = 30_000
 
 @dataclass(frozen=True, kw_only=True)
 class ModelScores:
-    """Poses and shape where the true mesh is known; None otherwise.
+    """Poses and shape if the true mesh is known; None otherwise.
 
     Attributes:
         bop_ar: Mean of the next three; None unless all are known.
         bop_ar_vsd: Average recall of the visible surface discrepancy; needs depth and the unit in millimetres.
-        bop_ar_mssd: Of the maximum surface distance.
-        bop_ar_mspd: Of the maximum projection distance; needs the camera.
+        bop_ar_mssd: Average recall of the maximum surface distance.
+        bop_ar_mspd: Average recall of the maximum projection distance; needs the camera.
         chamfer_percent: Symmetric Chamfer distance in percent of the object's diameter.
         shape_f_score: F-score at 2 percent of the diameter.
         shape_f_score_fine: At 1 percent.
         shape_f_score_seen: At 2 percent, of the surface that the frames show; needs the camera.
         shape_f_score_fine_seen: The same at 1 percent.
-        shape_f_score_fitted: At 2 percent, of the surface that the frames show (all of it, where the camera is not
+        shape_f_score_fitted: At 2 percent, of the surface that the frames show (all of it, if the camera is not
             known), size and place fitted to the surfaces instead of the poses.
         shape_f_score_fine_fitted: The same at 1 percent.
         shape_accuracy_percent: Mean distance of the estimated from the true surface in percent of the diameter.
-        shape_completeness_percent: Of the true from the estimated surface.
+        shape_completeness_percent: Completeness of the true from the estimated surface.
         shape_normals: Mean cosine between normals of the two surfaces.
         shape_genus_error: By how many handles they differ; None unless both are one closed surface.
     """
@@ -76,7 +76,7 @@ def score_model(
     is wrong at every threshold.
 
     Args:
-        answers: The method's.
+        answers: The method's results.
         truth: The clip's.
         pairs: Their poses.
         alignment: Fitted to all frames.

@@ -43,8 +43,8 @@ class PoseScores:
     Attributes:
         rotation_error_mean_deg, rotation_error_median_deg, rotation_error_max_deg: Aligned by one rotation.
         rotation_error_anchored_median_deg: Anchored at the first of these frames that has an estimate.
-        rotation_error_consecutive_median_deg: From each to the next, where both have an estimate.
-        rotation_error_return_deg: Of the turn from the first to the last of these frames, in a clip that ends with
+        rotation_error_consecutive_median_deg: From each to the next, if both have an estimate.
+        rotation_error_return_deg: Error of the turn from the first to the last of the frames, in a clip that ends with
             the view that it began with and was 45 degrees away from it in between; None in others.
         share_under_5_deg: Share with an aligned error under 5 degrees; a lost frame counts as not.
         rotation_auc_20_deg: The same share for a limit from 0 to 20 degrees, averaged over the limit.
@@ -131,7 +131,7 @@ def fit_alignment(pairs: PosePairs | None, diameter: float | None) -> ObjectAlig
 
     Args:
         pairs: The poses.
-        diameter: Of the object in the truth's unit, where known.
+        diameter: Diameter of the object in the truth's unit, if known.
     """
     whole = pairs and pairs.with_rotation.with_position
     if whole is None or not len(whole.found):
@@ -246,7 +246,7 @@ def _score_translations(
 
 
 def _of_positions(pairs: PosePairs) -> ObjectAlignment:
-    """Scale and offset where no true rotation is known; the rotation means nothing."""
+    """Scale and offset if no true rotation is known; the rotation means nothing."""
     T_true = pairs.T_true.copy()
     T_true[:, :3, :3] = pairs.T_est[:, :3, :3]
     return align_object_frame(pairs.T_est, T_true)

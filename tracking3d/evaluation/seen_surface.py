@@ -28,7 +28,7 @@ def make_visibility_test(
         mesh: The true shape.
         diameter: Its diameter.
         T_cam_obj: ``(4, 4)`` true pose of each frame; those that are not finite show nothing.
-        camera: Of all frames.
+        camera: Camera of all frames.
     """
     whole = [pose for pose in T_cam_obj if np.isfinite(pose).all()]
     poses = [whole[n] for n in np.unique(np.linspace(0, len(whole) - 1, MOST).astype(int))] if whole else []

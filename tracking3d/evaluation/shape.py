@@ -30,7 +30,7 @@ _NEAREST = 5
 
 @dataclass(frozen=True)
 class ShapeScores:
-    """Of one estimated mesh.
+    """Scores of one estimated mesh.
 
     Attributes:
         chamfer: Mean distance from the estimated to the true surface and back, half of their sum, in diameters.
@@ -74,10 +74,10 @@ def shape_scores(
     Args:
         estimated: In estimated object coordinates.
         true: In true object coordinates.
-        diameter: Of the true mesh, in its unit.
+        diameter: Diameter of the true mesh, in its unit.
         T_true_est: ``(4, 4)`` similarity from estimated to true coordinates; None if they are the same.
         samples: Points on each surface.
-        seed: Of the points.
+        seed: Seed of the points.
         seen: Says of points ``(N, 3)`` of the true surface with normals ``(N, 3)`` which were seen.
 
     Raises:

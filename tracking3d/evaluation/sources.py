@@ -32,9 +32,9 @@ def open_answers(
         path: A run folder, or what `tracking3d.datasets.readers.read_answers` reads.
         truth: The clip.
         form: ``run`` or a format of `read_answers`; recognised if None.
-        refined: Of a run folder: take the estimates of the final refinement if there are any, else the causal ones.
-        offset: Of a run folder: its frame ``i`` is frame ``i + offset`` of the clip.
-        options: Of that format, such as ``of`` of a trajectory; a run folder has none.
+        refined: For a run folder: take the estimates of the final refinement if there are any, else the causal ones.
+        offset: For a run folder: its frame ``i`` is frame ``i + offset`` of the clip.
+        options: Options of that format, such as ``of`` of a trajectory; a run folder has none.
 
     Returns:
         The estimates, and what they were read as, in words.

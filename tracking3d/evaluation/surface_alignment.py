@@ -37,7 +37,7 @@ def align_surfaces(
     Args:
         estimated: In estimated object coordinates.
         true: In true object coordinates.
-        diameter: Of the true mesh, in its unit.
+        diameter: Diameter of the true mesh, in its unit.
         T_true_est: ``(4, 4)`` where to begin, such as `tracking3d.evaluation.alignment` gives.
         seen: Says of points ``(N, 3)`` of the true surface with normals ``(N, 3)`` which were seen; the others have no
             say.

@@ -27,9 +27,9 @@ in every fifth frame that sees it and scored in all frames but that one."""
 
 @dataclass(frozen=True)
 class PointScores:
-    """Of one video; the figures of a data set are the means over its videos.
+    """Figures of one video; those of a data set are the means over its videos.
 
-    A share of nothing is None (NaN in ``tapnet``): where no point is visible in a scored frame, or no frame is scored.
+    A share of nothing is None (NaN in ``tapnet``): if no point is visible in a scored frame, or no frame is scored.
 
     Attributes:
         average_jaccard: AJ, the mean of `jaccard`.

@@ -27,7 +27,7 @@ class LongTermSequence:
 
     Attributes:
         overlaps: ``(T,)`` of `mask_overlap` or `rectangle_overlap` with the truth, in [0, 1].
-        confidence: ``(T,)``; the toolkit takes 0 where the tracker gave none.
+        confidence: ``(T,)``; the toolkit takes 0 if the tracker gave none.
         visible: ``(T,)`` bool, whether the truth has a region.
     """
 
@@ -87,7 +87,7 @@ def rectangle_overlap(a: ArrayLike, b: ArrayLike, size: tuple[int, int] | None =
 def confidence_thresholds(confidence: ArrayLike, resolution: int = RESOLUTION) -> NDArray[np.float64]:
     """Thresholds from all confidences ``(N,)`` of a tracker, falling, between infinity and minus infinity.
 
-    Up to ``resolution - 2`` confidences are all thresholds. Of more, as many are taken at even ranks.
+    Up to ``resolution - 2`` confidences are all thresholds. If there are more, as many are taken at even ranks.
 
     Raises:
         ValueError: If the shape is another or a value is not finite.
@@ -105,7 +105,7 @@ def long_term_curves(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Precision ``(M,)`` and recall ``(M,)`` of one sequence at each threshold.
 
-    Where the tracker is nowhere confident, precision is 1 and recall 0.
+    If the tracker is nowhere confident, precision is 1 and recall 0.
 
     Args:
         overlaps, confidence, visible: ``(T,)``, see `LongTermSequence`.

@@ -41,7 +41,7 @@ def vsd(
         depth_test: ``(H, W)`` measured z of the scene; 0 where it is unknown.
         K: ``(3, 3)`` intrinsics of the full frame.
         delta: `VISIBILITY_TOLERANCE` in the unit of the depths.
-        diameter: Of the model.
+        diameter: Diameter of the model.
         tolerances: In diameters.
 
     Raises:

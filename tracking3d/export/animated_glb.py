@@ -24,7 +24,7 @@ from tracking3d.results.mesh_export import glb_file
 CAMERA_NODE = "tracking3d_camera"
 _FLOAT = 5126  # glTF's constant
 _NEAREST = 0.01
-"""Of the near plane, in depths of the object's origin in its nearest frame."""
+"""Depth of the near plane, in depths of the object's origin in its nearest frame."""
 _LEAST_NEAR = 1e-6
 """glTF wants it above 0, wherever a damaged run has the object."""
 

@@ -1,6 +1,6 @@
 """Poses in the format of the BOP Challenge: ``scene_id,im_id,obj_id,score,R,t,time``, one row a frame.
 
-Lengths are in millimetres; where the size of the object is not known, one unit of the run is taken for a metre. Frames
+Lengths are in millimetres; if the size of the object is not known, one unit of the run is taken for a metre. Frames
 without a pose have no row. Scene and object are number 1, images are numbered by frame index.
 """
 

@@ -29,7 +29,7 @@ from tracking3d.export.seen_surface import find_seen_surface
 from tracking3d.export.training_images import picture_name, write_pictures
 
 CENTRE = 0.5
-"""Of the top-left pixel, in COLMAP's and nerfstudio's coordinates."""
+"""Coordinates of the top-left pixel, in COLMAP's and nerfstudio's coordinates."""
 _PINHOLE = 1
 """Number of the camera model with fx, fy, cx, cy."""
 _LEAST_VIEWS = 2

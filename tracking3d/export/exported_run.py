@@ -53,7 +53,7 @@ class PosedFrame:
     def T_through(self, camera: Camera) -> NDArray[np.float64]:
         """The pose for a format that has one lens for all frames, ``camera``.
 
-        Where the frame was solved with another focal length, the object is moved along the axis until it is seen at
+        If the frame was solved with another focal length, the object is moved along the axis until it is seen at
         its place and in its size again; what remains is the perspective within the object.
         """
         if (self.camera.fx, self.camera.cx, self.camera.cy) == (camera.fx, camera.cx, camera.cy):
@@ -232,7 +232,7 @@ class ExportedRun:
 def visible_side(model: ObjectModel) -> float:
     """The longest side of what the video has shown of an object; what it has not is a guess, and often too deep.
 
-    Of an object that was hardly seen it is that of the whole mesh.
+    For an object that was hardly seen it is that of the whole mesh.
 
     Raises:
         InputError: If that has no extent.

@@ -29,11 +29,11 @@ class Exporter:
             ``scene``.
         writes: What it writes, in a few words.
         write: Writes a run to a path that does not exist yet: a file if there is a ``suffix``, else a folder.
-        suffix: Of the file; empty if a folder is written.
+        suffix: Suffix of the file; empty if a folder is written.
         file_name: What it is called in the folder of exports, ``{run}`` standing for letters and digits of the run's
             name; empty for the format's name and suffix.
-        options: Names of those `ExportOptions` that it has a use for, beside `ANYWHERE`.
-        modules: What has to be importable, beside what tracking3d always needs.
+        options: Names of those `ExportOptions` that it has a use for, besides `ANYWHERE`.
+        modules: What has to be importable, besides what tracking3d always needs.
         extra: What brings them: the name of an extra of this package.
     """
 

@@ -181,7 +181,7 @@ def _is_export(folder: Path) -> bool:
 
 @contextmanager
 def _replace_when_done(path: Path) -> Iterator[Path]:
-    """A place of the same name in a folder beside ``path``; what is there at a good end takes the place of ``path``."""
+    """A path of the same name in a folder next to ``path``; what is there at a good end replaces ``path``."""
     workshop = partial_path(path)
     made, earlier = workshop / path.name, workshop / "earlier"
     with writing(path):

@@ -14,13 +14,13 @@ class ExportOptions:
     """What may be asked of an export; a format that has no use for an option refuses it.
 
     Attributes:
-        answers: ``final`` takes the answers of the final refinement where there are any, ``causal`` those before it.
+        answers: ``final`` takes the estimates of the final refinement if there are any, ``causal`` those before it.
         object_size: Metres of the longest side of the smallest box around the object; None leaves the run's unit.
         fps: Frames per second; None takes what the run knows.
-        source: The video, where it is no longer where the run found it.
+        source: The video, if it is no longer where the run found it.
         of: ``object`` for poses ``T_cam_obj``, ``camera`` for those of a camera about the still object, ``T_obj_cam``.
-        cut_out: Pictures as PNG that are transparent around the object, instead of whole ones with masks beside.
-        images: Whether pictures are written where a format has room for them.
+        cut_out: Pictures as PNG that are transparent around the object, instead of whole ones with separate masks.
+        images: Whether pictures are written if a format has room for them.
         undistorted: Masks and pictures as a camera without the distortion of the lens sees them, instead of as they
             were taken.
         frame: The frame that ``xy`` is in; None takes the first one with a pose.

@@ -1,7 +1,7 @@
 """A recording for the viewer rerun: images, masks, mesh, poses, and the status and confidence of each frame.
 
 Entities: ``camera`` (pinhole, OpenCV's axes), ``camera/image``, ``camera/mask``, ``camera/object`` (pose and mesh),
-``status`` and ``confidence``. Timelines: ``frame``, and ``time`` where the run knows it. Where there is no pose,
+``status`` and ``confidence``. Timelines: ``frame``, and ``time`` where the run knows it. If there is no pose,
 the last one stays and ``status`` says so.
 """
 

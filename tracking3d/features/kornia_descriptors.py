@@ -39,7 +39,7 @@ class KorniaEncoder:
     Args:
         descriptor: Which; see ``Options``.
         network: It, with its weights; None for ``dense-sift``.
-        stride: Of descriptors of patches.
+        stride: Stride of descriptors of patches.
 
     Attributes:
         channels: 128.

@@ -31,7 +31,7 @@ class Camera:
         width, height: Frame size in pixels.
         origin: Where the intrinsics came from, in words; recorded in the run.
         assumed: Whether nobody gave the focal length.
-        lens: How the pictures that were taken differ from what this camera sees; None where they do not.
+        lens: How the pictures that were taken differ from what this camera sees; None if they do not.
     """
 
     fx: float

@@ -22,7 +22,7 @@ def read_mesh_file(path: Path) -> trimesh.Trimesh:
     """Read any mesh that trimesh reads, as one piece, with the vertices as the file has them.
 
     The axes are the file's. Only a ``mesh.glb`` of a run, which knows its object by its name, comes back in
-    object coordinates, and so agrees with the ``mesh.obj`` beside it.
+    object coordinates, and so agrees with the ``mesh.obj`` next to it.
 
     Raises:
         Exception: Whatever trimesh's loaders raise.

@@ -24,7 +24,7 @@ def is_single(values: Tensor, dimensions: int) -> bool:
 
 
 def matrix_of(quaternion: Tensor) -> Tensor:
-    """``(3, 3)`` of ``(4,)``, w first, of any length; the identity where that is 0."""
+    """``(3, 3)`` of ``(4,)``, w first, of any length; the identity if that is 0."""
     values = quaternion.detach()
     length = torch.linalg.vector_norm(values).numpy()
     if length != 0:  # NaN is passed on

@@ -67,7 +67,7 @@ class OutlineLoss(_PerFrame):
         """Compare outlines; differentiable in where the outline's points are, their number and weights held fixed.
 
         Args:
-            views: Of `MeshRenderer`.
+            views: Views of `MeshRenderer`.
             mask: ``(B, 1, H, W)`` in [0, 1].
 
         Raises:
@@ -97,7 +97,7 @@ class TextureLoss(nn.Module):
         """Compare; differentiable in texture, vertices, poses and cameras.
 
         Args:
-            views: Of `MeshRenderer`.
+            views: Views of `MeshRenderer`.
             observed: ``(B, C, H, W)``.
 
         Raises:
@@ -126,5 +126,5 @@ class LaplacianLoss(nn.Module):
         self.register_buffer("laplacian", uniform_laplacian(faces, vertices))
 
     def forward(self, vertices: Tensor) -> Tensor:
-        """Of ``(V, 3)`` vertices."""
+        """The loss of ``(V, 3)`` vertices."""
         return laplacian_loss(self.laplacian.to(vertices.dtype), vertices)

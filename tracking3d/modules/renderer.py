@@ -53,7 +53,7 @@ class RenderedViews:
     Attributes:
         image: ``(B, C, H, W)`` texture, zero where uncovered.
         silhouette: ``(B, 1, H, W)`` soft, in [0, 1].
-        drawn: All that the renderer answers.
+        drawn: All that the renderer returns.
     """
 
     image: Tensor
@@ -83,9 +83,9 @@ class MeshRenderer(nn.Module):
 
         Args:
             mesh: The mesh.
-            camera: Of each of B frames, or one for all; all of one size. Its extrinsics follow the pose: where they
+            camera: Camera of each frame, or one for all; all of one size. Its extrinsics follow the pose: where they
                 are the identity the pose maps object to camera, else object to world.
-            pose: Of each of B frames, or one for all.
+            pose: Pose of each of B frames, or one for all.
 
         Raises:
             ValueError: If cameras and poses are not as many, sizes differ, or a camera has a skew.

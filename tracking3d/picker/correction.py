@@ -39,7 +39,7 @@ class CorrectionProgress:
         running: Whether it goes on.
         sentence: How far, or how it ended; empty if there was none.
         failed: Whether it ended without a result.
-        share: Of the frames that are done, in [0, 1]; None if unknown.
+        share: Share of the frames that are done, in [0, 1]; None if unknown.
     """
 
     running: bool = False
@@ -54,7 +54,7 @@ class CorrectionPage(Picker):
     Args:
         session: The frames, and the tracker that makes the masks.
         name: What the object is called.
-        begin: Begins to correct the run; raises a `Tracking3dError` where it cannot.
+        begin: Begins to correct the run; raises a `Tracking3dError` if it cannot.
         progress: How far that is.
         access: Where to listen, and whom to serve.
         port: The port, or the next one that is free; 0 for any.

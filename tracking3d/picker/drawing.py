@@ -25,7 +25,7 @@ class Point(_Drawn):
     Attributes:
         x: Column in pixels.
         y: Row in pixels.
-        on: Whether it is on the object, or beside it.
+        on: Whether it is on the object, or on the background.
     """
 
     x: Pixel
@@ -38,7 +38,7 @@ class Stroke(_Drawn):
 
     Attributes:
         path: Its points ``(x, y)`` in pixels.
-        radius: Of the brush, in pixels.
+        radius: Radius of the brush, in pixels.
         on: Whether it adds to the mask, or takes away from it.
     """
 

@@ -57,14 +57,14 @@ def _of_points(image: Image, drawn: DrawnObject) -> NDArray[np.uint8]:
 
 
 def _in_box(image: Image, drawn: DrawnObject, box: Box) -> NDArray[np.uint8]:
-    """The object in a box, by points on it and beside it."""
+    """The object in a box, by points on it and on the background."""
     height, width = image.shape[:2]
     scale = _SIZE / max(height, width)
     small = cv2.resize(
         image, (max(round(width * scale), 8), max(round(height * scale), 8)), interpolation=cv2.INTER_AREA
     )
     on = [(point.x * scale, point.y * scale) for point in drawn.points if point.on]
-    beside = [(point.x * scale, point.y * scale) for point in drawn.points if not point.on]
+    off = [(point.x * scale, point.y * scale) for point in drawn.points if not point.on]
     labels = np.full(small.shape[:2], cv2.GC_BGD, np.uint8)
     inside = clip_box((box[0] * scale, box[1] * scale, box[2] * scale, box[3] * scale), small.shape)
     if inside is None:
@@ -72,7 +72,7 @@ def _in_box(image: Image, drawn: DrawnObject, box: Box) -> NDArray[np.uint8]:
     left, top, across, down = (round(side) for side in inside)
     labels[top : top + down, left : left + across] = cv2.GC_PR_FGD
     radius = max(round(_SEED * _SIZE), 2)
-    for points, label in ((on, cv2.GC_FGD), (beside, cv2.GC_BGD)):
+    for points, label in ((on, cv2.GC_FGD), (off, cv2.GC_BGD)):
         for x, y in points:
             cv2.circle(labels, (round(x), round(y)), radius, int(label), -1)
     if small.std(axis=(0, 1)).max() >= _LEAST_CONTRAST and (labels == cv2.GC_BGD).any():

@@ -34,12 +34,12 @@ def save_outcome(picked: Picked, config: PipelineConfig, folder: Path, source: s
         (folder / FOLDER if picked.masks else folder).mkdir(parents=True, exist_ok=True)
     for path, mask in zip(mask_files(picked, folder), picked.masks, strict=True):
         write_mask(path, mask)
-    told = {
+    description = {
         "source": source,
         "frame": picked.frame,
         "objects": [one.model_dump(mode="json") for one in picked.objects],
     }
-    write_atomic(folder / DESCRIPTION, (json.dumps(told, indent=1) + "\n").encode())
+    write_atomic(folder / DESCRIPTION, (json.dumps(description, indent=1) + "\n").encode())
     write_atomic(folder / SETTINGS, settings_as_yaml(config).encode())
 
 

@@ -30,8 +30,8 @@ class Picked:
     Attributes:
         frame: Index of the frame that it was picked in, which the run begins with.
         objects: What was drawn.
-        boxes: One ``(x, y, width, height)`` for each object, where boxes say it all, else none.
-        masks: One ``(H, W)`` bool for each object, where they do not, else none.
+        boxes: One ``(x, y, width, height)`` for each object, if boxes are enough, else none.
+        masks: One ``(H, W)`` bool for each object, if they are not, else none.
     """
 
     frame: int
@@ -109,8 +109,8 @@ class PickingSession:
         """
         frames = sorted({one.frame for one in drawing.objects})
         if len(frames) > 1:
-            told = " and ".join(str(index) for index in frames)
-            raise InputError(f"The objects are drawn on frames {told}; draw all of them on one frame.")
+            drawn_on = " and ".join(str(index) for index in frames)
+            raise InputError(f"The objects are drawn on frames {drawn_on}; draw all of them on one frame.")
         if len(drawing.objects) > 1 and self.config.tracker.name == "precomputed":
             raise InputError("The tracker precomputed has masks of one object; pick one object.")
         frame = self._frame(frames[0])

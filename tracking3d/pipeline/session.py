@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tracking3d.config.camera import warn_of_unlikely
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError
-from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status, lost_estimate
+from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status, lost_estimate, mark_failed
 from tracking3d.estimation.solver import GuidedSolver, RefiningSolver, Solver
 from tracking3d.estimation.tracker_feedback import corrects
 from tracking3d.estimation.undistortion import undistort_solver
@@ -297,15 +297,7 @@ class Session:
     def _with_failure(self, estimate: FrameEstimate) -> FrameEstimate:
         """The estimate for a frame in which plug-ins failed says so, and is not relied on."""
         failure = self._failures.get(estimate.index)
-        if failure is None:
-            return estimate
-        return replace(
-            estimate,
-            status=Status.UNCERTAIN if estimate.status is Status.TRACKED else estimate.status,
-            reason="; ".join(filter(None, (failure, estimate.reason))),
-            confidence=estimate.confidence / 2,
-            failure=failure,
-        )
+        return estimate if failure is None else mark_failed(estimate, failure)
 
     def result(self) -> ObjectModel:
         """The object as it is known now: one textured mesh."""

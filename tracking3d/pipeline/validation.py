@@ -106,7 +106,7 @@ def set_known_object(config: PipelineConfig, known: Any) -> PipelineConfig:
         return config
     if not isinstance(known, str | Path):
         raise InputError(f"object= is {a_kind(known)}; give the folder of an earlier run, or a mesh file.")
-    section = ObjectConfig.model_validate({**config.object.model_dump(), "known": str(known)})
+    section = ObjectConfig.model_validate({**config.object.model_dump(), "model": str(known)})
     return config.model_copy(update={"object": section})
 
 

@@ -52,7 +52,7 @@ class Registered:
 def find_plugins(*groups: str) -> list[Registered]:
     """Registered plug-ins of the given groups, of all groups by default; imports none of them.
 
-    Of plug-ins with the same name, the one that is used comes first. A single group takes half the time.
+    Among plug-ins with the same name, the one that is used comes first. A single group takes half the time.
     """
     groups = groups or tuple(KIND)
     packaged = [plugin for group in groups for plugin in _packaged_plugins(group, _search_path())]

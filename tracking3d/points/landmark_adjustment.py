@@ -45,7 +45,7 @@ _Corners = tuple[NDArray[np.int64], Array, Array]
 
 
 @dataclass(frozen=True)
-class Support:
+class LandmarkSupport:
     """What landmarks say of a view's pose.
 
     Attributes:
@@ -78,7 +78,7 @@ class LandmarkScene:
     vertices: Array
     faces: NDArray[np.int64]
     focal_factor: float = 1.0
-    support: Mapping[int, Support] = field(default_factory=dict)
+    support: Mapping[int, LandmarkSupport] = field(default_factory=dict)
     may_reverse: bool = False
     reversal: Reversal | None = None
 
@@ -193,7 +193,7 @@ def _refine_once(scene: LandmarkScene, free_focal: bool) -> LandmarkScene:
     points = np.einsum("nk,nkd->nd", barycentric, scene.vertices[scene.faces[face]])
     if np.median(followed) < _LEAST_SUPPORT:
         return replace(
-            scene, support={at: Support(count, 0) for at, count in zip(there, followed, strict=True)}
+            scene, support={at: LandmarkSupport(count, 0) for at, count in zip(there, followed, strict=True)}
         )
     solved = partial(
         bundle,
@@ -215,7 +215,7 @@ def _refine_once(scene: LandmarkScene, free_focal: bool) -> LandmarkScene:
     kept = (found.weight > 0).sum(0) >= min(_LEAST_VIEWS, len(there))
     vertices = move_surface(vertices, scene.faces, face[kept], barycentric[kept], found.points[kept])
     counts = zip(there, followed, found.agreeing.sum(1).tolist(), strict=True)
-    support = {at: Support(count, agreeing) for at, count, agreeing in counts}
+    support = {at: LandmarkSupport(count, agreeing) for at, count, agreeing in counts}
     redrawn = scene.redrawn(vertices, dict(zip(there, found.T_cam_obj, strict=True)), found.focal_factor)
     return replace(redrawn, support=support)
 

@@ -10,13 +10,13 @@ import math
 
 from tracking3d.estimation.assessment import Assessment
 from tracking3d.estimation.estimate import Status
-from tracking3d.points.landmark_adjustment import Support
+from tracking3d.points.landmark_adjustment import LandmarkSupport
 from tracking3d.results.records import FrameRecord
 
 BELIEVED = 0.5
 """Confidence from which a frame is `tracked`."""
 _EVEN, _NEARLY_ALL = 0.5, 0.95
-"""Shares of the followed landmarks that agree, between which belief grows: where poses are wrong, what is followed is
+"""Shares of the followed landmarks that agree, between which belief grows: if poses are wrong, what is followed is
 often something else, such as the background, and much of it fits no pose."""
 _INTERCEPT = -0.8803
 _TERMS = {  # weight, and the range that was seen
@@ -25,7 +25,7 @@ _TERMS = {  # weight, and the range that was seen
 }
 
 
-def assess_estimate(estimate: FrameRecord, support: Support) -> tuple[Assessment, dict[str, float]]:
+def assess_estimate(estimate: FrameRecord, support: LandmarkSupport) -> tuple[Assessment, dict[str, float]]:
     """The assessment of a refined estimate, and what it comes from, for the estimate's ``diagnostics``."""
     assessment = judge_with_landmarks(
         Assessment(estimate.status, estimate.reason, estimate.confidence), support
@@ -38,10 +38,10 @@ def assess_estimate(estimate: FrameRecord, support: Support) -> tuple[Assessment
     }
 
 
-def judge_with_landmarks(rendering: Assessment, support: Support) -> Assessment:
+def judge_with_landmarks(rendering: Assessment, support: LandmarkSupport) -> Assessment:
     """The assessment of a frame by its rendering and its landmarks; a lost frame stays lost.
 
-    A logistic regression of whether the answer is right, that is, within 10 degrees and above an IoU of 0.7. Fitted by
+    A logistic regression of whether the estimate is right, that is, within 10 degrees and above IoU 0.7. Fitted by
     ``training/confidence.py --refined`` on the suites ``fresh`` of seeds 605, 606, 607, 609 and 610, with true masks
     and those of `csrt` and `flow`; docs/benchmark.md has what it is worth on another. How many landmarks agree, and
     whether the object is plain, adds nothing to the share that does.
@@ -67,7 +67,7 @@ def judge_with_landmarks(rendering: Assessment, support: Support) -> Assessment:
     return Assessment(Status.UNCERTAIN, reason, confidence)
 
 
-def refined_confidence_features(rendering: float, support: Support) -> dict[str, float]:
+def refined_confidence_features(rendering: float, support: LandmarkSupport) -> dict[str, float]:
     """The evidence that a confidence is made of, by name.
 
     Args:

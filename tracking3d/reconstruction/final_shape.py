@@ -1,4 +1,4 @@
-"""The shape of a run's mesh, made anew where its configuration asks for it."""
+"""The shape of a run's mesh, reconstructed again if its configuration asks for it."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from tracking3d.video.source import FrameSource
 
 
 def make_final_shape(folder: Path, config: PipelineConfig, source: FrameSource) -> str:
-    """Make the shape of a finished run anew, if ``object.shape`` is ``fine``; where that cannot be, the mesh stays.
+    """Reconstruct the shape of a finished run if ``object.shape`` is ``fine``; if that is not possible, the mesh stays.
 
     What came of it stands in ``run.json`` under ``shape`` too.
 
     Args:
         folder: The run folder.
-        config: Of the run.
+        config: Config of the run.
         source: Its video.
 
     Returns:
-        What came of it, in a sentence; empty where nothing was asked.
+        What came of it, in a sentence; empty if nothing was asked.
 
     Raises:
         OutputError: If something cannot be written.

@@ -20,7 +20,7 @@ from tracking3d.estimation.online.features.klt import grey
 from tracking3d.estimation.online.features.texture_strength import PLAIN, texture_strength
 from tracking3d.frames import Image
 from tracking3d.geometry.camera import Camera
-from tracking3d.points.landmark_adjustment import LandmarkScene, Support, fit_outlines, refine_scene
+from tracking3d.points.landmark_adjustment import LandmarkScene, LandmarkSupport, fit_outlines, refine_scene
 from tracking3d.points.resection import resect
 from tracking3d.points.view import SurfaceView, open_view
 from tracking3d.reconstruction.views import TextureView
@@ -29,7 +29,7 @@ from tracking3d.results.records import FrameRecord
 ROUNDS = (4, 12)
 """Least and most of them. Each brings what is left of an error down by some tenths, not to nothing."""
 _DRAWN = 480
-"""Views that all rounds draw together, where that allows for more than the least of them."""
+"""Views that all rounds draw together, if that allows for more than the least of them."""
 LONGEST_SIDE = 240
 """Pixels of the windows in which points are followed."""
 _LEAST_VIEWS = 4
@@ -41,12 +41,12 @@ class GlobalAdjustment:
 
     Args:
         model: The final object; its surface is what points are on.
-        camera: Of the full frame.
+        camera: Camera of the full frame.
         answered: Indices of the frames that will come, ascending.
         most: How many of them are kept.
 
     Attributes:
-        camera: The same, through another lens where nobody gave it and `settle` found it.
+        camera: The same, through another lens if nobody gave it and `settle` found it.
         vertices: ``(V, 3)`` of the object; others after `settle`.
         vertices_of_landmarks: The same as landmarks alone have it, which know nothing of what masks are wrong by.
         faces: ``(F, 3)``.
@@ -98,13 +98,13 @@ class GlobalAdjustment:
 
     def pose(
         self, record: FrameRecord, image: Image, mask: NDArray[np.bool_]
-    ) -> tuple[_Pose, Support | None]:
-        """The pose ``(4, 4)`` of any frame after `settle`, and what landmarks say of it; None where nothing does.
+    ) -> tuple[_Pose, LandmarkSupport | None]:
+        """The pose ``(4, 4)`` of any frame after `settle`, and what landmarks say of it; None if nothing does.
 
         Args:
-            record: Its answer.
+            record: Its estimate.
             image: ``(H, W, 3)`` RGB.
-            mask: ``(H, W)`` the answer's.
+            mask: ``(H, W)`` the estimate's.
         """
         scene = self._scene
         if scene is None or not np.isfinite(record.T_cam_obj).all():
@@ -128,7 +128,7 @@ class GlobalAdjustment:
         resected, share = resect(scene, view, around)
         there = [scene.support[at] for at in around if at in scene.support]
         followed = max((one.followed for one in there), default=0)
-        return resected.T_cam_obj, self._told(Support(followed, round(share * followed)))
+        return resected.T_cam_obj, self._told(LandmarkSupport(followed, round(share * followed)))
 
     def moved(self, model: ObjectModel) -> ObjectModel:
         """The model with the surface that was found."""
@@ -139,7 +139,7 @@ class GlobalAdjustment:
         factor = self.camera.fx / self._lens
         return replace(view, K=view.K @ np.diag([factor, factor, 1.0]), T_cam_obj=record.T_cam_obj)
 
-    def _told(self, support: Support | None) -> Support | None:
+    def _told(self, support: LandmarkSupport | None) -> LandmarkSupport | None:
         """What landmarks say, with whether they can tell anything on this object."""
         return support and replace(support, telling=float(np.median(self._strengths)) >= PLAIN)
 

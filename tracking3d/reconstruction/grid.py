@@ -31,14 +31,14 @@ class Grid:
         Args:
             points: What it has to hold.
             cells: Along the longest side of the points' box.
-            margin: Beside that box on every side, relative to its longest side.
+            margin: Free space around that box on every side, relative to its longest side.
         """
         low, high = points.min(0), points.max(0)
         longest = float((high - low).max())
         spacing = longest / cells
-        beside = margin * longest + 2 * spacing
-        x, y, z = np.ceil((high - low + 2 * beside) / spacing).astype(int) + 1
-        return cls(low - beside, spacing, (int(x), int(y), int(z)))
+        padding = margin * longest + 2 * spacing
+        x, y, z = np.ceil((high - low + 2 * padding) / spacing).astype(int) + 1
+        return cls(low - padding, spacing, (int(x), int(y), int(z)))
 
     @property
     def points(self) -> FloatArray:

@@ -22,7 +22,7 @@ _MOST_DECIBELS = 60.0
 
 @dataclass(frozen=True)
 class HeldOutScores:
-    """Of frames that were left out, in the mean; within the mask, as far as colours there are surely the object's.
+    """Mean scores of frames that were left out; within the mask, as far as colours there are surely the object's.
 
     Attributes:
         frames: How many.
@@ -74,7 +74,7 @@ def _compare(
     picture, inside = view.image / 255.0, view.valid > 0
     covered = drawn.face_index[0].numpy() >= 0
     predicted = np.where(covered[..., None], drawn.image()[0].permute(1, 2, 0).numpy(), _UNCOVERED)
-    predicted = np.where(inside[..., None], predicted, picture)  # beside the mask nothing is predicted
+    predicted = np.where(inside[..., None], predicted, picture)  # outside the mask nothing is predicted
     ratio = psnr(torch.from_numpy(predicted[inside]), torch.from_numpy(picture[inside]), 1.0)
     _, similarity = structural_similarity(
         picture, predicted, channel_axis=2, full=True, data_range=1.0, gaussian_weights=True

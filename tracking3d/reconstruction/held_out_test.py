@@ -14,9 +14,9 @@ from tracking3d.reconstruction.shape_views import ShapeView
 from tracking3d.rendering import render
 
 EVERY = 8
-"""Every so manyeth believed frame is kept out of the reconstruction."""
+"""One in this many reliable frames is kept out of the reconstruction."""
 _WORSE_OUTLINE = 0.01
-"""IoU that may be lost where colours gain."""
+"""IoU that may be lost if colours gain."""
 
 
 MOST_LEFT_OUT = 32
@@ -24,7 +24,7 @@ MOST_LEFT_OUT = 32
 
 
 def is_held_out(place: int) -> bool:
-    """Whether a believed frame, counted from 0, is kept out of the reconstruction."""
+    """Whether a reliable frame, counted from 0, is kept out of the reconstruction."""
     return place % EVERY == EVERY // 2
 
 
@@ -33,7 +33,7 @@ class HeldOutScore:
     """How well a shape explains frames, in the mean.
 
     Attributes:
-        iou: Of silhouette and mask.
+        iou: IoU of silhouette and mask.
         colour: Mean difference of colours in [0, 1] where both the mask and the surface are; what the surface does not
             cover counts in the IoU.
     """

@@ -62,7 +62,7 @@ def inside_mesh(grid: Grid, vertices: NDArray[np.float64], faces: NDArray[np.int
         vertices: ``(V, 3)``.
         faces: ``(F, 3)``.
     """
-    # A little beside the centres: edges and corners of a mesh like to lie on round numbers.
+    # Slightly off the centres: edges and corners of a mesh often lie on round numbers.
     shifted = (vertices - grid.origin) / grid.spacing + (1.234e-5, 2.345e-5, 0.0)
     a, b, c = shifted[faces].transpose(1, 0, 2)
     low = np.ceil(np.minimum(np.minimum(a, b), c)[:, :2]).clip(0)

@@ -17,10 +17,10 @@ CELL = 8
 
 
 def extract_surface(grid: Grid, inside: FloatArray) -> trimesh.Trimesh | None:
-    """The surface where the volume is zero; None where it is nowhere, or leaves the grid.
+    """The surface where the volume is zero; None if it is nowhere, or leaves the grid.
 
     Args:
-        grid: Of the volume.
+        grid: Grid of the volume.
         inside: ``(X * Y * Z,)`` signed distance, positive inside.
     """
     from skimage.measure import marching_cubes
@@ -53,7 +53,7 @@ def is_sound(mesh: trimesh.Trimesh) -> bool:
 
 
 def simplify(mesh: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
-    """With about so many faces at most; with more where fewer would tear it."""
+    """With about so many faces at most; with more if fewer would tear it."""
     while faces < len(mesh.faces):
         simple = decimate_roughly(mesh, faces)
         if is_sound(simple):

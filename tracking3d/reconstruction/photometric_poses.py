@@ -32,7 +32,7 @@ COLOUR, OUTLINE = 0.1, 2.0
 OUTLINE_WEIGHT = 0.3
 _STEPS = 6
 _ENOUGH = 1e-4
-_FARTHEST = 5.0  # degrees a pose may turn; a view that wants more is not to be believed
+_FARTHEST = 5.0  # degrees a pose may turn; a view that turns farther is rejected
 
 
 def coloured_surface(
@@ -56,9 +56,9 @@ def coloured_surface(
         valid = torch.from_numpy(np.clip((view.depth_inside - 1) / 2, 0, 1))
         seen = seen + back_project(_picture(view), valid, points, corners, texels, R, t, K)
     # Between the cells texels continue the nearest one on a face: samples at a face's edge mix with them.
-    beside = np.ones((size, size), np.bool_)
-    beside.flat[texels.texel.numpy()] = False
-    row, column = distance_transform_edt(beside, return_distances=False, return_indices=True)
+    uncovered = np.ones((size, size), np.bool_)
+    uncovered.flat[texels.texel.numpy()] = False
+    row, column = distance_transform_edt(uncovered, return_distances=False, return_indices=True)
     texture = seen.mean()[:, row, column].contiguous()
     known = (seen.weight > 0)[row, column][None].float()
     return Surface(points, corners, uvs, texture, known)
@@ -75,7 +75,7 @@ def refine_views(surface: Surface, views: Sequence[ShapeView]) -> list[ShapeView
 
 
 def _fit_pose(surface: Surface, view: ShapeView) -> NDArray[np.float64]:
-    """``(4, 4)`` the pose that fits best, the one at hand where none fits better or it runs away."""
+    """``(4, 4)`` the pose that fits best, the present one if none fits better or it runs away."""
     mask = torch.from_numpy(view.mask)
     target = PoseTarget(
         torch.from_numpy(view.K).float(),

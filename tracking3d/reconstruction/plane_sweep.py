@@ -3,7 +3,7 @@
 A surface that is about right says where to look. Around its depth, planes with its normal are tried at every pixel: the
 patch is carried into the neighbouring views, and agrees with them as much as the brightness correlates there, gain and
 offset left out. The mean over the views that agree best counts, since something may stand before the others. The depth
-lies at the vertex of the parabola through the best score and its neighbours. It is believed where the patch has
+lies at the vertex of the parabola through the best score and its neighbours. It is accepted if the patch has
 contrast, the score is high, and other views' depths say the same.
 """
 
@@ -29,12 +29,12 @@ NEIGHBOURS, AGREEING = 6, 3
 BASELINE = (4.0, 25.0, 12.0)
 """Degrees between the directions of two views that are compared: least, most, and best."""
 RADIUS = 3
-"""Of a patch, pixels."""
+"""Radius of a patch, pixels."""
 LEAST_CONTRAST = 3.0
 """Deviation of grey values from which on a patch tells something."""
 LEAST_SCORE = 0.85
 MOST_PIXELS = 5000
-"""Of a view whose depth is asked for."""
+"""Pixels of a view whose depth is estimated."""
 _STEEPEST = 0.2  # cosine of the viewing angle below which a surface is too slanted to be compared
 
 
@@ -63,7 +63,7 @@ class Guide:
     faces: NDArray[np.int64]
 
     def visible_to(self, view: ShapeView) -> tuple[FloatArray, FloatArray]:
-        """Depth ``(S, S)``, infinite beside the surface, and unit normals ``(S, S, 3)`` in camera coordinates."""
+        """Depth ``(S, S)``, infinite outside the surface, and unit normals ``(S, S, 3)`` in camera coordinates."""
         R = torch.from_numpy(view.T_cam_obj[None, :3, :3]).float()
         t = torch.from_numpy(view.T_cam_obj[None, :3, 3]).float()
         vertices, faces = torch.from_numpy(self.vertices).float(), torch.from_numpy(self.faces)
@@ -148,7 +148,7 @@ def _depth_map(
     rays = np.column_stack([pixels[:, 1], pixels[:, 0], np.ones(len(pixels))]) @ K_inverse.T
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
     facing = -(normal * rays).sum(1) / np.linalg.norm(rays, axis=1)
-    # Where it is too slanted, as if half turned towards the camera.
+    # If the surface is too slanted, as if half turned towards the camera.
     towards = -rays / np.linalg.norm(rays, axis=1, keepdims=True)
     normal = np.where((facing > _STEEPEST)[:, None], normal, normal + towards)
     offsets = np.linspace(-reach, reach, 2 * steps + 1)
@@ -199,7 +199,7 @@ def patch_scores(
 
     Returns:
         ``(N, D)`` mean correlation with the views that agree best, a view that does not see the patch counting -1,
-        and ``(N,)`` the deviation of the patches' grey values, 0 where there is no patch.
+        and ``(N,)`` the deviation of the patches' grey values, 0 if there is no patch.
     """
     agreeing = min(AGREEING, len(others))
     from tracking3d.reconstruction.kernels.plane_sweep import OtherViews, ReferenceView, SweptPatches, sweep

@@ -1,4 +1,4 @@
-"""The texture, and the shape, of a run that exists, from its answers and the video that it was made of."""
+"""The texture, and the shape, of a run that exists, from its estimates and the video that it was made of."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class ShapedRun:
 def retexture_run(
     folder: Path, source: str | None = None, most: int = 24, largest: int = 2048
 ) -> tuple[ObjectModel, int]:
-    """Write the mesh of the online map of a run anew, with a texture at the resolution of its video.
+    """Write the mesh of the online map of a run again, with a texture at the resolution of its video.
 
     Args:
         folder: The run folder.
@@ -61,7 +61,7 @@ def retexture_run(
         The model, and how many frames its texture was taken from.
 
     Raises:
-        InputError: If the run goes on, has no mesh or no frame that is believed, or the video is another one.
+        InputError: If the run goes on, has no mesh or no reliable frame, or the video is another one.
         OutputError: If the mesh cannot be written.
     """
     run = RunReader(folder)
@@ -81,18 +81,18 @@ def retexture_run(
 def rebuild_shape(
     folder: Path, source: str | FrameSource | None = None, most: int = 24, largest: int = 2048
 ) -> ShapedRun:
-    """Make the shape of a run's object anew from all its frames, and write the mesh if that explains them better.
+    """Reconstruct the shape of a run's object from all its frames, and write the mesh if that explains them better.
 
     The mesh of the online map is kept in `layout.ONLINE`.
 
     Args:
         folder: The run folder.
-        source: The video, or where that is; None for the one that the run names.
+        source: The video, or its path; None for the one that the run names.
         most: Frames that the texture is taken from.
         largest: Most texels along a side.
 
     Raises:
-        InputError: If a package is missing, the run goes on, has no mesh or no frame that is believed, or the video
+        InputError: If a package is missing, the run goes on, has no mesh or no reliable frame, or the video
             is another one.
         OutputError: If the mesh cannot be written.
     """
@@ -101,15 +101,15 @@ def rebuild_shape(
     online = _online_model(run)
     shapes: list[ShapeView] = []
     left_out: list[ShapeView] = []
-    believed = 0
+    count = 0
     views: tuple[TextureView, ...] = ()
     for frame, record in reliable_frames(run, source):
         seen = _views_of_frame(run, frame, record)
         if seen is None:
             continue
         views = keep_best_views(views, seen[1], most)
-        (left_out if is_held_out(believed) else shapes).append(seen[0])
-        believed += 1
+        (left_out if is_held_out(count) else shapes).append(seen[0])
+        count += 1
         if len(shapes) > 4 * MOST:  # memory does not grow with the video
             shapes = spread_by_rotation(shapes, 0.5, 2 * MOST)
         if len(left_out) > 2 * MOST_LEFT_OUT:
@@ -134,8 +134,8 @@ def rebuild_shape(
 def score_run(folder: Path, source: str | None = None, largest: int = 2048) -> HeldOutScores:
     """How well the mesh of a run predicts frames that it was not made from.
 
-    The frames that `rebuild_shape` keeps out are; the others give the mesh its texture anew, and the poses alone of
-    those kept out are fitted to it. Nothing is written. Of a mesh of the online map all frames have shaped the surface.
+    The frames that `rebuild_shape` keeps out are; the others give the mesh its texture again, and the poses alone of
+    those kept out are fitted to it. Nothing is written. All frames have shaped the surface of an online map's mesh.
 
     Args:
         folder: The run folder.
@@ -143,7 +143,7 @@ def score_run(folder: Path, source: str | None = None, largest: int = 2048) -> H
         largest: Most texels along a side.
 
     Raises:
-        InputError: If a package is missing, the run goes on, has no mesh, too few frames that are believed, or the
+        InputError: If a package is missing, the run goes on, has no mesh, too few reliable frames, or the
             video is another one.
     """
     check_packages()
@@ -152,23 +152,23 @@ def score_run(folder: Path, source: str | None = None, largest: int = 2048) -> H
     used: list[ShapeView] = []
     left_out: list[tuple[ShapeView, TextureView]] = []
     views: tuple[TextureView, ...] = ()
-    believed = 0
+    count = 0
     for frame, record in reliable_frames(run, source):
         if (seen := _views_of_frame(run, frame, record)) is None:
             continue
-        if is_held_out(believed):
+        if is_held_out(count):
             left_out.append(seen)
         else:
             used.append(seen[0])
             views = keep_best_views(views, seen[1], _TEXTURE_VIEWS)
-        believed += 1
+        count += 1
         if len(used) > 2 * MOST:
             used = spread_by_rotation(used, 0.5, MOST)
         if len(left_out) > MOST_LEFT_OUT:
             left_out = left_out[::2]
     if not left_out:
         raise InputError(
-            f"Only {believed} frames of the run {folder} are believed; none can be left out to judge its model by."
+            f"Only {count} frames of the run {folder} are reliable; none can be held out to test its model."
         )
     return held_out_scores(bake_texture(model, views, largest), used, left_out)
 
@@ -176,7 +176,7 @@ def score_run(folder: Path, source: str | None = None, largest: int = 2048) -> H
 def _views_of_frame(
     run: RunReader, frame: Frame, record: FrameRecord
 ) -> tuple[ShapeView, TextureView] | None:
-    """A frame as shapes and textures are made from it; None where its mask is empty or too small."""
+    """A frame as shapes and textures are made from it; None if its mask is empty or too small."""
     given = run.pinhole_mask(frame.index), run.camera_of(record), np.asarray(record.T_cam_obj)
     shape = shape_view(frame.index, frame.image, *given)
     view = texture_view(frame.index, frame.image, *given)
@@ -191,7 +191,7 @@ def check_packages() -> None:
     """
     if any(find_spec(name) is None for name in _NEEDED):
         raise InputError(
-            "A shape is made anew with scikit-image, fast-simplification and xatlas: pip install 'tracking3d[model]', "
+            "A new shape needs scikit-image, fast-simplification and xatlas: pip install 'tracking3d[model]', "
             "or leave the mesh as it is."
         )
 

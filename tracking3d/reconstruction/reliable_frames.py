@@ -1,4 +1,4 @@
-"""The frames of a run whose poses are believed, read from its video once more."""
+"""The frames of a run whose poses are reliable, read from its video once more."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from tracking3d.video.source import FrameSource
 
 
 def reliable_frames(run: RunReader, source: str | FrameSource | None) -> Iterator[tuple[Frame, FrameRecord]]:
-    """Each frame with its answer, where that is tracked with enough confidence; as the camera of the poses sees it.
+    """Each frame that is tracked with enough confidence, with its estimate; as the camera of the poses sees it.
 
     Args:
         run: The run.
-        source: Its video, or where that is; None for the one that it names.
+        source: Its video, or its path; None for the one that it names.
 
     Raises:
         InputError: If it goes on, or the video is another one.
@@ -55,7 +55,7 @@ def reliable_frames(run: RunReader, source: str | FrameSource | None) -> Iterato
 
 
 def no_reliable_frame_error(run: RunReader) -> InputError:
-    """What is said where there is no such frame."""
+    """The message if there is no such frame."""
     return InputError(
         f"No frame of the run {run.folder} is tracked with a confidence of {BELIEVED} or more; its mesh stays as it is."
     )

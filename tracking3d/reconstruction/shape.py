@@ -1,7 +1,7 @@
-"""The shape of an object of any topology, from all frames that are believed.
+"""The shape of an object of any topology, from all reliable frames.
 
 Silhouettes bound it, matched patches say how deep it is, and the mesh of the online map holds it where neither knows;
-everything is fused in a volume. Poses are taken as they are: landmarks told them to a tenth of a degree, which no
+everything is fused in a volume. Poses are taken as they are: landmarks determine them to a tenth of a degree, which no
 fit to a surface that is still rough can better. Every eighth frame is kept out; only if the new shape explains those
 better than the old one does it take its place.
 """
@@ -56,9 +56,9 @@ class ReconstructedShape:
     """What came of it.
 
     Attributes:
-        vertices: ``(V, 3)``; faces: ``(F, 3)``: closed and oriented; None where the old shape stays.
+        vertices: ``(V, 3)``; faces: ``(F, 3)``: closed and oriented; None if the old shape stays.
         sentence: What was found, or why the old shape stays.
-        old: How the old shape explains the frames that were left out; None where it was not asked.
+        old: How the old shape explains the frames that were left out; None if it was not asked.
         new: How the new one does.
     """
 
@@ -99,13 +99,13 @@ def reconstruct_shape(
     )
     old = score_held_out(vertices, faces, used, left_out)
     new = score_held_out(new_vertices, new_faces, used, left_out)
-    told = (
+    comparison = (
         f"silhouettes of {len(left_out)} frames that were left out agree by {new.iou:.3f} instead of {old.iou:.3f}, "
         f"colours differ by {new.colour:.3f} instead of {old.colour:.3f}"
     )
     if not new.better_than(old):
-        return _keep_mesh(f"the new one is no better ({told})", old, new)
-    return ReconstructedShape(new_vertices, new_faces, told, old, new)
+        return _keep_mesh(f"the new one is no better ({comparison})", old, new)
+    return ReconstructedShape(new_vertices, new_faces, comparison, old, new)
 
 
 def _volume(start: trimesh.Trimesh, views: Sequence[ShapeView]) -> tuple[Grid, FloatArray]:

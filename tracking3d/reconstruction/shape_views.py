@@ -15,15 +15,15 @@ from tracking3d.trackers.crops import box_of, crop_window, inside_frame
 
 SIDE = 192
 """Pixels of a view's side; a smaller window is seen larger."""
-_MARGIN = 0.08  # beside the mask, relative to its longer side
+_MARGIN = 0.08  # around the mask, relative to its longer side
 
 
 @dataclass(frozen=True, eq=False)
 class ShapeView:
-    """A frame with a pose and a mask that are believed, cut out around the object.
+    """A frame with a reliable pose and mask, cut out around the object.
 
     Attributes:
-        index: Of the frame.
+        index: Index of the frame.
         image: ``(S, S, 3)`` uint8 RGB.
         depth_inside: ``(S, S)`` float32, pixels from the mask's outline, positive inside.
         within: ``(4,)`` left, right, top and bottom edge of the frame in the window's pixels; beyond them nothing
@@ -65,13 +65,13 @@ def shape_view(
     T_cam_obj: NDArray[np.float64],
     side: int = SIDE,
 ) -> ShapeView | None:
-    """A frame as a shape is made from it; None where its mask is empty.
+    """A frame as a shape is made from it; None if its mask is empty.
 
     Args:
-        index: Of the frame.
+        index: Index of the frame.
         image: ``(H, W, 3)`` RGB.
         mask: ``(H, W)`` the object.
-        camera: Of the full frame.
+        camera: Camera of the full frame.
         T_cam_obj: ``(4, 4)``.
         side: Pixels of the view's side.
     """
@@ -95,7 +95,7 @@ def shape_view(
 
 
 def spread_by_rotation(views: Sequence[ShapeView], degrees: float, most: int) -> list[ShapeView]:
-    """Those views that differ by at least ``degrees`` from all chosen before; by more, where they are too many."""
+    """Those views that differ by at least ``degrees`` from all chosen before; by more, if they are too many."""
     rotations = np.stack([view.T_cam_obj[:3, :3] for view in views]) if views else np.zeros((0, 3, 3))
     while True:
         chosen: list[int] = []

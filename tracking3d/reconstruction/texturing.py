@@ -35,7 +35,7 @@ Seen = tuple[NDArray[np.int64], FloatArray, FloatArray]
 
 
 def bake_texture(model: ObjectModel, views: Sequence[TextureView], largest: int = 2048) -> ObjectModel:
-    """The model with a texture at the views' resolution; the same where no view shows it.
+    """The model with a texture at the views' resolution; the same if no view shows it.
 
     Args:
         model: With shape and texture coordinates; its features stay.
@@ -89,7 +89,7 @@ def add_view(
         seen: What the view shows.
         gain: ``(3,)`` factors for its colours.
         expected: ``(T * T, 3)`` colours that all views together give.
-        sharpness: Of the view, relative to the sharpest.
+        sharpness: Sharpness of the view, relative to the sharpest.
     """
     from tracking3d.reconstruction.kernels import texturing
 

@@ -2,8 +2,8 @@
 
 Positive inside. What matched depths say of a voxel is a weighted mean (Curless and Levoy, "A volumetric method for
 building complex models from range images", 1996): near a depth its distance from it, before it that the voxel is free.
-Behind it nothing is known. The mesh of the online map is one more such witness, a weak one, which decides where nobody
-else knows. Nothing reaches beyond the visual hull. Of all volumes that agree about as well with that, the one with the
+Behind it nothing is known. The mesh of the online map is one more such measurement, a weak one, decisive where nothing
+else knows. Nothing reaches beyond the visual hull. Among volumes that agree about as well with that, the one with the
 least total variation is taken (Zach, Pock and Bischof, "A globally optimal algorithm for robust TV-L1 range image
 integration", 2007): noise and holes go, and what nobody saw is closed by a small surface.
 """
@@ -70,7 +70,7 @@ def fuse_depth(
     """``(N,)`` signed distance of the surface in truncations, positive inside.
 
     Args:
-        shape: Of the grid of N voxels.
+        shape: Shape of the grid of N voxels.
         hull: ``(N,)`` signed distance from the visual hull.
         prior: ``(N,)`` from the mesh of the online map.
         total: ``(N,)`` and weight: ``(N,)`` from `depth_evidence`.

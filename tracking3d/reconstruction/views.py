@@ -14,7 +14,7 @@ from tracking3d.trackers.crops import box_of, crop_window, inside_frame
 
 BELIEVED = 0.5
 """Confidence of a pose from which on a texture is taken from its frame."""
-_MARGIN = 0.05  # beside the mask, relative to its longer side
+_MARGIN = 0.05  # around the mask, relative to its longer side
 _LARGEST = 640  # pixels of a view's side; a larger window is seen smaller
 _OUTLINE = (1.5, 4.5)
 """Pixels within the outline up to which, and from which on, colours are the background's and the object's."""
@@ -22,10 +22,10 @@ _OUTLINE = (1.5, 4.5)
 
 @dataclass(frozen=True, eq=False)
 class TextureView:
-    """A frame with a pose that is believed, cut out around the object.
+    """A frame with a reliable pose, cut out around the object.
 
     Attributes:
-        index: Of the frame.
+        index: Index of the frame.
         image: ``(S, S, 3)`` uint8 RGB.
         valid: ``(S, S)`` float32 in [0, 1], how far each pixel is surely the object's.
         K: ``(3, 3)`` intrinsics of the window.
@@ -56,13 +56,13 @@ def texture_view(
     camera: Camera,
     T_cam_obj: NDArray[np.float64],
 ) -> TextureView | None:
-    """A frame as a texture is taken from it; None where its mask is empty or too small to have an inside.
+    """A frame as a texture is taken from it; None if its mask is empty or too small to have an inside.
 
     Args:
-        index: Of the frame.
+        index: Index of the frame.
         image: ``(H, W, 3)`` RGB.
         mask: ``(H, W)`` the object.
-        camera: Of the full frame.
+        camera: Camera of the full frame.
         T_cam_obj: ``(4, 4)``.
     """
     box = box_of(mask)

@@ -16,7 +16,7 @@ from tracking3d.reconstruction.grid import FloatArray
 from tracking3d.reconstruction.shape_views import ShapeView
 
 SHARE = 0.05
-"""Of the views that see a point, those that may be wrong."""
+"""Share of the views that see a point and may be wrong."""
 LEAST = 1
 """And so many at least."""
 
@@ -34,7 +34,7 @@ def carve_hull(
         points: ``(N, 3)`` in object coordinates.
         views: The frames.
         far: Distances are cut off there.
-        share: Of the views that may be wrong.
+        share: Share of the views that may be wrong.
         least: Number of views that may be wrong however few there are.
 
     Returns:

@@ -127,7 +127,7 @@ def share_threads(threads: int) -> Iterator[None]:
 
 
 def _kernels_threads() -> int:
-    """Threads of the kernels; the default where nobody has imported them, which takes its time."""
+    """Threads of the kernels; the default if nobody has imported them, which takes its time."""
     module = sys.modules.get("tracking3d.rendering.kernels.threads")
     return int(module.get_num_threads()) if module else 1
 

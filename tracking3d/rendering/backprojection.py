@@ -21,7 +21,7 @@ from tracking3d.rendering.visibility import rasterize
 _DEPTH_TOLERANCE = 0.02
 """A texel is hidden if something is nearer by more than this share of the mesh's radius."""
 _GRAZING = 0.15
-"""Texels seen at a smaller cosine are not believed: the outline is uncertain by a pixel or so."""
+"""Texels seen at a smaller cosine are ignored: the outline is uncertain by a pixel or so."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +89,7 @@ class SeenTexels:
     Attributes:
         texel: ``(N,)`` flat indices, each once.
         values: ``(C, N)`` the frame's values there.
-        weight: ``(N,)`` squared cosine of the viewing angle, times how far the frame is believed there; above 0.
+        weight: ``(N,)`` squared cosine of the viewing angle, times the weight of the frame there; above 0.
     """
 
     texel: Tensor
@@ -138,14 +138,14 @@ def seen_texels(
 
     Args:
         values: ``(C, H, W)`` colours or features of the frame.
-        valid: ``(H, W)`` in [0, 1], how far each pixel may be believed.
+        valid: ``(H, W)`` in [0, 1], weight of each pixel.
         vertices: ``(V, 3)`` in object coordinates.
         faces: ``(F, 3)``.
         texels: The atlas.
         R: ``(3, 3)``; t: ``(3,)``: ``T_cam_obj``.
         K: ``(3, 3)`` of the window.
         backend: See `tracking3d.rendering.backend`.
-        by_kernel: Whether texels may be looked up by the kernel, where that is the backend: it rounds otherwise.
+        by_kernel: Whether texels may be looked up by the kernel, if that is the backend: it rounds otherwise.
     """
     height, width = values.shape[1:]
     screen, depth = project(vertices, R[None], t[None], K[None])

@@ -46,7 +46,7 @@ def on_faces(values: NDArray[np.float64], texels: TexelMap) -> NDArray[np.float6
 
 
 def paint_faces(colours: NDArray[np.float64], texels: TexelMap) -> NDArray[np.uint8]:
-    """A texture ``(T, T, 3)``; beside the faces it goes on as at the nearest texel, so that no seam shows.
+    """A texture ``(T, T, 3)``; outside the faces it repeats the nearest texel, so that no seam shows.
 
     Args:
         colours: ``(N, 3)`` in [0, 255], of the texels.

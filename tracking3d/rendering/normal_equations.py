@@ -53,7 +53,7 @@ class NormalEquations:
         )
 
     def step(self, damping: float | Tensor = 0.0) -> Tensor:
-        """``(B, 6)`` step (v, w) to the model's minimum; zero where there is none.
+        """``(B, 6)`` step (v, w) to the model's minimum; zero if there is none.
 
         Args:
             damping: Levenberg-Marquardt's: added to the diagonal, as a share of each entry; one, or ``(B,)`` of them.
@@ -111,7 +111,7 @@ def pose_normal_equations(
     value, by_u, by_v = bilinear_taps(drawn.texture, drawn.uv)
     target = rows.index_select(0, drawn.pixels)
     residual = value - target
-    # Of the rendered image by x and y, (2, P, C); the Jacobian has the opposite sign.
+    # Slopes of the rendered image by x and y, (2, P, C); the Jacobian has the opposite sign.
     slopes = torch.stack([uv[:, :1] * by_u + uv[:, 1:] * by_v for uv in (uv_by_x, uv_by_y)])
     total = weight.new_zeros(batch).index_add(0, view, weight).clamp_min(1.0)
     share = (weight / total.index_select(0, view)) / residual.shape[1]

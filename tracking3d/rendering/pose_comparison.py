@@ -23,7 +23,7 @@ class PoseTarget:
         features: ``(C, S, S)``.
         comparable: ``(S, S)`` how much each pixel's features count, in [0, 1].
         inside: ``(S, S)`` bool, inside the frame.
-        mask: ``(S, S)`` bool; None where there is none.
+        mask: ``(S, S)`` bool; None if there is none.
         distance: ``(S, S)`` signed distance in pixels to the mask's outline; None without a mask.
     """
 
@@ -65,9 +65,9 @@ class PoseTerms:
     """The terms of B poses, float64 on the CPU; a term of which a frame says nothing is zero.
 
     Attributes:
-        appearance: Of the covered pixels, weighted by `PoseTarget.comparable` and by how far their texture is seen.
-        outline: Of the silhouette's contour.
-        points: Of the matched points.
+        appearance: Term of the covered pixels, weighted by `PoseTarget.comparable` and how far their texture is seen.
+        outline: Term of the silhouette's contour.
+        points: Term of the matched points.
         comparable: ``(B,)`` sum of `PoseTarget.comparable` over the covered pixels.
         known: ``(B,)`` the same of those whose texture is seen.
         overlap: ``(B,)`` IoU of what is covered with the mask, inside the frame; 1 without a mask.

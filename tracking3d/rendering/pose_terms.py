@@ -39,7 +39,7 @@ def pose_terms(
         target: The frame.
         R: ``(B, 3, 3)``; t: ``(B, 3)``: rotations and translations of ``T_cam_obj``.
         matched: Points with known places in the window, or None.
-        scales: Of the losses.
+        scales: Scales of the losses.
 
     Raises:
         ValueError: If a shape does not fit. If the surface's renderer cannot render these tensors.

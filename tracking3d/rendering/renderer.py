@@ -32,7 +32,7 @@ class SoftBand:
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """What the renderer answers. P pixels are covered, in the order of ``(face_index >= 0).nonzero()``.
+    """What the renderer returns. P pixels are covered, in the order of ``(face_index >= 0).nonzero()``.
 
     Attributes:
         face_index: ``(B, H, W)`` int64, -1 where uncovered.

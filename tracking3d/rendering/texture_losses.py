@@ -36,7 +36,7 @@ def texture_losses(
         observed: ``(B, C, H, W)`` features of the frames.
         pixels: ``(P,)`` int64, flat indices of pixels in ``(B, H, W)``.
         scale: Residual at which the loss is ``log 2``.
-        total_variation: Whether to compute the second answer.
+        total_variation: Whether to compute the second result.
         backend: See `tracking3d.rendering.backend`.
 
     Returns:

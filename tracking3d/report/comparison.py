@@ -57,7 +57,7 @@ def write_comparison(comparison: RunComparison, path: Path) -> None:
 
 
 def _pairs(comparison: RunComparison) -> list[tuple[str, list[dict[str, str] | None]]]:
-    """Of every run its row in the table of every two, where there are more than two."""
+    """The row of every run in the table of pairs, if there are more than two runs."""
     if len(comparison.runs) < 3:
         return []
     rows = []
@@ -65,17 +65,17 @@ def _pairs(comparison: RunComparison) -> list[tuple[str, list[dict[str, str] | N
         cells: list[dict[str, str] | None] = []
         for column in range(len(comparison.names)):
             iou, turn = comparison.iou_between[row, column], comparison.rotation_between[row, column]
-            told = {
+            cell = {
                 "iou": f"{iou:.3f}" if np.isfinite(iou) else "–",
                 "rotation": f"{turn:.1f}°" if np.isfinite(turn) else "–",
             }
-            cells.append(None if row == column else told)
+            cells.append(None if row == column else cell)
         rows.append((name, cells))
     return rows
 
 
 def _frames(comparison: RunComparison) -> list[int]:
-    """Every frame that any run has answered: what the plots go over."""
+    """Every frame with an estimate of any run: what the plots go over."""
     return sorted({record.index for run in comparison.runs for record in run.frames})
 
 
@@ -109,16 +109,16 @@ def _strips(comparison: RunComparison) -> list[dict[str, Any]]:
     frames, strips = _frames(comparison), []
     for name, run in zip(comparison.names, comparison.runs, strict=True):
         status = {record.index: record.status.value for record in run.frames}
-        told = [status.get(index, "no estimate") for index in frames]
-        counts = ", ".join(f"{told.count(kind)} {kind}" for kind in dict.fromkeys(told))
+        statuses = [status.get(index, "no estimate") for index in frames]
+        counts = ", ".join(f"{statuses.count(kind)} {kind}" for kind in dict.fromkeys(statuses))
         strips.append(
-            {"name": name, "stretches": stretches(frames, told, [""] * len(told)), "summary": counts}
+            {"name": name, "stretches": stretches(frames, statuses, [""] * len(statuses)), "summary": counts}
         )
     return strips
 
 
 def _pictures(comparison: RunComparison) -> list[dict[str, Any]]:
-    """Of each frame that differs most, the overlays of all runs around the object, and in what they differ."""
+    """For each frame that differs most, the overlays of all runs around the object, and in what they differ."""
     size = OverlaySize.of(comparison.runs[0].camera)
     shown: list[dict[str, Any]] = [
         {"index": index, "pictures": [], "differs": _differs(comparison, index)} for index in comparison.worst
@@ -138,7 +138,7 @@ def _pictures(comparison: RunComparison) -> list[dict[str, Any]]:
 
 
 def _around(comparison: RunComparison, index: int, size: OverlaySize) -> tuple[slice, slice]:
-    """Rows and columns of the overlay around the masks of all runs; all of it where there is none."""
+    """Rows and columns of the overlay around the masks of all runs; all of it if there is none."""
     masks = [mask for run in comparison.runs if (mask := read_mask(run.mask_path(index))) is not None]
     boxes = [cv2.boundingRect(mask.astype(np.uint8)) for mask in masks if mask.any()]
     if not boxes:
@@ -152,7 +152,7 @@ def _around(comparison: RunComparison, index: int, size: OverlaySize) -> tuple[s
 
 
 def _differs(comparison: RunComparison, index: int) -> str:
-    told = []
+    sentences = []
     for one in comparison.differences:
         for place in np.flatnonzero(one.indices == index):
             parts = [
@@ -164,5 +164,5 @@ def _differs(comparison: RunComparison, index: int) -> str:
                 )
                 if np.isfinite(value[place])
             ]
-            told.append(f"{one.name}: {', '.join(parts) or 'nothing to compare'}")
-    return "; ".join(told)
+            sentences.append(f"{one.name}: {', '.join(parts) or 'nothing to compare'}")
+    return "; ".join(sentences)

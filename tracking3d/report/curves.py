@@ -15,7 +15,7 @@ from tracking3d.estimation.estimate import Status
 WIDTH, HEIGHT = 1000.0, 100.0
 """The picture's own units: it is stretched to the page."""
 MOST_POINTS = 2000
-"""Of a curve; of more frames every n-th is drawn."""
+"""Points of a curve; if there are more frames, every n-th is drawn."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def curve(
     Args:
         title: What it is.
         values: ``(N,)``; not finite if there is none.
-        unit: Written behind the figures, with a space before it where it needs one.
+        unit: Written behind the figures, with a space before it if it needs one.
         limits: Figures at the lower and the upper edge; the least and the greatest if None.
         digits: After the decimal point.
 
@@ -61,15 +61,15 @@ def curve(
     if high - low < 10.0**-digits:  # nothing to see but noise, which would fill the picture
         low, high = low - 10.0**-digits, high + 10.0**-digits
 
-    def told(value: float) -> str:
+    def text(value: float) -> str:
         return f"{value:.{digits}f}{unit}"
 
     return Curve(
         title=title,
         path=path_of((y - low) / (high - low)),
-        low=told(low),
-        high=told(high),
-        summary=f"{title}: from {told(known.min())} to {told(known.max())}, {told(known[-1])} at the end",
+        low=text(low),
+        high=text(high),
+        summary=f"{title}: from {text(known.min())} to {text(known.max())}, {text(known[-1])} at the end",
     )
 
 
@@ -140,7 +140,7 @@ def stretches(indices: Sequence[int], statuses: Sequence[str], reasons: Sequence
     Figures within a reason do not part them, nor do the reasons of frames that are tracked.
 
     Args:
-        indices: Of the frames in the source.
+        indices: Indices of the frames in the source.
         statuses: One a frame.
         reasons: One a frame.
     """

@@ -70,7 +70,7 @@ class RunComparison:
         runs: The runs; the first one is what the others are held against.
         names: What to call them; no two alike.
         settings: By name, the value in each run as text, of those that differ; None if a run has none such.
-        differences: Of each run but the first.
+        differences: Differences of each run but the first.
         worst: Indices of the frames that differ most, in order of time.
         notes: What to know, in sentences.
         iou_between: ``(R, R)`` mean IoU of the masks of every two runs; NaN if there is none.
@@ -88,7 +88,7 @@ class RunComparison:
 
     def as_json(self) -> dict[str, Any]:
         """All of it in JSON's types, frame by frame too."""
-        told: dict[str, Any] = jsonable(
+        summary: dict[str, Any] = jsonable(
             {
                 "runs": [
                     {"name": name, "folder": run.folder, "state": run.state, **run_figures(run)}
@@ -121,7 +121,7 @@ class RunComparison:
                 "notes": self.notes,
             }
         )
-        return told
+        return summary
 
 
 def compare_runs(folders: Sequence[Path], against: Path | None = None) -> RunComparison:
@@ -130,7 +130,7 @@ def compare_runs(folders: Sequence[Path], against: Path | None = None) -> RunCom
     Poses are compared after the similarity that fits best, since object frame and unit of a run are its own.
 
     Args:
-        folders: Two run folders or more; one is enough where ``against`` is another.
+        folders: Two run folders or more; one is enough if ``against`` is another.
         against: The run that the others are held against, among them or not; the first if None.
 
     Raises:
@@ -151,11 +151,11 @@ def compare_runs(folders: Sequence[Path], against: Path | None = None) -> RunCom
     configs = [flat(run.config) for run in runs]
     keys = dict.fromkeys(key for config in configs for key in config)
     values = {key: [config.get(key) for config in configs] for key in keys}
-    values["frames that were asked for"] = [run.description.get("selection") or "all" for run in runs]
+    values["selected frames"] = [run.description.get("selection") or "all" for run in runs]
     return RunComparison(
         runs=runs,
         names=names,
-        settings={key: told for key, told in values.items() if len(set(told)) > 1},
+        settings={key: each for key, each in values.items() if len(set(each)) > 1},
         differences=differences,
         worst=worst_frames(differences),
         notes=_notes(runs, names, differences),

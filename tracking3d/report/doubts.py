@@ -22,25 +22,25 @@ def doubts_of(run: RunReader) -> list[str]:
 
 
 def _about_its_end(run: RunReader) -> list[str]:
-    told = []
+    sentences = []
     if run.state != "finished":
         why = run.description.get("error")
-        told.append(
+        sentences.append(
             f"The run is {run.state_in_words}{f': {why}' if why else ''}. "
             f"This report shows the {len(run.frames)} frames that were estimated before it stopped."
         )
     refinement = run.description.get("refinement") or {}
     if run.frames and refinement.get("state") not in (None, "finished"):
         reason = refinement.get("reason")
-        told.append(
+        sentences.append(
             f"The final refinement is {refinement['state']}{f' ({reason})' if reason else ''}. The estimates "
             "are causal: each uses only the frames up to its own."
         )
-    return told
+    return sentences
 
 
 def _about_frames(run: RunReader) -> list[str]:
-    told, count = [], len(run.frames)
+    sentences, count = [], len(run.frames)
     diagnostics = [record.diagnostics for record in run.frames if record.status is Status.LOST]
     guessed = sum(UNALIGNED_MAP in terms for terms in diagnostics)
     lost = len(diagnostics) - guessed
@@ -48,28 +48,28 @@ def _about_frames(run: RunReader) -> list[str]:
     failed = sum(bool(record.failure) for record in run.frames)
     skipped = len(run.description.get("skipped") or [])
     if lost:
-        told.append(
+        sentences.append(
             f"The object was lost in {_of(lost, count)}: their poses are meaningless, and their masks, if "
             "any, come from the mask tracker."
         )
     if guessed:
-        told.append(
+        sentences.append(
             f"In {_of(guessed, count)} tracking was re-initialized on a side of the object that had not been "
             "seen before. The pose relative to the earlier map is unknown, so these frames count as lost: "
             "their masks can be used, and their poses are consistent with each other at most."
         )
     if uncertain:
-        told.append(
+        sentences.append(
             f"{_of(uncertain, count).capitalize()} {_are(uncertain)} uncertain; the pose may be wrong."
         )
     if failed:
-        told.append(f"A plug-in failed in {_of(failed, count)}.")
+        sentences.append(f"A plug-in failed in {_of(failed, count)}.")
     if skipped:
-        told.append(
+        sentences.append(
             f"{skipped} {'frame was' if skipped == 1 else 'frames were'} skipped: unreadable, of another "
             "size, or dropped to keep up with a camera."
         )
-    return told
+    return sentences
 
 
 def _about_masks(run: RunReader) -> list[str]:

@@ -76,7 +76,7 @@ class StageShare:
         what: In words.
         seconds: Frame by frame, over the whole run.
         again: In the final refinement.
-        share: Of the longest stage, in percent: frame by frame.
+        share: Share of the longest stage, in percent: frame by frame.
         share_again: The same of the refinement.
     """
 

@@ -2,7 +2,7 @@
 
 The picture has two halves: above the colours, below how much of each texel was ever seen. The viewer paints what was
 never seen in a pale colour of the page instead of a guess. As an alpha channel it would not do: browsers forget the
-colour of what is transparent. Where it would be large as PNG it is WebP, of which the eye sees no difference.
+colour of what is transparent. If it would be large as PNG, it is WebP, in which the eye sees no difference.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MOST_TEXTURE = 1_500_000
 _LARGE = 300_000  # bytes of a PNG that is not worth losing anything for
 _QUALITIES = (90, 75, 55, 30, 10)
 MOST_FACES = 200_000
-"""Of a model that is put into a page."""
+"""Faces of a model that is put into a page."""
 
 
 def read_model(folder: Path) -> ObjectModel:

@@ -39,7 +39,7 @@ _DAMAGED = (KeyError, TypeError, ValueError, AttributeError, RecursionError)
 
 
 def write_report(folder: Path) -> Path:
-    """Write the report of a run, and the turntable movie of its model beside it.
+    """Write the report of a run, and the turntable movie of its model next to it.
 
     Args:
         folder: A run folder: of a run that has ended in any way, or still goes on.

@@ -17,7 +17,7 @@ class Setting:
     Attributes:
         name: With its section, such as ``solver.local_window``.
         value: As text.
-        usual: The value of preset ``default``, where that is another one; None if it is the same or unknown.
+        usual: The value of preset ``default``, if that is another one; None if it is the same or unknown.
     """
 
     name: str

@@ -58,7 +58,7 @@ def benchmark(
         ``measurements`` and of ``measured_frames``, from which they are scaled up; ``ratio_to_torch``, its
         ``total_ms`` over that of ``torch``; ``speedup_over_dense``, how many times longer ``dense`` takes, None if it
         was not asked for; ``peak_memory_mb``, see `peak_memory`, None for ``dense`` and ``others``.
-        ``speedup_over_dense`` of ``torch`` stands outside, too. With ``growth`` the answer of `measure_growth`.
+        ``speedup_over_dense`` of ``torch`` stands outside, too. With ``growth`` the result of `measure_growth`.
 
     Raises:
         InputError: If the device is not there.

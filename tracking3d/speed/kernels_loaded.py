@@ -12,6 +12,6 @@ from contextlib import suppress
 from tracking3d.speed.kernels_ahead import find_kernels, kernel_modules
 
 for _name in kernel_modules():
-    with suppress(Exception):  # whoever needs it is told
+    with suppress(Exception):  # whoever needs it gets an error later
         for _kernel in find_kernels(importlib.import_module(_name)):
             _kernel.load()

@@ -1,9 +1,9 @@
 """How much memory the iterations of a backend need.
 
 On the CPU a process of its own imports everything, compiles the kernels on a tiny scene, builds the scene that is
-asked for, and notes its resident set size. Then it runs a few iterations. The answer is the highest resident set size
+asked for, and notes its resident set size. Then it runs a few iterations. The result is the highest resident set size
 during these, less the noted one: what forward and backward passes and the gradients take, without libraries and data.
-The allocator of glibc is told to give everything back that is large; what it would keep depends on what ran before.
+The allocator of glibc is set to give everything back that is large; what it would keep depends on what ran before.
 
 On a GPU it is the same difference in what torch's allocator has handed out.
 """

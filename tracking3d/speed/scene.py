@@ -34,7 +34,7 @@ class RenderWorkload:
         frames: Frames in the batch.
         channels: Channels of the texture and of the frames.
         texture: Side of the texture in texels.
-        frequency: Of the icosphere.
+        frequency: Frequency of the icosphere.
     """
 
     size: int = 128

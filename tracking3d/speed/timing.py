@@ -79,7 +79,7 @@ def time_backends(
         repeats: Measurements of each backend.
         threads: CPU threads of every backend.
         dense: Whether to time the dense implementation, too, once and for a single frame.
-        others: Further renderers to time beside those of `backends`, by name.
+        others: Further renderers to time besides those of `backends`, by name.
 
     Returns:
         Measurements by name.

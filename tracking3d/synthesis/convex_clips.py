@@ -143,7 +143,7 @@ def make_demo_clip(
 ) -> Path:
     """Write the clip of ``tracking3d demo`` in the layout of `tracking3d.datasets.clip`.
 
-    Beside the exact ``masks/`` it holds ``rough_masks/``, the same with noise on their boundaries.
+    Besides the exact ``masks/`` it holds ``rough_masks/``, the same with noise on their boundaries.
 
     Args:
         folder: Where to write; made if absent.

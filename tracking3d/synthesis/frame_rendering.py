@@ -97,7 +97,7 @@ def _samples(scene: Scene) -> tuple[Array, Array]:
 def _sample(
     scene: Scene, time: float, offset: Array, lamp: Lamp, source: Array
 ) -> tuple[Array, Array, Array]:
-    """Light ``(H, W, 3)`` of one ray a pixel, and the depths ``(H, W)`` of object and hand, infinite beside them."""
+    """Light ``(H, W, 3)`` of one ray a pixel, and the depths ``(H, W)`` of object and hand, infinite outside them."""
     T_cam_obj = scene.path.T_cam_obj(np.array([time]))[0]
     light = scene.background * lamp.brightness
     depth, front = np.full(light.shape[:2], np.inf), np.full(light.shape[:2], np.inf)

@@ -67,7 +67,7 @@ def lamp_at(spec: SequenceSpec, frame: int, centre: Array, radius: float) -> Lam
             frame 0 it does not differ.
         frame: Index.
         centre: ``(3,)`` where the object is in frame 0.
-        radius: Of the object.
+        radius: Radius of the object.
     """
     rng = spec.random("light")
     strength = spec.disturbances.light

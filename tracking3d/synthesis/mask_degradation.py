@@ -93,7 +93,7 @@ def degrade_to_iou(
         masks: ``(N, H, W)`` true masks of what is seen.
         images: ``(N, H, W, 3)`` uint8 RGB, or N of such images; where masks leak depends on them.
         mean_iou: Above 0 and below 1; met within 0.01.
-        seed: Of all that is random.
+        seed: Seed of all that is random.
         faults: Which faults.
 
     Returns:

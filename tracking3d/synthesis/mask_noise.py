@@ -35,7 +35,7 @@ def noisy_boundaries(masks: Masks, pixels: float, seed: int) -> Masks:
     Args:
         masks: ``(N, H, W)`` true masks.
         pixels: Standard deviation of the shift.
-        seed: Of the noise.
+        seed: Seed of the noise.
 
     Raises:
         ValueError: If ``pixels`` is not positive.
@@ -58,7 +58,7 @@ def with_hand(masks: Masks, seed: int) -> Masks:
 
     Args:
         masks: ``(N, H, W)`` true masks.
-        seed: Of the sides.
+        seed: Seed of the sides.
     """
     rng = np.random.default_rng(seed)
     biased = masks.copy()

@@ -58,7 +58,7 @@ def _texture(mesh: trimesh.Trimesh) -> tuple[NDArray[np.uint8] | None, NDArray[n
 
 
 def _colours(mesh: trimesh.Trimesh, spec: SequenceSpec) -> NDArray[np.uint8]:
-    """``(V, 3)``: the file's own where it has some, else one plain colour."""
+    """``(V, 3)``: the file's own if it has some, else one plain colour."""
     if (
         spec.textured
         and isinstance(mesh.visual, trimesh.visual.ColorVisuals)

@@ -35,8 +35,8 @@ class Hand:
 
     Attributes:
         surface: In hand coordinates.
-        path: Of the object.
-        radius: Of the object.
+        path: Path of the object.
+        radius: Radius of the object.
         angle: Direction in the image that the hand comes from, in radians.
         cycles: How many times it comes and goes.
         last: Index of the last frame.

@@ -105,7 +105,7 @@ def tube(
 
     Args:
         centres: ``(M, 3)`` along the curve, in a plane.
-        radius: Of the whole tube, or ``(M, 1)``; where it ends at 0 the tube is closed.
+        radius: Radius of the whole tube, or ``(M, 1)``; where it ends at 0 the tube is closed.
         side: ``(3,)`` unit normal of the curve's plane.
         steps: Divisions around.
         sections: Patches along the curve.

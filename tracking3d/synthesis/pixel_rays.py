@@ -28,7 +28,7 @@ def pixels_around(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Columns and rows ``(N,)`` of the image's pixels around the projection of ``vertices`` ``(V, 3)``.
 
-    Every ``step``-th in both directions; all of the image where a part of the bounding box is behind the camera.
+    Every ``step``-th in both directions; all of the image if a part of the bounding box is behind the camera.
     """
     corners = np.array(list(product(*zip(vertices.min(0), vertices.max(0), strict=True))))
     pixels = camera_to_pixels(camera, corners @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3])

@@ -34,7 +34,7 @@ class GroundTruthTracks:
 def sample_point_tracks(scene: Scene, count: int = 200) -> GroundTruthTracks:
     """Random points, evenly spread over what is seen of the object in at least one frame.
 
-    Fewer than ``count`` only where hardly anything of the object is seen.
+    Fewer than ``count`` only if hardly anything of the object is seen.
     """
     rng = scene.spec.random("points")
     points, faces = _on_surface(scene, _CANDIDATES * count, rng)

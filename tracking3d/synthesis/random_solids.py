@@ -73,7 +73,7 @@ def organic(rng: np.random.Generator) -> list[Patch]:
     stretch = rng.uniform(0.55, 1, 3)
     patches = []
     for patch in cube_sphere(36):
-        # Of exponentials, so that no dent reaches the centre.
+        # An exponential of exponentials, so that no dent reaches the centre.
         shape = np.exp(np.exp(narrowness * (patch.vertices @ centres.T - 1)) @ heights.clip(-0.5, 0.6))
         patches.append(Patch(stretch * patch.vertices * shape[:, None], patch.faces, patch.uvs))
     return _fit_in_unit_ball(patches)

@@ -43,7 +43,7 @@ class Scene:
         background: ``(H, W, 3)`` linear light.
         hand: What moves in front of it.
         texture: ``(h, w, 3)`` linear light, no finer than the rays resolve; None if vertices have colours.
-        room: What is around the object instead of the background where the camera walks round it, else None.
+        room: What is around the object instead of the background if the camera walks round it, else None.
     """
 
     spec: SequenceSpec

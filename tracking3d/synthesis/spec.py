@@ -129,7 +129,7 @@ def check_spec(settings: Mapping[str, Any], origin: str) -> SequenceSpec:
     """The spec with these settings.
 
     Args:
-        settings: Of `SequenceSpec`, as YAML or options give them.
+        settings: Settings of `SequenceSpec`, as YAML or options give them.
         origin: Where they come from, as messages call it.
 
     Raises:

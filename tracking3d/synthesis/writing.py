@@ -52,7 +52,7 @@ def write_sequence(
 ) -> Path:
     """Render a sequence and write it, one frame in memory at a time.
 
-    It is made in ``.NAME.part`` beside ``folder`` and takes its place when it is complete.
+    It is made in ``.NAME.part`` next to ``folder`` and takes its place when it is complete.
 
     Args:
         folder: Made if absent; an earlier synthetic sequence in it is replaced.

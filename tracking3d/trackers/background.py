@@ -104,7 +104,7 @@ class BackgroundMemory:
 
         Args:
             image: ``(H, W, 3)`` RGB.
-            window: Of the frame.
+            window: Window of the frame.
             background: ``(S, S)`` which are outside the mask.
             proof: ``(S, S)`` how far this frame proves that they are background, 1 in full; negative where it speaks
                 for the object.

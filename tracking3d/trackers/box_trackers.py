@@ -21,8 +21,8 @@ class BoxOffset:
     """How the object's box lies to the one that a tracker follows, which keeps to what it was started on.
 
     Attributes:
-        shift: Of the corner, in widths and heights of the box.
-        factor: Of width and height.
+        shift: Shift of the corner, in widths and heights of the box.
+        factor: Factor of width and height.
     """
 
     shift: tuple[float, float] = (0.0, 0.0)
@@ -30,7 +30,7 @@ class BoxOffset:
 
     @classmethod
     def between(cls, followed: Box, told: Box) -> Self:
-        """From the box that is followed to the one that is told."""
+        """From the box that is followed to the given one."""
         x, y, width, height = followed
         return cls(((told[0] - x) / width, (told[1] - y) / height), (told[2] / width, told[3] / height))
 

@@ -24,7 +24,7 @@ class CocoMasks:
     """One object's masks out of a COCO file; the pieces of one object in one image are one mask.
 
     A list of results (``image_id``, ``category_id``, ``segmentation``) is read as well as a whole data set. Images are
-    called by their file names, or by their numbers where they have none.
+    called by their file names, or by their numbers if they have none.
 
     Args:
         path: The file.

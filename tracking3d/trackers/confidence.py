@@ -27,7 +27,7 @@ class Judgement:
     Attributes:
         separation: How much better than its surroundings the mask fits the first frame's colours, in [-1, 1].
         margin: The same just inside and outside the outline, by all the evidence but the prior, in [-1, 1].
-        agreement: IoU of the mask's box and the witness's; None without a witness.
+        agreement: IoU of the mask's box and the box tracker's; None without a box tracker.
         believed: False if the propagated last mask replaces a segmentation that changed too much.
     """
 

@@ -50,7 +50,7 @@ def open_masks(path: Path, object: int | None = None) -> MaskFiles:
 
     Args:
         path: What the user gave.
-        object: Which object, where there are several: its palette index, or its number in COCO's file.
+        object: Which object, if there are several: its palette index, or its number in COCO's file.
 
     Raises:
         InputError: If there is nothing at ``path``, no mask in it, or several objects of which none is chosen.

@@ -48,10 +48,10 @@ def mask_from_points(image: Image, points: Points) -> NDArray[np.float32]:
     scale = min(_WHOLE / max(height, width), 1.0)
     size = max(round(width * scale), 2), max(round(height * scale), 2)
     whole = lab(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
-    on, beside = _seeds(
+    on, background = _seeds(
         (points[:, :2] + 0.5) * (size[0] / width, size[1] / height), points[:, 2], whole.shape
     )
-    coarse = _grab_cut(whole, _nearer(whole, on, beside), on, beside, np.ones(on.shape, bool))
+    coarse = _grab_cut(whole, _nearer(whole, on, background), on, background, np.ones(on.shape, bool))
     coarse = cv2.resize(coarse.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
     around = box_of(coarse)
     if around is None:  # an object of less than a pixel at that size
@@ -61,20 +61,20 @@ def mask_from_points(image: Image, points: Points) -> NDArray[np.float32]:
     pixels = (points[:, :2] + 0.5 - (window.left, window.top)) * window.scale
     here = ((pixels >= 0) & (pixels < _SIZE)).all(1)
     inner = inside_frame(image.shape, window)
-    on, beside = _seeds(pixels[here], points[here, 2], inner.shape)
+    on, background = _seeds(pixels[here], points[here, 2], inner.shape)
     likely = (crop_window(coarse, window) > 0.5) & inner
     near = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _BAND + 1, 2 * _BAND + 1))
     on |= cv2.erode(likely.astype(np.uint8), near) > 0
     inner &= cv2.dilate((likely | on).astype(np.uint8), near) > 0
     return paste_mask(
-        _grab_cut(lab(crop_window(image, window)), likely, on, beside & ~on, inner), window, image.shape
+        _grab_cut(lab(crop_window(image, window)), likely, on, background & ~on, inner), window, image.shape
     )
 
 
 def _seeds(
     pixels: NDArray, kinds: NDArray, shape: tuple[int, ...]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """What the points are sure of: the object, and what is none of it. Where both are near, the nearer point counts."""
+    """What the points are sure of: the object, and what is none of it. If both are near, the nearer point counts."""
     rows, columns = np.mgrid[: shape[0], : shape[1]] + 0.5
     gaps = []
     for kind in (1, 0):
@@ -83,12 +83,12 @@ def _seeds(
         for x, y in those:
             gap = np.minimum(gap, np.hypot(columns - x, rows - y))
         gaps.append(gap)
-    on, beside = gaps
-    return (on <= _SEED) & (on <= beside), (beside <= _SEED) & (beside < on)
+    on, background = gaps
+    return (on <= _SEED) & (on <= background), (background <= _SEED) & (background < on)
 
 
 def _nearer(
-    colours: NDArray[np.uint8], on: NDArray[np.bool_], beside: NDArray[np.bool_]
+    colours: NDArray[np.uint8], on: NDArray[np.bool_], background: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
     """Pixels from which the way to the object's seeds is shorter than to the others, or to the border."""
     border = np.ones(on.shape, bool)
@@ -108,7 +108,7 @@ def _nearer(
     graph = coo_array(edges, shape=(on.size, on.size)).tocsr()
     to_object, to_rest = (
         dijkstra(graph, directed=False, indices=np.flatnonzero(seeds), min_only=True).reshape(on.shape)
-        for seeds in (on, (beside | border) & ~on)
+        for seeds in (on, (background | border) & ~on)
     )
     return np.asarray(to_object < to_rest)
 
@@ -117,13 +117,13 @@ def _grab_cut(
     colours: NDArray[np.uint8],
     likely: NDArray[np.bool_],
     on: NDArray[np.bool_],
-    beside: NDArray[np.bool_],
+    background: NDArray[np.bool_],
     inside: NDArray[np.bool_],
 ) -> NDArray[np.bool_]:
     """The object by its colours, as far as it is connected to an object point; the likely pixels if colours are
     uniform."""
     labels = np.where(likely, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
-    labels[~inside | beside] = cv2.GC_BGD
+    labels[~inside | background] = cv2.GC_BGD
     labels[on & inside] = cv2.GC_FGD
     found = np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD))
     if found.any() and not found.all() and colours.std(axis=(0, 1)).max() >= _LEAST_CONTRAST:

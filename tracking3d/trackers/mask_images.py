@@ -25,7 +25,7 @@ def natural_key(name: str) -> tuple[str | int, ...]:
 
 
 def binarize(values: NDArray) -> NDArray[np.bool_]:
-    """Object where a value is above half its type's range; where none is, wherever it is above zero.
+    """Object where a value is above half its type's range; if none is, wherever it is above zero.
 
     So masks of 0 and 255 lose what a lossy codec left in between, and masks of 0 and 1 or of small labels
     work too. Floats range from 0 to 1.
@@ -90,7 +90,7 @@ class ImageMasks:
 
 
 def split_object(path: Path) -> tuple[Path, int | None]:
-    """``FILE@N`` as file and number; the path as it is where it exists, or ends otherwise."""
+    """``FILE@N`` as file and number; the path as it is if it exists, or ends otherwise."""
     name, at, number = str(path).rpartition("@")
     if not at or not name or not re.fullmatch("[0-9]{1,9}", number) or path.exists():
         return path, None

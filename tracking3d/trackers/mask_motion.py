@@ -34,9 +34,9 @@ class MaskMotion:
         by_flow: ``(S, S)`` float32 in [0, 1], the last mask warped by the flow.
         by_similarity: ``(S, S)`` float32 in [0, 1], the last mask moved by one similarity.
         cue: ``(S, S)`` float32 pixels: how much better a pixel's motion fits the object's affine motion than
-            the background's; 0 where it cannot be told.
+            the background's; 0 if it is unknown.
         background: ``(3, 3)``, the background's homography from present to last pixels, a similarity where that
-            explains as much; None if it cannot be told.
+            explains as much; None if it is unknown.
     """
 
     source: NDArray[np.float32]

@@ -73,7 +73,7 @@ def remove_specks(
     Args:
         mask: What the evidence says.
         moved: The last mask moved along; a part of which it covers less than 30 % is dropped.
-        motion: The cue of `tracking3d.trackers.mask_motion`; where there are several parts, one that moves like the
+        motion: The cue of `tracking3d.trackers.mask_motion`; if there are several parts, one that moves like the
             background is dropped.
     """
     area = int(np.count_nonzero(moved))

@@ -126,9 +126,9 @@ class PrecomputedMasks:
 def match_masks(names: Sequence[str], first: Frame) -> Callable[[Frame], int | None]:
     """Decide on the first frame how masks belong to frames.
 
-    1. By name without suffix, where the first frame has a mask of its name: ``000012.png`` or ``12.png`` is
+    1. By name without suffix, if the first frame has a mask of its name: ``000012.png`` or ``12.png`` is
        the mask of ``000012.jpg``.
-    2. Else by the number in the mask's name: the frame's index counted from 0; or, where no mask is numbered
+    2. Else by the number in the mask's name: the frame's index counted from 0; or, if no mask is numbered
        0, the number in the frame's own name.
     3. Else by order: mask n belongs to frame n of the source.
 

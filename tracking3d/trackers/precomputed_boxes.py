@@ -15,7 +15,7 @@ _CUES = Cues(outline=0.0, background=0.0, novelty=0.0)  # the box does their wor
 
 
 class PrecomputedBoxes:
-    """What the tracker ``precomputed`` is where its file holds boxes: the segmentation of ``csrt``, the box given.
+    """What the tracker ``precomputed`` is if its file holds boxes: the segmentation of ``csrt``, the box given.
 
     Args:
         regions: The boxes; line n is frame n.

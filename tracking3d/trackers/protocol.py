@@ -70,7 +70,7 @@ class ResumableTracker(Protocol):
     """
 
     def state(self) -> Any:
-        """All that later estimates depend on, beside the first frame: numpy arrays, lists, dicts and plain values.
+        """All that later estimates depend on, besides the first frame: numpy arrays, lists, dicts and plain values.
 
         A returned state never changes afterwards.
         """

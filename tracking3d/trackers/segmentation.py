@@ -168,7 +168,7 @@ class ColourSegmentation:
         return full, Judgement(separation, margin, agreement, believed)
 
     def _search(self, image: Image) -> _Answer:
-        """Where the object was out of sight: the mask of what has its colours, if anything has."""
+        """The mask of what has the object's colours, if anything has, after the object was out of sight."""
         self._background.lose()
         unchanged = self._background.unchanged_score(image) if self._cues.background else None
         found = find_by_colours(image, self._colours, self._usual_area, _MARGIN, self._size, unchanged)

@@ -19,7 +19,7 @@ def deinterlace(pictures: Iterable[av.VideoFrame | str]) -> Iterator[av.VideoFra
     """The same pictures in the same number and order, interlaced ones deinterlaced; progressive ones pass as they are.
 
     The lines of a picture that are missing at its moment come from the pictures before and after it, so that each
-    is held until the next one is there. Where one could not be decoded, which its reason stands for, they are not
+    is held until the next one is there. If one could not be decoded, which its reason stands for, they are not
     looked for beyond it.
     """
     graph: _Deinterlacer | None = None

@@ -21,9 +21,9 @@ class FrameSource(Protocol):
 
     Attributes:
         name: What messages call the source: the path as given, or ``"camera 0"``.
-        count: Number of selected frames where it is cheaply known (of videos, as the header has it), or None.
+        count: Number of selected frames if it is cheaply known (of videos, as the header has it), or None.
         fps: Selected frames per second (the source's rate over the step), or None if it has no rate.
-        intrinsics: ``(fx, fy, cx, cy)`` in pixels where the source knows its lens, else None.
+        intrinsics: ``(fx, fy, cx, cy)`` in pixels if the source knows its lens, else None.
         intrinsics_origin: Where the intrinsics came from, in words; empty if there are none.
         repeatable: Whether iterating once more gives the same frames again.
     """

@@ -1,7 +1,7 @@
 """Videos by address: files on a web server and live streams over HTTP(S) and RTSP(S), through FFmpeg.
 
-A file (whose length the server tells) is read like one on disk; where the connection breaks off, it is taken up again
-where it was. A stream gives its newest frame, as a camera does; where it breaks off it is asked for again, a few times.
+A file (whose length the server tells) is read like one on disk; if the connection breaks off, it is taken up again
+where it was. A stream gives its newest frame, as a camera does; if it breaks off it is asked for again, a few times.
 Nothing but these protocols and the common video formats is followed, whatever an address leads to.
 """
 

@@ -79,7 +79,7 @@ def tone_mapping_of(picture: av.VideoFrame) -> ToneMapping | None:
     primaries = getattr(picture, "color_primaries", _UNSPECIFIED)  # older versions of PyAV do not tell
     wide = primaries == _BT2020
     hdr = _HDR.get(getattr(picture, "color_trc", _UNSPECIFIED))
-    if hdr is not None:  # whose primaries are BT.2020's where nobody says
+    if hdr is not None:  # whose primaries are BT.2020's if nobody says
         return ToneMapping(hdr, wide or primaries == _UNSPECIFIED)
     return ToneMapping("SDR", True) if wide else None
 
@@ -113,7 +113,7 @@ _TRANSFERS: dict[str, Callable[[NDArray], NDArray[np.float64]]] = {
 
 @lru_cache(maxsize=4)
 def _light(transfer: str) -> NDArray[np.float32]:
-    """Of all signals of 10 bits."""
+    """Light of all signals of 10 bits."""
     return _TRANSFERS[transfer](np.arange(1024) / 1023).astype(np.float32)
 
 

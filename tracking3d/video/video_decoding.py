@@ -1,4 +1,4 @@
-"""Decoding a video stream so that every picture keeps its index, also where some cannot be decoded."""
+"""Decoding a video stream so that every picture keeps its index, even if some cannot be decoded."""
 
 from __future__ import annotations
 

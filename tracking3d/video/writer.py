@@ -73,7 +73,7 @@ class VideoWriter:
         stream.height, stream.width = height + height % 2, width + width % 2
         stream.pix_fmt = "yuv420p"
         stream.codec_context.thread_count = codec_threads()
-        # FFmpeg's own assumption where an encoder cannot store it, such as mpeg4; H.264 does, for browsers.
+        # FFmpeg's own assumption if an encoder cannot store it, such as mpeg4; H.264 does, for browsers.
         stream.codec_context.colorspace = Colorspace.ITU601
         stream.codec_context.color_range = ColorRange.MPEG
         return stream

@@ -12,7 +12,7 @@ from tracking3d.viewer.scene import ObjectScene
 
 _FOV = 0.8  # radians, upright
 _ASPECT = 0.6  # width through height of what the panels leave of a usual window
-_NARROW = 0.38  # the same where videos are beside one another, and their panel is wider
+_NARROW = 0.38  # the same if videos are side by side, and their panel is wider
 _TILT = 0.5  # of the look onto a path's plane, so that it is seen from aside, too
 _BEHIND = 1.5  # of the look from where the cameras are, so that the sides that they saw are seen
 _MARGIN = 1.15

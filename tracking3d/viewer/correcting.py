@@ -40,7 +40,7 @@ class RunCorrection:
     Args:
         run: The run.
         images: Its frames.
-        source: The video, where it is not where the run found it.
+        source: The video, if it is not where the run found it.
         access: Where the page listens, and whom it serves.
     """
 
@@ -147,9 +147,9 @@ class RunCorrection:
         )
         if not done:
             return CorrectionProgress(True, f"Correcting frame {self._frame}: starting …")
-        told = f"{again} of {total} refined" if again else f"{done} of {total} frames estimated"
+        progress = f"{again} of {total} refined" if again else f"{done} of {total} frames estimated"
         share = (done + again) / (2 * total if self.run.refined else total)
-        return CorrectionProgress(True, f"Correcting frame {self._frame}: {told}.", share=min(share, 1.0))
+        return CorrectionProgress(True, f"Correcting frame {self._frame}: {progress}.", share=min(share, 1.0))
 
     def close(self) -> None:
         """Stop serving; a correction that goes on is stopped, and can go on by the command."""
@@ -173,11 +173,11 @@ class RunCorrection:
         (self.run.folder / layout.DRAWN).unlink(missing_ok=True)
         if code == 0:
             return CorrectionProgress(sentence=f"Frame {self._frame} is corrected.")
-        told = next(
+        message = next(
             (line for line in lines if line.startswith("error: ")), "error: the correction was stopped."
         )
         return CorrectionProgress(
-            sentence=f"The correction failed and the run is unchanged: {told.removeprefix('error: ')}",
+            sentence=f"The correction failed and the run is unchanged: {message.removeprefix('error: ')}",
             failed=True,
         )
 
@@ -218,21 +218,21 @@ class Corrections:
     def _offer(self, one: RunCorrection, index: int) -> str:
         name = f"<b>{html.escape(one.run.name)}</b>: " if len(self._each) > 1 else ""
         now = one.progress()
-        told = f"<br>{html.escape(now.sentence)}" if now.sentence else ""
+        note = f"<br>{html.escape(now.sentence)}" if now.sentence else ""
         if now.running:
             share = "" if now.share is None else f' value="{now.share:.3f}"'
             bar = f'<progress max="1"{share} style="width:100%"></progress>'
             return f"<p>{name}{html.escape(now.sentence)}<br>{bar}</p>"
         if why := one.why_not or one.why_not_frame(index):
-            return f"<p>{name}{html.escape(why)}{told}</p>"
+            return f"<p>{name}{html.escape(why)}{note}</p>"
         try:
             port = one.port()
         except Tracking3dError as error:
-            return f"<p>{name}{html.escape(str(error))}{told}</p>"
+            return f"<p>{name}{html.escape(str(error))}{note}</p>"
         address = f"{self._access.address(port)}#frame={index}"
         # The browser may know this machine by another name than the address that was printed.
         here = "this.href=this.href.replace(/\\/\\/[^/]*:/, '//'+location.hostname+':')"
         return (
             f'<p>{name}<a class="correct" target="_blank" rel="noopener" href="{html.escape(address)}" '
-            f'onclick="{html.escape(here)}" style="color:inherit;font-weight:600">Correct frame {index} …</a>{told}</p>'
+            f'onclick="{html.escape(here)}" style="color:inherit;font-weight:600">Correct frame {index} …</a>{note}</p>'
         )

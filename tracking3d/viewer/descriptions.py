@@ -23,16 +23,16 @@ LONGEST_LIST = 200
 def list_streaks(runs: Sequence[FollowedRun]) -> str:
     """The uncertain and lost frames of all runs with their reasons; a click goes to a frame."""
     rows = [(run, streak) for run in runs for streak in run.streaks()]
-    told = "".join(_row(run, streak, len(runs) > 1) for run, streak in rows[:LONGEST_LIST])
+    items = "".join(_row(run, streak, len(runs) > 1) for run, streak in rows[:LONGEST_LIST])
     if not rows:
-        told = "<p>No frame is uncertain or lost.</p>"
+        items = "<p>No frame is uncertain or lost.</p>"
     elif len(rows) > LONGEST_LIST:
-        told += f"<p>… and {len(rows) - LONGEST_LIST} more.</p>"
-    return f'<div style="font-size:12px;line-height:1.35;max-height:40vh;overflow-y:auto;margin:4px 12px">{told}</div>'
+        items += f"<p>… and {len(rows) - LONGEST_LIST} more.</p>"
+    return f'<div style="font-size:12px;line-height:1.35;max-height:40vh;overflow-y:auto;margin:4px 12px">{items}</div>'
 
 
 def describe_frame(run: FollowedRun, record: FrameRecord | None, colour: Colour | None = None) -> str:
-    """One run's answer for a frame in a line of HTML, after the colour of its curve."""
+    """One run's estimate of a frame in a line of HTML, after the colour of its curve."""
     name = html.escape(run.name)
     if colour is not None:
         name = f'<span style="color:{hexadecimal(colour)}">▬</span> {name}'
@@ -41,10 +41,10 @@ def describe_frame(run: FollowedRun, record: FrameRecord | None, colour: Colour 
     figures = f"confidence {record.confidence:.2f}"
     if record.iou_initial is not None:
         figures += f", IoU with the initial mask {record.iou_initial:.2f}"
-    told = [figures, *(["keyframe"] if record.keyframe else []), *(["refined"] if record.refined else [])]
+    details = [figures, *(["keyframe"] if record.keyframe else []), *(["refined"] if record.refined else [])]
     why = [html.escape(text) for text in (record.reason, record.failure) if text]
     return (
-        f"<div><b>{name}</b> {_badge(record.status)} {', '.join(told)}"
+        f"<div><b>{name}</b> {_badge(record.status)} {', '.join(details)}"
         f"{'<br>' if why else ''}{'; '.join(why)}</div>"
     )
 

@@ -70,7 +70,7 @@ class FollowedRun:
         self._model_time = 0.0
         self.reader = RunReader(self.folder)
         self.description = self.reader.description
-        self.reader.camera  # noqa: B018 (a damaged one is told of before anything is shown)
+        self.reader.camera  # noqa: B018 (a damaged one is reported before anything is shown)
 
     @property
     def camera(self) -> Camera:
@@ -143,12 +143,12 @@ class FollowedRun:
     def _look_at_lines(self) -> bool:
         path = self.folder / layout.FRAMES
         try:
-            told = path.stat()
-            size = told.st_size
+            stat = path.stat()
+            size = stat.st_size
             # Restarted, cut back to where a stopped run goes on, or replaced by a corrected one.
-            if size < self._read or told.st_ino != self._inode:
+            if size < self._read or stat.st_ino != self._inode:
                 self._lines.clear()
-                self._read, self._inode = 0, told.st_ino
+                self._read, self._inode = 0, stat.st_ino
             if size == self._read:
                 return False
             with path.open("rb") as file:
@@ -204,8 +204,8 @@ def open_followed_runs(folder: Path) -> list[FollowedRun]:
 def picked_names(folder: Path) -> dict[str, str]:
     """What the objects of a run were called when they were picked, by the name of their folder."""
     try:
-        told = json.loads((folder / "picked.json").read_bytes()[:LONGEST_LINE])
-        names = [str(one["name"])[:60] for one in told["objects"]]
+        picked = json.loads((folder / "picked.json").read_bytes()[:LONGEST_LINE])
+        names = [str(one["name"])[:60] for one in picked["objects"]]
     except (OSError, ValueError, KeyError, TypeError):
         return {}
     return {f"object_{number}": name for number, name in enumerate(names)}

@@ -2,7 +2,7 @@
 
 Viser has no check of its own: it lets pages of any origin connect, takes messages of 50 MB and as many connections
 as there are. All of that is decided where it calls `websockets.asyncio.server.serve`, so that call is the one thing
-that is replaced here, while the server starts; where a version of viser no longer calls it, nothing is served.
+that is replaced here, while the server starts; if a version of viser no longer calls it, nothing is served.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def start_server(access: Access, port: int) -> viser.ViserServer:
 
     Args:
         access: Where it listens, and whom it serves.
-        port: The port; where it is taken, the next one that is free. 0 for any.
+        port: The port; if it is taken, the next one that is free. 0 for any.
 
     Raises:
         PluginError: If this version of viser cannot be guarded.

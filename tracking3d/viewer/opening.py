@@ -47,7 +47,7 @@ def open_viewer(
         folders: Run folders, or folders of the several objects of one video.
         access: Where to listen, and whom to serve.
         port: The port, or the next one that is free; 0 for any.
-        source: The video, where it is not where the runs found it.
+        source: The video, if it is not where the runs found it.
         images: Gives the frames of all runs, where they are at hand already.
 
     Raises:

@@ -20,7 +20,7 @@ _ON_A_PHONE = """<style>
     div[style*="flex-grow: 1; height: 100%"] { height: 42% !important; }
 }
 </style>"""
-"""Viser's panel on a phone leaves a strip beside it and hides the middle of the model. Where a version of viser is made
+"""Viser's panel on a phone leaves a strip next to it and hides the middle of the model. If a version of viser is made
 otherwise, this says nothing."""
 _STEPS = ("◀◀", "◀", "▶", "▶▶")
 _STEP_HINT = "Previous uncertain or lost frame, previous frame, next frame, next uncertain or lost frame."
@@ -31,7 +31,7 @@ class Panel:
 
     Args:
         server: Shows them.
-        videos: How many stand beside one another.
+        videos: How many stand side by side.
         live: Whether a run may still grow.
         causal: Whether there are causal estimates besides refined ones.
     """

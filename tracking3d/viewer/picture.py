@@ -18,7 +18,7 @@ from tracking3d.results.records import FrameRecord
 from tracking3d.viewer.followed_run import FollowedRun
 
 WIDEST = 960
-"""Pixels of the picture that is sent; the panel beside the model is not wider."""
+"""Pixels of the picture that is sent; the panel next to the model is not wider."""
 CAUSAL: drawing.Colour = (255, 120, 230)
 LAYERS = {"initial": drawing.INITIAL, "causal": CAUSAL, "refined": drawing.REFINED}
 """The masks whose outlines can be drawn, and their colours, from the lowest to the uppermost."""
@@ -34,7 +34,7 @@ class Shown:
     Attributes:
         layers: Names of those of `LAYERS`.
         axes: Whether the object's axes are.
-        probability: Whether the object's probability is, where it was kept.
+        probability: Whether the object's probability is, if it was kept.
     """
 
     layers: frozenset[str] = frozenset({"refined"})
@@ -57,8 +57,8 @@ def draw_picture(
         runs: The objects of one video.
         index: The frame.
         shown: What to draw.
-        axes: Of each object, or None.
-        colours: Of each object's final mask, where several are to be told apart.
+        axes: Axes of each object, or None.
+        colours: Colours of each object's final mask, if several are to be distinguished.
 
     Returns:
         ``(H, W, 3)``, at most `WIDEST` wide.

@@ -81,12 +81,12 @@ class LatestImages:
 
 
 class OverlayPictures:
-    """The frames out of a run's own overlay video, where those that it was made from are gone.
+    """The frames out of a run's own overlay video, if those that it was made from are gone.
 
     Args:
         folder: The run folder.
-        indices: Of the frames that it shows, in order.
-        height: Of a frame; the status bar below it is cut off.
+        indices: Indices of the frames that it shows, in order.
+        height: Height of a frame; the status bar below it is cut off.
 
     Raises:
         InputError: If the run has no such video.

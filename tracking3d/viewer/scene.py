@@ -217,9 +217,9 @@ def _wxyz(T: NDArray[np.float64]) -> NDArray[np.float64]:
 def _read_if_changed(path: Path, before: float) -> tuple[float, bytes | None]:
     """When a file was written, and what it holds if that is not as ``before``; None if it is, or there is none."""
     try:
-        told = path.stat()
-        if told.st_mtime == before or told.st_size > LARGEST_MESH:
+        stat = path.stat()
+        if stat.st_mtime == before or stat.st_size > LARGEST_MESH:
             return before, None
-        return told.st_mtime, path.read_bytes()
+        return stat.st_mtime, path.read_bytes()
     except OSError:
         return before, None

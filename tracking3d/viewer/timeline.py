@@ -1,7 +1,7 @@
 """The timeline: status, keyframes and one quantity over time, as a clickable image.
 
 Viser's plots do not report where they are clicked, so the plot is HTML of our own. A click writes the frame's number
-into the field beside the slider, as a person would; everything else follows from that.
+into the field next to the slider, as a person would; everything else follows from that.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ from tracking3d.web.access import Access
 POLL = 0.5
 """Seconds between two looks at run folders that may grow."""
 _DRAW_ANEW = 2.0  # seconds between two drawings of the path of a run that grows
-_USUAL_RATE = 10.0  # frames a second where the source has no rate
+_USUAL_RATE = 10.0  # frames a second if the source has no rate
 
 
 @dataclass(eq=False)
@@ -169,7 +169,7 @@ class Viewer:
             self.go_to(found[0] if way == "▶▶" else found[-1])
 
     def _advance(self) -> None:
-        """Go on through the frames while the video plays; frames are left out where drawing is slower."""
+        """Go on through the frames while the video plays; frames are left out if drawing is slower."""
         while not self._over:
             with self._changed:
                 self._changed.wait_for(lambda: self._playing or self._over)
@@ -303,7 +303,7 @@ class Viewer:
             if scene is not self._scenes[0]:
                 place += max(1.6 * scene.distance, 1.1 * (above + scene.reach))
             scene.place, above = np.array([0.0, place, 0.0]), scene.reach
-            # Of the state of a run that goes on: the final refinement may scale and turn the object.
+            # From the state of a run that goes on: the final refinement may scale and turn the object.
             points = None if run.refined else landmarks_of_checkpoint(run.folder)
             scene.draw_landmarks(points)
             any_landmarks = any_landmarks or points is not None

@@ -104,7 +104,7 @@ def test_a_doubtful_start_is_tried_again_only_after_more_motion(asked):
 
 def test_candidates_do_not_show_motion(asked):
     given = belief_of(STEADY)
-    object_map = replace(given.known, candidate=np.ones(len(given.known.landmarks), bool))
+    object_map = replace(given.object_map, candidate=np.ones(len(given.object_map.landmarks), bool))
     assert try_initialize(replace(given, object_map=object_map), CONFIG)[1] is None
     assert not asked["points"]
 
@@ -130,9 +130,9 @@ def test_what_is_still_for_long_keeps_waiting_with_fewer_frames_and_says_why(ask
 
 def test_points_that_are_gone_without_having_moved_tell_no_shape(asked):
     given = belief_of([0.0] * 14)
-    view, estimate = given.waiting[-1]
+    view, estimate = given.pending[-1]
     bare = replace(view, points=view.points.only(view.points.landmark < 2))
-    state, start = try_initialize(replace(given, pending=(*given.waiting[:-1], (bare, estimate))), CONFIG)
+    state, start = try_initialize(replace(given, pending=(*given.pending[:-1], (bare, estimate))), CONFIG)
     assert start is None
     assert not asked["points"]
     assert not asked["turning"]
@@ -200,7 +200,7 @@ def test_points_that_run_wild_give_way_to_turning_without_more_motion(asked):
     """They show as much change of form as half a turn and fit no start: waiting for more of it is in vain."""
     asked["bundle"] = 0.6
     given = belief_of(list(np.linspace(0, 80, 15)))
-    assert try_initialize(replace(given, pending=given.waiting[:12]), CONFIG)[1] is None
+    assert try_initialize(replace(given, pending=given.pending[:12]), CONFIG)[1] is None
     _, start = try_initialize(replace(given, next_attempt=9.0), CONFIG)
     assert start is not None and start.origin == "turning"
     assert asked["turning"] == [15]
@@ -208,7 +208,7 @@ def test_points_that_run_wild_give_way_to_turning_without_more_motion(asked):
 
 def test_a_plain_object_is_started_without_points_once_it_had_time_to_turn(asked):
     given = belief_of(list(np.linspace(0, 60, 13)))
-    plain = [(replace(view, strength=0.1), estimate) for view, estimate in given.waiting]
+    plain = [(replace(view, strength=0.1), estimate) for view, estimate in given.pending]
     early = replace(given, pending=tuple(plain[:12]))
     assert try_initialize(early, CONFIG) == (early, None)
     _, start = try_initialize(replace(given, pending=tuple(plain)), CONFIG)
@@ -218,7 +218,7 @@ def test_a_plain_object_is_started_without_points_once_it_had_time_to_turn(asked
 
 def test_one_frame_that_looks_plain_or_printed_does_not_decide(asked):
     given = belief_of(STEADY)
-    first, *others = given.waiting
+    first, *others = given.pending
     mixed = ((replace(first[0], strength=0.1), first[1]), *others)
     assert try_initialize(replace(given, pending=mixed), CONFIG)[1].origin == "points"
 
@@ -226,9 +226,9 @@ def test_one_frame_that_looks_plain_or_printed_does_not_decide(asked):
 def test_an_object_that_has_left_is_solved_with_what_was_seen_of_it(asked):
     asked["bundle"] = 0.6
     given = belief_of([*STEADY, 30.0, 30.0, 30.0])
-    slip = replace(given, pending=hidden(given.waiting[:7], 1))
+    slip = replace(given, pending=hidden(given.pending[:7], 1))
     assert try_initialize(slip, CONFIG)[1] is None
-    assert try_initialize(replace(given, pending=hidden(given.waiting, 3)), CONFIG)[1].origin == "turning"
+    assert try_initialize(replace(given, pending=hidden(given.pending, 3)), CONFIG)[1].origin == "turning"
 
 
 def hidden(waiting, last: int):
@@ -290,10 +290,10 @@ def test_where_points_get_worse_the_start_of_before_is_taken_up_again(monkeypatc
     monkeypatch.setattr(initializer, "solve_start", solve_start)
     monkeypatch.setattr(initializer, "_same_axis", lambda one, other: False)
     given = belief_of(STEADY)
-    state, start = try_initialize(replace(given, pending=given.waiting[:5]), CONFIG)
+    state, start = try_initialize(replace(given, pending=given.pending[:5]), CONFIG)
     assert start is None
     assert state.ambiguous_frames == 5
-    _, start = try_initialize(replace(state, pending=given.waiting, next_attempt=0.0), CONFIG)
+    _, start = try_initialize(replace(state, pending=given.pending, next_attempt=0.0), CONFIG)
     assert start is not None and start.origin == "5"
     assert asked == [5, 6, 5]
 

@@ -9,6 +9,7 @@ import pytest
 import torch
 from rendered_solids import pose_of
 
+from tracking3d.estimation.online.state.solver_state import SolverPhase
 from tracking3d.estimation.online.tracking.motion_model import is_consistent_with_motion, pose_predictions
 from tracking3d.geometry.camera import Camera
 
@@ -18,7 +19,13 @@ def lost(frames: int, step: float = 5.0):
     trail = tuple((pose_of(step * n, (0, 1, 0)), n) for n in range(10))
     camera = Camera.from_fov(80, 60)
     return SimpleNamespace(
-        trajectory=trail, lost_frames=frames, last=trail[-1], before=None, camera=camera, last_candidate=None
+        trajectory=trail,
+        lost_frames=frames,
+        last_pose=trail[-1],
+        previous_pose=None,
+        camera=camera,
+        last_candidate=None,
+        phase=SolverPhase.LOST if frames else SolverPhase.TRACKING,
     )
 
 
@@ -37,13 +44,15 @@ def test_a_long_loss_leads_nowhere():
 
 
 def test_without_any_motion_nothing_is_led_to():
-    assert not is_consistent_with_motion(SimpleNamespace(trajectory=(), lost_frames=1), pose_of(0), 1)
+    assert not is_consistent_with_motion(
+        SimpleNamespace(trajectory=(), lost_frames=1, phase=SolverPhase.LOST), pose_of(0), 1
+    )
 
 
 def test_a_lost_object_is_looked_for_where_it_goes_first():
     starts = pose_predictions(lost(3), 12, None)
-    assert list(starts) == ["coasting", "last"]
-    turned = np.degrees(2 * np.arccos(abs(float(starts["coasting"].quaternion[0]))))
+    assert list(starts) == ["motion_model", "last"]
+    turned = np.degrees(2 * np.arccos(abs(float(starts["motion_model"].quaternion[0]))))
     assert turned == pytest.approx(60, abs=1)
 
 
@@ -53,9 +62,15 @@ def test_a_mask_tells_where_a_lost_object_is_again():
     state = lost(3)
     state.last_candidate = pose_of(200.0, (0, 1, 0))
     starts = pose_predictions(state, 12, mask)
-    assert list(starts) == ["coasting", "last", "coasting in the mask", "last in the mask", "tried"]
-    for name in ("coasting in the mask", "last in the mask", "tried"):
+    assert list(starts) == [
+        "motion_model",
+        "last",
+        "motion_model in the mask",
+        "last in the mask",
+        "last_candidate",
+    ]
+    for name in ("motion_model in the mask", "last in the mask", "last_candidate"):
         x, y, z = starts[name].translation.tolist()
         K = state.camera.K
         assert (K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]) == pytest.approx((64.5, 14.5), abs=1e-3)
-    assert torch.equal(starts["tried"].quaternion, state.last_candidate.quaternion)
+    assert torch.equal(starts["last_candidate"].quaternion, state.last_candidate.quaternion)

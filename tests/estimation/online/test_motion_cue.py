@@ -29,14 +29,14 @@ def state(monkeypatch):
     return updated
 
 
-def found(state, mask=None, witnesses=motion_cue._WITNESSES, lost=False) -> SimpleNamespace:
+def found(state, mask=None, inliers=motion_cue._WITNESSES, lost=False) -> SimpleNamespace:
     """The last keyframe found where it is."""
     view = state.object_map.keyframes[-1]
     view = replace(view, mask=view.mask if mask is None else mask)
     return SimpleNamespace(
         view=view,
         lost=lost,
-        support=SimpleNamespace(witnesses=witnesses),
+        evidence=SimpleNamespace(inliers=inliers),
         fit=SimpleNamespace(pose=view.pose),
     )
 
@@ -48,7 +48,7 @@ def test_a_pose_that_points_agree_with_tells_what_moves_along(state):
 
 def test_others_do_not(state):
     assert motion_cue_in_window(state, found(state, lost=True), IMAGE) is None
-    assert motion_cue_in_window(state, found(state, witnesses=motion_cue._WITNESSES - 1), IMAGE) is None
+    assert motion_cue_in_window(state, found(state, inliers=motion_cue._WITNESSES - 1), IMAGE) is None
     assert motion_cue_in_window(replace(state, motion_references=()), found(state), IMAGE) is None
 
 
@@ -75,7 +75,7 @@ def test_frames_are_remembered_while_they_are_believed(state):
     estimate = known_run(FRAMES)[1][-1]
     after = remember_motion(state, estimate, found(state), IMAGE)
     assert after.motion_references[:-1] == state.motion_references[-motion_cue._MOST + 1 :]
-    assert remember_motion(state, estimate, found(state, witnesses=0), IMAGE) is state
+    assert remember_motion(state, estimate, found(state, inliers=0), IMAGE) is state
     assert not remember_motion(state, estimate, found(state, lost=True), IMAGE).motion_references
 
 

@@ -89,7 +89,7 @@ def test_rotations_are_found_and_the_silhouette_overlaps_the_object():
         assert not estimate.refined
         assert estimate.diagnostics["mask_iou"] > 0.85
         assert np.linalg.det(estimate.T_cam_obj[:3, :3]) == pytest.approx(1, abs=1e-5)
-    last = whole_run()[0].last[0]
+    last = whole_run()[0].last_pose[0]
     assert mask_iou(object_map.silhouette(last, turning_clip().camera), true_mask(FRAMES - 1)) > 0.9
 
 

@@ -29,8 +29,8 @@ def by_twins(monkeypatch):
 
     def call(function):
         with monkeypatch.context() as patch:
-            patch.setattr(AdjustmentProblem, "evaluate", bundle_adjustment.evaluate)
-            patch.setattr(AdjustmentProblem, "linearize", bundle_adjustment.linearize)
+            patch.setattr(AdjustmentProblem, "evaluate", bundle_adjustment.evaluated)
+            patch.setattr(AdjustmentProblem, "linearize", bundle_adjustment.linearised)
             patch.setattr(System, "step", bundle_adjustment.step)
             return function()
 
@@ -55,10 +55,10 @@ def posed(given, fixed, free_focal):
 @pytest.mark.parametrize(("fixed", "free_focal"), [(0, False), (1, False), (1, True), (2, True)])
 def test_cost_residuals_equations_and_step_of_a_bundle(settings, fixed, free_focal):
     problem, at = posed(scene(**settings), fixed, free_focal)
-    mine, expected = problem.evaluate(at), bundle_adjustment.evaluate(problem, at)
+    mine, expected = problem.evaluate(at), bundle_adjustment.evaluated(problem, at)
     assert mine.cost == pytest.approx(expected.cost, rel=1e-12)
     np.testing.assert_allclose(mine.residual, expected.residual, rtol=1e-9, atol=1e-9)
-    mine, expected = problem.linearize(at), bundle_adjustment.linearize(problem, at)
+    mine, expected = problem.linearize(at), bundle_adjustment.linearised(problem, at)
     for field in fields(mine):
         values = getattr(expected, field.name)
         np.testing.assert_allclose(

@@ -1,7 +1,7 @@
 """Camera poses of a COLMAP model, text or binary, with the object as the world.
 
-COLMAP's poses map world to camera with OpenCV's axes, so they are ``T_cam_obj`` where the model is of the object alone.
-The world's origin is moved to the median of the model's points: COLMAP leaves it near the cameras, and where these are
+COLMAP's poses map world to camera with OpenCV's axes, so they are ``T_cam_obj`` if the model is of the object alone.
+The world's origin is moved to the median of the model's points: COLMAP leaves it near the cameras, and if these are
 close together, that is many times their distances away from the object. ``cameras``, ``rigs`` and ``frames`` tell
 nothing more about poses.
 Format: https://colmap.github.io/format.html

@@ -19,7 +19,7 @@ _OBSERVATION_SIZE = 8
 
 
 def read_points(model: Path) -> NDArray[np.float64]:
-    """The places ``(N, 3)`` of a model's points in world coordinates; none where it has no points file.
+    """The places ``(N, 3)`` of a model's points in world coordinates; none if it has no points file.
 
     Args:
         model: Folder of ``points3D.bin`` or ``points3D.txt``.

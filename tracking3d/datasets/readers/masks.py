@@ -42,7 +42,7 @@ def answers_from_masks(folder: Path, truth: Truth, object_id: int | None = None)
     """Masks by the names of their frames, without suffix; numbers in names count as numbers, so 7 is 0007.
 
     Args:
-        folder: Of the images, or of one folder a clip, as DAVIS has its results.
+        folder: Folder of the images, or of one folder a clip, as DAVIS has its results.
         truth: The clip.
         object_id: Which object of indexed images; every object if None.
 

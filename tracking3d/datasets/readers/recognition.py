@@ -48,7 +48,7 @@ def read_answers(path: Path, truth: Truth, format: str | None = None, **options:
         path: File or folder.
         truth: The clip.
         format: One of `ANSWER_FORMATS`; recognised if None.
-        options: Of that format's function, such as ``object_id`` or ``of``.
+        options: Options of that format's function, such as ``object_id`` or ``of``.
 
     Returns:
         The estimates, and what they were read as, in words.

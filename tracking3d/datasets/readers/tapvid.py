@@ -1,7 +1,7 @@
 """Point tracks in the form of TAP-Vid: a pickle or .npz of the data set's kind or of a tracker's predictions.
 
 For N points in T frames, ``points`` or ``tracks`` is ``(N, T, 2)`` x and y, ``occluded`` ``(N, T)``, and
-``query_points``, where given, ``(N, 3)`` t, y and x. (0, 0) is the outer corner of the top-left pixel, as in TAP-Vid;
+``query_points``, if given, ``(N, 3)`` t, y and x. (0, 0) is the outer corner of the top-left pixel, as in TAP-Vid;
 here it is that pixel's centre, so half a pixel is taken off.
 https://github.com/google-deepmind/tapnet/tree/main/tapnet/tapvid
 """

@@ -31,7 +31,7 @@ def answers_from_tum(
         truth: The clip.
         of: ``object`` if the lines are the object's poses in camera coordinates, ``T_cam_obj``; ``camera`` if they
             are the camera's poses in object coordinates, ``T_obj_cam``, as SLAM programs give them.
-        fps: Frames a second where timestamps are in seconds since frame 0; None if they are frame indices.
+        fps: Frames a second if timestamps are in seconds since frame 0; None if they are frame indices.
 
     Raises:
         InputError: If the file is no trajectory, two lines are about one frame, or none about a frame of the clip.

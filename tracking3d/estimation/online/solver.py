@@ -55,6 +55,7 @@ from tracking3d.estimation.online.mapping.global_refinement import refine_global
 from tracking3d.estimation.online.mapping.keyframe_insertion import (
     insert_keyframe,
     insert_points,
+    needs_keyframe,
     refine_local_map,
 )
 from tracking3d.estimation.online.mapping.object_model import object_model
@@ -78,13 +79,10 @@ from tracking3d.estimation.shape import Shape
 from tracking3d.estimation.solver import STATE_CLASSES
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.geometry.camera import Camera
-from tracking3d.geometry.pose import Pose, pose_from_arrays, rotation_angle
+from tracking3d.geometry.pose import Pose, pose_from_arrays
 from tracking3d.rendering import TexelMap
 from tracking3d.runtime.stage_times import in_stage
 
-_FEW_INLIERS = 40  # inliers below which a frame becomes a keyframe for the sake of new points
-_MIN_INTERVAL = 3  # frames between two such keyframes
-_MIN_OVERLAP = 0.8  # IoU with the mask from which a frame without inliers can be a keyframe
 _LOOKS_FLAT = (
     "all points seen so far lie in one plane; if the whole object is flat, --flat estimates its back better"
 )
@@ -294,7 +292,7 @@ class OnlineSolver(FrameTracker):
         found = self._find(state, self._view(state, frame, mask, likeliest, followed), frame, image, starts)
         usual = not is_high_loss(found.fit, state.baseline, found.view.mask_weight)
         reliable = usual or found.evidence.is_decisive
-        is_keyframe = not found.lost and reliable and self._is_keyframe(state, found)
+        is_keyframe = not found.lost and reliable and needs_keyframe(state.object_map, found, self.online)
         pose = extrapolate_motion(state.trajectory, frame.index) if found.lost else found.fit.pose
         updated = advance(state, found, pose, image)
         if usual and not found.lost:
@@ -360,14 +358,3 @@ class OnlineSolver(FrameTracker):
             return replace(state, reinitialization=None), estimate
         similarity = guess_alignment(state, begun)
         return switch_map(state, begun, similarity), transform_estimates(again, similarity, state.camera)
-
-    def _is_keyframe(self, state: SolverState, found: PoseCandidate) -> bool:
-        """Whether a frame shows the map something new, and its pose is reliable."""
-        view, fit, agreed = found.view, found.fit, found.evidence.inliers
-        if view.mask is None or (agreed < ENOUGH_POINTS and fit.overlap < _MIN_OVERLAP):
-            return False
-        keyframes = state.object_map.keyframes
-        if agreed < _FEW_INLIERS and view.index >= keyframes[-1].index + _MIN_INTERVAL:
-            return True
-        angles = [float(rotation_angle(other.pose.quaternion, fit.pose.quaternion)) for other in keyframes]
-        return bool(np.degrees(min(angles)) > self.online.keyframe_rotation)

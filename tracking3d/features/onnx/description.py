@@ -76,7 +76,7 @@ def load_encoder_description(name: str | Path) -> EncoderDescription:
     """Read a description.
 
     Args:
-        name: Of one that comes with the package, or a YAML file.
+        name: Name of a description that comes with the package, or a YAML file.
 
     Raises:
         InputError: If there is no such description, or a key or value in it cannot be used.

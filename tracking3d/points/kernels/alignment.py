@@ -64,7 +64,7 @@ _PLANES = record(AlignedPlanes, float32[:, ::1], float32[:, ::1], float32[:, ::1
 _SETTINGS = record(AlignmentSettings, float64[:, ::1], float64, float64, float64, int64)
 _FOUND = record(AlignmentArrays, float64[:, ::1], float64[:, ::1], float64[:, ::1])
 
-_inner = numba.njit(fastmath=REORDER, **OPTIONS)
+_inner = numba.njit(inline="always", fastmath=REORDER, **OPTIONS)
 
 
 @numba.njit(inline="always", fastmath=REORDER, **OPTIONS)

@@ -39,7 +39,7 @@ class WarpSource(NamedTuple):
 _TARGET = record(WarpTarget, float32[:, ::1], float32[:, ::1], float64[::1], float64)
 _SOURCE = record(WarpSource, float64[::1], float32[:, ::1], float32[:, ::1], float32[:, ::1])
 
-_inner = numba.njit(fastmath=REORDER, **OPTIONS)
+_inner = numba.njit(inline="always", fastmath=REORDER, **OPTIONS)
 
 
 @numba.njit(inline="always", **OPTIONS)

@@ -42,7 +42,7 @@ _REFERENCE = record(ReferenceView, float32[:, ::1], float32[:, ::1], float64[:, 
 _OTHERS = record(OtherViews, float32[:, :, ::1], float64[:, :, ::1])
 _PATCHES = record(SweptPatches, int64[:, ::1], float64[::1], float64[:, ::1], float64[::1])
 
-_inner = numba.njit(fastmath=REORDER, **OPTIONS)
+_inner = numba.njit(inline="always", fastmath=REORDER, **OPTIONS)
 
 
 @kernel(

@@ -71,11 +71,11 @@ def seen_texels(
 
     Args:
         values: ``(C, H, W)``; valid: ``(H, W)``; K: ``(3, 3)``, see `tracking3d.rendering.seen_texels`.
-        drawn: ``(H, W)`` depth of the mesh, infinite beside it.
+        drawn: ``(H, W)`` depth of the mesh, infinite where it does not cover the pixel.
         corners: ``(F, 3, 3)`` of the faces, in camera coordinates.
         normals: ``(F, 3)``; facing: ``(F,)`` bool, which of them may be seen.
         texels: Flat indices ``(M,)``, faces ``(M,)`` and barycentric coordinates ``(M, 3)``.
-        grazing: Smallest cosine of the viewing angle that is believed.
+        grazing: Smallest accepted cosine of the viewing angle.
         tolerance: By how much something may be nearer at a cosine of 1.
     """
     texel, face, barycentric = texels
@@ -138,10 +138,10 @@ def _seen_texels(frame, faces, texels, grazing, tolerance, seen):
             continue
         column, row = math.floor(u), math.floor(v)
         right, down = u - np.float32(column), v - np.float32(row)
-        believed = cosine * cosine * _sample(valid, column, row, right, down)
-        if not believed > 0:
+        quality = cosine * cosine * _sample(valid, column, row, right, down)
+        if not quality > 0:
             continue
-        index[found], weight[found] = texel[one], believed
+        index[found], weight[found] = texel[one], quality
         for channel in range(len(values)):
             shown[channel, found] = _sample(values[channel], column, row, right, down)
         found += 1

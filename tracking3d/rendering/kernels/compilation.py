@@ -1,7 +1,7 @@
 """Compiling kernels once and keeping them on disk.
 
 Numba's cache replaces files atomically and every kernel has one signature, so that several processes that start
-at once do the same work at worst. Where no folder can be written, each process compiles for itself.
+at once do the same work at worst. If no folder can be written, each process compiles for itself.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
-"""Of every kernel: several may run at once, and dividing by zero gives infinity as it does in torch."""
+"""Options of every kernel: several may run at once, and dividing by zero gives infinity as it does in torch."""
 REORDER = {"reassoc", "contract", "arcp", "nsz"}
 """Freedoms of sums and products that let them use vector instructions; NaN and infinity stay what they are."""
 
@@ -81,7 +81,7 @@ class Kernel:
         return compiled
 
     def _with_cache(self) -> Any:
-        """Load or compile and keep; None where no folder can be written, or the kernel is at fault."""
+        """Load or compile and keep; None if no folder can be written, or the kernel is at fault."""
         try:
             dispatcher = numba.njit(cache=True, **self._options)(self._function)
         except RuntimeError:

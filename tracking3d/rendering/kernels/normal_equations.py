@@ -78,7 +78,7 @@ def accumulate(
 
 @numba.njit(inline="always", **OPTIONS)
 def of_channels(texture, taps, target, channels, sharpness, by_x, by_y):
-    """Of one pixel, summed over the channels: the 2 x 2 matrix, the two slopes of half the loss, and the loss.
+    """Terms of one pixel, summed over the channels: the 2 x 2 matrix, the two slopes of half the loss, and the loss.
 
     ``by_x`` and ``by_y`` are the derivatives of the place in the texture, in texels, by the pixel's x and y.
     """

@@ -11,7 +11,7 @@ from numba import boolean, float32, float64, int64
 from numpy.typing import NDArray
 
 from tracking3d.rendering.kernels.compilation import OPTIONS, array, check_corners, record
-from tracking3d.rendering.pose_terms import MatchedPoints, PoseTarget
+from tracking3d.rendering.pose_comparison import MatchedPoints, PoseTarget
 from tracking3d.rendering.surface import Surface
 
 

@@ -203,7 +203,7 @@ def _appearance(texture, uv, observed, pixels, scale, loss, first, last):
     fastmath=REORDER,
 )
 def _appearance_slope(texture, uv, observed, pixels, scale, grad, grad_textures, grad_uv, first, last):
-    """Of the pixels in parts ``first`` to ``last`` of ``len(grad_textures)``."""
+    """Gradients from the pixels in parts ``first`` to ``last`` of ``len(grad_textures)``."""
     height, width, channels = texture.shape
     sharpness = np.float32(1 / scale**2)
     parts = len(grad_textures)

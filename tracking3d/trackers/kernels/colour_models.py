@@ -54,9 +54,9 @@ def _local_shares(labels, last_labels, last_mask, radius, size, shares):
         if at < 0:
             continue
         for column in range(width):
-            entry, inside, beside = labels[at, column], 0.0, 0.0
+            entry, inside, outside = labels[at, column], 0.0, 0.0
             for place in range(column, column + 2 * radius + 1):
                 inside += columns[0, entry, place]
-                beside += columns[1, entry, place]
+                outside += columns[1, entry, place]
             shares[0, at, column] = inside / (2 * radius + 1) ** 2
-            shares[1, at, column] = beside / (2 * radius + 1) ** 2
+            shares[1, at, column] = outside / (2 * radius + 1) ** 2

@@ -109,7 +109,7 @@ class PromptableNetwork(Section):
     input: ImageInput = ImageInput(size=1024, fit="pad", divisor=1.0)
     embeddings: dict[str, str] = Field(
         {},
-        description="Decoder input: encoder output, where their names differ; equal names need no entry.",
+        description="Decoder input: encoder output, if their names differ; equal names need no entry.",
     )
     decoder: Decoder = Decoder()
 

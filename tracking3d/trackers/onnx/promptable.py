@@ -70,8 +70,8 @@ class PromptableSegmenter:
         if last is not None and self._description.decoder.mask is not None:
             proposals += look.ask(box, centre, last, "box, centre and last mask")
         if len(holes := background_points(image, sharpest.mask)):
-            beside = np.column_stack([holes, np.zeros(len(holes), np.float32)])
-            proposals += look.ask(box, beside, origin="box without holes")
+            negatives = np.column_stack([holes, np.zeros(len(holes), np.float32)])
+            proposals += look.ask(box, negatives, origin="box without holes")
         return proposals
 
     def propose_by_points(self, image: Image, points: Points) -> list[Proposal]:

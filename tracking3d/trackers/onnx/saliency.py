@@ -87,7 +87,7 @@ class SaliencySegmenter:
 
 
 def validate_name(name: str | None, names: Mapping[str, object], file: Path, what: str) -> str:
-    """``name``, or the first of the network's ``names`` where it is None; an error if there is none such."""
+    """``name``, or the first of the network's ``names`` if it is None; an error if there is none such."""
     if name is None:
         return next(iter(names))
     if name not in names:

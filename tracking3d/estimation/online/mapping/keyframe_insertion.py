@@ -15,10 +15,28 @@ from tracking3d.estimation.online.mapping.keyframe_culling import cull_keyframes
 from tracking3d.estimation.online.mapping.local_mapping import refine_map, window_of, with_landmarks
 from tracking3d.estimation.online.mapping.photometric_adjustment import refine_without_points
 from tracking3d.estimation.online.optimization.shape_fit import FitWeights
+from tracking3d.estimation.online.state.confidence import ENOUGH_POINTS
 from tracking3d.estimation.online.state.object_map import Keyframe, ObjectMap
+from tracking3d.estimation.online.state.pose_candidate import PoseCandidate
 from tracking3d.geometry.camera import Camera
+from tracking3d.geometry.pose import rotation_angle
 
+_FEW_INLIERS = 40  # inliers below which a frame becomes a keyframe for the sake of new points
+_MIN_INTERVAL = 3  # frames between two such keyframes
+_MIN_OVERLAP = 0.8  # IoU with the mask from which a frame without inliers can be a keyframe
 _MOST_WITHOUT_POINTS = 15
+
+
+def needs_keyframe(object_map: ObjectMap, found: PoseCandidate, config: OnlineConfig) -> bool:
+    """Whether a frame shows the map something new, and its pose is reliable."""
+    view, fit, inliers = found.view, found.fit, found.evidence.inliers
+    if view.mask is None or (inliers < ENOUGH_POINTS and fit.overlap < _MIN_OVERLAP):
+        return False
+    keyframes = object_map.keyframes
+    if inliers < _FEW_INLIERS and view.index >= keyframes[-1].index + _MIN_INTERVAL:
+        return True
+    angles = [float(rotation_angle(other.pose.quaternion, fit.pose.quaternion)) for other in keyframes]
+    return bool(np.degrees(min(angles)) > config.keyframe_rotation)
 
 
 def insert_points(
