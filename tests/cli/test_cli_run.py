@@ -176,7 +176,7 @@ def test_interrupted_run_keeps_what_was_finished(call, clip, script):
     assert result.exit_code == 130
     assert result.stderr.splitlines() == [
         "interrupted",
-        "What was finished until then is kept in run.",
+        "The frames finished until then are in run.",
         "To continue from there, repeat the command with --resume.",
     ]
     run = RunReader(Path("run"))
@@ -267,7 +267,7 @@ def test_failing_plugin_ends_the_run_with_a_sentence_and_keeps_what_was_finished
     assert result.exit_code == 2
     assert result.stderr.splitlines() == [
         "error: The tracker gave up.",
-        "What was finished until then is kept in run.",
+        "The frames finished until then are in run.",
         "To continue from there, repeat the command with --resume.",
     ]
     description = json.loads(Path("run/run.json").read_text())

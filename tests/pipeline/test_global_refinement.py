@@ -323,7 +323,7 @@ def test_an_error_before_the_refinement_is_told_as_ever(clip, source, tmp_path, 
     monkeypatch.setattr(CausalSolver, "faults", {2: KeyboardInterrupt()})
     with pytest.raises(KeyboardInterrupt) as caught:
         record(source, settings(), tmp_path / "run", mask=clip.masks[0])
-    assert caught.value.__notes__ == [f"What was finished until then is kept in {tmp_path / 'run'}."]
+    assert caught.value.__notes__ == [f"The frames finished until then are in {tmp_path / 'run'}."]
     assert refinement_of(tmp_path / "run") is None
 
 

@@ -58,7 +58,9 @@ def test_doubt_says_why():
 
 def test_doubt_about_a_plain_object_says_that_it_is_plain():
     hardly = Assessment(Status.TRACKED, "", 0.03)
-    assert "hardly any texture" in judge_with_landmarks(hardly, LandmarkSupport(300, 300, telling=False)).reason
+    assert (
+        "hardly any texture" in judge_with_landmarks(hardly, LandmarkSupport(300, 300, telling=False)).reason
+    )
 
 
 def test_what_is_lost_stays_lost():
