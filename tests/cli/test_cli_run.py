@@ -134,7 +134,7 @@ def test_final_refinement_is_switched_by_its_option(call, clip, script, tmp_path
 
 def test_why_there_is_no_final_refinement_is_on_the_screen(call, clip, script):
     result = call("run", clip, *BOX, "--final-refine", "--set", "solver.name=paper")
-    assert "the solver paper gives causal answers only" in result.stdout
+    assert "the solver paper gives causal estimates only" in result.stdout
 
 
 def test_undecodable_frame_is_skipped_and_recorded(call, clip, script):
@@ -176,7 +176,7 @@ def test_interrupted_run_keeps_what_was_finished(call, clip, script):
     assert result.exit_code == 130
     assert result.stderr.splitlines() == [
         "interrupted",
-        "What was finished until then is kept in run.",
+        "The frames finished until then are in run.",
         "To continue from there, repeat the command with --resume.",
     ]
     run = RunReader(Path("run"))
@@ -267,7 +267,7 @@ def test_failing_plugin_ends_the_run_with_a_sentence_and_keeps_what_was_finished
     assert result.exit_code == 2
     assert result.stderr.splitlines() == [
         "error: The tracker gave up.",
-        "What was finished until then is kept in run.",
+        "The frames finished until then are in run.",
         "To continue from there, repeat the command with --resume.",
     ]
     description = json.loads(Path("run/run.json").read_text())

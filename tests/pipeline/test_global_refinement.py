@@ -232,7 +232,7 @@ def test_nothing_is_refined_unless_asked_for(clip, source, tmp_path):
 def test_a_solver_that_cannot_leaves_it_out_and_says_so(clip, source, tmp_path):
     record(source, settings("paper"), tmp_path / "run", mask=clip.masks[0])
     told = refinement_of(tmp_path / "run")
-    assert (told["state"], told["reason"]) == ("skipped", "the solver paper gives causal answers only")
+    assert (told["state"], told["reason"]) == ("skipped", "the solver paper gives causal estimates only")
     assert RunReader(tmp_path / "run").state == "finished"
 
 
@@ -299,7 +299,7 @@ def test_what_ends_the_refinement_leaves_the_causal_answers_whole(
         record(source, settings(), tmp_path / "run", mask=clip.masks[0])
     [note] = caught.value.__notes__
     assert note == (
-        f"The final refinement was not finished; the causal answers are whole in {tmp_path / 'run'}."
+        f"The final refinement was not finished; the causal estimates are whole in {tmp_path / 'run'}."
     )
     for refined in (True, False):
         run, expected = RunReader(tmp_path / "run", refined), RunReader(reference)
@@ -323,7 +323,7 @@ def test_an_error_before_the_refinement_is_told_as_ever(clip, source, tmp_path, 
     monkeypatch.setattr(CausalSolver, "faults", {2: KeyboardInterrupt()})
     with pytest.raises(KeyboardInterrupt) as caught:
         record(source, settings(), tmp_path / "run", mask=clip.masks[0])
-    assert caught.value.__notes__ == [f"What was finished until then is kept in {tmp_path / 'run'}."]
+    assert caught.value.__notes__ == [f"The frames finished until then are in {tmp_path / 'run'}."]
     assert refinement_of(tmp_path / "run") is None
 
 

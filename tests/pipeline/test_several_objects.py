@@ -121,7 +121,7 @@ def test_one_object_is_a_tuple_of_one(images):
 @pytest.mark.parametrize(
     ("objects", "message"),
     [
-        ({}, "what the objects are"),
+        ({}, "Give the objects with"),
         ({"boxes": [LEFT, (500, 1, 5, 5)]}, "outside frame 0"),
         ({"boxes": [LEFT, (1, 1, 0, 5)]}, "has no size"),
         ({"masks": [np.zeros(SIZE, bool)]}, "is empty"),
@@ -215,7 +215,7 @@ def test_an_object_that_fails_leaves_the_others_finished(source, tmp_path, monke
     with pytest.raises(ZeroDivisionError) as caught:
         record_objects(source, settings(), tmp_path / "run", boxes=[LEFT, RIGHT])
     [note] = caught.value.__notes__
-    assert note == f"What was finished until then is kept in {tmp_path / 'run' / 'object_0'}."
+    assert note == f"The frames finished until then are in {tmp_path / 'run' / 'object_0'}."
     first, second = (RunReader(tmp_path / "run" / f"object_{number}") for number in (0, 1))
     assert (first.state, len(first.frames), first.description["error"]) == ("failed", 2, "division by zero")
     assert (second.state, len(second.frames)) == ("finished", 5)
@@ -261,7 +261,7 @@ def test_folders_of_other_runs_are_left_alone(source, tmp_path):
     with pytest.raises(OutputError, match="a run of one object"):
         record_objects(source, settings(), tmp_path / "one", boxes=[LEFT, RIGHT], overwrite=True)
     record_objects(source, settings(), tmp_path / "three", boxes=[LEFT, RIGHT, LEFT])
-    with pytest.raises(OutputError, match="more objects, such as object_2"):
+    with pytest.raises(OutputError, match="a run of several objects, such as object_2"):
         record_objects(source, settings(), tmp_path / "three", boxes=[LEFT, RIGHT], overwrite=True)
     with pytest.raises(OutputError, match="already holds a run"):
         record_objects(source, settings(), tmp_path / "three", boxes=[LEFT, RIGHT, LEFT])

@@ -350,7 +350,7 @@ def test_a_finished_run_is_computed_again_where_a_frame_is_corrected(clip, image
     run(clip, images, tmp_path / "run", CAUSAL, mask=wrong)
     finish_state(tmp_path / "run", 0)
     run(clip, images, tmp_path / "run", CAUSAL, mask=wrong, corrections=given, resume=True)
-    assert "No state of before frame 4 was kept" in caplog.text
+    assert "No checkpoint before frame 4 is saved" in caplog.text
     assert_alike(tmp_path / "run", tmp_path / "whole")
     created = RunReader(tmp_path / "run").description["created"]
     run(clip, images, tmp_path / "run", CAUSAL, mask=wrong, corrections=given, resume=True)

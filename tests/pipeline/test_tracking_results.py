@@ -174,7 +174,7 @@ def test_a_fine_model_needs_packages_and_says_which(clip, config, monkeypatch):
             {"frames": iter(()), "model": "fine"},
             r"^model='fine' makes .* the iterable of frames comes once only",
         ),
-        ({"config": "paper", "refine": True}, r"^refine=True: the solver .* gives causal answers only"),
+        ({"config": "paper", "refine": True}, r"^refine=True: the solver .* gives causal estimates only"),
     ],
 )
 def test_results_that_cannot_be_are_refused_at_once(clip, config, asked, sentence):

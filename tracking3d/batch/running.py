@@ -71,7 +71,7 @@ class Batch:
     ) -> None:
         self._out, self._jobs, self._report, self._listener = out, jobs, report, listener
         self._tasks: Tasks | None = None
-        self._shares: defaultdict[str, float] = defaultdict(float)  # of long videos, what is done
+        self._shares: defaultdict[str, float] = defaultdict(float)  # finished share of each long video
         self._rows: dict[str, list[Mapping[str, Any]]] = {}
         self._pictures: dict[str, str] = {}
         self._workers: dict[int, str] = {}

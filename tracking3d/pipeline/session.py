@@ -314,9 +314,8 @@ class Session:
     def refine(self) -> None:
         """Refine the whole model with the observations of the whole video.
 
-        The focal length may be estimated too, if it is not given: ``camera`` is then that of the refined estimates.
-        ``step`` must not be called afterwards: ``refine_frame`` refines each frame, and ``result`` gives the final
-        object.
+        A focal length that was not given may be estimated too: ``camera`` is then that of the refined estimates.
+        Do not call ``step`` afterwards: ``refine_frame`` refines each frame, and ``result`` gives the final object.
 
         Raises:
             RuntimeError: If the solver cannot, see ``can_refine``.

@@ -80,8 +80,8 @@ def refuse_what_cannot_be_joined(config: PipelineConfig) -> None:
     """
     if not isinstance(config.solver, OnlineConfig) or not config.solver.final_refine:
         raise InputError(
-            "Parts of a video are merged in the final refinement of the solver online; leave out --split, or what "
-            "chooses otherwise (solver.name, solver.final_refine, --quality draft)."
+            "Parts of a video are merged in the final refinement of the solver online; leave out --split, or the "
+            "option that chooses otherwise (solver.name, solver.final_refine, --quality draft)."
         )
 
 

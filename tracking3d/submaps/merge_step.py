@@ -76,7 +76,7 @@ class MergedSubmaps:
 
     Attributes:
         begun: The video.
-        looks: Frames to be refined again, by parts.
+        looks: Frames to be refined, by parts.
         about: The section ``split`` of ``run.json``.
         seconds: What each step took, by name.
     """

@@ -30,7 +30,7 @@ class Step:
     Attributes:
         function: Called as ``function(tell, argument)``; ``tell`` takes the record of every frame that is estimated.
         argument: What it is called with; it can be pickled, as can what is returned.
-        label: What it is called, for who looks on.
+        label: Its name for the user.
         frames: Number of estimates it gives; 0 if unknown.
     """
 
