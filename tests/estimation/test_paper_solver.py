@@ -64,7 +64,9 @@ def test_the_paper_recipe_as_it_is_published():
     published = PaperSolver(load_config(preset="paper"), short_clip().camera, RgbEncoder())
     estimates, state = run(published, range(2))
     assert [estimate.status for estimate in estimates] == [Status.TRACKED, Status.TRACKED]
-    assert all(1 < estimate.iterations < 500 for estimate in estimates)
+    first, second = estimates
+    # On some processors the second frame is below tau from the first frame's pose on.
+    assert 1 < first.iterations < 500 and 0 < second.iterations < 500
     assert len(state.vertices) == 1212
     assert state.texture.shape == (3, 300, 300)
     assert all(mask_iou(estimate.mask, true_mask(estimate.index)) > 0.8 for estimate in estimates)

@@ -161,10 +161,10 @@ def test_the_kernel_says_of_poses_what_torch_says(frame, points):
 @pytest.mark.parametrize("points", [matched(), None], ids=["points", "no points"])
 @pytest.mark.parametrize("steps", [(1,), (8, 8)])
 def test_the_kernel_goes_where_torch_goes(frame, points, steps):
-    """From a start far off a pixel's rounding can lead elsewhere."""
+    """From an initial pose far off, a pixel's rounding can lead elsewhere, and take other steps to the same place."""
     for ours, twins in by_both(frame, STARTS[:1], points, steps):
         assert ours.cost == pytest.approx(twins.cost, rel=0.02, abs=1e-4)
-        assert abs(ours.iterations - twins.iterations) <= 2
+        assert abs(ours.iterations - twins.iterations) <= max(2, sum(steps) // 3)
         assert rotation_angle(ours.pose.quaternion, twins.pose.quaternion) < 2e-3
         assert (ours.pose.translation - twins.pose.translation).norm() < 5e-3
 
