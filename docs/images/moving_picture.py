@@ -1,4 +1,4 @@
-"""Makes a moving picture of a finished run: the overlay, cropped to the object, and the model in the same pose.
+"""Makes a moving picture of a finished run: the video with outline and axes, and the model in the same pose.
 
 docs/gallery.md says how the clips and runs of the README and the gallery were made.
 
@@ -13,44 +13,76 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
+from tracking3d.estimation.estimate import ObjectModel, Status
 from tracking3d.frames import Frame, Image
-from tracking3d.results.layout import OVERLAY
+from tracking3d.results.drawing import REFINED, draw_outline
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.mesh_view import render_view
+from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
-from tracking3d.video import open_source
+from tracking3d.results.run_source import open_run_source
 
-MARGIN = 1.25
+MARGIN = 1.2
 """Side of the crop, relative to the object's."""
+ZOOM = 1.2
+"""Of the model's picture, which leaves a margin around the object."""
+FINER = 2
+"""Pixels drawn for each pixel shown, in both directions."""
+AXES = ((235, 64, 72), (64, 220, 72), (80, 120, 255))
+THICKNESS = 2
+"""Of the lines, in pixels shown."""
 
 
 def draw_pictures(run: RunReader, side: int, most: int) -> list[Image]:
     """Draw ``(side, 2 side, 3)`` pictures: one fixed crop around the object in all frames, and the model.
 
     Args:
-        run: A finished run.
+        run: A finished run; its video is read again.
         side: In pixels.
         most: Number of pictures; of a longer run every second, third, ... frame is drawn.
     """
     frames = [frame for frame in run.frames if frame.index % -(-len(run.frames) // most) == 0]
+    video = {one.index: one.image for one in open_run_source(run) if isinstance(one, Frame)}
     boxes = np.array([cv2.boundingRect(run.mask(frame.index).astype(np.uint8)) for frame in frames])
-    left, top = boxes[:, :2].min(axis=0)
-    right, bottom = (boxes[:, :2] + boxes[:, 2:]).max(axis=0)
-    video = {one.index: one.image for one in open_source(str(run.folder / OVERLAY)) if isinstance(one, Frame)}
-    scale = next(iter(video.values())).shape[1] / run.camera.width
-    rows = round(scale * run.camera.height)  # below them is the status bar
-    half = min(scale * MARGIN * max(right - left, bottom - top), rows) / 2
-    x = float(np.clip(scale * (left + right) / 2, half, scale * run.camera.width - half))
-    y = float(np.clip(scale * (top + bottom) / 2, half, rows - half))
-    crop = slice(round(y - half), round(y + half)), slice(round(x - half), round(x + half))
+    low, high = boxes[:, :2].min(axis=0), (boxes[:, :2] + boxes[:, 2:]).max(axis=0)
+    size = np.array([run.camera.width, run.camera.height])
+    half = min(MARGIN * (high - low).max(), size.min()) / 2
+    corner = np.clip((low + high) / 2 - half, 0, size - 2 * half)
+    scale = FINER * side / (2 * half)
+    crop = scale * np.array([[1, 0, -corner[0]], [0, 1, -corner[1]]])
     model = load_model(run.folder)
     drawn = []
     for frame in frames:
-        overlay = cv2.resize(video[frame.index][:rows][crop], (side, side), interpolation=cv2.INTER_AREA)
-        drawn.append(np.concatenate([overlay, render_view(model, frame.T_cam_obj[:3, :3], side)], axis=1))
+        left = cv2.warpAffine(video[frame.index], crop, (FINER * side, FINER * side), flags=cv2.INTER_CUBIC)
+        draw_estimate(left, run, frame, model, crop)
+        right = render_view(model, frame.T_cam_obj[:3, :3], round(ZOOM * FINER * side))
+        margin = (len(right) - FINER * side) // 2
+        right = right[margin : margin + FINER * side, margin : margin + FINER * side]
+        both = np.concatenate([left, right], axis=1)
+        drawn.append(cv2.resize(both, (2 * side, side), interpolation=cv2.INTER_AREA))
     return drawn
+
+
+def draw_estimate(
+    picture: Image, run: RunReader, frame: FrameRecord, model: ObjectModel, crop: NDArray[np.float64]
+) -> None:
+    """Draw the outline of the mask, and the axes of the pose if the frame was tracked."""
+    mask = cv2.warpAffine(run.mask(frame.index).astype(np.float32), crop, picture.shape[1::-1])
+    draw_outline(picture, mask > 0.5, REFINED, FINER * THICKNESS)
+    if frame.status is not Status.TRACKED:
+        return
+    low, high = model.vertices.min(axis=0), model.vertices.max(axis=0)
+    ends = (low + high) / 2 + 0.4 * (high - low).max() * np.array(
+        [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    )
+    points = ends @ frame.T_cam_obj[:3, :3].T + frame.T_cam_obj[:3, 3]
+    pixels = run.camera.to_picture((points @ run.camera.K.T)[:, :2] / points[:, 2:])
+    start, *tips = (pixels @ crop[:, :2].T + crop[:, 2]).round().astype(int)
+    for axis in np.argsort(-points[1:, 2]):  # the nearest last, on top
+        cv2.line(picture, start, tips[axis], AXES[axis], FINER * (THICKNESS + 1), cv2.LINE_AA)
 
 
 def main() -> None:

@@ -26,7 +26,7 @@ METRES = 0.08
 ROWS, COLUMNS = 160, 320
 TEXELS = 1024
 """Rows of the texture, from the top of the sphere of directions to the bottom; it has twice as many columns."""
-CREAM, RUST, TEAL, MUSTARD, INK = "#efe2c6", "#a8481f", "#1d5560", "#d79a2b", "#2a1c14"
+CREAM, RUST, TEAL, MUSTARD, INK = "#f0dcab", "#a8481f", "#1d5560", "#d79a2b", "#2a1c14"
 BODY, HEAD, WING, CLAW, BEAK, EYE, BASE = range(7)
 
 
@@ -65,7 +65,7 @@ def owl_parts(p: Array) -> list[tuple[int, float, Array]]:
     ]
     for side in (-1, 1):
         found += [
-            (HEAD, 0.08, cone(p, (side * 0.25, 0.68, 0.05), (side * 0.40, 0.98, 0.0), 0.15, 0.035)),
+            (HEAD, 0.08, cone(p, (side * 0.25, 0.68, 0.05), (side * 0.40, 0.96, 0.0), 0.16, 0.05)),
             (EYE, 0.03, ellipsoid(p, (side * 0.19, 0.52, 0.38), (0.15, 0.15, 0.10))),
             (WING, 0.04, ellipsoid(p, (side * 0.52, -0.22, -0.05), (0.13, 0.50, 0.38), side * 0.14)),
             (CLAW, 0.03, ellipsoid(p, (side * 0.19, -0.80, 0.36), (0.13, 0.10, 0.16))),
@@ -181,14 +181,14 @@ def paint_texture(points: Array) -> Image.Image:
     picture = np.tile(colour(CREAM), (*kind.shape, 1))
     paint_feathers(picture, share[BODY], p, 22, 0.15, [TEAL, "#2f7279", RUST, "#8a3a1c", TEAL, "#3c4f36"])
     belly = edge(0.40 - np.abs(p[..., 0]) - 0.25 * (p[..., 1] + 0.2) ** 2, 0.03) * (p[..., 2] > 0)
-    paint_feathers(picture, share[BODY] * belly, p, 26, 0.12, [CREAM, "#f6ecd6", "#e3c78f", "#efb46a"])
+    paint_feathers(picture, share[BODY] * belly, p, 26, 0.12, [CREAM, "#f4e4ba", "#e0b466", "#eaa04e"])
     paint_feathers(picture, share[HEAD], p, 34, 0.085, [RUST, "#8a3a1c", "#c0672f", MUSTARD, "#6f2f18"])
     paint_feathers(picture, share[WING], p, 30, 0.19, [TEAL, MUSTARD, "#17434c", "#3f8489", RUST])
     paint_face(picture, p, edge(p[..., 2] - 0.2) * (share[HEAD] + share[EYE] + share[BEAK]).clip(0, 1))
-    blend(picture, share[BEAK], "#3a2a20")
+    blend(picture, share[BEAK], "#cf8a1f")
     blend(picture, share[CLAW], MUSTARD)
     blend(picture, share[CLAW] * edge(np.sin(75 * p[..., 0]) - 0.6, 0.4), INK)
-    blend(picture, share[BASE], "#4a2c1a")
+    blend(picture, share[BASE], "#a8431c")
     blend(
         picture,
         share[BASE] * draw_lettering(np.arctan2(p[..., 0], p[..., 2]), (p[..., 1] + 0.985) / 0.12),

@@ -48,7 +48,7 @@ def paint_planks(rng: np.random.Generator) -> NDArray[np.uint8]:
     picture = Image.new("RGB", (1024, 1024))
     pen = ImageDraw.Draw(picture)
     for y in range(0, 1024, 146):
-        base = np.array([150, 108, 70]) + rng.integers(-14, 14)
+        base = np.array([126, 110, 98]) + rng.integers(-14, 14)
         pen.rectangle([0, y, 1024, y + 146], fill=tuple(base.tolist()))
         for _ in range(90):
             x, at = rng.uniform(-200, 1024), y + rng.uniform(2, 144)
@@ -58,28 +58,28 @@ def paint_planks(rng: np.random.Generator) -> NDArray[np.uint8]:
                 fill=ink,
                 width=int(rng.integers(1, 4)),
             )
-        pen.line([(0, y), (1024, y)], fill="#3c2817", width=4)
+        pen.line([(0, y), (1024, y)], fill="#3a322c", width=4)
     return cv2.GaussianBlur(np.asarray(picture), (0, 0), 1.2)
 
 
 def paint_wall(rng: np.random.Generator) -> NDArray[np.uint8]:
     """Paint a wall with a picture and a shelf of books, out of focus: 16 x 8 radii, 100 pixels each."""
-    picture = Image.new("RGB", (1600, 800), "#c9c2b2")
+    picture = Image.new("RGB", (1600, 800), "#8b9bab")
     pen = ImageDraw.Draw(picture)
-    pen.rectangle([560, 130, 760, 330], fill="#5d4632")
-    pen.rectangle([576, 146, 744, 314], fill="#e6dfcd")
-    pen.ellipse([610, 180, 710, 280], fill="#7c9a8e")
-    pen.rectangle([0, 610, 1600, 634], fill="#6a4c33")
+    pen.rectangle([560, 130, 760, 330], fill="#39434d")
+    pen.rectangle([576, 146, 744, 314], fill="#b9c6d2")
+    pen.ellipse([610, 180, 710, 280], fill="#5d6f86")
+    pen.rectangle([0, 610, 1600, 634], fill="#4c5560")
     x = 120.0
     while x < 1500:
         if 940 < x < 960:
             x = 1010.0
         wide, tall = rng.uniform(22, 58), rng.uniform(130, 210)
-        ink = np.array([[120, 62, 50], [60, 84, 96], [150, 128, 88], [84, 98, 74], [188, 176, 152]])[
+        ink = np.array([[92, 86, 112], [58, 70, 92], [112, 122, 128], [84, 104, 92], [128, 112, 124]])[
             rng.integers(5)
         ]
         pen.rectangle([x, 610 - tall, x + wide, 609], fill=tuple((ink + rng.integers(-18, 18, 3)).tolist()))
-        pen.rectangle([x + 5, 610 - 0.85 * tall, x + wide - 5, 610 - 0.75 * tall], fill="#d8ccb0")
+        pen.rectangle([x + 5, 610 - 0.85 * tall, x + wide - 5, 610 - 0.75 * tall], fill="#aab4be")
         x += wide + float(rng.choice([1.0, 2.0, 30.0]))
     blurred = cv2.GaussianBlur(np.asarray(picture).astype(np.float32), (0, 0), 9)
     shade = np.linspace(1.08, 0.8, 1600)[None, :, None] * np.linspace(1.0, 0.86, 800)[:, None, None]
@@ -104,8 +104,8 @@ def build_room(scene: Scene, T_cam_room: Array) -> Room:
     uvs = furniture.vertices[:, [0, 2]] / (7 * r) + 0.5
     looks = np.repeat([6, 7], [len(one.faces) for one in both])
     rng = np.random.default_rng(12)
-    pale = np.full((64, 64, 3), (214, 209, 200), np.uint8)
-    plain = np.full((64, 64, 3), (176, 168, 152), np.uint8)
+    pale = np.full((64, 64, 3), (198, 205, 212), np.uint8)
+    plain = np.full((64, 64, 3), (150, 158, 166), np.uint8)
     pictures = [plain, plain, plain, plain, paint_wall(rng), plain, paint_planks(rng), pale]
     T_obj_room = np.linalg.inv(scene.T_cam_obj[0]) @ T_cam_room
     textures = [pyramid(linear(one)) for one in pictures]
