@@ -39,7 +39,7 @@ docs: $(VENV)/installed-docs
 clean:
 	rm -rf $(VENV) demo build *.egg-info plugins/*/build plugins/*/*.egg-info
 	rm -rf .pytest_cache .mypy_cache .ruff_cache
-	find tracking3d tests plugins -name __pycache__ -type d -prune -exec rm -rf {} +
+	find tracking3d benchmarks tests plugins -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Editable, so that what runs is what lies here, without installing again after a change. Plug-ins are built with what
 # `dev` installs, and not each in an environment of its own.

@@ -14,6 +14,7 @@ from PIL import Image
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
+from tracking3d.results.description import RunHeader
 from tracking3d.results.run_writer import RunWriter
 
 WIDTH, HEIGHT = 96, 64
@@ -72,8 +73,7 @@ def write_frames(folder: Path, count: int) -> Path:
 
 def open_run(folder: Path, source: str = "frames") -> RunWriter:
     """A run that goes on."""
-    return RunWriter(
-        folder,
+    header = RunHeader(
         config={"tracker": {"name": "csrt"}},
         camera=Camera.from_fov(WIDTH, HEIGHT),
         source=source,
@@ -81,6 +81,7 @@ def open_run(folder: Path, source: str = "frames") -> RunWriter:
         fps=10,
         command="tracking3d run",
     )
+    return RunWriter(folder, header)
 
 
 def write_run(folder: Path, count: int = 12, doubts: dict[int, tuple[Status, str]] | None = None) -> Path:

@@ -27,7 +27,7 @@ EXACT = {
     "tracking3d": """Frame FrameEstimate ObjectModel PipelineConfig Prompt Session Status __version__ export_run
         load_config track track_objects Tracking TrackingResult""",
     "tracking3d.modules": """LaplacianLoss MeshRenderer OutlineLoss Silhouette SilhouetteLoss TextureLoss
-        TexturedMesh Views camera_from_pinhole pinhole_of_camera pose_from_se3 quaternion_from_kornia
+        TexturedMesh RenderedViews camera_from_pinhole pinhole_of_camera pose_from_se3 quaternion_from_kornia
         quaternion_of_pose se3_from_matrix se3_of_pose""",
     "tracking3d.plugins": """FEATURES PluginInfo TRACKERS VARIABLE build_plugin check_options list_plugins
         load_plugin plugin_label""",
@@ -51,7 +51,7 @@ AT_LEAST = {
     "tracking3d.errors": "InputError OutputError PluginError Tracking3dError",
     "tracking3d.estimation.estimate": "FrameEstimate ObjectModel Status",
     "tracking3d.estimation.solver": "Solver",
-    "tracking3d.benchmark.compare": "Comparison compare interval",
+    "tracking3d.benchmark.compare": "MeasureComparison compare interval",
     "tracking3d.benchmark.results": "ResultSet read_results write_results",
     "tracking3d.benchmark.suite": "run_suite",
     "tracking3d.benchmark.tables": "TABLES",
@@ -83,7 +83,8 @@ AT_LEAST = {
     "tracking3d.synthesis.suite": "SUITES SUITE_VERSION load_suite make_suite",
     "tracking3d.synthesis.convex_clips": """SyntheticClip SyntheticSpec degrade_masks make_demo_clip
         synthesize""",
-    "tracking3d.export.exporter": "Exporter ExportOptions",
+    "tracking3d.export.exporter": "Exporter",
+    "tracking3d.export.options": "ExportOptions",
     "tracking3d.export.exporting": "Export export_run find_format",
     "tracking3d.export.formats": "FORMATS",
     "tracking3d.export.supervision_detections": "detections",
@@ -101,17 +102,19 @@ AT_LEAST = {
     "tracking3d.networks.download": "adopt fetch",
     "tracking3d.networks.session": "Network TensorInfo",
     "tracking3d.networks.store": "find_network",
-    "tracking3d.prompts": "make_prompt parse_box",
+    "tracking3d.open_tracking": "TrackRequest request_tracking",
+    "tracking3d.prompts": "PromptSet make_prompt parse_box",
     "tracking3d.point_prompts": "parse_points points_prompt",
-    "tracking3d.recording": "record record_objects",
+    "tracking3d.recording": "RecordOptions record record_objects record_tracking",
     "tracking3d.report.comparison": "write_comparison",
-    "tracking3d.report.differences": "Comparison Difference compare_runs",
+    "tracking3d.report.differences": "Difference RunComparison compare_runs",
     "tracking3d.report.run_report": "write_report",
     "tracking3d.report.several": "write_reports",
     "tracking3d.results.correspondences": "PointTracks track_points",
     "tracking3d.results.mesh_export": "export_mesh load_mesh",
     "tracking3d.results.records": "FrameRecord",
     "tracking3d.results.run_reader": "RunReader",
+    "tracking3d.results.description": "RunHeader",
     "tracking3d.results.run_writer": "RunWriter",
     "tracking3d.trackers.csrt": "CsrtTracker",
     "tracking3d.trackers.precomputed": "PrecomputedMasks",

@@ -19,6 +19,7 @@ from tracking3d.geometry.prototypes import sphere
 from tracking3d.rendering.interpolation import interpolate
 from tracking3d.rendering.texture import sample_texture
 from tracking3d.rendering.visibility import rasterize
+from tracking3d.results.description import RunHeader
 from tracking3d.results.run_writer import RunWriter
 
 
@@ -105,7 +106,8 @@ def started_run(folder: Path, clip: TurningSphere, **changes: Any) -> RunWriter:
         "fps": 30.0,
         "command": "tracking3d run clip.mp4",
     }
-    return RunWriter(folder, **(arguments | changes))
+    settings = {name: changes.pop(name) for name in ("overwrite", "resume") if name in changes}
+    return RunWriter(folder, RunHeader(**(arguments | changes)), **settings)
 
 
 def written_run(folder: Path, clip: TurningSphere, *, with_model: bool = True, **changes: Any) -> None:

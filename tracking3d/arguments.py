@@ -83,7 +83,7 @@ def needs_prompt(config: PipelineConfig) -> bool:
     return config.tracker.name != "precomputed" and config.object.known is None
 
 
-def check_known(config: PipelineConfig, objects: int) -> None:
+def check_single_known_object(config: PipelineConfig, objects: int) -> None:
     """Make sure that several objects are not all said to be one that is known.
 
     Raises:

@@ -15,7 +15,9 @@ from tracking3d.config.models import PipelineConfig
 from tracking3d.corrections import Correction, checked_corrections
 from tracking3d.errors import InputError
 from tracking3d.frames import SkippedFrame
-from tracking3d.recording import record
+from tracking3d.open_tracking import request_tracking
+from tracking3d.prompts import PromptSet
+from tracking3d.recording import RecordOptions, record_tracking
 from tracking3d.results.given_masks import given_mask
 from tracking3d.results.layout import runs_in
 from tracking3d.results.records import FrameRecord
@@ -60,19 +62,15 @@ def correct_run(
         ) from error
     [new] = checked_corrections(corrections)
     together = {one.frame: one for one in _earlier(folder, given)} | new
-    record(
+    request = request_tracking(
         open_run_source(run, source),
         config,
-        folder,
-        **_prompt(folder, given),
-        start_frame=given.get("start_frame"),
-        corrections=together.values(),
-        command=run.description.get("command"),
-        selection=run.description.get("selection"),
+        PromptSet.of_one(**_prompt(folder, given), start_frame=given.get("start_frame")),
+        together.values(),
         skip_damaged=True,
-        resume=True,
-        listener=listener,
     )
+    command, selection = (run.description.get(key) for key in ("command", "selection"))
+    record_tracking(request, folder, RecordOptions(command, selection, resume=True), listener)
 
 
 def object_folders_of(folder: Path, corrections: Iterable[Correction]) -> dict[Path, list[Correction]]:
@@ -95,7 +93,7 @@ def object_folders_of(folder: Path, corrections: Iterable[Correction]) -> dict[P
 
 
 def _prompt(folder: Path, given: dict[str, Any]) -> dict[str, Any]:
-    """What the object is in the first frame, as `record` takes it."""
+    """What the object is in the first frame, as `PromptSet.of_one` takes it."""
     if given.get("points") is not None:
         return {"points": given["points"]}
     if given.get("mask") is not None:

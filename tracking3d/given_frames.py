@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from tracking3d.config.explain import a_kind
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, Image, SkippedFrame
 from tracking3d.images import WANTED, checked_image
+from tracking3d.video.array_source import ArraySource
 from tracking3d.video.opening import open_source
 from tracking3d.video.source import FrameSource, Intrinsics
 
@@ -55,45 +56,10 @@ def open_frames(frames: Any) -> FrameSource:
     if isinstance(frames, FrameSource):
         return frames
     if isinstance(frames, Sequence | Tensor) and len(frames):
-        next(iter(GivenFrames(frames[:1])))  # what is wrong with all of them is said at once
-    return GivenFrames(frames)
-
-
-@dataclass(frozen=True, eq=False)
-class GivenFrames:
-    """Any iterable of pictures, taken one at a time; frames of another size than the first are not sorted out.
-
-    See `tracking3d.video.source.FrameSource` for the attributes.
-    """
-
-    frames: Iterable[Any]
-    name: str = "the frame iterable"
-    fps: float | None = None
-    intrinsics: Intrinsics | None = None
-    intrinsics_origin: str = ""
-
-    @property
-    def count(self) -> int | None:
-        """Number of frames where the iterable has a length."""
-        if isinstance(self.frames, Sized):
-            return len(self.frames)
-        count: int | None = getattr(self.frames, "count", None)
-        return count if isinstance(count, int) else None
-
-    @property
-    def repeatable(self) -> bool:
-        """Whether the iterable can be gone through again, as an iterator cannot."""
-        return bool(getattr(self.frames, "repeatable", not isinstance(self.frames, Iterator)))
-
-    def __iter__(self) -> Iterator[Frame | SkippedFrame]:
-        """Give the frames; an `InputError` ends it at the first that is no picture."""
-        for position, item in enumerate(self.frames):
-            if isinstance(item, SkippedFrame):
-                yield item
-            elif isinstance(item, Frame):
-                yield replace(item, image=checked_image(item.image, item.index))
-            else:
-                yield Frame(position, checked_image(item, position))
+        next(
+            iter(ArraySource(frames[:1], convert=checked_image))
+        )  # what is wrong with all of them is said at once
+    return ArraySource(frames, convert=checked_image)
 
 
 @dataclass(eq=False)

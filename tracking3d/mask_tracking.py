@@ -11,7 +11,7 @@ from tracking3d.config.models import PluginChoice
 from tracking3d.frames import Frame, MaskEstimate, Prompt
 from tracking3d.plugins import TRACKERS, build_plugin, plugin_label
 from tracking3d.plugins.guard import GuardedTracker, PluginFailure
-from tracking3d.results.records import mask_iou
+from tracking3d.results.records import mask_iou_or_none
 from tracking3d.trackers.crops import box_of
 
 _NOTHING = MaskEstimate(None, 0.0, "nobody has said yet where the object is")
@@ -92,7 +92,7 @@ class PromptedTracker:
         except PluginFailure:
             own = None
         mask = told.found
-        common = None if mask is None else mask_iou(mask, own)
+        common = None if mask is None else mask_iou_or_none(mask, own)
         if mask is not None and self.can_correct and common is not None and common >= STRAYED:
             self._tracker.correct(frame, mask)
         else:

@@ -52,10 +52,10 @@ def known_object(config: PipelineConfig) -> KnownObject | None:
         raise InputError(
             f"{_OBJECT}{path} has its shape, flat or not; leave out {argument('object.flat', '--flat')}."
         )
-    return read_object(Path(path))
+    return read_known_object(Path(path))
 
 
-def read_object(path: Path) -> KnownObject:
+def read_known_object(path: Path) -> KnownObject:
     """The object of a run folder or a mesh file.
 
     Raises:
@@ -70,7 +70,7 @@ def read_object(path: Path) -> KnownObject:
     return _of_run(path) if is_folder else _of_mesh(path)
 
 
-def camera_of(
+def select_camera(
     config: PipelineConfig,
     width: int,
     height: int,

@@ -1,26 +1,23 @@
-"""Objects on their way from the frames to their run folders: answered, kept, and looked at once more at the end."""
+"""One object on its way from the frames to its run folder: estimated, written, and refined at the end."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
-import numpy as np
-
-from tracking3d.checkpoint.folder import Checkpoint
-from tracking3d.checkpoint.progress import Kept, Progress, TakenFrame, check_picture, checksum
-from tracking3d.checkpoint.trees import UnkeptError
-from tracking3d.corrections import Correction, prompts_in
-from tracking3d.errors import OutputError, PluginError
-from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
-from tracking3d.evidence.scene import Mask
-from tracking3d.frames import Frame, MaskEstimate, SkippedFrame
-from tracking3d.last_passes import Foreseen, LastPasses
-from tracking3d.reconstruction import BELIEVED, TextureView, kept_views, texture_view, textured
+from tracking3d.checkpoint.progress import JournalEntry, Kept, check_picture, checksum
+from tracking3d.checkpoint.run_state import RunState
+from tracking3d.corrections import prompts_in
+from tracking3d.errors import OutputError
+from tracking3d.estimation.estimate import FrameEstimate, ObjectModel
+from tracking3d.final_refinement import FinalRefinement
+from tracking3d.frames import Frame, SkippedFrame
+from tracking3d.last_passes import PrecomputedRefinement
+from tracking3d.open_tracking import TrackedObject
+from tracking3d.reconstruction import bake_texture
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.refinement_writer import RefinementWriter
@@ -36,50 +33,44 @@ class ObjectRecording:
     """One object on its way from the frames to its run folder.
 
     Args:
-        session: Answers for the frames.
-        writer: Keeps the answers.
-        checkpoint: Keeps the state after each; None where that is of no use, since the source cannot be read again.
-        kept: The state of a stopped run that this one goes on with, which ``session`` was given.
-        corrections: What the user has said of the object in later frames, by their index.
+        tracked: The object.
+        writer: Writes the run folder.
+        state: How far the run is; the session was given the state of the stopped run, if there is one.
         redraw: Whether frames come in another order than that of time, and are drawn once more in that order.
+        temporary: Whether the run folder is removed in the end, so that errors do not name it.
 
     Attributes:
-        latest: The answer for the frame that was taken last.
-        foreseen: What the last passes come to, where somebody else found it.
+        latest: The estimate for the frame that was taken last.
+        refinement: The second passes; None before `begin_refinement`, and if there are none.
+        precomputed: What the last steps come to, if other processes have computed it.
     """
 
     def __init__(
         self,
-        session: Session,
+        tracked: TrackedObject,
         writer: RunWriter,
-        checkpoint: Checkpoint | None = None,
-        kept: Kept | None = None,
-        corrections: Mapping[int, Correction] | None = None,
+        state: RunState,
         redraw: bool = False,
+        temporary: bool = False,
     ) -> None:
-        self._session, self._writer, self._checkpoint = session, writer, checkpoint
-        self._corrections, self._unmet = corrections or {}, set(corrections or {})
-        self._redraw = redraw
-        self._kept = kept
-        self._work = WorkBehind()  # all that touches writer and checkpoint while frames come
-        self.latest: FrameEstimate | None = None
-        self.foreseen: Foreseen | None = None
-        self._progress = kept.progress if kept else Progress()
-        self._until = self._progress  # what was done before
-        self._past = {*kept.taken, *(one.index for one in kept.skipped)} if kept else set()
-        self._answered = kept is not None
-        self._said = False
+        self._tracked, self._session = tracked, tracked.session
+        self._writer, self._state = writer, state
+        self._redraw, self._temporary = redraw, temporary
+        self._work = WorkBehind()  # all that touches writer and state while frames come
+        self._unmet = set(tracked.corrections)
+        self._answered = state.kept is not None
+        self._warned = False
         self._initial: dict[int, tuple[float, str]] = {}
-        if kept and session.config.solver.final_refine:
-            self._initial = {one.index: (one.score, one.reason) for one in kept.taken.values()}
+        if state.kept and self._refines:
+            self._initial = {one.index: (one.score, one.reason) for one in state.kept.taken.values()}
         self._causal_model: ObjectModel | None = None
-        self._refinement: RefinementWriter | None = None
-        self._last: LastPasses | None = None
-        self._views: tuple[TextureView, ...] = ()
+        self.latest: FrameEstimate | None = None
+        self.refinement: FinalRefinement | None = None
+        self.precomputed: PrecomputedRefinement | None = None
 
     @contextmanager
     def writing_beside(self) -> Iterator[None]:
-        """Within, answers are kept by another thread while the next frame is solved, one at a time."""
+        """Within, estimates are written by another thread while the next frame is solved, one at a time."""
         self._work.threaded = True
         try:
             yield
@@ -87,38 +78,42 @@ class ObjectRecording:
             self._work.end()
 
     def written(self) -> Any:
-        """Wait until all answers are kept; what is to be told of the last one."""
+        """Wait until all estimates are written; what is to be told of the last one."""
         return self._work.wait()
+
+    @property
+    def takes(self) -> bool:
+        """Whether the frames are to come for the first time, or for the mask tracker to see them again."""
+        return not self._state.before.refining
 
     def take(
         self, frame: Frame | SkippedFrame, coming: Frame | SkippedFrame | None = None
     ) -> FrameRecord | SkippedFrame | None:
-        """Answer for the next frame and keep the answer; what was answered before the run was stopped stands.
+        """Estimate the object in the next frame and write the estimate; what a stopped run has estimated stands.
 
         Args:
             frame: The frame.
-            coming: The one that will be taken next, where that is known.
+            coming: The one that will be taken next, if it is known.
 
         Returns:
             What is to be told: of this frame, or of the one before while `writing_beside`.
         """
         if isinstance(frame, Frame):
             self._unmet.discard(frame.index)
-        if self._kept and frame.index in self._past:
-            return self._take_kept(self._kept, frame)
+        if self._state.kept and self._state.has(frame.index):
+            return self._take_kept(self._state.kept, frame)
         if isinstance(frame, SkippedFrame):
             return self._work.do(partial(self._skip, frame))
-        if not isinstance(coming, Frame) or coming.index in self._past:
+        if not isinstance(coming, Frame) or self._state.has(coming.index):
             coming = None
-        self._session.coming = coming
-        estimate = self._session.step(frame, *prompts_in(frame, self._corrections))
+        estimate = self._tracked.step(frame, coming)
         self._answered, self.latest = True, estimate
         initial = self._session.initial_mask
-        if self._session.config.solver.final_refine:
+        if self._refines:
             self._initial[frame.index] = initial.score, initial.reason
-        taken = state = None
-        if self._checkpoint:
-            taken = TakenFrame(
+        taken = kept = None
+        if self._state.checkpoint:
+            taken = JournalEntry(
                 frame.index,
                 checksum(frame.image),
                 initial.score,
@@ -126,168 +121,143 @@ class ObjectRecording:
                 self._session.corrected,
                 self._session.failure_at(frame.index),
             )
-            state = self._session.kept()
-        return self._work.do(partial(self._keep_answer, estimate, frame, taken, state))
+            kept = self._session.kept()
+        return self._work.do(partial(self._write, estimate, frame, taken, kept))
 
     def _skip(self, frame: SkippedFrame) -> SkippedFrame:
         self._writer.skip(frame)
-        if self._checkpoint:
-            self._checkpoint.note(frame)
+        if self._state.checkpoint:
+            self._state.checkpoint.note(frame)
         return frame
 
-    def _keep_answer(
-        self, estimate: FrameEstimate, frame: Frame, taken: TakenFrame | None, state: dict[str, Any] | None
+    def _write(
+        self,
+        estimate: FrameEstimate,
+        frame: Frame,
+        taken: JournalEntry | None,
+        session: dict[str, Any] | None,
     ) -> FrameRecord:
-        answer = self._writer.write(estimate, frame)
-        if self._checkpoint and taken is not None and state is not None:
+        record, checkpoint = self._writer.write(estimate, frame), self._state.checkpoint
+        if checkpoint and taken is not None and session is not None:
             if taken.corrected:
-                self._checkpoint.keep_correction(frame.index, estimate.mask)
-            self._progress = replace(self._progress, last=frame.index, lines=self._writer.lines)
-            self._keep(state, taken, [one.index for one in estimate.revised])
-        return answer
+                checkpoint.keep_correction(frame.index, estimate.mask)
+            revised = [one.index for one in estimate.revised]
+            so_far = {"lines": self._writer.lines, "seconds": self._writer.seconds}
+            self._state.save(session, taken, revised, last=frame.index, **so_far)
+        return record
+
+    def _take_kept(self, kept: Kept, frame: Frame | SkippedFrame) -> FrameRecord | SkippedFrame | None:
+        """Draw a frame that has its estimate, and show it to a mask tracker that cannot be resumed otherwise."""
+        if isinstance(frame, SkippedFrame) and frame.index not in kept.taken:
+            return frame
+        if frame.index not in kept.taken or not self.takes:
+            return None
+        check_picture(kept, frame)
+        assert isinstance(frame, Frame)
+        if self._session.replays:
+            self._replay(kept, frame)
+        return self._writer.draw_again(frame)
+
+    def _replay(self, kept: Kept, frame: Frame) -> None:
+        """Show a frame to the mask tracker again; warn once if the tracker gives another mask than before."""
+        taken, first = kept.taken[frame.index], frame.index == next(iter(kept.taken))
+        correction = None
+        if taken.corrected and self._state.checkpoint:
+            correction = self._state.checkpoint.correction(frame.index)
+        prompts = prompts_in(frame, self._tracked.corrections)
+        mask = self._session.replay(frame, first, correction, *prompts)
+        if self._warned or taken.failure or not mask or self._writer.is_initial_mask(frame, mask):
+            return
+        self._warned = True
+        _log.warning(
+            "The mask tracker gives another mask of %s than before the run was stopped; what follows may differ from a "
+            "run that was not.",
+            frame.name or f"frame {frame.index}",
+        )
 
     @property
-    def takes(self) -> bool:
-        """Whether the frames are to come for the first time, or for the mask tracker to see them again."""
-        return not self._until.refining
-
-    @property
-    def looks_again(self) -> bool:
-        """Whether the frames are to come once more, in order of time."""
-        return self._refinement is not None or self._redraw
+    def _refines(self) -> bool:
+        """Whether a final refinement is asked for."""
+        return self._session.config.solver.final_refine
 
     def begin_refinement(self, source: FrameSource) -> None:
-        """All frames were taken: solve everything once more, or record why not though it was asked for."""
+        """All frames were taken: refine everything, or record why not though it was asked for."""
         for index in sorted(self._unmet):
             _log.warning(
                 "Frame %d, which was to be corrected, is not among the frames that could be read.", index
             )
-        self._begin_refinement(source)
-        if self._refinement is not None:
-            wanted, camera = self._session.config.object, self._session.camera
-            self._last = LastPasses(
-                self._refinement, self._session.result(), camera, wanted.landmark_views, wanted.evidence,
-                self._corrections, self.foreseen,
-            )  # fmt: skip
+        estimates = self._refined(source)
+        if estimates is not None:
+            estimates.together = self._session.refining
+            self._writer.refine_camera(self._session.camera)
+            self.refinement = FinalRefinement(
+                self._tracked,
+                self._writer,
+                estimates,
+                self._state,
+                self._work,
+                self._initial,
+                self.precomputed,
+            )
         elif self._redraw:
             self._writer.begin_drawing_anew()
 
-    def _begin_refinement(self, source: FrameSource) -> None:
-        if self._until.refining:
-            self._refinement = self._writer.begin_refinement(
-                None, self._until.refined_lines, self._until.refinement_seconds
-            )
-            self._causal_model = load_model(self._writer.folder)
-            self._refinement.together = self._session.refining
-            self._writer.refine_camera(self._session.camera)
-            return
-        solver = self._session.config.solver
-        if not solver.final_refine:
-            return
+    def _refined(self, source: FrameSource) -> RefinementWriter | None:
+        """Refine everything, unless the stopped run has done so; None if there is no refinement."""
+        before = self._state.before
+        if before.refining:
+            estimates = self._writer.begin_refinement(None, before.refined_lines, before.refinement_seconds)
+            self._causal_model = load_model(
+                self._writer.folder
+            )  # in its place again, if it was being replaced
+            return estimates
+        if not self._refines:
+            return None
         if not self._session.can_refine or not source.repeatable:
             self._writer.leave_out_refinement(
                 f"{source.name} cannot be read a second time"
                 if self._session.can_refine
-                else f"the solver {solver.name} gives causal answers only"
+                else f"the solver {self._session.config.solver.name} gives causal answers only"
             )
-            return
+            return None
         self._causal_model = self._session.result()
-        self._refinement = self._writer.begin_refinement(self._causal_model)
+        estimates = self._writer.begin_refinement(self._causal_model)
         self._session.refine()
-        self._refinement.together = self._session.refining
-        self._writer.refine_camera(self._session.camera)
-        self._progress = replace(self._progress, refining=True)
-        self._keep(self._session.kept())
+        self._state.save(
+            self._session.kept(),
+            refining=True,
+            seconds=self._writer.seconds,
+            refinement_seconds=estimates.seconds,
+        )
+        return estimates
+
+    @property
+    def looks_again(self) -> bool:
+        """Whether the frames are to come once more, in order of time."""
+        return self.refinement is not None or self._redraw
 
     def take_again(self, frame: Frame) -> FrameRecord | None:
-        """Answer for a frame once more; None where it has no causal answer or there is no refinement."""
-        refinement = self._refinement
-        if refinement is None:
-            self._writer.draw_again(frame)
-            return None
-        if frame.index not in refinement.causal:
-            return None
-        if self._kept:
-            check_picture(self._kept, frame)
-            if frame.index <= self._until.last_refined:
-                answer = refinement.answer(frame.index)
-                return self._work.do(partial(self._seen_again, answer, frame, refinement.mask(answer)))
-        mask = refinement.initial_mask(frame.index)
-        score, reason = self._initial.get(frame.index, (1.0, ""))
-        initial = MaskEstimate(None if mask is None else mask.astype(np.float32), score, reason)
-        estimate = None
-        try:
-            estimate = self._session.revisit(frame, initial, refinement.causal[frame.index].T_cam_obj)
-        except PluginError:
-            if self._session.config.runtime.on_plugin_failure == "stop":
-                raise
-        state = self._session.kept() if self._checkpoint else {}
-        return self._work.do(partial(self._keep_second, estimate, frame, mask, state))
-
-    def _keep_second(
-        self, estimate: FrameEstimate | None, frame: Frame, initial: Mask | None, state: dict[str, Any]
-    ) -> FrameRecord:
-        refinement = self._refinement
-        assert refinement is not None
-        answer = refinement.write(estimate, frame, initial)
-        self._progress = replace(self._progress, last_refined=frame.index, refined_lines=refinement.lines)
-        self._keep(state)
-        return self._seen_again(answer, frame, estimate.mask if estimate else refinement.mask(answer))
-
-    def _seen_again(self, answer: FrameRecord, frame: Frame, mask: Mask) -> FrameRecord:
-        """Keep what poses, surface and texture of the end can be taken from; the answer as it is."""
-        most = self._session.config.object.texture_views
-        if self._last:
-            self._last.see(answer, frame.image, mask)
-        if most and answer.status is Status.TRACKED and answer.confidence >= BELIEVED:
-            camera = answer.through(self._session.camera)
-            image, seen = camera.undistorted(frame.image), camera.mask_to_pinhole(mask)
-            view = texture_view(frame.index, image, seen, camera, answer.T_cam_obj)
-            self._views = self._views if view is None else kept_views(self._views, view, most)
-        return answer
-
-    @property
-    def draws(self) -> bool:
-        """Whether the frames are to come a last time, to be drawn as they are answered in the end."""
-        return self._refinement is not None
-
-    @property
-    def weighs_masks(self) -> bool:
-        """Whether they are to come once before that, for their masks to be weighed together."""
-        return self._last is not None and self._last.weighs_masks
-
-    def settle(self) -> None:
-        """All frames were looked at again: put right together what they say."""
-        if self._last:
-            self._writer.refine_camera(self._last.settle())
-
-    def put_right(self, frame: Frame) -> None:
-        """Give the final answer for a frame the pose that all frames together say."""
-        if self._last:
-            self._last.put_right(frame)
-
-    def draw(self, frame: Frame) -> None:
-        """Draw the final answer for a frame."""
-        if self._last:
-            self._last.draw(frame, self._work.do)
+        """Estimate the object in a frame again; without a refinement, only draw the frame, and give None."""
+        if self.refinement is not None:
+            return self.refinement.take_again(frame)
+        self._writer.draw_again(frame)
+        return None
 
     def finish(self) -> None:
         """Write what is made at the end."""
-        model, views = self._session.result(), self._views
-        if self._last:
-            self._last.rest(self._work.do)
+        model, largest = self._session.result(), self._session.config.object.largest_texture
+        if self.refinement is not None:
+            self.refinement.draw_rest()
             self._work.wait()
-            model, views = self._last.moved(model, views)
-        model = textured(model, views, self._session.config.object.largest_texture)
-        if self._refinement is not None:
+            model = bake_texture(*self.refinement.final_model(), largest)
             self._writer.end_refinement()
             self._causal_model = None
         self._writer.finish(model, "finished")
-        if self._checkpoint:
-            self._checkpoint.finish()
+        if self._state.checkpoint:
+            self._state.checkpoint.finish()
 
     def pause(self) -> None:
-        """Stop here; the folder is that of a stopped run, which can go on."""
+        """Stop here; the folder is that of a stopped run, which can be resumed."""
         self._writer.finish(_model(self._session), "interrupted")
 
     def give_up(self, error: BaseException) -> None:
@@ -295,65 +265,19 @@ class ObjectRecording:
         self._work.end()
         failed = isinstance(error, Exception)
         folder = self._writer.folder
-        if self._causal_model is not None:
+        if self._causal_model is not None and not self._temporary:
             error.add_note(
                 f"The final refinement was not finished; the causal answers are whole in {folder}."
             )
-        elif self._answered:
+        elif self._answered and not self._temporary:
             error.add_note(f"What was finished until then is kept in {folder}.")
         model = self._causal_model or _model(self._session)
         with suppress(OutputError):  # the first error is the one to tell
             self._writer.finish(model, "failed" if failed else "interrupted", str(error) or None)
 
-    def _take_kept(self, kept: Kept, frame: Frame | SkippedFrame) -> FrameRecord | SkippedFrame | None:
-        """Draw a frame that is answered, and show it to a mask tracker that knows no other way to go on."""
-        if isinstance(frame, SkippedFrame) and frame.index not in kept.taken:
-            return frame
-        if frame.index not in kept.taken or self._until.refining:
-            return None
-        check_picture(kept, frame)
-        assert isinstance(frame, Frame)
-        if self._session.replays:
-            taken, first = kept.taken[frame.index], frame.index == next(iter(kept.taken))
-            correction = None
-            if taken.corrected and self._checkpoint:
-                correction = self._checkpoint.correction(frame.index)
-            answer = self._session.replay(frame, first, correction, *prompts_in(frame, self._corrections))
-            if (
-                not self._said
-                and not taken.failure
-                and answer
-                and not self._writer.is_initial_mask(frame, answer)
-            ):
-                self._said = True
-                _log.warning(
-                    "The mask tracker gives another mask of %s than before the run was stopped; what follows may "
-                    "differ from a run that was not.",
-                    frame.name or f"frame {frame.index}",
-                )
-        return self._writer.draw_again(frame)
-
-    def _keep(
-        self, state: dict[str, Any], taken: TakenFrame | None = None, revised: Iterable[int] = ()
-    ) -> None:
-        """Keep the session's state."""
-        if self._checkpoint is None:
-            return
-        self._progress = replace(
-            self._progress,
-            seconds=self._writer.seconds,
-            refinement_seconds=self._refinement.seconds if self._refinement else 0.0,
-        )
-        try:
-            self._checkpoint.save(self._progress, state, taken, revised)
-        except UnkeptError as error:
-            _log.warning("This run cannot be resumed when it is stopped: %s.", error)
-            self._checkpoint.remove()
-            self._checkpoint = None
-
 
 def _model(session: Session) -> ObjectModel | None:
-    """The object as far as it is known; None where the session stopped in a state that gives none."""
+    """The object as far as it is known; None if the session stopped in a state that gives none."""
     try:
         return session.result()
     except Exception:

@@ -22,7 +22,7 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.plugins import FEATURES, build_plugin, plugin_label
 from tracking3d.plugins.guard import GuardedEncoder
 from tracking3d.process_settings import process_kept
-from tracking3d.rendering.backend import choose_backend, threads_kept
+from tracking3d.rendering.backend import choose_backend, threads_kept, why_no_numba
 from tracking3d.stages import StageTimes, Stopwatch
 
 SOLVERS: dict[str, Callable[[PipelineConfig, Camera, FeatureEncoder], Solver[Any]]] = {
@@ -79,9 +79,11 @@ def chosen_renderer(runtime: RuntimeConfig) -> dict[str, str | int]:
     """What renders, and why, see `tracking3d.rendering.backend.choose_backend`.
 
     Raises:
-        InputError: If that cannot be used here.
+        InputError: If that cannot be used here, or Numba cannot, without whose kernels nothing can be tracked.
     """
     check_device(runtime.device)
+    if why_no_numba():
+        raise InputError(f"Tracking needs Numba to compile its kernels: {why_no_numba()}.")
     try:
         return choose_backend(runtime.renderer, runtime.device, runtime.threads)
     except ValueError as error:

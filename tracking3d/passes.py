@@ -1,148 +1,182 @@
-"""The passes over a video: every frame is answered, looked at again where there is a final refinement, and drawn."""
+"""The passes over a video: every frame is estimated, again with the final model if that is asked for, and drawn.
+
+In short::
+
+    for frame in frames:                             # first pass: causal estimates
+        for recording in active:
+            recording.take(frame)                    # TrackedObject.step, Session.step, Solver.step
+    for recording in active:
+        recording.begin_refinement(source)           # everything is refined
+    for frame in frames:                             # second pass: estimates with the final model
+        recording.take_again(frame)
+    recording.refinement.adjust_all()                # poses, surface and lens by all frames together
+    for frame in frames:                             # third pass: what masks have in common
+        recording.refinement.collect_mask(frame)
+    for frame in frames:                             # last pass: masks and pictures
+        recording.refinement.draw(frame)
+"""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from contextlib import ExitStack, closing, suppress
-from dataclasses import replace
-from functools import partial
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 
-import cv2
-
+from tracking3d.final_refinement import FinalRefinement
+from tracking3d.frame_reading import read_again, read_with_next, with_share
 from tracking3d.frames import Frame, SkippedFrame
 from tracking3d.object_recording import ObjectRecording
 from tracking3d.rendering.backend import shared_among
 from tracking3d.results.records import FrameRecord
-from tracking3d.side_by_side import read_ahead, with_next
 from tracking3d.video.source import FrameSource
 
 Listener = Callable[[FrameRecord | SkippedFrame], None]
-"""Is told of every frame as it is done, or skipped; where there is a final refinement, once more of each."""
+"""Is called with every frame that is done or skipped, and with each once more in a final refinement."""
+
+
+class ActiveRecordings:
+    """The recordings of one tracking that have not failed; iterating gives them.
+
+    Args:
+        recordings: One for each object.
+        listener: Is called with every frame of every object.
+
+    Attributes:
+        errors: What ended the others, in the order in which they failed.
+    """
+
+    def __init__(
+        self, recordings: Sequence[ObjectRecording], listener: Listener = lambda frame: None
+    ) -> None:
+        self._active, self._listener = list(recordings), listener
+        self.errors: list[Exception] = []
+
+    def __len__(self) -> int:
+        return len(self._active)
+
+    def __iter__(self) -> Iterator[ObjectRecording]:
+        """Give each active recording; after the last one, raise the first error if all have failed."""
+        yield from tuple(self._active)
+        if not self._active:
+            raise self.errors[0]
+
+    def refining(self) -> Iterator[tuple[ObjectRecording, FinalRefinement]]:
+        """Give each active recording that has a final refinement, with it; see `__iter__`."""
+        for recording in self:
+            if recording.refinement is not None:
+                yield recording, recording.refinement
+
+    @contextmanager
+    def guard(self, recording: ObjectRecording) -> Iterator[None]:
+        """If something fails within, this recording ends and the others go on."""
+        try:
+            yield
+        except Exception as error:
+            self._active.remove(recording)
+            with suppress(Exception):  # the first error is the one to tell
+                self.tell(recording.written())
+            recording.give_up(error)
+            self.errors.append(error)
+
+    def give_up(self, error: BaseException) -> None:
+        """End all active recordings because of ``error``."""
+        for recording in self._active:
+            recording.give_up(error)
+
+    def tell(self, done: FrameRecord | SkippedFrame | None) -> None:
+        """Call the listener, if there is something to tell."""
+        if done:
+            self._listener(done)
 
 
 def go_through(
     source: FrameSource,
     frames: Iterable[Frame | SkippedFrame],
-    recordings: list[ObjectRecording],
+    recordings: Sequence[ObjectRecording],
     listener: Listener,
     first_pass_only: bool = False,
 ) -> None:
-    """Take every recording through the frames, and through them again where it refines.
-
-    A recording that fails is ended; the others go on.
+    """Run all passes. A recording that fails is ended; the others go on.
 
     Args:
         source: Where the frames come from.
         frames: Its frames, begun already.
-        recordings: One an object.
-        listener: Is told of every frame of every object.
-        first_pass_only: Stop when every frame has its causal answer.
+        recordings: One for each object.
+        listener: Is called with every frame of every object.
+        first_pass_only: Stop when every frame has its causal estimate.
 
     Raises:
         Tracking3dError: The first failure, at the end or as soon as no recording is left.
     """
-    going_on, errors = list(recordings), list[Exception]()
-    share = 1 / len(recordings)
-
-    def each(action: Callable[[ObjectRecording], FrameRecord | SkippedFrame | None]) -> None:
-        for recording in tuple(going_on):
-            try:
-                if told := action(recording):
-                    listener(told)
-            except Exception as error:
-                going_on.remove(recording)
-                with suppress(Exception):  # the first error is the one to tell
-                    if told := recording.written():
-                        listener(told)
-                recording.give_up(error)
-                errors.append(error)
-        if not going_on:
-            raise errors[0]
-
+    active = ActiveRecordings(recordings, listener)
     with ExitStack() as threads:
-        # Of a live source, answers are told at once.
+        # The listener hears of a live source's frames at once.
         for recording in recordings if source.repeatable else ():
             threads.enter_context(recording.writing_beside())
         try:
-            for frame, coming in _in_turn(source, frames) if any(one.takes for one in going_on) else ():
-                each(partial(ObjectRecording.take, frame=_shared(frame, share), coming=coming))
-            each(ObjectRecording.written)
+            waits = any(one.takes for one in active)
+            for frame, coming in read_with_next(source, frames) if waits else ():
+                shared = with_share(frame, len(recordings)) if isinstance(frame, Frame) else frame
+                for recording in active:
+                    with active.guard(recording):
+                        active.tell(recording.take(shared, coming))
+            _finish_writing(active)
             if first_pass_only:
-                each(ObjectRecording.pause)
+                for recording in active:
+                    with active.guard(recording):
+                        recording.pause()
                 return
-            look_again(source, going_on, each)
+            look_again(source, active)
         except BaseException as error:
-            for recording in going_on:
-                recording.give_up(error)
+            active.give_up(error)
             raise
-    if errors:
-        raise errors[0]
+    if active.errors:
+        raise active.errors[0]
 
 
-def look_again(
-    source: FrameSource,
-    recordings: Sequence[ObjectRecording],
-    each: Callable[[Callable[[ObjectRecording], FrameRecord | SkippedFrame | None]], None],
-) -> None:
-    """All frames are answered: the final refinement where it is asked for and possible, the pictures, and the end.
+def look_again(source: FrameSource, active: ActiveRecordings) -> None:
+    """All frames have causal estimates: run the final refinement, if it is asked for and possible, and draw.
 
     Args:
         source: Where the frames come from.
-        recordings: One an object; some may be taken out on the way.
-        each: Does something with every one of them.
+        active: The recordings.
     """
-    share = 1 / len(recordings)
+    objects = len(active)
     with shared_among(1):
-        each(partial(ObjectRecording.begin_refinement, source=source))
-        for frame in _once_more(source) if any(recording.looks_again for recording in recordings) else ():
-            each(partial(ObjectRecording.take_again, frame=_shared(frame, share)))
-        each(ObjectRecording.written)
-        with shared_among(cv2.getNumThreads()):
-            each(ObjectRecording.settle)
-        for frame in _once_more(source) if any(recording.weighs_masks for recording in recordings) else ():
-            each(partial(ObjectRecording.put_right, frame=frame))
-        for frame in _once_more(source) if any(recording.draws for recording in recordings) else ():
-            each(partial(ObjectRecording.draw, frame=frame))
-        each(ObjectRecording.written)
-        each(ObjectRecording.finish)
+        for recording in active:
+            with active.guard(recording):
+                recording.begin_refinement(source)
+        for frame in read_again(source) if any(one.looks_again for one in active) else ():
+            for recording in active:
+                with active.guard(recording):
+                    active.tell(recording.take_again(with_share(frame, objects)))
+        _finish_writing(active)
+        _run_last_passes(source, active)
+        for recording in active:
+            with active.guard(recording):
+                recording.finish()
 
 
-def _in_turn(
-    source: FrameSource, frames: Iterable[Frame | SkippedFrame]
-) -> Iterator[tuple[Frame | SkippedFrame, Frame | SkippedFrame | None]]:
-    """The frames, each with the one that comes next, which is read meanwhile; that of a live source is not known."""
-    if not source.repeatable:
-        for frame in frames:
-            yield frame, None
-        return
-    with closing(read_ahead(frames)) as ahead:
-        yield from with_next(ahead)
+def _run_last_passes(source: FrameSource, active: ActiveRecordings) -> None:
+    """Adjust poses, surface and lens by all frames together, then masks; and draw."""
+    for recording, refinement in active.refining():
+        with active.guard(recording):
+            refinement.adjust_all()
+    for frame in read_again(source) if any(each.decides_masks for _, each in active.refining()) else ():
+        for recording, refinement in active.refining():
+            with active.guard(recording):
+                refinement.collect_mask(frame)
+    for recording, refinement in active.refining():
+        with active.guard(recording):
+            refinement.settle_masks()
+    for frame in read_again(source) if any(active.refining()) else ():
+        for recording, refinement in active.refining():
+            with active.guard(recording):
+                refinement.draw(frame)
+    _finish_writing(active)
 
 
-def _once_more(source: FrameSource) -> Iterator[Frame]:
-    """The frames that can be read, read once more."""
-    with closing(timed(source)) as frames, closing(read_ahead(frames)) as ahead:
-        for frame in ahead:
-            if isinstance(frame, Frame):
-                yield frame
-
-
-def timed(source: FrameSource) -> Generator[Frame | SkippedFrame]:
-    """The frames of a source with the time that reading them took; of a live one, which is waited for, without."""
-    frames, started = iter(source), time.perf_counter()
-    try:
-        for frame in frames:
-            if isinstance(frame, Frame) and source.repeatable:
-                yield replace(frame, decoding=time.perf_counter() - started)
-            else:
-                yield frame
-            started = time.perf_counter()
-    finally:
-        if isinstance(frames, Generator):
-            frames.close()
-
-
-def _shared(frame: Frame | SkippedFrame, share: float) -> Any:
-    return replace(frame, decoding=share * frame.decoding) if isinstance(frame, Frame) else frame
+def _finish_writing(active: ActiveRecordings) -> None:
+    """Wait until everything is written that is written in other threads."""
+    for recording in active:
+        with active.guard(recording):
+            active.tell(recording.written())

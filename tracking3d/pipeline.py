@@ -6,33 +6,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
-from functools import partial
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.arguments import check_known, checked_config, needs_prompt, with_known
+from tracking3d.arguments import checked_config, with_known
 from tracking3d.config.camera import choose_camera
 from tracking3d.config.models import PipelineConfig
-from tracking3d.corrections import Correction, check_corrections_fit, checked_corrections, prompts_in
-from tracking3d.errors import PluginError
-from tracking3d.estimation.estimate import FrameEstimate, unanswered
-from tracking3d.frames import Box, Frame, MaskEstimate, Prompt, SkippedFrame
+from tracking3d.corrections import Correction
+from tracking3d.estimation.estimate import FrameEstimate
+from tracking3d.frames import Box
 from tracking3d.given_frames import open_frames
 from tracking3d.images import checked_image
-from tracking3d.parts import SOLVERS, build_encoder
+from tracking3d.open_tracking import TrackRequest, request_tracking
+from tracking3d.parts import SOLVERS
 from tracking3d.point_following import checked_queries
-from tracking3d.prompts import check_prompt, check_prompts, damaged_start, make_prompt, make_prompts
-from tracking3d.recording import check_order, opened
+from tracking3d.prompts import PromptSet
 from tracking3d.result_choice import ModelChoice, config_of_result
 from tracking3d.session import Session
-from tracking3d.tracker_choice import choose_tracker
-from tracking3d.tracking import Task, Tracking
-from tracking3d.video.source import FrameSource
+from tracking3d.tracking import Tracking, track_frames
 
 __all__ = ["SOLVERS", "Session", "Tracking", "checked_image", "choose_camera", "track", "track_objects"]
 
@@ -88,20 +84,9 @@ def track(
     """
     source, config = open_frames(frames), with_known(checked_config(config), object)
     config = config_of_result(config, source, refine, model)
-    check_prompt(box, mask, needed=needs_prompt(config), points=points)
-    [told] = checked_corrections(corrections)
-    check_order(source, config, start_frame)
-    untold = box is None and mask is None and points is None
-    task = Task(
-        source=source,
-        config=config,
-        prompt=None if untold else partial(make_prompt, box=box, mask=mask, points=points),
-        corrections=told,
-        start_frame=start_frame,
-        skip_damaged=skip_damaged or untold,
-        queries=checked_queries(follow),
-    )
-    return Tracking(task, keeps=refine is not None or model is not None)
+    prompts = PromptSet.of_one(box, mask, points, start_frame)
+    request = request_tracking(source, config, prompts, corrections, skip_damaged)
+    return Tracking(request, refine is not None or model is not None, checked_queries(follow))
 
 
 def track_objects(
@@ -137,65 +122,13 @@ def track_objects(
         Tracking3dError: If an argument cannot be used; on the way, if a frame cannot, the first one does not fit a box
             or mask, or the last object has failed.
     """
-    source, config = open_frames(frames), checked_config(config)
-    check_order(source, config, start_frame)
-    check_prompts(boxes, masks, points)
-    check_known(config, len(boxes) + len(masks) + len(points))
-    told = checked_corrections(corrections, len(boxes) + len(masks) + len(points))
-    prompts = partial(make_prompts, boxes=boxes, masks=masks, tracker=config.tracker.name, points=points)
-    return _track_objects(source, prompts, told, config, start_frame, skip_damaged)
+    prompts = PromptSet(boxes, masks, points, start_frame, as_lists=True)
+    request = request_tracking(open_frames(frames), config, prompts, corrections, skip_damaged)
+    return _estimates_of(request)
 
 
-def _track_objects(
-    source: FrameSource,
-    prompts: Callable[[Frame], list[Prompt]],
-    corrections: Sequence[Mapping[int, Correction]],
-    config: PipelineConfig,
-    start_frame: int | None,
-    skip_damaged: bool,
-) -> Iterator[tuple[FrameEstimate, ...]]:
-    with opened(source, config, start_frame) as frames:
-        yield from _answers_of_objects(source, frames, prompts, corrections, config, skip_damaged)
-
-
-def _answers_of_objects(
-    source: FrameSource,
-    frames: Iterator[Frame | SkippedFrame],
-    prompts: Callable[[Frame], list[Prompt]],
-    corrections: Sequence[Mapping[int, Correction]],
-    config: PipelineConfig,
-    skip_damaged: bool,
-) -> Iterator[tuple[FrameEstimate, ...]]:
-    sessions: list[Session] = []
-    failures: dict[int, PluginError] = {}
-    poses: list[NDArray[np.float64]] = []
-    for frame in frames:
-        if isinstance(frame, SkippedFrame):
-            if not sessions and not skip_damaged:
-                raise damaged_start(frame)
-            continue
-        if not sessions:
-            encoder = build_encoder(config)
-            given = prompts(frame)
-            config, _ = choose_tracker(config, source.count, not source.repeatable, frame, given[0])
-            lens = source.intrinsics, source.intrinsics_origin
-            sessions = [Session(config, prompt, *lens, encoder) for prompt in given]
-            for theirs in corrections:
-                check_corrections_fit(theirs.values(), frame, config.tracker.name)
-            poses = [np.eye(4) for _ in sessions]
-        frame = replace(frame, decoding=frame.decoding / len(sessions))
-        answers = []
-        for number, session in enumerate(sessions):
-            if number not in failures:
-                try:
-                    answers.append(session.step(frame, *prompts_in(frame, corrections[number])))
-                    poses[number] = answers[-1].T_cam_obj
-                    continue
-                except PluginError as error:
-                    failures[number] = error
-                    if len(failures) == len(sessions):
-                        raise
-            why = str(failures[number])
-            answer = unanswered(frame, MaskEstimate(None), poses[number])
-            answers.append(replace(answer, reason=why, failure=why))
-        yield tuple(answers)
+def _estimates_of(request: TrackRequest) -> Iterator[tuple[FrameEstimate, ...]]:
+    """What `track_objects` gives; the source is closed when it ends."""
+    with closing(track_frames(request)) as tracked:
+        for _, _, estimates in tracked:
+            yield estimates

@@ -1,10 +1,11 @@
-"""What the user says the object is in a frame: a box, a mask or points, checked against that frame."""
+"""What the user says the objects are in a frame: a box, a mask or points each, checked against that frame."""
 
 from __future__ import annotations
 
 import logging
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ BOX = argument("box=", "--box ")
 MASK = argument("mask=", "--mask ")
 """What sentences call the two, before their values."""
 
+_OPTIONS = {"boxes": "--box ", "masks": "--mask ", "points": "--points "}
 _SKIP = argument("skip_damaged=True", "--skip-damaged")
 _EITHER = "Say what the object is by either a box or a mask of the first frame, or points in it: {}, {} or {}.".format(
     argument("box=", "--box"), argument("mask=", "--mask"), argument("points=", "--points")
@@ -34,6 +36,106 @@ _NO_OBJECTS = (
         argument("boxes=", "--box"), argument("masks=", "--mask"), argument("points=", "--points")
     )
 )
+
+
+@dataclass(frozen=True, eq=False)
+class PromptSet:
+    """What the user says the objects of a video are in one frame, before that frame is read.
+
+    There is one box, one mask or one list of points for each object. Objects are counted from 0: first those of the
+    boxes, then those of the masks, then those of the points.
+
+    Attributes:
+        boxes: Each ``(x, y, width, height)`` in pixels.
+        masks: Each ``(H, W)``, or the image file of one.
+        points: Each ``(N, 3)``: x, y in pixels, and 1 on the object or 0 on the background.
+        start_frame: Index of the prompt frame; None for the first frame of the video.
+        as_lists: Whether the user gave lists of boxes, masks and points, as of several objects. Messages then say
+            which item is wrong.
+    """
+
+    boxes: Sequence[Box] = ()
+    masks: Sequence[NDArray[np.bool_] | Path] = ()
+    points: Sequence[Any] = ()
+    start_frame: int | None = None
+    as_lists: bool = False
+
+    @classmethod
+    def of_one(
+        cls,
+        box: Box | None = None,
+        mask: NDArray[np.bool_] | Path | None = None,
+        points: Any = None,
+        start_frame: int | None = None,
+    ) -> PromptSet:
+        """The prompt of one object; an empty set if all three are None."""
+        boxes = () if box is None else (box,)
+        masks = () if mask is None else (mask,)
+        return cls(boxes, masks, () if points is None else (points,), start_frame)
+
+    def __len__(self) -> int:
+        """The number of objects; 0 if the mask tracker or an earlier run knows the only one."""
+        return len(self.boxes) + len(self.masks) + len(self.points)
+
+    def check(self, needed: bool = True) -> None:
+        """Check everything that can be checked before the prompt frame is read.
+
+        Args:
+            needed: Whether a prompt is needed; lists must always have one.
+
+        Raises:
+            InputError: If there is no prompt though one is needed, there are several for one object, or one cannot be
+                used.
+        """
+        if self.as_lists:
+            for name, given in (("boxes", self.boxes), ("masks", self.masks), ("points", self.points)):
+                if not isinstance(given, Sequence | np.ndarray) or isinstance(given, str | bytes):
+                    raise InputError(
+                        f"{name}={shown(given)} is {a_kind(given)}; give a list with one for each object."
+                    )
+            if not len(self):
+                raise InputError(_NO_OBJECTS)
+        elif len(self) > 1 or (needed and not len(self)):
+            raise InputError(_EITHER)
+        for number, box in enumerate(self.boxes):
+            checked_box(box, self._name(BOX, "boxes", number))
+        for number, mask in enumerate(self.masks):
+            if not isinstance(mask, Path):
+                checked_mask(mask, self._name(MASK, "masks", number))
+        for number, each in enumerate(self.points):
+            checked_points(each, self._name(POINTS, "points", number))
+
+    def make(self, frame: Frame, tracker: str) -> list[Prompt | None]:
+        """Make the prompt of every object; that of the only one is None if the set is empty.
+
+        Args:
+            frame: The prompt frame.
+            tracker: Name of the mask tracker.
+
+        Raises:
+            InputError: If a prompt cannot be used in this frame, or the tracker knows the masks of one object only.
+        """
+        prompts: list[Prompt | None] = [
+            make_prompt(frame, box, box_name=self._name(BOX, "boxes", number))
+            for number, box in enumerate(self.boxes)
+        ]
+        prompts += [
+            make_prompt(frame, mask=mask, mask_name=self._name(MASK, "masks", number))
+            for number, mask in enumerate(self.masks)
+        ]
+        prompts += [
+            make_prompt(frame, points=each, points_name=self._name(POINTS, "points", number))
+            for number, each in enumerate(self.points)
+        ]
+        if len(prompts) > 1 and tracker == "precomputed":
+            raise InputError("Precomputed masks are of one object; track several in runs of their own.")
+        return prompts or [None]
+
+    def _name(self, one: str, several: str, number: int) -> str:
+        """What messages call a prompt, before its value."""
+        if not self.as_lists:
+            return one
+        return argument(f"{several}[{number}]=", _OPTIONS[several])
 
 
 def parse_box(text: str, name: str = BOX) -> Box:
@@ -49,29 +151,6 @@ def parse_box(text: str, name: str = BOX) -> Box:
             f"{name}'{text}' is not four numbers; write it as X,Y,WIDTH,HEIGHT in pixels."
         ) from error
     return checked_box((x, y, width, height), name)
-
-
-def check_prompt(box: Any, mask: Any, needed: bool = True, points: Any = None) -> None:
-    """Make sure of a box, a mask or points as far as that can be done before the first frame is there.
-
-    Args:
-        box: ``(x, y, width, height)`` in pixels, or None.
-        mask: ``(H, W)``, an image file of one, or None.
-        needed: Whether one of them must be given.
-        points: See `tracking3d.point_prompts.checked_points`, or None.
-
-    Raises:
-        InputError: None (if needed) or more than one are given, or what is given cannot be one.
-    """
-    given = sum(one is not None for one in (box, mask, points))
-    if given > 1 or (needed and not given):
-        raise InputError(_EITHER)
-    if box is not None:
-        checked_box(box)
-    if points is not None:
-        checked_points(points)
-    if mask is not None and not isinstance(mask, Path):
-        checked_mask(mask)
 
 
 def make_prompt(
@@ -101,7 +180,7 @@ def make_prompt(
             cannot be read, is empty, covers everything or is not of the frame's size, or the points lie outside,
             contradict each other, or none is on the object.
     """
-    check_prompt(box, mask, points=points)
+    PromptSet.of_one(box, mask, points).check()
     if points is not None:
         return points_prompt(frame, points, points_name)
     if box is not None:
@@ -122,72 +201,12 @@ def make_prompt(
     return Prompt(around, binary)
 
 
-def make_prompts(
-    frame: Frame,
-    boxes: Sequence[Box] = (),
-    masks: Sequence[NDArray[np.bool_] | Path] = (),
-    tracker: str = "",
-    points: Sequence[Any] = (),
-) -> list[Prompt]:
-    """The prompts of several objects, first those of the boxes, then those of the masks; see `make_prompt`.
-
-    Args:
-        frame: The first frame.
-        boxes: Each ``(x, y, width, height)`` in pixels.
-        masks: Each ``(H, W)``, or an image file of one.
-        tracker: Name of the mask tracker.
-        points: The points of each object.
-
-    Raises:
-        InputError: If there is no object, one cannot be used, or the tracker knows the masks of one object only.
-    """
-    prompts = [
-        make_prompt(frame, box, box_name=argument(f"boxes[{number}]=", "--box "))
-        for number, box in enumerate(boxes)
-    ]
-    prompts += [
-        make_prompt(frame, mask=mask, mask_name=argument(f"masks[{number}]=", "--mask "))
-        for number, mask in enumerate(masks)
-    ]
-    prompts += [
-        make_prompt(frame, points=each, points_name=argument(f"points[{number}]=", "--points "))
-        for number, each in enumerate(points)
-    ]
-    if not prompts:
-        raise InputError(_NO_OBJECTS)
-    if len(prompts) > 1 and tracker == "precomputed":
-        raise InputError("Precomputed masks are of one object; track several in runs of their own.")
-    return prompts
-
-
 def damaged_start(frame: SkippedFrame) -> InputError:
     """The first frame cannot be read, and what the object is was said of that frame."""
     return InputError(
         f"The first frame, in which the object is given, cannot be read ({frame.reason.rstrip('.')}); begin with "
         f"another one, or give {_SKIP} where the object has not moved until the next."
     )
-
-
-def check_prompts(boxes: Any, masks: Any, points: Any = ()) -> None:
-    """Make sure of the prompts of several objects as far as that can be done before the first frame is there.
-
-    Raises:
-        InputError: If there is none, or one cannot be used.
-    """
-    for name, given in (("boxes", boxes), ("masks", masks), ("points", points)):
-        if not isinstance(given, Sequence | np.ndarray) or isinstance(given, str | bytes):
-            raise InputError(
-                f"{name}={shown(given)} is {a_kind(given)}; give a list with one for each object."
-            )
-    if not len(boxes) and not len(masks) and not len(points):
-        raise InputError(_NO_OBJECTS)
-    for number, box in enumerate(boxes):
-        checked_box(box, argument(f"boxes[{number}]=", "--box "))
-    for number, mask in enumerate(masks):
-        if not isinstance(mask, Path):
-            checked_mask(mask, argument(f"masks[{number}]=", "--mask "))
-    for number, each in enumerate(points):
-        checked_points(each, argument(f"points[{number}]=", "--points "))
 
 
 def check_prompt_fits(prompt: Prompt, frame: Frame) -> None:

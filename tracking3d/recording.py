@@ -1,44 +1,63 @@
-"""From a source to a run folder: every frame through the session, every answer kept the moment it exists."""
+"""From a source to run folders: every frame is estimated, and every estimate is written as soon as it exists."""
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from functools import partial
-from itertools import chain
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.arguments import check_known, check_source, checked_config, checked_folder, needs_prompt
+from tracking3d.arguments import checked_folder
 from tracking3d.checkpoint.folder import Checkpoint, finish_state
-from tracking3d.checkpoint.resuming import earlier_run, given_of
+from tracking3d.checkpoint.progress import Kept
+from tracking3d.checkpoint.resuming import Earlier, earlier_run, given_of
+from tracking3d.checkpoint.run_state import RunState
 from tracking3d.checkpoint.staging import corrected_aside, take_over
-from tracking3d.config.models import PipelineConfig, PluginChoice
-from tracking3d.corrections import Correction, check_corrections_fit, checked_corrections
+from tracking3d.config.models import PipelineConfig
+from tracking3d.corrections import Correction
 from tracking3d.errors import InputError
-from tracking3d.frames import Box, Frame, Prompt, SkippedFrame
-from tracking3d.object_files import camera_of
+from tracking3d.frames import Box
+from tracking3d.object_files import select_camera
 from tracking3d.object_recording import ObjectRecording
-from tracking3d.parts import build_encoder, check_turns
-from tracking3d.passes import Listener, go_through, timed
-from tracking3d.prompts import check_prompt, check_prompts, damaged_start, make_prompt, make_prompts
+from tracking3d.open_tracking import OpenTracking, TrackRequest, open_tracking, request_tracking
+from tracking3d.passes import Listener, go_through
+from tracking3d.prompts import PromptSet
 from tracking3d.reconstruction.asked_shape import shape_as_asked
+from tracking3d.results.description import RunHeader
 from tracking3d.results.given_masks import keep_given_masks
-from tracking3d.results.layout import RUN, object_folders
+from tracking3d.results.layout import object_folders
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_writer import RunWriter, WrittenSoFar
 from tracking3d.session import Session
-from tracking3d.tracker_choice import AUTO, choose_tracker
-from tracking3d.video.both_ways import both_ways, check_start_frame
-from tracking3d.video.source import FrameSource, notes_of
+from tracking3d.video.source import FrameSource, source_notes
 
-_log = logging.getLogger(__name__)
+__all__ = ["Listener", "RecordOptions", "record", "record_objects", "record_tracking"]
 
-__all__ = ["Listener", "record", "record_objects"]
+
+@dataclass(frozen=True)
+class RecordOptions:
+    """How a tracking is written into run folders.
+
+    Attributes:
+        command: The command line, for the record.
+        selection: The ``START:STOP:STEP`` that the source was opened with, for the record.
+        overwrite: Replace a run that is in the folder.
+        resume: Continue the run that is in the folder from its last finished frame, or begin one if there is none. A
+            finished run stays as it is. If a frame that has an estimate is corrected now, what depends on it is
+            computed again from the last state kept before it, in a copy within the folder; until that is finished, the
+            run stays as it is.
+        first_pass_only: Stop when every frame has its causal estimate; ``resume`` continues from there.
+    """
+
+    command: str | None = None
+    selection: str | None = None
+    overwrite: bool = False
+    resume: bool = False
+    first_pass_only: bool = False
 
 
 def record(
@@ -51,18 +70,15 @@ def record(
     points: Any = None,
     start_frame: int | None = None,
     corrections: Iterable[Correction] = (),
-    command: str | None = None,
-    selection: str | None = None,
-    overwrite: bool = False,
     skip_damaged: bool = False,
+    overwrite: bool = False,
     resume: bool = False,
-    first_pass_only: bool = False,
     listener: Listener = lambda frame: None,
 ) -> RunReader:
-    """Track the object through ``source`` and write the run folder.
+    """Track one object through ``source`` and write its run folder.
 
-    With ``solver.final_refine`` the frames are gone through a second time, where the solver can use that and the
-    source can be read again: every frame is answered anew against the final object.
+    With ``solver.final_refine`` there is a second pass, if the solver supports it and the source can be read again: the
+    object is estimated in every frame again, with the final model.
 
     Args:
         source: The frames.
@@ -71,52 +87,29 @@ def record(
         box: The object in the first frame, ``(x, y, width, height)``.
         mask: The object in the first frame, as a mask or the image file of one. Without a box, a mask and points
             the tracker's own first mask is the prompt.
-        points: The object in the first frame by ``(N, 3)`` points: x, y in pixels, and 1 on it or 0 beside it. None of
-            the three is needed where ``object.known`` says which object it is.
-        start_frame: Index of the frame in which the object is given, instead of the first: it is tracked from there to
-            the end, and then backwards to the beginning, with what was learnt. Only of a source that can be read
-            again.
-        corrections: What the object is in later frames: there the mask tracker is set on it, and the mask is trusted.
-        command: The command line, for the record.
-        selection: The ``START:STOP:STEP`` that the source was opened with, for the record.
+        points: The object in the first frame by ``(N, 3)`` points: x, y in pixels, and 1 on the object or 0 on the
+            background. None of the three is needed if ``object.known`` says which object it is.
+        start_frame: Index of the frame in which the object is given, instead of the first. The object is tracked from
+            there to the end, and then backwards to the beginning with what was learnt. The source must be one that can
+            be read again.
+        corrections: What the object is in later frames: there the mask tracker is set to it, and the mask is trusted.
+        skip_damaged: If the first frame cannot be decoded, apply the prompt to the first frame that can.
         overwrite: Replace a run that is in the folder.
-        skip_damaged: Where the first frame cannot be read, take the box or mask for the first one that can.
-        resume: Go on with the run that is in the folder, from the last frame that it finished; begin one where there
-            is none. With a finished run nothing is done. Where a frame that is answered is corrected, what depends on
-            it is computed again, from the last state of before it that was kept, in a copy within the folder; until
-            that is finished the run stays as it is.
-        first_pass_only: Stop when every frame has its causal answer; ``resume`` goes on from there.
-        listener: Is told of every frame, those finished before included.
+        resume: Continue the run that is in the folder; see `RecordOptions`.
+        listener: Is called with every frame, also with those that were finished before.
 
     Returns:
         The reader of the run folder.
 
     Raises:
-        InputError: If the run in the folder is of other settings or another source; the difference is named.
+        InputError: If the run in the folder has other settings or another source; the difference is named.
         Tracking3dError: What was finished until then is kept in the folder, as it is on Ctrl-C.
     """
-    check_source(source)
-    config, folder = checked_config(config), checked_folder(folder)
-    check_prompt(box, mask, needed=needs_prompt(config), points=points)
-    [told] = checked_corrections(corrections)
-    begin = partial(
-        begun, source, command=command, selection=selection, overwrite=overwrite, resume=resume,
-        start_frame=start_frame,
-    )  # fmt: skip
-    untold = box is None and mask is None and points is None
-    with opened(source, config, start_frame) as frames, ExitStack() as writers:
-        skipped, first = first_frame(frames, source.name, skip_damaged or untold)
-        prompt = None if untold else make_prompt(first, box, mask, points=points)
-        config, choice = with_tracker(config, source, first, prompt, folder, resume)
-        session = Session(config, prompt, source.intrinsics, source.intrinsics_origin)
-        recording = begin(
-            session, prompt, choice=choice, first=first, folder=folder, writers=writers, corrections=told
-        )
-        if recording is not None:
-            go_through(source, chain(skipped, [first], frames), [recording], listener, first_pass_only)
-    if recording is not None and not first_pass_only:
-        shape_as_asked(folder, config, source)
-    return RunReader(folder)
+    prompts = PromptSet.of_one(box, mask, points, start_frame)
+    request = request_tracking(source, config, prompts, corrections, skip_damaged)
+    options = RecordOptions(overwrite=overwrite, resume=resume)
+    [reader] = record_tracking(request, folder, options, listener)
+    return reader
 
 
 def record_objects(
@@ -129,10 +122,8 @@ def record_objects(
     points: Sequence[Any] = (),
     start_frame: int | None = None,
     corrections: Iterable[Correction] = (),
-    command: str | None = None,
-    selection: str | None = None,
-    overwrite: bool = False,
     skip_damaged: bool = False,
+    overwrite: bool = False,
     resume: bool = False,
     listener: Listener = lambda frame: None,
 ) -> list[RunReader]:
@@ -149,202 +140,138 @@ def record_objects(
         points: More objects, after those of the masks.
         start_frame: The frame in which the objects are given.
         corrections: What an object is in later frames; `Correction.object` says which, in the order of the objects.
-        command: The command line.
-        selection: The ``START:STOP:STEP`` that the source was opened with.
+        skip_damaged: If the first frame cannot be decoded, apply the prompts to the first frame that can.
         overwrite: Replace runs that are in those folders.
-        skip_damaged: Where the first frame cannot be read, take the boxes and masks for the first one that can.
-        resume: Go on with the runs that are in those folders; those that are finished stay as they are.
-        listener: Is told of every frame of every object.
+        resume: Continue the runs that are in those folders; those that are finished stay as they are.
+        listener: Is called with every frame of every object.
 
     Returns:
         The readers of the run folders, in the order of the objects.
 
     Raises:
-        InputError: If a run in those folders is of other settings or another source; the difference is named.
+        InputError: If a run in those folders has other settings or another source; the difference is named.
         Tracking3dError: What was finished until then is kept in the folders, as it is on Ctrl-C.
     """
-    check_source(source)
-    config, folder = checked_config(config), checked_folder(folder)
-    check_prompts(boxes, masks, points)
-    check_known(config, len(boxes) + len(masks) + len(points))
-    told = checked_corrections(corrections, len(boxes) + len(masks) + len(points))
-    begin = partial(
-        begun, source, command=command, selection=selection, overwrite=overwrite, resume=resume,
-        start_frame=start_frame,
-    )  # fmt: skip
-    with opened(source, config, start_frame) as frames, ExitStack() as writers:
-        skipped, first = first_frame(frames, source.name, skip_damaged)
-        prompts = make_prompts(first, boxes, masks, config.tracker.name, points)
-        folders = object_folders(folder, len(prompts))
-        config, choice = with_tracker(config, source, first, prompts[0], folders[0], resume)
-        encoder = build_encoder(config)
-        sessions = [
-            Session(config, prompt, source.intrinsics, source.intrinsics_origin, encoder)
-            for prompt in prompts
-        ]
-        recordings = [
-            begin(
-                session, prompt, choice=choice, first=first, folder=into, writers=writers, corrections=theirs
-            )
-            for session, prompt, into, theirs in zip(sessions, prompts, folders, told, strict=True)
-        ]
-        if unfinished := [recording for recording in recordings if recording is not None]:
-            go_through(source, chain(skipped, [first], frames), unfinished, listener)
-    for one, begun_now in zip(folders, recordings, strict=True):
-        if begun_now is not None:
-            shape_as_asked(one, config, source)
-    return [RunReader(one) for one in folders]
+    prompts = PromptSet(boxes, masks, points, start_frame, as_lists=True)
+    request = request_tracking(source, config, prompts, corrections, skip_damaged)
+    options = RecordOptions(overwrite=overwrite, resume=resume)
+    return record_tracking(request, folder, options, listener)
 
 
-@contextmanager
-def opened(
-    source: FrameSource, config: PipelineConfig, start_frame: int | None = None
-) -> Iterator[Iterator[Frame | SkippedFrame]]:
-    """The frames of a source, which is let go at the end, however that comes.
+def record_tracking(
+    request: TrackRequest,
+    folder: Path | str,
+    options: RecordOptions,
+    listener: Listener = lambda frame: None,
+) -> list[RunReader]:
+    """Track the objects of a request and write their run folders: what `record` and `record_objects` do.
 
     Args:
-        source: The source.
-        config: The pipeline.
-        start_frame: The frame to start from and to go both ways; None gives the frames in order of time.
+        request: What is to be tracked.
+        folder: The run folder of the one object; if prompts were given as lists, the folder that gets one for each.
+        options: How it is written.
+        listener: Is called with every frame of every object.
+
+    Returns:
+        The readers of the run folders, in the order of the objects.
 
     Raises:
-        InputError: If the source or the solver cannot go both ways.
+        InputError: If a run in those folders has other settings or another source; the difference is named.
+        Tracking3dError: What was finished until then is kept in the folders, as it is on Ctrl-C.
     """
-    check_order(source, config, start_frame)
-    once = partial(timed, source)
-    frames = once() if start_frame is None else both_ways(once, start_frame, source.name)
-    try:
-        yield frames
-    finally:
-        frames.close()
+    folder, prompts = checked_folder(folder), request.prompts
+    folders = object_folders(folder, len(prompts)) if prompts.as_lists else [folder]
+    with (
+        open_tracking(request, folders[0] if options.resume else None) as opened,
+        ExitStack() as writers,
+    ):
+        recordings = [
+            begin_recording(opened, number, into, options, writers) for number, into in enumerate(folders)
+        ]
+        if unfinished := [recording for recording in recordings if recording is not None]:
+            go_through(opened.source, opened.frames, unfinished, listener, options.first_pass_only)
+    for into, recording in zip(folders, recordings, strict=True):
+        if recording is not None and not options.first_pass_only:
+            shape_as_asked(into, opened.config, opened.source)
+    return [RunReader(into) for into in folders]
 
 
-def check_order(source: FrameSource, config: PipelineConfig, start_frame: int | None) -> None:
-    """Make sure that source and solver can go both ways, where that is asked for; see `opened`.
-
-    Raises:
-        InputError: If not.
-    """
-    if start_frame is not None:
-        check_start_frame(start_frame, source.repeatable, source.name)
-        check_turns(config)
-
-
-def begun(
-    source: FrameSource,
-    session: Session,
-    prompt: Prompt | None,
-    *,
-    choice: str | None,
-    first: Frame,
+def begin_recording(
+    opened: OpenTracking,
+    number: int,
     folder: Path,
-    command: str | None,
-    selection: str | None,
-    overwrite: bool,
-    resume: bool,
+    options: RecordOptions,
     writers: ExitStack,
-    start_frame: int | None = None,
-    corrections: Mapping[int, Correction] | None = None,
-    resumable: bool = True,
+    temporary: bool = False,
 ) -> ObjectRecording | None:
-    """One object's recording, begun or resumed; None where its run is finished. See `record` for the arguments.
+    """Begin or resume the recording of one object; None if its run is finished.
 
-    Where it is not to be ``resumable``, no state is kept on the way.
+    Args:
+        opened: The tracking.
+        number: Which of its objects.
+        folder: The object's run folder.
+        options: How it is written.
+        writers: Closes the run folder at the end.
+        temporary: Whether the folder is removed in the end: no state is kept, and errors do not name the folder.
 
     Raises:
         OutputError: If the folder is in use, holds a run already, or cannot be written.
         InputError: If the run there cannot be resumed.
     """
-    corrections = corrections or {}
-    check_corrections_fit(
-        corrections.values(), first, session.config.tracker.name, getattr(source, "selection", None)
-    )
-    given = given_of(first, prompt, source.count, start_frame, corrections.values())
-    config = session.config.model_dump(mode="json")
-    if resume and not source.repeatable:
-        raise InputError(
-            f"{source.name} cannot be read again from its start, so that no run of it can be resumed."
-        )
-    if resume:
+    source, one = opened.source, opened.objects[number]
+    session, runtime = one.session, opened.config.runtime
+    given = given_of(opened.first, one.prompt, source.count, opened.start_frame, one.corrections.values())
+    header = _header(opened, one.session, options, given)
+    earlier: Earlier = "none"
+    if options.resume:
+        if not source.repeatable:
+            raise InputError(
+                f"{source.name} cannot be read again from its start, so that no run of it can be resumed."
+            )
         take_over(folder)
-    earlier = earlier_run(folder, config, selection, given) if resume else "none"
+        earlier = earlier_run(folder, header.config, options.selection, given)
     if earlier == "finished":
         finish_state(folder)
         return None
     if earlier == "outdated":
-        folder, earlier = corrected_aside(folder, config, selection, given, writers)
-    runtime = session.config.runtime
-    keeps = runtime.device, runtime.milestones
-    checkpoint = kept = None
+        folder, earlier = corrected_aside(folder, header.config, options.selection, given, writers)
+    checkpoint: Checkpoint | None = None
+    kept: Kept | None = None
     if earlier == "stopped":
-        checkpoint = Checkpoint(folder, session.state_classes, *keeps)
+        checkpoint = Checkpoint(folder, session.state_classes, runtime.device, runtime.milestones)
         kept = checkpoint.read()
-    height, width = first.size
-    writer = RunWriter(
-        folder,
-        config=config,
-        camera=camera_of(session.config, width, height, source.intrinsics, source.intrinsics_origin),
-        source=source.name,
-        seed=session.config.runtime.seed,
-        renderer=session.renderer,
-        fps=source.fps,
-        source_notes=notes_of(source),
-        command=command,
-        selection=selection,
-        given=given,
-        tracker_choice=choice,
-        overwrite=overwrite or resume,
-        resume=WrittenSoFar(kept.progress.lines, kept.progress.seconds, kept.skipped) if kept else None,
+    so_far = WrittenSoFar(kept.progress.lines, kept.progress.seconds, kept.skipped) if kept else None
+    writer = writers.enter_context(
+        RunWriter(folder, header, overwrite=options.overwrite or options.resume, resume=so_far)
     )
-    writers.enter_context(writer)
-    keep_given_masks(folder, first.index, prompt, corrections.values())
+    keep_given_masks(folder, opened.first.index, one.prompt, one.corrections.values())
     if checkpoint is not None and kept is not None:
         checkpoint.clear_strangers()
         failures = {index: frame.failure for index, frame in kept.taken.items() if frame.failure}
-        session.resume(first, kept.session, failures)
+        session.resume(opened.first, kept.session, failures)
         writer.use_camera(session.camera)
-    elif resumable and source.repeatable:
-        checkpoint = Checkpoint(folder, session.state_classes, *keeps)
-    return ObjectRecording(session, writer, checkpoint, kept, corrections, redraw=start_frame is not None)
+    elif not temporary and source.repeatable:
+        checkpoint = Checkpoint(folder, session.state_classes, runtime.device, runtime.milestones)
+    state = RunState(checkpoint, kept)
+    return ObjectRecording(one, writer, state, opened.start_frame is not None, temporary)
 
 
-def with_tracker(
-    config: PipelineConfig,
-    source: FrameSource,
-    first: Frame,
-    prompt: Prompt | None,
-    folder: Path,
-    resume: bool,
-) -> tuple[PipelineConfig, str | None]:
-    """The configuration with a tracker in place of ``auto``, and why it is that one; None where it was named.
-
-    A run that goes on does so with the tracker that it was begun with.
-    """
-    if config.tracker.name != AUTO:
-        return config, None
-    if resume and (folder / RUN).is_file():
-        before = RunReader(folder)
-        if why := before.description.get("tracker_choice"):
-            tracker = PluginChoice.model_validate(before.config["tracker"])
-            return config.model_copy(update={"tracker": tracker}), str(why)
-    config, why = choose_tracker(config, source.count, not source.repeatable, first, prompt)
-    _log.info("Mask tracker: %s.", why)
-    return config, why
-
-
-def first_frame(
-    frames: Iterator[Frame | SkippedFrame], name: str, skip_damaged: bool
-) -> tuple[list[SkippedFrame], Frame]:
-    """The first frame that can be decoded, and those before it that cannot.
-
-    Raises:
-        InputError: If there is none; or there are frames before it, and they must not be skipped.
-    """
-    skipped: list[SkippedFrame] = []
-    for frame in frames:
-        if isinstance(frame, Frame):
-            return skipped, frame
-        if not skip_damaged:
-            raise damaged_start(frame)
-        skipped.append(frame)
-    raise InputError(f"{name} has no frame that can be decoded.")
+def _header(
+    opened: OpenTracking, session: Session, options: RecordOptions, given: Mapping[str, Any]
+) -> RunHeader:
+    """What ``run.json`` says of an object's run from its start."""
+    source, config = opened.source, opened.config
+    height, width = opened.first.size
+    return RunHeader(
+        config=config.model_dump(mode="json"),
+        camera=select_camera(config, width, height, source.intrinsics, source.intrinsics_origin),
+        source=source.name,
+        seed=config.runtime.seed,
+        fps=source.fps,
+        command=options.command,
+        source_notes=source_notes(source),
+        selection=options.selection,
+        renderer=session.renderer,
+        given=given,
+        tracker_choice=opened.tracker_choice,
+    )

@@ -22,7 +22,7 @@ from tracking3d.frames import Frame, MaskEstimate, Prompt, pixels
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.lens import Lens
 from tracking3d.mask_tracking import PromptedTracker
-from tracking3d.object_files import camera_of, known_object
+from tracking3d.object_files import known_object, select_camera
 from tracking3d.parts import SOLVERS, build_encoder, build_solver, check_turns, chosen_renderer, with_times
 from tracking3d.plugins.guard import PluginFailure
 from tracking3d.presented import Presented
@@ -139,7 +139,7 @@ class Session:
     def _begun(self, first: Frame) -> Solver[Any]:
         """The solver for a video that begins with ``first``; the camera is set for it, too."""
         height, width = first.size
-        self._camera = camera_of(self.config, width, height, *self._intrinsics)
+        self._camera = select_camera(self.config, width, height, *self._intrinsics)
         warn_of_unlikely(self._camera)
         self._first, self._presented, self._latest = first, Presented(first.index), first.index
         solver = build_solver(self.config, self._camera, self._encoder, self._known)

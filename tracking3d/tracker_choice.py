@@ -25,7 +25,7 @@ _CARRIED = 0.05
 
 
 @dataclass(frozen=True)
-class Candidate:
+class TrackerCandidate:
     """A mask tracker that was measured.
 
     Attributes:
@@ -52,22 +52,22 @@ _SAM_FILES, _U2_FILES = ("mobile-sam-encoder", "mobile-sam-decoder"), ("u2netp",
 _NANO_FILES = ("nanotrack-backbone", "nanotrack-head")
 
 CANDIDATES = (
-    Candidate("onnx", "MobileSAM in NanoTrack's box", 0.940, 1.57, _SAM_FILES + _NANO_FILES, _SAM | _NANO),
-    Candidate("onnx", "MobileSAM in CSR-DCF's box", 0.919, 1.60, _SAM_FILES, _SAM),
-    Candidate("onnx", "U2Netp in NanoTrack's box", 0.918, 0.97, _U2_FILES + _NANO_FILES, _U2 | _NANO),
-    Candidate(
+    TrackerCandidate("onnx", "MobileSAM in NanoTrack's box", 0.940, 1.57, _SAM_FILES + _NANO_FILES, _SAM | _NANO),
+    TrackerCandidate("onnx", "MobileSAM in CSR-DCF's box", 0.919, 1.60, _SAM_FILES, _SAM),
+    TrackerCandidate("onnx", "U2Netp in NanoTrack's box", 0.918, 0.97, _U2_FILES + _NANO_FILES, _U2 | _NANO),
+    TrackerCandidate(
         "onnx", "MobileSAM in NanoTrack's box, every 5th frame", 0.912, 0.36, _SAM_FILES + _NANO_FILES,
         _SAM | _NANO | {"every": 5},
     ),
-    Candidate(
+    TrackerCandidate(
         "onnx", "U2Netp in NanoTrack's box, every 5th frame", 0.894, 0.25, _U2_FILES + _NANO_FILES,
         _U2 | _NANO | {"every": 5},
     ),
-    Candidate("onnx", "U2Netp in CSR-DCF's box", 0.888, 1.00, _U2_FILES, _U2),
+    TrackerCandidate("onnx", "U2Netp in CSR-DCF's box", 0.888, 1.00, _U2_FILES, _U2),
     # Answers to the masks of both, which correct them, have a mean IoU of .880 with csrt and .883 with flow on 24 fresh
     # clips, and of .891 and .874 on five real ones; flow takes half of the time.
-    Candidate("csrt", "csrt, which needs no network", 0.857, 0.06),
-    Candidate("flow", "flow, which needs neither network nor correlation filter", 0.789, 0.05),
+    TrackerCandidate("csrt", "csrt, which needs no network", 0.857, 0.06),
+    TrackerCandidate("flow", "flow, which needs neither network nor correlation filter", 0.789, 0.05),
 )  # fmt: skip
 """The best first."""
 
@@ -121,7 +121,7 @@ def choose_tracker(
     raise AssertionError("the last candidate needs nothing and is always taken")
 
 
-def _usable() -> Iterator[Candidate]:
+def _usable() -> Iterator[TrackerCandidate]:
     """The candidates whose networks are in the cache, whole; ``csrt`` where this OpenCV has its correlation filter."""
     from tracking3d.trackers.csrt import CsrtTracker
 
@@ -137,7 +137,7 @@ def _usable() -> Iterator[Candidate]:
             yield candidate
 
 
-def _timed(candidate: Candidate, first: Frame, prompt: Prompt) -> float | None:
+def _timed(candidate: TrackerCandidate, first: Frame, prompt: Prompt) -> float | None:
     """Seconds that a frame takes here; None where the tracker cannot be used.
 
     The same frame is shown twice. Where a network sees every k-th frame only, it is the share of one in k.

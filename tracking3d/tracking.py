@@ -3,57 +3,28 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Generator, Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
-from dataclasses import dataclass
-from pathlib import Path
+from contextlib import ExitStack, closing
+from dataclasses import replace
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.config.models import PipelineConfig
-from tracking3d.corrections import Correction, check_corrections_fit, prompts_in
-from tracking3d.errors import InputError
-from tracking3d.estimation.estimate import FrameEstimate
-from tracking3d.frames import Frame, Prompt, SkippedFrame
-from tracking3d.object_recording import ObjectRecording
-from tracking3d.passes import look_again
+from tracking3d.errors import InputError, PluginError
+from tracking3d.estimation.estimate import FrameEstimate, unanswered
+from tracking3d.frame_reading import with_share
+from tracking3d.frames import Frame, MaskEstimate
+from tracking3d.open_tracking import NoFrameError, TrackedObject, TrackRequest, open_tracking
+from tracking3d.passes import ActiveRecordings, look_again
 from tracking3d.point_following import PointFollowing
-from tracking3d.prompts import damaged_start
 from tracking3d.reconstruction.asked_shape import shape_as_asked
-from tracking3d.recording import begun, opened
-from tracking3d.session import Session
-from tracking3d.tracker_choice import choose_tracker
+from tracking3d.recording import RecordOptions, begin_recording
 from tracking3d.tracking_result import TemporaryRun, TrackingResult
-from tracking3d.video.source import FrameSource
 
 _T = TypeVar("_T")
-
-
-@dataclass(frozen=True, eq=False)
-class Task:
-    """What `tracking3d.track` was asked for, checked.
-
-    Attributes:
-        source: The frames.
-        config: The pipeline.
-        prompt: Makes the object of the first frame; None where the mask tracker knows it.
-        corrections: What the object is in later frames, by their index.
-        start_frame: The frame in which the object is given; None for the first.
-        skip_damaged: Whether frames before the first that can be read are passed over.
-        queries: Points to follow, see `tracking3d.point_following.checked_queries`.
-    """
-
-    source: FrameSource
-    config: PipelineConfig
-    prompt: Callable[[Frame], Prompt] | None
-    corrections: Mapping[int, Correction]
-    start_frame: int | None
-    skip_damaged: bool
-    queries: NDArray[np.float64] | None
 
 
 class Tracking(Iterator[FrameEstimate]):
@@ -67,8 +38,10 @@ class Tracking(Iterator[FrameEstimate]):
     temporary run folder, which lives as long as the result.
     """
 
-    def __init__(self, task: Task, keeps: bool) -> None:
-        self._task, self._keeps = task, keeps
+    def __init__(
+        self, request: TrackRequest, keeps: bool, queries: NDArray[np.float64] | None = None
+    ) -> None:
+        self._request, self._keeps, self._queries = request, keeps, queries
         self._answers: Generator[FrameEstimate] | None = None
         self._kept: TemporaryRun | None = None
         self._result: TrackingResult | None = None
@@ -92,7 +65,7 @@ class Tracking(Iterator[FrameEstimate]):
                     "The answers that were taken one by one are not kept; ask for result() first, or give refine= or "
                     "model= where both are wanted."
                 )
-            self._result = TrackingResult(self._kept, self._task.source, self._task.queries)
+            self._result = TrackingResult(self._kept, self._request.source, self._queries)
         return self._result
 
     async def result_async(self) -> TrackingResult:
@@ -133,8 +106,14 @@ class Tracking(Iterator[FrameEstimate]):
         if self._answers is None:
             if keeps:
                 self._kept = TemporaryRun()
-            self._answers = _answers(self._task, self._kept)
+            self._answers = self._estimates()
         return self._answers
+
+    def _estimates(self) -> Generator[FrameEstimate]:
+        following = None if self._queries is None else PointFollowing(self._queries)
+        with closing(track_frames(self._request, self._kept)) as tracked:
+            for frame, [one], [estimate] in tracked:
+                yield estimate if following is None else following.step(one.session, frame, estimate)
 
 
 class _Worker:
@@ -162,64 +141,77 @@ class _Worker:
             yield answer
 
 
-def _answers(task: Task, kept: TemporaryRun | None) -> Generator[FrameEstimate]:
-    """The answers, frame by frame; where there is a run they are kept in it, and after the last all is finished."""
-    folder = None if kept is None else kept.folder
-    session: Session | None = None
-    recording: ObjectRecording | None = None
-    following = None if task.queries is None else PointFollowing(task.queries)
-    skipped: list[SkippedFrame] = []
-    with opened(task.source, task.config, task.start_frame) as frames, ExitStack() as writers:
-        for frame in frames:
-            if isinstance(frame, SkippedFrame):
-                if session is None and not task.skip_damaged:
-                    raise damaged_start(frame)
-                skipped.append(frame)
-                continue
-            if session is None:
-                session, recording = _started(task, frame, folder, writers)
-            if recording is None:
-                estimate = session.step(frame, *prompts_in(frame, task.corrections))
-            else:
-                for one in skipped:
-                    recording.take(one)
+def track_frames(
+    request: TrackRequest, run: TemporaryRun | None = None
+) -> Generator[tuple[Frame, tuple[TrackedObject, ...], tuple[FrameEstimate, ...]]]:
+    """Track the objects of a request, frame by frame as the caller takes them.
+
+    Args:
+        request: What is to be tracked.
+        run: Keeps everything about the only object; after the last frame the run is finished as any run is. If None,
+            nothing is kept, and an object whose plug-in has failed is estimated as lost from then on.
+
+    Yields:
+        Each frame that can be decoded, the objects, and the estimate of each object.
+
+    Raises:
+        Tracking3dError: If a frame cannot be used, a prompt does not fit the first one, or the last object has failed.
+    """
+    with ExitStack() as ends:
+        try:
+            opened = ends.enter_context(open_tracking(request))
+        except NoFrameError:
+            if run is None:
+                return
+            raise
+        objects, recording = _ObjectsInStep(opened.objects), None
+        if run is not None:
+            recording = begin_recording(opened, 0, run.folder, RecordOptions(), ends, temporary=True)
+        for frame in opened.frames:
+            if recording is not None:
                 recording.take(frame)
-                assert recording.latest is not None
-                estimate = recording.latest
-            skipped.clear()
-            yield estimate if following is None else following.step(session, frame, estimate)
+            if not isinstance(frame, Frame):
+                continue
+            if recording is None:
+                yield frame, opened.objects, objects.step(frame)
+            elif recording.latest is not None:
+                yield frame, opened.objects, (recording.latest,)
         if recording is not None:
-            _finish(recording, task.source)
-        elif folder is not None:
-            raise InputError(f"{task.source.name} has no frame that can be decoded.")
-    if kept is not None:
-        kept.about_shape = shape_as_asked(kept.folder, task.config, task.source)
+            look_again(opened.source, ActiveRecordings([recording]))
+    if run is not None:
+        run.about_shape = shape_as_asked(run.folder, opened.config, opened.source)
 
 
-def _started(
-    task: Task, first: Frame, folder: Path | None, writers: ExitStack
-) -> tuple[Session, ObjectRecording | None]:
-    source, prompt = task.source, task.prompt and task.prompt(first)
-    config, choice = choose_tracker(task.config, source.count, not source.repeatable, first, prompt)
-    session = Session(config, prompt, source.intrinsics, source.intrinsics_origin)
-    check_corrections_fit(task.corrections.values(), first, config.tracker.name)
-    if folder is None:
-        return session, None
-    recording = begun(
-        source, session, prompt, choice=choice or None, first=first, folder=folder, command=None, selection=None,
-        overwrite=False, resume=False, writers=writers, start_frame=task.start_frame, corrections=task.corrections,
-        resumable=False,
-    )  # fmt: skip
-    return session, recording
+class _ObjectsInStep:
+    """Objects that take frame after frame together; one whose plug-in has failed is lost from then on."""
 
+    def __init__(self, objects: Sequence[TrackedObject]) -> None:
+        self._objects = objects
+        self._failures: dict[int, PluginError] = {}
+        self._latest: list[FrameEstimate | None] = [None for _ in objects]
 
-def _finish(recording: ObjectRecording, source: FrameSource) -> None:
-    """The final refinement, where the configuration asks for it and it is possible, and the model."""
+    def step(self, frame: Frame) -> tuple[FrameEstimate, ...]:
+        """The estimate of each object in the next frame.
 
-    def does(action: Callable[[ObjectRecording], Any]) -> None:
-        action(recording)
-
-    look_again(source, [recording], does)
+        Raises:
+            PluginError: If the last object has failed.
+        """
+        shared, estimates = with_share(frame, len(self._objects)), []
+        for number, one in enumerate(self._objects):
+            if number not in self._failures:
+                try:
+                    self._latest[number] = estimate = one.step(shared)
+                    estimates.append(estimate)
+                    continue
+                except PluginError as error:
+                    self._failures[number] = error
+                    if len(self._failures) == len(self._objects):
+                        raise
+            why, latest = str(self._failures[number]), self._latest[number]
+            pose = np.eye(4) if latest is None else latest.T_cam_obj
+            lost = unanswered(shared, MaskEstimate(None), pose)
+            estimates.append(replace(lost, reason=why, failure=why))
+        return tuple(estimates)
 
 
 def _nothing() -> Generator[FrameEstimate]:

@@ -18,13 +18,13 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from tracking3d.arguments import checked_folder
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import ObjectModel, Status
-from tracking3d.export.exporter import ExportOptions
 from tracking3d.export.exporting import Export, export_run
+from tracking3d.export.options import ExportOptions
 from tracking3d.geometry.camera import Camera
 from tracking3d.results.correspondences import PointTracks, track_points
 from tracking3d.results.files import writing
 from tracking3d.results.following import RunScene, open_scene
-from tracking3d.results.making_room import make_room
+from tracking3d.results.making_room import clear_run_folder
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
@@ -46,7 +46,7 @@ class TemporaryRun:
         weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)
 
 
-class Masks(Sequence[NDArray[np.bool_]]):
+class MaskSequence(Sequence[NDArray[np.bool_]]):
     """The answers' masks in the order of the frames, each read when it is asked for; ``np.asarray`` reads all.
 
     Args:
@@ -125,9 +125,9 @@ class TrackingResult:
         return np.array([record.T_cam_obj for record in self.frames]).reshape(-1, 4, 4)
 
     @property
-    def masks(self) -> Masks:
+    def masks(self) -> MaskSequence:
         """``(N, H, W)`` bool, read as they are asked for."""
-        return Masks(self.run)
+        return MaskSequence(self.run)
 
     @property
     def statuses(self) -> tuple[Status, ...]:
@@ -229,7 +229,7 @@ class TrackingResult:
         into = checked_folder(folder)
         with writing(into):
             into.mkdir(parents=True, exist_ok=True)
-        make_room(into, overwrite)
+        clear_run_folder(into, overwrite)
         with writing(into):
             shutil.copytree(self.run.folder, into, dirs_exist_ok=True)
         return RunReader(into, refined=self.run.refined)

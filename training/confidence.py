@@ -4,7 +4,7 @@
 ``--out`` of ``tracking3d evaluate suite``. Evidence are names of losses in ``frames.jsonl``, and ``has_mask``,
 ``iou_initial`` and ``recorded`` (the confidence that the run said itself), and of the online solver's runs what its
 confidence is made of (`tracking3d.estimation.online.judgement.weighed`), and of refined answers what landmarks say of
-them (`tracking3d.reconstruction.support.weighed`). Without ``--evidence`` all losses count. A
+them (`tracking3d.reconstruction.support.refined_confidence_features`). Without ``--evidence`` all losses count. A
 name with a sign, ``--evidence=-silhouette,+matching``, can only speak against an answer, or for it.
 """
 
@@ -25,12 +25,18 @@ from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.online.judgement import weighed
 from tracking3d.evaluation.calibration import area_under_roc, expected_calibration_error, reliability
-from tracking3d.evaluation.confidence_fit import PENALTY, LogisticConfidence, fit_confidence, halves, paste
+from tracking3d.evaluation.confidence_fit import (
+    PENALTY,
+    LogisticConfidence,
+    as_python_source,
+    fit_confidence,
+    halves,
+)
 from tracking3d.evaluation.confidence_scores import right_frames
 from tracking3d.evaluation.mask_scores import compare_masks
 from tracking3d.evaluation.pose_scores import pair_poses, rotation_errors
 from tracking3d.points.landmarks import Support
-from tracking3d.reconstruction.support import weighed as supported_by
+from tracking3d.reconstruction.support import refined_confidence_features as supported_by
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
 
@@ -137,9 +143,9 @@ def main(words: list[str]) -> None:
                 print(f"  {low:.1f} to {high:.1f}: {count:5d} frames, said {mean:.2f}, right {share:.2f}")
     everything = fit_confidence(*table(frames, names), signs, options.penalty)
     print("\n# fitted on the first half:")
-    print(paste(fits[0]))
+    print(as_python_source(fits[0]))
     print("\n# fitted on all sequences:")
-    print(paste(everything))
+    print(as_python_source(everything))
     if options.json:
         options.json.write_text(json.dumps({"half": asdict(fits[0]), "all": asdict(everything)}, indent=1))
 

@@ -19,7 +19,7 @@ import numpy as np
 from point_uncertainty import fit
 
 from tracking3d.points.image_following import follow_in_images
-from tracking3d.points.image_uncertainty import features
+from tracking3d.points.image_uncertainty import image_error_features
 from tracking3d.points.pictures import Picture, open_picture
 from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
 from tracking3d.synthesis.procedural_texture import paint_background
@@ -94,7 +94,7 @@ def collected(cases: Iterator[Case]) -> Iterator[tuple[np.ndarray, np.ndarray, n
         hidden = np.zeros(visible.shape)
         for row in range(1, len(gap)):
             hidden[row] = np.where(found.visible[row], 0, hidden[row - 1] + 1)
-        known = features(found.variance, np.broadcast_to(gap[:, None], visible.shape), hidden)
+        known = image_error_features(found.variance, np.broadcast_to(gap[:, None], visible.shape), hidden)
         yield known[counts], error[counts], found.visible[counts], 2 * found.uncertainty[counts]
 
 

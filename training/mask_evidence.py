@@ -27,7 +27,7 @@ from tracking3d.benchmark.variant import Variant
 from tracking3d.errors import InputError
 from tracking3d.estimation.online import answers
 from tracking3d.estimation.online.answer_mask import finer, seen_through
-from tracking3d.evidence import SOURCES, as_lab, features, weighing
+from tracking3d.evidence import SOURCES, as_lab, pixel_features, weighing
 
 PIXELS = 500
 """Of a frame, at most; each frame counts the same."""
@@ -94,7 +94,7 @@ def told(truth: Any, sequence: int, into: list[Samples]) -> Iterator[None]:
         if asked and max(_overlap(initial, exact), _overlap(rendered, exact)) >= _LEAST_OVERLAP:
             window, image = finer(observation)
             masks = [seen_through(mask, window) for mask in (initial, rendered, exact)]
-            found = features(as_lab(image), *masks[:2], confidence, colours)
+            found = pixel_features(as_lab(image), *masks[:2], confidence, colours)
             chosen = sampled(found, observation.index)
             rows = found.reshape(-1, found.shape[-1])[chosen].astype(np.float64)
             count = len(chosen)

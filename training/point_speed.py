@@ -18,7 +18,7 @@ import trimesh
 from scipy.spatial import HalfspaceIntersection
 
 from tracking3d.points.follow import follow_points
-from tracking3d.points.landmarks import Scene
+from tracking3d.points.landmarks import LandmarkScene
 from tracking3d.points.view import open_view
 from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
 
@@ -39,7 +39,7 @@ def main() -> None:
         open_view(image, mask, clip.camera, T, *surface)
         for image, mask, T in zip(clip.images, clip.masks, clip.T_cam_obj, strict=True)
     ]
-    scene = Scene(list(views), *surface)
+    scene = LandmarkScene(list(views), *surface)
     rows, columns = np.nonzero(clip.masks[0])
     chosen = np.random.default_rng(0).choice(len(rows), POINTS, replace=False)
     xy = np.stack([columns[chosen], rows[chosen]], 1).astype(float)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tracking3d.batch import in_parts, tasks
-from tracking3d.batch.folder import read_failures, read_results
+from tracking3d.batch.folder import read_failures, read_result_rows
 from tracking3d.batch.listing import list_jobs
 from tracking3d.batch.running import run_batch
 from tracking3d.batch.tasks import Tasks
@@ -19,7 +19,7 @@ from tracking3d.engines.in_this_process import InThisProcess
 from tracking3d.engines.protocol import Ended as TaskEnded
 from tracking3d.engines.protocol import Fault
 from tracking3d.errors import OutputError
-from tracking3d.splitting.long_video import Ended
+from tracking3d.splitting.long_video import SplitResult
 from tracking3d.splitting.steps import Step
 
 
@@ -56,7 +56,7 @@ def cut(monkeypatch, finished_run):
         assert answers == [10, 20]
         folders = [begun.folder / "parts" / f"part_{n}" for n in (0, 1)] if refused else [begun.folder]
         yield [Step(end, folders, "its end")]
-        return Ended(tuple(folders), 2, *refused)
+        return SplitResult(tuple(folders), 2, *refused)
 
     monkeypatch.setattr(in_parts, "begin", begin)
     monkeypatch.setattr(tasks, "steps_of", steps_of)
@@ -90,7 +90,7 @@ def test_its_parts_are_tasks_and_its_run_is_one_row(cut, long_batch, tmp_path):
     began = [one.about.get("step", "") for one in told if one.video == "one" and one.event == "began"]
     assert began == ["", "part 1 of 2", "part 2 of 2", "its end", "its report"]
     assert [one.event for one in told if one.video == "one"].count("finished") == 1
-    assert sorted(row["run"] for row in read_results(str(tmp_path / "out"))) == ["in/two", "one"]
+    assert sorted(row["run"] for row in read_result_rows(str(tmp_path / "out"))) == ["in/two", "one"]
     assert (tmp_path / "out/one/batch.json").is_file() and not (tmp_path / "out/.work").exists()
 
 
@@ -98,7 +98,7 @@ def test_parts_that_cannot_be_joined_are_a_row_each_with_the_reason(cut, long_ba
     cut[2].append("they tell of two objects")
     progress, _ = long_batch()
     assert progress.failed == 0
-    rows = {row["run"]: row for row in read_results(str(tmp_path / "out"))}
+    rows = {row["run"]: row for row in read_result_rows(str(tmp_path / "out"))}
     assert set(rows) == {"in/two", "one/parts/part_0", "one/parts/part_1"}
     assert "two objects" in rows["one/parts/part_1"]["note"] and not rows["in/two"]["note"]
     assert (tmp_path / "out/one/parts/part_1/run.json").is_file()
@@ -109,7 +109,7 @@ def test_a_part_that_fails_once_is_tried_again_by_itself(cut, long_batch, tmp_pa
     cut[1][2] = [OutputError("The disk is full.")]
     progress, _ = long_batch()
     assert progress.failed == 0 and cut[0].count(1) == 1 and cut[0].count(2) == 2
-    [row] = [row for row in read_results(str(tmp_path / "out")) if row["run"] == "one"]
+    [row] = [row for row in read_result_rows(str(tmp_path / "out")) if row["run"] == "one"]
     assert row["attempts"] == "2"
 
 

@@ -7,8 +7,8 @@ import socket
 import fsspec
 import pytest
 
-from tracking3d.batch.folder import read_failures, read_progress, read_results
-from tracking3d.batch.places import joined
+from tracking3d.batch.folder import read_failures, read_progress, read_result_rows
+from tracking3d.batch.places import join_path
 from tracking3d.batch.summary import MARKER
 
 pytestmark = [
@@ -63,22 +63,22 @@ def test_a_batch_from_a_store_into_a_store(kind, request, batch, videos):
     files.put(str(videos), "clips/videos", recursive=True)
     files.pipe_file("clips/videos/broken.mp4", b"nothing")
     files.pipe_file("clips/videos/broken.box", b"1,1,5,5")
-    out = joined(bucket, "runs")
+    out = join_path(bucket, "runs")
 
-    progress, _ = batch(joined(bucket, "videos"), out=out)
+    progress, _ = batch(join_path(bucket, "videos"), out=out)
     assert (progress.finished, progress.failed) == (2, 1)
     files.invalidate_cache()
     found = set(files.find("clips/runs"))
     for name in ("one", "in/two"):
         assert {f"clips/runs/{name}/{file}" for file in ("run.json", "frames.jsonl", MARKER)} <= found
     assert {"clips/runs/index.html", "clips/runs/logs/broken.log"} <= found
-    assert sorted(row["run"] for row in read_results(out)) == ["in/two", "one"]
+    assert sorted(row["run"] for row in read_result_rows(out)) == ["in/two", "one"]
     assert [failure.run for failure in read_failures(out)] == ["broken"]
     assert read_progress(out).state == "finished"
 
-    table = joined(bucket, "jobs.csv")
+    table = join_path(bucket, "jobs.csv")
     files.pipe_file("clips/jobs.csv", b'video,box\nvideos/one.mp4,"30,20,36,24"\n')
-    again, _ = batch(table, out=joined(bucket, "by_table"))
+    again, _ = batch(table, out=join_path(bucket, "by_table"))
     assert again.finished == 1
-    once_more, _ = batch(table, out=joined(bucket, "by_table"))
+    once_more, _ = batch(table, out=join_path(bucket, "by_table"))
     assert once_more.before == 1

@@ -14,7 +14,7 @@ from recorded_runs import write_frames
 from small_videos import BOX, write_video
 
 from tracking3d.batch.listing import NO_PROMPT, dataset_jobs, list_jobs
-from tracking3d.batch.places import absolute, joined, local
+from tracking3d.batch.places import absolute, join_path, local
 from tracking3d.benchmark.sequences import open_dataset
 from tracking3d.config.loading import load_config
 from tracking3d.datasets.clip import write_clip
@@ -184,5 +184,5 @@ def test_places_mean_the_same_everywhere(monkeypatch, tmp_path):
     assert absolute("b.mp4", "s3://bucket/a") == "s3://bucket/a/b.mp4"
     assert absolute("s3://bucket/b.mp4", "/a") == "s3://bucket/b.mp4"
     assert absolute(f"file://{tmp_path}/b.mp4") == str(tmp_path / "b.mp4")
-    assert joined("gs://bucket/a", "b", "c") == "gs://bucket/a/b/c"
-    assert joined("a", "b") == str(Path("a/b"))
+    assert join_path("gs://bucket/a", "b", "c") == "gs://bucket/a/b/c"
+    assert join_path("a", "b") == str(Path("a/b"))

@@ -6,7 +6,7 @@ import pytest
 from browser import open_page
 
 from tracking3d.batch import overview
-from tracking3d.batch.folder import Failure, Progress
+from tracking3d.batch.folder import BatchProgress, Failure
 from tracking3d.batch.overview import write_overview
 from tracking3d.batch.summary import COLUMNS
 
@@ -24,7 +24,7 @@ ROWS = [row("day/b", 0.9), row("day/a", 0.2, lost=3), row("night/c", None)]
 
 
 def written(folder, rows=ROWS, failures=(), pictures=None) -> str:
-    write_overview(str(folder), Progress("finished", len(rows)), rows, pictures or {}, failures)
+    write_overview(str(folder), BatchProgress("finished", len(rows)), rows, pictures or {}, failures)
     return (folder / "index.html").read_text()
 
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from heavy_task import hold
 
-from tracking3d.batch.demonstration import ABORTING, DAMAGED, FILLING, Asked, demonstrate, make_clips
-from tracking3d.batch.load import load_now
+from batch_passes import ABORTING, DAMAGED, FILLING, Asked, demonstrate, make_clips
+from machine_load import load_now
 from tracking3d.batch.running import run_batch
 from tracking3d.batch.video_job import VideoJob
 from tracking3d.benchmark.job import Job

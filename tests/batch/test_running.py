@@ -11,7 +11,7 @@ import fsspec
 import pytest
 
 from tracking3d.batch import folder as batch_folder
-from tracking3d.batch.folder import read_failures, read_progress, read_results
+from tracking3d.batch.folder import read_failures, read_progress, read_result_rows
 from tracking3d.batch.places import _opened
 from tracking3d.batch.summary import COLUMNS, MARKER
 from tracking3d.config.loading import load_config
@@ -32,7 +32,7 @@ def test_every_video_gets_a_run_folder_a_row_a_log_and_a_picture(batch, videos, 
         assert RunReader(out / name).state == "finished"
         assert (out / "logs" / f"{name}.log").is_file()
         assert events(told, name) == ["began", "progress", "progress", "finished"]
-    rows = read_results(str(out))
+    rows = read_result_rows(str(out))
     assert sorted(row["run"] for row in rows) == ["in/two", "one"]
     assert set(rows[0]) == set(COLUMNS) and rows[0]["frames"] == "2" and float(rows[0]["confidence"]) == 0.9
     assert read_failures(str(out)) == []
@@ -54,7 +54,7 @@ def test_parquet_has_the_same_rows(batch, videos, tmp_path):
 def test_without_pyarrow_there_is_csv(batch, videos, tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
     batch(videos)
-    assert len(read_results(str(tmp_path / "out"))) == 2
+    assert len(read_result_rows(str(tmp_path / "out"))) == 2
     assert not (tmp_path / "out/results.parquet").exists()
 
 
@@ -62,7 +62,7 @@ def test_what_is_whole_is_not_done_again_and_is_in_the_tables_all_the_same(batch
     batch(videos)
     progress, told = batch(videos)
     assert len(recorded.calls) == 2 and progress.before == progress.finished == 2
-    assert len(read_results(str(tmp_path / "out"))) == 2
+    assert len(read_result_rows(str(tmp_path / "out"))) == 2
     assert {one.event for one in told} == {"batch"}
     batch(videos, overwrite=True)
     assert len(recorded.calls) == 4
@@ -94,7 +94,7 @@ def test_a_video_that_fails_once_goes_on_where_it_was(batch, videos, recorded, t
     assert events(told, "one").count("again") == 1
     first, second = (call["folder"] for call in recorded.calls if "one" in call["source"].name)
     assert first == second and all(call["resume"] for call in recorded.calls)
-    [row] = [row for row in read_results(str(tmp_path / "out")) if row["run"] == "one"]
+    [row] = [row for row in read_result_rows(str(tmp_path / "out")) if row["run"] == "one"]
     assert row["attempts"] == "2"
 
 
@@ -130,7 +130,7 @@ def test_ctrl_c_keeps_what_is_done_and_the_same_call_goes_on(batch, videos, reco
         batch(videos)
     out = str(tmp_path / "out")
     assert read_progress(out).state == "interrupted" and read_progress(out).finished == 1
-    assert [row["run"] for row in read_results(out)] == ["one"]
+    assert [row["run"] for row in read_result_rows(out)] == ["one"]
     assert not (tmp_path / "out/in/two").exists()
     [left] = (tmp_path / "out/.work").iterdir()
     progress, _ = batch(videos)
@@ -143,7 +143,7 @@ def test_several_objects_are_one_video_with_a_row_each(batch, videos, recorded, 
     progress, _ = batch(videos)
     assert progress.finished == 2
     assert (tmp_path / "out/one/object_1/run.json").is_file()
-    runs = {row["run"] for row in read_results(str(tmp_path / "out"))}
+    runs = {row["run"] for row in read_result_rows(str(tmp_path / "out"))}
     assert runs == {"one/object_0", "one/object_1", "in/two"}
 
 
@@ -165,7 +165,9 @@ def test_results_elsewhere_have_their_marker_last(batch, videos, monkeypatch):
             len(put) - 1,
         ]
         assert files.exists("/results/in/two/frames.jsonl") and files.exists("/results/logs/one.log")
-        assert len(read_results("memory://results")) == 2 and read_progress("memory://results").finished == 2
+        assert (
+            len(read_result_rows("memory://results")) == 2 and read_progress("memory://results").finished == 2
+        )
         again, _ = batch(videos, out="memory://results")
         assert again.before == 2
     finally:
@@ -180,7 +182,7 @@ def test_videos_elsewhere_are_fetched_and_not_kept(batch, videos, recorded, tmp_
     finally:
         files.rm("/sources", recursive=True)
     assert progress.finished == 2
-    assert all(row["video"].startswith("memory://") for row in read_results(str(tmp_path / "out")))
+    assert all(row["video"].startswith("memory://") for row in read_result_rows(str(tmp_path / "out")))
     assert not any(Path(call["source"].path).exists() for call in recorded.calls)
 
 

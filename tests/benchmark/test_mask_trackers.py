@@ -12,8 +12,8 @@ from tracking3d.benchmark.mask_table import format_masks, report
 from tracking3d.benchmark.mask_trackers import (
     FLOW_CUES,
     Contestant,
-    Measured,
     TrackedFrame,
+    TrackerMeasurement,
     ablation,
     area_under_roc,
     measure_trackers,
@@ -83,7 +83,7 @@ def test_there_is_no_area_without_both_right_and_wrong(right):
 def test_the_figures_of_a_few_frames():
     frames = [(0.9, 0.8, 0.9), (0.6, np.nan, 0.5), (0.4, 0.2, 0.7), (0.5, 0.5, 0.1)]
     tracked = tuple(TrackedFrame(n, *values) for n, values in enumerate(frames, start=1))
-    figures = Measured("t", "s", tracked, seconds=(0.01, 0.5, 0.03)).figures()
+    figures = TrackerMeasurement("t", "s", tracked, seconds=(0.01, 0.5, 0.03)).figures()
     assert figures == {
         "iou_mean": pytest.approx(0.6),
         "boundary_f_mean": pytest.approx(0.5),
@@ -96,7 +96,7 @@ def test_the_figures_of_a_few_frames():
 
 
 def test_nothing_measured_is_nothing():
-    assert set(Measured("t", "s", error="it failed").figures().values()) == {None, 0}
+    assert set(TrackerMeasurement("t", "s", error="it failed").figures().values()) == {None, 0}
 
 
 def test_masks_are_compared_with_the_truth_after_the_first_frame(contestant, dataset, clips):
@@ -173,9 +173,9 @@ def test_a_start_from_the_mask_needs_one(contestant, dataset, clips):
 def test_means_count_sequences_once_and_areas_count_frames():
     right, wrong = TrackedFrame(1, 1.0, 1.0, 0.9), TrackedFrame(1, 0.0, 0.0, 0.2)
     results = [
-        Measured("t", "a", (right,), (0.1,)),
-        Measured("t", "b", (wrong, wrong, wrong), (0.3,) * 3),
-        Measured("t", "c", error="no"),
+        TrackerMeasurement("t", "a", (right,), (0.1,)),
+        TrackerMeasurement("t", "b", (wrong, wrong, wrong), (0.3,) * 3),
+        TrackerMeasurement("t", "c", error="no"),
     ]
     mean = overall(results)["t"]
     assert (mean["iou_mean"], mean["share_under_half"]) == (0.5, 0.5)

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tracking3d.benchmark.pool import Outcome
+from tracking3d.benchmark.pool import JobOutcome
 from tracking3d.benchmark.results import (
     ResultSet,
     collect,
@@ -92,9 +92,9 @@ def test_a_file_gives_back_causal_answers_too_and_files_from_before_have_none(tm
 
 
 def test_scores_of_jobs_are_told_apart_by_what_they_score():
-    outcome = Outcome(SimpleNamespace(sequence="a"), {"iou_mean": 0.9, "causal": {"iou_mean": 0.8}})
-    plain = Outcome(SimpleNamespace(sequence="b"), {"iou_mean": 0.6, "causal": None})
-    lost = Outcome(SimpleNamespace(sequence="c"), None, "it crashed")
+    outcome = JobOutcome(SimpleNamespace(sequence="a"), {"iou_mean": 0.9, "causal": {"iou_mean": 0.8}})
+    plain = JobOutcome(SimpleNamespace(sequence="b"), {"iou_mean": 0.6, "causal": None})
+    lost = JobOutcome(SimpleNamespace(sequence="c"), None, "it crashed")
     variant = Variant(label="mine", config=load_config())
     found = collect(variant, Dataset("real", None, "clip", Path(), ("a", "b", "c")), [outcome, plain, lost])
     assert found.scores == {"a": {"iou_mean": 0.9}, "b": {"iou_mean": 0.6}, "c": None}

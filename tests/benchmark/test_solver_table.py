@@ -16,7 +16,7 @@ from tracking3d.benchmark.solver_table import (
     fill,
     format_table,
     plan,
-    side_by_side,
+    tabulate_results,
     to_csv,
     to_json,
     to_markdown,
@@ -52,7 +52,7 @@ def both(monkeypatch):
 
 @pytest.fixture
 def table():
-    return side_by_side([PAPER, ONLINE], "caption")
+    return tabulate_results([PAPER, ONLINE], "caption")
 
 
 @pytest.mark.usefixtures("both")
@@ -99,7 +99,7 @@ def test_means_are_over_the_sequences_that_every_column_has(table):
 
 def test_speed_is_a_ratio_to_the_paper_with_the_same_features(table):
     assert [table.speed(column) for column in table.columns] == pytest.approx([1, 20, 5])
-    assert side_by_side([ONLINE], "").speed("online, RGB, causal") is None
+    assert tabulate_results([ONLINE], "").speed("online, RGB, causal") is None
 
 
 def test_a_measure_that_nobody_has_is_not_shown(table):

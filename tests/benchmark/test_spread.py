@@ -16,7 +16,7 @@ import pytest
 from tracking3d.benchmark import spread
 from tracking3d.benchmark.job import Job
 from tracking3d.benchmark.noisy_frames import NoisyFrames
-from tracking3d.benchmark.processors import KERNELS, Kernels, kernels_of
+from tracking3d.benchmark.processors import KERNELS, Kernels, detect_kernels
 from tracking3d.benchmark.results import ResultSet
 from tracking3d.benchmark.sequences import Dataset
 from tracking3d.benchmark.spread import (
@@ -65,7 +65,7 @@ def kernels(monkeypatch):
         level = environment.get("ATEN_CPU_CAPABILITY", "avx2").upper()
         return None if core == "SkylakeX" else Kernels({"Zen": "Haswell"}.get(core, core), level)
 
-    monkeypatch.setattr(spread, "kernels_of", pretended)
+    monkeypatch.setattr(spread, "detect_kernels", pretended)
 
 
 @pytest.mark.usefixtures("kernels")
@@ -125,14 +125,14 @@ def test_every_variant_has_runs_of_its_own(clips, tmp_path):
 
 @pytest.mark.slow
 def test_a_process_tells_which_kernels_it_takes():
-    usual = kernels_of({})
+    usual = detect_kernels({})
     assert usual is not None
-    plain = kernels_of({"ATEN_CPU_CAPABILITY": "default"})
+    plain = detect_kernels({"ATEN_CPU_CAPABILITY": "default"})
     assert plain == Kernels(usual.openblas, "DEFAULT")
     if not usual.openblas or platform.machine() not in ("x86_64", "AMD64"):
         pytest.skip("NumPy has no OpenBLAS for x86 here")
     # Every x86 processor of today runs these.
-    assert kernels_of(KERNELS["OpenBLAS Nehalem"]) == Kernels("Nehalem", usual.aten)
+    assert detect_kernels(KERNELS["OpenBLAS Nehalem"]) == Kernels("Nehalem", usual.aten)
 
 
 def test_noise_is_one_grey_level_its_own_in_every_frame_and_the_same_each_time():

@@ -9,7 +9,7 @@ import pytest
 from seen_boards import HEIGHT, WIDTH, lens, view
 
 from tracking3d.calibration.boards import Board, parse_squares
-from tracking3d.calibration.calibrate import View, calibrate, coverage, spread_views
+from tracking3d.calibration.calibrate import BoardView, calibrate, coverage, spread_views
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, SkippedFrame
 from tracking3d.geometry.lens import Lens
@@ -89,8 +89,10 @@ def test_views_from_one_side_are_refused():
 def test_views_that_differ_are_taken():
     rng = np.random.default_rng(0)
     corners = rng.uniform(0, 50, (12, 2)).astype(np.float32)
-    near = [View(index, np.arange(12), corners + index % 2) for index in range(20)]
-    away = [View(20 + index, np.arange(12), corners + np.array([200 * index, 100])) for index in range(1, 3)]
+    near = [BoardView(index, np.arange(12), corners + index % 2) for index in range(20)]
+    away = [
+        BoardView(20 + index, np.arange(12), corners + np.array([200 * index, 100])) for index in range(1, 3)
+    ]
     kept = {one.index for one in spread_views([*near, *away], (640, 480), 4)}
     assert {21, 22} <= kept and len(kept) == 4
     assert coverage(away, (640, 480)) > coverage(away[:1], (640, 480))

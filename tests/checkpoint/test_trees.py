@@ -14,7 +14,7 @@ import torch
 
 from tracking3d import Frame, Session, load_config
 from tracking3d.checkpoint.folder import Checkpoint
-from tracking3d.checkpoint.progress import Progress, TakenFrame, checksum
+from tracking3d.checkpoint.progress import JournalEntry, RunProgress, checksum
 from tracking3d.checkpoint.trees import INLINE, TreeFolder, UnkeptError
 from tracking3d.errors import InputError
 from tracking3d.frames import SkippedFrame
@@ -160,7 +160,7 @@ def test_small_arrays_have_no_file(tmp_path):
     assert not files(tmp_path)
 
 
-@pytest.mark.parametrize("value", [object(), {1, 2}, np.array([object()]), Progress(), Leaf])
+@pytest.mark.parametrize("value", [object(), {1, 2}, np.array([object()]), RunProgress(), Leaf])
 def test_what_nobody_has_named_is_refused(tmp_path, value):
     with pytest.raises(UnkeptError):
         TreeFolder(tmp_path, CLASSES).text(value)
@@ -209,8 +209,8 @@ def test_in_every_frame_what_is_kept_is_the_solvers_state(tmp_path, preset, fram
     checkpoint = Checkpoint(tmp_path, session.state_classes)
     for index, image in enumerate(clip.images):
         session.step(Frame(index, image))
-        taken = TakenFrame(index, checksum(image), 0.5, "so", True, "")
-        checkpoint.save(Progress(last=index, lines=10 * index), session.kept(), taken)
+        taken = JournalEntry(index, checksum(image), 0.5, "so", True, "")
+        checkpoint.save(RunProgress(last=index, lines=10 * index), session.kept(), taken)
         kept = Checkpoint(tmp_path, session.state_classes).read()
         assert_same(kept.session, session.kept())
         assert (kept.progress.last, kept.progress.lines, kept.taken[index]) == (index, 10 * index, taken)
@@ -222,14 +222,14 @@ def test_in_every_frame_what_is_kept_is_the_solvers_state(tmp_path, preset, fram
 def test_the_journal_ends_where_the_state_says(tmp_path):
     checkpoint = Checkpoint(tmp_path, ())
     checkpoint.note(SkippedFrame(0, "torn"))
-    checkpoint.save(Progress(last=1), {}, TakenFrame(1, 5))
+    checkpoint.save(RunProgress(last=1), {}, JournalEntry(1, 5))
     journal = tmp_path / layout.STATE / layout.JOURNAL
     with journal.open("ab") as file:
         file.write(b'{"index": 2, "pict')
     again = Checkpoint(tmp_path, ())
     kept = again.read()
     assert (list(kept.taken), kept.skipped) == ([1], (SkippedFrame(0, "torn"),))
-    again.save(Progress(last=2), {}, TakenFrame(2, 6))
+    again.save(RunProgress(last=2), {}, JournalEntry(2, 6))
     assert list(Checkpoint(tmp_path, ()).read().taken) == [1, 2]
     journal.write_bytes(journal.read_bytes()[:20])
     with pytest.raises(InputError, match="too short"):

@@ -67,6 +67,16 @@ def test_importing_the_command_line_loads_nothing_heavy():
     assert answer.stdout == "set()\n"
 
 
+def test_help_loads_nothing_heavy():
+    heavy = "{'torch', 'cv2', 'kornia', 'numba', 'numpy', 'trimesh'}"
+    code = (
+        "import sys\nfrom tracking3d.cli import main\nsys.argv = ['tracking3d', 'run', '--help']\n"
+        f"try:\n    main()\nfinally:\n    print({heavy} & set(sys.modules))"
+    )
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert "--box" in answer.stdout and answer.stdout.endswith("set()\n"), answer.stderr
+
+
 def test_broken_pipe_ends_quietly():
     code = "from tracking3d.cli import main; main()"
     program = subprocess.Popen(

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from tracking3d.benchmark import solver_table
 from tracking3d.benchmark import suite as suite_module
-from tracking3d.benchmark.pool import Outcome
+from tracking3d.benchmark.pool import JobOutcome
 from tracking3d.benchmark.results import ResultSet, write_results
 from tracking3d.datasets.clip import write_clip
 from tracking3d.synthesis.convex_clips import SyntheticSpec, synthesize
@@ -50,7 +50,7 @@ def jobs(monkeypatch):
             if job.variant.config.solver.name == "online":
                 scores["causal"] = {**scores, "iou_mean": scores["iou_mean"] - 0.02}
             failed = job.sequence in failing
-            outcomes.append(Outcome(job, None if failed else scores, "it crashed" if failed else ""))
+            outcomes.append(JobOutcome(job, None if failed else scores, "it crashed" if failed else ""))
             listener(outcomes[-1])
         return outcomes
 

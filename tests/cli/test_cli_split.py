@@ -1,15 +1,13 @@
-"""``tracking3d run --split`` and what measures it: what reaches the library, and what is said."""
+"""``tracking3d run --split``: what reaches the library, and what is said."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
 
-from tracking3d.benchmark.split_benefit import Measured, looped
 from tracking3d.errors import OutputError
-from tracking3d.splitting.long_video import Ended
+from tracking3d.splitting.long_video import SplitResult
 
 BOX = ("--box", "20,10,20,20")
 
@@ -33,7 +31,7 @@ def parts(monkeypatch):
 
 def test_what_is_given_reaches_the_library(call, clip, parts):
     asked, answers = parts
-    answers.append(Ended((Path("run"),), 3))
+    answers.append(SplitResult((Path("run"),), 3))
     result = call(
         "run", clip, *BOX, "--split", "40f", "--workers", 3, "--out", "run", "--frames", "0:4", "--resume"
     )
@@ -48,7 +46,7 @@ def test_what_is_given_reaches_the_library(call, clip, parts):
 
 def test_parts_that_were_not_joined_are_named_with_the_reason(call, clip, parts):
     parts[1].append(
-        Ended((Path("run/parts/part_0"), Path("run/parts/part_1")), 2, "parts 1 and 2: they differ")
+        SplitResult((Path("run/parts/part_0"), Path("run/parts/part_1")), 2, "parts 1 and 2: they differ")
     )
     result = call("run", clip, *BOX, "--split", "40f", "--out", "run")
     assert result.exit_code == 0, result.output
@@ -58,7 +56,7 @@ def test_parts_that_were_not_joined_are_named_with_the_reason(call, clip, parts)
 
 
 def test_a_video_that_was_not_cut_says_why(call, clip, parts):
-    parts[1].append(Ended((Path("run"),), 1, "clip has 5 frames, which is one part"))
+    parts[1].append(SplitResult((Path("run"),), 1, "clip has 5 frames, which is one part"))
     result = call("run", clip, *BOX, "--split", "40f", "--out", "run")
     assert "one part" in result.stderr
 
@@ -93,43 +91,3 @@ def test_what_does_not_go_together_is_refused_in_a_sentence(options, said, call,
     assert result.exit_code == 2
     assert said in result.stderr
     assert not Path("run").exists()
-
-
-def test_a_video_is_played_to_and_fro():
-    assert looped(9, 4).tolist() == [0, 1, 2, 3, 2, 1, 0, 1, 2]
-    assert looped(3, 1).tolist() == [0, 0, 0]
-
-
-def test_the_benefit_is_told_side_by_side(call, monkeypatch):
-    def measured(config, folder, **named):
-        assert (named["frames"], named["length"], named["size"]) == (100, 50, (320, 240))
-        return {
-            "whole": Measured(100.0, 2.0, 1.5, 1.0, {}),
-            "split": Measured(60.0, 2.1, 1.6, 0.9, {"join": 5.0}, 2),
-        }
-
-    monkeypatch.setattr("tracking3d.benchmark.split_benefit.measure_split", measured)
-    result = call("bench", "split", "--frames", 100)
-    assert result.exit_code == 0, result.output
-    for word in ("0.60", "2.10", "90%", "join"):
-        assert word in result.stdout
-    printed = json.loads(call("bench", "split", "--frames", 100, "--json").stdout)
-    assert printed["split"]["stages"] == {"join": 5.0}
-
-
-def test_a_fleet_is_simulated_and_drawn(call, tmp_path):
-    pytest.importorskip("matplotlib")
-    options = ("--videos", 60, "--workers", 5, "--part", 30)
-    result = call("bench", "schedule", *options, "--plot", tmp_path / "plot.png")
-    assert result.exit_code == 0, result.output
-    assert "longest first, split" in result.stdout
-    assert (tmp_path / "plot.png").stat().st_size > 5000
-    printed = json.loads(call("bench", "schedule", *options, "--json").stdout)
-    assert len(printed) == 6
-    assert len(json.loads(call("bench", "schedule", *options, "--part", 0, "--json").stdout)) == 3
-
-
-def test_costs_of_a_run_that_is_none_are_refused(call, tmp_path):
-    result = call("bench", "cost", tmp_path)
-    assert result.exit_code == 2
-    assert "not a run folder" in result.stderr

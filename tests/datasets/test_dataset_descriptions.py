@@ -15,11 +15,11 @@ from tracking3d.datasets.layout import (
     DatasetLayout,
     Depth,
     Intrinsics,
-    Masks,
+    MaskLayout,
     Poses,
     Regions,
     Sequences,
-    Shape,
+    ShapeLayout,
     Symmetries,
     builtin_layouts,
     load_layout,
@@ -464,6 +464,16 @@ def test_a_sequence_without_any_truth_has_nothing_to_score(read):
 
 def test_the_documentation_names_every_description_and_key():
     page = (Path(__file__).resolve().parents[2] / "docs/datasets.md").read_text(encoding="utf-8")
-    models = (DatasetLayout, Sequences, Masks, Regions, Poses, Intrinsics, Depth, Shape, Symmetries)
+    models = (
+        DatasetLayout,
+        Sequences,
+        MaskLayout,
+        Regions,
+        Poses,
+        Intrinsics,
+        Depth,
+        ShapeLayout,
+        Symmetries,
+    )
     named = {*builtin_layouts(), *(key for model in models for key in model.model_fields)}
     assert [name for name in sorted(named) if f"`{name}`" not in page] == []

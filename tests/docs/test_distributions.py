@@ -85,7 +85,17 @@ def test_the_source_distribution_holds_the_project(sdist_names):
         "mkdocs.yml",
         "setup.py",
     }
-    names = ("docs", "conda", "configs", "examples", "tests", "plugins", "training", "tracking3d")
+    names = (
+        "benchmarks",
+        "docs",
+        "conda",
+        "configs",
+        "examples",
+        "tests",
+        "plugins",
+        "training",
+        "tracking3d",
+    )
     folders = [files_of(name) for name in names]
     assert sorted(single.union(*folders) - sdist_names) == []
     assert [name for name in sdist_names if "__pycache__" in name or name.endswith(".pyc")] == []

@@ -18,7 +18,7 @@ from tracking3d.evaluation.score import Scores
 from tracking3d.geometry.camera import Camera
 from tracking3d.rendering import prepare_backend
 from tracking3d.results import layout
-from tracking3d.results.description import description_at_start, summary
+from tracking3d.results.description import RunHeader, description_at_start, summary
 from tracking3d.results.records import FrameRecord
 
 
@@ -71,8 +71,8 @@ def field_named(model: Any, key: str) -> Any:
 
 
 @pytest.mark.parametrize("preset", [name for name in list_presets() if name != "paper"])
-def test_method_lists_exactly_what_a_preset_changes(preset):
-    page = (ROOT / "docs/method.md").read_text(encoding="utf-8")
+def test_page_of_the_paper_lists_exactly_what_a_preset_changes(preset):
+    page = (ROOT / "docs/method/paper.md").read_text(encoding="utf-8")
     section = re.search(
         rf"^#+ What (?:the {preset} preset|preset {preset}) changes\n(.*?)^#", page, re.M | re.S
     )
@@ -103,16 +103,8 @@ def test_run_folder_page_names_every_file_and_key():
     page = (ROOT / "docs/run-folder.md").read_text(encoding="utf-8")
     names = [value for name, value in vars(layout).items() if name.isupper() and isinstance(value, str)]
     files = [value for value in names if value.isprintable()]  # what sentences call arguments is not
-    start = description_at_start(
-        config={},
-        camera=Camera.from_fov(4, 4),
-        source="",
-        selection=None,
-        seed=0,
-        fps=None,
-        command=None,
-        renderer=prepare_backend("auto", "cpu"),
-    )
+    renderer = prepare_backend("auto", "cpu")
+    start = description_at_start(RunHeader({}, Camera.from_fov(4, 4), "", 0, None, None, renderer=renderer))
     end = summary([], 0, 0.0)
     keys = {
         *start,

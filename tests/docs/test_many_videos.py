@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from documentation_pages import ROOT, blocks
 
-from tracking3d.benchmark.scheduling import Fleet, Splitting, skewed_lengths
-from tracking3d.benchmark.scheduling_plot import compared, markdown
+from fleet_report import compared, markdown
+from fleet_simulation import Fleet, Splitting, skewed_lengths
 
 PAGE = ROOT / "docs/many-videos.md"
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tracking3d.config.loading import load_config
 from tracking3d.estimation.estimate import FrameEstimate
-from tracking3d.estimation.paper.belief import Belief
+from tracking3d.estimation.paper.belief import PaperState
 from tracking3d.estimation.paper.solver import PaperSolver
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.features.rgb import RgbEncoder
@@ -81,7 +81,7 @@ def estimate_of(mask: Mask) -> MaskEstimate:
     return MaskEstimate(None if mask is None else mask.astype(np.float32))
 
 
-Run = tuple[list[FrameEstimate], Belief]
+Run = tuple[list[FrameEstimate], PaperState]
 
 
 def run(
@@ -97,7 +97,7 @@ def run(
     torch.manual_seed(0)
     given = masks or {}
     answers: list[FrameEstimate] = list(after[0]) if after else []
-    state: Belief | None = after[1] if after else None
+    state: PaperState | None = after[1] if after else None
     for index in frames:
         mask = estimate_of(given.get(index, true_mask(index)))
         if state is None:

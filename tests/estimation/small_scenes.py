@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from tracking3d.config.solvers import PaperConfig
-from tracking3d.estimation.observation import Batch, Observation, mask_distance
+from tracking3d.estimation.observation import Observation, ObservationBatch, mask_distance
 from tracking3d.estimation.paper.problem import Parameters, Problem
 from tracking3d.estimation.shape import Shape
 from tracking3d.geometry.camera import Camera, Window
@@ -78,4 +78,4 @@ def parameters_of(poses: list[Pose], texture: Tensor | None = None) -> Parameter
 
 def problem_of(observations: list[Observation], flat: bool = False, **solver: object) -> Problem:
     """The problem of explaining observations, with settings of the section ``solver``."""
-    return Problem(small_shape(flat), Batch.of(observations), PaperConfig.model_validate(solver))
+    return Problem(small_shape(flat), ObservationBatch.of(observations), PaperConfig.model_validate(solver))

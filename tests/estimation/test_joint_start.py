@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from short_runs import quick_solver, run, short_clip
 
-from tracking3d.estimation.paper.belief import Belief, Keyframe
+from tracking3d.estimation.paper.belief import PaperState, PosedObservation
 from tracking3d.estimation.paper.joint_start import DIRECTIONS, RATES, hypotheses, joint_start
 from tracking3d.estimation.paper.problem import Parameters
 from tracking3d.evaluation.metrics import aligned_rotation_errors
@@ -17,7 +18,7 @@ from tracking3d.geometry.pose import Pose, from_matrix, rotation_about, rotation
 
 
 @pytest.fixture(scope="module")
-def waiting() -> tuple[Belief, list[Keyframe]]:
+def waiting() -> tuple[PaperState, list[PosedObservation]]:
     """Five frames found one by one, and what is known after them."""
     _, belief = run(quick_solver("rerendering", solver={"start_frames": 8}), range(5))
     return belief, [keyframe for keyframe, _ in belief.waiting]
@@ -57,7 +58,7 @@ def test_one_hypothesis_is_mirrored_in_depth(waiting, axis, mirrored):
         turn = rotation_about(torch.tensor(about, dtype=torch.float32), 20)
         return from_matrix(turn @ first.pose.R, first.pose.translation)
 
-    start = hypotheses(belief, [first, Keyframe(frames[1].observation, tilted(axis))])[1]
+    start = hypotheses(belief, [first, PosedObservation(frames[1].observation, tilted(axis))])[1]
     assert degrees(start, 1, tilted(mirrored)) < 0.1
 
 
@@ -72,6 +73,32 @@ def test_the_others_turn_steadily_in_every_direction(waiting):
     ends = [Pose(start.translation[-1], start.quaternion[-1]) for start in turning]
     apart = [degrees(a, -1, b) for i, a in enumerate(turning) for b in ends[:i]]
     assert min(apart) > 5
+
+
+def test_rotations_of_a_batch_are_those_of_one_frame_after_another(waiting):
+    """Frames may be far apart: none turns by more than 60 degrees."""
+    belief, found = waiting
+    frames = [
+        PosedObservation(replace(keyframe.observation, index=index), keyframe.pose)
+        for keyframe, index in zip(found, (3, 4, 7, 12, 30), strict=True)
+    ]
+    first = frames[0].pose
+    flip = torch.diag(torch.tensor([1.0, 1.0, -1.0]))
+
+    def turned(axis: torch.Tensor, rate: float, keyframe: PosedObservation) -> Pose:
+        angle = min(rate * (keyframe.observation.index - 3), 60.0)
+        return from_matrix(rotation_about(axis, angle) @ first.R, keyframe.pose.translation)
+
+    expected = [[first for _ in frames]]
+    expected.append(
+        [from_matrix(flip @ f.pose.R @ first.R.T @ flip @ first.R, f.pose.translation) for f in frames]
+    )
+    for direction in range(DIRECTIONS):
+        angle = 2 * math.pi * direction / DIRECTIONS
+        axis = torch.tensor([math.cos(angle), math.sin(angle), 0.0])
+        expected += [[turned(axis, rate, keyframe) for keyframe in frames] for rate in RATES]
+    for start, poses in zip(hypotheses(belief, frames), expected, strict=True):
+        torch.testing.assert_close(start.poses.R, torch.stack([pose.R for pose in poses]))
 
 
 def test_the_answer_is_the_best_of_what_was_tried_and_keeps_the_gauge(waiting):

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tracking3d.config.solvers import KeyframeConfig
-from tracking3d.estimation.keyframes import Candidate, select_keyframes, thin_out
+from tracking3d.estimation.keyframes import KeyframeCandidate, select_keyframes, thin_out
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
 
 TAU = 0.2
@@ -15,13 +15,13 @@ OBJECT_SIZE = 1.8
 
 def frame(
     degrees: float = 0.0, x: float = 0.0, silhouette: float = 0.1, appearance: float = 0.1
-) -> Candidate:
+) -> KeyframeCandidate:
     axis = torch.tensor([0.0, 1.0, 0.0])
     pose = from_matrix(rotation_about(axis, degrees), torch.tensor([x, 0.0, 3.0]))
-    return Candidate(pose, silhouette, appearance)
+    return KeyframeCandidate(pose, silhouette, appearance)
 
 
-def select(*candidates: Candidate, **criteria) -> list[int]:
+def select(*candidates: KeyframeCandidate, **criteria) -> list[int]:
     return select_keyframes(candidates, OBJECT_SIZE, TAU, KeyframeConfig.model_validate(criteria))
 
 
@@ -90,7 +90,7 @@ def test_the_six_most_recent_are_kept():
 
 
 def test_history_of_a_steady_turn():
-    poses: list[tuple[int, Candidate]] = []
+    poses: list[tuple[int, KeyframeCandidate]] = []
     for index in range(73):
         candidates = [*poses, (index, frame(10 * index))]
         poses = [candidates[i] for i in select(*(candidate for _, candidate in candidates))]
@@ -129,5 +129,5 @@ def test_thinning_out_spreads_the_older_half_evenly():
 
 def test_poses_may_be_given_by_either_quaternion():
     turned = frame(60)
-    opposite = Candidate(Pose(turned.pose.translation, -turned.pose.quaternion), 0.1, 0.1)
+    opposite = KeyframeCandidate(Pose(turned.pose.translation, -turned.pose.quaternion), 0.1, 0.1)
     assert select(turned, opposite) == [0]

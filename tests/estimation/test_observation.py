@@ -8,7 +8,7 @@ import torch
 from scipy.ndimage import distance_transform_edt
 from small_scenes import observed, pose_of, small_shape
 
-from tracking3d.estimation.observation import Batch, crop, halved, mask_distance, observe
+from tracking3d.estimation.observation import ObservationBatch, crop, halved, mask_distance, observe
 from tracking3d.features.rgb import RgbEncoder
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera, Window
@@ -200,7 +200,7 @@ def test_halving_calls_a_pixel_valid_that_is_mostly_so():
 
 
 def test_a_batch_stacks_observations_in_order():
-    batch = Batch.of([observed(pose_of(0), 4), observed(pose_of(20), 7, has_mask=False)])
+    batch = ObservationBatch.of([observed(pose_of(0), 4), observed(pose_of(20), 7, has_mask=False)])
     assert batch.index.tolist() == [4, 7]
     assert batch.has_mask.tolist() == [1, 0]
     assert batch.K.shape == (2, 3, 3)

@@ -10,14 +10,14 @@ import torch
 from short_runs import quick_solver, run, short_clip, true_mask
 
 from tracking3d.estimation.framing import mask_box, projected_box
-from tracking3d.estimation.paper.belief import Belief
+from tracking3d.estimation.paper.belief import PaperState
 from tracking3d.estimation.paper.prediction import candidate_poses, moved_to_mask
 from tracking3d.evaluation.metrics import mask_iou
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
 
 
 @pytest.fixture(scope="module")
-def belief() -> Belief:
+def belief() -> PaperState:
     """After one frame."""
     return run(quick_solver("paper"), range(1))[1]
 

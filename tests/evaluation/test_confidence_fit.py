@@ -7,7 +7,7 @@ import pytest
 from scipy.special import expit
 
 from tracking3d.evaluation.calibration import area_under_roc, expected_calibration_error
-from tracking3d.evaluation.confidence_fit import fit_confidence, halves, paste
+from tracking3d.evaluation.confidence_fit import as_python_source, fit_confidence, halves
 
 
 def made(count, seed=0):
@@ -84,7 +84,7 @@ def test_the_pasted_table_is_python_and_says_the_same():
     evidence, right = made(1000)
     fit = fit_confidence(evidence, right)
     names: dict = {}
-    exec(paste(fit), names)
+    exec(as_python_source(fit), names)
     odds = names["INTERCEPT"]
     for name, (weight, low, high, _) in names["TERMS"].items():
         odds = odds + weight * np.clip(evidence[name], low, high)

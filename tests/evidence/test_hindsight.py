@@ -16,10 +16,10 @@ from tracking3d.evidence.hindsight import Hindsight, all_decided
 from tracking3d.evidence.hindsight_weights import WEIGHTS
 from tracking3d.evidence.motion import apart, background_motion, motion_cue, small_grey
 from tracking3d.evidence.order import InOrder
-from tracking3d.evidence.scene import Answered, Scene
+from tracking3d.evidence.scene import Answered, FrameWindow
 from tracking3d.evidence.sources import Said
 from tracking3d.geometry.camera import Camera
-from tracking3d.trackers.outline import signed_distance
+from tracking3d.trackers.outline import inside_distance
 
 CAMERA = Camera(200.0, 200.0, 79.5, 59.5, 160, 120)
 BALL = trimesh.creation.icosphere(3)
@@ -124,8 +124,8 @@ def test_a_mask_that_would_change_beyond_belief_stands():
     )
 
 
-def scenes(count: int, spoil=lambda mask: mask) -> list[Scene]:
-    found = [Scene.of(answered(number, spoil), CAMERA, VERTICES, FACES) for number in range(count)]
+def scenes(count: int, spoil=lambda mask: mask) -> list[FrameWindow]:
+    found = [FrameWindow.of(answered(number, spoil), CAMERA, VERTICES, FACES) for number in range(count)]
     return [scene for scene in found if scene is not None]
 
 
@@ -180,9 +180,9 @@ def test_an_outline_on_edges_is_told_from_one_beside_them():
     lab = np.where(disc[..., None], 200, 60).astype(np.uint8).repeat(3, 2)
     edges = edge_strength(lab)
     around = np.hypot(*(np.mgrid[:96, :96] - 48))
-    on, off = (alignment(edges, signed_distance(around < radius))[1] for radius in (30, 24))
+    on, off = (alignment(edges, inside_distance(around < radius))[1] for radius in (30, 24))
     assert on > 1 > 0 > off
-    assert alignment(edges, signed_distance(disc & False)) == (pytest.approx(np.zeros((96, 96))), 0.0)
+    assert alignment(edges, inside_distance(disc & False)) == (pytest.approx(np.zeros((96, 96))), 0.0)
 
 
 def test_every_source_is_odd_and_has_a_weight():

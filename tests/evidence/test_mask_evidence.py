@@ -11,9 +11,9 @@ from tracking3d.evidence import (
     Colours,
     along_edges,
     as_lab,
-    features,
     in_question,
     log_odds,
+    pixel_features,
     tidied,
 )
 
@@ -37,7 +37,7 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def decided(image, initial, rendered, confidence=0.8, colours=None) -> np.ndarray:
-    found = features(as_lab(image), initial, rendered, confidence, colours)
+    found = pixel_features(as_lab(image), initial, rendered, confidence, colours)
     return along_edges(image, log_odds(found), in_question(found)) > 0
 
 
@@ -45,7 +45,9 @@ def test_where_both_outlines_agree_the_image_is_hardly_asked():
     """An exact mask of a small object in a soft picture: edges to the next colour would only pull the outline aside."""
     truth = disc(64)
     soft = cv2.GaussianBlur(picture(truth), (0, 0), 4)
-    asked = [in_question(features(as_lab(soft), truth, disc(64 + off), 0.8, None)) for off in (0, 1, 3, 30)]
+    asked = [
+        in_question(pixel_features(as_lab(soft), truth, disc(64 + off), 0.8, None)) for off in (0, 1, 3, 30)
+    ]
     assert asked == sorted(asked) and asked[0] == 0 and asked[-1] == 1
     assert iou(decided(soft, truth, disc(64.5)), truth) > 0.97
 
@@ -53,7 +55,7 @@ def test_where_both_outlines_agree_the_image_is_hardly_asked():
 def test_there_is_a_weight_for_each_source_and_each_speaks_for_what_it_shows():
     image, mask = picture(disc(64)), disc(64)
     colours = Colours.of(as_lab(image), mask)
-    seen = features(as_lab(image), mask, disc(65, radius=34), 0.8, colours)
+    seen = pixel_features(as_lab(image), mask, disc(65, radius=34), 0.8, colours)
     assert seen.shape == (SIZE, SIZE, len(SOURCES))
     assert (seen[64, 64] > 0).all()
     assert (seen[64, 8] < 0).all()
@@ -88,7 +90,7 @@ def test_a_pose_that_is_not_believed_has_less_say():
     truth, aside = disc(64), disc(76)
     lab = as_lab(picture(truth))
     doubted, believed = (
-        log_odds(features(lab, truth, aside, confidence, None)) for confidence in (0.05, 0.95)
+        log_odds(pixel_features(lab, truth, aside, confidence, None)) for confidence in (0.05, 0.95)
     )
     assert doubted[aside & ~truth].mean() < believed[aside & ~truth].mean() - 0.3
 

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+from twins import motion_cue
 
 from tracking3d.evidence.moving_along import Glimpse, moves_along
 from tracking3d.evidence.scene import surface_in
@@ -75,7 +76,7 @@ def test_a_side_that_turns_into_view_moves_along_and_the_background_does_not(tur
 
 def test_it_says_the_same_without_the_kernel(turning, monkeypatch):
     fast = asked(turning, 4)[0]
-    monkeypatch.setattr("tracking3d.evidence.motion.compiled", lambda: False)
+    monkeypatch.setattr("tracking3d.evidence.moving_along.parted_ways", motion_cue.parted_ways)
     assert np.mean(np.abs(fast - asked(turning, 4)[0]) > 0.02) < 0.01  # where rounding decides
 
 

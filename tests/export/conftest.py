@@ -15,11 +15,12 @@ from scipy.spatial.transform import Rotation
 
 from tracking3d.checkpoint.progress import checksum
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
-from tracking3d.export.exporter import ExportOptions
 from tracking3d.export.exporting import export_run
+from tracking3d.export.options import ExportOptions
 from tracking3d.frames import Frame, SkippedFrame
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.prototypes import ellipsoid
+from tracking3d.results.description import RunHeader
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_writer import RunWriter
 
@@ -79,9 +80,8 @@ def write_run(folder: Path, camera: Camera, lenses: Mapping[int, Camera] | None 
         Image.fromarray(picture).save(video / f"{index:03d}.png")
     (video / f"{SKIPPED:03d}.png").write_bytes(b"no picture")
     given = {"first_frame": 0, "first_picture": checksum(pictures[0])}
-    with RunWriter(
-        folder / "run", config={}, camera=camera, source=str(video), seed=0, fps=FPS, command="", given=given
-    ) as writer:
+    header = RunHeader(config={}, camera=camera, source=str(video), seed=0, fps=FPS, command="", given=given)
+    with RunWriter(folder / "run", header) as writer:
         for index, picture in enumerate(pictures):
             if index == SKIPPED:
                 writer.skip(SkippedFrame(index, "damaged"))

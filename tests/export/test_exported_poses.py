@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from tracking3d.datasets.pose_files import read_matrix_lines
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.export.exported_run import ExportedRun, longest_side, seen_side
-from tracking3d.export.exporter import ExportOptions
+from tracking3d.export.options import ExportOptions
 from tracking3d.results.run_reader import RunReader
 
 POSED = [0, 1, 3, 5, 6]

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from tracking3d.errors import InputError, OutputError
-from tracking3d.export.exporter import ExportOptions
 from tracking3d.export.exporting import export_run
 from tracking3d.export.formats import FORMATS
+from tracking3d.export.options import ExportOptions
 
 
 def names(folder: Path) -> list[str]:

@@ -14,7 +14,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from tracking3d.results.correspondences import project
+from tracking3d.results.correspondences import project_object_points
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.run_reader import RunReader
 
@@ -80,7 +80,7 @@ def test_blender_builds_the_scene(export, shifted_run, tmp_path):
     vertices = load_model(shifted_run).vertices
     assert [int(frame) for frame, places in seen.items() if places is not None] == POSED
     for record in (one for one in reader.frames if one.index in POSED):
-        pixels, _ = project(reader.camera, record.T_cam_obj, vertices)
+        pixels, _ = project_object_points(reader.camera, record.T_cam_obj, vertices)
         places = np.array(seen[str(record.index)])  # from the lower left to the upper right corner
         np.testing.assert_allclose(places[:, 0] * 128 - 0.5, pixels[:, 0], atol=0.01)
         np.testing.assert_allclose((1 - places[:, 1]) * 96 - 0.5, pixels[:, 1], atol=0.01)

@@ -78,11 +78,11 @@ def test_colmap_has_a_camera_for_every_lens(export, zooming_run, silhouettes):
 def test_points_are_those_that_are_seen(export, run):
     """A vertex of the far side is in no image."""
     from tracking3d.export.exported_run import ExportedRun
-    from tracking3d.export.exporter import ExportOptions
-    from tracking3d.export.seen_surface import seen_surface
+    from tracking3d.export.options import ExportOptions
+    from tracking3d.export.seen_surface import find_seen_surface
 
     exported = ExportedRun(RunReader(run), ExportOptions())
-    surface = seen_surface(exported)
+    surface = find_seen_surface(exported)
     normals = trimesh.Trimesh(exported.model.vertices, exported.model.faces, process=False).vertex_normals
     for row, one in enumerate(exported.poses):
         T_obj_cam = np.linalg.inv(one.T_cam_obj)

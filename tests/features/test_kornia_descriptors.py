@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import kornia.feature
+import numpy as np
 import pytest
 import torch
+from kornia.color import rgb_to_grayscale
 from kornia.feature import DISK, HardNet, HyNet, SOSNet, TFeat
 
 from tracking3d import load_config, track
@@ -96,6 +98,31 @@ def test_patches_lie_around_the_middle_of_their_pixels(symmetric, stride):
     KorniaEncoder("hardnet", Sees(), stride).encode(symmetric)
     row = seen[0][: 64 // stride]
     torch.testing.assert_close(row, row.flip(0, 3))
+
+
+@pytest.mark.parametrize("stride", [2, 4, 8])
+def test_patches_are_windows_of_the_picture_one_after_another(stride):
+    """Two pictures whose sides are no multiples; beyond the border the outermost pixels go on."""
+    seen = []
+
+    class Sees(torch.nn.Module):
+        def forward(self, patches):
+            seen.append(patches)
+            return torch.ones(len(patches), 128)
+
+    pictures = torch.rand(2, 1, 21, 34, generator=torch.Generator().manual_seed(3))
+    KorniaEncoder("hardnet", Sees(), stride).encode(pictures.expand(2, 3, 21, 34))
+    whole = rgb_to_grayscale(pictures.expand(2, 3, 21, 34)).numpy()
+    rows, columns = 21 // stride, 34 // stride
+    whole, border = whole[..., : stride * rows, : stride * columns], (32 - stride) // 2
+    padded = np.pad(whole, ((0, 0), (0, 0), (border, border), (border, border)), mode="edge")
+    expected = [
+        picture[:, stride * row : stride * row + 32, stride * column : stride * column + 32]
+        for picture in padded
+        for row in range(rows)
+        for column in range(columns)
+    ]
+    assert (seen[0].numpy() == np.stack(expected)).all()
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,11 @@ from torch.nn import functional
 
 from tracking3d.config.models import PluginChoice
 from tracking3d.errors import InputError
-from tracking3d.features.onnx.description import EncoderDescription, builtin_descriptions, load_description
+from tracking3d.features.onnx.description import (
+    EncoderDescription,
+    builtin_encoder_descriptions,
+    load_encoder_description,
+)
 from tracking3d.features.onnx.encoder import OnnxEncoder
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.networks.session import Network
@@ -207,30 +211,30 @@ def test_a_description_with_a_fault_is_refused_with_its_file(tmp_path, text, mes
     file = tmp_path / "mine.yaml"
     file.write_text(text)
     with pytest.raises(InputError, match=rf"mine\.yaml.*{message}"):
-        load_description(file)
+        load_encoder_description(file)
 
 
 def test_an_unknown_description_is_told_with_the_nearest_name():
     with pytest.raises(InputError, match=r"description of a feature network 'alik'.*did you mean 'alike'"):
-        load_description("alik")
+        load_encoder_description("alik")
 
 
 def test_an_empty_description_is_the_usual_network(tmp_path):
     file = tmp_path / "empty.yaml"
     file.write_text("")
-    assert load_description(file) == EncoderDescription()
+    assert load_encoder_description(file) == EncoderDescription()
 
 
 def test_every_description_that_comes_along_is_valid_and_says_where_from():
-    assert builtin_descriptions() == ["alike", "aliked", "s2dnet_original", "xfeat"]
-    for name in builtin_descriptions():
-        assert load_description(name).link.startswith("https://")
+    assert builtin_encoder_descriptions() == ["alike", "aliked", "s2dnet_original", "xfeat"]
+    for name in builtin_encoder_descriptions():
+        assert load_encoder_description(name).link.startswith("https://")
 
 
 def test_the_original_s2dnets_three_maps_become_one(tmp_path, images):
     outputs = {"conv1_2": (1, 128), "conv3_3": (4, 128), "conv5_3": (16, 128)}
     file = write_network(tmp_path / "s2dnet.onnx", outputs)
-    made = OnnxEncoder(Network(file), load_description("s2dnet_original"))
+    made = OnnxEncoder(Network(file), load_encoder_description("s2dnet_original"))
     assert (made.channels, made.stride) == (384, 4)
     mean, std = torch.tensor([[0.485, 0.456, 0.406], [0.229, 0.224, 0.225]])[..., None, None]
     middle = functional.normalize(expected((images - mean) / std, 4, 128), dim=1) / 3**0.5

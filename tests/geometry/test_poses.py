@@ -12,7 +12,14 @@ from scipy.spatial.transform import Rotation
 from torch.autograd import gradcheck
 from torch.nn import functional
 
-from tracking3d.geometry.pose import Pose, extrapolate, from_matrix, rotation_about, rotation_angle
+from tracking3d.geometry.pose import (
+    Pose,
+    extrapolate,
+    from_matrix,
+    rotation_about,
+    rotation_angle,
+    rotation_exponential,
+)
 
 
 def quaternion(vector: list[float]) -> torch.Tensor:
@@ -155,6 +162,17 @@ def test_a_single_rotation_is_converted_to_the_same_digits_as_by_kornia(dtype):
     for one, R, again in zip(drawn, matrices, rotation_matrix_to_quaternion(matrices), strict=True):
         assert torch.equal(Pose(torch.zeros(3), one).R.nan_to_num(9), R.nan_to_num(9))
         assert torch.equal(from_matrix(R, torch.zeros(3)).quaternion.nan_to_num(9), again.nan_to_num(9))
+
+
+def test_many_rotations_about_axes_have_the_digits_of_each_by_itself():
+    turns = torch.randn(3, 7, 3, generator=torch.Generator().manual_seed(6))
+    turns[0, 0] = 0
+    together = rotation_exponential(turns)
+    assert torch.equal(
+        together, torch.stack([torch.stack(list(map(rotation_exponential, row))) for row in turns])
+    )
+    judge = Rotation.from_rotvec(turns.reshape(-1, 3).double().numpy()).as_matrix()
+    np.testing.assert_allclose(together.reshape(-1, 3, 3), judge, atol=1e-6)
 
 
 def test_a_rotation_that_is_solved_for_has_gradients():

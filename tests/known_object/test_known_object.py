@@ -15,7 +15,7 @@ from tracking3d.estimation.online import known_views
 from tracking3d.estimation.online.known_solver import NOT_SEEN
 from tracking3d.evaluation.metrics import mask_iou
 from tracking3d.mask_tracking import PromptedTracker
-from tracking3d.object_files import read_object
+from tracking3d.object_files import read_known_object
 
 
 @pytest.fixture
@@ -120,7 +120,7 @@ def test_an_object_of_an_earlier_run_is_found_under_another_light(tmp_path):
 
 
 def test_points_of_a_drawn_side_lie_where_its_pixels_show_them(clip, tmp_path, few_sides):
-    known = read_object(written(clip.scene.solid, tmp_path))
+    known = read_known_object(written(clip.scene.solid, tmp_path))
     from tracking3d.estimation.online.mapping import project_points
     from tracking3d.geometry.camera import Camera
     from tracking3d.parts import build_encoder

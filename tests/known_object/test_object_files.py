@@ -19,7 +19,7 @@ from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.known_object import KnownObject
 from tracking3d.estimation.start import RADIUS
 from tracking3d.geometry.camera import Camera
-from tracking3d.object_files import camera_of, known_object, read_object
+from tracking3d.object_files import known_object, read_known_object, select_camera
 from tracking3d.rendering import TexelMap
 from tracking3d.rendering.face_atlas import face_atlas, on_faces, painted, shares_no_texel
 
@@ -93,7 +93,7 @@ def test_beside_the_faces_a_texture_goes_on_as_at_their_rim():
 
 def test_colours_of_vertices_are_baked_where_the_vertices_are(tmp_path):
     mesh = coloured_box()
-    known = read_object(in_file(mesh, tmp_path))
+    known = read_known_object(in_file(mesh, tmp_path))
     model = known.model
     assert known.has_colours and shares_no_texel(model.face_uvs)
     side = len(model.texture)
@@ -110,7 +110,7 @@ def known_colours(mesh, model):
 
 
 def test_a_mesh_of_one_colour_has_none_to_be_known_by(tmp_path):
-    assert not read_object(in_file(trimesh.creation.box(), tmp_path)).has_colours
+    assert not read_known_object(in_file(trimesh.creation.box(), tmp_path)).has_colours
 
 
 def test_vertices_that_are_split_are_joined_and_faces_look_outward(tmp_path):
@@ -118,7 +118,7 @@ def test_vertices_that_are_split_are_joined_and_faces_look_outward(tmp_path):
     corners = box.vertices[box.faces].reshape(-1, 3)
     faces = np.arange(len(corners)).reshape(-1, 3)
     faces[3] = faces[3, ::-1]
-    model = read_object(in_file(trimesh.Trimesh(corners, faces, process=False), tmp_path)).model
+    model = read_known_object(in_file(trimesh.Trimesh(corners, faces, process=False), tmp_path)).model
     solid = trimesh.Trimesh(model.vertices, model.faces, process=False)
     assert len(model.vertices) == 8 and solid.is_watertight and solid.volume == pytest.approx(6)
 
@@ -156,50 +156,51 @@ def test_what_is_no_mesh_is_refused(tmp_path, content, sentence):
     if content is not None:
         path.write_bytes(content)
     with pytest.raises(InputError, match=sentence):
-        read_object(path)
+        read_known_object(path)
 
 
 def test_a_run_is_read_with_its_mesh_and_lens(tmp_path):
-    known = read_object(run_folder(tmp_path / "run"))
+    known = read_known_object(run_folder(tmp_path / "run"))
     assert known.camera is not None and known.camera.width == WIDTH
     assert known.has_colours
 
 
 def test_a_folder_that_is_no_run_a_run_without_a_mesh_and_one_that_tracked_nothing_are_refused(tmp_path):
     with pytest.raises(InputError, match="not a run folder"):
-        read_object(tmp_path)
+        read_known_object(tmp_path)
     with pytest.raises(InputError, match=r"cannot be tracked by.*holds no features\.npz"):
-        read_object(run_folder(tmp_path / "bare", model=False))
+        read_known_object(run_folder(tmp_path / "bare", model=False))
     with pytest.raises(InputError, match="no frame of that run was tracked"):
-        read_object(run_folder(tmp_path / "waiting", Status.UNCERTAIN))
+        read_known_object(run_folder(tmp_path / "waiting", Status.UNCERTAIN))
 
 
 def test_damaged_meshes_of_runs_are_refused(tmp_path):
     folder = run_folder(tmp_path / "run")
     (folder / "features.npz").write_bytes(b"nothing")
     with pytest.raises(InputError, match="cannot be tracked by"):
-        read_object(folder)
+        read_known_object(folder)
 
 
 def test_the_lens_of_the_run_is_taken_over_where_it_was_told_and_fits(tmp_path):
     given = Camera.from_fov(WIDTH, HEIGHT, 30, "given field of view of 30 degrees")
     path = str(run_folder(tmp_path / "run", camera=given))
     config = load_config(object={"known": path})
-    taken = camera_of(config, WIDTH, HEIGHT, None, "")
+    taken = select_camera(config, WIDTH, HEIGHT, None, "")
     assert taken.fov == pytest.approx(30) and not taken.assumed and path in taken.origin
-    assert camera_of(config, WIDTH + 2, HEIGHT, None, "").assumed
+    assert select_camera(config, WIDTH + 2, HEIGHT, None, "").assumed
     assert (
-        camera_of(load_config(object={"known": path}, camera={"fov": 50}), WIDTH, HEIGHT, None, "").fov == 50
+        select_camera(load_config(object={"known": path}, camera={"fov": 50}), WIDTH, HEIGHT, None, "").fov
+        == 50
     )
-    assert camera_of(config, WIDTH, HEIGHT, (90.0, 90.0, 40.0, 30.0), "EXIF").origin == "EXIF"
+    assert select_camera(config, WIDTH, HEIGHT, (90.0, 90.0, 40.0, 30.0), "EXIF").origin == "EXIF"
     description = json.loads((tmp_path / "run/run.json").read_bytes())
     description["camera"]["assumed"] = True
     (tmp_path / "run/run.json").write_text(json.dumps(description))
-    assert camera_of(config, WIDTH, HEIGHT, None, "").assumed
+    assert select_camera(config, WIDTH, HEIGHT, None, "").assumed
     # What nobody gave, but the run has solved, is known too.
     description["camera"]["origin"] = given.solved(1.0).origin
     (tmp_path / "run/run.json").write_text(json.dumps(description))
-    solved = camera_of(config, WIDTH, HEIGHT, None, "")
+    solved = select_camera(config, WIDTH, HEIGHT, None, "")
     assert solved.fov == pytest.approx(30) and not solved.assumed and "solved" in solved.origin
 
 

@@ -13,7 +13,7 @@ from recorded_runs import frame_of
 from tracking3d.cli import app
 from tracking3d.config.loading import load_config
 from tracking3d.errors import InputError
-from tracking3d.picker.drawing import Drawing, DrawnObject, Point, Stroke, read_drawing, read_object
+from tracking3d.picker.drawing import Drawing, DrawnObject, Point, Stroke, parse_object, read_drawing
 from tracking3d.picker.drawn_mask import drawn_mask
 from tracking3d.picker.outcome import command_of, save_picked
 from tracking3d.picker.session import Picked
@@ -99,7 +99,7 @@ def test_a_picture_of_one_colour_and_points_far_outside_end_nothing():
 )
 def test_what_is_no_drawing_is_refused_in_a_sentence(fault):
     with pytest.raises(InputError, match="cannot be used"):
-        read_object(json.dumps({**OBJECT, **fault}).encode())
+        parse_object(json.dumps({**OBJECT, **fault}).encode())
 
 
 @pytest.mark.parametrize("text", [b"", b"{", b"[]", b"null", b"\xff", b'{"objects": []}', b"[" * 100_000])
@@ -113,7 +113,7 @@ def test_nonsense_is_refused_in_a_sentence(text):
 def test_numbers_that_are_none_are_refused():
     for number in ("NaN", "Infinity", "1e999"):
         with pytest.raises(InputError):
-            read_object(
+            parse_object(
                 f'{{"name": "a", "colour": "#000000", "frame": 0, "box": [{number}, 1, 1, 1]}}'.encode()
             )
 

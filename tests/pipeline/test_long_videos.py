@@ -54,8 +54,6 @@ class Known:
 @pytest.mark.slow
 @pytest.mark.parametrize("solver", sorted(SOLVERS))
 def test_memory_is_flat_over_three_thousand_frames(solver, tmp_path, monkeypatch):
-    if resident_memory() is None:
-        pytest.skip("this system does not tell how much memory a process holds")
     clip = synthesize(SyntheticSpec(frames=61, size=(96, 72), supersample=1))
     np.save(tmp_path / "masks.npy", clip.masks)
     (tmp_path / "known.py").write_text(TRACKER)

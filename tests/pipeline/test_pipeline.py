@@ -241,13 +241,13 @@ def test_without_a_configuration_the_default_preset_is_used(clip, monkeypatch):
     used: list[PipelineConfig] = []
 
     class Recorder:
-        def __init__(self, config, prompt, intrinsics, origin):
+        def __init__(self, config, prompt, intrinsics, origin, encoder):
             used.append(config)
 
         def step(self, frame):
             return frame.index
 
-    monkeypatch.setattr("tracking3d.tracking.Session", Recorder)
+    monkeypatch.setattr("tracking3d.open_tracking.Session", Recorder)
     assert list(track(clip.images, box=clip.box)) == [0, 1, 2, 3]
     assert used == [load_config(preset="default")]
     assert used[0].solver.name == "online"

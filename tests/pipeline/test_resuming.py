@@ -18,7 +18,9 @@ from tracking3d.checkpoint.folder import Checkpoint
 from tracking3d.errors import InputError, OutputError
 from tracking3d.estimation.online.solver import OnlineSolver
 from tracking3d.geometry.camera import Camera
-from tracking3d.recording import record, record_objects
+from tracking3d.open_tracking import request_tracking
+from tracking3d.prompts import PromptSet
+from tracking3d.recording import RecordOptions, record, record_objects, record_tracking
 from tracking3d.results import layout, run_writer
 from tracking3d.results.files import write_image
 from tracking3d.results.frame_lines import FrameLines
@@ -360,14 +362,10 @@ def test_other_settings_or_another_source_are_refused_with_the_difference(
         ("selection of frames was None and is 0:5", images, settings(), {"mask": clip.masks[0]}, "0:5"),
     ):
         with pytest.raises(InputError, match=what) as error:
-            record(
-                open_source(str(source), selection),
-                config,
-                folder,
-                **prompt,
-                selection=selection,
-                resume=True,
+            request = request_tracking(
+                open_source(str(source), selection), config, PromptSet.of_one(**prompt)
             )
+            record_tracking(request, folder, RecordOptions(selection=selection, resume=True))
         assert str(error.value).count(". ") == 0
     (other / "000.png").write_bytes((images / "000.png").read_bytes())
     (other / "005.png").unlink()

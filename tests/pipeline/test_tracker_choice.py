@@ -140,7 +140,7 @@ def test_a_run_says_which_it_was_and_goes_on_with_it(monkeypatch, tmp_path):
     def refuse(*given):
         raise AssertionError("it is known already")
 
-    monkeypatch.setattr("tracking3d.recording.choose_tracker", refuse)
+    monkeypatch.setattr("tracking3d.open_tracking.choose_tracker", refuse)
     record(open_source(images), AUTO, tmp_path / "run", box=PROMPT.box, resume=True)
     assert json.loads((tmp_path / "run/run.json").read_text())["config"]["tracker"]["name"] == "csrt"
 

@@ -19,7 +19,7 @@ import tracking3d
 from tracking3d import Status, TrackingResult, load_config, track
 from tracking3d.errors import InputError, OutputError
 from tracking3d.reconstruction import of_run
-from tracking3d.reconstruction.shape import Shape
+from tracking3d.reconstruction.shape import ReconstructedShape
 from tracking3d.recording import record, record_objects
 from tracking3d.rendering.kernels import threads as kernels
 from tracking3d.results.mesh_export import load_model
@@ -131,7 +131,7 @@ def test_a_fine_model_has_a_new_shape_where_that_explains_the_frames_better(clip
 
     def smaller(vertices, faces, views, left_out):
         given.extend(view.index for view in (*views, *left_out))
-        return Shape(vertices * 0.9, faces, "It is better.", None, None)
+        return ReconstructedShape(vertices * 0.9, faces, "It is better.", None, None)
 
     def reshaped(model, vertices, faces, views):  # the stand-in's texture is too small to be taken apart
         return replace(model, vertices=vertices)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tracking3d.points.image_following import follow_in_images
-from tracking3d.points.image_uncertainty import expected_error
+from tracking3d.points.image_uncertainty import expected_image_error
 from tracking3d.points.pictures import (
     likeness,
     open_picture,
@@ -180,6 +180,6 @@ def test_pixels_know_how_far_inside_the_mask_they_lie():
 
 
 def test_what_is_known_worse_is_expected_to_be_further_off():
-    assert (np.diff(expected_error([0.01, 0.1, 1.0], 3, 0)) > 0).all()
-    assert (np.diff(expected_error(0.1, [1, 5, 25], 0)) > 0).all()
-    assert (np.diff(expected_error(0.1, 5, [1, 5, 25])) > 0).all()
+    assert (np.diff(expected_image_error([0.01, 0.1, 1.0], 3, 0)) > 0).all()
+    assert (np.diff(expected_image_error(0.1, [1, 5, 25], 0)) > 0).all()
+    assert (np.diff(expected_image_error(0.1, 5, [1, 5, 25])) > 0).all()

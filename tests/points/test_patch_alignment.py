@@ -3,6 +3,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from twins import patch_alignment
 
 from tracking3d.points.alignment import align
 
@@ -24,52 +25,45 @@ KNOWN = np.ones((SIZE, SIZE), np.float32)
 POINTS = np.array([[20.0, 25.0], [31.5, 33.25], [40.0, 22.0]])
 
 
-@pytest.mark.parametrize("backend", ["numba", "torch"])
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (0.4, -0.7), (-1.6, 1.1)])
-def test_a_shift_is_found_to_a_tenth_of_a_pixel_whatever_the_light(backend, shift):
+def test_a_shift_is_found_to_a_tenth_of_a_pixel_whatever_the_light(shift):
     image = moved(painted(), shift) * 1.3 + 20
-    found = align(painted(), KNOWN, image, POINTS, prior=3.0, backend=backend)
+    found = align(painted(), KNOWN, image, POINTS, prior=3.0)
     assert np.abs(found.shift - shift).max() < 0.1
     assert (found.agreement > 0.98).all()
     assert (found.variance < 0.1).all()
 
 
-def test_kernel_and_numpy_say_the_same():
+def test_the_kernel_says_what_its_twin_says():
     rng = np.random.default_rng(1)
     xy = np.concatenate([rng.uniform(-10, SIZE + 10, (60, 2)), [[np.nan, 3.0]]])
     known = (painted(2) > 90).astype(np.float32)
-    results = [
-        align(painted(), known, moved(painted(), (0.6, 0.3)), xy, backend=backend)
-        for backend in ("numba", "torch")
-    ]
+    given = painted(), known, moved(painted(), (0.6, 0.3)), xy
+    results = align(*given), patch_alignment.align(*given)
     for name in ("shift", "covariance", "agreement", "contrast"):
         one, other = (getattr(result, name) for result in results)
         assert np.allclose(one, other, atol=2e-3, rtol=2e-3), name
 
 
-@pytest.mark.parametrize("backend", ["numba", "torch"])
-def test_without_texture_the_prediction_stands_and_the_variance_says_so(backend):
+def test_without_texture_the_prediction_stands_and_the_variance_says_so():
     flat = np.full((SIZE, SIZE), 90, np.float32)
-    found = align(flat, KNOWN, flat + 5, POINTS, prior=1.5, backend=backend)
+    found = align(flat, KNOWN, flat + 5, POINTS, prior=1.5)
     assert np.abs(found.shift).max() < 1e-6
     assert np.allclose(found.variance, 1.5**2, rtol=0.01)
 
 
-@pytest.mark.parametrize("backend", ["numba", "torch"])
-def test_along_an_edge_nothing_is_known(backend):
+def test_along_an_edge_nothing_is_known():
     edge = cv2.GaussianBlur(np.where(np.arange(SIZE) < 32, 40.0, 200.0)[None].repeat(SIZE, 0), (0, 0), 1)
     found = align(
         edge.astype(np.float32), KNOWN, moved(edge.astype(np.float32), (0.5, 0.9)), np.array([[32.0, 32.0]]),
-        backend=backend,
     )  # fmt: skip
     assert found.shift[0] == pytest.approx([0.5, 0.0], abs=0.1)
     assert found.covariance[0, 0] < 0.1 < 0.9 < found.covariance[0, 2]
 
 
-@pytest.mark.parametrize("backend", ["numba", "torch"])
-def test_what_is_hidden_or_outside_is_not_aligned(backend):
-    hidden = align(painted(), np.zeros_like(KNOWN), painted(), POINTS, backend=backend)
-    outside = align(painted(), KNOWN, painted(), np.array([[-50.0, 3.0], [np.nan, 3.0]]), backend=backend)
+def test_what_is_hidden_or_outside_is_not_aligned():
+    hidden = align(painted(), np.zeros_like(KNOWN), painted(), POINTS)
+    outside = align(painted(), KNOWN, painted(), np.array([[-50.0, 3.0], [np.nan, 3.0]]))
     for found in (hidden, outside):
         assert np.isinf(found.covariance).all()
         assert (found.agreement == -1).all()

@@ -5,10 +5,10 @@ from functools import partial
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from twins import ray_intersection
 
 from tracking3d.bundle_adjustment.reversal import reversal_of
 from tracking3d.points.bundle import LEAST_MEASURED, bundle, intersect, other_way_round
-from tracking3d.rendering.backend import compiled
 
 RNG = np.random.default_rng(3)
 POINTS = RNG.uniform(-1, 1, (40, 3))
@@ -37,40 +37,28 @@ def turned(T: np.ndarray, degrees: float) -> np.ndarray:
     return off
 
 
-BOTH = pytest.mark.parametrize(
-    "backend",
-    [
-        pytest.param("numba", marks=pytest.mark.skipif(not compiled(), reason="numba compiles nothing here")),
-        "torch",
-    ],
-)
-
-
-@BOTH
-def test_points_come_to_lie_where_the_views_saw_them(backend):
+def test_points_come_to_lie_where_the_views_saw_them():
     start = POINTS + RNG.normal(0, 0.05, POINTS.shape)
     before = start.copy()
     measured = projected(POINTS, poses())
     found, weight = intersect(
-        start, INTRINSICS, poses(), measured, np.full(measured.shape[:2], 0.1), held=1.0, backend=backend
+        start, INTRINSICS, poses(), measured, np.full(measured.shape[:2], 0.1), held=1.0
     )
     assert np.array_equal(start, before)
     assert np.abs(found - POINTS).max() < 2e-3
     assert (weight > 0).all()
 
 
-@BOTH
-def test_a_wrong_measurement_hardly_counts(backend):
+def test_a_wrong_measurement_hardly_counts():
     measured = projected(POINTS, poses())
     measured[4] += 25.0
     found, weight = intersect(
-        POINTS, INTRINSICS, poses(), measured, np.full(measured.shape[:2], 0.1), held=1.0, backend=backend
+        POINTS, INTRINSICS, poses(), measured, np.full(measured.shape[:2], 0.1), held=1.0
     )
     assert np.abs(found - POINTS).max() < 2e-3
     assert (weight[4] < 1e-2 * weight[3]).all()
 
 
-@pytest.mark.skipif(not compiled(), reason="numba compiles nothing here")
 def test_the_kernel_moves_points_as_its_twin_does():
     rng = np.random.default_rng(7)
     measured = projected(POINTS, poses()) + rng.normal(0, 0.5, (9, 40, 2))
@@ -81,10 +69,8 @@ def test_the_kernel_moves_points_as_its_twin_does():
     T = poses()
     T[8, 2, 3] = -6.0  # behind the camera
     start = POINTS + rng.normal(0, 0.1, POINTS.shape)
-    (mine, weight), (expected, weights) = (
-        intersect(start, INTRINSICS, T, measured, deviation, held=0.2, backend=backend)
-        for backend in ("numba", "torch")
-    )
+    given = start, INTRINSICS, T, measured, deviation, 0.2
+    (mine, weight), (expected, weights) = intersect(*given), ray_intersection.intersect(*given)
     np.testing.assert_allclose(mine, expected, atol=1e-9)
     np.testing.assert_allclose(weight, weights, rtol=1e-6, atol=1e-9)
     np.testing.assert_array_equal(mine[3], start[3])

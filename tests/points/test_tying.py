@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.prototypes import sphere
 from tracking3d.points.follow import Followed
-from tracking3d.points.landmarks import Scene
-from tracking3d.points.tying import joined, meetings
+from tracking3d.points.landmarks import LandmarkScene
+from tracking3d.points.tying import meetings, merge_image_points
 from tracking3d.points.uncertainty import FEATURES
 from tracking3d.points.view import open_view
 
@@ -31,10 +31,10 @@ def poses(step: float = 4.0) -> list[np.ndarray]:
     return result
 
 
-def scene(Ts: list[np.ndarray]) -> Scene:
+def scene(Ts: list[np.ndarray]) -> LandmarkScene:
     image, mask = np.zeros((480, 640, 3), np.uint8), np.zeros((480, 640), bool)
     views = [open_view(image, mask, CAMERA, T, MESH.vertices, MESH.faces) for T in Ts]
-    return Scene(list(views), np.asarray(MESH.vertices, float), np.asarray(MESH.faces))
+    return LandmarkScene(list(views), np.asarray(MESH.vertices, float), np.asarray(MESH.faces))
 
 
 def seen(points: np.ndarray, Ts: list[np.ndarray]) -> np.ndarray:
@@ -98,7 +98,7 @@ def surface() -> Followed:
 def test_surface_and_images_are_brought_together_by_variance(surface):
     xy = np.array([[[10.0, 11.0]], [[20.0, 20.0]], [[30.0, 30.0]]])
     found = np.array([[True], [False], [True]])
-    both = joined(surface, xy, np.full((3, 1), 0.5), found)
+    both = merge_image_points(surface, xy, np.full((3, 1), 0.5), found)
     np.testing.assert_allclose(both.positions[:, 0], [(10, 10.8), (20, 20), (30, 30)])
     np.testing.assert_allclose(both.uncertainty[:, 0], [0.5, 1.0, 0.5])
     assert both.visible[:, 0].tolist() == [True, False, True]
@@ -107,9 +107,11 @@ def test_surface_and_images_are_brought_together_by_variance(surface):
 
 def test_where_they_contradict_the_image_counts_and_the_gap_is_told(surface):
     xy = np.array([[[10.0, 30.0]], [[20.0, 20.0]], [[30.0, 30.0]]])
-    both = joined(surface, xy, np.full((3, 1), 0.5), np.array([[True], [False], [False]]))
+    both = merge_image_points(surface, xy, np.full((3, 1), 0.5), np.array([[True], [False], [False]]))
     np.testing.assert_allclose(both.positions[0, 0], (10, 30))
     assert both.uncertainty[0, 0] == pytest.approx(10)
     assert np.isnan(both.positions[2]).all() and np.isnan(both.uncertainty[2]).all()
     nothing = dataclasses.replace(surface, positions=np.full((3, 1, 2), np.nan))
-    assert np.isnan(joined(nothing, xy, np.full((3, 1), 0.5), np.zeros((3, 1), bool)).positions).all()
+    assert np.isnan(
+        merge_image_points(nothing, xy, np.full((3, 1), 0.5), np.zeros((3, 1), bool)).positions
+    ).all()

@@ -6,22 +6,15 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from twins import warping
 
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.prototypes import sphere
-from tracking3d.points.carrying import Warps
+from tracking3d.points.carrying import _warped
 from tracking3d.points.view import open_view
-from tracking3d.rendering.backend import compiled
 
 MESH = sphere(12)
 CAMERA = Camera(900.0, 900.0, 319.5, 239.5, 640, 480)
-BOTH = pytest.mark.parametrize(
-    "backend",
-    [
-        pytest.param("numba", marks=pytest.mark.skipif(not compiled(), reason="numba compiles nothing here")),
-        "torch",
-    ],
-)
 
 
 def view(turn: float, depth: float = 5.0):
@@ -36,10 +29,9 @@ def view(turn: float, depth: float = 5.0):
     return open_view(image, mask > 0, CAMERA, T, MESH.vertices, MESH.faces)
 
 
-@BOTH
-def test_a_point_of_the_surface_has_the_grey_of_where_the_other_view_shows_it(backend):
+def test_a_point_of_the_surface_has_the_grey_of_where_the_other_view_shows_it():
     start, end = view(0.0), view(20.0)
-    warped, known = Warps([start, end], 0.02)._warp(0, 1, backend)
+    warped, known = _warped(start, end, 0.02)
     points = np.array([[0.0, 0.0, -1.0], [0.3, 0.2, -0.933], [-0.4, 0.1, -0.911]])
     here, there = end.project(points)[0].round().astype(int), start.project(points)[0]
     assert (known[here[:, 1], here[:, 0]] > 0.99).all()
@@ -47,19 +39,17 @@ def test_a_point_of_the_surface_has_the_grey_of_where_the_other_view_shows_it(ba
     assert np.abs(warped[here[:, 1], here[:, 0]] - expected).max() < 1.0  # half a pixel, and whole greys
 
 
-@BOTH
-def test_what_the_other_view_does_not_show_is_not_known(backend):
-    warped, known = Warps([view(0.0), view(150.0)], 0.02)._warp(0, 1, backend)
+def test_what_the_other_view_does_not_show_is_not_known():
+    warped, known = _warped(view(0.0), view(150.0), 0.02)
     front = known[60:-60, 60:-60]
     assert (front == 0).mean() > 0.5
     assert np.isfinite(warped).all()
 
 
-@pytest.mark.skipif(not compiled(), reason="numba compiles nothing here")
 @pytest.mark.parametrize(("turn", "depth"), [(8.0, 5.0), (-30.0, 4.0), (0.0, 7.0)])
 def test_the_kernel_agrees_with_its_twin(turn, depth):
-    warps = Warps([view(0.0), view(turn, depth)], 0.02)
-    (mine, known), (expected, seen) = (warps._warp(0, 1, backend) for backend in ("numba", "torch"))
+    given = view(0.0), view(turn, depth), 0.02
+    (mine, known), (expected, seen) = _warped(*given), warping.warped(*given)
     # OpenCV takes positions to a thirty-second of a pixel, which decides some pixels at the rim of what is seen.
     same = np.abs(known - seen) < 0.05
     assert same.mean() > 0.99

@@ -18,7 +18,8 @@ from tracking3d.estimation.estimate import FrameEstimate, Status
 from tracking3d.frames import Frame
 from tracking3d.reconstruction import of_run
 from tracking3d.reconstruction.of_run import shape_run, texture_run
-from tracking3d.reconstruction.shape import Shape
+from tracking3d.reconstruction.shape import ReconstructedShape
+from tracking3d.results.description import RunHeader
 from tracking3d.results.files import write_image
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.run_writer import RunWriter
@@ -39,9 +40,10 @@ def written(folder: Path, yaws=YAWS, **changes) -> Path:
         estimates.append(replace(one, **changes))
     given = {"first_frame": 0, "first_picture": checksum(frames[0].image)}
     run = folder / "run"
-    with RunWriter(
-        run, config={}, camera=CAMERA, source=str(images), seed=0, fps=None, command=None, given=given
-    ) as writer:
+    header = RunHeader(
+        config={}, camera=CAMERA, source=str(images), seed=0, fps=None, command=None, given=given
+    )
+    with RunWriter(run, header) as writer:
         for frame, estimate in zip(frames, estimates, strict=True):
             writer.write(estimate, frame)
         writer.finish(ball(), "finished")
@@ -109,7 +111,7 @@ def test_a_shape_that_cannot_be_told_leaves_the_mesh_and_its_texture(tmp_path):
 def test_a_new_shape_takes_the_place_of_the_old_one_which_is_kept(tmp_path, monkeypatch):
     run = written(tmp_path)
     before, smaller = load_model(run), ball().vertices * 0.97
-    made = Shape(smaller, ball().faces, "it is better", None, None)
+    made = ReconstructedShape(smaller, ball().faces, "it is better", None, None)
     monkeypatch.setattr(of_run, "reconstructed", lambda vertices, faces, views, left_out: made)
     shaped = shape_run(run)
     after = load_model(run)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rendered_views import CAMERA, ball, pattern, pose, seen
 
-from tracking3d.points.landmarks import Scene, outlined, refine_scene
+from tracking3d.points.landmarks import LandmarkScene, outlined, refine_scene
 from tracking3d.points.outline_fit import outline_of
 from tracking3d.points.view import open_view
 
@@ -14,16 +14,16 @@ TRUE = [pose(yaw, 0.4 * yaw) for yaw in np.linspace(0, 48, 9)]
 FRAMES = [seen(T, pattern()) for T in TRUE]
 
 
-def opened(vertices: np.ndarray, edited=lambda index, mask: mask) -> Scene:
+def opened(vertices: np.ndarray, edited=lambda index, mask: mask) -> LandmarkScene:
     faces = ball().faces
     views = [
         open_view(image, edited(index, mask), CAMERA, T, vertices, faces)
         for index, (T, (image, mask)) in enumerate(zip(TRUE, FRAMES, strict=True))
     ]
-    return Scene(list(views), vertices, faces)
+    return LandmarkScene(list(views), vertices, faces)
 
 
-def agreement(scene: Scene) -> float:
+def agreement(scene: LandmarkScene) -> float:
     """Mean IoU of silhouettes and true masks."""
     shares = []
     for view, (_, mask) in zip(scene.views, FRAMES, strict=True):

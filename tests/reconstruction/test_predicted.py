@@ -9,7 +9,7 @@ import pytest
 from rendered_views import ball, pattern, pose, seen, view
 from test_volume import CAMERA, shape_views
 
-from tracking3d.reconstruction import textured
+from tracking3d.reconstruction import bake_texture, predicted
 from tracking3d.reconstruction.predicted import picture_scores
 from tracking3d.reconstruction.shape_views import shape_view
 
@@ -26,9 +26,9 @@ def out():
 
 def test_the_right_model_predicts_what_a_wrong_one_does_not(out):
     views = [view(n, yaw) for n, yaw in enumerate(YAWS)]
-    right = picture_scores(textured(ball(), views), shape_views(YAWS), [out])
+    right = picture_scores(bake_texture(ball(), views), shape_views(YAWS), [out])
     small = ball()
-    small = textured(replace(small, vertices=0.7 * small.vertices), views)
+    small = bake_texture(replace(small, vertices=0.7 * small.vertices), views)
     wrong = picture_scores(small, shape_views(YAWS), [out])
     assert right.frames == 1 and right.psnr > 22 and right.ssim > 0.8 and right.covered > 0.97
     assert wrong.psnr < right.psnr - 3 and wrong.ssim < right.ssim - 0.1 and wrong.covered < 0.8
@@ -37,9 +37,25 @@ def test_the_right_model_predicts_what_a_wrong_one_does_not(out):
 def test_what_is_beside_the_mask_is_not_judged(out):
     shape, texture = out
     views = [view(n, yaw) for n, yaw in enumerate(YAWS)]
-    model = textured(ball(), views)
+    model = bake_texture(ball(), views)
     other = texture.image.copy()
     other[texture.valid <= 0] = 255
     elsewhere = picture_scores(model, shape_views(YAWS), [(shape, replace(texture, image=other))])
     assert elsewhere.psnr == pytest.approx(picture_scores(model, shape_views(YAWS), [out]).psnr, abs=1e-6)
     assert np.isfinite(elsewhere.ssim)
+
+
+def test_the_signal_to_noise_ratio_is_that_of_the_pixels_within_the_mask(out, monkeypatch):
+    """Of a model out of sight every pixel is predicted as middle grey; of two like pictures the ratio is 60 dB."""
+    shape, texture = out
+    away = ball()
+    away = replace(away, vertices=away.vertices + 100)
+    monkeypatch.setattr(predicted, "polished", lambda surface, views: views)
+    picture, inside = texture.image / 255.0, texture.valid > 0
+    scores = picture_scores(away, shape_views(YAWS), [out])
+    assert scores.covered == 0
+    assert scores.psnr == pytest.approx(-10 * np.log10(np.square(picture - 0.5)[inside].mean()), abs=1e-9)
+
+    monkeypatch.setattr(predicted, "_UNCOVERED", 0.0)
+    black = replace(texture, image=np.zeros_like(texture.image))
+    assert picture_scores(away, shape_views(YAWS), [(shape, black)]).psnr == 60

@@ -7,7 +7,7 @@ import pytest
 from tracking3d.estimation.assessment import Assessment
 from tracking3d.estimation.estimate import Status
 from tracking3d.points.landmarks import Support
-from tracking3d.reconstruction.support import BELIEVED, supported, weighed
+from tracking3d.reconstruction.support import BELIEVED, judge_with_landmarks, refined_confidence_features
 
 TRACKED = Assessment(Status.TRACKED, "", 0.9)
 DOUBTED = Assessment(Status.UNCERTAIN, "points agree, pixels do not", 0.3)
@@ -15,49 +15,56 @@ DOUBTED = Assessment(Status.UNCERTAIN, "points agree, pixels do not", 0.3)
 
 def test_the_more_of_the_landmarks_agree_the_more_an_answer_is_believed():
     for before in (TRACKED, DOUBTED):
-        said = [supported(before, Support(300, count)).confidence for count in (150, 200, 250, 280)]
+        said = [
+            judge_with_landmarks(before, Support(300, count)).confidence for count in (150, 200, 250, 280)
+        ]
         assert said == sorted(set(said))
     barely = Assessment(Status.TRACKED, "", 0.52)
     assert (
-        supported(barely, Support(300, 150)).confidence
+        judge_with_landmarks(barely, Support(300, 150)).confidence
         < BELIEVED
-        < supported(barely, Support(300, 290)).confidence
+        < judge_with_landmarks(barely, Support(300, 290)).confidence
     )
 
 
 def test_few_that_agree_say_less_than_many():
-    assert supported(TRACKED, Support(3, 3)).confidence < supported(TRACKED, Support(90, 90)).confidence
+    assert (
+        judge_with_landmarks(TRACKED, Support(3, 3)).confidence
+        < judge_with_landmarks(TRACKED, Support(90, 90)).confidence
+    )
 
 
 def test_what_was_believed_before_counts_too():
     support = Support(200, 120)
-    assert supported(DOUBTED, support).confidence <= supported(TRACKED, support).confidence
+    assert (
+        judge_with_landmarks(DOUBTED, support).confidence <= judge_with_landmarks(TRACKED, support).confidence
+    )
 
 
 def test_a_frame_is_tracked_from_the_confidence_on_at_which_it_is_believed():
     for agreeing in range(0, 400, 10):
         for before in (TRACKED, DOUBTED):
-            after = supported(before, Support(400, agreeing))
+            after = judge_with_landmarks(before, Support(400, agreeing))
             assert (after.status is Status.TRACKED) is (after.confidence >= BELIEVED)
             assert (after.reason == "") is (after.status is Status.TRACKED)
 
 
 def test_doubt_says_why():
     barely = Assessment(Status.TRACKED, "", 0.52)
-    assert "(0 agree of 40" in supported(barely, Support(40, 0)).reason
-    assert supported(DOUBTED, Support(40, 0)).reason == DOUBTED.reason
+    assert "(0 agree of 40" in judge_with_landmarks(barely, Support(40, 0)).reason
+    assert judge_with_landmarks(DOUBTED, Support(40, 0)).reason == DOUBTED.reason
 
 
 def test_doubt_about_a_plain_object_says_that_it_is_plain():
     hardly = Assessment(Status.TRACKED, "", 0.03)
-    assert "plain" in supported(hardly, Support(300, 300, telling=False)).reason
+    assert "plain" in judge_with_landmarks(hardly, Support(300, 300, telling=False)).reason
 
 
 def test_what_is_lost_stays_lost():
     lost = Assessment(Status.LOST, "out of sight", 0.05)
-    assert supported(lost, Support(300, 300)) is lost
+    assert judge_with_landmarks(lost, Support(300, 300)) is lost
 
 
 @pytest.mark.parametrize("before", [0.0, 1.0])
 def test_certainty_and_nothing_followed_are_numbers(before):
-    assert all(abs(value) < 10 for value in weighed(before, Support(0, 0)).values())
+    assert all(abs(value) < 10 for value in refined_confidence_features(before, Support(0, 0)).values())

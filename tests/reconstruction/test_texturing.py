@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+import twins.texturing
 from rendered_views import FINE, ball, pattern, view
 
 from tracking3d.estimation.estimate import ObjectModel
-from tracking3d.reconstruction import textured, texturing
+from tracking3d.reconstruction import bake_texture, texturing
 from tracking3d.reconstruction.texturing import filled, texture_size
 from tracking3d.rendering import sample_texture
 
@@ -30,7 +31,7 @@ def error(model: ObjectModel, truth: np.ndarray) -> float:
 
 def test_the_texture_is_as_fine_as_the_views():
     views = [view(n, yaw) for n, yaw in enumerate(YAWS)]
-    model = textured(ball(), views)
+    model = bake_texture(ball(), views)
     assert len(model.texture) == texture_size(views, 2048) == 512
     assert error(model, pattern()) < 0.04
     # What a texture of the size that the solver works with could say at best.
@@ -40,7 +41,7 @@ def test_the_texture_is_as_fine_as_the_views():
 
 
 def test_what_no_view_shows_is_marked_and_continues_what_is_seen():
-    model = textured(ball(), [view(0, 0.0)])
+    model = bake_texture(ball(), [view(0, 0.0)])
     known = model.texture_weight > 0
     assert 0.2 < known.mean() < 0.5
     low, high = model.texture[known].min(0), model.texture[known].max(0)
@@ -49,7 +50,7 @@ def test_what_no_view_shows_is_marked_and_continues_what_is_seen():
 
 def test_shape_and_features_stay():
     before = ball()
-    after = textured(before, [view(0, 0.0)])
+    after = bake_texture(before, [view(0, 0.0)])
     for name in ("vertices", "faces", "face_uvs", "features"):
         assert getattr(after, name) is getattr(before, name)
 
@@ -57,11 +58,11 @@ def test_shape_and_features_stay():
 def test_one_view_that_shows_something_else_is_outvoted():
     """A hand, a highlight: nearly white, over a third of the ball."""
     views = [view(n, yaw) for n, yaw in enumerate(YAWS)]
-    clean = error(textured(ball(), views), pattern())
+    clean = error(bake_texture(ball(), views), pattern())
     image = views[2].image.copy()
     image[: len(image) // 2, len(image) // 3 :] = 250
-    alone = error(textured(ball(), [replace(views[2], image=image)]), pattern())
-    among = error(textured(ball(), [*views[:2], replace(views[2], image=image), *views[3:]]), pattern())
+    alone = error(bake_texture(ball(), [replace(views[2], image=image)]), pattern())
+    among = error(bake_texture(ball(), [*views[:2], replace(views[2], image=image), *views[3:]]), pattern())
     assert alone > 0.1
     assert among < clean + 0.2 * (alone - clean)
 
@@ -72,33 +73,33 @@ def test_exposures_are_brought_to_one_level():
         replace(one, image=(one.image * (0.85 if n % 2 else 1.0)).round().astype(np.uint8))
         for n, one in enumerate(views)
     ]
-    level = textured(ball(), darker).texture.astype(float)
-    even = textured(ball(), views).texture.astype(float)
-    well = textured(ball(), views).texture_weight > 0.3
+    level = bake_texture(ball(), darker).texture.astype(float)
+    even = bake_texture(ball(), views).texture.astype(float)
+    well = bake_texture(ball(), views).texture_weight > 0.3
     ratio = level[well].mean(-1) / even[well].mean(-1)
     assert ratio.std() < 0.03  # 0.075 where each texel has its own view's exposure
 
 
 def test_the_kernel_adds_up_what_numpy_adds_up(monkeypatch):
     views = [view(n, yaw) for n, yaw in enumerate(YAWS)]
-    fast = textured(ball(), views)
-    monkeypatch.setattr(texturing, "compiled", lambda: False)
-    plain = textured(ball(), views)
+    fast = bake_texture(ball(), views)
+    monkeypatch.setattr(texturing, "add_view", twins.texturing.add_view)
+    plain = bake_texture(ball(), views)
     assert np.abs(fast.texture.astype(int) - plain.texture).max() <= 1
     assert fast.texture_weight == pytest.approx(plain.texture_weight, rel=1e-4)
 
 
 def test_the_largest_texture_is_bounded():
-    assert len(textured(ball(), [view(0, 0.0)], largest=128).texture) == 128
+    assert len(bake_texture(ball(), [view(0, 0.0)], largest=128).texture) == 128
 
 
 def test_without_views_or_where_none_shows_it_the_model_is_the_same():
     model = ball()
-    assert textured(model, []) is model
+    assert bake_texture(model, []) is model
     behind = view(0, 0.0)
     T_cam_obj = behind.T_cam_obj.copy()
     T_cam_obj[2, 3] = -5.0
-    assert textured(model, [replace(behind, T_cam_obj=T_cam_obj)]) is model
+    assert bake_texture(model, [replace(behind, T_cam_obj=T_cam_obj)]) is model
 
 
 def test_a_uniform_texture_is_continued_as_it_is():

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from rendered_views import CAMERA, pattern, pose, seen
+from twins import plane_sweep, visual_hull
 
 from tracking3d.geometry.prototypes import sphere
 from tracking3d.reconstruction.depth_maps import DepthMap, Guide, depth_maps, patch_scores
@@ -60,7 +61,8 @@ def test_nothing_is_known_beyond_the_frame(around):
 
 def test_kernel_and_twin_of_the_hull_agree(around):
     points = np.random.default_rng(2).uniform(-1.3, 1.3, (500, 3)).astype(np.float32)
-    kernel, twin = (robust_hull(points, around, 0.4, 0.1, 1, backend) for backend in ("numba", "torch"))
+    given = points, around, 0.4, 0.1, 1
+    kernel, twin = robust_hull(*given), visual_hull.robust_hull(*given)
     np.testing.assert_allclose(kernel[0], twin[0], atol=1e-5)
     np.testing.assert_array_equal(kernel[1], twin[1])
 
@@ -98,7 +100,7 @@ def test_kernel_and_twin_of_the_sweep_agree():
     normal = random.normal(size=(60, 3)) * 0.3 - (0, 0, 1)
     given = (image, np.ones_like(image), K_inverse, np.stack(others), P, pixels, np.full(60, 3.0), normal)
     offsets = np.linspace(-0.5, 0.5, 5)
-    kernel, twin = (patch_scores(*given, offsets, backend) for backend in ("numba", "torch"))
+    kernel, twin = patch_scores(*given, offsets), plane_sweep.patch_scores(*given, offsets)
     assert (kernel[0] > -1).any() and (kernel[0] == -1).any()
     for one, other in zip(kernel, twin, strict=True):
         np.testing.assert_allclose(one, other, atol=2e-3)

@@ -11,6 +11,9 @@ import torch
 from scenes import bumpy_sphere, triangles
 from torch import Tensor
 
+from tracking3d import parts
+from tracking3d.config.models import RuntimeConfig
+from tracking3d.errors import InputError
 from tracking3d.rendering import (
     back_project,
     backend,
@@ -277,3 +280,10 @@ def test_kernels_that_are_not_compiled_are_not_used_and_that_is_told(monkeypatch
             prepare_backend("numba", "cpu")
     finally:
         why_no_numba.cache_clear()
+
+
+@pytest.mark.parametrize("renderer", ["auto", "torch"])
+def test_nothing_is_tracked_without_numba_whatever_renders(renderer, monkeypatch):
+    monkeypatch.setattr(parts, "why_no_numba", lambda: "numba cannot be imported (ImportError: gone)")
+    with pytest.raises(InputError, match=r"needs Numba to compile its kernels: numba cannot be imported"):
+        parts.chosen_renderer(RuntimeConfig(renderer=renderer))

@@ -16,7 +16,7 @@ from tracking3d.speed import benchmark as bench_render
 from tracking3d.speed import growth as bench_growth
 from tracking3d.speed.growth import exponent, measure_growth
 from tracking3d.speed.plot import check_plot, plot_growth
-from tracking3d.speed.scene import Problem
+from tracking3d.speed.scene import RenderWorkload
 from tracking3d.speed.table import format_growth
 from tracking3d.speed.timing import Duration
 
@@ -43,7 +43,7 @@ needs_matplotlib = pytest.mark.skipif(
 @pytest.fixture
 def few_points(monkeypatch) -> None:
     monkeypatch.setattr(bench_growth, "RANGES", FEW)
-    monkeypatch.setattr(bench_render, "peak_memory", lambda name, problem, device, threads: None)
+    monkeypatch.setattr(bench_render, "peak_memory", lambda name, problem, device, threads: 0.0)
 
 
 def bench(*arguments: object):
@@ -69,7 +69,7 @@ def test_points_beside_the_line_are_averaged_in_logarithms():
 
 
 def test_everything_grows_alone(few_points):
-    problem = Problem(size=16, frames=1, channels=1, texture=8, frequency=2)
+    problem = RenderWorkload(size=16, frames=1, channels=1, texture=8, frequency=2)
     growth = measure_growth(problem, torch.device("cpu"), repeats=1, threads=1)
     assert {name: measured["values"] for name, measured in growth.items()} == {
         "pixels": [256, 400, 576],
@@ -99,14 +99,14 @@ def test_a_busy_moment_spoils_no_point(monkeypatch):
 
     monkeypatch.setattr(bench_growth, "RANGES", {"pixels": FEW["pixels"]})
     monkeypatch.setattr(bench_growth, "time_backends", busy_in_the_first_pass)
-    growth = measure_growth(Problem(), torch.device("cpu"), repeats=15, threads=1)
+    growth = measure_growth(RenderWorkload(), torch.device("cpu"), repeats=15, threads=1)
     assert growth["pixels"]["total_ms"] == {"torch": growth["pixels"]["values"]}
     assert growth["pixels"]["exponent"] == {"torch": 1.0}
 
 
 def test_the_ranges_are_those_that_the_documentation_names():
     ends = {
-        name: [getattr(Problem(**changes[end]), name) for end in (0, -1)]
+        name: [getattr(RenderWorkload(**changes[end]), name) for end in (0, -1)]
         for name, changes in bench_growth.RANGES.items()
     }
     assert ends == {

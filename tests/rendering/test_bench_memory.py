@@ -6,13 +6,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import psutil
 import pytest
 import torch
 
 from tracking3d import process_memory
 from tracking3d.process_memory import resident_memory
 from tracking3d.speed.memory import peak_memory
-from tracking3d.speed.scene import Problem
+from tracking3d.speed.scene import RenderWorkload
 
 CPU = torch.device("cpu")
 needs_proc = pytest.mark.skipif(
@@ -41,26 +42,32 @@ def test_the_peak_is_that_since_it_was_forgotten():
     assert without < 20
 
 
-def test_without_proc_the_operating_system_is_asked_in_its_unit(monkeypatch):
+def test_the_peak_is_never_below_the_present_size():
+    now, peak = resident_memory()
+    assert 0 < now <= peak
+
+
+@pytest.mark.parametrize(("system", "unit"), [("linux", 1024), ("darwin", 1)])
+def test_without_proc_the_operating_system_is_asked_in_its_unit(monkeypatch, system, unit):
     resource = pytest.importorskip("resource", reason="this system has no module resource")
+    most = 10**12 // unit  # above what this process holds
     monkeypatch.setattr(process_memory, "_STATUS", Path("no such file"))
-    monkeypatch.setattr(resource, "getrusage", lambda who: type("usage", (), {"ru_maxrss": 3_000_000}))
-    monkeypatch.setattr(sys, "platform", "linux")
-    assert resident_memory() == pytest.approx((3072.0, 3072.0))
-    monkeypatch.setattr(sys, "platform", "darwin")
-    assert resident_memory() == pytest.approx((3.0, 3.0))
+    monkeypatch.setattr(resource, "getrusage", lambda who: type("usage", (), {"ru_maxrss": most}))
+    monkeypatch.setattr(sys, "platform", system)
+    now, peak = resident_memory()
+    assert 0 < now < peak == pytest.approx(1e6)
 
 
-def test_where_nobody_tells_there_is_no_answer(monkeypatch):
-    monkeypatch.setattr(process_memory, "_STATUS", Path("no such file"))
-    monkeypatch.setitem(sys.modules, "resource", None)
-    assert resident_memory() is None
-    assert peak_memory("torch", Problem(), CPU) is None
+def test_windows_knows_the_peak_itself(monkeypatch):
+    usage = type("usage", (), {"rss": 3_000_000, "peak_wset": 5_000_000})
+    monkeypatch.setattr(psutil.Process, "memory_info", lambda self: usage)
+    monkeypatch.setattr(sys, "platform", "win32")
+    assert resident_memory() == pytest.approx((3.0, 5.0))
 
 
 @pytest.mark.slow
 @needs_proc
 def test_a_backend_needs_at_least_the_gradient_of_the_texture():
-    problem = Problem(size=32, frames=1, channels=32, texture=256)
+    problem = RenderWorkload(size=32, frames=1, channels=32, texture=256)
     gradient = 4e-6 * problem.channels * problem.texture**2  # 8.4 MB
     assert gradient <= peak_memory("numba", problem, CPU) < 10 * gradient

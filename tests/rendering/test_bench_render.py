@@ -16,11 +16,11 @@ from tracking3d.speed import benchmark as bench_render
 from tracking3d.speed import timing as bench_timing
 from tracking3d.speed.benchmark import benchmark
 from tracking3d.speed.dense import render_dense
-from tracking3d.speed.scene import Problem, Scene, default_texture
+from tracking3d.speed.scene import RenderScene, RenderWorkload, default_texture
 from tracking3d.speed.timing import backends, time_backends
 
 CPU = torch.device("cpu")
-SMALL = Problem(size=20, frames=2, channels=3, texture=24, frequency=3)
+SMALL = RenderWorkload(size=20, frames=2, channels=3, texture=24, frequency=3)
 SCENES = {
     "closed mesh": (bumpy_sphere((24, 30), frequency=3), SoftBand()),
     "wide band": (bumpy_sphere((24, 24), frequency=3), SoftBand(100.0, 0.2, 1000)),
@@ -92,7 +92,7 @@ def test_the_kernels_take_no_part_on_a_gpu():
 
 @pytest.mark.parametrize("name", ["torch", "numba"])
 def test_all_backends_are_timed_on_the_same_loss_and_gradients(name):
-    scene, answers = Scene.make(SMALL, CPU), []
+    scene, answers = RenderScene.make(SMALL, CPU), []
     assert scene.mask.mean() > 0
     for backend in (render_dense, backends(CPU)[name]):
         scene.forget_gradients()
@@ -107,7 +107,7 @@ def test_all_backends_are_timed_on_the_same_loss_and_gradients(name):
 
 
 def test_each_backend_is_rendered_by_what_its_name_says():
-    scene = Scene.make(SMALL, CPU)
+    scene = RenderScene.make(SMALL, CPU)
     for name in ("torch", "numba"):
         assert backends(CPU)[name](**scene.parameters, **scene.constants).backend == name
 

@@ -20,6 +20,7 @@ from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.prototypes import sphere
 from tracking3d.results.correspondences import PointTracks, surface_under, track_points
+from tracking3d.results.description import RunHeader
 from tracking3d.results.point_files import points_to_csv, points_to_json
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_writer import RunWriter
@@ -62,7 +63,8 @@ def run_of(
     """A finished run; ``changes`` maps a field of the estimate to its value in some frames."""
     mask = np.ones((CAMERA.height, CAMERA.width), dtype=bool)
     image = np.zeros((CAMERA.height, CAMERA.width, 3), dtype=np.uint8)
-    with RunWriter(folder, config={}, camera=CAMERA, source="", seed=0, fps=None, command=None) as writer:
+    header = RunHeader(config={}, camera=CAMERA, source="", seed=0, fps=None, command=None)
+    with RunWriter(folder, header) as writer:
         for index, T in enumerate(Ts):
             estimate = FrameEstimate(10 + index, None, T, mask, None, Status.TRACKED, "", 1.0)
             some = {field: values[index] for field, values in changes.items() if index in values}
@@ -155,7 +157,8 @@ def test_a_point_behind_another_part_of_the_object_is_hidden(tmp_path):
     xy = np.array([wide.fx * (point[0] - 1.5) / (5 + point[2]) + wide.cx, wide.cy])
     assert wide.width == CAMERA.width
     mask = np.ones((120, 160), dtype=bool)
-    with RunWriter(tmp_path, config={}, camera=wide, source="", seed=0, fps=None, command=None) as writer:
+    header = RunHeader(config={}, camera=wide, source="", seed=0, fps=None, command=None)
+    with RunWriter(tmp_path, header) as writer:
         for index, T in enumerate(Ts):
             estimate = FrameEstimate(index, None, T, mask, None, Status.TRACKED, "", 1.0)
             writer.write(estimate, Frame(index, np.zeros((120, 160, 3), dtype=np.uint8)))

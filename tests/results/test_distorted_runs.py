@@ -10,8 +10,8 @@ import pytest
 
 from tracking3d.errors import InputError
 from tracking3d.export.exported_run import ExportedRun
-from tracking3d.export.exporter import ExportOptions
 from tracking3d.export.exporting import export_run
+from tracking3d.export.options import ExportOptions
 from tracking3d.geometry.lens import Lens
 from tracking3d.results.correspondences import grid_on_object, track_points
 from tracking3d.results.following import open_scene

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from tracking3d.errors import InputError
 from tracking3d.results import layout
-from tracking3d.results.correspondences import grid_on_object, project, track_points
+from tracking3d.results.correspondences import grid_on_object, project_object_points, track_points
 from tracking3d.results.following import open_scene
 from tracking3d.results.point_files import COLUMNS, points_to_csv
 from tracking3d.results.point_trails import draw_trails, write_trails
@@ -59,12 +59,12 @@ def true_positions(clip, truth, xy):
     t = T[:3, 3]
     a, b, c = (ray**2).sum(1), ray @ t, t @ t - 1
     points = ((b - np.sqrt(b * b - a * c)) / a)[:, None] * ray - t
-    return np.stack([project(camera, one, points @ T[:3, :3])[0] for one in truth])
+    return np.stack([project_object_points(camera, one, points @ T[:3, :3])[0] for one in truth])
 
 
 def test_the_images_put_right_what_the_poses_have_wrong(shaken, scene):
     folder, clip, truth = shaken
-    left, top = project(clip.camera, truth[0], np.zeros((1, 3)))[0][0]
+    left, top = project_object_points(clip.camera, truth[0], np.zeros((1, 3)))[0][0]
     xy = np.stack(np.meshgrid(left + np.arange(-15, 16, 6), top + np.arange(-15, 16, 6)), -1).reshape(-1, 2)
     exact = true_positions(clip, truth, xy)
     by_mesh, corrected = track_points(folder, 0, xy), scene.track(0, xy)
@@ -80,7 +80,7 @@ def test_the_images_put_right_what_the_poses_have_wrong(shaken, scene):
 
 def test_points_beside_the_object_have_no_track_and_those_on_its_rim_have(shaken, scene):
     _, clip, truth = shaken
-    rim = project(clip.camera, truth[0], np.zeros((1, 3)))[0][0] + (clip.camera.fx / 4 + 0.5, 0)
+    rim = project_object_points(clip.camera, truth[0], np.zeros((1, 3)))[0][0] + (clip.camera.fx / 4 + 0.5, 0)
     tracks = scene.track(0, [[1, 1], rim, [1e6, 0]])
     assert tracks.on_object.tolist() == [False, True, False]
     assert tracks.face[0] == tracks.face[2] == -1
@@ -128,7 +128,7 @@ def test_a_grid_lies_on_the_object(shaken):
 
 def test_files_and_pictures_hold_what_is_known(shaken, scene, tmp_path):
     _, clip, truth = shaken
-    middle = project(clip.camera, truth[0], np.zeros((1, 3)))[0][0]
+    middle = project_object_points(clip.camera, truth[0], np.zeros((1, 3)))[0][0]
     tracks = scene.track(0, [middle, [1, 1]])
     rows = list(csv.DictReader(io.StringIO(points_to_csv(tracks))))
     assert list(rows[0]) == COLUMNS

@@ -10,6 +10,7 @@ from scipy.spatial import HalfspaceIntersection
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
 from tracking3d.frames import Frame
 from tracking3d.results.correspondences import PointKind, check_asked, on_mask, track_points
+from tracking3d.results.description import RunHeader
 from tracking3d.results.following import open_scene
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_writer import RunWriter
@@ -44,9 +45,8 @@ def run_of(folder, clip, solid, poses=None, size=1.0) -> RunReader:
         np.zeros((8, 8, 1), np.float32),
     )
     poses = clip.T_cam_obj if poses is None else poses
-    with RunWriter(
-        folder, config={}, camera=clip.camera, source="", seed=0, fps=None, command=None
-    ) as writer:
+    header = RunHeader(config={}, camera=clip.camera, source="", seed=0, fps=None, command=None)
+    with RunWriter(folder, header) as writer:
         for index, (image, mask, T) in enumerate(zip(clip.images, clip.masks, poses, strict=True)):
             writer.write(
                 FrameEstimate(index, None, T, mask, None, Status.TRACKED, "", 1.0), Frame(index, image)

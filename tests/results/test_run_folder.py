@@ -215,6 +215,7 @@ sys.path.insert(0, sys.argv[2])
 from pathlib import Path
 from turning_sphere import turning_sphere_of
 from tracking3d.results import pictures, run_writer
+from tracking3d.results.description import RunHeader
 
 def die(*_):
     os.kill(os.getpid(), signal.SIGKILL)
@@ -230,7 +231,7 @@ for name in sys.argv[3:]:  # every run has a process of its own, and only this o
         break
 if where is None:
     sys.exit(0)
-writer = run_writer.RunWriter(Path(sys.argv[1]) / where, **about)
+writer = run_writer.RunWriter(Path(sys.argv[1]) / where, RunHeader(**about))
 for frame, estimate in zip(clip.frames[:4], clip.estimates[:4]):
     writer.write(estimate, frame)
 if where == "masks":  # the fifth frame's masks are there, its line is not

@@ -95,11 +95,12 @@ from dataclasses import replace
 from pathlib import Path
 from turning_sphere import turning_sphere_of
 from tracking3d.errors import OutputError
+from tracking3d.results.description import RunHeader
 from tracking3d.results.run_writer import RunWriter
 
 clip = turning_sphere_of(6)
 about = {"config": {}, "camera": clip.camera, "source": "clip", "seed": 0, "fps": None, "command": None}
-writer = RunWriter(Path(sys.argv[1]), **about)
+writer = RunWriter(Path(sys.argv[1]), RunHeader(**about))
 for frame, estimate in zip(clip.frames[:3], clip.estimates[:3]):
     writer.write(estimate, frame)
 # No file may grow beyond this: within the fourth line.

@@ -12,7 +12,7 @@ from tracking3d.cli.progress import print_summary
 from tracking3d.estimation.estimate import MaskSource, unanswered
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.results.contact_sheet import CROPS, TILE
-from tracking3d.results.notes import notes_of, notes_of_run, notes_of_times, unseen_share
+from tracking3d.results.notes import describe_camera_and_model, notes_of_run, notes_of_times, unseen_share
 from tracking3d.results.records import FrameRecord
 from tracking3d.stages import STAGES, StageTimes
 from tracking3d.video.image_file import read_image
@@ -96,11 +96,11 @@ def test_an_assumed_lens_is_noted(summary, turning_sphere):
 
 def test_a_lens_that_was_solved_is_told():
     camera = {"assumed": True, "origin": "solved field of view of 52.1 degrees"}
-    [note] = notes_of(camera, None)
+    [note] = describe_camera_and_model(camera, None)
     assert (
         note == "nobody gave the lens: solved field of view of 52.1 degrees; the final refinement solved it"
     )
-    assert notes_of(camera | {"assumed": False}, None) == []
+    assert describe_camera_and_model(camera | {"assumed": False}, None) == []
 
 
 def test_a_surface_that_was_mostly_never_seen_is_noted(turning_sphere):
@@ -111,7 +111,7 @@ def test_a_surface_that_was_mostly_never_seen_is_noted(turning_sphere):
     mostly = dataclasses.replace(turning_sphere.model, texture_weight=weight)
     share = unseen_share(mostly)
     assert 0.6 < share < 0.85
-    assert notes_of({"assumed": False, "origin": ""}, mostly) == [
+    assert describe_camera_and_model({"assumed": False, "origin": ""}, mostly) == [
         f"{100 * share:.0f} % of the mesh's surface was never seen; what is there is a guess"
     ]
 

@@ -14,6 +14,7 @@ import pytest
 from tracking3d import load_config
 from tracking3d.checkpoint.folder import Checkpoint
 from tracking3d.config.models import PipelineConfig
+from tracking3d.prompts import PromptSet
 from tracking3d.recording import record
 from tracking3d.results import layout
 from tracking3d.results.files import write_image, write_mask
@@ -21,7 +22,7 @@ from tracking3d.results.run_reader import RunReader
 from tracking3d.splitting.beginning import Begun
 from tracking3d.splitting.ending import Joined
 from tracking3d.splitting.long_video import LongVideo
-from tracking3d.splitting.part_runs import Given, Revisit
+from tracking3d.splitting.part_runs import Revisit
 from tracking3d.splitting.plan import Plan
 from tracking3d.splitting.steps import Step, steps_to_the_end
 from tracking3d.synthesis.convex_clips import SyntheticSpec, degrade_masks, synthesize
@@ -70,10 +71,10 @@ def looked_at_again(frames: Path, config: PipelineConfig, folder: Path) -> Path:
 
 def ended_in_parts(frames: Path, config: PipelineConfig, folder: Path, cut: int) -> list[list[Step]]:
     """Go on with such a run in two parts; the steps that were taken, side by side."""
-    video = LongVideo(str(frames), config, folder, Given(), "13f")
+    video = LongVideo(str(frames), config, folder, PromptSet(), "13f")
     begun = Begun(video, config, None, FRAMES, Plan([]), ())
     looks = tuple(
-        Revisit(str(frames), None, selection, config, folder, Given(), folder / "not needed any more")
+        Revisit(str(frames), None, selection, config, folder, PromptSet(), folder / "not needed any more")
         for selection in (f"0:{cut}:1", f"{cut}:{FRAMES}:1")
     )
     return taken(steps_to_the_end(Joined(begun, looks, {}, {"refine": 1.0, "second_look": 1.0})))

@@ -7,7 +7,7 @@ import os
 import pytest
 
 from tracking3d.errors import InputError, Tracking3dError
-from tracking3d.splitting.processes import side_by_side
+from tracking3d.splitting.processes import run_in_processes
 
 
 def where(tell, job):
@@ -25,14 +25,14 @@ def fail_or_crash(tell, job):
 
 def test_one_worker_is_this_process():
     told = []
-    assert side_by_side(where, [3, 1], 1, told.append) == [(3, os.getpid()), (1, os.getpid())]
+    assert run_in_processes(where, [3, 1], 1, told.append) == [(3, os.getpid()), (1, os.getpid())]
     assert told == [3, 1]
-    assert side_by_side(where, [], 4) == []
+    assert run_in_processes(where, [], 4) == []
 
 
 def test_several_are_others_and_answers_come_in_the_order_of_the_jobs():
     told = []
-    answers = side_by_side(where, [3, 1, 2], 2, told.append)
+    answers = run_in_processes(where, [3, 1, 2], 2, told.append)
     assert [job for job, _ in answers] == [3, 1, 2]
     assert os.getpid() not in {process for _, process in answers}
     assert sorted(told) == [1, 2, 3]
@@ -45,4 +45,4 @@ def test_several_are_others_and_answers_come_in_the_order_of_the_jobs():
 )
 def test_a_fault_is_raised_here(jobs, error, said):
     with pytest.raises(error, match=said):
-        side_by_side(fail_or_crash, jobs, 2)
+        run_in_processes(fail_or_crash, jobs, 2)

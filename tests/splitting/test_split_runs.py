@@ -12,6 +12,7 @@ from tracking3d import load_config
 from tracking3d.checkpoint.folder import Checkpoint
 from tracking3d.errors import InputError, OutputError
 from tracking3d.evaluation.metrics import aligned_rotation_errors
+from tracking3d.prompts import PromptSet
 from tracking3d.recording import record
 from tracking3d.results import layout
 from tracking3d.results.files import write_image, write_mask
@@ -19,8 +20,7 @@ from tracking3d.results.mesh_export import load_model
 from tracking3d.results.run_reader import RunReader
 from tracking3d.splitting import beginning, ending, steps
 from tracking3d.splitting.agreement import DisagreementError
-from tracking3d.splitting.long_video import Ended
-from tracking3d.splitting.part_runs import Given
+from tracking3d.splitting.long_video import SplitResult
 from tracking3d.splitting.plan import PARTS
 from tracking3d.splitting.split_run import record_in_parts
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, degrade_masks, synthesize
@@ -57,30 +57,32 @@ def short(tmp_path_factory) -> Path:
 @pytest.mark.parametrize("length", ["0", "-5f", "3f", "many", "nan"])
 def test_a_wrong_length_is_refused_before_anything_is_written(length, short, tmp_path):
     with pytest.raises(InputError, match="split="):
-        record_in_parts(short, settings(short), tmp_path / "run", Given(), length=length)
+        record_in_parts(short, settings(short), tmp_path / "run", PromptSet(), length=length)
     assert not (tmp_path / "run").exists()
 
 
 def test_seconds_are_refused_of_images_without_a_rate(short, tmp_path):
     with pytest.raises(InputError, match="in frames"):
-        record_in_parts(short, settings(short), tmp_path / "run", Given(), length="5")
+        record_in_parts(short, settings(short), tmp_path / "run", PromptSet(), length="5")
 
 
 @pytest.mark.parametrize("override", ["solver.final_refine=false", "solver.name=paper"])
 def test_what_cannot_be_joined_is_not_split(override, short, tmp_path):
     with pytest.raises(InputError, match="final refinement"):
-        record_in_parts(short, settings(short, override), tmp_path / "run", Given(), length="25f")
+        record_in_parts(short, settings(short, override), tmp_path / "run", PromptSet(), length="25f")
 
 
 def test_a_video_shorter_than_a_part_is_one_run(short, tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr(beginning, "record", lambda *given, **named: asked.append(named))
+    monkeypatch.setattr(
+        beginning, "record_tracking", lambda request, folder, options, tell: asked.append(options)
+    )
     ended = record_in_parts(
-        short, settings(short), tmp_path / "run", Given(), length="1000f", selection="0:40"
+        short, settings(short), tmp_path / "run", PromptSet(), length="1000f", selection="0:40"
     )
     assert (ended.folders, ended.parts) == ((tmp_path / "run",), 1)
     assert "one part" in ended.reason
-    assert [one["selection"] for one in asked] == ["0:40"]
+    assert [options.selection for options in asked] == ["0:40"]
 
 
 def test_parts_that_cannot_be_joined_are_finished_each_by_itself(short, tmp_path, monkeypatch):
@@ -99,8 +101,10 @@ def test_parts_that_cannot_be_joined_are_finished_each_by_itself(short, tmp_path
     monkeypatch.setattr(ending, "joined_parts", refuse)
     monkeypatch.setattr(ending, "_begun_elsewhere", lambda tracked: None)
     run = tmp_path / "run"
-    ended = record_in_parts(short, settings(short), run, Given(), length="25f", workers=1, selection="2:50")
-    assert ended == Ended((run / PARTS / "part_0", run / PARTS / "part_1"), 2, ended.reason)
+    ended = record_in_parts(
+        short, settings(short), run, PromptSet(), length="25f", workers=1, selection="2:50"
+    )
+    assert ended == SplitResult((run / PARTS / "part_0", run / PARTS / "part_1"), 2, ended.reason)
     assert "two objects" in ended.reason
     assert [(name, first) for name, first, _ in done] == [
         ("part_0", True), ("part_1", True), ("part_0", False), ("part_1", False),
@@ -109,7 +113,7 @@ def test_parts_that_cannot_be_joined_are_finished_each_by_itself(short, tmp_path
     assert (first, last) == (2, 50)
     assert first < start < stop < last
     again = record_in_parts(
-        short, settings(short), run, Given(), length="25f", workers=1, selection="2:50", resume=True
+        short, settings(short), run, PromptSet(), length="25f", workers=1, selection="2:50", resume=True
     )
     assert again.folders == ended.folders
     assert len(done) == 4
@@ -122,24 +126,24 @@ def test_parts_of_other_settings_are_not_gone_on_with(short, tmp_path, monkeypat
     monkeypatch.setattr(steps, "track_part", fail)
     run = tmp_path / "run"
     with pytest.raises(OutputError):
-        record_in_parts(short, settings(short), run, Given(), length="25f", workers=1)
+        record_in_parts(short, settings(short), run, PromptSet(), length="25f", workers=1)
     with pytest.raises(InputError, match="length of parts"):
-        record_in_parts(short, settings(short), run, Given(), length="24f", workers=1, resume=True)
+        record_in_parts(short, settings(short), run, PromptSet(), length="24f", workers=1, resume=True)
     with pytest.raises(InputError, match="configuration"):
         record_in_parts(
-            short, settings(short, "window.size=32"), run, Given(), length="25f", workers=1, resume=True
+            short, settings(short, "window.size=32"), run, PromptSet(), length="25f", workers=1, resume=True
         )
     (run / PARTS / "plan.json").write_text("{")
     with pytest.raises(InputError, match="damaged"):
-        record_in_parts(short, settings(short), run, Given(), length="25f", workers=1, resume=True)
+        record_in_parts(short, settings(short), run, PromptSet(), length="25f", workers=1, resume=True)
 
 
 def test_a_folder_of_somebody_s_parts_is_left_alone(short, tmp_path, monkeypatch):
     own = tmp_path / "run" / PARTS / "mine.txt"
     own.parent.mkdir(parents=True)
     own.write_text("mine")
-    monkeypatch.setattr(beginning, "record", lambda *given, **named: None)
-    record_in_parts(short, settings(short), tmp_path / "run", Given(), length="1000f", overwrite=True)
+    monkeypatch.setattr(beginning, "record_tracking", lambda *given: None)
+    record_in_parts(short, settings(short), tmp_path / "run", PromptSet(), length="1000f", overwrite=True)
     assert own.read_text() == "mine"
 
 
@@ -161,10 +165,10 @@ def test_a_video_in_two_parts_is_one_run_as_good_as_a_whole_one(workers, clip, t
     config = settings(frames, "runtime.probabilities=true")
     told: list[tuple[int, bool]] = []
     ended = record_in_parts(
-        frames, config, tmp_path / "split", Given(), length="30f", workers=workers,
+        frames, config, tmp_path / "split", PromptSet(), length="30f", workers=workers,
         listener=lambda one: told.append((one.index, one.refined)),
     )  # fmt: skip
-    assert ended == Ended((tmp_path / "split",), 2)
+    assert ended == SplitResult((tmp_path / "split",), 2)
     assert sorted(told) == sorted([(index, refined) for index in range(LONG) for refined in (False, True)])
     record(open_source(str(frames)), config, tmp_path / "whole")
 
@@ -189,15 +193,19 @@ def test_a_video_in_two_parts_is_one_run_as_good_as_a_whole_one(workers, clip, t
     assert split["split"]["joints"][0]["frames"] >= 5
     assert files_of(tmp_path / "split") == files_of(tmp_path / "whole")
     assert len(load_model(tmp_path / "split").vertices) == len(load_model(tmp_path / "whole").vertices)
-    record_in_parts(frames, config, tmp_path / "split", Given(), length="30f", resume=True)  # done already
+    record_in_parts(
+        frames, config, tmp_path / "split", PromptSet(), length="30f", resume=True
+    )  # done already
 
 
 @pytest.mark.slow
 def test_a_split_run_that_was_stopped_anywhere_goes_on(clip, tmp_path, monkeypatch):
     frames, run = written(clip, tmp_path / "clip"), tmp_path / "run"
 
-    def go_on() -> Ended:
-        return record_in_parts(frames, settings(frames), run, Given(), length="30f", workers=1, resume=True)
+    def go_on() -> SplitResult:
+        return record_in_parts(
+            frames, settings(frames), run, PromptSet(), length="30f", workers=1, resume=True
+        )
 
     saves, save = [0], Checkpoint.save
     due = {"in the first part", "in the second", "joined", "looked at again"}
@@ -225,7 +233,7 @@ def test_a_split_run_that_was_stopped_anywhere_goes_on(clip, tmp_path, monkeypat
         except KeyboardInterrupt:
             stops += 1
     assert (stops, due) == (4, set())
-    assert ended == Ended((run,), ended.parts)
+    assert ended == SplitResult((run,), ended.parts)
     assert RunReader(run).state == "finished"
     assert json.loads((run / layout.RUN).read_bytes())["split"]["parts"]
     R = np.stack([one.T_cam_obj[:3, :3] for one in RunReader(run).frames])

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tracking3d.synthesis.mask_noise import HAND_OFF, HAND_ON, noisy_boundaries, signed_distance, with_hand
+from tracking3d.synthesis.mask_noise import HAND_OFF, HAND_ON, boundary_distance, noisy_boundaries, with_hand
 
 FRAMES, SIZE, RADIUS = 60, 120, 30
 
@@ -23,7 +23,7 @@ def discs():
 def test_the_signed_distance_of_a_half_plane_is_the_distance_to_its_edge():
     mask = np.zeros((7, 9), bool)
     mask[:, 4:] = True  # the edge is between columns 3 and 4
-    assert signed_distance(mask)[3] == pytest.approx(np.arange(9) - 3.5, abs=1e-6)
+    assert boundary_distance(mask)[3] == pytest.approx(np.arange(9) - 3.5, abs=1e-6)
 
 
 @pytest.mark.parametrize("pixels", [0.5, 1.5, 3.0])

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from tracking3d.errors import InputError
-from tracking3d.synthesis.ray_casting import Surface
+from tracking3d.synthesis.ray_casting import RayMesh
 
 
 def rays(count=2000, seed=0):
@@ -31,7 +31,7 @@ def entry_into_a_box(origins, directions, half):
 def test_a_box_is_hit_at_the_distance_of_the_slab_method():
     half = np.array([0.6, 0.9, 0.4])
     origins, directions = rays()
-    hits = Surface.of(trimesh.creation.box(2 * half)).cast(origins, directions)
+    hits = RayMesh.of(trimesh.creation.box(2 * half)).cast(origins, directions)
     expected, thickness = entry_into_a_box(origins, directions, half)
     grazing = np.abs(thickness) < 1e-4
     assert (np.isfinite(expected) == (hits.face >= 0))[~grazing].all()
@@ -42,7 +42,7 @@ def test_a_box_is_hit_at_the_distance_of_the_slab_method():
 
 
 def test_a_fine_sphere_is_hit_where_the_sphere_is_and_has_its_normals():
-    surface = Surface.of(trimesh.creation.icosphere(5))
+    surface = RayMesh.of(trimesh.creation.icosphere(5))
     origins, directions = rays()
     hits = surface.cast(origins, directions)
     a, b = (directions**2).sum(1), (origins * directions).sum(1)
@@ -57,7 +57,7 @@ def test_a_fine_sphere_is_hit_where_the_sphere_is_and_has_its_normals():
 
 
 def test_the_weights_give_the_point_that_is_hit():
-    surface = Surface.of(trimesh.creation.icosphere(1))
+    surface = RayMesh.of(trimesh.creation.icosphere(1))
     origins, directions = rays()
     hits = surface.cast(origins, directions)
     hit = hits.face >= 0
@@ -69,19 +69,19 @@ def test_the_weights_give_the_point_that_is_hit():
 
 @pytest.mark.parametrize("size", [1e-3, 1e3])
 def test_precision_does_not_depend_on_the_unit(size):
-    surface = Surface.of(trimesh.creation.box((2 * size, 2 * size, 2 * size)))
+    surface = RayMesh.of(trimesh.creation.box((2 * size, 2 * size, 2 * size)))
     hits = surface.cast(np.array([[0.1, 0.2, -5.0]]) * size, np.array([[0.0, 0.0, 1.0]]))
     assert hits.distance[0] == pytest.approx(4 * size, rel=1e-9)
 
 
 def test_edges_of_a_box_stay_sharp_and_a_texture_seam_of_a_cylinder_does_not_show():
-    box = Surface.of(trimesh.creation.box())
+    box = RayMesh.of(trimesh.creation.box())
     assert box.corner_normals == pytest.approx(np.repeat(box.face_normals[:, None], 3, 1))
     cylinder = trimesh.creation.cylinder(1.0, 2.0, sections=32)
     split = trimesh.Trimesh(
         cylinder.triangles.reshape(-1, 3), np.arange(3 * len(cylinder.faces)).reshape(-1, 3), process=False
     )
-    surface = Surface.of(split)
+    surface = RayMesh.of(split)
     side = np.abs(surface.face_normals[:, 2]) < 0.5
     radial = surface.vertices[surface.faces[side]] * (1, 1, 0)
     assert (surface.corner_normals[side] * radial).sum(2).min() > np.cos(np.radians(2.5))
@@ -91,7 +91,7 @@ def test_edges_of_a_box_stay_sharp_and_a_texture_seam_of_a_cylinder_does_not_sho
 
 
 def test_no_rays_meet_nothing():
-    surface = Surface.of(trimesh.creation.box())
+    surface = RayMesh.of(trimesh.creation.box())
     none = np.zeros((0, 3))
     assert len(surface.cast(none, none).face) == 0 and len(surface.blocked(none, none)) == 0
 
@@ -99,4 +99,4 @@ def test_no_rays_meet_nothing():
 def test_without_embree_one_sentence_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "trimesh.ray.ray_pyembree", None)
     with pytest.raises(InputError, match=r"pip install 'tracking3d\[synth\]'"):
-        Surface.of(trimesh.creation.box())
+        RayMesh.of(trimesh.creation.box())

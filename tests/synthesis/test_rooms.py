@@ -9,7 +9,7 @@ from tracking3d.errors import InputError
 from tracking3d.synthesis import room
 from tracking3d.synthesis.frame_rendering import render_frame
 from tracking3d.synthesis.lighting import lamp_at
-from tracking3d.synthesis.pixel_rays import project, ray_directions
+from tracking3d.synthesis.pixel_rays import camera_to_pixels, ray_directions
 from tracking3d.synthesis.room_rendering import room_light
 from tracking3d.synthesis.scene import make_scene
 from tracking3d.synthesis.spec import SequenceSpec, check_spec
@@ -99,13 +99,13 @@ def test_points_of_the_room_move_with_the_objects_pose_and_by_parallax(scenes, f
     depth = room_depth(scene, first, x, y)
     points = (depth[:, None] * ray_directions(scene.camera, x, y) - first[:3, 3]) @ first[:3, :3]
     in_later = points @ later[:3, :3].T + later[:3, 3]
-    pixels = project(scene.camera, in_later)
+    pixels = camera_to_pixels(scene.camera, in_later)
     again = room_depth(scene, later, pixels[:, 0], pixels[:, 1])
     inside = ((pixels > 0) & (pixels < (63, 47))).all(1)
     same = np.abs(again - in_later[:, 2]) < 1e-3 * in_later[:, 2]
     assert same[inside].mean() > 0.8  # others are hidden behind something now
 
-    object_moved = project(scene.camera, later[:3, 3]) - project(scene.camera, first[:3, 3])
+    object_moved = camera_to_pixels(scene.camera, later[:3, 3]) - camera_to_pixels(scene.camera, first[:3, 3])
     moved = pixels - np.stack([x, y], 1)
     far = inside & same & (depth > first[2, 3] + 4 * scene.solid.radius)
     assert far.sum() > 20
@@ -121,7 +121,7 @@ def test_the_images_background_moves_with_the_room():
     y, x = (grid.ravel().astype(float) for grid in np.mgrid[4:116:2, 4:156:2])
     depth = room_depth(scene, first, x, y)
     points = (depth[:, None] * ray_directions(scene.camera, x, y) - first[:3, 3]) @ first[:3, :3]
-    pixels = project(scene.camera, points @ later[:3, :3].T + later[:3, 3])
+    pixels = camera_to_pixels(scene.camera, points @ later[:3, :3].T + later[:3, 3])
     column, row = pixels.round().astype(int).T
     here = (column > 0) & (column < 159) & (row > 0) & (row < 119)
     here &= ~render_frame(scene, 0).mask[y.astype(int), x.astype(int)]

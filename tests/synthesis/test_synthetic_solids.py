@@ -11,7 +11,7 @@ from scipy.spatial import Delaunay
 from tracking3d.errors import InputError
 from tracking3d.synthesis.procedural_solids import PROCEDURAL
 from tracking3d.synthesis.random_solids import _ASSEMBLIES
-from tracking3d.synthesis.ray_casting import Surface
+from tracking3d.synthesis.ray_casting import RayMesh
 from tracking3d.synthesis.scene import make_solid
 from tracking3d.synthesis.spec import SequenceSpec
 from tracking3d.synthesis.texture_lookup import bilinear
@@ -57,7 +57,7 @@ def test_textures_are_seen_upright_and_not_mirrored_from_outside(name):
 
 
 def test_one_can_look_through_the_handle_of_the_mug_and_into_it():
-    surface = Surface.of(solid("mug").mesh())
+    surface = RayMesh.of(solid("mug").mesh())
     ahead = np.array([[0.0, 0.0, 1.0]])
     through, handle = (surface.cast(np.array([[x, 0.0, -5.0]]), ahead).face[0] for x in (0.57, 0.7))
     assert through == -1 and handle >= 0
@@ -90,7 +90,7 @@ def test_shapes_of_the_seed_are_closed_in_the_middle_and_never_show_their_inside
     mesh = merged(made)
     assert mesh.is_watertight and mesh.volume > 0
     assert made.vertices.min(0) == pytest.approx(-made.vertices.max(0)) and made.radius == pytest.approx(0.95)
-    surface = Surface.of(made.mesh())
+    surface = RayMesh.of(made.mesh())
     rng = np.random.default_rng(seed)
     origins = rng.normal(size=(400, 3))
     origins *= 4 / np.linalg.norm(origins, axis=1, keepdims=True)
@@ -160,7 +160,7 @@ def test_the_symmetries_of_textureless_objects_map_them_to_themselves(name, coun
     made = solid(name, textured=False)
     assert made.symmetries.shape == (count, 4, 4)
     assert (made.symmetries[0] == np.eye(4)).all()
-    surface = Surface.of(made.mesh())
+    surface = RayMesh.of(made.mesh())
     rng = np.random.default_rng(0)
     origins, directions = rng.normal(0, 5, (500, 3)), rng.normal(0, 0.3, (500, 3))
     directions -= origins
@@ -180,7 +180,7 @@ def test_only_the_textureless_bottle_and_the_vase_have_an_axis():
 
 def test_a_vase_looks_the_same_from_all_around_and_not_upside_down():
     made = solid("vase")
-    surface = Surface.of(made.mesh())
+    surface = RayMesh.of(made.mesh())
     height = np.linspace(-0.8, 0.8, 40)
 
     def colours(angle, flip=1.0):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+import twins.background
 from moving_shape import clutter
 
 from tracking3d.geometry.camera import Window
@@ -189,16 +190,15 @@ def memory_of(rng: np.random.Generator) -> tuple[np.ndarray, ...]:
     return tuple(plane[10:80, 5:100] for plane in (mean, spread.T, frames.T, proven.T))
 
 
-def test_both_implementations_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_kernels_agree_with_their_twins() -> None:
     rng = np.random.default_rng(3)
     kept, seen, proof = memory_of(rng), rng.random((70, 95)) < 0.7, rng.normal(0, 1, (70, 95))
     present = np.clip(kept[0] + rng.normal(0, 15, kept[0].shape), 0, 255).astype(np.uint8)
     answers = []
-    for chosen in (True, False):
-        monkeypatch.setattr(background, "compiled", lambda chosen=chosen: chosen)
+    for module in (background, twins.background):
         memory = tuple(plane.copy() for plane in kept)
-        difference = background.differences(present, *memory[:2])
-        background.learn(present, difference < 0.2, seen, proof.astype(np.float32), memory)
+        difference = module.differences(present, *memory[:2])
+        module.learn(present, difference < 0.2, seen, proof.astype(np.float32), memory)
         answers.append((difference, *memory))
     assert 0.1 < (answers[0][0] < 0.2).mean() < 0.9
     for ours, theirs in zip(*answers, strict=True):

@@ -1,11 +1,11 @@
-"""Where each colour lay around a pixel: the compiled kernel, its NumPy twin, and counting by hand."""
+"""Where each colour lay around a pixel: the compiled kernel, its twin of box filters, and counting by hand."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+import twins.colour_models
 
-from tracking3d.trackers import colour_models
 from tracking3d.trackers.colour_models import Palette, local_shares
 
 
@@ -17,13 +17,10 @@ def crops(size, labels=7, seed=0):
 
 @pytest.mark.parametrize("radius", [0, 1, 5, 12])
 @pytest.mark.parametrize("size", [(30, 41), (13, 13), (64, 20)], ids=str)
-def test_both_implementations_agree(monkeypatch, size, radius):
+def test_the_kernel_agrees_with_its_twin(size, radius):
     labels, last_labels, mask = crops(size)
-    answers = []
-    for chosen in (True, False):
-        monkeypatch.setattr(colour_models, "compiled", lambda chosen=chosen: chosen)
-        answers.append(local_shares(labels, last_labels, mask, radius, 7))
-    np.testing.assert_allclose(*answers, atol=1e-6)
+    expected = twins.colour_models.local_shares(labels, last_labels, mask, radius)
+    np.testing.assert_allclose(local_shares(labels, last_labels, mask, radius, 7), expected, atol=1e-6)
 
 
 def test_shares_are_means_over_the_neighbourhood():

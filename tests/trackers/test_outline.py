@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tracking3d.trackers.outline import both_sides, prior, shifted_to, signed_distance, tidied, touches_border
+from tracking3d.trackers.outline import (
+    both_sides,
+    inside_distance,
+    prior,
+    remove_specks,
+    shifted_to,
+    touches_border,
+)
 
 
 def square(top: int = 30, left: int = 30, side: int = 40, size: int = 100) -> np.ndarray:
@@ -15,7 +22,7 @@ def square(top: int = 30, left: int = 30, side: int = 40, size: int = 100) -> np
 
 
 def test_the_signed_distance_counts_from_the_outline() -> None:
-    distance = signed_distance(square())
+    distance = inside_distance(square())
     assert distance[50, 30] == pytest.approx(1, abs=0.1) and distance[50, 29] == pytest.approx(-1, abs=0.1)
     assert distance[50, 20] == pytest.approx(-10, abs=0.5)
 
@@ -23,7 +30,7 @@ def test_the_signed_distance_counts_from_the_outline() -> None:
 def test_the_prior_is_the_weighted_mean_of_opinions_in_units_of_the_size() -> None:
     near, far = square().astype(np.float32), square(left=40).astype(np.float32)
     both = prior([(3.0, near), (1.0, far)], 1600)
-    expected = (3 * signed_distance(near > 0) + signed_distance(far > 0)) / 4 / (0.12 * 40)
+    expected = (3 * inside_distance(near > 0) + inside_distance(far > 0)) / 4 / (0.12 * 40)
     np.testing.assert_allclose(both, np.clip(expected, -4, 4), atol=1e-5)
 
 
@@ -64,19 +71,19 @@ def test_specks_pinholes_and_parts_that_were_not_there_are_dropped() -> None:
     mask[50, 50] = False
     mask[5, 5] = True
     mask[80:95, 75:95] = True
-    assert_same_but_corners(tidied(mask, square()), square())
+    assert_same_but_corners(remove_specks(mask, square()), square())
 
 
 def test_a_hole_that_is_no_pinhole_stays() -> None:
     mask = square()
     mask[40:50, 40:50] = False
-    assert_same_but_corners(tidied(mask, mask), mask)
+    assert_same_but_corners(remove_specks(mask, mask), mask)
 
 
 def test_a_part_that_moves_with_the_background_is_dropped() -> None:
     other = square(80, 75, 15)
     mask = square() | other
-    assert_same_but_corners(tidied(mask, mask), mask)
+    assert_same_but_corners(remove_specks(mask, mask), mask)
     motion = np.where(other, -1.0, 1.0).astype(np.float32)
-    assert_same_but_corners(tidied(mask, mask, motion), square())
-    assert_same_but_corners(tidied(mask, mask, -np.ones_like(motion)), mask)
+    assert_same_but_corners(remove_specks(mask, mask, motion), square())
+    assert_same_but_corners(remove_specks(mask, mask, -np.ones_like(motion)), mask)

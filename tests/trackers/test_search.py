@@ -8,7 +8,7 @@ from moving_shape import SIZE, iou, moving_shape
 
 from tracking3d.geometry.camera import Window
 from tracking3d.trackers.colour_models import GlobalColours, lab
-from tracking3d.trackers.crops import cut, paste
+from tracking3d.trackers.crops import cut, paste_mask
 from tracking3d.trackers.outline import both_sides
 from tracking3d.trackers.search import find_by_colours
 
@@ -26,7 +26,7 @@ def known() -> tuple[GlobalColours, float]:
 def test_the_object_is_found_wherever_it_is(known, start) -> None:
     frames, truth = moving_shape(1, start=start)
     mask, window, separation = find_by_colours(frames[0].image, *known, 0.45, 224)
-    assert iou(paste(mask, window, SIZE) > 0.5, truth[0]) > 0.85
+    assert iou(paste_mask(mask, window, SIZE) > 0.5, truth[0]) > 0.85
     assert separation > 0.6
 
 
@@ -42,7 +42,7 @@ def test_what_was_there_without_the_object_is_not_it(known) -> None:
     there = truth[0].astype(np.float32)
     assert find_by_colours(frames[0].image, *known, 0.45, 224, there) is None
     mask, window, _ = find_by_colours(frames[0].image, *known, 0.45, 224, 1 - there)
-    assert iou(paste(mask, window, SIZE) > 0.5, truth[0]) > 0.85
+    assert iou(paste_mask(mask, window, SIZE) > 0.5, truth[0]) > 0.85
 
 
 @pytest.mark.parametrize("factor", [20, 1 / 20])

@@ -106,6 +106,25 @@ def test_the_light_changes_and_the_same_generator_repeats_it():
     assert np.abs(disturb(image, np.random.default_rng(5), 0.0) - image / 255).max() < 0.01
 
 
+@pytest.mark.parametrize("stride", [1.0, 2.0])
+def test_descriptors_between_cells_are_mixed_of_the_four_around(stride):
+    """Cells lie in the middle of their pixels; beyond the map there are zeros."""
+    from loss import sample
+
+    generator = torch.Generator().manual_seed(4)
+    features = torch.randn(8, 9, 13, generator=generator)
+    points = torch.rand(50, 2, generator=generator) * torch.tensor([13.0, 9.0]) * stride - 0.5
+    points[0] = torch.tensor([-0.4, 0.0])
+    padded = np.pad(features.numpy(), ((0, 0), (1, 1), (1, 1)))
+    expected = []
+    for x, y in ((points.numpy() + 0.5) / stride - 0.5).tolist():
+        left, top = int(np.floor(x)), int(np.floor(y))
+        corners = padded[:, top + 1 : top + 3, left + 1 : left + 3]
+        mixed = corners @ [left + 1 - x, x - left] @ [top + 1 - y, y - top]
+        expected.append(mixed / np.linalg.norm(mixed))
+    np.testing.assert_allclose(sample(features, points, stride), np.stack(expected), atol=1e-5)
+
+
 def test_the_matching_loss_is_low_where_the_truth_is_found_and_high_where_it_is_not():
     from loss import matching_loss, sample
 

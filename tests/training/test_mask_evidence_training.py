@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tracking3d.errors import InputError
-from tracking3d.evidence import SOURCES, features
+from tracking3d.evidence import SOURCES, pixel_features
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def test_known_weights_are_found_again(script):
 def test_pixels_are_asked_near_either_outline_and_nowhere_else(script):
     rows, columns = np.mgrid[:128, :128]
     masks = [(columns - x) ** 2 + (rows - 64) ** 2 < 30**2 for x in (60, 68)]
-    found = features(np.zeros((128, 128, 3), np.uint8), *masks, 0.5, None)
+    found = pixel_features(np.zeros((128, 128, 3), np.uint8), *masks, 0.5, None)
     assert found.shape[-1] == len(SOURCES)
     chosen = script.sampled(found, 0)
     assert len(chosen) == script.PIXELS

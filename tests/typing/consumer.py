@@ -22,7 +22,7 @@ from tracking3d import (
 )
 from tracking3d.corrections import Correction
 from tracking3d.errors import InputError, Tracking3dError
-from tracking3d.export.exporter import ExportOptions
+from tracking3d.export.options import ExportOptions
 from tracking3d.frames import MaskEstimate
 from tracking3d.prompts import make_prompt
 from tracking3d.recording import record, record_objects

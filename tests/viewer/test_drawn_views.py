@@ -89,8 +89,8 @@ def test_a_frame_that_is_not_at_hand_is_said_to_be_so(follower):
 def test_what_a_run_says_is_text_and_never_markup(follower):
     pages = [
         told.list_streaks([follower, follower]),
-        told.describe(follower, follower.frames[5]),
-        told.describe(follower, None),
+        told.describe_frame(follower, follower.frames[5]),
+        told.describe_frame(follower, None),
     ]
     for page in pages:
         tags = Tags(page)

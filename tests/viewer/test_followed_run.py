@@ -12,7 +12,7 @@ from recorded_runs import estimate_of, frame_of, model, open_run, write_run
 from tracking3d.checkpoint.trees import TreeFolder
 from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import Status
-from tracking3d.viewer.followed_run import FollowedRun, Streak, runs_in
+from tracking3d.viewer.followed_run import FollowedRun, Streak, open_followed_runs
 from tracking3d.viewer.kept_landmarks import kept_landmarks
 
 
@@ -102,15 +102,15 @@ def test_objects_of_one_video_come_in_their_order_with_the_names_they_were_picke
     (tmp_path / "runs" / "picked.json").write_text(
         json.dumps({"objects": [{"name": "cup"}, {"name": "box"}]})
     )
-    names = [run.name for run in runs_in(tmp_path / "runs")]
+    names = [run.name for run in open_followed_runs(tmp_path / "runs")]
     assert names[:3] == ["cup", "box", "object_2"] and names[-1] == "object_10"
     (tmp_path / "runs" / "picked.json").write_text('{"objects": 7}')
-    assert runs_in(tmp_path / "runs")[0].name == "object_0"
+    assert open_followed_runs(tmp_path / "runs")[0].name == "object_0"
 
 
 def test_a_folder_without_a_run_is_refused(tmp_path):
     with pytest.raises(InputError, match="is not a run folder"):
-        runs_in(tmp_path)
+        open_followed_runs(tmp_path)
 
 
 def kept_state(folder: Path, points: np.ndarray) -> Path:

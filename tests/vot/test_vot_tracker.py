@@ -12,7 +12,7 @@ from tracking3d.errors import InputError
 from tracking3d.evaluation.metrics import mask_iou
 from tracking3d.frames import Frame
 from tracking3d.vot import VotTracker
-from tracking3d.vot.regions import MaskRows, placed, prompt_of, rectangle_of
+from tracking3d.vot.regions import MaskRows, place_mask, prompt_of, rectangle_of
 from tracking3d.vot.sessions import configuration
 
 
@@ -188,11 +188,14 @@ def test_a_mask_smaller_than_the_frame_lies_at_its_offset():
 
 def test_a_mask_beyond_the_frame_is_cut_off():
     ones = np.ones((10, 10), bool)
-    assert placed(ones, (-4, -7), (20, 30))[:3, :6].all() and placed(ones, (-4, -7), (20, 30)).sum() == 6 * 3
-    assert placed(ones, (25, 15), (20, 30)).sum() == 5 * 5
-    assert placed(ones, (40, 0), (20, 30)).sum() == 0
-    assert placed(ones, (-10, -20), (20, 30)).sum() == 0
-    assert placed(np.ones((40, 50), bool), (0, 0), (20, 30)).all()
+    assert (
+        place_mask(ones, (-4, -7), (20, 30))[:3, :6].all()
+        and place_mask(ones, (-4, -7), (20, 30)).sum() == 6 * 3
+    )
+    assert place_mask(ones, (25, 15), (20, 30)).sum() == 5 * 5
+    assert place_mask(ones, (40, 0), (20, 30)).sum() == 0
+    assert place_mask(ones, (-10, -20), (20, 30)).sum() == 0
+    assert place_mask(np.ones((40, 50), bool), (0, 0), (20, 30)).all()
 
 
 def test_a_polygon_is_filled():

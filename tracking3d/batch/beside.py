@@ -6,8 +6,8 @@ import json
 from collections.abc import Iterable
 from pathlib import PurePosixPath
 
-from tracking3d.batch.places import base, is_folder, joined, matches, names_in, parent, read
-from tracking3d.batch.rows import Row, read_row
+from tracking3d.batch.places import base, is_folder, join_path, matches, names_in, parent, read
+from tracking3d.batch.rows import VideoRow, read_row
 from tracking3d.errors import InputError
 
 # fmt: off
@@ -23,7 +23,7 @@ MASKS = (".png", ".mask.png", ".jpg", ".mask.jpg")
 """What is added to a video's name, with its suffix or without, for the files that say what is tracked in it."""
 
 
-def videos_of(place: str) -> list[tuple[Row, int]]:
+def videos_of(place: str) -> list[tuple[VideoRow, int]]:
     """The videos of a folder and of folders within it, or those that a pattern names; and the bytes of each.
 
     A folder of images counts as a video where a file beside it says what is tracked in it.
@@ -34,12 +34,14 @@ def videos_of(place: str) -> list[tuple[Row, int]]:
     if is_folder(place):
         sizes = names_in(place, everything=True)
         names = _videos_among(sizes)
-        found = [(joined(place, name), sizes.get(name, 0)) for name in names]
-        beside = {joined(place, name) for name in sizes}
+        found = [(join_path(place, name), sizes.get(name, 0)) for name in names]
+        beside = {join_path(place, name) for name in sizes}
     else:
         found = [(one, 0) for one in matches(place) if not _is_prompt(one)]
         folders = {parent(one) for one, _ in found}
-        sizes = {joined(folder, name): size for folder in folders for name, size in names_in(folder).items()}
+        sizes = {
+            join_path(folder, name): size for folder in folders for name, size in names_in(folder).items()
+        }
         found = [(one, sizes.get(one, 0)) for one, _ in found]
         beside = set(sizes)
     if not found:
@@ -66,7 +68,7 @@ def _ends() -> tuple[str, ...]:
     return (BOX, JSON, *MASKS)
 
 
-def _with_prompt(video: str, beside: set[str]) -> Row:
+def _with_prompt(video: str, beside: set[str]) -> VideoRow:
     """The row that the files beside a video make; one without a prompt where there is none."""
     stems = [video, video.removesuffix(PurePosixPath(base(video)).suffix)]
     for stem in stems:
@@ -79,10 +81,10 @@ def _with_prompt(video: str, beside: set[str]) -> Row:
         for end in MASKS:
             if (file := stem + end) in beside and file != video:
                 return read_row({"video": video, "mask": [file]}, file)
-    return Row(video=video)
+    return VideoRow(video=video)
 
 
-def _from_json(file: str, video: str) -> Row:
+def _from_json(file: str, video: str) -> VideoRow:
     try:
         values = json.loads(read(file) or b"")
         if not isinstance(values, dict):

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from tracking3d.batch.places import joined, read, write
+from tracking3d.batch.places import join_path, read, write
 from tracking3d.batch.summary import COLUMNS
 from tracking3d.errors import InputError
 
@@ -42,7 +42,7 @@ class Failure:
 
 
 @dataclass(frozen=True)
-class Progress:
+class BatchProgress:
     """How far a batch is.
 
     Attributes:
@@ -80,7 +80,7 @@ class Progress:
         return self.state
 
 
-def write_progress(out: str, progress: Progress) -> Progress:
+def write_progress(out: str, progress: BatchProgress) -> BatchProgress:
     """Write how far the batch is, with the time of now.
 
     Raises:
@@ -88,27 +88,30 @@ def write_progress(out: str, progress: Progress) -> Progress:
     """
     progress = replace(progress, updated=time.time())
     write(
-        joined(out, PROGRESS), json.dumps({"format": FORMAT, **asdict(progress)}, indent=1).encode() + b"\n"
+        join_path(out, PROGRESS),
+        json.dumps({"format": FORMAT, **asdict(progress)}, indent=1).encode() + b"\n",
     )
     return progress
 
 
-def read_progress(out: str) -> Progress:
+def read_progress(out: str) -> BatchProgress:
     """How far a batch is.
 
     Raises:
         InputError: If the folder is none of a batch, or what is there is damaged.
     """
-    content = read(joined(out, PROGRESS))
+    content = read(join_path(out, PROGRESS))
     if content is None:
         raise InputError(f"{out} is no folder of a batch: it holds no {PROGRESS}; give what --out was.")
     try:
         document = json.loads(content)
         if document.pop("format") != FORMAT:
             raise ValueError("another format")
-        return Progress(**document)
+        return BatchProgress(**document)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{joined(out, PROGRESS)} is damaged ({error}); run the batch once more.") from error
+        raise InputError(
+            f"{join_path(out, PROGRESS)} is damaged ({error}); run the batch once more."
+        ) from error
 
 
 def write_tables(out: str, rows: Sequence[Mapping[str, Any]], failures: Iterable[Failure]) -> None:
@@ -117,10 +120,10 @@ def write_tables(out: str, rows: Sequence[Mapping[str, Any]], failures: Iterable
     Raises:
         OutputError: If one cannot be written; it is then as it was.
     """
-    write(joined(out, RESULTS), _csv(COLUMNS, rows))
-    write(joined(out, FAILURES), _csv(_FAILURE, [asdict(one) for one in failures]))
+    write(join_path(out, RESULTS), _csv(COLUMNS, rows))
+    write(join_path(out, FAILURES), _csv(_FAILURE, [asdict(one) for one in failures]))
     if (content := _parquet(rows)) is not None:
-        write(joined(out, PARQUET), content)
+        write(join_path(out, PARQUET), content)
 
 
 def read_failures(out: str) -> list[Failure]:
@@ -129,7 +132,7 @@ def read_failures(out: str) -> list[Failure]:
     Raises:
         InputError: If the table is damaged.
     """
-    content = read(joined(out, FAILURES)) or b""
+    content = read(join_path(out, FAILURES)) or b""
     try:
         return [
             Failure(
@@ -143,12 +146,14 @@ def read_failures(out: str) -> list[Failure]:
             for row in csv.DictReader(io.StringIO(content.decode("utf-8")), strict=True)
         ]
     except (ValueError, KeyError, TypeError, csv.Error) as error:
-        raise InputError(f"{joined(out, FAILURES)} is damaged ({error}); run the batch once more.") from error
+        raise InputError(
+            f"{join_path(out, FAILURES)} is damaged ({error}); run the batch once more."
+        ) from error
 
 
-def read_results(out: str) -> list[dict[str, str]]:
+def read_result_rows(out: str) -> list[dict[str, str]]:
     """The rows of the table of results, as texts."""
-    content = read(joined(out, RESULTS)) or b""
+    content = read(join_path(out, RESULTS)) or b""
     return list(csv.DictReader(io.StringIO(content.decode("utf-8", "replace"))))
 
 

@@ -10,10 +10,9 @@ from tracking3d.batch.one_video import RUN, begun_before, counted, counting, fet
 from tracking3d.batch.video_job import VideoJob
 from tracking3d.engines.protocol import Tell
 from tracking3d.point_prompts import parse_points
-from tracking3d.prompts import parse_box
+from tracking3d.prompts import PromptSet, parse_box
 from tracking3d.splitting.beginning import Begun, begin
-from tracking3d.splitting.long_video import Ended, LongVideo
-from tracking3d.splitting.part_runs import Given
+from tracking3d.splitting.long_video import LongVideo, SplitResult
 from tracking3d.splitting.steps import Step
 
 
@@ -43,7 +42,7 @@ def begin_in_parts(
     with worked_on(job, out, networks) as work:
         attempts = counted(work)
         begun = begin(counting(tell, None), _video(fetched(job, work / "source"), work, command, workers))
-        if isinstance(begun, Ended):
+        if isinstance(begun, SplitResult):
             return put_away(job, out, work, begun.folders, report, attempts, _note(begun))
         return begun
 
@@ -73,7 +72,7 @@ def step_in_parts(
 
 
 def settle_in_parts(
-    tell: Tell, job: VideoJob, out: str, report: bool, ended: Ended, again: int
+    tell: Tell, job: VideoJob, out: str, report: bool, ended: SplitResult, again: int
 ) -> dict[str, Any]:
     """Put what became of a video into its place.
 
@@ -94,7 +93,7 @@ def settle_in_parts(
 
 
 def _video(job: VideoJob, work: Path, command: str, workers: int) -> LongVideo:
-    given = Given(
+    prompts = PromptSet.of_one(
         next(map(parse_box, job.box), None),
         next(map(Path, job.mask), None),
         next(map(parse_points, job.points), None),
@@ -103,7 +102,7 @@ def _video(job: VideoJob, work: Path, command: str, workers: int) -> LongVideo:
         job.video,
         job.config,
         work / RUN,
-        given,
+        prompts,
         job.split,
         workers,
         job.frames,
@@ -112,5 +111,5 @@ def _video(job: VideoJob, work: Path, command: str, workers: int) -> LongVideo:
     )
 
 
-def _note(ended: Ended) -> str:
+def _note(ended: SplitResult) -> str:
     return f"its {ended.parts} parts could not be joined: {ended.reason}" if len(ended.folders) > 1 else ""

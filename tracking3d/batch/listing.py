@@ -14,7 +14,7 @@ from tracking3d.arguments import needs_prompt
 from tracking3d.batch.beside import videos_of
 from tracking3d.batch.one_video import LOGS
 from tracking3d.batch.places import absolute, is_folder, local, parent
-from tracking3d.batch.rows import Row
+from tracking3d.batch.rows import VideoRow
 from tracking3d.batch.tables import is_table, read_table
 from tracking3d.batch.video_job import VideoJob
 from tracking3d.benchmark.sequences import Dataset
@@ -23,7 +23,7 @@ from tracking3d.datasets.layout import load_layout
 from tracking3d.datasets.reading import read_sequence
 from tracking3d.errors import InputError, Tracking3dError
 
-Configure = Callable[[Row], PipelineConfig]
+Configure = Callable[[VideoRow], PipelineConfig]
 """Makes the pipeline of a row."""
 
 NO_PROMPT = (
@@ -88,7 +88,7 @@ def joined_name(root: str, name: str) -> str:
     return posixpath.join(root, name)
 
 
-def _absolute(row: Row, folder: str) -> Row:
+def _absolute(row: VideoRow, folder: str) -> VideoRow:
     """The row with places that mean the same everywhere."""
     update: dict[str, Any] = {
         "video": absolute(row.video, folder),
@@ -98,9 +98,9 @@ def _absolute(row: Row, folder: str) -> Row:
     return row.model_copy(update=update)
 
 
-def _together(rows: Sequence[tuple[Row, int]]) -> list[tuple[Row, int]]:
+def _together(rows: Sequence[tuple[VideoRow, int]]) -> list[tuple[VideoRow, int]]:
     """Rows that differ in the object only, as one."""
-    groups: defaultdict[str, list[tuple[Row, int]]] = defaultdict(list)
+    groups: defaultdict[str, list[tuple[VideoRow, int]]] = defaultdict(list)
     for row, size in rows:
         groups[row.model_copy(update={"box": (), "mask": (), "points": ()}).model_dump_json()].append(
             (row, size)
@@ -115,7 +115,7 @@ def _together(rows: Sequence[tuple[Row, int]]) -> list[tuple[Row, int]]:
     return together
 
 
-def _names(rows: Sequence[Row], root: str) -> list[str]:
+def _names(rows: Sequence[VideoRow], root: str) -> list[str]:
     """What the run folders are called: after the video's place within ``root``, or within what all have in common.
 
     Raises:
@@ -168,7 +168,7 @@ def _within(video: str, root: str) -> str:
     return "/".join(part.lstrip(".") or "_" for part in path.parts) or "video"
 
 
-def _job(row: Row, name: str, size: int, configure: Configure, split: str) -> VideoJob:
+def _job(row: VideoRow, name: str, size: int, configure: Configure, split: str) -> VideoJob:
     fault = "" if row.has_prompt else NO_PROMPT
     try:
         config = configure(row)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from tracking3d.batch.networks import SharedNetwork, keep_networks
-from tracking3d.batch.places import absolute, fetch, joined, local, remove, send, write
+from tracking3d.batch.places import absolute, copy_to_local, join_path, local, remove, send, write
 from tracking3d.batch.summary import MARKER, write_marker
 from tracking3d.batch.video_job import VideoJob
 from tracking3d.config.models import PipelineConfig
@@ -24,9 +24,10 @@ from tracking3d.datasets.reading import read_sequence
 from tracking3d.engines.protocol import Tell
 from tracking3d.errors import InputError, OutputError
 from tracking3d.frames import SkippedFrame
+from tracking3d.open_tracking import request_tracking
 from tracking3d.point_prompts import parse_points
-from tracking3d.prompts import parse_box
-from tracking3d.recording import record, record_objects
+from tracking3d.prompts import PromptSet, parse_box
+from tracking3d.recording import RecordOptions, record_tracking
 from tracking3d.report.several import write_reports
 from tracking3d.results import layout
 from tracking3d.results.files import write_atomic, writing
@@ -141,7 +142,7 @@ def put_away(
     if report:
         write_reports(runs)
     told = write_marker(work / RUN, job, attempts, runs, note)
-    _put_into_place(work / RUN, joined(out, job.name))
+    _put_into_place(work / RUN, join_path(out, job.name))
     send_log(out, job)
     _forget(work)
     return told
@@ -155,19 +156,10 @@ def _track(tell: Tell, job: VideoJob, run: Path, command: str) -> None:
     boxes: list[Any] = [parse_box(text) for text in job.box]
     masks: list[Any] = [Path(file) for file in job.mask]
     points: list[Any] = [parse_points(text) for text in job.points]
-    about: dict[str, Any] = {
-        "start_frame": job.start_frame,
-        "corrections": [parse_correction(text) for text in job.correct],
-        "command": command,
-        "selection": job.frames,
-        "resume": True,
-        "listener": listener,
-    }
-    if job.objects > 1:
-        record_objects(source, job.config, run, boxes=boxes, masks=masks, points=points, **about)
-    else:
-        box, mask, point = (next(iter(given), None) for given in (boxes, masks, points))
-        record(source, job.config, run, box=box, mask=mask, points=point, **about)
+    prompts = PromptSet(boxes, masks, points, job.start_frame, as_lists=job.objects > 1)
+    corrections = [parse_correction(text) for text in job.correct]
+    request = request_tracking(source, job.config, prompts, corrections)
+    record_tracking(request, run, RecordOptions(command, job.frames, resume=True), listener)
 
 
 def counting(tell: Tell, of: int | None, **about: Any) -> Callable[[FrameRecord | SkippedFrame], None]:
@@ -199,7 +191,7 @@ def fetched(job: VideoJob, folder: Path) -> VideoJob:
     def here(place: str, number: int) -> str:
         if local(place) is not None:
             return absolute(place)
-        return str(fetch(place, folder / str(number)))
+        return str(copy_to_local(place, folder / str(number)))
 
     if job.sequence is not None:
         return job
@@ -239,7 +231,7 @@ def send_log(out: str, job: VideoJob) -> bool:
     log = log_file(out, job)
     if local(out) is None and log.is_file():
         with suppress(OutputError):  # the results are what counts
-            write(joined(out, LOGS, f"{job.name}.log"), log.read_bytes())
+            write(join_path(out, LOGS, f"{job.name}.log"), log.read_bytes())
     return log.is_file()
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from tracking3d.batch.folder import Failure, Progress
-from tracking3d.batch.places import base, joined, write
+from tracking3d.batch.folder import BatchProgress, Failure
+from tracking3d.batch.places import base, join_path, write
 from tracking3d.report.rendering import render_page
 from tracking3d.results import layout
 
@@ -16,7 +16,7 @@ MOST_PICTURES = 2000
 
 def write_overview(
     out: str,
-    progress: Progress,
+    progress: BatchProgress,
     rows: Sequence[Mapping[str, Any]],
     pictures: Mapping[str, str],
     failures: Sequence[Failure],
@@ -55,4 +55,4 @@ def write_overview(
         frames=sum(row["frames"] for row in rows),
         seconds=sum(row["seconds"] for row in rows),
     )
-    write(joined(out, layout.INDEX), page)
+    write(join_path(out, layout.INDEX), page)

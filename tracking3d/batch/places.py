@@ -32,10 +32,10 @@ def absolute(place: str, folder: str = ".") -> str:
     assert path is not None
     if path.is_absolute():
         return str(path)
-    return joined(absolute(folder), place) if "://" in folder else str(Path(folder).absolute() / path)
+    return join_path(absolute(folder), place) if "://" in folder else str(Path(folder).absolute() / path)
 
 
-def joined(folder: str, *names: str) -> str:
+def join_path(folder: str, *names: str) -> str:
     """A place within a folder."""
     if "://" in folder:
         return posixpath.join(folder, *names)
@@ -144,7 +144,7 @@ def is_folder(place: str) -> bool:
         return bool(files.isdir(inner))
 
 
-def fetch(place: str, folder: Path) -> Path:
+def copy_to_local(place: str, folder: Path) -> Path:
     """A file or folder from elsewhere, copied into ``folder``; a path of this machine as it is.
 
     Raises:

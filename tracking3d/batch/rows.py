@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, ValidationError
 
-from tracking3d.config.explain import describe
+from tracking3d.config.explain import describe_validation_error
 from tracking3d.config.section import Section
 from tracking3d.errors import InputError
 
@@ -50,7 +50,7 @@ def _numbers(values: Any) -> Any:
 Texts = Annotated[tuple[str, ...], BeforeValidator(_texts)]
 
 
-class Row(Section):
+class VideoRow(Section):
     """What is said of one video; everything but the video may be left out."""
 
     video: str
@@ -77,7 +77,7 @@ class Row(Section):
         return bool(self.box or self.mask or self.points or self.masks)
 
 
-def read_row(values: Mapping[str, Any], where: str) -> Row:
+def read_row(values: Mapping[str, Any], where: str) -> VideoRow:
     """A row from what a table or a JSON file holds; cells that are empty say nothing.
 
     Args:
@@ -89,9 +89,9 @@ def read_row(values: Mapping[str, Any], where: str) -> Row:
     """
     given = {str(key): value for key, value in values.items() if not _empty(value)}
     try:
-        return Row.model_validate(given)
+        return VideoRow.model_validate(given)
     except ValidationError as error:
-        raise InputError(f"{where}: {describe(error, Row, 'column')}") from error
+        raise InputError(f"{where}: {describe_validation_error(error, VideoRow, 'column')}") from error
 
 
 def _empty(value: Any) -> bool:

@@ -10,13 +10,13 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
-from tracking3d.batch.folder import Failure, Progress, write_progress, write_tables
+from tracking3d.batch.folder import BatchProgress, Failure, write_progress, write_tables
 from tracking3d.batch.networks import share_networks
 from tracking3d.batch.one_video import LOGS, WORK, send_log
 from tracking3d.batch.overview import write_overview
-from tracking3d.batch.places import joined, local, read_many
+from tracking3d.batch.places import join_path, local, read_many
 from tracking3d.batch.summary import MARKER, read_marker
-from tracking3d.batch.tasks import Tasks, is_whole
+from tracking3d.batch.tasks import Tasks, is_finished_video
 from tracking3d.batch.video_job import VideoJob
 from tracking3d.engines.mapping import PAUSE, map_tasks
 from tracking3d.engines.protocol import Began, Ended, Engine, Event, Task, Told
@@ -45,7 +45,7 @@ class Happening:
     event: str
     video: str
     about: Mapping[str, Any]
-    progress: Progress
+    progress: BatchProgress
 
 
 Listener = Callable[[Happening], None]
@@ -80,13 +80,13 @@ class Batch:
         self._clock = time.monotonic()
         self._refused = 0
         self.failures: dict[str, Failure] = {}
-        self.progress = Progress(
+        self.progress = BatchProgress(
             "running", len(jobs), engine=engine.name, workers=engine.workers, began=time.time()
         )
 
     def find_finished(self, overwrite: bool) -> list[int]:
         """Take in what an earlier command has finished; the numbers of the jobs that are still to be done."""
-        places = [joined(self._out, job.name, MARKER) for job in self._jobs]
+        places = [join_path(self._out, job.name, MARKER) for job in self._jobs]
         contents = {} if overwrite else read_many(places)
         left = []
         for number, (job, place) in enumerate(zip(self._jobs, places, strict=True)):
@@ -174,7 +174,7 @@ class Batch:
 
     def _why_taken(self, job: VideoJob, marker: Mapping[str, Any] | None) -> str:
         """Why a video's run folder cannot be had, in a sentence; empty where it can, or is there already."""
-        place = joined(self._out, job.name)
+        place = join_path(self._out, job.name)
         if marker is not None:
             what = "" if marker["key"] == job.key else "a run of another video, prompt or setting"
         else:  # what is whole comes with its marker, but elsewhere, where a part of it may have been sent
@@ -185,7 +185,7 @@ class Batch:
     def _end(self, job: VideoJob, ended: Ended) -> None:
         last = self._running.pop(self._workers.pop(ended.number, ""), {})
         fault = ended.fault
-        if fault is None and not is_whole(ended):  # a step of a long video
+        if fault is None and not is_finished_video(ended):  # a step of a long video
             self._shares[job.name] += last.get("share", 0.0)
             return
         self._shares.pop(job.name, None)
@@ -254,7 +254,7 @@ def run_batch(
     command: str = "",
     listener: Listener = lambda happening: None,
     pause: float = PAUSE,
-) -> Progress:
+) -> BatchProgress:
     """Track all videos; how far it came.
 
     What an earlier command has finished is left alone, and what it has begun goes on from its last finished frame.

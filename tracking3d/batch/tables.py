@@ -9,7 +9,7 @@ from pathlib import PurePosixPath
 from typing import Any
 
 from tracking3d.batch.places import read
-from tracking3d.batch.rows import Row, read_row
+from tracking3d.batch.rows import VideoRow, read_row
 from tracking3d.errors import InputError
 
 SUFFIXES = (".csv", ".jsonl", ".ndjson", ".parquet")
@@ -20,7 +20,7 @@ def is_table(place: str) -> bool:
     return PurePosixPath(place).suffix.lower() in SUFFIXES
 
 
-def read_table(place: str) -> list[Row]:
+def read_table(place: str) -> list[VideoRow]:
     """The rows of a table.
 
     Raises:

@@ -76,7 +76,7 @@ class Tasks:
     def further(self, ended: Ended) -> list[Task]:
         """What is to be done after a task that has ended for good."""
         long = self._long.get(ended.number)
-        if long is None or ended.fault is not None or long.failed or is_whole(ended):
+        if long is None or ended.fault is not None or long.failed or is_finished_video(ended):
             if long is not None:
                 long.failed |= ended.fault is not None
             return []
@@ -110,6 +110,6 @@ class Tasks:
         return Task(number, function, arguments, log_file(self._out, self._jobs[long.video]))
 
 
-def is_whole(ended: Ended) -> bool:
+def is_finished_video(ended: Ended) -> bool:
     """Whether a video is finished with a task; steps of long ones answer with other things than its rows."""
     return isinstance(ended.value, Mapping) and "rows" in ended.value

@@ -29,7 +29,7 @@ MEASURES = {
 
 
 @dataclass(frozen=True)
-class Comparison:
+class MeasureComparison:
     """One measure of two result sets on their common sequences.
 
     Attributes:
@@ -56,7 +56,7 @@ class Comparison:
         return "B is better" if (self.low > 0) == MEASURES[self.measure][1] else "B is worse"
 
 
-def compare(a: ResultSet, b: ResultSet, seed: int = 0) -> list[Comparison]:
+def compare(a: ResultSet, b: ResultSet, seed: int = 0) -> list[MeasureComparison]:
     """Compare two result sets by every measure that both have.
 
     Raises:
@@ -75,7 +75,7 @@ def compare(a: ResultSet, b: ResultSet, seed: int = 0) -> list[Comparison]:
         differences = {name: of_b[name] - of_a[name] for name in common}
         low, high = interval(np.array(list(differences.values())), seed)
         mean_a, mean_b = (float(np.mean([values[name] for name in common])) for values in (of_a, of_b))
-        comparisons.append(Comparison(measure, mean_a, mean_b, differences, low, high))
+        comparisons.append(MeasureComparison(measure, mean_a, mean_b, differences, low, high))
     if not comparisons:
         raise InputError(
             "The two result sets have no scored sequence in common; compare two of the same data."
@@ -83,7 +83,7 @@ def compare(a: ResultSet, b: ResultSet, seed: int = 0) -> list[Comparison]:
     return comparisons
 
 
-def format_comparison(comparisons: list[Comparison], a: ResultSet, b: ResultSet) -> list[Table]:
+def format_comparison(comparisons: list[MeasureComparison], a: ResultSet, b: ResultSet) -> list[Table]:
     """A table of the means with their intervals, and one of the differences by sequence."""
     means = Table(title=escape(f"{a.dataset}: A = {a.label}, B = {b.label}"), title_justify="left")
     for title in ("measure", "A", "B", "B - A", f"{LEVEL:.0%} interval", "sequences", ""):

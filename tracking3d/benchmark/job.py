@@ -171,8 +171,8 @@ def _track(job: Job, run: Path) -> None:
 
     def after_frame(frame: object) -> None:
         # The second pass holds more once, not more and more.
-        if not getattr(frame, "refined", False) and (memory := resident_memory()):
-            held.append(memory[0])
+        if not getattr(frame, "refined", False):
+            held.append(resident_memory()[0])
 
     _record(job, run, after_frame)
     write_atomic(job.folder / MEMORY, json.dumps(held).encode())

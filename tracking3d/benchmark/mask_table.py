@@ -9,7 +9,7 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
-from tracking3d.benchmark.mask_trackers import Measured, overall
+from tracking3d.benchmark.mask_trackers import TrackerMeasurement, overall
 from tracking3d.benchmark.sequences import Dataset
 from tracking3d.results.description import versions
 from tracking3d.results.records import jsonable
@@ -26,7 +26,7 @@ COLUMNS = {
 """Measures that the table shows: what it calls them, and digits after the point."""
 
 
-def format_masks(results: Sequence[Measured], dataset: Dataset) -> Table:
+def format_masks(results: Sequence[TrackerMeasurement], dataset: Dataset) -> Table:
     """A row for every tracker on every sequence, and one for every tracker's mean."""
     table = Table("tracker", "sequence", title=escape(f"{dataset.name}: mask trackers"), title_justify="left")
     for title, _ in COLUMNS.values():
@@ -44,7 +44,7 @@ def format_masks(results: Sequence[Measured], dataset: Dataset) -> Table:
     return table
 
 
-def report(results: Sequence[Measured], dataset: Dataset, start: str) -> dict[str, Any]:
+def report(results: Sequence[TrackerMeasurement], dataset: Dataset, start: str) -> dict[str, Any]:
     """Everything that was measured, frame by frame too, for JSON."""
     document = {
         "dataset": dataset.name,

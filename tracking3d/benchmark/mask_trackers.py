@@ -83,7 +83,7 @@ class TrackedFrame:
 
 
 @dataclass(frozen=True)
-class Measured:
+class TrackerMeasurement:
     """One tracker on one sequence, or on several together.
 
     Attributes:
@@ -127,8 +127,8 @@ def measure_trackers(
     dataset: Dataset,
     start: Start = "box",
     most_frames: int | None = None,
-    listener: Callable[[Measured], None] = lambda measured: None,
-) -> list[Measured]:
+    listener: Callable[[TrackerMeasurement], None] = lambda measured: None,
+) -> list[TrackerMeasurement]:
     """Every tracker on every sequence, one after the other, so that the times mean something.
 
     Args:
@@ -165,14 +165,14 @@ def ablation(contestant: Contestant) -> list[Contestant]:
     ]
 
 
-def overall(results: Sequence[Measured]) -> dict[str, dict[str, float | int | None]]:
+def overall(results: Sequence[TrackerMeasurement]) -> dict[str, dict[str, float | int | None]]:
     """Figures by tracker: means over its sequences; areas and times over all of its frames together."""
     figures = {}
     for tracker in dict.fromkeys(one.tracker for one in results):
         done = [one for one in results if one.tracker == tracker and not one.error]
         frames = tuple(frame for one in done for frame in one.frames)
         seconds = tuple(second for one in done for second in one.seconds)
-        pooled = Measured(tracker, "all", frames, seconds).figures()
+        pooled = TrackerMeasurement(tracker, "all", frames, seconds).figures()
         means = {
             name: _mean([figure for one in done if (figure := one.figures()[name]) is not None])
             for name in ("iou_mean", "boundary_f_mean", "share_under_half")
@@ -201,8 +201,8 @@ def track_masks(
 
 def _measure(
     contestant: Contestant, dataset: Dataset, sequence: str, start: Start, most_frames: int | None
-) -> Measured:
-    measured = Measured(contestant.label, sequence)
+) -> TrackerMeasurement:
+    measured = TrackerMeasurement(contestant.label, sequence)
     frames, seconds = [], []
     try:
         truth = _seen(read_sequence(load_layout(dataset.layout), dataset.root, sequence))

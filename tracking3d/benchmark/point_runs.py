@@ -51,7 +51,7 @@ class PointErrors:
         error: ``(M,)`` pixels of the frame.
         uncertainty: ``(M,)``.
         measured: ``(M,)`` bool.
-        features: ``(M, F)``, see `tracking3d.points.uncertainty.features`.
+        features: ``(M, F)``, see `tracking3d.points.uncertainty.error_features`.
     """
 
     error: NDArray[np.float64]

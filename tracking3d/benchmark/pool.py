@@ -17,7 +17,7 @@ from tracking3d.errors import Tracking3dError
 
 
 @dataclass(frozen=True)
-class Outcome:
+class JobOutcome:
     """What became of a job.
 
     Attributes:
@@ -35,7 +35,7 @@ class Outcome:
     seconds: float = 0.0
 
 
-Listener = Callable[[Outcome], None]
+Listener = Callable[[JobOutcome], None]
 """Is told of every job as it is done."""
 
 
@@ -44,7 +44,7 @@ def run_jobs(
     processes: int = 1,
     listener: Listener = lambda outcome: None,
     address: str | None = None,
-) -> list[Outcome]:
+) -> list[JobOutcome]:
     """Run all jobs, ``processes`` at a time; the outcomes are in the order of the jobs.
 
     Jobs that depend on the same things, as when two rows of a table are one setting, are done once. Ctrl-C stops
@@ -56,11 +56,11 @@ def run_jobs(
         listener: Is told of every outcome.
         address: Of a Ray cluster that runs them, which must see the same files; this machine if None.
     """
-    outcomes: dict[int, Outcome] = {}
+    outcomes: dict[int, JobOutcome] = {}
     equal: dict[Path, list[int]] = {}
     began: dict[int, float] = {}
 
-    def done(number: int, outcome: Outcome) -> None:
+    def done(number: int, outcome: JobOutcome) -> None:
         outcomes[number] = outcome
         listener(outcome)
 
@@ -68,17 +68,20 @@ def run_jobs(
         try:
             others = equal.setdefault(job.folder, [])
             if not others and (scores := job.finished()) is not None:
-                done(number, Outcome(job, scores, cached=True))
+                done(number, JobOutcome(job, scores, cached=True))
             others.append(number)
         except Tracking3dError as error:  # the sequence cannot be read
-            done(number, Outcome(job, None, str(error)))
+            done(number, JobOutcome(job, None, str(error)))
     same = {numbers[0]: numbers for numbers in equal.values()}
 
     def follow(first: int) -> None:
         """The second of two equal jobs has the first one's result."""
         result = outcomes[first]
         for number in same[first][1:]:
-            done(number, Outcome(jobs[number], result.scores, result.error, cached=result.scores is not None))
+            done(
+                number,
+                JobOutcome(jobs[number], result.scores, result.error, cached=result.scores is not None),
+            )
 
     def told(event: Event) -> None:
         if isinstance(event, Began):
@@ -111,12 +114,12 @@ def _run_written(tell: Tell, file: Path) -> None:
     run_job(Job.read(file))
 
 
-def _outcome(job: Job, ended: Ended, seconds: float) -> Outcome:
+def _outcome(job: Job, ended: Ended, seconds: float) -> JobOutcome:
     if ended.fault is not None:
-        return Outcome(job, None, ended.fault.reason, seconds=seconds)
+        return JobOutcome(job, None, ended.fault.reason, seconds=seconds)
     scores = job.written()
     error = "" if scores is not None else "Its scores are not there; do all machines see the same files?"
-    return Outcome(job, scores, error, seconds=seconds)
+    return JobOutcome(job, scores, error, seconds=seconds)
 
 
 def _absolute(path: Path) -> Path:

@@ -49,7 +49,7 @@ class Kernels:
     aten: str
 
 
-def kernels_of(environment: Mapping[str, str]) -> Kernels | None:
+def detect_kernels(environment: Mapping[str, str]) -> Kernels | None:
     """What a process with these environment variables computes with; None where this processor cannot run it."""
     found = subprocess.run(
         [sys.executable, "-c", _PROBE],

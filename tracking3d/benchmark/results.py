@@ -14,7 +14,7 @@ from rich.table import Table
 
 from tracking3d.benchmark.fingerprint import code_fingerprint
 from tracking3d.benchmark.intervals import LEVEL, interval
-from tracking3d.benchmark.pool import Outcome
+from tracking3d.benchmark.pool import JobOutcome
 from tracking3d.benchmark.sequences import Dataset
 from tracking3d.benchmark.variant import Variant
 from tracking3d.errors import InputError
@@ -89,7 +89,7 @@ class ResultSet:
         return None if low is None or high is None else (low, high)
 
 
-def collect(variant: Variant, dataset: Dataset, outcomes: Sequence[Outcome]) -> ResultSet:
+def collect(variant: Variant, dataset: Dataset, outcomes: Sequence[JobOutcome]) -> ResultSet:
     """The result set of one variant's outcomes."""
     about = {
         "suite_version": dataset.version,

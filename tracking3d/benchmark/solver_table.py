@@ -166,10 +166,10 @@ def fill(
     for one in sets:
         write_results(one, out / "results" / f"{NAME}-{file_name(one.label)}-{masks}{dataset.name}.json")
     notes = [f"{label}: {one}." for label, one in chosen.items() if isinstance(one, str)]
-    return side_by_side(sets, _caption(base, dataset), notes)
+    return tabulate_results(sets, _caption(base, dataset), notes)
 
 
-def side_by_side(results: Sequence[ResultSet], caption: str, notes: Sequence[str] = ()) -> SideBySide:
+def tabulate_results(results: Sequence[ResultSet], caption: str, notes: Sequence[str] = ()) -> SideBySide:
     """Result sets of the same data as columns; one with refined answers makes two."""
     columns = [half for one in results for half in one.split()]
     failed = [f"{one.label} failed on {', '.join(one.errors)}." for one in results if one.errors]

@@ -17,7 +17,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from tracking3d.benchmark.pool import Listener
-from tracking3d.benchmark.processors import KERNELS, kernels_of
+from tracking3d.benchmark.processors import KERNELS, detect_kernels
 from tracking3d.benchmark.results import ResultSet, figure
 from tracking3d.benchmark.sequences import Dataset
 from tracking3d.benchmark.suite import run_suite
@@ -81,9 +81,9 @@ def plan(base: Variant) -> tuple[list[Variant], dict[str, str]]:
     Those whose kernels are the ones that the processor takes anyway are left out too: they are one computation.
     """
     variants, left_out = [base.changed(AS_IT_IS)], {}
-    seen = {kernels_of({}): AS_IT_IS}
+    seen = {detect_kernels({}): AS_IT_IS}
     for label, environment in KERNELS.items():
-        kernels = kernels_of(environment)
+        kernels = detect_kernels(environment)
         if kernels is None:
             left_out[label] = "this processor cannot run them"
         elif kernels in seen:

@@ -18,7 +18,7 @@ from tracking3d.benchmark.pool import Listener
 from tracking3d.benchmark.results import ResultSet, write_results
 from tracking3d.benchmark.sequences import Dataset
 from tracking3d.benchmark.suite import run_suite
-from tracking3d.benchmark.tables import Row, Table
+from tracking3d.benchmark.tables import Table, TableRow
 from tracking3d.benchmark.variant import Variant
 from tracking3d.results.files import write_atomic, writing
 
@@ -131,7 +131,7 @@ def _chosen(table: Table, dataset: Dataset) -> Dataset:
 
 
 def _lines(
-    row: Row, table: Table, plan: Mapping[str, Variant | str], results: Mapping[str, ResultSet]
+    row: TableRow, table: Table, plan: Mapping[str, Variant | str], results: Mapping[str, ResultSet]
 ) -> list[Line]:
     """A row's line; two, causal and refined, where its run has both answers and the row shows answers."""
     result = results.get(row.plan)
@@ -145,7 +145,7 @@ def _lines(
 
 
 def _line(
-    row: Row, table: Table, plan: Mapping[str, Variant | str], results: Mapping[str, ResultSet]
+    row: TableRow, table: Table, plan: Mapping[str, Variant | str], results: Mapping[str, ResultSet]
 ) -> Line:
     paper = row.paper.value if row.paper else None
     line = Line(row.label, paper, row.paper.gain if row.paper else None)

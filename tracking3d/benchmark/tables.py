@@ -26,7 +26,7 @@ DEEP = "s2dnet"
 
 
 @dataclass(frozen=True)
-class Row:
+class TableRow:
     """One row of a table.
 
     Attributes:
@@ -64,7 +64,7 @@ class Table:
     title: str
     source: str
     dataset: str
-    rows: tuple[Row, ...]
+    rows: tuple[TableRow, ...]
     plan: Callable[[Variant, bool, Mapping[str, Path]], Plan]
     note: str = ""
     measure: str = "iou_mean"
@@ -208,12 +208,12 @@ def _features(base: Variant, synthetic: bool, initial: Mapping[str, Path]) -> Pl
     return plan
 
 
-def _with_gain(published: Mapping[str, Published], names: tuple[str, ...]) -> tuple[Row, ...]:
+def _with_gain(published: Mapping[str, Published], names: tuple[str, ...]) -> tuple[TableRow, ...]:
     rows = []
     for name in names:
         rows += [
-            Row(name, published[name], name, initial=True),
-            Row(f"{name} + ours", published[f"{name} + ours"], name),
+            TableRow(name, published[name], name, initial=True),
+            TableRow(f"{name} + ours", published[f"{name} + ours"], name),
         ]
     return tuple(rows)
 
@@ -228,8 +228,8 @@ TABLES: dict[str, Table] = {
             "cdtb",
             (
                 *_with_gain(paper_numbers.CDTB, ("CSR-DCF", "D3S", "OSTrack")),
-                Row("csrt of this package", None, "csrt", initial=True),
-                Row("csrt of this package + ours", None, "csrt"),
+                TableRow("csrt of this package", None, "csrt", initial=True),
+                TableRow("csrt of this package + ours", None, "csrt"),
             ),
             _cdtb,
         ),
@@ -239,9 +239,9 @@ TABLES: dict[str, Table] = {
             "Table 2",
             "inhand",
             (
-                Row("OSVOS", paper_numbers.IN_HAND["OSVOS"]),
+                TableRow("OSVOS", paper_numbers.IN_HAND["OSVOS"]),
                 *_with_gain(paper_numbers.IN_HAND, ("OSTrack",)),
-                Row("BackFlow (RGB-D)", paper_numbers.IN_HAND["BackFlow (RGB-D)"]),
+                TableRow("BackFlow (RGB-D)", paper_numbers.IN_HAND["BackFlow (RGB-D)"]),
             ),
             _in_hand,
             note="The paper runs S2DNet features here, we run those of the configuration.",
@@ -252,8 +252,8 @@ TABLES: dict[str, Table] = {
             "Table 3",
             "coin",
             (
-                Row("Coin tracking", paper_numbers.COIN["Coin tracking"], "RGB", initial=True),
-                *(Row(name, paper_numbers.COIN[name], name) for name in list(paper_numbers.COIN)[1:]),
+                TableRow("Coin tracking", paper_numbers.COIN["Coin tracking"], "RGB", initial=True),
+                *(TableRow(name, paper_numbers.COIN[name], name) for name in list(paper_numbers.COIN)[1:]),
             ),
             _coin,
             sequences=("*card*",),
@@ -264,15 +264,15 @@ TABLES: dict[str, Table] = {
             "Table 4",
             "cdtb",
             (
-                Row(
+                TableRow(
                     "initial masks (OSTrack)",
                     paper_numbers.ABLATION["initial masks (OSTrack)"],
                     "RGB",
                     initial=True,
                 ),
-                Row("RGB", paper_numbers.ABLATION["RGB"], "RGB"),
-                Row("S2DNet", paper_numbers.ABLATION["S2DNet"], "S2DNet"),
-                *(Row(label, paper_numbers.ABLATION.get(label), label) for label in LOSSES),
+                TableRow("RGB", paper_numbers.ABLATION["RGB"], "RGB"),
+                TableRow("S2DNet", paper_numbers.ABLATION["S2DNet"], "S2DNet"),
+                *(TableRow(label, paper_numbers.ABLATION.get(label), label) for label in LOSSES),
             ),
             _ablation,
             note="The paper's rows without a loss use S2DNet features, ours those of the configuration.",
@@ -287,9 +287,9 @@ TABLES: dict[str, Table] = {
                 row
                 for name in ("csrt", "flow", "OSTrack", "true masks")
                 for row in (
-                    Row(f"{name}, initial masks", None, f"{name}, RGB", initial=True),
+                    TableRow(f"{name}, initial masks", None, f"{name}, RGB", initial=True),
                     *(
-                        Row(label, None, label)
+                        TableRow(label, None, label)
                         for prior in FLAT
                         for label in (f"{name}, RGB{prior}", f"{name}, S2DNet{prior}")
                     ),
@@ -305,10 +305,10 @@ TABLES: dict[str, Table] = {
             "Table 5",
             "tudl",
             (
-                *(Row(name, row) for name, row in paper_numbers.TUD_L.items() if name != "ours"),
-                Row("ours, csrt", None, "csrt"),
-                Row("ours, OSTrack", paper_numbers.TUD_L["ours"], "OSTrack"),
-                Row("ours, true masks", None, "truth"),
+                *(TableRow(name, row) for name, row in paper_numbers.TUD_L.items() if name != "ours"),
+                TableRow("ours, csrt", None, "csrt"),
+                TableRow("ours, OSTrack", paper_numbers.TUD_L["ours"], "OSTrack"),
+                TableRow("ours, true masks", None, "truth"),
             ),
             _bop,
             note="All but ours are given the 3D model and were trained; ours are aligned by one similarity on frame 0.",
@@ -319,7 +319,7 @@ TABLES: dict[str, Table] = {
             "Influence of the number of keyframes",
             "the figure on keyframes",
             "cdtb",
-            tuple(Row(str(count), row, str(count)) for count, row in paper_numbers.KEYFRAMES.items()),
+            tuple(TableRow(str(count), row, str(count)) for count, row in paper_numbers.KEYFRAMES.items()),
             _keyframes,
             note="The paper uses S2DNet features, we those of the configuration.",
             sample=16,

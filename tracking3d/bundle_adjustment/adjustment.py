@@ -17,16 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.bundle_adjustment.reprojection import (
-    BEHIND,
     FloatArray,
+    apply_pose_steps,
     finite_rows,
-    moved,
-    pixel_by_point,
-    pixel_by_pose,
-    project,
-    to_camera,
+    transform_to_camera,
 )
-from tracking3d.rendering.backend import compiled
 
 _FIRST_DAMPING = 1e-3
 _LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e9
@@ -96,26 +91,13 @@ class System:
     def step(self, damping: float) -> tuple[FloatArray, FloatArray] | None:
         """Damped step of poses ``(C,)`` and points ``(N, 3)``; None where there is none."""
         poses, points = _damped(self.poses, damping), _damped(self.points, damping)
-        if compiled():
-            from tracking3d.bundle_adjustment.kernels import elimination
+        from tracking3d.bundle_adjustment.kernels import elimination
 
-            return elimination.step(poses, points, self.coupling, self.poses_gradient, self.points_gradient)
-        flat = self.coupling.reshape(3 * len(points), len(poses))
-        by_points = (np.linalg.inv(points) @ self.coupling).reshape(flat.shape)
-        gradient = self.poses_gradient - by_points.T @ self.points_gradient.ravel()
-        try:
-            factor = np.linalg.cholesky(poses - flat.T @ by_points)
-        except np.linalg.LinAlgError:
-            return None
-        d_poses = np.asarray(-np.linalg.solve(factor.T, np.linalg.solve(factor, gradient)), np.float64)
-        right = self.points_gradient + self.coupling @ d_poses
-        d_points = np.asarray(-np.linalg.solve(points, right[..., None])[..., 0], np.float64)
-        sound = np.isfinite(d_poses).all() and np.isfinite(d_points).all()
-        return (d_poses, d_points) if sound else None
+        return elimination.step(poses, points, self.coupling, self.poses_gradient, self.points_gradient)
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class AdjustmentProblem:
     """What stays the same during one adjustment; arguments of `adjust`, with nothing in them that is not finite."""
 
     pixels: FloatArray
@@ -136,75 +118,22 @@ class Problem:
 
     def evaluated(self, at: Structure) -> Structure:
         """With its cost and its residuals."""
-        K = self.intrinsics(at.focal_factor)
-        if compiled():
-            from tracking3d.bundle_adjustment.kernels import normal_equations
+        from tracking3d.bundle_adjustment.kernels import normal_equations
 
-            given = self.pixels, self.weight, K, at.R, at.t, at.points
-            total, residual = normal_equations.evaluated(*given, self.scale)
-        else:
-            difference = project(to_camera(at.R, at.t, at.points), K) - self.pixels
-            distance = np.hypot(difference[..., 0], difference[..., 1])
-            residual = np.where(self.weight > 0, distance, np.nan)
-            relative = np.where(np.isfinite(residual), residual / self.scale, BEHIND)
-            total = float(np.sum(self.weight * np.log1p(relative**2)))
+        given = self.pixels, self.weight, self.intrinsics(at.focal_factor), at.R, at.t, at.points
+        total, residual = normal_equations.evaluated(*given, self.scale)
         total += float(np.sum(self.prior_weight * np.sum((at.points - self.prior) ** 2, 1)))
         return replace(at, cost=float(total / max(self.weight.sum(), 1e-12)), residual=residual)
 
     def linearised(self, at: Structure) -> System:
         """The quadratic model of the weighted sum of losses."""
-        given = self.pixels, self.weight, self.intrinsics(at.focal_factor), at.R, at.t, at.points
-        if compiled():
-            from tracking3d.bundle_adjustment.kernels import normal_equations
+        from tracking3d.bundle_adjustment.kernels import normal_equations
 
-            system = System(*normal_equations.linearised(*given, self.scale, self.fixed, self.free_focal))
-        else:
-            system = self._linearised(at)
+        given = self.pixels, self.weight, self.intrinsics(at.focal_factor), at.R, at.t, at.points
+        system = System(*normal_equations.linearised(*given, self.scale, self.fixed, self.free_focal))
         points = system.points + 2 * self.prior_weight[:, None, None] * np.eye(3)
         points_gradient = system.points_gradient + 2 * self.prior_weight[:, None] * (at.points - self.prior)
         return replace(system, points=points, points_gradient=points_gradient)
-
-    def _linearised(self, at: Structure) -> System:
-        """The same without the prior."""
-        K = self.intrinsics(at.focal_factor)
-        x_cam = to_camera(at.R, at.t, at.points)
-        difference = project(x_cam, K) - self.pixels
-        used = (self.weight > 0) & np.isfinite(difference).all(-1)
-        difference = np.where(used[..., None], difference, 0.0)
-        # The Cauchy loss as weights of least squares: its derivative is 2 r / (scale^2 + r^2).
-        root = np.sqrt(2 * np.where(used, self.weight, 0.0) / (self.scale**2 + np.sum(difference**2, -1)))
-        by_point = root[..., None, None] * pixel_by_point(x_cam, K)
-        residual = root[..., None] * difference
-        by_pose = pixel_by_pose(by_point, x_cam - at.t[:, None])[self.fixed :]
-        by_point_obj = by_point @ at.R[:, None]
-        free, many = len(at.R) - self.fixed, len(at.points)
-        count = 6 * free
-        size = count + self.free_focal
-        poses, gradient = np.zeros((size, size)), np.zeros(size)
-        coupling = np.zeros((many, 3, size))
-        rows = by_pose.reshape(free, 2 * many, 6)
-        blocks = rows.transpose(0, 2, 1) @ rows
-        for n in range(free):
-            poses[6 * n : 6 * n + 6, 6 * n : 6 * n + 6] = blocks[n]
-        gradient[:count] = np.einsum(
-            "fki,fk->fi", rows, residual[self.fixed :].reshape(free, 2 * many)
-        ).ravel()
-        coupling[..., :count] = np.einsum("fnki,fnkj->njfi", by_pose, by_point_obj[self.fixed :]).reshape(
-            many, 3, count
-        )
-        if self.free_focal:
-            # Depths go with the focal length: to first order the image of the object's origin plane stays.
-            pixel = project(x_cam, K) - K[:2, 2]
-            by_focal = np.where(used[..., None], root[..., None] * pixel, 0.0)
-            by_focal += by_point[..., 2] * at.t[:, None, 2:]
-            poses[count, count] = np.sum(by_focal**2)
-            gradient[count] = np.sum(by_focal * residual)
-            border = np.einsum("fnki,fnk->fi", by_pose, by_focal[self.fixed :]).ravel()
-            poses[count, :count] = poses[:count, count] = border
-            coupling[..., count] = np.einsum("fnki,fnk->ni", by_point_obj, by_focal)
-        points = np.einsum("fnki,fnkj->nij", by_point_obj, by_point_obj)
-        points_gradient = np.einsum("fnki,fnk->ni", by_point_obj, residual)
-        return System(poses, points, coupling, gradient, points_gradient)
 
     def stepped(self, at: Structure, d_poses: FloatArray, d_points: FloatArray) -> Structure:
         """After a step."""
@@ -213,7 +142,7 @@ class Problem:
             factor = float(np.exp(np.clip(d_poses[-1], -0.5, 0.5)))
             t = t * [1.0, 1.0, factor]
             d_poses = d_poses[:-1]
-        R_moved, t_moved = moved(at.R[self.fixed :], t[self.fixed :], d_poses.reshape(-1, 6))
+        R_moved, t_moved = apply_pose_steps(at.R[self.fixed :], t[self.fixed :], d_poses.reshape(-1, 6))
         R, t = np.concatenate([at.R[: self.fixed], R_moved]), np.concatenate([t[: self.fixed], t_moved])
         return replace(at, R=R, t=t, points=at.points + d_points, focal_factor=at.focal_factor * factor)
 
@@ -263,7 +192,7 @@ def adjust(
     known = finite_rows(start.points)
     prior = np.full((count, 3), np.nan) if point_prior is None else point_prior
     held = known & finite_rows(prior)
-    problem = Problem(
+    problem = AdjustmentProblem(
         pixels=np.where(tracks.visible[..., None], np.nan_to_num(tracks.pixels), 0.0),
         weight=tracks.weights() * known,
         K=np.asarray(K, np.float64),
@@ -300,7 +229,8 @@ def _with_depth_of(reference: Structure, structure: Structure, used: NDArray[np.
     if not used.any():
         return structure
     before, after = (
-        float(np.median(to_camera(s.R[0], s.t[0], s.points[used])[:, 2])) for s in (reference, structure)
+        float(np.median(transform_to_camera(s.R[0], s.t[0], s.points[used])[:, 2]))
+        for s in (reference, structure)
     )
     factor = before / after * structure.focal_factor / reference.focal_factor
     if not (math.isfinite(factor) and factor > 0):

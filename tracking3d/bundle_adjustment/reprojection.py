@@ -25,44 +25,18 @@ def finite_rows(rows: FloatArray) -> NDArray[np.bool_]:
     return np.logical_and.reduce(np.isfinite(rows), axis=-1)
 
 
-def to_camera(R: FloatArray, t: FloatArray, points: FloatArray) -> FloatArray:
+def transform_to_camera(R: FloatArray, t: FloatArray, points: FloatArray) -> FloatArray:
     """``(..., N, 3)`` points in camera coordinates, from poses ``(..., 3, 3)`` and ``(..., 3)``."""
     return points @ np.swapaxes(R, -1, -2) + t[..., None, :]
 
 
-def project(x_cam: FloatArray, K: FloatArray) -> FloatArray:
+def project_camera_points(x_cam: FloatArray, K: FloatArray) -> FloatArray:
     """``(..., 2)`` pixels of points ``(..., 3)`` in camera coordinates; nan for those not in front of the camera."""
     depth = np.where(x_cam[..., 2] > NEAREST, x_cam[..., 2], np.nan)
     focal, centre = np.array([K[0, 0], K[1, 1]]), K[:2, 2]
     return x_cam[..., :2] / depth[..., None] * focal + centre
 
 
-def pixel_by_point(x_cam: FloatArray, K: FloatArray) -> FloatArray:
-    """``(..., 2, 3)`` derivative of `project`; zero for points not in front of the camera."""
-    seen = x_cam[..., 2] > NEAREST
-    inverse = np.where(seen, 1 / np.where(seen, x_cam[..., 2], 1.0), 0.0)
-    derivative = np.zeros((*x_cam.shape[:-1], 2, 3))
-    for row in range(2):
-        derivative[..., row, row] = K[row, row] * inverse
-        derivative[..., row, 2] = -K[row, row] * x_cam[..., row] * inverse**2
-    return derivative
-
-
-def pixel_by_pose(by_point: FloatArray, from_pivot: FloatArray) -> FloatArray:
-    """``(..., 2, 6)`` derivative of pixels by (v, w).
-
-    Args:
-        by_point: ``(..., 2, 3)`` of `pixel_by_point`.
-        from_pivot: ``(..., 3)`` points in camera coordinates less the pivot that rotations turn about.
-    """
-    # a . (w x y) is w . (y x a).
-    y, a = from_pivot[..., None, :], by_point
-    turned = np.empty_like(by_point)
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        turned[..., i] = y[..., j] * a[..., k] - y[..., k] * a[..., j]
-    return np.concatenate([by_point, turned], -1)
-
-
-def moved(R: FloatArray, t: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray]:
+def apply_pose_steps(R: FloatArray, t: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Poses ``(F, 3, 3)`` and ``(F, 3)`` after steps ``(F, 6)``."""
     return Rotation.from_rotvec(step[:, 3:]).as_matrix() @ R, t + step[:, :3]

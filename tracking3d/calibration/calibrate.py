@@ -31,7 +31,7 @@ _OUTLIER, _ROUNDS = 3.0, 3
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class BoardView:
     """The board in one frame.
 
     Attributes:
@@ -68,13 +68,13 @@ class Calibration:
 
 def find_views(
     frames: Iterable[Frame | SkippedFrame], board: Board
-) -> tuple[list[View], tuple[int, int], dict[int, str]]:
+) -> tuple[list[BoardView], tuple[int, int], dict[int, str]]:
     """Look for the board in every frame.
 
     Returns:
         The views, ``(width, height)`` of the frames, and why the others are none.
     """
-    views: list[View] = []
+    views: list[BoardView] = []
     left_out: dict[int, str] = {}
     size = 0, 0
     for frame in frames:
@@ -88,7 +88,7 @@ def find_views(
         elif _in_a_line(board.corners[numbers]):
             left_out[frame.index] = "its corners lie in one line"
         else:
-            views.append(View(frame.index, numbers, pixels))
+            views.append(BoardView(frame.index, numbers, pixels))
     return views, size, left_out
 
 
@@ -144,12 +144,12 @@ def calibrate(
     )
 
 
-def coverage(views: Sequence[View], size: tuple[int, int]) -> float:
+def coverage(views: Sequence[BoardView], size: tuple[int, int]) -> float:
     """Share of the cells of the picture that a corner was seen in."""
     return float(_cells(views, size).mean())
 
 
-def spread_views(views: Sequence[View], size: tuple[int, int], most: int) -> list[View]:
+def spread_views(views: Sequence[BoardView], size: tuple[int, int], most: int) -> list[BoardView]:
     """At most so many views, those that differ most in place, size and slant, in their order."""
     if len(views) <= most:
         return list(views)
@@ -162,7 +162,7 @@ def spread_views(views: Sequence[View], size: tuple[int, int], most: int) -> lis
     return [views[number] for number in sorted(chosen)]
 
 
-def _look(view: View, size: tuple[int, int]) -> NDArray[np.float64]:
+def _look(view: BoardView, size: tuple[int, int]) -> NDArray[np.float64]:
     """Middle and spread of the corners, in widths of the picture."""
     pixels = view.pixels / size[0]
     spread = np.cov(pixels.T)
@@ -171,7 +171,7 @@ def _look(view: View, size: tuple[int, int]) -> NDArray[np.float64]:
     )
 
 
-def _cells(views: Sequence[View], size: tuple[int, int]) -> NDArray[np.bool_]:
+def _cells(views: Sequence[BoardView], size: tuple[int, int]) -> NDArray[np.bool_]:
     cells = np.zeros(CELLS, bool)
     for view in views:
         column, row = (view.pixels / size * CELLS[::-1]).astype(int).T
@@ -179,7 +179,7 @@ def _cells(views: Sequence[View], size: tuple[int, int]) -> NDArray[np.bool_]:
     return cells
 
 
-def _check_coverage(views: Sequence[View], size: tuple[int, int], name: str) -> None:
+def _check_coverage(views: Sequence[BoardView], size: tuple[int, int], name: str) -> None:
     cells = _cells(views, size)
     if cells.mean() >= LEAST_COVERAGE:
         return
@@ -201,7 +201,7 @@ def _in_a_line(corners: NDArray[np.float32]) -> bool:
 
 
 def _solve(
-    views: Sequence[View], board: Board, size: tuple[int, int], model: Model, name: str
+    views: Sequence[BoardView], board: Board, size: tuple[int, int], model: Model, name: str
 ) -> Calibration:
     corners = [board.corners[view.numbers] for view in views]
     pixels = [view.pixels for view in views]

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.checkpoint.milestones import Milestones, keep_milestones_only
-from tracking3d.checkpoint.progress import Kept, Progress, TakenFrame, journal_line, read_journal
+from tracking3d.checkpoint.progress import JournalEntry, Kept, RunProgress, journal_line, read_journal
 from tracking3d.checkpoint.trees import TreeFolder
 from tracking3d.errors import InputError
 from tracking3d.frames import SkippedFrame
@@ -54,15 +54,15 @@ class Checkpoint:
         self._journal = 0
         self._waiting = b""
 
-    def note(self, frame: SkippedFrame | TakenFrame) -> None:
+    def note(self, frame: SkippedFrame | JournalEntry) -> None:
         """Remember a frame that was not taken, or whose state is of no use; it is kept with the next state."""
         self._waiting += journal_line(frame)
 
     def save(
         self,
-        progress: Progress,
+        progress: RunProgress,
         session: dict[str, Any],
-        taken: TakenFrame | None = None,
+        taken: JournalEntry | None = None,
         revised: Iterable[int] = (),
     ) -> None:
         """Keep the state after a frame.
@@ -118,7 +118,7 @@ class Checkpoint:
                 raise ValueError(f"{journal.name} is too short")
             taken, skipped = read_journal(text)
             self._taken = {index: number for number, index in enumerate(taken, 1)}
-            kept = Kept(Progress(**state["progress"]), self._trees.read(state["session"]), taken, skipped)
+            kept = Kept(RunProgress(**state["progress"]), self._trees.read(state["session"]), taken, skipped)
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise InputError(f"{path} is damaged ({error}); start anew with {layout.OVERWRITE}.") from error
         return kept

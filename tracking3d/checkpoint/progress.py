@@ -15,7 +15,7 @@ from tracking3d.frames import Frame, SkippedFrame
 
 
 @dataclass(frozen=True)
-class Progress:
+class RunProgress:
     """Where a run stands.
 
     Attributes:
@@ -38,8 +38,8 @@ class Progress:
 
 
 @dataclass(frozen=True)
-class TakenFrame:
-    """What the answers do not tell of a frame that was taken.
+class JournalEntry:
+    """What the journal says of a frame that was tracked, beside what ``frames.jsonl`` says of it.
 
     Attributes:
         index: The frame's index in the source.
@@ -68,9 +68,9 @@ class Kept:
         skipped: Those that were not.
     """
 
-    progress: Progress
+    progress: RunProgress
     session: dict[str, Any]
-    taken: dict[int, TakenFrame] = field(default_factory=dict)
+    taken: dict[int, JournalEntry] = field(default_factory=dict)
     skipped: tuple[SkippedFrame, ...] = ()
 
 
@@ -79,7 +79,7 @@ def checksum(image: NDArray[np.uint8]) -> int:
     return zlib.crc32(np.ascontiguousarray(image).reshape(-1).data)
 
 
-def journal_line(frame: TakenFrame | SkippedFrame) -> bytes:
+def journal_line(frame: JournalEntry | SkippedFrame) -> bytes:
     """One frame as a line of the journal."""
     fields = asdict(frame)
     if isinstance(frame, SkippedFrame):
@@ -87,20 +87,20 @@ def journal_line(frame: TakenFrame | SkippedFrame) -> bytes:
     return json.dumps(fields).encode("ascii") + b"\n"
 
 
-def read_journal(text: bytes) -> tuple[dict[int, TakenFrame], tuple[SkippedFrame, ...]]:
+def read_journal(text: bytes) -> tuple[dict[int, JournalEntry], tuple[SkippedFrame, ...]]:
     """The frames of a journal.
 
     Raises:
         ValueError: If a line is damaged.
     """
-    taken, skipped = dict[int, TakenFrame](), list[SkippedFrame]()
+    taken, skipped = dict[int, JournalEntry](), list[SkippedFrame]()
     for line in text.splitlines():
         fields = json.loads(line)
         try:
             if fields.pop("skipped", False):
                 skipped.append(SkippedFrame(**fields))
             else:
-                frame = TakenFrame(**fields)
+                frame = JournalEntry(**fields)
                 taken[frame.index] = replace(frame, score=float(frame.score))
         except (TypeError, AttributeError) as error:
             raise ValueError(f"not a frame of the journal: {error}") from error

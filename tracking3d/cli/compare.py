@@ -10,7 +10,7 @@ import typer
 from tracking3d.cli.options import Debug
 
 if TYPE_CHECKING:
-    from tracking3d.report.differences import Comparison
+    from tracking3d.report.differences import RunComparison
 
 
 def compare(
@@ -49,11 +49,11 @@ def compare(
         typer.echo(out)
 
 
-def _print(comparison: Comparison) -> None:
+def _print(comparison: RunComparison) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from tracking3d.cli.tables import print_table, shown
+    from tracking3d.cli.tables import format_value, print_table
     from tracking3d.report.differences import run_figures
     from tracking3d.stages import STAGES
 
@@ -62,7 +62,7 @@ def _print(comparison: Comparison) -> None:
     def table(title: str, rows: dict[str, list[Any]], columns: list[str]) -> None:
         drawn = Table("", *columns, title=title, title_justify="left")
         for name, values in rows.items():
-            drawn.add_row(escape(name), *(escape(shown(value)) for value in values))
+            drawn.add_row(escape(name), *(escape(format_value(value)) for value in values))
         print_table(drawn)
 
     figures = [run_figures(run) for run in comparison.runs]
@@ -84,7 +84,7 @@ def _print(comparison: Comparison) -> None:
         table("frames that differ most", worst, names[1:])
 
 
-def _every_two(comparison: Comparison) -> dict[str, list[Any]]:
+def _every_two(comparison: RunComparison) -> dict[str, list[Any]]:
     iou, turn = comparison.iou_between, comparison.rotation_between
     return {
         name: [

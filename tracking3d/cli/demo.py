@@ -29,7 +29,9 @@ def demo(
     from tracking3d.cli.tables import print_figures
     from tracking3d.datasets.clip import read_truth
     from tracking3d.evaluation.score import score_run
-    from tracking3d.recording import record
+    from tracking3d.open_tracking import request_tracking
+    from tracking3d.prompts import PromptSet
+    from tracking3d.recording import RecordOptions, record_tracking
     from tracking3d.results.files import write_atomic
     from tracking3d.results.layout import REPORT
     from tracking3d.synthesis.convex_clips import make_demo_clip
@@ -39,9 +41,10 @@ def demo(
     clip, folder = make_demo_clip(out / "clip", seed=seed), out / "run"
     source = open_source(clip / "frames")
     box = read_truth(clip).box
-    command = f"tracking3d demo --seed {seed}"
+    options = RecordOptions(f"tracking3d demo --seed {seed}", overwrite=True)
+    request = request_tracking(source, settings, PromptSet.of_one(box))
     with reported([folder]) as told, progress(source.count, quiet) as listener:
-        record(source, settings, folder, box=box, command=command, overwrite=True, listener=told(listener))
+        record_tracking(request, folder, options, told(listener))
 
     scores = score_run(folder, clip)
     summary = {

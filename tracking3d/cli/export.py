@@ -72,8 +72,8 @@ def export(
         return
     if run is None or to is None:
         raise InputError("export takes RUN and --to FORMAT; --list shows the formats.")
-    from tracking3d.export.exporter import ExportOptions
     from tracking3d.export.exporting import export_run
+    from tracking3d.export.options import ExportOptions
 
     pixels = tuple(numbers(text, 2, "--xy", "X,Y in pixels") for text in xy or ())
     options = ExportOptions(

@@ -48,7 +48,7 @@ def given_masks(file: Path) -> list[Path]:
     return [Path(f"{image}@{number}") for number in numbers]
 
 
-def check_known(settings: PipelineConfig, objects: int, fine: bool, split: bool) -> None:
+def check_object_options(settings: PipelineConfig, objects: int, fine: bool, split: bool) -> None:
     """Make sure of what is asked for beside ``--object``.
 
     Raises:
@@ -56,7 +56,7 @@ def check_known(settings: PipelineConfig, objects: int, fine: bool, split: bool)
     """
     if settings.object.known is None:
         return
-    from tracking3d.arguments import check_known as check_one
+    from tracking3d.arguments import check_single_known_object as check_one
 
     check_one(settings, objects)
     if fine:

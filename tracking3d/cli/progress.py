@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from tracking3d.cli.tables import print_table, shown
+from tracking3d.cli.tables import format_value, print_table
 from tracking3d.frames import SkippedFrame
 from tracking3d.recording import Listener
 from tracking3d.results import layout
@@ -109,7 +109,7 @@ def print_summary(folder: Path) -> None:
         for failure in run["failures"]:
             table.add_row(f"    {failure['frames']} of them", escape(failure["reason"]))
     if refinement := run.get("refinement"):
-        took = f"{refinement['frames']} frames in {shown(refinement['seconds'])} s"
+        took = f"{refinement['frames']} frames in {format_value(refinement['seconds'])} s"
         table.add_row("final refinement", took if refinement["frames"] else escape(refinement["reason"]))
     own = own_masks(run)
     if own is not None:
@@ -123,11 +123,11 @@ def print_summary(folder: Path) -> None:
             "mean IoU with the initial masks"
             if own is None
             else "  mean IoU of these with the initial masks",
-            shown(run["iou_initial_mean"] if own is None else run["iou_initial_mean_own"]),
+            format_value(run["iou_initial_mean"] if own is None else run["iou_initial_mean_own"]),
         )
-    table.add_row("seconds per frame", shown(whole))
+    table.add_row("seconds per frame", format_value(whole))
     for stage in STAGES if stages else ():
-        table.add_row(f"  {stage}", shown(getattr(stages, stage)))
+        table.add_row(f"  {stage}", format_value(getattr(stages, stage)))
     if shape := run.get("shape"):
         table.add_row("shape", escape(str(shape)))
     for note in run["notes"]:
@@ -154,5 +154,5 @@ def _line(frame: FrameRecord | SkippedFrame) -> str:
     once_more = "once more: " if frame.refined else ""
     return (
         f"{once_more}frame {frame.index} [{_COLOURS[frame.status]}]{frame.status}[/] "
-        f"IoU {shown(frame.iou_initial)} {frame.seconds:.2f} s"
+        f"IoU {format_value(frame.iou_initial)} {frame.seconds:.2f} s"
     )

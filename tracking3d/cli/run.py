@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from tracking3d.cli.model import check_fine
-from tracking3d.cli.objects import check_known, given_box, given_masks
+from tracking3d.cli.objects import check_object_options, given_box, given_masks
 from tracking3d.cli.options import (
     ConfigFile,
     Debug,
@@ -309,7 +309,7 @@ def run(
     corrections = [parse_correction(text) for text in correct or told.correct]
     checked_corrections(corrections, max(len(given), 1))  # before anything is written
     folder = out or default_folder(source)
-    check_known(settings, len(given), fine, split is not None)
+    check_object_options(settings, len(given), fine, split is not None)
     if not given and needs_prompt(settings):
         if not a_person_is_there() or quiet or resume or source.isdigit():
             raise InputError(

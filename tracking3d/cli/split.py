@@ -51,14 +51,13 @@ def track_in_parts(
     """
     from tracking3d.cli.progress import print_summary, progress
     from tracking3d.cli.report import reported
-    from tracking3d.splitting.part_runs import Given as GivenOfPart
+    from tracking3d.prompts import PromptSet
     from tracking3d.splitting.split_run import record_in_parts
     from tracking3d.video import open_source
 
     _check(given, about, workers, view, fps)
     if quiet:
         logging.getLogger("tracking3d").setLevel(logging.ERROR)
-    box, mask, points = (next(iter(one), None) for one in (given.boxes, given.masks, given.points))
     with ExitStack() as ends:
         ends.enter_context(_to_be_resumed(folder))
         reporting = ends.enter_context(reported([folder] if report else []))
@@ -69,7 +68,7 @@ def track_in_parts(
             source,
             settings,
             folder,
-            GivenOfPart(box, mask, points),
+            PromptSet(given.boxes, given.masks, given.points),
             length=length,
             workers=workers or _processors(),
             selection=about["selection"],

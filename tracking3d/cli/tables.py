@@ -22,11 +22,11 @@ def print_figures(title: str, figures: Mapping[str, Any]) -> None:
     """Print names and figures in two columns; None is a dash."""
     table = Table(title=escape(title), show_header=False, title_justify="left")
     for name, value in figures.items():
-        table.add_row(escape(name), escape(shown(value)))
+        table.add_row(escape(name), escape(format_value(value)))
     print_table(table)
 
 
-def shown(value: Any) -> str:
+def format_value(value: Any) -> str:
     """A figure as tables show it."""
     if value is None:
         return "-"

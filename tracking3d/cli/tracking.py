@@ -59,7 +59,9 @@ def track(
     from tracking3d.cli.progress import print_summary, progress
     from tracking3d.cli.report import reported
     from tracking3d.cli.view import watched
-    from tracking3d.recording import record, record_objects
+    from tracking3d.open_tracking import request_tracking
+    from tracking3d.prompts import PromptSet
+    from tracking3d.recording import RecordOptions, record_tracking
     from tracking3d.results.layout import object_folders
     from tracking3d.results.run_reader import is_finished
     from tracking3d.video import open_source
@@ -76,13 +78,12 @@ def track(
         listener = reporting(ends.enter_context(progress(opened.count, quiet, objects)))
         if view:
             opened, listener = ends.enter_context(watched(opened, folder, listener, host, quiet))
-        about = {**about, "listener": listener}
-        if objects > 1:
-            several: dict[str, Any] = {"boxes": given.boxes, "masks": given.masks, "points": given.points}
-            record_objects(opened, settings, folder, **several, **about)
-        else:
-            box, mask, points = (next(iter(one), None) for one in (given.boxes, given.masks, given.points))
-            record(opened, settings, folder, box=box, mask=mask, points=points, **about)
+        about = dict(about)
+        start, corrections = about.pop("start_frame", None), about.pop("corrections", ())
+        skip_damaged = about.pop("skip_damaged", False)
+        prompts = PromptSet(given.boxes, given.masks, given.points, start, as_lists=objects > 1)
+        request = request_tracking(opened, settings, prompts, corrections, skip_damaged)
+        record_tracking(request, folder, RecordOptions(**about), listener)
     for one in () if quiet else folders:
         if one in finished and finished[one] == _written(one):
             typer.echo(f"The run {one} is finished already; there is nothing to resume.")

@@ -47,7 +47,7 @@ def a_kind(value: Any) -> str:
     return f"{'an' if name[0].lower() in 'aeiou' else 'a'} {name}"
 
 
-def describe(error: ValidationError, model: type[BaseModel], noun: str = "setting") -> str:
+def describe_validation_error(error: ValidationError, model: type[BaseModel], noun: str = "setting") -> str:
     """Say in one sentence what is wrong with the values given for ``model``.
 
     Args:

@@ -13,7 +13,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from tracking3d.config.explain import describe, hint, shown
+from tracking3d.config.explain import describe_validation_error, hint, shown
 from tracking3d.config.models import PipelineConfig, PluginChoice
 from tracking3d.config.prompt_section import PromptSection
 from tracking3d.config.yaml_files import parse_yaml, read_mapping
@@ -195,7 +195,7 @@ def _prompt_of(file: Path | None, from_file: dict[str, Any]) -> PromptSection:
     try:
         return PromptSection.model_validate(given)
     except ValidationError as error:
-        raise InputError(f"{file}: prompt.{describe(error, PromptSection)}") from error
+        raise InputError(f"{file}: prompt.{describe_validation_error(error, PromptSection)}") from error
 
 
 def _named_layer(kind: str, folder: str, names: Sequence[str], name: str) -> Layer:
@@ -277,4 +277,4 @@ def _validated(settings: Mapping[str, Any], origin: str) -> PipelineConfig:
         return PipelineConfig.model_validate(settings)
     except ValidationError as error:
         prefix = f"{origin}: " if origin else ""
-        raise InputError(prefix + describe(error, PipelineConfig)) from error
+        raise InputError(prefix + describe_validation_error(error, PipelineConfig)) from error

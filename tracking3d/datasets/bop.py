@@ -53,7 +53,7 @@ def read_scene_gt(file: Path) -> dict[int, list[Annotation]]:
 def read_scene_camera(file: Path) -> dict[int, tuple[Any, float]]:
     """Read ``scene_camera.json``: K, and millimetres per count of the depth image, by the image's number.
 
-    ``K`` is as it stands in the file; see `tracking3d.datasets.cameras.camera_of`.
+    ``K`` is as it stands in the file; see `tracking3d.datasets.cameras.camera_from_matrix`.
 
     Raises:
         InputError: If it is not such a file.

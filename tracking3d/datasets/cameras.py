@@ -16,7 +16,7 @@ _LARGEST_SKEW = 1.0
 """Pixels. Less than that moves no point of a frame by more than about half a pixel."""
 
 
-def camera_of(K: Any, width: Any, height: Any, origin: str) -> Camera:
+def camera_from_matrix(K: Any, width: Any, height: Any, origin: str) -> Camera:
     """The camera of frames of ``width`` x ``height`` pixels with the intrinsic matrix ``K``.
 
     Args:
@@ -48,17 +48,17 @@ def camera_of(K: Any, width: Any, height: Any, origin: str) -> Camera:
     return Camera(fx, fy, cx, cy, width, height, origin)
 
 
-def read_camera(file: Path) -> Camera:
+def read_clip_camera(file: Path) -> Camera:
     """Read ``camera.json`` of the clip layout: K, width, height.
 
     Raises:
-        InputError: If it is not such a file; see `camera_of`.
+        InputError: If it is not such a file; see `camera_from_matrix`.
     """
     document = read_json(file)
-    return camera_of(document.get("K"), document.get("width"), document.get("height"), str(file))
+    return camera_from_matrix(document.get("K"), document.get("width"), document.get("height"), str(file))
 
 
-def read_intrinsics(file: Path, form: Literal["json", "text"], size: tuple[int, int]) -> Camera:
+def read_dataset_intrinsics(file: Path, form: Literal["json", "text"], size: tuple[int, int]) -> Camera:
     """Read a camera file of any data set.
 
     Args:
@@ -69,7 +69,7 @@ def read_intrinsics(file: Path, form: Literal["json", "text"], size: tuple[int, 
         size: ``(width, height)`` of the frames, where the file does not tell.
 
     Raises:
-        InputError: If it is not such a file; see `camera_of`.
+        InputError: If it is not such a file; see `camera_from_matrix`.
     """
     if form == "json":
         document = read_json(file)
@@ -88,4 +88,4 @@ def read_intrinsics(file: Path, form: Literal["json", "text"], size: tuple[int, 
     if isinstance(numbers, list) and len(numbers) == 4:
         fx, fy, cx, cy = numbers
         numbers = [fx, 0, cx, 0, fy, cy, 0, 0, 1]
-    return camera_of(numbers, *size, str(file))
+    return camera_from_matrix(numbers, *size, str(file))

@@ -30,7 +30,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.datasets.cameras import read_camera
+from tracking3d.datasets.cameras import read_clip_camera
 from tracking3d.datasets.json_files import read_json
 from tracking3d.datasets.truth import DepthFile, MaskFile, MeshFile, PointTruth, Truth
 from tracking3d.errors import InputError
@@ -211,7 +211,7 @@ def _optional(file: Path) -> dict[str, Any]:
 
 
 def _camera(file: Path) -> Camera | None:
-    return read_camera(file) if file.exists() else None
+    return read_clip_camera(file) if file.exists() else None
 
 
 def _depth(folder: Path, index: dict[str, int], millimetres: float | None) -> dict[int, DepthFile]:

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, field_validator, model_validator
 
-from tracking3d.config.explain import describe, hint
+from tracking3d.config.explain import describe_validation_error, hint
 from tracking3d.config.models import Section
 from tracking3d.config.yaml_files import read_mapping
 from tracking3d.errors import InputError
@@ -61,7 +61,7 @@ class Sequences(Section):
     )
 
 
-class Masks(Section):
+class MaskLayout(Section):
     """Images of masks."""
 
     files: Patterns = Field(description="Pattern of the images; with {frame}, the image of each frame.")
@@ -135,7 +135,7 @@ class Depth(Section):
     )
 
 
-class Shape(Section):
+class ShapeLayout(Section):
     """The true mesh."""
 
     file: Patterns
@@ -173,15 +173,15 @@ class DatasetLayout(Section):
         description="How files belong to frames: by the last number in their names, their names, or their order.",
     )
     every: int = Field(1, ge=1, description="With order: file n belongs to frame n times this.")
-    masks: Masks | None = Field(None, description="The whole object where known.")
-    visible_masks: Masks | None = Field(None, description="What is seen of it.")
-    initial_masks: Masks | None = Field(None, description="Rough masks, a tracker's input.")
+    masks: MaskLayout | None = Field(None, description="The whole object where known.")
+    visible_masks: MaskLayout | None = Field(None, description="What is seen of it.")
+    initial_masks: MaskLayout | None = Field(None, description="Rough masks, a tracker's input.")
     regions: Regions | None = None
     box: Regions | None = Field(None, description="File whose first line is the object in the first frame.")
     poses: Poses | None = None
     camera: Intrinsics | None = None
     depth: Depth | None = None
-    mesh: Shape | None = None
+    mesh: ShapeLayout | None = None
     symmetries: Symmetries | None = None
     millimetres: float | None = Field(None, gt=0, description="Length of the unit of the poses.")
 
@@ -228,4 +228,4 @@ def _read(file: Path) -> DatasetLayout:
     try:
         return DatasetLayout.model_validate(read_mapping(file))
     except ValidationError as error:
-        raise InputError(f"{file}: {describe(error, DatasetLayout, 'key')}") from error
+        raise InputError(f"{file}: {describe_validation_error(error, DatasetLayout, 'key')}") from error

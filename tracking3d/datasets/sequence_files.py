@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.datasets.bop import Annotation, read_scene_camera, read_scene_gt, read_symmetries
-from tracking3d.datasets.cameras import camera_of, read_intrinsics
+from tracking3d.datasets.cameras import camera_from_matrix, read_dataset_intrinsics
 from tracking3d.datasets.clip import read_poses, symmetries_of
 from tracking3d.datasets.frame_matching import frame_numbers, match_frames
-from tracking3d.datasets.layout import DatasetLayout, Masks, Regions
+from tracking3d.datasets.layout import DatasetLayout, MaskLayout, Regions
 from tracking3d.datasets.masks import IndexedMask, RegionMask
 from tracking3d.datasets.placeholders import Place
 from tracking3d.datasets.pose_files import read_matrices, read_matrix_lines
@@ -71,12 +71,12 @@ class SequenceFiles:
         }
         return {n: file for n, file in sorted(found.items()) if file is not None}
 
-    def masks(self, told: Masks | None) -> dict[int, MaskReference]:
+    def masks(self, told: MaskLayout | None) -> dict[int, MaskReference]:
         """Masks in images by frame index."""
         files = self.matched(told.files) if told else {}
         return {n: self.mask(file, told) for n, file in files.items()} if told else {}
 
-    def mask(self, file: Path, told: Masks) -> MaskReference:
+    def mask(self, file: Path, told: MaskLayout) -> MaskReference:
         """The mask that an image holds."""
         if told.values == "threshold":
             return MaskFile(file)
@@ -142,14 +142,18 @@ class SequenceFiles:
         size = self.size[::-1]
         if told.values is not None:
             fx, fy, cx, cy = told.values
-            return camera_of([fx, 0, cx, 0, fy, cy, 0, 0, 1], *size, f"the description {self.layout.name}")
+            return camera_from_matrix(
+                [fx, 0, cx, 0, fy, cy, 0, 0, 1], *size, f"the description {self.layout.name}"
+            )
         assert told.file is not None  # the model sees to it
         file = self.place.required(told.file, "camera")
         if told.form != "bop":
-            return read_intrinsics(file, told.form, size)
+            return read_dataset_intrinsics(file, told.form, size)
         index = frame_numbers(self.frames)
         cameras = {
-            camera_of(K, *size, str(file)) for n, (K, _) in read_scene_camera(file).items() if n in index
+            camera_from_matrix(K, *size, str(file))
+            for n, (K, _) in read_scene_camera(file).items()
+            if n in index
         }
         return cameras.pop() if len(cameras) == 1 else None
 

@@ -19,6 +19,8 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from tracking3d.engines.protocol import ONE_CORE, Began, Ended, Event, Fault, Needs, Task, Told
 from tracking3d.engines.worker import call, interruptible, last_words, threads_in_words
 
@@ -156,8 +158,8 @@ def default_workers(needs: Needs) -> int:
     """How many tasks the cores that this process may use, and the memory that is free, are enough for."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     workers = max(1, cores // needs.threads)
-    if needs.memory and hasattr(os, "sysconf") and "SC_AVPHYS_PAGES" in os.sysconf_names:
-        free = 1e-6 * os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    if needs.memory:
+        free = 1e-6 * psutil.virtual_memory().available
         workers = max(1, min(workers, int(free // needs.memory)))
     return workers
 

@@ -17,7 +17,7 @@ from tracking3d.geometry.pose import Pose, rotation_angle
 
 
 @dataclass(frozen=True, eq=False)
-class Candidate:
+class KeyframeCandidate:
     """A keyframe, or the current frame, as it stands after the optimization.
 
     Attributes:
@@ -32,7 +32,7 @@ class Candidate:
 
 
 def select_keyframes(
-    candidates: Sequence[Candidate], object_size: float, tau: float, config: KeyframeConfig
+    candidates: Sequence[KeyframeCandidate], object_size: float, tau: float, config: KeyframeConfig
 ) -> list[int]:
     """Positions of the candidates that are keyframes from now on.
 

@@ -70,7 +70,7 @@ class Observation:
 
 
 @dataclass(frozen=True, eq=False)
-class Batch:
+class ObservationBatch:
     """Several observations stacked: the same fields with a leading ``(B,)``, see `Observation`."""
 
     index: Tensor
@@ -82,7 +82,7 @@ class Batch:
     has_mask: Tensor
 
     @classmethod
-    def of(cls, observations: list[Observation]) -> Batch:
+    def of(cls, observations: list[Observation]) -> ObservationBatch:
         """Stack observations."""
         device = observations[0].features.device
         return cls(

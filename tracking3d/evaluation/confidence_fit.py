@@ -106,7 +106,7 @@ def fit_confidence(
     return LogisticConfidence(float(intercept), tuple(terms))
 
 
-def paste(confidence: LogisticConfidence) -> str:
+def as_python_source(confidence: LogisticConfidence) -> str:
     """The table as Python source: an intercept, and by name weight, low, high and what stands for a missing number."""
     rows = [
         f'    "{one.name}": ({one.weight:.4g}, {one.low:.4g}, {one.high:.4g}, {one.missing:.4g}),'

@@ -12,7 +12,7 @@ from tracking3d.datasets.truth import Truth
 from tracking3d.evaluation.alignment import ObjectAlignment, align_on_frame
 from tracking3d.evaluation.bop import AverageRecall, average_recall, mspd, mssd
 from tracking3d.evaluation.pose_scores import PosePairs
-from tracking3d.evaluation.seen_surface import seen_surface
+from tracking3d.evaluation.seen_surface import make_visibility_test
 from tracking3d.evaluation.shape import ShapeScores, shape_scores
 from tracking3d.evaluation.surface_alignment import align_surfaces
 from tracking3d.evaluation.vsd import TOLERANCES, VISIBILITY_TOLERANCE, model_depth, vsd
@@ -92,7 +92,7 @@ def score_model(
         try:
             seen = None
             if truth.camera is not None:
-                seen = seen_surface(mesh, diameter, list(truth.T_cam_obj.values()), truth.camera)
+                seen = make_visibility_test(mesh, diameter, list(truth.T_cam_obj.values()), truth.camera)
             estimated = answers.mesh()
             shape = shape_scores(estimated, mesh, diameter, alignment.T_true_est, SAMPLES, seen=seen)
             T_true_est = align_surfaces(estimated, mesh, diameter, alignment.T_true_est, seen)

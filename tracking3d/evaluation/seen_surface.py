@@ -17,7 +17,7 @@ _TOLERANCE = 0.01
 """How far behind what is drawn a point may lie and still be seen, in diameters."""
 
 
-def seen_surface(
+def make_visibility_test(
     mesh: trimesh.Trimesh, diameter: float, T_cam_obj: Sequence[NDArray[np.float64]], camera: Camera
 ) -> Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.bool_]]:
     """A function that says of points ``(N, 3)`` on the surface with normals ``(N, 3)`` which any frame shows.

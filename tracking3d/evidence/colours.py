@@ -10,9 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.rendering.backend import compiled
-from tracking3d.trackers.colour_models import Palette, histograms, local_shares, log_ratio
-from tracking3d.trackers.outline import signed_distance
+from tracking3d.trackers.colour_models import Palette, histograms, log_ratio
+from tracking3d.trackers.outline import inside_distance
 
 _RATE = 0.1
 _INSIDE, _BESIDE = 0.03, (0.06, 0.4)
@@ -90,13 +89,9 @@ def alike_around(
         radius: Half the side of the neighbourhood in pixels.
         size: More than any label.
     """
-    if compiled():
-        from tracking3d.evidence.kernels import colours
+    from tracking3d.evidence.kernels import colours
 
-        return colours.alike_around(labels, mask, radius, size)
-    sides = np.stack([mask, ~mask]).astype(np.float32)
-    total = np.maximum(np.stack([cv2.blur(one, (2 * radius + 1,) * 2) for one in sides]), 0.02)
-    return local_shares(labels, labels, sides[0], radius, size) / total
+    return colours.alike_around(labels, mask, radius, size)
 
 
 def relative_distance(
@@ -111,7 +106,7 @@ def relative_distance(
     area = int(np.count_nonzero(mask))
     if area in (0, mask.size):  # without an outline everything is far on one side of it
         return np.full(mask.shape, 1.0 if area else -1.0, np.float32)
-    return (signed_distance(mask) if distance is None else distance) / math.sqrt(area)
+    return (inside_distance(mask) if distance is None else distance) / math.sqrt(area)
 
 
 def as_lab(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -9,12 +9,10 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from tracking3d.evidence.scene import Scene
-from tracking3d.rendering.backend import compiled
-from tracking3d.trackers.outline import signed_distance
+from tracking3d.evidence.scene import FrameWindow
+from tracking3d.trackers.outline import inside_distance
 
 CELLS = 64
 RANKS = (0.04, 0.15)
@@ -42,16 +40,16 @@ class Consensus:
         self._views: list[NDArray[np.int8]] = []
         self._hulls: NDArray[np.float32] | None = None
 
-    def see(self, scene: Scene) -> None:
+    def see(self, scene: FrameWindow) -> None:
         """Add a frame whose pose and mask are believed."""
         # Beyond the window nothing is the object, beyond the frame nothing is known.
         size = scene.window.size
-        distance = np.clip(signed_distance(scene.answer), -size, size)
+        distance = np.clip(inside_distance(scene.answer), -size, size)
         P = scene.K @ scene.T_cam_obj[:3]
         step = self._side / CELLS
         to_pixels = np.column_stack([step * P[:, :3], P[:, :3] @ (self._low + step / 2) + P[:, 3]])
         by_depth = 1 / (float(scene.K[0, 0]) * self._unit)
-        values = carried(distance, ~scene.valid, to_pixels, by_depth, -size)
+        values = sample_grid_distances(distance, ~scene.valid, to_pixels, by_depth, -size)
         if values is not None:
             self._views.append(values)
 
@@ -69,7 +67,7 @@ class Consensus:
         self._hulls = with_peaks(hull.reshape(len(RANKS), CELLS, CELLS, CELLS))
         self._views = []
 
-    def drawn(self, scene: Scene) -> NDArray[np.float32] | None:
+    def drawn(self, scene: FrameWindow) -> NDArray[np.float32] | None:
         """``(R, S, S)`` pixels within (positive) or from the hulls in a frame; None where they are not known."""
         if self._hulls is None or not np.isfinite(scene.T_cam_obj).all():
             return None
@@ -99,7 +97,7 @@ class Consensus:
         return np.stack([cv2.resize(one, (size, size), interpolation=cv2.INTER_LINEAR) for one in nearest])
 
 
-def carried(
+def sample_grid_distances(
     distance: NDArray[np.float32],
     unknown: NDArray[np.bool_],
     to_pixels: NDArray[np.float64],
@@ -118,24 +116,11 @@ def carried(
     Returns:
         None where a cell is not in front of the camera.
     """
-    if compiled():
-        from tracking3d.evidence.kernels import consensus
+    from tracking3d.evidence.kernels import consensus
 
-        return consensus.carried(distance, unknown, to_pixels, by_depth, beyond, _NEAR, CELLS, _UNKNOWN)
-    z, y, x = np.mgrid[:CELLS, :CELLS, :CELLS].reshape(3, -1)
-    u, v, depth = to_pixels @ np.stack([x, y, z, np.ones_like(x)])
-    if (depth <= _NEAR).any():
-        return None
-    u, v = ((one / depth).astype(np.float32).reshape(CELLS, -1) for one in (u, v))
-    value, hidden = (
-        cv2.remap(plane, u, v, method, borderMode=cv2.BORDER_CONSTANT, borderValue=border).ravel()
-        for plane, method, border in (
-            (distance, cv2.INTER_LINEAR, beyond),
-            (unknown.astype(np.uint8), cv2.INTER_NEAREST, 0),
-        )
+    return consensus.sample_grid_distances(
+        distance, unknown, to_pixels, by_depth, beyond, _NEAR, CELLS, _UNKNOWN
     )
-    value = np.clip(np.rint(value * depth * by_depth), -_UNKNOWN + 1, _UNKNOWN - 1)
-    return np.where(hidden > 0, _UNKNOWN, value).astype(np.int8)
 
 
 def with_peaks(hulls: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -165,16 +150,6 @@ def marched(
         focal: Pixels that a distance of 1 has at a depth of 1.
         beyond: What rays get that miss the grid.
     """
-    if compiled():
-        from tracking3d.evidence.kernels import consensus
+    from tracking3d.evidence.kernels import consensus
 
-        return consensus.marched(hulls, origin, rays, depths, focal, beyond)
-    cells = origin + depths[:, None, None, None] * rays
-    grid = torch.from_numpy((2 * cells + 1) / np.float32(len(hulls)) - 1)
-    signed = torch.from_numpy(hulls[..., : hulls.shape[-1] // 2])
-    value = torch.nn.functional.grid_sample(
-        signed.permute(3, 0, 1, 2)[None], grid[None], align_corners=False, padding_mode="border"
-    )[0].numpy()
-    pixels = value / depths[:, None, None] * np.float32(focal)
-    missed = (grid.abs().amax(-1) > 1).numpy()
-    return np.asarray(np.where(missed, np.float32(beyond), pixels).max(1))
+    return consensus.marched(hulls, origin, rays, depths, focal, beyond)

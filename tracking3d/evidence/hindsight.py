@@ -22,7 +22,7 @@ from tracking3d.evidence.decision import along_edges, pasted, tidied
 from tracking3d.evidence.hindsight_weights import WEIGHTS
 from tracking3d.evidence.motion import motion_cue
 from tracking3d.evidence.order import REACH, InOrder
-from tracking3d.evidence.scene import Answered, Mask, Plane, Scene
+from tracking3d.evidence.scene import Answered, FrameWindow, Mask, Plane
 from tracking3d.evidence.sources import Said
 from tracking3d.geometry.camera import Camera
 from tracking3d.side_by_side import InTurn
@@ -120,7 +120,7 @@ class Hindsight:
         if self._jobs is not None:
             yield from self._jobs.rest()
 
-    def said(self, frame: Answered, order: InOrder | None = None) -> tuple[Scene, Said] | None:
+    def said(self, frame: Answered, order: InOrder | None = None) -> tuple[FrameWindow, Said] | None:
         """What the sources say of one of the latest frames; None where it has no masks or no pose.
 
         Args:
@@ -136,8 +136,8 @@ class Hindsight:
         motion = motion_cue(scene, self._camera, around)
         return scene, Said.of(scene, self._consensus.drawn(scene), self._colours, motion)
 
-    def _scene(self, frame: Answered) -> Scene | None:
-        return Scene.of(frame, self._camera, self._vertices, self._faces)
+    def _scene(self, frame: Answered) -> FrameWindow | None:
+        return FrameWindow.of(frame, self._camera, self._vertices, self._faces)
 
     def _begin(self, frame: Answered) -> Iterator[tuple[int, Decided | None]]:
         if self._jobs is None:  # as many threads as there are where frames are decided

@@ -13,10 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.evidence.scene import Mask, Plane, Scene
+from tracking3d.evidence.scene import FrameWindow, Mask, Plane
 from tracking3d.frames import Image
 from tracking3d.geometry.camera import Camera
-from tracking3d.rendering.backend import compiled
 
 _CORNERS, _LEAST_CORNERS = 300, 12
 _AGREEING = 0.3  # of the corners
@@ -78,7 +77,7 @@ def background_motion(
     return np.asarray(np.linalg.inv(to_small) @ H @ to_small)
 
 
-def apart(scene: Scene, camera: Camera, target: Target) -> float:
+def apart(scene: FrameWindow, camera: Camera, target: Target) -> float:
     """Median of the frame pixels by which the two motions part in the answer; 0 where it cannot be told."""
     step = max(scene.window.size // 24, 1)
     parted = np.linalg.norm(
@@ -88,7 +87,7 @@ def apart(scene: Scene, camera: Camera, target: Target) -> float:
     return float(np.median(parted)) if parted.size else 0.0
 
 
-def motion_cue(scene: Scene, camera: Camera, targets: Sequence[Target]) -> NDArray[np.float32]:
+def motion_cue(scene: FrameWindow, camera: Camera, targets: Sequence[Target]) -> NDArray[np.float32]:
     """``(2, S, S)`` log of how badly the background's motion explains a pixel over how badly the object's does.
 
     Args:
@@ -119,7 +118,7 @@ def motion_cue(scene: Scene, camera: Camera, targets: Sequence[Target]) -> NDArr
 
 
 def _parted_ways(
-    scene: Scene, camera: Camera, target: Target
+    scene: FrameWindow, camera: Camera, target: Target
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Where pixels are in another frame.
 
@@ -151,31 +150,20 @@ def parted_ways(
     Returns:
         See `_parted_ways`.
     """
-    if compiled():
-        from tracking3d.evidence.kernels import motion
+    from tracking3d.evidence.kernels import motion
 
-        return motion.parted_ways(
-            inverse_depth, of_surface, np.ascontiguousarray(of_background), image_size, apart
-        )
-    near = inverse_depth[..., None]
-    moved = _carried(len(inverse_depth), of_surface[:, :3]) + near * of_surface[:, 3]
-    beyond = _carried(len(inverse_depth), of_background)
-    ways = np.stack([_projected(np.where(near > 0, moved, np.nan)), _projected(beyond)])
-    limit = np.array([image_size[1] - 1, image_size[0] - 1])
-    with np.errstate(invalid="ignore"):
-        inside = np.asarray(((ways > 0) & (ways < limit)).all((0, -1)))
-    ways = np.where(inside[..., None], ways, 0).astype(np.float32)
-    parted = np.linalg.norm(ways[0] - ways[1], axis=-1)
-    return ways, np.clip((parted - apart[0]) / (apart[1] - apart[0]), 0, 1) * inside
+    return motion.parted_ways(
+        inverse_depth, of_surface, np.ascontiguousarray(of_background), image_size, apart
+    )
 
 
-def _through(scene: Scene, camera: Camera, T_cam_obj: Matrix) -> tuple[Matrix, Matrix]:
+def _through(scene: FrameWindow, camera: Camera, T_cam_obj: Matrix) -> tuple[Matrix, Matrix]:
     """``(3, 3)`` and ``(3,)`` that take the window's ``u, v, 1`` and one over a depth to the other frame's pixels."""
     T = T_cam_obj @ np.linalg.inv(scene.T_cam_obj)
     return camera.K @ T[:3, :3] @ np.linalg.inv(scene.K), camera.K @ T[:3, 3]
 
 
-def _object_flow(scene: Scene, camera: Camera, T_cam_obj: Matrix, step: int = 1) -> NDArray[np.float32]:
+def _object_flow(scene: FrameWindow, camera: Camera, T_cam_obj: Matrix, step: int = 1) -> NDArray[np.float32]:
     """``(S, S, 2)`` where in the other frame a pixel's surface point is; NaN where there is none."""
     inverse_depth = scene.inverse_depth[::step, ::step, None]
     through, shift = _through(scene, camera, T_cam_obj)
@@ -183,7 +171,7 @@ def _object_flow(scene: Scene, camera: Camera, T_cam_obj: Matrix, step: int = 1)
     return _projected(np.where(inverse_depth > 0, moved, np.nan))
 
 
-def _background_flow(scene: Scene, H: Matrix, step: int = 1) -> NDArray[np.float32]:
+def _background_flow(scene: FrameWindow, H: Matrix, step: int = 1) -> NDArray[np.float32]:
     """``(S, S, 2)`` where in the other frame a pixel of the background is."""
     return _projected(_carried(scene.window.size, H @ scene.window.to_frame, step))
 

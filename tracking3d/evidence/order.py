@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.evidence.motion import Target, apart, background_motion, small_grey
-from tracking3d.evidence.scene import Answered, Scene
+from tracking3d.evidence.scene import Answered, FrameWindow
 from tracking3d.geometry.camera import Camera
 
 STEPS = (1, 2, 3, 5, 8)
@@ -48,14 +48,14 @@ class InOrder:
             self._links.append(_Link(last.frame, last.grey, background_motion(last.grey, grey, hidden)))
         self._links.append(_Link(frame, grey))
 
-    def around(self, index: int, scene: Scene, camera: Camera) -> list[Target]:
+    def around(self, index: int, scene: FrameWindow, camera: Camera) -> list[Target]:
         """The nearest frame on either side of frame ``index`` at which the motions part; the farthest if none does."""
         if not np.isfinite(scene.T_cam_obj).all():
             return []
         (place,) = (at for at, link in enumerate(self._links) if link.frame.index == index)
         return [found for side in (-1, 1) if (found := self._beside(place, side, scene, camera))]
 
-    def _beside(self, place: int, side: int, scene: Scene, camera: Camera) -> Target | None:
+    def _beside(self, place: int, side: int, scene: FrameWindow, camera: Camera) -> Target | None:
         H, found, at = np.eye(3), None, place
         for step in STEPS:
             while at != place + side * step:

@@ -45,7 +45,7 @@ class Answered:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class FrameWindow:
     """A frame, the object's surface at its pose, and where masks say that the object is.
 
     Attributes:

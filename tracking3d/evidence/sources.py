@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from tracking3d.evidence.alignment import alignment, edge_strength
 from tracking3d.evidence.colours import Colours, as_lab, beside_outline, relative_distance
-from tracking3d.evidence.scene import Scene
-from tracking3d.trackers.outline import signed_distance
+from tracking3d.evidence.scene import FrameWindow
+from tracking3d.trackers.outline import inside_distance
 
 Plane = NDArray[np.float32]
 
@@ -47,7 +47,7 @@ class Said:
     confidence: float
 
     @classmethod
-    def of(cls, scene: Scene, hulls: Plane | None, colours: Colours | None, motion: Plane) -> Said:
+    def of(cls, scene: FrameWindow, hulls: Plane | None, colours: Colours | None, motion: Plane) -> Said:
         """Ask all of them.
 
         Args:
@@ -59,13 +59,13 @@ class Said:
         lab = as_lab(scene.image)
         masks = {"initial": scene.initial, "answer": scene.answer}
         masks |= {"drawn": scene.drawn} if scene.drawn.any() else {}
-        outlines = {name: signed_distance(mask) for name, mask in masks.items()}
+        outlines = {name: inside_distance(mask) for name, mask in masks.items()}
         distances = {name: relative_distance(mask, outlines[name]) for name, mask in masks.items()}
         if hulls is not None:
             root = math.sqrt(max(int(np.count_nonzero(scene.answer)), 1))
             named = dict(zip(("hull", "wide hull"), hulls, strict=True))
             distances |= {name: hull / root for name, hull in named.items()}
-            outlines |= {name: signed_distance(hull > 0) for name, hull in named.items()}
+            outlines |= {name: inside_distance(hull > 0) for name, hull in named.items()}
         edges = edge_strength(lab)
         alignments = {name: alignment(edges, outline) for name, outline in outlines.items()}
         nearby = beside_outline(lab, scene.answer) if scene.answer.any() else np.zeros_like(edges)

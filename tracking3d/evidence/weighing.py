@@ -19,7 +19,7 @@ SOURCES = {
     "colours beside the outline": 0.519,
     "colours remembered": 0.395,
 }
-"""Weights of what `features` gives, by ``training/mask_evidence.py``. "Believed" is by the pose's confidence.
+"""Weights of what `pixel_features` gives, by ``training/mask_evidence.py``. "Believed" is by the pose's confidence.
 
 There is no constant: one would say that trackers' masks are too large, as those of the sequences it was fitted on are.
 """
@@ -35,7 +35,7 @@ _BY_SHAPE = np.array([0.251, 1.108, 0.104, 0.253, -0.277, -0.089, 0.463, 0.607])
 """Of the first eight, where colours are not asked; fitted likewise."""
 
 
-def features(
+def pixel_features(
     lab: NDArray[np.uint8],
     initial: NDArray[np.bool_],
     rendered: NDArray[np.bool_],

@@ -63,7 +63,7 @@ def add_object(scene, numbers, folder):
     corners = (uv for face in numbers["face_uvs"] for uv in face)
     for corner, uv in zip(layer.data, corners, strict=True):
         corner.uv = uv
-    mesh.materials.append(textured(folder / numbers["texture"]))
+    mesh.materials.append(textured_material(folder / numbers["texture"]))
     thing = bpy.data.objects.new("tracking3d_object", mesh)
     scene.collection.objects.link(thing)
     thing.rotation_mode = "QUATERNION"
@@ -92,7 +92,7 @@ def add_light(scene):
     scene.collection.objects.link(light)
 
 
-def textured(path):
+def textured_material(path):
     """A material with the colours of the picture at ``path``."""
     material = bpy.data.materials.new("tracking3d_texture")
     if bpy.app.version < (5, 0):  # later ones always do

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from tracking3d.export.axes import quaternion
 from tracking3d.export.exported_run import ExportedRun
-from tracking3d.export.seen_surface import seen_surface
+from tracking3d.export.seen_surface import find_seen_surface
 from tracking3d.export.training_images import picture_name, write_pictures
 
 CENTRE = 0.5
@@ -88,7 +88,7 @@ write_colmap_binary = partial(write_colmap, binary=True)
 
 
 def _model_of(run: ExportedRun) -> _Model:
-    surface = seen_surface(run)
+    surface = find_seen_surface(run)
     kept = np.flatnonzero(surface.seen.sum(0) >= _LEAST_VIEWS)
     number_of = np.zeros(len(surface.points), np.int64)
     number_of[kept] = np.arange(1, len(kept) + 1)

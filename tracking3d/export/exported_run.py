@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tracking3d.datasets.clip import is_rigid
 from tracking3d.errors import InputError, argument
 from tracking3d.estimation.estimate import ObjectModel, Status
-from tracking3d.export.exporter import ExportOptions
+from tracking3d.export.options import ExportOptions
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.results.mesh_export import load_model
@@ -217,9 +217,9 @@ class ExportedRun:
         yield from self.pinhole_pictures() if self.options.undistorted else self._read_pictures()
 
     def _read_pictures(self) -> Iterator[Frame]:
-        from tracking3d.export.pictures import read_pictures
+        from tracking3d.export.pictures import read_selected_images
 
-        return read_pictures(self.reader, self.options.source, self.records)
+        return read_selected_images(self.reader, self.options.source, self.records)
 
     def _scaled(self, T_cam_obj: NDArray[np.float64]) -> NDArray[np.float64]:
         scaled = T_cam_obj.copy()

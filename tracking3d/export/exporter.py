@@ -1,4 +1,4 @@
-"""What a format is, and what may be asked of an export."""
+"""What a format is."""
 
 from __future__ import annotations
 
@@ -6,45 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from tracking3d.errors import InputError
+from tracking3d.export.options import ExportOptions
 
 if TYPE_CHECKING:
     from tracking3d.export.exported_run import ExportedRun
-
-Answers = Literal["final", "causal"]
-Of = Literal["object", "camera"]
-
-
-@dataclass(frozen=True)
-class ExportOptions:
-    """What may be asked of an export; a format that has no use for an option refuses it.
-
-    Attributes:
-        answers: ``final`` takes the answers of the final refinement where there are any, ``causal`` those before it.
-        object_size: Metres of the longest side of the smallest box around the object; None leaves the run's unit.
-        fps: Frames per second; None takes what the run knows.
-        source: The video, where it is no longer where the run found it.
-        of: ``object`` for poses ``T_cam_obj``, ``camera`` for those of a camera about the still object, ``T_obj_cam``.
-        cut_out: Pictures as PNG that are transparent around the object, instead of whole ones with masks beside.
-        images: Whether pictures are written where a format has room for them.
-        undistorted: Masks and pictures as a camera without the distortion of the lens sees them, instead of as they
-            were taken.
-        frame: The frame that ``xy`` is in; None takes the first one with a pose.
-        xy: Pixels on the object whose surface points are followed; empty for a grid over the object.
-    """
-
-    answers: Answers = "final"
-    object_size: float | None = None
-    fps: float | None = None
-    source: str | None = None
-    of: Of = "object"
-    cut_out: bool = False
-    images: bool = True
-    undistorted: bool = False
-    frame: int | None = None
-    xy: tuple[tuple[float, float], ...] = ()
 
 
 ANYWHERE = frozenset({"answers"})

@@ -15,7 +15,7 @@ import trimesh
 from tracking3d.export.axes import HALF_TURN, inverse
 from tracking3d.export.colmap import CENTRE
 from tracking3d.export.exported_run import ExportedRun
-from tracking3d.export.seen_surface import seen_surface
+from tracking3d.export.seen_surface import find_seen_surface
 from tracking3d.export.training_images import picture_name, write_pictures
 
 POINTS = "sparse_pc.ply"
@@ -41,7 +41,7 @@ def write_nerfstudio(run: ExportedRun, folder: Path) -> None:
         frames.append(frame | lens | {"transform_matrix": T_world_camera.tolist()})
     document = {"camera_model": "PINHOLE", "ply_file_path": POINTS, "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(document, indent=1) + "\n", encoding="ascii")
-    surface = seen_surface(run)
+    surface = find_seen_surface(run)
     seen = surface.seen.any(0)
     cloud = trimesh.PointCloud(surface.points[seen], colors=surface.colours[seen])
     cloud.export(folder / POINTS)

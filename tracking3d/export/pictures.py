@@ -14,7 +14,7 @@ from tracking3d.video import open_source
 _SOURCE = argument("source=", "--source")
 
 
-def read_pictures(run: RunReader, source: str | None, wanted: Container[int]) -> Iterator[Frame]:
+def read_selected_images(run: RunReader, source: str | None, wanted: Container[int]) -> Iterator[Frame]:
     """The pictures of the ``wanted`` frames, in order.
 
     Args:

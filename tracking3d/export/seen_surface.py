@@ -30,7 +30,7 @@ class SeenSurface:
     seen: NDArray[np.bool_]
 
 
-def seen_surface(run: ExportedRun) -> SeenSurface:
+def find_seen_surface(run: ExportedRun) -> SeenSurface:
     """Look for every vertex in every frame.
 
     Raises:

@@ -11,6 +11,7 @@ from typing import Literal, Self
 
 import torch
 from kornia.color import rgb_to_grayscale
+from kornia.contrib import extract_tensor_patches
 from kornia.feature import DISK, DenseSIFTDescriptor, HardNet, HardNet8, HyNet, SOSNet, TFeat
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
@@ -119,7 +120,6 @@ class KorniaEncoder:
         grey = functional.pad(
             grey[..., : rows * self.stride, : columns * self.stride], (border,) * 4, mode="replicate"
         )
-        patches = functional.unfold(grey, _PATCH, stride=self.stride)  # (B, 1024, rows columns)
-        rowwise = patches.transpose(1, 2).reshape(-1, 1, _PATCH, _PATCH)
-        described: Tensor = network(rowwise)
+        patches = extract_tensor_patches(grey, _PATCH, self.stride)  # (B, rows columns, 1, _PATCH, _PATCH)
+        described: Tensor = network(patches.flatten(0, 1))
         return described.reshape(views, rows, columns, -1).permute(0, 3, 1, 2)

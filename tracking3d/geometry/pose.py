@@ -67,7 +67,7 @@ class Pose:
 
 
 def from_matrix(R: Tensor, translation: Tensor) -> Pose:
-    """A pose from a rotation matrix ``(3, 3)`` and a translation ``(3,)``."""
+    """A pose, or a batch of them, from rotation matrices ``(..., 3, 3)`` and translations ``(..., 3)``."""
     if is_single(R, 2):
         return Pose(translation, quaternion_of(R))
     from kornia.geometry.conversions import rotation_matrix_to_quaternion
@@ -104,11 +104,11 @@ def _log(R: Tensor) -> Tensor:
 
 
 def rotation_exponential(axis_angle: Tensor) -> Tensor:
-    """``(3, 3)`` rotation by the length of ``axis_angle`` ``(3,)``, in radians, about it."""
+    """``(..., 3, 3)`` rotations by the length of ``axis_angle`` ``(..., 3)``, in radians, about it."""
     from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
-    result: Tensor = axis_angle_to_rotation_matrix(axis_angle[None])[0]
-    return result
+    result: Tensor = axis_angle_to_rotation_matrix(axis_angle.reshape(-1, 3))
+    return result.reshape(*axis_angle.shape, 3)
 
 
 def rotation_about(axis: Tensor, degrees: float) -> Tensor:

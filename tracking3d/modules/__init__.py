@@ -10,17 +10,17 @@ from tracking3d.modules.conversions import (
     se3_of_pose,
 )
 from tracking3d.modules.losses import LaplacianLoss, OutlineLoss, SilhouetteLoss, TextureLoss
-from tracking3d.modules.renderer import MeshRenderer, Silhouette, TexturedMesh, Views
+from tracking3d.modules.renderer import MeshRenderer, RenderedViews, Silhouette, TexturedMesh
 
 __all__ = [
     "LaplacianLoss",
     "MeshRenderer",
     "OutlineLoss",
+    "RenderedViews",
     "Silhouette",
     "SilhouetteLoss",
     "TextureLoss",
     "TexturedMesh",
-    "Views",
     "camera_from_pinhole",
     "pinhole_of_camera",
     "pose_from_se3",

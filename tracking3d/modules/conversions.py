@@ -25,11 +25,12 @@ def pinhole_of_camera(
     device: torch.device | str | None = None,
 ) -> PinholeCamera:
     """The camera as kornia's, once for each of ``views`` frames; its extrinsics are the identity."""
-    intrinsics = torch.eye(4, dtype=dtype, device=device)
-    intrinsics[:3, :3] = torch.tensor(camera.K, dtype=dtype, device=device)
-    size = torch.tensor([[camera.height], [camera.width]], dtype=dtype, device=device).expand(2, views)
-    extrinsics = torch.eye(4, dtype=dtype, device=device).expand(views, 4, 4)
-    return PinholeCamera(intrinsics.expand(views, 4, 4), extrinsics, size[0], size[1])
+    fx, fy, cx, cy, tx, ty, tz = torch.tensor(
+        [camera.fx, camera.fy, camera.cx, camera.cy, 0.0, 0.0, 0.0], dtype=dtype, device=device
+    )
+    return PinholeCamera.from_parameters(
+        fx, fy, cx, cy, camera.height, camera.width, tx, ty, tz, views, device, dtype
+    )
 
 
 def camera_from_pinhole(pinhole: PinholeCamera, view: int = 0) -> Camera:
@@ -38,13 +39,15 @@ def camera_from_pinhole(pinhole: PinholeCamera, view: int = 0) -> Camera:
     Raises:
         InputError: If it has a skew, or no whole size.
     """
-    K = pinhole.intrinsics[view].detach().double().cpu()
-    height, width = (float(side[view]) for side in (pinhole.height, pinhole.width))
-    if float(K[0, 1].abs() + K[1, 0].abs()) > 1e-6 * float(K[0, 0].abs()):
-        raise InputError(f"pinhole= has a skew of {float(K[0, 1]):g}, and cameras here have none.")
+    fx, fy, cx, cy, height, width = (
+        float(values[view])
+        for values in (pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, pinhole.height, pinhole.width)
+    )
+    (_, skew, _), (other, _, _), _ = pinhole.camera_matrix[view].tolist()
+    if abs(skew) + abs(other) > 1e-6 * abs(fx):
+        raise InputError(f"pinhole= has a skew of {skew:g}, and cameras here have none.")
     if not (height == int(height) > 0 and width == int(width) > 0):
         raise InputError(f"pinhole= is {width:g} x {height:g} pixels; give a whole size.")
-    fx, fy, cx, cy = (float(value) for value in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
     return Camera(fx, fy, cx, cy, int(width), int(height), origin="kornia's PinholeCamera")
 
 
@@ -78,5 +81,5 @@ def quaternion_of_pose(pose: Pose) -> Quaternion:
 
 def quaternion_from_kornia(quaternion: Quaternion) -> Tensor:
     """``(..., 4)`` of unit length, w first; kornia takes one of any length for its direction."""
-    q: Tensor = quaternion.data
-    return torch.nn.functional.normalize(q, dim=-1)
+    unit: Tensor = quaternion.normalize().data
+    return unit

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from tracking3d.estimation.losses import iou_loss, laplacian_loss
 from tracking3d.geometry.mesh import uniform_laplacian
-from tracking3d.modules.renderer import Views
+from tracking3d.modules.renderer import RenderedViews
 from tracking3d.rendering import contour_loss, find_contour, signed_distance, texture_losses
 from tracking3d.rendering.shapes import check_shapes
 
@@ -63,7 +63,7 @@ class OutlineLoss(_PerFrame):
         super().__init__(reduction)
         self.scale = scale
 
-    def forward(self, views: Views, mask: Tensor) -> Tensor:
+    def forward(self, views: RenderedViews, mask: Tensor) -> Tensor:
         """Compare outlines; differentiable in where the outline's points are, their number and weights held fixed.
 
         Args:
@@ -93,7 +93,7 @@ class TextureLoss(nn.Module):
         super().__init__()
         self.scale, self.roughness = scale, roughness
 
-    def forward(self, views: Views, observed: Tensor) -> Tensor:
+    def forward(self, views: RenderedViews, observed: Tensor) -> Tensor:
         """Compare; differentiable in texture, vertices, poses and cameras.
 
         Args:

@@ -47,7 +47,7 @@ class TexturedMesh(nn.Module):
 
 
 @dataclass(frozen=True, eq=False)
-class Views:
+class RenderedViews:
     """What a mesh looks like in B frames.
 
     Attributes:
@@ -78,7 +78,7 @@ class MeshRenderer(nn.Module):
         super().__init__()
         self.band, self.backend = band or SoftBand(), backend
 
-    def forward(self, mesh: TexturedMesh, camera: PinholeCamera, pose: Se3) -> Views:
+    def forward(self, mesh: TexturedMesh, camera: PinholeCamera, pose: Se3) -> RenderedViews:
         """Draw the mesh.
 
         Args:
@@ -95,7 +95,7 @@ class MeshRenderer(nn.Module):
         drawn = render(
             vertices, mesh.faces, mesh.face_uvs, texture, R, t, K, size, self.band, self.backend
         )  # fmt: skip
-        return Views(drawn.image(), drawn.silhouette[:, None], drawn)
+        return RenderedViews(drawn.image(), drawn.silhouette[:, None], drawn)
 
     def extra_repr(self) -> str:
         """Band and backend."""

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pydantic import Field, ValidationError, model_validator
 
-from tracking3d.config.explain import describe
+from tracking3d.config.explain import describe_validation_error
 from tracking3d.config.models import Section
 from tracking3d.config.yaml_files import read_mapping
 from tracking3d.errors import InputError
@@ -77,6 +77,10 @@ def read_catalogue(file: Path) -> dict[str, KnownNetwork]:
         try:
             networks[name] = KnownNetwork.model_validate({"name": name, **(entry or {})})
         except (ValidationError, TypeError) as error:
-            told = describe(error, KnownNetwork, "key") if isinstance(error, ValidationError) else str(error)
+            told = (
+                describe_validation_error(error, KnownNetwork, "key")
+                if isinstance(error, ValidationError)
+                else str(error)
+            )
             raise InputError(f"{file}, network '{name}': {told}") from error
     return networks

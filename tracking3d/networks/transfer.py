@@ -63,7 +63,7 @@ def transfer(
             write(error.partial)
             listener(len(error.partial))
         except (OSError, http.client.HTTPException) as error:
-            broken = told(error)
+            broken = describe_connection_error(error)
         if (count := part.tell()) < size and count <= before:
             raise TransferError(broken or f"the connection broke off after {count} of {size} bytes")
 
@@ -82,10 +82,10 @@ def _goes_on(response: http.client.HTTPResponse, before: int) -> bool:
     return response.status == http.client.PARTIAL_CONTENT and given is not None and int(given[1]) == before
 
 
-def told(error: object) -> str:
+def describe_connection_error(error: object) -> str:
     """The reason of a failed connection in a few words."""
     if isinstance(error, urllib.error.URLError):
-        return told(error.reason)
+        return describe_connection_error(error.reason)
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     return " ".join(str(error).split()) or type(error).__name__

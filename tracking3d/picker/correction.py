@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.frames import Box
-from tracking3d.picker.drawing import read_object
+from tracking3d.picker.drawing import parse_object
 from tracking3d.picker.server import Picker
 from tracking3d.picker.session import PickingSession
 from tracking3d.web.access import Access
@@ -86,7 +86,7 @@ class CorrectionPage(Picker):
             return super().ordered(path, body)
         if path != "/correct":
             return None
-        drawn = read_object(body)
+        drawn = parse_object(body)
         if drawn.only_a_box:
             # The mask is made to see that one can be.
             self.session.mask(drawn)

@@ -85,7 +85,7 @@ class Drawing(_Drawn):
     objects: Annotated[tuple[DrawnObject, ...], Field(min_length=1, max_length=MOST_OBJECTS)]
 
 
-def read_object(text: bytes) -> DrawnObject:
+def parse_object(text: bytes) -> DrawnObject:
     """One object from JSON.
 
     Raises:

@@ -14,7 +14,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from tracking3d.errors import InputError, Tracking3dError
-from tracking3d.picker.drawing import read_drawing, read_object
+from tracking3d.picker.drawing import parse_object, read_drawing
 from tracking3d.picker.session import Picked, PickingSession
 from tracking3d.web.access import SAFE_HEADERS, Access
 
@@ -88,7 +88,7 @@ class Picker:
             Tracking3dError: If it cannot be done.
         """
         if path == "/mask":
-            drawn = read_object(body)
+            drawn = parse_object(body)
             mask = self.session.mask(drawn)
             return {"veil": self.session.veil(mask, drawn.colour), "area": int(mask.sum())}, _nothing
         if path not in ("/save", "/start"):

@@ -18,7 +18,7 @@ from torch import Tensor
 from tracking3d.errors import PluginError, Tracking3dError
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame, MaskEstimate, Prompt
-from tracking3d.plugins.registration import told
+from tracking3d.plugins.registration import describe_exception
 from tracking3d.stages import in_stage
 from tracking3d.trackers.protocol import CorrectableTracker, ForewarnedTracker, MaskTracker, ResumableTracker
 
@@ -249,7 +249,7 @@ def _blamed(label: str, but: type[Exception] = PluginFailure) -> Iterator[None]:
     except but:
         raise
     except (Exception, SystemExit) as error:
-        raise PluginFailure(label, told(error)) from error
+        raise PluginFailure(label, describe_exception(error)) from error
 
 
 def _kind(value: Any) -> str:

@@ -74,7 +74,7 @@ def import_plugin(plugin: Registered) -> type[Any]:
     return cls
 
 
-def told(error: BaseException) -> str:
+def describe_exception(error: BaseException) -> str:
     """An exception in one short line, without a full stop."""
     text = " ".join(str(error).split()).rstrip(".")
     if not isinstance(error, Tracking3dError):

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ValidationError
 
-from tracking3d.config.explain import describe, nearest, unknown_key
+from tracking3d.config.explain import describe_validation_error, nearest, unknown_key
 from tracking3d.config.models import PluginChoice
 from tracking3d.errors import PluginError, Tracking3dError
 from tracking3d.plugins.registration import (
@@ -15,9 +15,9 @@ from tracking3d.plugins.registration import (
     KIND,
     TRACKERS,
     Registered,
+    describe_exception,
     import_plugin,
     registered_plugins,
-    told,
 )
 
 _ATTRIBUTES: dict[str, tuple[str, ...]] = {TRACKERS: (), FEATURES: ("channels", "stride", "tau")}
@@ -62,7 +62,7 @@ def list_plugins() -> list[PluginInfo]:
             try:
                 options = import_plugin(plugin).Options.model_json_schema()
             except (Exception, SystemExit) as error:
-                status, reason = "broken", told(error)
+                status, reason = "broken", describe_exception(error)
         infos.append(
             PluginInfo(plugin.name, plugin.group, plugin.package, plugin.version, status, reason, options)
         )
@@ -111,7 +111,7 @@ def _checked(plugin: Registered, choice: PluginChoice) -> BaseModel:
     try:
         return model.model_validate(choice.options)
     except ValidationError as error:
-        raise PluginError(f"{plugin.label}: {describe(error, model, 'option')}") from error
+        raise PluginError(f"{plugin.label}: {describe_validation_error(error, model, 'option')}") from error
 
 
 def build_plugin(group: str, choice: PluginChoice) -> Any:
@@ -130,7 +130,7 @@ def build_plugin(group: str, choice: PluginChoice) -> Any:
     except Tracking3dError:
         raise
     except (Exception, SystemExit) as error:
-        raise PluginError(f"{plugin.label} could not be started: {told(error)}.") from error
+        raise PluginError(f"{plugin.label} could not be started: {describe_exception(error)}.") from error
     if absent := [name for name in _ATTRIBUTES[group] if not hasattr(instance, name)]:
         raise PluginError(f"{plugin.label} is broken: it has no attribute {', '.join(absent)}.")
     return instance
@@ -154,5 +154,5 @@ def _load(plugin: Registered) -> type[Any]:
         return import_plugin(plugin)
     except (Exception, SystemExit) as error:
         raise PluginError(
-            f"{plugin.label} is broken: {told(error)}; `tracking3d plugins` lists those that work."
+            f"{plugin.label} is broken: {describe_exception(error)}; `tracking3d plugins` lists those that work."
         ) from error

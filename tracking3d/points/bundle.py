@@ -12,13 +12,11 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from tracking3d.bundle_adjustment import Structure, Tracks, adjust
 from tracking3d.bundle_adjustment.reversal import Reversal, reversal_of
 from tracking3d.points.view import Array
-from tracking3d.rendering.backend import use_numba
 
 TURNS = 12
 _CONVERGED = 3e-4
@@ -67,7 +65,6 @@ def intersect(
     deviation: Array,
     held: float,
     turns: int = TURNS,
-    backend: str = "auto",
 ) -> tuple[Array, Array]:
     """Move points to where the views say they are.
 
@@ -79,28 +76,10 @@ def intersect(
         deviation: ``(T, N)`` of them in pixels; infinite where there is none.
         held: Deviation of the points' movement, in object units.
         turns: Steps.
-        backend: ``numba``, ``torch`` for NumPy, or ``auto``; see `tracking3d.rendering.backend`.
 
     Returns:
         The points, and the weights ``(T, N)`` that the measurements had in the end: 0 where there is none.
     """
-    if turns and use_numba(backend, torch.empty(0, dtype=torch.float32)):
-        return _intersect_compiled(points, intrinsics, T_cam_obj, measured, deviation, held, turns)
-    start, weight = points, np.zeros(deviation.shape)
-    for _ in range(turns):
-        points, weight = _move_points(points, start, intrinsics, T_cam_obj, measured, deviation, held)
-    return points, weight
-
-
-def _intersect_compiled(
-    points: Array,
-    intrinsics: Array,
-    T_cam_obj: Array,
-    measured: Array,
-    deviation: Array,
-    held: float,
-    turns: int,
-) -> tuple[Array, Array]:
     from tracking3d.points.kernels.intersection import intersect as compiled
     from tracking3d.rendering.kernels.threads import share
 
@@ -218,42 +197,3 @@ def other_way_round(
     for _ in range(2):
         found = solved(found.points, T_cam_obj=found.T_cam_obj)
     return OtherWayRound(reversal, found, found.cost / cost)
-
-
-def _move_points(
-    points: Array,
-    start: Array,
-    intrinsics: Array,
-    T_cam_obj: Array,
-    measured: Array,
-    deviation: Array,
-    held: float,
-) -> tuple[Array, Array]:
-    """One step of all points, and the weights that it was made with."""
-    left, jacobian, weight, _ = _residuals(points, intrinsics, T_cam_obj, measured, deviation)
-    jacobian = np.einsum("tnij,tjk->tnik", jacobian, T_cam_obj[:, :3, :3])
-    weighted = weight[..., None, None] * jacobian
-    H = np.einsum("tnij,tnik->njk", weighted, jacobian) + np.eye(3) / held**2
-    b = np.einsum("tnij,tni->nj", weighted, left) - (points - start) / held**2
-    return points + np.linalg.solve(H, b[..., None])[..., 0], weight
-
-
-def _residuals(
-    points: Array, intrinsics: Array, T_cam_obj: Array, measured: Array, deviation: Array
-) -> tuple[Array, Array, Array, Array]:
-    """What is left of the measurements ``(T, N, 2)``, how pixels change with the point in camera coordinates ``(T, N,
-    2, 3)``, weights ``(T, N)``, and the points in camera coordinates ``(T, N, 3)``.
-    """
-    seen = points @ T_cam_obj[:, :3, :3].transpose(0, 2, 1) + T_cam_obj[:, None, :3, 3]
-    focal, centre = intrinsics[:, None, :2], intrinsics[:, None, 2:]
-    ahead = seen[..., 2] > _AHEAD
-    inverse = 1 / np.where(ahead, seen[..., 2], 1.0)
-    xy = focal * seen[..., :2] * inverse[..., None] + centre
-    known = ahead & np.isfinite(deviation) & np.isfinite(measured).all(2)
-    left = np.where(known[..., None], measured - xy, 0.0)
-    jacobian = np.zeros((*seen.shape[:2], 2, 3))
-    jacobian[..., 0, 0], jacobian[..., 1, 1] = focal[..., 0] * inverse, focal[..., 1] * inverse
-    jacobian[..., 2] = -focal * seen[..., :2] * inverse[..., None] ** 2
-    certain = 1 / np.where(known, deviation, 1.0) ** 2
-    far = certain * (left**2).sum(2) / _OUTLIER**2
-    return left, jacobian, np.where(known, certain / (1 + far) ** 2, 0.0), seen

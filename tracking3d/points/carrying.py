@@ -8,14 +8,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
-import torch
-from numpy.typing import NDArray
 
 from tracking3d.points.alignment import NOISE, align
-from tracking3d.points.view import REACH, Array, Plane, View
-from tracking3d.rendering.backend import use_numba
+from tracking3d.points.view import REACH, Array, Plane, SurfaceView
 from tracking3d.rendering.visibility import NEAR
 
 LEAST_AGREEMENT = 0.7
@@ -54,22 +50,19 @@ class Warps:
         tolerance: How far behind a drawn surface a point may lie and be seen, in object units.
     """
 
-    def __init__(self, views: list[View | None], tolerance: float) -> None:
+    def __init__(self, views: list[SurfaceView | None], tolerance: float) -> None:
         self.views, self.tolerance = views, tolerance
-        self._pixels: tuple[int, NDArray[np.bool_], Array] | None = (
-            None  # of the view that was last asked for
-        )
 
-    def carry(self, source: int, target: int, xy: Array, backend: str = "auto") -> Carried:
+    def carry(self, source: int, target: int, xy: Array) -> Carried:
         """Carry pixels ``xy`` ``(N, 2)`` of view ``source`` into view ``target``."""
         start, end = self.views[source], self.views[target]
         if start is None or end is None:
             nothing = np.full(xy.shape, np.nan)
             return Carried(nothing, nothing, np.full(len(xy), np.inf), np.full(len(xy), -1.0))
         predicted, seen = end.sees(start.surface(xy), self.tolerance)
-        warped, known = self._warp(source, target, backend)
+        warped, known = _warped(start, end, self.tolerance)
         at = np.where(seen[:, None], predicted, np.nan)
-        found = align(warped, known, end.image, at, prior=_EXPECTED, backend=backend)
+        found = align(warped, known, end.image, at, prior=_EXPECTED)
         good = found.agreement > LEAST_AGREEMENT
         return Carried(
             predicted,
@@ -78,50 +71,24 @@ class Warps:
             np.where(found.contrast > _TELLS, found.agreement, np.sign(found.contrast) * 2 - 1),
         )
 
-    def _warp(self, source: int, target: int, backend: str) -> tuple[Plane, Plane]:
-        """The image of ``source`` as ``target`` would see it, and where it is known."""
-        start, end = self.views[source], self.views[target]
-        assert start is not None and end is not None
-        if use_numba(backend, torch.empty(0, dtype=torch.float32)):
-            return _warped(start, end, self.tolerance)
-        near, points = self._surface_pixels(target)
-        xy, depth = start.project(points)
-        maps = np.full((2, *near.shape), -1e4, np.float32)
-        maps[:, near] = np.nan_to_num(xy.T, nan=-1e4)
-        behind = np.full(near.shape, np.inf, np.float32)
-        behind[near] = depth
-        image, mask, inverse = (
-            cv2.remap(plane, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-            for plane in (start.image, start.mask, start.inverse_depth)
-        )
-        with np.errstate(divide="ignore", invalid="ignore"):
-            seen = (inverse > 0) & (behind < 1 / inverse + self.tolerance)
-        return image, np.where(seen, mask, 0).astype(np.float32)
 
-    def _surface_pixels(self, index: int) -> tuple[NDArray[np.bool_], Array]:
-        """``(h, w)`` pixels on or near the surface of a view, and ``(P, 3)`` the points under them."""
-        if self._pixels is None or self._pixels[0] != index:
-            view = self.views[index]
-            assert view is not None
-            near = (view.beyond < _BEYOND) & (view.inverse_depth > 0)
-            rows, columns = np.nonzero(near)
-            points = view.back_project(np.stack([columns, rows], 1).astype(float), view.inverse_depth[near])
-            self._pixels = index, near, points
-        return self._pixels[1:]
-
-
-def _warped(source: View, target: View, tolerance: float) -> tuple[Plane, Plane]:
-    """The same by the kernel, rows shared among threads."""
-    from tracking3d.points.kernels.warping import warp
+def _warped(source: SurfaceView, target: SurfaceView, tolerance: float) -> tuple[Plane, Plane]:
+    """The image of ``source`` as ``target`` would see it, and where it is known."""
+    from tracking3d.points.kernels.warping import WarpSource, WarpTarget, warp
     from tracking3d.rendering.kernels.threads import share
 
     height, width = target.image.shape
     warped, known = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
     share(
-        warp, height, _LEAST_ROWS,
-        target.inverse_depth, target.beyond, _BEYOND, target.intrinsics,
+        warp,
+        height,
+        _LEAST_ROWS,
+        WarpTarget(target.inverse_depth, target.beyond, target.intrinsics, float(_BEYOND)),
+        WarpSource(source.intrinsics, source.image, source.mask, source.inverse_depth),
         np.ascontiguousarray(source.T_cam_obj @ np.linalg.inv(target.T_cam_obj)),
-        source.intrinsics, source.image, source.mask, source.inverse_depth, NEAR, tolerance,
-        warped, known,
-    )  # fmt: skip
+        NEAR,
+        tolerance,
+        warped,
+        known,
+    )
     return warped, known

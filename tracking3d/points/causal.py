@@ -21,7 +21,7 @@ from tracking3d.points.carrying import Warps
 from tracking3d.points.chain import STEPS, Chain, extend
 from tracking3d.points.follow import RIM, agreed
 from tracking3d.points.landmarks import TOLERANCE
-from tracking3d.points.view import Array, View, draw, sample
+from tracking3d.points.view import Array, SurfaceView, redraw_surface, sample
 
 KEPT = 16
 """Views that are kept; no fewer than the templates reach back."""
@@ -43,7 +43,7 @@ class _Row:
     """What is known of N points in one view; see `Chain`."""
 
     index: int
-    view: View | None
+    view: SurfaceView | None
     measured: Array
     variance: Array
     likeness: Array
@@ -62,7 +62,7 @@ class CausalPoints:
         self._rows: list[_Row] = []
         self._first: _Row | None = None
 
-    def step(self, index: int, view: View | None, radius: float) -> PointAnswers:
+    def step(self, index: int, view: SurfaceView | None, radius: float) -> PointAnswers:
         """Answer for the next frame; the first one is that of the question.
 
         Args:
@@ -107,7 +107,7 @@ class CausalPoints:
             if better is not None:
                 camera, T_cam_obj = better
                 view = replace(view, intrinsics=view.intrinsics_of(camera))
-            row.view = draw(view, vertices, faces, T_cam_obj)
+            row.view = redraw_surface(view, vertices, faces, T_cam_obj)
 
     def again(self, radius: float) -> dict[int, PointAnswers]:
         """Answer for the kept frames once more, by frame; nothing unless that of the question is among them."""
@@ -189,7 +189,7 @@ class CausalPoints:
         )
 
 
-def _bundled(views: list[View], points: Array, chain: Chain, radius: float) -> list[View]:
+def _bundled(views: list[SurfaceView], points: Array, chain: Chain, radius: float) -> list[SurfaceView]:
     """The views in poses that agree with what the images say of the points; as they are drawn otherwise."""
     intrinsics, poses = (
         np.stack([one.intrinsics for one in views]),
@@ -202,7 +202,7 @@ def _bundled(views: list[View], points: Array, chain: Chain, radius: float) -> l
     return [replace(one, T_cam_obj=T) for one, T in zip(views, poses, strict=True)]
 
 
-def _grid(view: View) -> Array:
+def _grid(view: SurfaceView) -> Array:
     """``(N, 2)`` pixels of the frame, all over the object."""
     height, width = view.beyond.shape
     steps = (np.arange(_GRID) + 0.5) / _GRID

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from tracking3d.points.bundle import intersect
 from tracking3d.points.chain import Chain, follow_chain
-from tracking3d.points.landmarks import Scene
-from tracking3d.points.uncertainty import FEATURES, Evidence, expected_error, features
-from tracking3d.points.view import Array, View, sample
+from tracking3d.points.landmarks import LandmarkScene
+from tracking3d.points.uncertainty import FEATURES, Evidence, error_features, expected_error
+from tracking3d.points.view import Array, SurfaceView, sample
 
 RIM = 3.0
 """Pixels beside the drawn surface that are still on its rim."""
@@ -34,8 +34,8 @@ class Followed:
             no position.
         measured: ``(T, N)`` bool: whether the image had a say.
         points: ``(N, 3)`` in object coordinates; NaN for points beside the object.
-        features: ``(T, N, F)`` what the uncertainty was told from, see `tracking3d.points.uncertainty.features`; NaN
-            where there is no position.
+        features: ``(T, N, F)`` what the uncertainty is estimated from, see
+            `tracking3d.points.uncertainty.error_features`; NaN if there is no position.
     """
 
     positions: Array
@@ -46,7 +46,7 @@ class Followed:
     features: Array
 
 
-def follow_points(scene: Scene, start: int, xy: Array) -> Followed:
+def follow_points(scene: LandmarkScene, start: int, xy: Array) -> Followed:
     """Follow pixels of one view through all of them.
 
     Args:
@@ -92,7 +92,7 @@ def follow_points(scene: Scene, start: int, xy: Array) -> Followed:
 
 
 def agreed(
-    views: list[View], points: Array, chain: Chain, slant: Array, gap: NDArray[np.int64], radius: float
+    views: list[SurfaceView], points: Array, chain: Chain, slant: Array, gap: NDArray[np.int64], radius: float
 ) -> Followed:
     """Surface points brought together with what the images say of them.
 
@@ -127,12 +127,17 @@ def agreed(
         [one.to_frame(xy) for one, xy in zip(views, predicted + gain[..., None] * left, strict=True)]
     )
     return Followed(
-        positions, seen & ~unlike, expected_error(evidence) / scales, believed, moved, features(evidence)
+        positions,
+        seen & ~unlike,
+        expected_error(evidence) / scales,
+        believed,
+        moved,
+        error_features(evidence),
     )
 
 
 def _landmarks(
-    views: list[View], points: Array, measured: Array, variance: Array, held: float
+    views: list[SurfaceView], points: Array, measured: Array, variance: Array, held: float
 ) -> tuple[Array, Array]:
     """Points moved to where all views see them, and the share of its weight that each measurement kept."""
     deviation = np.sqrt(variance + _DEVIATION**2)

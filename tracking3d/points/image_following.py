@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.points.image_uncertainty import expected_error
+from tracking3d.points.image_uncertainty import expected_image_error
 from tracking3d.points.pictures import (
     Grey,
     Picture,
@@ -117,7 +117,7 @@ class ImageFollower:
         """The answer for the picture that the pixels are in."""
         count = len(self.xy)
         nothing = np.zeros(count)
-        error = expected_error(nothing, 0, 0)
+        error = expected_image_error(nothing, 0, 0)
         return ImageAnswers(self.xy, np.ones(count, bool), error, np.ones(count), nothing)
 
     def step(self, index: int, now: Picture) -> ImageAnswers:
@@ -175,7 +175,7 @@ class ImageFollower:
         return ImageAnswers(
             self._position,
             is_found,
-            expected_error(self._variance, abs(index - self._first), self._hidden),
+            expected_image_error(self._variance, abs(index - self._first), self._hidden),
             np.where(is_found, alike, -1.0),
             self._variance,
         )

@@ -13,11 +13,11 @@ from tracking3d.points.view import Array
 
 FOUND = (1.969, 0.939, 0.692, 0.0)
 NOT_FOUND = (0.776, 0.288, 0.27, 0.342)
-"""Weights of `features`, of points that were found in a frame and of those that were not."""
+"""Weights of `image_error_features`, of points that were found in a frame and of those that were not."""
 _MOST = 3.5  # logarithm of the pixels beyond which nothing is known at all
 
 
-def features(variance: ArrayLike, gap: ArrayLike, hidden: ArrayLike) -> Array:
+def image_error_features(variance: ArrayLike, gap: ArrayLike, hidden: ArrayLike) -> Array:
     """``(..., 4)``: one, and logarithms of what makes points be known badly.
 
     Args:
@@ -31,9 +31,9 @@ def features(variance: ArrayLike, gap: ArrayLike, hidden: ArrayLike) -> Array:
     return np.stack(parts, -1)
 
 
-def expected_error(variance: ArrayLike, gap: ArrayLike, hidden: ArrayLike) -> Array:
-    """Pixels: twice as much holds some 19 of 20 errors; arguments as of `features`."""
-    known = features(variance, gap, hidden)
+def expected_image_error(variance: ArrayLike, gap: ArrayLike, hidden: ArrayLike) -> Array:
+    """Pixels: twice as much holds some 19 of 20 errors; arguments as of `image_error_features`."""
+    known = image_error_features(variance, gap, hidden)
     logarithm = np.where(np.asarray(hidden) > 0, known @ np.array(NOT_FOUND), known @ np.array(FOUND))
     error: Array = np.exp(np.clip(logarithm, -3.0, _MOST))
     return error

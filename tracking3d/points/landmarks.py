@@ -23,7 +23,7 @@ from tracking3d.points.chain import follow_chain
 from tracking3d.points.meeting import surface_under
 from tracking3d.points.outline_fit import fitted_to_outlines, outline_of
 from tracking3d.points.surface import move_surface
-from tracking3d.points.view import Array, View, draw
+from tracking3d.points.view import Array, SurfaceView, redraw_surface
 
 ROUNDS = 6
 START_VIEWS = 8
@@ -61,7 +61,7 @@ class Support:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class LandmarkScene:
     """A rigid surface in T views.
 
     Attributes:
@@ -74,7 +74,7 @@ class Scene:
         reversal: What was done to surface and poses, where landmarks said that it was.
     """
 
-    views: list[View | None]
+    views: list[SurfaceView | None]
     vertices: Array
     faces: NDArray[np.int64]
     focal_factor: float = 1.0
@@ -91,13 +91,17 @@ class Scene:
         """The views for carrying points between them."""
         return Warps(self.views, TOLERANCE * self.radius)
 
-    def redrawn(self, vertices: Array, poses: Mapping[int, Array], focal_factor: float = 1.0) -> Scene:
+    def redrawn(
+        self, vertices: Array, poses: Mapping[int, Array], focal_factor: float = 1.0
+    ) -> LandmarkScene:
         """The same views with another surface in other poses, by index of the view, through another lens."""
         lens = np.array([focal_factor, focal_factor, 1.0, 1.0])
         views = [
             None
             if view is None
-            else draw(replace(view, intrinsics=view.intrinsics * lens), vertices, self.faces, poses[index])
+            else redraw_surface(
+                replace(view, intrinsics=view.intrinsics * lens), vertices, self.faces, poses[index]
+            )
             for index, view in enumerate(self.views)
         ]
         return replace(
@@ -106,11 +110,11 @@ class Scene:
 
 
 def refine_scene(
-    scene: Scene,
+    scene: LandmarkScene,
     rounds: int = ROUNDS,
     after_round: Callable[[int], None] = lambda done: None,
     free_focal: bool = False,
-) -> Scene:
+) -> LandmarkScene:
     """Put surface and poses right, as far as the images say how, until the poses hardly turn any more.
 
     Where the images say little, as of a plain object, or where poses are so wrong that views do not show each other's
@@ -134,7 +138,7 @@ def refine_scene(
     return scene
 
 
-def outlined(scene: Scene) -> Scene:
+def outlined(scene: LandmarkScene) -> LandmarkScene:
     """The scene with a surface whose silhouettes lie on the masks: landmarks leave the rim where they found it.
 
     Outlines have no say while `refine_scene` goes on: where the texture is faint, they would hold the surface where
@@ -148,14 +152,14 @@ def outlined(scene: Scene) -> Scene:
     return _fitted(_refine_once(replace(_fitted(scene), may_reverse=False), free_focal=False))
 
 
-def _fitted(scene: Scene) -> Scene:
+def _fitted(scene: LandmarkScene) -> LandmarkScene:
     views = {index: view for index, view in enumerate(scene.views) if view is not None}
     vertices = fitted_to_outlines(scene.vertices, scene.faces, [outline_of(view) for view in views.values()])
     redrawn = scene.redrawn(vertices, {index: view.T_cam_obj for index, view in views.items()})
     return replace(redrawn, support=scene.support)
 
 
-def _turned(before: Scene, after: Scene) -> float:
+def _turned(before: LandmarkScene, after: LandmarkScene) -> float:
     """Median angle in radians by which the poses turned, that of the object frame itself left out."""
     pairs = [
         (a.T_cam_obj, b.T_cam_obj)
@@ -169,7 +173,7 @@ def _turned(before: Scene, after: Scene) -> float:
     return float(np.median((turned.mean().inv() * turned).magnitude()))
 
 
-def _refine_once(scene: Scene, free_focal: bool) -> Scene:
+def _refine_once(scene: LandmarkScene, free_focal: bool) -> LandmarkScene:
     there = [index for index, view in enumerate(scene.views) if view is not None]
     if not there:
         return scene
@@ -248,7 +252,7 @@ class _Begun:
 
 
 def _begin(
-    scene: Scene, there: Sequence[int], corners: Sequence[_Corners], starts: NDArray[np.integer]
+    scene: LandmarkScene, there: Sequence[int], corners: Sequence[_Corners], starts: NDArray[np.integer]
 ) -> _Begun:
     """Landmarks that begin in some views, followed through all.
 
@@ -307,7 +311,7 @@ def _unlike(R_cam_obj: Array, count: int) -> NDArray[np.int64]:
     return np.sort(np.array(chosen))
 
 
-def seeds(view: View, vertices: Array, faces: NDArray[np.int64]) -> _Corners:
+def seeds(view: SurfaceView, vertices: Array, faces: NDArray[np.int64]) -> _Corners:
     """Where landmarks begin in a view of a surface: face ``(N,)``, weights of its corners ``(N, 3)``, and pixel
     ``(N, 2)`` of each.
     """

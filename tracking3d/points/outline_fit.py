@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csr_matrix, diags, identity
 from scipy.sparse.linalg import spsolve
 
-from tracking3d.points.view import View
+from tracking3d.points.view import SurfaceView
 from tracking3d.rendering import find_contour, render
 from tracking3d.rendering.contour import contour_slopes
 
@@ -59,7 +59,7 @@ class Outline:
     T_cam_obj: NDArray[np.float64]
 
 
-def outline_of(view: View) -> Outline:
+def outline_of(view: SurfaceView) -> Outline:
     """What the mask of a view says of the outline.
 
     A window ends that near to the object only where the frame does.

@@ -8,14 +8,14 @@ import numpy as np
 
 from tracking3d.points.bundle import bundle
 from tracking3d.points.carrying import Warps
-from tracking3d.points.landmarks import DEVIATION, TOLERANCE, Scene, seeds
-from tracking3d.points.view import Array, View, draw
+from tracking3d.points.landmarks import DEVIATION, TOLERANCE, LandmarkScene, seeds
+from tracking3d.points.view import Array, SurfaceView, redraw_surface
 
 TURNS = 2
 _FIXED = 1e-6  # deviation in radii of points that stay where they are
 
 
-def resect(scene: Scene, view: View, known: Sequence[int]) -> tuple[View, float]:
+def resect(scene: LandmarkScene, view: SurfaceView, known: Sequence[int]) -> tuple[SurfaceView, float]:
     """A view drawn at the pose at which it shows what other views show, and how much of that it shows there.
 
     The second is in [0, 1]: the share of their points that it shows where surface and pose put them.
@@ -44,11 +44,11 @@ def resect(scene: Scene, view: View, known: Sequence[int]) -> tuple[View, float]
             _FIXED * scene.radius,
         )
         share = float(placed.agreeing[0].mean()) if len(points) else 0.0
-        view = draw(view, scene.vertices, scene.faces, placed.T_cam_obj[0])
+        view = redraw_surface(view, scene.vertices, scene.faces, placed.T_cam_obj[0])
     return view, share
 
 
-def _carried(scene: Scene, warps: Warps, source: int) -> tuple[Array, Array, Array]:
+def _carried(scene: LandmarkScene, warps: Warps, source: int) -> tuple[Array, Array, Array]:
     """Points in space under corners of a view, their pixels in the last view, and deviations of these."""
     view = warps.views[source]
     assert view is not None

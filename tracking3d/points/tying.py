@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.points.follow import Followed
-from tracking3d.points.landmarks import Scene
-from tracking3d.points.view import Array, View, sample
+from tracking3d.points.landmarks import LandmarkScene
+from tracking3d.points.view import Array, SurfaceView, sample
 
 _CANDIDATES = 12  # meetings of one point that are looked into
 _LEAST_SLANT = 0.3  # cosine between ray and surface; below, a pixel is many points
@@ -24,7 +24,9 @@ _LEAST_SHARE = 0.7  # of the views in which the point is known and the surface i
 _LEAST_TURN = np.cos(np.deg2rad(6.0))  # by which the agreeing views differ; from one side anything agrees
 
 
-def meetings(scene: Scene, xy: Array, uncertainty: Array, visible: NDArray[np.bool_]) -> NDArray[np.int64]:
+def meetings(
+    scene: LandmarkScene, xy: Array, uncertainty: Array, visible: NDArray[np.bool_]
+) -> NDArray[np.int64]:
     """In which view each point is known to lie on the surface.
 
     Args:
@@ -49,7 +51,7 @@ def meetings(scene: Scene, xy: Array, uncertainty: Array, visible: NDArray[np.bo
     return found
 
 
-def _met(views: list[View], xy: Array) -> Array:
+def _met(views: list[SurfaceView], xy: Array) -> Array:
     """``(V, 3)`` points of the surface under one pixel ``(V, 2)`` of each view; NaN where it does not lie there."""
     points = np.full((len(views), 3), np.nan)
     for row, view in enumerate(views):
@@ -59,7 +61,7 @@ def _met(views: list[View], xy: Array) -> Array:
     return points
 
 
-def _best(views: list[View], xy: Array, uncertainty: Array, met: Array, radius: float) -> int | None:
+def _best(views: list[SurfaceView], xy: Array, uncertainty: Array, met: Array, radius: float) -> int | None:
     """Which meeting explains best where the images have the point; None where none does."""
     on = np.flatnonzero(np.isfinite(met).all(1))
     if len(on) < _LEAST_AGREEING:
@@ -80,13 +82,15 @@ def _best(views: list[View], xy: Array, uncertainty: Array, met: Array, radius: 
     return None if best is None else best[1]
 
 
-def _turned_enough(views: list[View], point: Array) -> bool:
+def _turned_enough(views: list[SurfaceView], point: Array) -> bool:
     eyes = np.stack([-view.T_cam_obj[:3, :3].T @ view.T_cam_obj[:3, 3] for view in views]) - point
     direction = eyes / np.linalg.norm(eyes, axis=1, keepdims=True)
     return bool((direction @ direction.T).min() < _LEAST_TURN)
 
 
-def joined(surface: Followed, xy: Array, uncertainty: Array, visible: NDArray[np.bool_]) -> Followed:
+def merge_image_points(
+    surface: Followed, xy: Array, uncertainty: Array, visible: NDArray[np.bool_]
+) -> Followed:
     """Points carried by the surface, with what the images alone said of them.
 
     Their mean by variance counts where they agree; where they do not, the image does in the frames that show the point,

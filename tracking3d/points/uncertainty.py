@@ -15,7 +15,7 @@ from tracking3d.points.view import Array
 
 MEASURED = (-1.277, 0.028, 0.229, 0.27, -0.911, 0.498)
 PREDICTED = (1.813, 0.417, 0.069, -0.392, 0.097, 0.657)
-"""Weights of `features`, of points that the image corrected and of those that it did not."""
+"""Weights of `error_features`, of points that the image corrected and of those that it did not."""
 FEATURES = len(MEASURED)
 """How many there are."""
 _UNMEASURED = 1.0  # squared pixels
@@ -45,7 +45,7 @@ class Evidence:
         return np.isfinite(self.variance)
 
 
-def features(evidence: Evidence) -> Array:
+def error_features(evidence: Evidence) -> Array:
     """``(T, N, 6)``: one, and logarithms that are small for points that are known well."""
     shape = evidence.variance.shape
     known = np.where(evidence.measured, evidence.variance, _UNMEASURED)
@@ -62,7 +62,7 @@ def features(evidence: Evidence) -> Array:
 
 def expected_error(evidence: Evidence) -> Array:
     """``(T, N)`` pixels: twice as much holds some 19 of 20 errors."""
-    known = features(evidence)
+    known = error_features(evidence)
     logarithm = np.where(evidence.measured, known @ np.array(MEASURED), known @ np.array(PREDICTED))
     error: Array = np.exp(np.clip(logarithm, -3.0, 5.0))
     return error

@@ -25,7 +25,7 @@ _MOST_AT_ONCE = 2**14  # pixels that OpenCV looks up in one call
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class SurfaceView:
     """A window of a frame and the surface in it. All pixels are the window's own; see `to_window`.
 
     Attributes:
@@ -139,7 +139,7 @@ def open_view(
     vertices: Array,
     faces: NDArray[np.int64],
     longest_side: int = LONGEST_SIDE,
-) -> View | None:
+) -> SurfaceView | None:
     """The window of a frame around its mask and the projected mesh.
 
     Args:
@@ -178,14 +178,16 @@ def open_view(
     scale = np.array([width / (right - left), height / (bottom - top)])
     centre = (whole[2:] + 0.5 - (left, top)) * scale - 0.5
     empty = np.zeros((height, width), np.float32)
-    view = View(
+    view = SurfaceView(
         cv2.GaussianBlur(grey, (0, 0), 0.5), inside, (left, top), scale,
         np.concatenate([whole[:2] * scale, centre]), T_cam_obj, empty, empty,
     )  # fmt: skip
-    return draw(view, vertices, faces, T_cam_obj)
+    return redraw_surface(view, vertices, faces, T_cam_obj)
 
 
-def draw(view: View, vertices: Array, faces: NDArray[np.int64], T_cam_obj: Array) -> View:
+def redraw_surface(
+    view: SurfaceView, vertices: Array, faces: NDArray[np.int64], T_cam_obj: Array
+) -> SurfaceView:
     """The view with the mesh drawn into it at another pose."""
     view = replace(view, T_cam_obj=T_cam_obj)
     screen, depth = view.project(vertices)

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from tracking3d.geometry.mesh import vertex_normals
 from tracking3d.reconstruction.grid import FloatArray
 from tracking3d.reconstruction.shape_views import ShapeView
-from tracking3d.rendering.backend import use_numba
 from tracking3d.rendering.interpolation import interpolate
 from tracking3d.rendering.renderer import project
 from tracking3d.rendering.visibility import rasterize
@@ -85,7 +84,6 @@ def depth_maps(
     guide: Guide,
     reach: float,
     steps: int,
-    backend: str = "auto",
 ) -> list[DepthMap]:
     """The depths that the references see, as far as others say the same.
 
@@ -95,12 +93,11 @@ def depth_maps(
         guide: The surface around which to look.
         reach: How far from it, to either side.
         steps: Depths that are tried on either side.
-        backend: See `tracking3d.rendering.backend`.
     """
     grey = {view.index: _grey(view) for view in views}
     stride = _stride(references)
     maps = [
-        _depth_map(view, neighbours, grey, guide, reach, steps, stride, backend)
+        _depth_map(view, neighbours, grey, guide, reach, steps, stride)
         for view in references
         if len(neighbours := _neighbours(view, views)) >= 2
     ]
@@ -139,7 +136,6 @@ def _depth_map(
     reach: float,
     steps: int,
     stride: int,
-    backend: str,
 ) -> DepthMap:
     drawn, normals = guide.seen_by(view)
     side = len(drawn)
@@ -168,7 +164,6 @@ def _depth_map(
         first,
         normal,
         offsets,
-        backend,
     )
     depth, score = (np.full((side, side), fill, np.float32) for fill in (np.nan, -1.0))
     place, value = _peak(scores)
@@ -189,7 +184,6 @@ def patch_scores(
     depth: NDArray[np.float64],
     normal: NDArray[np.float64],
     offsets: NDArray[np.float64],
-    backend: str = "auto",
 ) -> tuple[FloatArray, FloatArray]:
     """How well patches agree with other views at each of D depths.
 
@@ -202,84 +196,27 @@ def patch_scores(
         pixels: ``(N, 2)`` row and column of the patches' middles.
         depth: ``(N,)``; normal: ``(N, 3)``: the surface at hand, in camera coordinates.
         offsets: ``(D,)`` what is added to the depth.
-        backend: See `tracking3d.rendering.backend`.
 
     Returns:
         ``(N, D)`` mean correlation with the views that agree best, a view that does not see the patch counting -1,
         and ``(N,)`` the deviation of the patches' grey values, 0 where there is no patch.
     """
     agreeing = min(AGREEING, len(others))
-    if not use_numba(backend, torch.empty(0, dtype=torch.float32)):
-        return _scores_together(image, inside, K_inverse, others, P, pixels, depth, normal, offsets, agreeing)
-    from tracking3d.reconstruction.kernels.plane_sweep import sweep
+    from tracking3d.reconstruction.kernels.plane_sweep import OtherViews, ReferenceView, SweptPatches, sweep
 
     scores = np.empty((len(pixels), len(offsets)), np.float32)
     contrast = np.empty(len(pixels), np.float32)
     sweep(
-        image, inside, np.ascontiguousarray(K_inverse), others, np.ascontiguousarray(P), pixels, depth, normal,
-        offsets, RADIUS, LEAST_CONTRAST, agreeing, scores, contrast,
-    )  # fmt: skip
+        ReferenceView(image, inside, np.ascontiguousarray(K_inverse)),
+        OtherViews(others, np.ascontiguousarray(P)),
+        SweptPatches(pixels, depth, normal, offsets),
+        RADIUS,
+        LEAST_CONTRAST,
+        agreeing,
+        scores,
+        contrast,
+    )
     return scores, contrast
-
-
-def _scores_together(
-    image: FloatArray,
-    inside: FloatArray,
-    K_inverse: NDArray[np.float64],
-    others: FloatArray,
-    P: NDArray[np.float64],
-    pixels: NDArray[np.int64],
-    depth: NDArray[np.float64],
-    normal: NDArray[np.float64],
-    offsets: NDArray[np.float64],
-    agreeing: int,
-) -> tuple[FloatArray, FloatArray]:
-    """The same as the kernel in torch, all patches at once."""
-    side = len(image)
-    count, depths = len(pixels), len(offsets)
-    scores, contrast = torch.full((count, depths), -1.0), torch.zeros(count)
-    middle = torch.from_numpy(pixels)
-    whole = ((middle >= RADIUS) & (middle < side - RADIUS)).all(1)
-    step = torch.arange(-RADIUS, RADIUS + 1)
-    i, j = (one.flatten() for one in torch.meshgrid(step, step, indexing="ij"))
-    rows, columns = (middle[:, :1] + i).clamp(0, side - 1), (middle[:, 1:] + j).clamp(0, side - 1)
-    w = (torch.from_numpy(inside)[rows, columns] > 0.5).double()
-    cover = w.sum(1, keepdim=True)
-    T = torch.from_numpy(image)[rows, columns].double()
-    T = (T - (w * T).sum(1, keepdim=True) / cover.clamp_min(1)) * w
-    variance = T.square().sum(1)
-    enough = whole & (cover[:, 0] >= 0.5 * len(i))
-    contrast[enough] = (variance / cover[:, 0])[enough].sqrt().float()
-    chosen = torch.nonzero(contrast >= LEAST_CONTRAST)[:, 0]
-    Kinv, normals = torch.from_numpy(K_inverse), torch.from_numpy(normal)[chosen]
-    ray = torch.column_stack([middle[chosen].flip(1).double(), torch.ones(len(chosen))]) @ Kinv.T
-    facing = (normals * ray).sum(1, keepdim=True)
-    tangents = [Kinv[:, axis] - ray * (normals @ Kinv[:, axis])[:, None] / facing for axis in (0, 1)]
-    z = torch.from_numpy(depth)[chosen, None] + torch.from_numpy(offsets)  # (n, D)
-    w, T, cover, variance = w[chosen, None], T[chosen, None], cover[chosen], variance[chosen, None]
-    of_views = torch.full((len(others), len(chosen), depths), -1.0, dtype=torch.float64)
-    for view, (other, projection) in enumerate(
-        zip(torch.from_numpy(others), torch.from_numpy(P), strict=True)
-    ):
-        A, b = projection[:, :3], projection[:, 3]
-        at = z[..., None] * (ray @ A.T)[:, None] + b  # (n, D, 3)
-        u = at[..., :2] / at[..., 2:]
-        sides = [z[..., None] * (tangent @ A.T)[:, None] for tangent in tangents]
-        by_x, by_y = ((one[..., :2] - u * one[..., 2:]) / at[..., 2:] for one in sides)
-        seen = (at[..., 2] > 1e-6) & ((u > RADIUS) & (u < side - RADIUS - 1)).all(2)
-        seen &= by_x[..., 0] * by_y[..., 1] - by_y[..., 0] * by_x[..., 1] > 0.2
-        places = u[..., None, :] + by_x[..., None, :] * j[:, None] + by_y[..., None, :] * i[:, None]
-        values = torch.nn.functional.grid_sample(
-            other.double()[None, None],
-            (places.clamp(0, side - 1.001) * (2 / (side - 1)) - 1).reshape(1, len(chosen), -1, 2),
-            align_corners=True,
-        ).reshape(len(chosen), depths, -1)
-        total, squares = (w * values).sum(2), (w * values.square()).sum(2)
-        spread = squares - total.square() / cover
-        score = (T * values).sum(2) / ((variance + 1e-6) * torch.maximum(spread, cover)).sqrt()
-        of_views[view] = torch.where(seen, score, -1.0)
-    scores[chosen] = of_views.topk(agreeing, 0).values.mean(0).float()
-    return scores.numpy(), contrast.numpy()
 
 
 def _peak(scores: FloatArray) -> tuple[FloatArray, FloatArray]:

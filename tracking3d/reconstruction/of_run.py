@@ -17,7 +17,7 @@ from tracking3d.reconstruction.new_atlas import with_shape
 from tracking3d.reconstruction.predicted import PictureScores, picture_scores
 from tracking3d.reconstruction.shape import MOST, reconstructed
 from tracking3d.reconstruction.shape_views import ShapeView, shape_view, turned_apart
-from tracking3d.reconstruction.texturing import textured
+from tracking3d.reconstruction.texturing import bake_texture
 from tracking3d.reconstruction.views import TextureView, kept_views, texture_view
 from tracking3d.results import layout
 from tracking3d.results.mesh_export import export_mesh, load_model
@@ -73,7 +73,7 @@ def texture_run(
         views = views if view is None else kept_views(views, view, most)
     if not views:
         raise none_believed(run)
-    model = textured(model, views, largest)
+    model = bake_texture(model, views, largest)
     export_mesh(run.mesh_folder, model)
     return model, len(views)
 
@@ -119,10 +119,10 @@ def shape_run(
     judges = turned_apart(left_out, 0.5, MOST_LEFT_OUT)
     made = reconstructed(online.vertices, online.faces, shapes, judges)
     if made.vertices is None or made.faces is None:
-        model = textured(online, views, largest)
+        model = bake_texture(online, views, largest)
         export_mesh(run.mesh_folder, model)
         return ShapedRun(model, len(views), False, made.sentence)
-    model = textured(with_shape(online, made.vertices, made.faces, shapes), views, largest)
+    model = bake_texture(with_shape(online, made.vertices, made.faces, shapes), views, largest)
     kept = run.mesh_folder / layout.ONLINE
     if not (kept / layout.FEATURES).is_file():
         kept.mkdir(exist_ok=True)
@@ -170,7 +170,7 @@ def explained_run(folder: Path, source: str | None = None, largest: int = 2048) 
         raise InputError(
             f"Only {believed} frames of the run {folder} are believed; none can be left out to judge its model by."
         )
-    return picture_scores(textured(model, views, largest), used, left_out)
+    return picture_scores(bake_texture(model, views, largest), used, left_out)
 
 
 def _seen(run: RunReader, frame: Frame, record: FrameRecord) -> tuple[ShapeView, TextureView] | None:

@@ -17,7 +17,7 @@ from tracking3d.rendering import render
 
 _UNCOVERED = 0.5
 """Colour that is counted where the mask is and the model is not."""
-_LEAST_ERROR = 1e-6  # mean square; 60 dB
+_MOST_DECIBELS = 60.0
 
 
 @dataclass(frozen=True)
@@ -59,6 +59,7 @@ def picture_scores(
 def _compared(
     model: ObjectModel, view: TextureView, T_cam_obj: NDArray[np.float64]
 ) -> tuple[float, float, float]:
+    from kornia.metrics import psnr
     from skimage.metrics import structural_similarity
 
     T = torch.from_numpy(T_cam_obj[None]).float()
@@ -76,12 +77,12 @@ def _compared(
     covered = drawn.face_index[0].numpy() >= 0
     predicted = np.where(covered[..., None], drawn.image()[0].permute(1, 2, 0).numpy(), _UNCOVERED)
     predicted = np.where(inside[..., None], predicted, picture)  # beside the mask nothing is predicted
-    error = float(np.square(predicted - picture)[inside].mean())
+    ratio = psnr(torch.from_numpy(predicted[inside]), torch.from_numpy(picture[inside]), 1.0)
     _, similarity = structural_similarity(
         picture, predicted, channel_axis=2, full=True, data_range=1.0, gaussian_weights=True
     )
     return (
-        -10 * float(np.log10(max(error, _LEAST_ERROR))),
+        min(float(ratio), _MOST_DECIBELS),  # it is infinite if the two are the same
         float(similarity[inside].mean()),
         float(covered[inside].mean()),
     )

@@ -20,9 +20,9 @@ from tracking3d.estimation.online.points import grey
 from tracking3d.estimation.online.texture_strength import PLAIN, texture_strength
 from tracking3d.frames import Image
 from tracking3d.geometry.camera import Camera
-from tracking3d.points.landmarks import Scene, Support, outlined, refine_scene
+from tracking3d.points.landmarks import LandmarkScene, Support, outlined, refine_scene
 from tracking3d.points.resection import resect
-from tracking3d.points.view import View, open_view
+from tracking3d.points.view import SurfaceView, open_view
 from tracking3d.reconstruction.views import TextureView
 from tracking3d.results.records import FrameRecord
 
@@ -59,9 +59,9 @@ class SecondLook:
         count = min(most, len(answered))
         at = np.linspace(0, len(answered) - 1, count).round().astype(int) if count else ()
         self._wanted = {answered[index] for index in at}
-        self._views: dict[int, View] = {}
+        self._views: dict[int, SurfaceView] = {}
         self._strengths: list[float] = []
-        self._scene: Scene | None = None
+        self._scene: LandmarkScene | None = None
         self._bundled: list[int] = []
         self._before: dict[int, _Pose] = {}
 
@@ -82,11 +82,11 @@ class SecondLook:
         if len(self._views) < _LEAST_VIEWS:
             return
         self._bundled = sorted(self._views)
-        views: list[View | None] = [self._views[index] for index in self._bundled]
+        views: list[SurfaceView | None] = [self._views[index] for index in self._bundled]
         self._before = {index: self._views[index].T_cam_obj for index in self._bundled}
         self._views = {}
         scene = refine_scene(
-            Scene(views, self.vertices, self.faces, may_reverse=True),
+            LandmarkScene(views, self.vertices, self.faces, may_reverse=True),
             int(np.clip(_DRAWN // len(views), *ROUNDS)),
             free_focal=self.camera.assumed,
         )
@@ -154,7 +154,7 @@ class SecondLook:
         T[:3, 3] = (1 - share) * poses[0, :3, 3] + share * poses[1, :3, 3]
         return T
 
-    def _view(self, T_cam_obj: _Pose, image: Image, mask: NDArray[np.bool_]) -> View | None:
+    def _view(self, T_cam_obj: _Pose, image: Image, mask: NDArray[np.bool_]) -> SurfaceView | None:
         image, mask = self.camera.undistorted(image), self.camera.mask_to_pinhole(mask)
         return open_view(image, mask, self.camera, T_cam_obj, self.vertices, self.faces, LONGEST_SIDE)
 

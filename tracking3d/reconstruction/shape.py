@@ -46,7 +46,7 @@ _GUIDE_FACES, _FACES, _MOST_FACES = 4000, 8000, 16_000
 
 
 @dataclass(frozen=True, eq=False)
-class Shape:
+class ReconstructedShape:
     """What came of it.
 
     Attributes:
@@ -68,7 +68,7 @@ def reconstructed(
     faces: NDArray[np.int64],
     views: Sequence[ShapeView],
     left_out: Sequence[ShapeView],
-) -> Shape:
+) -> ReconstructedShape:
     """Make a shape that explains frames better than the one at hand.
 
     Args:
@@ -99,7 +99,7 @@ def reconstructed(
     )
     if not new.better_than(old):
         return _kept(f"the new one is no better ({told})", old, new)
-    return Shape(new_vertices, new_faces, told, old, new)
+    return ReconstructedShape(new_vertices, new_faces, told, old, new)
 
 
 def _volume(start: trimesh.Trimesh, views: Sequence[ShapeView]) -> tuple[Grid, FloatArray]:
@@ -149,5 +149,5 @@ def _turn(views: Sequence[ShapeView]) -> float:
     return float(np.degrees(np.arccos(np.clip((traces.min() - 1) / 2, -1, 1))))
 
 
-def _kept(why: str, old: Explained | None = None, new: Explained | None = None) -> Shape:
-    return Shape(None, None, f"The mesh keeps its shape: {why}.", old, new)
+def _kept(why: str, old: Explained | None = None, new: Explained | None = None) -> ReconstructedShape:
+    return ReconstructedShape(None, None, f"The mesh keeps its shape: {why}.", old, new)

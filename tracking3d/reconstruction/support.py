@@ -27,7 +27,7 @@ _TERMS = {  # weight, and the range that was seen
 
 def supported_answer(answer: FrameRecord, support: Support) -> tuple[Assessment, dict[str, float]]:
     """The judgement of a refined answer, and what it comes from, as the answer's ``losses`` keep it."""
-    judgement = supported(Assessment(answer.status, answer.reason, answer.confidence), support)
+    judgement = judge_with_landmarks(Assessment(answer.status, answer.reason, answer.confidence), support)
     return judgement, {
         "rendering": answer.confidence,
         "landmarks": float(support.agreeing),
@@ -36,7 +36,7 @@ def supported_answer(answer: FrameRecord, support: Support) -> tuple[Assessment,
     }
 
 
-def supported(rendering: Assessment, support: Support) -> Assessment:
+def judge_with_landmarks(rendering: Assessment, support: Support) -> Assessment:
     """The judgement of a frame by what is rendered and by landmarks; what is lost stays lost.
 
     A logistic regression of whether the answer is right, that is, within 10 degrees and above an IoU of 0.7. Fitted by
@@ -50,7 +50,7 @@ def supported(rendering: Assessment, support: Support) -> Assessment:
     """
     if rendering.status is Status.LOST:
         return rendering
-    evidence = weighed(rendering.confidence, support)
+    evidence = refined_confidence_features(rendering.confidence, support)
     odds = sum(weight * min(max(evidence[name], low), high) for name, (weight, low, high) in _TERMS.items())
     confidence = 1 / (1 + math.exp(-_INTERCEPT - odds))
     if confidence >= BELIEVED:
@@ -65,7 +65,7 @@ def supported(rendering: Assessment, support: Support) -> Assessment:
     return Assessment(Status.UNCERTAIN, reason, confidence)
 
 
-def weighed(rendering: float, support: Support) -> dict[str, float]:
+def refined_confidence_features(rendering: float, support: Support) -> dict[str, float]:
     """The evidence that a confidence is made of, by name.
 
     Args:

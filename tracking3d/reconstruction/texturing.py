@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.reconstruction.views import TextureView
 from tracking3d.rendering import TexelMap, seen_texels
-from tracking3d.rendering.backend import compiled, give_threads, threads_kept
+from tracking3d.rendering.backend import give_threads, threads_kept
 
 _SMALLEST = 64
 _STEEPNESS = 3
@@ -34,7 +34,7 @@ Seen = tuple[NDArray[np.int64], FloatArray, FloatArray]
 """The texels ``(N,)`` that a view shows, their colours ``(3, N)`` in [0, 1], and how well each is seen ``(N,)``."""
 
 
-def textured(model: ObjectModel, views: Sequence[TextureView], largest: int = 2048) -> ObjectModel:
+def bake_texture(model: ObjectModel, views: Sequence[TextureView], largest: int = 2048) -> ObjectModel:
     """The model with a texture at the views' resolution; the same where no view shows it.
 
     Args:
@@ -49,8 +49,7 @@ def textured(model: ObjectModel, views: Sequence[TextureView], largest: int = 20
     if not views:
         return model
     with threads_kept():
-        if compiled():
-            give_threads({"backend": "numba", "threads": 1})
+        give_threads({"backend": "numba", "threads": 1})
         return _textured(model, views, texture_size(views, largest))
 
 
@@ -90,17 +89,9 @@ def add_view(
         expected: ``(T * T, 3)`` colours that all views together give.
         sharpness: Of the view, relative to the sharpest.
     """
-    if compiled():
-        from tracking3d.reconstruction.kernels import texturing
+    from tracking3d.reconstruction.kernels import texturing
 
-        texturing.add_view(total, weight, seen, gain, expected, sharpness, _VOTED_DOWN, _STEEPNESS)
-        return
-    texel, colours, how_well = seen
-    colours = gain * colours.T
-    apart = np.square(colours - expected[texel]).sum(1) / _VOTED_DOWN**2
-    say = (how_well * np.float32(sharpness)) ** _STEEPNESS / (1 + apart)
-    total[texel] += say[:, None] * colours
-    weight[texel] += say
+    texturing.add_view(total, weight, seen, gain, expected, sharpness, _VOTED_DOWN, _STEEPNESS)
 
 
 def texture_size(views: Sequence[TextureView], largest: int) -> int:

@@ -17,7 +17,8 @@ from tracking3d.rendering.contour import (
 )
 from tracking3d.rendering.interpolation import interpolate
 from tracking3d.rendering.normal_equations import NormalEquations, pose_normal_equations
-from tracking3d.rendering.pose_terms import MatchedPoints, PoseTarget, PoseTerms, Scales, pose_terms
+from tracking3d.rendering.pose_comparison import MatchedPoints, PoseTarget, PoseTerms, Scales
+from tracking3d.rendering.pose_terms import pose_terms
 from tracking3d.rendering.renderer import Rendering, SoftBand, project, render
 from tracking3d.rendering.silhouette import soft_silhouette
 from tracking3d.rendering.surface import Surface

@@ -117,12 +117,12 @@ def threads_kept() -> Iterator[None]:
 
 @contextmanager
 def shared_among(threads: int) -> Iterator[None]:
-    """Within, kernels share their work among so many threads and torch has one; where there are no kernels, so many.
+    """Within, kernels share their work among so many threads, and torch has one.
 
     For work that is done once, when no frame waits.
     """
     with threads_kept():
-        give_threads({"backend": "numba" if compiled() else "torch", "threads": max(threads, 1)})
+        give_threads({"backend": "numba", "threads": max(threads, 1)})
         yield
 
 
@@ -135,11 +135,6 @@ def _kernels_threads() -> int:
 def _set_torch_threads(threads: int) -> None:
     if torch.get_num_threads() != threads:
         torch.set_num_threads(threads)
-
-
-def compiled() -> bool:
-    """Whether kernels that have no other backend than NumPy can be used on this machine."""
-    return not why_no_numba()
 
 
 @functools.cache

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tracking3d.report.curves import Curve, curve, stretches
-from tracking3d.report.differences import Comparison, run_figures
+from tracking3d.report.differences import RunComparison, run_figures
 from tracking3d.report.frame_pictures import jpeg_of, overlay_frames
 from tracking3d.report.rendering import render_page
 from tracking3d.results.files import read_mask, write_atomic
@@ -22,7 +22,7 @@ from tracking3d.stages import STAGES
 _MARGIN = 0.4  # of the longer side of what the masks cover, around it
 
 
-def write_comparison(comparison: Comparison, path: Path) -> None:
+def write_comparison(comparison: RunComparison, path: Path) -> None:
     """Write the page.
 
     Args:
@@ -56,7 +56,7 @@ def write_comparison(comparison: Comparison, path: Path) -> None:
     write_atomic(path, page)
 
 
-def _pairs(comparison: Comparison) -> list[tuple[str, list[dict[str, str] | None]]]:
+def _pairs(comparison: RunComparison) -> list[tuple[str, list[dict[str, str] | None]]]:
     """Of every run its row in the table of every two, where there are more than two."""
     if len(comparison.runs) < 3:
         return []
@@ -74,12 +74,12 @@ def _pairs(comparison: Comparison) -> list[tuple[str, list[dict[str, str] | None
     return rows
 
 
-def _frames(comparison: Comparison) -> list[int]:
+def _frames(comparison: RunComparison) -> list[int]:
     """Every frame that any run has answered: what the plots go over."""
     return sorted({record.index for run in comparison.runs for record in run.frames})
 
 
-def _plots(comparison: Comparison) -> list[list[Curve]]:
+def _plots(comparison: RunComparison) -> list[list[Curve]]:
     """One plot a figure, with a curve for every run but the first, on one scale."""
     place = {index: number for number, index in enumerate(_frames(comparison))}
 
@@ -104,7 +104,7 @@ def _plots(comparison: Comparison) -> list[list[Curve]]:
     return plots
 
 
-def _strips(comparison: Comparison) -> list[dict[str, Any]]:
+def _strips(comparison: RunComparison) -> list[dict[str, Any]]:
     """The statuses of every run."""
     frames, strips = _frames(comparison), []
     for name, run in zip(comparison.names, comparison.runs, strict=True):
@@ -117,7 +117,7 @@ def _strips(comparison: Comparison) -> list[dict[str, Any]]:
     return strips
 
 
-def _pictures(comparison: Comparison) -> list[dict[str, Any]]:
+def _pictures(comparison: RunComparison) -> list[dict[str, Any]]:
     """Of each frame that differs most, the overlays of all runs around the object, and in what they differ."""
     size = OverlaySize.of(comparison.runs[0].camera)
     shown: list[dict[str, Any]] = [
@@ -137,7 +137,7 @@ def _pictures(comparison: Comparison) -> list[dict[str, Any]]:
     return shown
 
 
-def _around(comparison: Comparison, index: int, size: OverlaySize) -> tuple[slice, slice]:
+def _around(comparison: RunComparison, index: int, size: OverlaySize) -> tuple[slice, slice]:
     """Rows and columns of the overlay around the masks of all runs; all of it where there is none."""
     masks = [mask for run in comparison.runs if (mask := read_mask(run.mask_path(index))) is not None]
     boxes = [cv2.boundingRect(mask.astype(np.uint8)) for mask in masks if mask.any()]
@@ -151,7 +151,7 @@ def _around(comparison: Comparison, index: int, size: OverlaySize) -> tuple[slic
     return slice(*rows), slice(*columns)
 
 
-def _differs(comparison: Comparison, index: int) -> str:
+def _differs(comparison: RunComparison, index: int) -> str:
     told = []
     for one in comparison.differences:
         for place in np.flatnonzero(one.indices == index):

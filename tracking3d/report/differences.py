@@ -19,7 +19,7 @@ from tracking3d.evaluation.alignment import align_object_frame
 from tracking3d.report.figures import angles_between, believed_poses, stage_times, status_counts
 from tracking3d.report.settings import flat
 from tracking3d.results.files import read_mask
-from tracking3d.results.records import jsonable, mask_iou
+from tracking3d.results.records import jsonable, mask_iou_or_none
 from tracking3d.results.run_reader import RunReader
 from tracking3d.stages import STAGES
 
@@ -63,7 +63,7 @@ class Difference:
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class RunComparison:
     """Runs over one video.
 
     Attributes:
@@ -124,7 +124,7 @@ class Comparison:
         return told
 
 
-def compare_runs(folders: Sequence[Path], against: Path | None = None) -> Comparison:
+def compare_runs(folders: Sequence[Path], against: Path | None = None) -> RunComparison:
     """Hold runs against one of them, and every two against each other.
 
     Poses are compared after the similarity that fits best, since object frame and unit of a run are its own.
@@ -152,7 +152,7 @@ def compare_runs(folders: Sequence[Path], against: Path | None = None) -> Compar
     keys = dict.fromkeys(key for config in configs for key in config)
     values = {key: [config.get(key) for config in configs] for key in keys}
     values["frames that were asked for"] = [run.description.get("selection") or "all" for run in runs]
-    return Comparison(
+    return RunComparison(
         runs=runs,
         names=names,
         settings={key: told for key, told in values.items() if len(set(told)) > 1},
@@ -235,7 +235,7 @@ def _iou(first: RunReader, other: RunReader, index: int) -> float:
     a, b = read_mask(first.mask_path(index)), read_mask(other.mask_path(index))
     if a is None or b is None or a.shape != b.shape:
         return np.nan
-    iou = mask_iou(a, b)
+    iou = mask_iou_or_none(a, b)
     return np.nan if iou is None else iou
 
 

@@ -10,7 +10,7 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.lens import COUNTS, Lens
 
 
-def read_camera(told: Mapping[str, Any]) -> Camera:
+def camera_from_record(told: Mapping[str, Any]) -> Camera:
     """The camera that ``dataclasses.asdict`` made a mapping of.
 
     Raises:

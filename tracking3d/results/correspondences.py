@@ -91,7 +91,7 @@ def track_points(run: RunReader | Path, frame: int, xy: ArrayLike) -> PointTrack
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     tolerance = DEPTH_TOLERANCE * float(np.linalg.norm(np.ptp(vertices, axis=0))) / 2
 
-    screen, depth = project(run.camera_of(asked), asked.T_cam_obj, vertices)
+    screen, depth = project_object_points(run.camera_of(asked), asked.T_cam_obj, vertices)
     camera = run.camera_of(asked)
     seen = camera.to_pinhole(query)
     face, barycentric = surface_under(screen, depth, faces, np.nan_to_num(seen, nan=-1e6))
@@ -107,13 +107,13 @@ def track_points(run: RunReader | Path, frame: int, xy: ArrayLike) -> PointTrack
         if not np.isfinite(record.T_cam_obj).all():
             continue
         camera = run.camera_of(record)
-        ahead, distance = project(camera, record.T_cam_obj, points)
+        ahead, distance = project_object_points(camera, record.T_cam_obj, points)
         positions[row] = camera.to_picture(ahead)
         if record.status == Status.LOST or record.area == 0:
             continue
         eye = -record.T_cam_obj[:3, :3].T @ record.T_cam_obj[:3, 3]
         facing = ((eye - points) * normals).sum(1) > 0
-        screen, depth = project(camera, record.T_cam_obj, vertices)
+        screen, depth = project_object_points(camera, record.T_cam_obj, vertices)
         behind = _deepest_around(camera, screen, depth, faces, ahead)
         visible[row] = on_object & facing & (distance > NEAR) & (distance <= behind + tolerance)
     indices = np.array([record.index for record in run.frames], dtype=np.int64)
@@ -186,7 +186,7 @@ def grid_on_object(run: RunReader, frame: int, step: int) -> list[tuple[float, f
     """
     record = tracked_record(run, frame)
     mesh, camera = run.mesh(), run.camera_of(record)
-    screen, depth = project(camera, record.T_cam_obj, np.asarray(mesh.vertices))
+    screen, depth = project_object_points(camera, record.T_cam_obj, np.asarray(mesh.vertices))
     rows, columns = np.mgrid[step // 2 : camera.height : step, step // 2 : camera.width : step]
     pixels = np.stack([columns.ravel(), rows.ravel()], 1).astype(np.float64)
     seen = np.nan_to_num(camera.to_pinhole(pixels), nan=-1e6)
@@ -198,7 +198,7 @@ def grid_on_object(run: RunReader, frame: int, step: int) -> list[tuple[float, f
     return [(float(x), float(y)) for x, y in on]
 
 
-def project(
+def project_object_points(
     camera: Camera, T_cam_obj: NDArray[np.float64], points: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Project ``points`` ``(N, 3)``: ``(N, 2)`` pixels, NaN behind the camera, and ``(N,)`` depths."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from importlib import metadata
 from typing import Any
@@ -25,25 +25,39 @@ MOST_FAILURES = 20
 """Different reasons of plug-in failures that a summary lists; the commonest come first."""
 
 
-def description_at_start(
-    *,
-    config: dict[str, Any],
-    camera: Camera,
-    source: str,
-    seed: int,
-    fps: float | None,
-    command: str | None,
-    source_notes: Sequence[str] = (),
-    selection: str | None,
-    renderer: Mapping[str, str | int] | None,
-    given: Mapping[str, Any] | None = None,
-    tracker_choice: str | None = None,
-) -> dict[str, Any]:
+@dataclass(frozen=True, eq=False)
+class RunHeader:
     """What is known of a run before its first frame.
 
-    ``source_notes`` say what was done to the pictures before anything else; ``given`` tells source and object apart
-    from others; ``tracker_choice`` is why ``auto`` stood for the tracker of ``config``.
+    Attributes:
+        config: The configuration as used.
+        camera: The camera of the full frame.
+        source: What was tracked, in words.
+        seed: Seed of everything random.
+        fps: Frames per second of the source, if known.
+        command: The command line, if there was one.
+        source_notes: What the source did to its pictures, in clauses.
+        selection: The ``START:STOP:STEP`` that the source was opened with.
+        renderer: What renders, and why.
+        given: What tells source and object apart from others, see `tracking3d.checkpoint.resuming.given_of`.
+        tracker_choice: Why the mask tracker ``auto`` stood for that of ``config``; None if the user named it.
     """
+
+    config: dict[str, Any]
+    camera: Camera
+    source: str
+    seed: int
+    fps: float | None
+    command: str | None
+    source_notes: Sequence[str] = ()
+    selection: str | None = None
+    renderer: Mapping[str, str | int] | None = None
+    given: Mapping[str, Any] | None = None
+    tracker_choice: str | None = None
+
+
+def description_at_start(header: RunHeader) -> dict[str, Any]:
+    """The contents of ``run.json`` before the first frame."""
     return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -53,17 +67,17 @@ def description_at_start(
         "finished": None,
         "process": this_process(),
         "resumed": [],
-        "source": source,
-        "selection": selection,
-        "given": given,
-        "fps": fps,
-        "command": command,
-        "source_notes": list(source_notes),
-        "seed": seed,
-        "config": config,
-        "tracker_choice": tracker_choice,
-        "camera": asdict(camera),
-        "renderer": renderer,
+        "source": header.source,
+        "selection": header.selection,
+        "given": header.given,
+        "fps": header.fps,
+        "command": header.command,
+        "source_notes": list(header.source_notes),
+        "seed": header.seed,
+        "config": header.config,
+        "tracker_choice": header.tracker_choice,
+        "camera": asdict(header.camera),
+        "renderer": header.renderer,
         "versions": versions(),
         "conventions": CONVENTIONS,
         "refinement": None,
@@ -117,7 +131,6 @@ def summary(
     causal = records if causal is None else causal
     per_frame = [record.seconds for record in causal]
     own = [record for record in records if record.mask_source is not None and record.mask_source.is_own]
-    memory = resident_memory()
     failures = Counter(record.failure for record in records if record.failure)
     return {
         "counts": {
@@ -141,7 +154,7 @@ def summary(
         },
         "iou_initial_mean": _mean_iou(records),
         "iou_initial_mean_own": _mean_iou(own),
-        "peak_memory_mb": memory and memory[1],
+        "peak_memory_mb": resident_memory()[1],
     }
 
 

@@ -20,10 +20,10 @@ from tracking3d.errors import InputError, OutputError
 from tracking3d.estimation.estimate import Status
 from tracking3d.frames import Frame, Image
 from tracking3d.points.follow import follow_points
-from tracking3d.points.landmarks import ROUNDS, Scene, outlined, refine_scene
+from tracking3d.points.landmarks import ROUNDS, LandmarkScene, outlined, refine_scene
 from tracking3d.points.meeting import surface_under
 from tracking3d.points.pictures import Picture
-from tracking3d.points.view import View, open_view
+from tracking3d.points.view import SurfaceView, open_view
 from tracking3d.results import layout
 from tracking3d.results.correspondences import (
     PointTracks,
@@ -34,7 +34,7 @@ from tracking3d.results.correspondences import (
     tracked_record,
 )
 from tracking3d.results.files import write_atomic
-from tracking3d.results.image_points import follow_beside_mesh, read_pictures, with_image_points
+from tracking3d.results.image_points import follow_beside_mesh, read_run_images, with_image_points
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_source import open_run_source
@@ -56,7 +56,7 @@ class RunScene:
     """
 
     run: RunReader
-    scene: Scene
+    scene: LandmarkScene
     pictures: Callable[[], list[Picture | None]] | None = None
 
     def track(self, frame: int, xy: ArrayLike, beside_object: bool = False) -> PointTracks:
@@ -132,7 +132,7 @@ def open_scene(
     """
     run = run if isinstance(run, RunReader) else RunReader(run)
     vertices, faces = _surface(run)
-    images: dict[int, View | None] = {}
+    images: dict[int, SurfaceView | None] = {}
     records = {one.index: one for one in run.frames}
     source = source if source is not None else open_run_source(run)
     for frame in source:
@@ -142,8 +142,8 @@ def open_scene(
         raise InputError(
             f"The video has no frame of the run {run.folder}; say by --source which one it was made on."
         )
-    scene = Scene([images.get(one.index) for one in run.frames], vertices, faces)
-    pictures = cache(partial(read_pictures, run, source)) if getattr(source, "repeatable", True) else None
+    scene = LandmarkScene([images.get(one.index) for one in run.frames], vertices, faces)
+    pictures = cache(partial(read_run_images, run, source)) if getattr(source, "repeatable", True) else None
     if not rounds:
         return RunScene(run, scene, pictures)
     file = run.mesh_folder / layout.LANDMARKS
@@ -161,7 +161,7 @@ def _view(
     image: Image,
     vertices: NDArray[np.float64],
     faces: NDArray[np.int64],
-) -> View | None:
+) -> SurfaceView | None:
     camera = run.camera_of(record)
     if image.shape[:2] != (camera.height, camera.width):
         raise InputError(
@@ -203,7 +203,7 @@ def _key(run: RunReader, vertices: NDArray[np.float64], rounds: int) -> str:
     return f"{_VERSION} {rounds} {hashlib.sha256(b''.join(parts)).hexdigest()}"
 
 
-def _read(file: Path, key: str, scene: Scene) -> Scene | None:
+def _read(file: Path, key: str, scene: LandmarkScene) -> LandmarkScene | None:
     """The scene with surface and poses as they were kept, if they are of the same run."""
     try:
         with np.load(file, allow_pickle=False) as kept:
@@ -217,7 +217,7 @@ def _read(file: Path, key: str, scene: Scene) -> Scene | None:
     return scene.redrawn(vertices, dict(enumerate(T)))
 
 
-def _write(file: Path, key: str, scene: Scene) -> None:
+def _write(file: Path, key: str, scene: LandmarkScene) -> None:
     nowhere = np.full((4, 4), np.nan)
     T = np.stack([nowhere if view is None else view.T_cam_obj for view in scene.views])
     data = io.BytesIO()

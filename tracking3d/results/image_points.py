@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from tracking3d.frames import Frame
 from tracking3d.points.follow import Followed, follow_points
 from tracking3d.points.image_following import ImageTracks, follow_in_images
-from tracking3d.points.landmarks import Scene
+from tracking3d.points.landmarks import LandmarkScene
 from tracking3d.points.meeting import surface_under
 from tracking3d.points.pictures import Picture, open_picture
-from tracking3d.points.tying import joined, meetings
+from tracking3d.points.tying import meetings, merge_image_points
 from tracking3d.points.uncertainty import FEATURES
 from tracking3d.results.correspondences import PointKind, PointTracks
 from tracking3d.results.run_reader import RunReader
@@ -40,7 +40,7 @@ class ImagePoints:
     barycentric: Array
 
 
-def read_pictures(run: RunReader, source: FrameSource) -> list[Picture | None]:
+def read_run_images(run: RunReader, source: FrameSource) -> list[Picture | None]:
     """The frames of a run, in the order of its records; None where there is no image.
 
     Args:
@@ -61,7 +61,7 @@ def read_pictures(run: RunReader, source: FrameSource) -> list[Picture | None]:
 
 def follow_beside_mesh(
     run: RunReader,
-    scene: Scene,
+    scene: LandmarkScene,
     pictures: Sequence[Picture | None],
     start: int,
     xy: Array,
@@ -95,7 +95,7 @@ def follow_beside_mesh(
         positions = np.stack(
             [camera.to_picture(at) for camera, at in zip(cameras, found.positions, strict=True)]
         )
-        both = joined(
+        both = merge_image_points(
             Followed(
                 positions, found.visible, found.uncertainty, found.measured, found.points, found.features
             ),

@@ -10,7 +10,7 @@ from tracking3d.results.files import writing
 from tracking3d.results.run_reader import RunReader
 
 
-def make_room(folder: Path, overwrite: bool) -> None:
+def clear_run_folder(folder: Path, overwrite: bool) -> None:
     """Remove an earlier run from the folder, or refuse to.
 
     Raises:

@@ -32,11 +32,11 @@ def notes_of_run(run: dict[str, Any], model: ObjectModel | None, records: Sequen
     return [
         *run["source_notes"],
         *(notes_of_times(records) if counted else ()),
-        *notes_of(run["camera"], model),
+        *describe_camera_and_model(run["camera"], model),
     ]
 
 
-def notes_of(camera: dict[str, Any], model: ObjectModel | None) -> list[str]:
+def describe_camera_and_model(camera: dict[str, Any], model: ObjectModel | None) -> list[str]:
     """What is known of lens and model.
 
     Args:

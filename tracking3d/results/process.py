@@ -4,44 +4,36 @@ from __future__ import annotations
 
 import os
 import socket
-import sys
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
-_BOOT = Path("/proc/sys/kernel/random/boot_id")
+import psutil
+
+_SAME_START = 2.0  # seconds; Linux counts the start of a process from that of the machine, known to a second
 
 
 def this_process() -> dict[str, Any]:
-    """Number, machine and start of this process, for ``run.json``."""
-    return {"pid": os.getpid(), "host": socket.gethostname(), "started": _started(os.getpid())}
+    """Number, machine and start (seconds since 1970) of this process, for ``run.json``."""
+    return {
+        "pid": os.getpid(),
+        "host": socket.gethostname(),
+        "started": round(psutil.Process().create_time(), 2),
+    }
 
 
 def is_gone(process: Mapping[str, Any]) -> bool | None:
-    """Whether a process that told of itself by `this_process` has ended; None where that cannot be known.
+    """Whether a process that described itself by `this_process` has ended; None if that cannot be known.
 
-    A number is given anew when its process has ended: one that started at another time is another process.
+    The system gives the number of an ended process to a later one: if the process of that number started at another
+    time, it is another process.
     """
     pid, started = process.get("pid"), process.get("started")
     if not isinstance(pid, int) or pid <= 0 or process.get("host") != socket.gethostname():
         return None
-    if sys.platform == "win32":  # asking there would end it
-        return None
     try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
+        now = psutil.Process(pid).create_time()
+    except psutil.NoSuchProcess:
         return True
-    except OSError:  # of another user, but there
-        pass
-    now = _started(pid)
-    return now != started if now and started else False
-
-
-def _started(pid: int) -> str | None:
-    """When a process began: the machine's start and the clock ticks since then; None where nobody tells."""
-    try:
-        # The name in parentheses may hold spaces and parentheses itself.
-        fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2]
-        return f"{_BOOT.read_text(encoding='ascii').strip()} {fields.split()[19]}"
-    except (OSError, IndexError):
-        return None
+    except psutil.AccessDenied:  # it is another user's, and exists
+        return False
+    return isinstance(started, int | float) and abs(now - started) > _SAME_START

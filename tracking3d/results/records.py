@@ -110,7 +110,7 @@ class FrameRecord:
             iterations=int(estimate.iterations),
             keyframe=bool(estimate.keyframe),
             seconds=float(estimate.seconds),
-            iou_initial=mask_iou(estimate.mask, initial_mask),
+            iou_initial=mask_iou_or_none(estimate.mask, initial_mask),
             area=int(np.count_nonzero(estimate.mask)),
             revision=revision,
             failure=estimate.failure,
@@ -186,7 +186,7 @@ def latest(records: Iterable[FrameRecord], refined: bool = True) -> list[FrameRe
     return [answers[index] for index in sorted(answers)]
 
 
-def mask_iou(a: NDArray[np.bool_], b: NDArray[np.bool_] | None) -> float | None:
+def mask_iou_or_none(a: NDArray[np.bool_], b: NDArray[np.bool_] | None) -> float | None:
     """Intersection over union of two ``(H, W)`` masks; None if one is absent or both are empty."""
     if b is None or not (union := np.count_nonzero(a | b)):
         return None

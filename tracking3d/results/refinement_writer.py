@@ -16,19 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.estimation.assessment import Assessment
-from tracking3d.estimation.estimate import FrameEstimate, MaskSource
+from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
 from tracking3d.results import description, layout
-from tracking3d.results.files import decoded_mask, mask_file, read_mask, write_atomic, write_mask, writing
+from tracking3d.results.files import write_atomic, writing
 from tracking3d.results.pictures import Pictures
-from tracking3d.results.probabilities import take_over_probability, write_probability
-from tracking3d.results.records import FrameRecord, mask_iou
-from tracking3d.results.run_reader import read_records
+from tracking3d.results.probabilities import take_over_probability
+from tracking3d.results.records import FrameRecord
+from tracking3d.results.refined_estimates import RefinedEstimates, write_refined
 from tracking3d.stages import StageTimes, measured
 
 
-class RefinementWriter:
+class RefinementWriter(RefinedEstimates):
     """Writes the answers of the final refinement of one run.
 
     Args:
@@ -40,7 +40,6 @@ class RefinementWriter:
         seconds: Wall time that they took.
 
     Attributes:
-        causal: The causal answers by frame index.
         pictures: Overlay and crops of the second pass.
         together: What it took to solve everything once more, before the frames.
 
@@ -57,20 +56,17 @@ class RefinementWriter:
         kept: int = 0,
         seconds: float = 0.0,
     ) -> None:
-        self._folder, self._aside = folder, folder / layout.REFINING
+        aside = folder / layout.REFINING
         self._started = time.monotonic() - seconds
         self._taken_over = False
         self.together = StageTimes()
-        self.causal = {record.index: record for record in causal}
-        self.pictures = Pictures(self._aside / layout.OVERLAY, camera, fps)
-        with writing(self._aside):
-            (self._aside / layout.MASKS).mkdir(parents=True, exist_ok=True)
+        self.pictures = Pictures(aside / layout.OVERLAY, camera, fps)
+        with writing(aside):
+            (aside / layout.MASKS).mkdir(parents=True, exist_ok=True)
             _undo_taking_over(folder)
-            with (self._aside / layout.FRAMES).open("ab") as lines:
+            with (aside / layout.FRAMES).open("ab") as lines:
                 lines.truncate(kept)
-        kept_records = read_records(self._aside / layout.FRAMES)
-        self._records = {record.index: record for record in kept_records}
-        self._decided: dict[int, bytes] = {}  # masks as PNG
+        super().__init__(folder, causal, (camera.height, camera.width))
 
     @property
     def lines(self) -> int:
@@ -81,50 +77,6 @@ class RefinementWriter:
     def seconds(self) -> float:
         """Wall time of the refinement so far, pauses left out."""
         return time.monotonic() - self._started
-
-    def answer(self, index: int) -> FrameRecord:
-        """The answer for frame ``index`` as it is now: the second one, or the causal one where there is none."""
-        return self._records.get(index) or self.causal[index]
-
-    def put(self, answer: FrameRecord) -> None:
-        """Let a second answer be what it is in the end, see `put_right`; causal ones stand.
-
-        It is not kept for a run that is stopped here and goes on later: that finds it anew.
-        """
-        if answer.index in self._records:
-            self._records[answer.index] = answer
-
-    def put_mask(
-        self,
-        index: int,
-        mask: NDArray[np.bool_],
-        probability: NDArray[np.float32] | None,
-        initial: NDArray[np.bool_] | None,
-    ) -> None:
-        """Give a second answer another mask ``(H, W)``, weighed against the image; causal ones stand.
-
-        Like a pose that is put right it is not kept for a run that is stopped here.
-
-        Args:
-            index: Of the frame.
-            mask: ``(H, W)``.
-            probability: ``(H, W)`` of the object; None where it was written before.
-            initial: ``(H, W)`` what the mask tracker gave.
-
-        Raises:
-            OutputError: If the probability cannot be written.
-        """
-        if (record := self._records.get(index)) is None:
-            return
-        self._records[index] = replace(
-            record,
-            area=int(np.count_nonzero(mask)),
-            iou_initial=mask_iou(mask, initial),
-            mask_source=MaskSource.WEIGHED,
-        )
-        self._decided[index] = mask_file(mask)
-        if probability is not None and (self._folder / layout.PROBABILITIES).is_dir():
-            write_probability(self._aside, index, probability)
 
     def draw(self, frame: Frame, mask: NDArray[np.bool_], initial: NDArray[np.bool_] | None) -> None:
         """Draw the answer for a frame.
@@ -137,7 +89,7 @@ class RefinementWriter:
         Raises:
             OutputError: If the video cannot be written.
         """
-        record = self.answer(frame.index)
+        record = self.estimate(frame.index)
         with measured("write") as watch:
             self.pictures.add_kept(frame, record, mask, initial)
         if frame.index in self._records:
@@ -161,36 +113,13 @@ class RefinementWriter:
         """
         if estimate is None:
             return self.causal[frame.index]
-        causal = self.causal[frame.index]
-        estimate = replace(
-            estimate, refined=True, initial_mask=initial, keyframe=estimate.keyframe or causal.keyframe
+        record = write_refined(
+            self._aside, estimate, frame, self.causal[frame.index], initial, self.writes_probabilities
         )
-        with measured("write") as watch:
-            record = FrameRecord.of(estimate, frame.name, initial, revision=True)
-            write_mask(layout.mask_path(self._aside, frame.index), estimate.mask)
-            if (self._folder / layout.PROBABILITIES).is_dir():
-                write_probability(self._aside, frame.index, estimate.probability)
-        record = record.and_wrote(watch.times.write)
         with writing(self._aside), (self._aside / layout.FRAMES).open("ab") as lines:
             lines.write(record.to_json().encode() + b"\n")
         self._records[record.index] = record
         return record
-
-    def mask(self, record: FrameRecord) -> NDArray[np.bool_]:
-        """The mask ``(H, W)`` of an answer, empty where it cannot be read."""
-        if record.refined and (decided := self._decided.get(record.index)) is not None:
-            mask = decoded_mask(decided)
-        else:
-            mask = read_mask(layout.mask_path(self._aside if record.refined else self._folder, record.index))
-        return (
-            np.zeros((self.pictures.camera.height, self.pictures.camera.width), bool)
-            if mask is None
-            else mask
-        )
-
-    def initial_mask(self, index: int) -> NDArray[np.bool_] | None:
-        """What the mask tracker gave for frame ``index``, ``(H, W)`` bool, or None."""
-        return read_mask(layout.initial_mask_path(self._folder, index))
 
     def take_over(self, append: Callable[[Sequence[FrameRecord]], None]) -> None:
         """Put masks and video in their places; what they replace goes to ``causal/``, the mesh too.

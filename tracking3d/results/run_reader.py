@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tracking3d.errors import InputError, argument
 from tracking3d.geometry.camera import Camera
 from tracking3d.results import layout
-from tracking3d.results.camera_record import read_camera
+from tracking3d.results.camera_record import camera_from_record
 from tracking3d.results.files import read_mask
 from tracking3d.results.lock import is_locked
 from tracking3d.results.mesh_export import load_mesh
@@ -76,7 +76,7 @@ class RunReader:
             InputError: If the run names none that can be.
         """
         try:
-            camera = read_camera(self.description["camera"])
+            camera = camera_from_record(self.description["camera"])
             fault = _camera_fault(camera)
         except (KeyError, TypeError, ValueError) as error:
             fault = str(error)

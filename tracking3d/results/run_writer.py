@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Self
+from typing import Literal, Self
 
 import numpy as np
 
@@ -31,7 +30,7 @@ from tracking3d.results.files import (
     writing,
 )
 from tracking3d.results.frame_lines import FrameLines, WrittenSoFar
-from tracking3d.results.making_room import make_room
+from tracking3d.results.making_room import clear_run_folder
 from tracking3d.results.mesh_export import export_mesh
 from tracking3d.results.notes import notes_of_run
 from tracking3d.results.pictures import Pictures
@@ -56,16 +55,7 @@ class RunWriter:
 
     Args:
         folder: The run folder; made with its parents.
-        config: The configuration as used.
-        camera: The camera of the full frame.
-        source: What was tracked, in words.
-        seed: Seed of everything random.
-        renderer: What renders, and why.
-        fps: Frames per second of the source, where known.
-        command: The command line, where there was one.
-        source_notes: What the source did to its pictures, in clauses.
-        given: What tells source and object apart from others, see `tracking3d.checkpoint.resuming.given_of`.
-        tracker_choice: Why the mask tracker ``auto`` stood for that of ``config``; None where it was named.
+        header: What is known of the run before its first frame.
         overwrite: Replace a run that is there. Only files a run writes are removed, only from a run folder.
         resume: Go on with the run that is there, of which so much is kept. What is behind that in ``frames.jsonl``
             stays until something is written in its place.
@@ -77,48 +67,25 @@ class RunWriter:
     def __init__(
         self,
         folder: Path,
+        header: description.RunHeader,
         *,
-        config: dict[str, Any],
-        camera: Camera,
-        source: str,
-        seed: int,
-        fps: float | None,
-        command: str | None,
-        source_notes: Sequence[str] = (),
-        selection: str | None = None,
-        renderer: Mapping[str, str | int] | None = None,
-        given: Mapping[str, Any] | None = None,
-        tracker_choice: str | None = None,
         overwrite: bool = False,
         resume: WrittenSoFar | None = None,
     ) -> None:
         self.folder = Path(folder)
-        self._camera = camera
-        self._fps = fps or DEFAULT_FPS
+        self._camera, self._fps = header.camera, header.fps or DEFAULT_FPS
         self._started, self._drawing, self._over = time.monotonic(), 0.0, False
-        self._pictures = Pictures(self.folder / layout.OVERLAY, camera, self._fps)
+        self._pictures = Pictures(self.folder / layout.OVERLAY, self._camera, self._fps)
         self._refinement: RefinementWriter | None = None
-        self._probabilities = bool(config.get("runtime", {}).get("probabilities"))
-        self._description = description.description_at_start(
-            config=config,
-            camera=camera,
-            source=source,
-            seed=seed,
-            fps=fps,
-            command=command,
-            source_notes=source_notes,
-            selection=selection,
-            renderer=renderer,
-            given=given,
-            tracker_choice=tracker_choice,
-        )
+        self._probabilities = bool(header.config.get("runtime", {}).get("probabilities"))
+        self._description = description.description_at_start(header)
         self._kept: dict[int, FrameRecord] = {}
         with writing(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
         self._lines = FrameLines(self.folder)
         try:
             if resume is None:
-                make_room(self.folder, overwrite)
+                clear_run_folder(self.folder, overwrite)
             with writing(self.folder):
                 if resume is None:
                     self._lines.begin()

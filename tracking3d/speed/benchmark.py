@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 import platform
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -20,8 +21,8 @@ import torch
 from tracking3d.results.description import versions
 from tracking3d.speed.growth import measure_growth
 from tracking3d.speed.memory import peak_memory
-from tracking3d.speed.scene import Problem, default_texture
-from tracking3d.speed.timing import DENSE, Duration, find_device, left_out, median, time_backends
+from tracking3d.speed.scene import Backend, RenderWorkload, default_texture
+from tracking3d.speed.timing import DENSE, Duration, find_device, median, time_backends
 
 
 def benchmark(
@@ -34,6 +35,7 @@ def benchmark(
     device: str = "cpu",
     dense: bool = True,
     growth: bool = False,
+    others: Mapping[str, Backend] | None = None,
 ) -> dict[str, Any]:
     """Time forward and backward passes of every backend on one problem.
 
@@ -48,29 +50,30 @@ def benchmark(
         device: ``cpu``, ``cuda`` or ``cuda:N``.
         dense: Whether to time the dense implementation, too, which takes most of the time.
         growth: Whether to measure how the times grow with the problem, see `measure_growth`.
+        others: Further renderers to time, by name; their memory and growth are not measured.
 
     Returns:
         The problem, where it ran (``threads``, ``device``, ``machine``), and for each of ``backends`` the median
         milliseconds ``forward_ms``, ``backward_ms`` and ``total_ms`` for all frames, with the number of
         ``measurements`` and of ``measured_frames``, from which they are scaled up; ``ratio_to_torch``, its
         ``total_ms`` over that of ``torch``; ``speedup_over_dense``, how many times longer ``dense`` takes, None if it
-        was not asked for; ``peak_memory_mb``, see `peak_memory`, None for ``dense``. ``speedup_over_dense`` of
-        ``torch`` stands outside, too. ``left_out`` has
-        backends that are installed and cannot render, with the reason. With ``growth`` the answer of `measure_growth`.
+        was not asked for; ``peak_memory_mb``, see `peak_memory`, None for ``dense`` and ``others``.
+        ``speedup_over_dense`` of ``torch`` stands outside, too. With ``growth`` the answer of `measure_growth`.
 
     Raises:
         InputError: If the device is not there.
     """
     place = find_device(device)
-    problem = Problem(size, frames, channels, texture or default_texture(channels))
-    times = time_backends(problem, place, repeats, threads, dense)
+    problem = RenderWorkload(size, frames, channels, texture or default_texture(channels))
+    times = time_backends(problem, place, repeats, threads, dense, others)
     results = {
         name: _figures(measured, frames, 1 if name == DENSE else frames) for name, measured in times.items()
     }
     for name, figures in results.items():
         figures["ratio_to_torch"] = _ratio(figures, results["torch"])
         figures["speedup_over_dense"] = _ratio(results[DENSE], figures) if dense else None
-        figures["peak_memory_mb"] = None if name == DENSE else _rounded(name, problem, place, threads)
+        apart = name == DENSE or name in (others or {})
+        figures["peak_memory_mb"] = None if apart else _rounded(name, problem, place, threads)
     report = {
         **{name: value for name, value in asdict(problem).items() if name != "frequency"},
         "faces": problem.faces,
@@ -78,7 +81,6 @@ def benchmark(
         "threads": threads,
         "machine": machine(),
         "backends": results,
-        "left_out": left_out(place),
         "speedup_over_dense": results["torch"]["speedup_over_dense"],
     }
     if growth:
@@ -123,6 +125,5 @@ def _ratio(one: dict[str, Any], other: dict[str, Any]) -> float:
     return float(f"{one['total_ms'] / other['total_ms']:.3g}")
 
 
-def _rounded(name: str, problem: Problem, device: torch.device, threads: int) -> float | None:
-    memory = peak_memory(name, problem, device, threads)
-    return None if memory is None else round(memory, 1)
+def _rounded(name: str, problem: RenderWorkload, device: torch.device, threads: int) -> float:
+    return round(peak_memory(name, problem, device, threads), 1)

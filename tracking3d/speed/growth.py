@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from tracking3d.speed.scene import Problem
+from tracking3d.speed.scene import RenderWorkload
 from tracking3d.speed.timing import Duration, median, time_backends
 
 RANGES: dict[str, list[dict[str, int]]] = {
@@ -21,7 +21,7 @@ RANGES: dict[str, list[dict[str, int]]] = {
     "frames": [{"frames": frames} for frames in (1, 2, 4, 7, 12, 16)],
     "channels": [{"channels": channels, "texture": 150} for channels in (1, 3, 8, 16, 32, 64, 128)],
 }
-"""What grows, a property of `Problem`, and the settings that make it grow."""
+"""What grows, a property of `RenderWorkload`, and the settings that make it grow."""
 
 LINEAR = 1.05
 """Exponents up to this are linear or better: measurements are noisy."""
@@ -29,7 +29,7 @@ _PASSES = 3
 
 
 def measure_growth(
-    problem: Problem, device: torch.device, repeats: int, threads: int
+    problem: RenderWorkload, device: torch.device, repeats: int, threads: int
 ) -> dict[str, dict[str, Any]]:
     """Time every backend while one property of the problem grows.
 
@@ -46,7 +46,7 @@ def measure_growth(
     problems = {name: [replace(problem, **change) for change in changes] for name, changes in RANGES.items()}
     # Another program that keeps the machine busy for a while spoils one pass of a few points, not all of one point.
     passes = min(_PASSES, repeats)
-    times: dict[Problem, dict[str, list[Duration]]] = defaultdict(lambda: defaultdict(list))
+    times: dict[RenderWorkload, dict[str, list[Duration]]] = defaultdict(lambda: defaultdict(list))
     for _ in range(passes):
         for one in chain.from_iterable(problems.values()):
             for backend, measured in time_backends(one, device, -(-repeats // passes), threads).items():

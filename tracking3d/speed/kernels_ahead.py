@@ -28,13 +28,13 @@ def compile_module(name: str) -> int:
     Returns:
         How many it holds.
     """
-    kernels = kernels_of(importlib.import_module(name))
+    kernels = find_kernels(importlib.import_module(name))
     for kernel in kernels:
         kernel.compile()
     return len(kernels)
 
 
-def kernels_of(module: ModuleType) -> list[Kernel]:
+def find_kernels(module: ModuleType) -> list[Kernel]:
     """The kernels that a module defines."""
     return [
         one for one in vars(module).values() if isinstance(one, Kernel) and one.__module__ == module.__name__

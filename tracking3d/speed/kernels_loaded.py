@@ -9,9 +9,9 @@ from __future__ import annotations
 import importlib
 from contextlib import suppress
 
-from tracking3d.speed.kernels_ahead import kernel_modules, kernels_of
+from tracking3d.speed.kernels_ahead import find_kernels, kernel_modules
 
 for _name in kernel_modules():
     with suppress(Exception):  # whoever needs it is told
-        for _kernel in kernels_of(importlib.import_module(_name)):
+        for _kernel in find_kernels(importlib.import_module(_name)):
             _kernel.load()

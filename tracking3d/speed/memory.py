@@ -19,20 +19,18 @@ from dataclasses import asdict
 import torch
 
 from tracking3d.process_memory import forget_peak, resident_memory
-from tracking3d.speed.scene import Problem, Scene
-from tracking3d.speed.timing import backends, give_threads
+from tracking3d.speed.scene import RenderScene, RenderWorkload
+from tracking3d.speed.timing import backends, set_benchmark_threads
 
 ITERATIONS = 3
-_TINY = Problem(size=16, frames=1, channels=1, texture=8, frequency=2)
+_TINY = RenderWorkload(size=16, frames=1, channels=1, texture=8, frequency=2)
 _GIVE_BACK = 128 * 1024  # bytes; blocks of at least this size go back to the system at once
 
 
-def peak_memory(name: str, problem: Problem, device: torch.device, threads: int = 1) -> float | None:
-    """Megabytes (10^6 bytes) that a backend needs to solve a problem; None where they cannot be measured."""
+def peak_memory(name: str, problem: RenderWorkload, device: torch.device, threads: int = 1) -> float:
+    """Megabytes (10^6 bytes) that a backend needs to solve a problem."""
     if device.type == "cuda":
         return _on_gpu(name, problem, device)
-    if resident_memory() is None:
-        return None
     asked = json.dumps({"name": name, "problem": asdict(problem), "threads": threads})
     command = [sys.executable, "-m", "tracking3d.speed.memory", asked]
     environment = {**os.environ, "MALLOC_MMAP_THRESHOLD_": str(_GIVE_BACK)}
@@ -40,23 +38,23 @@ def peak_memory(name: str, problem: Problem, device: torch.device, threads: int 
     return float(answer)
 
 
-def _in_this_process(name: str, problem: Problem, threads: int) -> float | None:
+def _in_this_process(name: str, problem: RenderWorkload, threads: int) -> float:
     device = torch.device("cpu")
-    give_threads(name, device, threads)
+    set_benchmark_threads(name, device, threads)
     backend = backends(device)[name]
-    Scene.make(_TINY, device).loss(backend).backward()
-    scene = Scene.make(problem, device)
+    RenderScene.make(_TINY, device).loss(backend).backward()
+    scene = RenderScene.make(problem, device)
     forget_peak()
-    before = resident_memory()
+    before, _ = resident_memory()
     for _ in range(ITERATIONS):
         scene.forget_gradients()
         scene.loss(backend).backward()
-    after = resident_memory()
-    return None if before is None or after is None else max(after[1] - before[0], 0.0)
+    _, peak = resident_memory()
+    return max(peak - before, 0.0)
 
 
-def _on_gpu(name: str, problem: Problem, device: torch.device) -> float:
-    backend, scene = backends(device)[name], Scene.make(problem, device)
+def _on_gpu(name: str, problem: RenderWorkload, device: torch.device) -> float:
+    backend, scene = backends(device)[name], RenderScene.make(problem, device)
     before = torch.cuda.memory_allocated(device)
     torch.cuda.reset_peak_memory_stats(device)
     for _ in range(ITERATIONS):
@@ -67,4 +65,4 @@ def _on_gpu(name: str, problem: Problem, device: torch.device) -> float:
 
 if __name__ == "__main__":
     asked = json.loads(sys.argv[1])
-    print(json.dumps(_in_this_process(asked["name"], Problem(**asked["problem"]), asked["threads"])))
+    print(json.dumps(_in_this_process(asked["name"], RenderWorkload(**asked["problem"]), asked["threads"])))

@@ -26,7 +26,7 @@ def default_texture(channels: int) -> int:
 
 
 @dataclass(frozen=True)
-class Problem:
+class RenderWorkload:
     """How much there is to render.
 
     Attributes:
@@ -55,7 +55,7 @@ class Problem:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class RenderScene:
     """One problem: what is rendered, and what it is compared with.
 
     Attributes:
@@ -71,7 +71,7 @@ class Scene:
     mask: Tensor
 
     @classmethod
-    def make(cls, problem: Problem, device: torch.device) -> Scene:
+    def make(cls, problem: RenderWorkload, device: torch.device) -> RenderScene:
         """An ellipsoid that turns by 10 degrees a frame and covers a quarter of the pixels."""
         size, frames, channels = problem.size, problem.frames, problem.channels
         generator = torch.Generator().manual_seed(0)

@@ -35,11 +35,6 @@ def format_problem(report: dict[str, Any]) -> str:
     )
 
 
-def format_left_out(report: dict[str, Any]) -> list[str]:
-    """A line for each backend that is installed and cannot render."""
-    return [f"{name} takes no part: {why}." for name, why in report["left_out"].items()]
-
-
 def format_growth(growth: dict[str, dict[str, Any]]) -> Table:
     """The exponents of `measure_growth`: a row for what grows, a column for each backend."""
     table = Table("time grows with the power of")

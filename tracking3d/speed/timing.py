@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import statistics
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -13,8 +14,7 @@ from tracking3d.errors import InputError
 from tracking3d.rendering import prepare_backend, render
 from tracking3d.rendering.backend import threads_kept, why_no_numba
 from tracking3d.speed.dense import render_dense
-from tracking3d.speed.pytorch3d import ABSENT, render_pytorch3d, why_no_pytorch3d
-from tracking3d.speed.scene import Backend, Problem, Scene
+from tracking3d.speed.scene import Backend, RenderScene, RenderWorkload
 
 DENSE = "dense"
 _PER_TURN = 3
@@ -52,24 +52,21 @@ def backends(device: torch.device) -> dict[str, Backend]:
     found: dict[str, Backend] = {"torch": partial(render, backend="torch")}
     if device.type == "cpu" and not why_no_numba():
         found["numba"] = partial(render, backend="numba")
-    if not why_no_pytorch3d(device):
-        found["pytorch3d"] = render_pytorch3d
     return found
 
 
-def left_out(device: torch.device) -> dict[str, str]:
-    """Backends of others that are installed and cannot render on a device, and why."""
-    why = why_no_pytorch3d(device)
-    return {"pytorch3d": why} if why not in ("", ABSENT) else {}
-
-
-def give_threads(name: str, device: torch.device, threads: int) -> None:
+def set_benchmark_threads(name: str, device: torch.device, threads: int) -> None:
     """What a run of the product with that backend and ``--threads`` does; see `prepare_backend`."""
     prepare_backend("numba" if name == "numba" else "torch", str(device), threads)
 
 
 def time_backends(
-    problem: Problem, device: torch.device, repeats: int, threads: int, dense: bool = False
+    problem: RenderWorkload,
+    device: torch.device,
+    repeats: int,
+    threads: int,
+    dense: bool = False,
+    others: Mapping[str, Backend] | None = None,
 ) -> dict[str, list[Duration]]:
     """Time every backend on one problem.
 
@@ -82,11 +79,12 @@ def time_backends(
         repeats: Measurements of each backend.
         threads: CPU threads of every backend.
         dense: Whether to time the dense implementation, too, once and for a single frame.
+        others: Further renderers to time beside those of `backends`, by name.
 
     Returns:
         Measurements by name.
     """
-    scene, candidates = Scene.make(problem, device), backends(device)
+    scene, candidates = RenderScene.make(problem, device), {**backends(device), **(others or {})}
     times: dict[str, list[Duration]] = {name: [] for name in candidates}
     with threads_kept():
         for done in range(0, repeats, _PER_TURN):
@@ -96,7 +94,7 @@ def time_backends(
                 times[name] += [_measure(scene, backend) for _ in range(min(_PER_TURN, repeats - done))]
         if dense:
             _begin_turn(DENSE, device, threads)
-            times[DENSE] = [_measure(Scene.make(replace(problem, frames=1), device), render_dense)]
+            times[DENSE] = [_measure(RenderScene.make(replace(problem, frames=1), device), render_dense)]
     return times
 
 
@@ -108,12 +106,12 @@ def median(measured: list[Duration]) -> Duration:
 
 
 def _begin_turn(name: str, device: torch.device, threads: int) -> None:
-    give_threads(name, device, threads)
+    set_benchmark_threads(name, device, threads)
     if threads > 1:
         time.sleep(_PAUSE)
 
 
-def _measure(scene: Scene, backend: Backend) -> Duration:
+def _measure(scene: RenderScene, backend: Backend) -> Duration:
     device = scene.mask.device
     scene.forget_gradients()
     start = _now(device)

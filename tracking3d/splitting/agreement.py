@@ -14,7 +14,7 @@ from tracking3d.estimation.online.uniting import moved, same_landmarks
 from tracking3d.geometry.camera import Camera
 from tracking3d.results.records import FrameRecord
 from tracking3d.splitting.map_joining import through_lens
-from tracking3d.splitting.similarity import Fit, fit_similarity
+from tracking3d.splitting.similarity import SimilarityFit, fit_similarity
 
 FEWEST_FRAMES = 5
 """Frames that both parts have tracked."""
@@ -41,7 +41,7 @@ class Joint:
         landmarks: How many were.
     """
 
-    fit: Fit
+    fit: SimilarityFit
     frames: int
     landmarks: int
 
@@ -69,7 +69,7 @@ def _is_there(record: FrameRecord) -> bool:
     return record.status is not Status.LOST and bool(np.isfinite(record.T_cam_obj).all())
 
 
-def check_agreement(fit: Fit, radius: float) -> None:
+def check_agreement(fit: SimilarityFit, radius: float) -> None:
     """Make sure that two parts can be joined.
 
     Args:

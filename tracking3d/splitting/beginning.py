@@ -2,27 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from tracking3d.config.models import PipelineConfig
-from tracking3d.prompts import make_prompt
-from tracking3d.recording import record, with_tracker
+from tracking3d.open_tracking import open_tracking, request_tracking
+from tracking3d.recording import RecordOptions, record_tracking
 from tracking3d.results import layout
-from tracking3d.results.making_room import make_room
+from tracking3d.results.making_room import clear_run_folder
 from tracking3d.results.run_reader import is_finished
 from tracking3d.splitting.cutting import windows
-from tracking3d.splitting.long_video import Ended, LongVideo, Tell, frames_of_part
-from tracking3d.splitting.part_runs import PartJob, begin_session
+from tracking3d.splitting.long_video import LongVideo, SplitResult, Tell, frames_of_part
+from tracking3d.splitting.part_runs import PartJob
 from tracking3d.splitting.plan import (
     Plan,
-    given_at,
     has_plan,
     kept_plan,
     make_plan,
     part_folder,
+    prompts_at,
     remove_parts,
     selection_of,
 )
@@ -53,35 +52,33 @@ class Begun:
     jobs: tuple[PartJob, ...]
 
 
-def begin(tell: Tell, video: LongVideo) -> Begun | Ended:
+def begin(tell: Tell, video: LongVideo) -> Begun | SplitResult:
     """Cut a video, unless it is one part, or done; ``tell`` is given the answers where it is tracked here.
 
     Raises:
         InputError: If the video cannot be split, or what is there is of something else.
         Tracking3dError: What was finished until then is kept.
     """
-    given, folder, resume = video.given, video.folder, video.resume
+    folder, resume = video.folder, video.resume
     opened = open_source(video.source, video.selection)
     frames = frames_of_part(opened, video.config, video.length)
-    one_part = partial(
-        record, opened, video.config, folder, box=given.box, mask=given.mask, points=given.points,
-        command=video.command, selection=video.selection, overwrite=video.overwrite, resume=resume, listener=tell,
-    )  # fmt: skip
+    request = request_tracking(opened, video.config, video.prompts)
+    options = RecordOptions(video.command, video.selection, video.overwrite, resume)
     count = opened.count
     assert count is not None
     if not windows(count, frames):
-        one_part()
-        return Ended((folder,), 1, f"{opened.name} has {count} frames, which is one part")
+        record_tracking(request, folder, options, tell)
+        return SplitResult((folder,), 1, f"{opened.name} has {count} frames, which is one part")
     if resume and (layout.has_state(folder) or is_there(folder)):  # joined already
-        one_part()
+        record_tracking(request, folder, options, tell)
         remove_parts(folder)
-        return Ended((folder,), 1)
+        return SplitResult((folder,), 1)
     if not resume:
-        make_room(folder, video.overwrite)
+        clear_run_folder(folder, video.overwrite)
         remove_parts(folder)
-    first, _ = begin_session(opened, video.config, given)
-    prompt = None if given.untold else make_prompt(first, given.box, given.mask, points=given.points)
-    config, choice = with_tracker(video.config, opened, first, prompt, folder, resume)
+    with open_tracking(replace(request, skip_damaged=True), folder if resume else None) as tracking:
+        config, choice, first = tracking.config, tracking.tracker_choice, tracking.first
+        prompt = tracking.objects[0].prompt
     asked: dict[str, Any] = {
         "count": count, "length": frames, "first": first, "prompt": prompt, "selection": video.selection,
     }  # fmt: skip
@@ -89,11 +86,11 @@ def begin(tell: Tell, video: LongVideo) -> Begun | Ended:
     plan = kept or make_plan(opened, config, folder, **asked)
     if len(plan.parts) == 1:
         remove_parts(folder)
-        one_part()
-        return Ended((folder,), 1, "no frame near to where it was to be cut shows the object well")
+        record_tracking(request, folder, options, tell)
+        return SplitResult((folder,), 1, "no frame near to where it was to be cut shows the object well")
     jobs = _part_jobs(video, config, count, plan, resume=kept is not None)
     if kept is not None and all(is_finished(job.folder) for job in jobs):
-        return Ended(tuple(job.folder for job in jobs), len(jobs), BEFORE)
+        return SplitResult(tuple(job.folder for job in jobs), len(jobs), BEFORE)
     return Begun(video, config, choice, count, plan, jobs)
 
 
@@ -111,7 +108,7 @@ def _part_jobs(
             selection_of(video.frames(count), part.start, part.stop),
             config,
             part_folder(video.folder, part),
-            given_at(video.folder, part, video.given, video.precomputed),
+            prompts_at(video.folder, part, video.prompts, video.precomputed),
             video.command,
             resume,
         )

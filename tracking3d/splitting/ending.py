@@ -7,30 +7,28 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tracking3d.checkpoint.resuming import given_of
-from tracking3d.frames import Frame, Prompt
-from tracking3d.last_passes import Foreseen
+from tracking3d.last_passes import PrecomputedRefinement
+from tracking3d.open_tracking import OpenTracking, TrackRequest, open_tracking, request_tracking
 from tracking3d.passes import go_through
-from tracking3d.prompts import make_prompt
+from tracking3d.prompts import PromptSet
 from tracking3d.reconstruction.asked_shape import shape_as_asked
-from tracking3d.recording import begun as begin_recording
-from tracking3d.recording import first_frame, opened
+from tracking3d.recording import RecordOptions, begin_recording
+from tracking3d.results.description import RunHeader
 from tracking3d.results.run_notes import note_in_run
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_writer import RunWriter
-from tracking3d.session import Session
 from tracking3d.splitting.agreement import DisagreementError
 from tracking3d.splitting.beginning import Begun
 from tracking3d.splitting.joined_run import write_causal_mesh, write_joined
 from tracking3d.splitting.joining import Whole, joined_parts
 from tracking3d.splitting.long_video import Tell
-from tracking3d.splitting.part_runs import Given, PartJob, Revisit, begin_session
+from tracking3d.splitting.part_runs import PartJob, Revisit
 from tracking3d.splitting.plan import PARTS, part_folder, put_cut_mask, remove_parts
 from tracking3d.video import open_source
 
@@ -99,7 +97,8 @@ def join(tell: Tell, tracked: Tracked) -> Again | Refused | Joined:
     video = begun.video
     if (again := _begun_elsewhere(tracked)) is not None:
         return again
-    first, session = begin_session(open_source(video.source, video.selection), begun.config, video.given)
+    with open_tracking(_request(begun)) as opened:
+        session = opened.objects[0].session
     try:
         whole = joined_parts(session, begun.config, begun.plan, video.folder)
     except DisagreementError as error:
@@ -115,9 +114,9 @@ def join(tell: Tell, tracked: Tracked) -> Again | Refused | Joined:
         "joints": whole.joints,
         "dearer": whole.dearer,
     }
-    writer = _begin_writing(begun, first, session, whole)
+    writer = _begin_writing(begun, opened, whole)
     owned = _owned(begun)
-    session.resume(first, whole.session, {})
+    session.resume(opened.first, whole.session, {})
     write_causal_mesh(video.folder, session)
     session.refine()
     write_joined(writer, session, whole.runs, owned, sum(seconds.values()) + time.monotonic() - clock)
@@ -132,11 +131,11 @@ class Ending:
 
     Attributes:
         joined: The run; its ``seconds`` tell what all steps took.
-        foreseen: What its frames are answered with in the end.
+        precomputed: What the last steps of its final refinement come to.
     """
 
     joined: Joined
-    foreseen: Foreseen
+    precomputed: PrecomputedRefinement
 
 
 def end(tell: Tell, ending: Ending) -> None:
@@ -151,27 +150,25 @@ def end(tell: Tell, ending: Ending) -> None:
     """
     begun = ending.joined.begun
     video, config = begun.video, begun.config
-    source = open_source(video.source, video.selection)
     about = {**ending.joined.about, "seconds": dict(ending.joined.seconds)}
     note_in_run(video.folder, {"split": about})
-    with opened(source, config) as frames, ExitStack() as writers:
-        skipped, first = first_frame(frames, source.name, skip_damaged=True)
-        prompt = _prompt(first, video.given)
-        session = Session(config, prompt, source.intrinsics, source.intrinsics_origin)
-        recording = begin_recording(
-            source, session, prompt, choice=begun.choice, first=first, folder=video.folder, command=video.command,
-            selection=video.selection, overwrite=False, resume=True, writers=writers,
-        )  # fmt: skip
+    options = RecordOptions(video.command, video.selection, resume=True)
+    with open_tracking(_request(begun)) as opened, ExitStack() as writers:
+        opened = replace(opened, tracker_choice=begun.choice)
+        recording = begin_recording(opened, 0, video.folder, options, writers)
         if recording is not None:
-            recording.foreseen = ending.foreseen
-            go_through(source, chain(skipped, [first], frames), [recording], tell)
+            recording.precomputed = ending.precomputed
+            go_through(opened.source, opened.frames, [recording], tell)
     if recording is not None:
-        shape_as_asked(video.folder, config, source)
+        shape_as_asked(video.folder, config, opened.source)
     remove_parts(video.folder)
 
 
-def _prompt(first: Frame, given: Given) -> Prompt | None:
-    return None if given.untold else make_prompt(first, given.box, given.mask, points=given.points)
+def _request(begun: Begun) -> TrackRequest:
+    """The whole video, with the mask tracker that was chosen."""
+    video = begun.video
+    source = open_source(video.source, video.selection)
+    return request_tracking(source, begun.config, video.prompts, skip_damaged=True)
 
 
 def _begun_elsewhere(tracked: Tracked) -> Again | None:
@@ -185,7 +182,8 @@ def _begun_elsewhere(tracked: Tracked) -> Again | None:
         cut = whole[part.start]
         earlier = RunReader(part_folder(folder, before), refined=False)
         answers = {one.index: one for one in earlier.frames}
-        began = tracked.jobs[part.number].given.mask
+        prompts = tracked.jobs[part.number].prompts
+        began = prompts.masks[0] if prompts.masks else None
         if cut not in answers or answers[cut].status != "tracked" or began is None or isinstance(began, Path):
             continue
         answer = earlier.mask(cut)
@@ -193,7 +191,7 @@ def _begun_elsewhere(tracked: Tracked) -> Again | None:
         if smaller and np.count_nonzero(answer & began) < _SAME_OBJECT * smaller:
             _log.warning("Part %d began on something else and is tracked again.", part.number + 1)
             put_cut_mask(folder, part, answer)
-            job = replace(tracked.jobs[part.number], given=Given(mask=answer), resume=False)
+            job = replace(tracked.jobs[part.number], prompts=PromptSet.of_one(mask=answer), resume=False)
             return Again(part.number, job)
     return None
 
@@ -205,25 +203,22 @@ def _owned(begun: Begun) -> list[range]:
     return [whole[start:stop] for start, stop in zip(starts, [*starts[1:], len(whole)], strict=True)]
 
 
-def _begin_writing(begun: Begun, first: Frame, session: Session, whole: Whole) -> RunWriter:
+def _begin_writing(begun: Begun, opened: OpenTracking, whole: Whole) -> RunWriter:
     """The writer of the joined run, with all that a run knows of itself before its first frame."""
-    video, given = begun.video, begun.video.given
-    opened = open_source(video.source, video.selection)
-    prompt = _prompt(first, given)
-    return RunWriter(
-        video.folder,
+    video, source, [one] = begun.video, opened.source, opened.objects
+    header = RunHeader(
         config=begun.config.model_dump(mode="json"),
         camera=whole.camera,
-        source=opened.name,
+        source=source.name,
         seed=begun.config.runtime.seed,
-        renderer=session.renderer,
-        fps=opened.fps,
+        renderer=one.session.renderer,
+        fps=source.fps,
         command=video.command,
         selection=video.selection,
-        given=given_of(first, prompt, opened.count),
+        given=given_of(opened.first, one.prompt, source.count),
         tracker_choice=begun.choice,
-        overwrite=True,
     )
+    return RunWriter(video.folder, header, overwrite=True)
 
 
 def _revisits(begun: Begun, owned: Sequence[range]) -> tuple[Revisit, ...]:
@@ -235,7 +230,7 @@ def _revisits(begun: Begun, owned: Sequence[range]) -> tuple[Revisit, ...]:
             f"{mine.start}:{mine[-1] + 1}:{mine.step}",
             begun.config,
             video.folder,
-            video.given,
+            video.prompts,
             video.folder / PARTS / f"second_{part.number}",
         )
         for part, mine in zip(begun.plan.parts, owned, strict=True)

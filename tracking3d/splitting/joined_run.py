@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from tracking3d.checkpoint.folder import Checkpoint
-from tracking3d.checkpoint.progress import Kept, Progress
+from tracking3d.checkpoint.progress import Kept, RunProgress
 from tracking3d.frames import SkippedFrame
 from tracking3d.geometry.similarity import Similarity
 from tracking3d.results import layout
@@ -84,7 +84,7 @@ def write_joined(
     for one in skipped:
         checkpoint.note(one)
     last = records[-1].index if records else -1
-    checkpoint.save(Progress(last, size, refining=True, seconds=seconds), session.kept())
+    checkpoint.save(RunProgress(last, size, refining=True, seconds=seconds), session.kept())
 
 
 def write_causal_mesh(folder: Path, session: Session) -> None:

@@ -26,7 +26,7 @@ from tracking3d.results.run_reader import RunReader
 from tracking3d.session import Session
 from tracking3d.splitting.agreement import DisagreementError, Joint, by_lens, joint_of
 from tracking3d.splitting.joined_run import PartRun
-from tracking3d.splitting.map_joining import joined
+from tracking3d.splitting.map_joining import merge_states
 from tracking3d.splitting.plan import Plan, part_folder
 from tracking3d.splitting.similarity import fit_similarity
 
@@ -171,7 +171,7 @@ def join_beliefs(
         DisagreementError: If together they explain what was seen far worse than each by itself.
     """
     own = float(np.mean([keyframe_cost(belief.known) for belief in before or beliefs]))
-    belief = joined(beliefs, similarities, config, encoder)
+    belief = merge_states(beliefs, similarities, config, encoder)
     together = keyframe_cost(belief.known)
     if together > MOST_DEARER * own:
         raise DisagreementError(

@@ -1,7 +1,7 @@
-"""What a joined run's answers become in the end, found side by side: poses by all points, then masks by all images.
+"""The last steps of a joined run's final refinement, taken by several processes: adjustment, then poses, then masks.
 
-It is what `tracking3d.last_passes` does frame by frame in one process. Points are bundled and masks put together once;
-what that says of a frame does not hang on the frames of other parts, but for those a few frames away.
+Each process takes its range of frames through `tracking3d.last_passes.LastPasses`. The adjustment, and what masks have
+in common, are computed once, for all frames; what they say of a frame depends only on frames a few frames away.
 """
 
 from __future__ import annotations
@@ -12,27 +12,24 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
-import numpy as np
-from numpy.typing import NDArray
 
+from tracking3d.evidence.hindsight import Hindsight
 from tracking3d.evidence.order import REACH
 from tracking3d.frames import Frame
-from tracking3d.last_passes import placed
+from tracking3d.geometry.camera import Camera
+from tracking3d.last_passes import Decision, LastPasses
 from tracking3d.reconstruction.second_look import SecondLook
-from tracking3d.reconstruction.second_masks import Decision, Masked, SecondMasks
 from tracking3d.rendering.backend import shared_among
 from tracking3d.results import layout
-from tracking3d.results.files import mask_file, read_mask
+from tracking3d.results.files import mask_file
 from tracking3d.results.probabilities import write_probability
 from tracking3d.results.records import FrameRecord
-from tracking3d.results.run_reader import RunReader, read_records
+from tracking3d.results.refined_estimates import RefinedEstimates
 from tracking3d.side_by_side import read_ahead
 from tracking3d.splitting.joined_run import take_second_answers
 from tracking3d.splitting.part_runs import Revisit, Tell, resumed
 from tracking3d.video import open_source
 from tracking3d.video.selection import parse_selection
-
-Answers = Mapping[int, FrameRecord]
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,23 +60,23 @@ class Placing:
 
 @dataclass(frozen=True, eq=False)
 class Weighing:
-    """Frames, to get their masks of the end.
+    """Frames, to get their final masks.
 
     Attributes:
-        job: The frames; those of the whole video where masks are put together.
-        answers: The whole video's, poses of the end.
-        masks: What was put together; None where that is to be done.
+        job: The frames; those of the whole video when masks are collected.
+        estimates: Those of the whole video with their final poses, by frame index.
         look: What all frames say together.
+        masks: What the masks of all frames have in common; None when that is to be found.
     """
 
     job: Revisit
-    answers: Answers
+    estimates: Mapping[int, FrameRecord]
     look: SecondLook
-    masks: SecondMasks | None = None
+    masks: Hindsight | None = None
 
 
 def settle(tell: Tell, job: Settling) -> SecondLook:
-    """Put the second answers of all parts into the run, and together what they say of poses, lens and surface.
+    """Put the refined estimates of all parts into the run, and adjust poses, lens and surface by all of them.
 
     Raises:
         Tracking3dError: If something cannot be read or written.
@@ -88,94 +85,81 @@ def settle(tell: Tell, job: Settling) -> SecondLook:
     kept, session = resumed(first)
     if kept.progress.last_refined < kept.progress.last:  # not in their places yet
         take_second_answers(first.folder, session, [look.out for look in job.looks], job.seconds)
-    answers = _answers(first.folder)
-    look = SecondLook(session.result(), session.camera, sorted(answers), session.config.object.landmark_views)
-    for frame in _frames(first.source, first.whole, answers):
-        if answers[frame.index].refined and look.wants(frame.index):
-            look.see(answers[frame.index], frame.image, _mask(first.folder, answers[frame.index], frame))
+    estimates = _estimates(first.folder, session.camera)
+    most = session.config.object.landmark_views
+    last = LastPasses(estimates, SecondLook(session.result(), session.camera, sorted(estimates.causal), most))
+    for frame in _frames(first.source, first.whole, estimates):
+        last.collect(frame)
     with shared_among(cv2.getNumThreads()):
-        look.settle()
-    return look
+        last.adjust_all()
+    return last.look
 
 
 def place(tell: Tell, job: Placing) -> list[FrameRecord]:
-    """The answers for some frames with the poses that they have in the end.
+    """The estimates of some frames with their adjusted poses.
 
     Raises:
         Tracking3dError: If something cannot be read.
     """
-    folder = job.job.folder
-    answers = _answers(folder)
-    return [
-        placed(answers[frame.index], job.look, frame.image, _mask(folder, answers[frame.index], frame))
-        for frame in _frames(job.job.source, job.job.selection, answers)
-    ]
+    estimates = _estimates(job.job.folder, job.look.camera)
+    last = LastPasses(estimates, job.look)
+    return [last.adjusted(frame) for frame in _frames(job.job.source, job.job.selection, estimates)]
 
 
-def put_together(tell: Tell, job: Weighing) -> SecondMasks:
-    """What all masks say together.
+def put_together(tell: Tell, job: Weighing) -> Hindsight:
+    """What the masks of all frames have in common.
 
     Raises:
         Tracking3dError: If something cannot be read.
     """
-    answers = job.answers
-    before = _answers(job.job.folder)  # which masks are believed is decided before poses are put right
-    masks = SecondMasks(
-        job.look.camera, job.look.vertices_of_landmarks, job.look.faces, list(before.values())
-    )
-    for frame in _frames(job.job.source, job.job.whole, answers):
-        if masks.wants(frame.index):
-            masks.see(_masked(job.job.folder, answers[frame.index], frame))
-    masks.settle()
-    return masks
+    estimates = _estimates(job.job.folder, job.look.camera)
+    last = LastPasses(estimates, job.look)
+    last.begin_masks()  # before poses are adjusted, as in one process
+    for record in job.estimates.values():
+        estimates.put(record)
+    for frame in _frames(job.job.source, job.job.whole, estimates):
+        last.collect_mask(frame)
+    last.settle_masks()
+    assert last.masks is not None
+    return last.masks
 
 
 def weigh(tell: Tell, job: Weighing) -> dict[int, bytes]:
-    """The masks that some frames have in the end, as PNG files, by index; those that stand are left out.
+    """The final masks of some frames, as PNG files, by index; those that stand are left out.
 
     Raises:
         Tracking3dError: If something cannot be read, or a probability not be written.
     """
-    assert job.masks is not None
     folder, own, found = job.job.folder, parse_selection(job.job.selection), dict[int, bytes]()
-    likely = (folder / layout.PROBABILITIES).is_dir()
-    for masked, decided in _decisions(job, job.masks, own):
-        index = masked.frame.index
-        if decided is not None and index in own:
-            found[index] = mask_file(decided.mask)
-            if likely:
-                write_probability(folder / layout.REFINING, index, decided.probability)
+    estimates = _estimates(folder, job.look.camera)
+    for record in job.estimates.values():
+        estimates.put(record)
+    for frame, decided in _decisions(job, estimates, own):
+        if decided is not None and frame.index in own:
+            found[frame.index] = mask_file(decided.mask)
+            if estimates.writes_probabilities:
+                write_probability(folder / layout.REFINING, frame.index, decided.probability)
     return found
 
 
-def _decisions(job: Weighing, masks: SecondMasks, own: range) -> Iterator[Decision]:
+def _decisions(job: Weighing, estimates: RefinedEstimates, own: range) -> Iterator[Decision]:
     """Those of a part's frames, and of the frames before and after that tell their motion."""
+    last = LastPasses(estimates, job.look, job.masks)
     reach = 2 * REACH * own.step
     whole = parse_selection(job.job.whole)
     start, stop = max(own.start - reach, whole.start), min(own.stop + reach, whole.stop)
-    for frame in _frames(job.job.source, f"{start}:{stop}:{own.step}", job.answers):
-        yield from masks.decide(_masked(job.job.folder, job.answers[frame.index], frame))
-    yield from masks.rest()
+    for frame in _frames(job.job.source, f"{start}:{stop}:{own.step}", estimates):
+        yield from last.decide(frame)
+    yield from last.rest()
 
 
-def _frames(source: str, selection: str | None, answers: Answers) -> Iterator[Frame]:
+def _estimates(folder: Path, camera: Camera) -> RefinedEstimates:
+    return RefinedEstimates.of_folder(folder, (camera.height, camera.width))
+
+
+def _frames(source: str, selection: str | None, estimates: RefinedEstimates) -> Iterator[Frame]:
+    """The frames that have an estimate."""
     with closing(read_ahead(open_source(source, selection))) as frames:
         for frame in frames:
-            if isinstance(frame, Frame) and frame.index in answers:
+            if isinstance(frame, Frame) and frame.index in estimates.causal:
                 yield frame
-
-
-def _answers(folder: Path) -> dict[int, FrameRecord]:
-    """The second answer of every frame, or the causal one where there is none."""
-    causal = {one.index: one for one in RunReader(folder, refined=False).frames}
-    return causal | {one.index: one for one in read_records(folder / layout.REFINING / layout.FRAMES)}
-
-
-def _masked(folder: Path, answer: FrameRecord, frame: Frame) -> Masked:
-    initial = read_mask(layout.initial_mask_path(folder, frame.index))
-    return Masked(frame, answer, initial, _mask(folder, answer, frame))
-
-
-def _mask(folder: Path, answer: FrameRecord, frame: Frame) -> NDArray[np.bool_]:
-    mask = read_mask(layout.mask_path(folder / layout.REFINING if answer.refined else folder, frame.index))
-    return np.zeros(frame.size, bool) if mask is None else mask

@@ -10,8 +10,8 @@ from typing import Any
 from tracking3d.config.models import PipelineConfig
 from tracking3d.config.solvers import OnlineConfig
 from tracking3d.errors import InputError
+from tracking3d.prompts import PromptSet
 from tracking3d.splitting.cutting import parse_length
-from tracking3d.splitting.part_runs import Given
 from tracking3d.video.selection import parse_selection
 from tracking3d.video.source import FrameSource
 
@@ -26,7 +26,7 @@ class LongVideo:
         source: A video file, or a folder or pattern of images.
         config: The pipeline; of the solver ``online``, with its final refinement.
         folder: The run folder.
-        given: What the object is in the first frame.
+        prompts: What the object is in the first frame.
         length: Of a part, in seconds or frames, see `parse_length`.
         workers: Processes at a time, for the record.
         selection: ``START:STOP:STEP`` of the frames.
@@ -38,7 +38,7 @@ class LongVideo:
     source: str
     config: PipelineConfig
     folder: Path
-    given: Given
+    prompts: PromptSet
     length: str
     workers: int = 2
     selection: str | None = None
@@ -58,7 +58,7 @@ class LongVideo:
 
 
 @dataclass(frozen=True)
-class Ended:
+class SplitResult:
     """What became of a video that was to be split.
 
     Attributes:

@@ -57,7 +57,7 @@ def in_space(
     return replace(known, keyframes=keyframes)
 
 
-def joined(beliefs: Sequence[Belief], similarities: Sequence[Similarity], config: OnlineConfig,
+def merge_states(beliefs: Sequence[Belief], similarities: Sequence[Similarity], config: OnlineConfig,
            encoder: FeatureEncoder) -> Belief:  # fmt: skip
     """What several parts know as one belief, poses, landmarks and shape refined together.
 

@@ -6,47 +6,31 @@ What is here runs in processes of its own.
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tracking3d.checkpoint.folder import Checkpoint
 from tracking3d.checkpoint.progress import Kept
 from tracking3d.config.models import PipelineConfig
-from tracking3d.errors import PluginError
-from tracking3d.frames import Box, Frame, MaskEstimate
-from tracking3d.passes import timed
-from tracking3d.prompts import make_prompt
-from tracking3d.recording import first_frame, record
+from tracking3d.frame_reading import read_timed
+from tracking3d.frames import Frame, MaskEstimate
+from tracking3d.last_passes import estimate_again
+from tracking3d.open_tracking import open_tracking, request_tracking
+from tracking3d.prompts import PromptSet
+from tracking3d.recording import RecordOptions, record_tracking
 from tracking3d.results import layout
-from tracking3d.results.files import read_mask, write_mask, writing
-from tracking3d.results.probabilities import write_probability
+from tracking3d.results.files import read_mask, writing
 from tracking3d.results.records import FrameRecord
+from tracking3d.results.refined_estimates import write_refined
 from tracking3d.results.run_reader import RunReader
 from tracking3d.session import Session
-from tracking3d.stages import measured
 from tracking3d.video import open_source
 from tracking3d.video.source import FrameSource
 
 Tell = Callable[[Any], None]
-
-
-@dataclass(frozen=True, eq=False)
-class Given:
-    """What the object is in a first frame; nothing where the mask tracker knows. See `tracking3d.recording.record`."""
-
-    box: Box | None = None
-    mask: NDArray[np.bool_] | Path | None = None
-    points: Any = None
-
-    @property
-    def untold(self) -> bool:
-        """Whether nothing is said."""
-        return self.box is None and self.mask is None and self.points is None
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +42,7 @@ class PartJob:
         selection: Frames of the part, ``START:STOP:STEP``.
         config: The pipeline.
         folder: The part's run folder.
-        given: What the object is in its first frame.
+        prompts: What the object is in its first frame.
         command: For the record.
         resume: Go on with what is there.
         first_pass_only: Stop when every frame has its causal answer.
@@ -68,7 +52,7 @@ class PartJob:
     selection: str
     config: PipelineConfig
     folder: Path
-    given: Given
+    prompts: PromptSet
     command: str | None = None
     resume: bool = False
     first_pass_only: bool = True
@@ -78,26 +62,16 @@ def track_part(tell: Tell, job: PartJob) -> None:
     """Track one part; ``tell`` is given each frame's record.
 
     Raises:
-        Tracking3dError: See `record`.
+        Tracking3dError: See `record_tracking`.
     """
     source = open_source(job.source, job.selection)
     if job.resume and job.first_pass_only and is_tracked(job.folder, source):
         return
-    record(
-        source,
-        job.config,
-        job.folder,
-        box=job.given.box,
-        mask=job.given.mask,
-        points=job.given.points,
-        command=job.command,
-        selection=job.selection,
-        overwrite=not job.resume,
-        resume=job.resume,
-        skip_damaged=True,
-        first_pass_only=job.first_pass_only,
-        listener=tell,
+    request = request_tracking(source, job.config, job.prompts, skip_damaged=True)
+    options = RecordOptions(
+        job.command, job.selection, not job.resume, job.resume, first_pass_only=job.first_pass_only
     )
+    record_tracking(request, job.folder, options, tell)
 
 
 def is_tracked(folder: Path, source: FrameSource) -> bool:
@@ -106,18 +80,6 @@ def is_tracked(folder: Path, source: FrameSource) -> bool:
         return False
     run = RunReader(folder, refined=False)
     return len(run.frames) + len(run.description["skipped"]) == source.count
-
-
-def begin_session(source: FrameSource, config: PipelineConfig, given: Given) -> tuple[Frame, Session]:
-    """The first frame of a video, and a session for its object that has seen nothing yet.
-
-    Raises:
-        Tracking3dError: If there is no such frame, the object cannot be in it, or a plug-in is broken.
-    """
-    with closing(timed(source)) as frames:
-        _, first = first_frame(frames, source.name, skip_damaged=True)
-    prompt = None if given.untold else make_prompt(first, given.box, given.mask, points=given.points)
-    return first, Session(config, prompt, source.intrinsics, source.intrinsics_origin)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +92,7 @@ class Revisit:
         selection: The frames that are looked at.
         config: The pipeline.
         folder: The joined run's.
-        given: What the object is in the video's first frame.
+        prompts: What the object is in the video's first frame.
         out: Folder that gets ``masks/`` and ``frames.jsonl`` of the second answers.
     """
 
@@ -139,7 +101,7 @@ class Revisit:
     selection: str
     config: PipelineConfig
     folder: Path
-    given: Given
+    prompts: PromptSet
     out: Path
 
 
@@ -158,7 +120,7 @@ def look_again(tell: Tell, job: Revisit) -> int:
         (job.out / layout.MASKS).mkdir(parents=True, exist_ok=True)
     answered = 0
     with (job.out / layout.FRAMES).open("wb") as lines:
-        for frame in timed(open_source(job.source, job.selection)):
+        for frame in read_timed(open_source(job.source, job.selection)):
             if not isinstance(frame, Frame) or frame.index not in causal:
                 continue
             record_ = _second_answer(session, job, kept, frame, causal[frame.index])
@@ -176,7 +138,9 @@ def resumed(job: Revisit) -> tuple[Kept, Session]:
     Raises:
         Tracking3dError: If it cannot be read.
     """
-    first, session = begin_session(open_source(job.source, job.whole), job.config, job.given)
+    request = request_tracking(open_source(job.source, job.whole), job.config, job.prompts, skip_damaged=True)
+    with open_tracking(request) as opened:
+        first, session = opened.first, opened.objects[0].session
     kept = Checkpoint(job.folder, session.state_classes, job.config.runtime.device).read()
     failures = {index: frame.failure for index, frame in kept.taken.items() if frame.failure}
     session.resume(first, kept.session, failures)
@@ -190,16 +154,8 @@ def _second_answer(
     mask = read_mask(layout.initial_mask_path(job.folder, frame.index))
     taken = kept.taken[frame.index]
     initial = MaskEstimate(None if mask is None else mask.astype(np.float32), taken.score, taken.reason)
-    try:
-        estimate = session.revisit(frame, initial, causal.T_cam_obj)
-    except PluginError:
-        if job.config.runtime.on_plugin_failure == "stop":
-            raise
+    estimate = estimate_again(session, frame, causal, initial)
+    if estimate is None:
         return None
-    with measured("write") as watch:
-        estimate = replace(estimate, refined=True, keyframe=estimate.keyframe or causal.keyframe)
-        record_ = FrameRecord.of(estimate, frame.name, mask, revision=True)
-        write_mask(layout.mask_path(job.out, frame.index), estimate.mask)
-        if (job.folder / layout.PROBABILITIES).is_dir():
-            write_probability(job.out, frame.index, estimate.probability)
-    return record_.and_wrote(watch.times.write)
+    probabilities = (job.folder / layout.PROBABILITIES).is_dir()
+    return write_refined(job.out, estimate, frame, causal, mask, probabilities)

@@ -14,12 +14,12 @@ from tracking3d.checkpoint.resuming import given_of
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, Prompt
+from tracking3d.prompts import PromptSet
 from tracking3d.results import layout
 from tracking3d.results.files import read_mask, write_atomic, write_mask, writing
 from tracking3d.results.records import jsonable
 from tracking3d.splitting.cutting import Part, cuts_in, overlap_of, parts_at, windows
 from tracking3d.splitting.looking_ahead import full_size, look_ahead, tracker_for_looking
-from tracking3d.splitting.part_runs import Given
 from tracking3d.video.source import FrameSource
 
 PARTS = "parts"
@@ -53,11 +53,11 @@ def part_folder(folder: Path, part: Part) -> Path:
     return folder / PARTS / f"part_{part.number}"
 
 
-def given_at(folder: Path, part: Part, given: Given, precomputed: bool) -> Given:
+def prompts_at(folder: Path, part: Part, prompts: PromptSet, precomputed: bool) -> PromptSet:
     """What the object is in a part's first frame."""
     if part.number == 0 or precomputed:
-        return given
-    return Given(mask=_cut_mask(folder, part))
+        return prompts
+    return PromptSet.of_one(mask=_cut_mask(folder, part))
 
 
 def make_plan(

@@ -17,7 +17,7 @@ Tell = Callable[[Any], None]
 """Takes whatever can be pickled to who waits for the job."""
 
 
-def side_by_side(
+def run_in_processes(
     function: Callable[[Tell, Job], Result],
     jobs: Sequence[Job],
     workers: int,

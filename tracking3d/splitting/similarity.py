@@ -31,7 +31,7 @@ _FLOOR = 1e-3  # of the median distance, so that no single row takes all the wei
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class SimilarityFit:
     """A similarity and how well it is told.
 
     Attributes:
@@ -51,7 +51,7 @@ class Fit:
 
 def fit_similarity(
     T_cam_first: Array, T_cam_second: Array, x_first: Array | None = None, x_second: Array | None = None
-) -> Fit:
+) -> SimilarityFit:
     """The similarity that explains two runs' poses of the same frames best.
 
     Args:
@@ -87,7 +87,7 @@ def fit_similarity(
     moved = similarity.poses(T_cam_second)
     distances = np.linalg.norm(moved[:, :3, 3] - t_first, axis=1)
     scale_error = float(np.sqrt(spread[3, 3]) / max(abs(similarity.scale), 1e-12))
-    return Fit(similarity, angles, distances, scale_error, float(np.sqrt(np.trace(spread[:3, :3]))))
+    return SimilarityFit(similarity, angles, distances, scale_error, float(np.sqrt(np.trace(spread[:3, :3]))))
 
 
 def _least_distances(rows: Array, values: Array, weight: Array) -> tuple[Array, Array]:

@@ -10,22 +10,22 @@ from typing import Any
 from tracking3d.config.models import PipelineConfig
 from tracking3d.frames import SkippedFrame
 from tracking3d.passes import Listener
+from tracking3d.prompts import PromptSet
 from tracking3d.results.records import FrameRecord
 from tracking3d.splitting.beginning import begin
-from tracking3d.splitting.long_video import Ended, LongVideo
-from tracking3d.splitting.part_runs import Given
-from tracking3d.splitting.processes import side_by_side
+from tracking3d.splitting.long_video import LongVideo, SplitResult
+from tracking3d.splitting.processes import run_in_processes
 from tracking3d.splitting.steps import Step, steps_of
 
 SideBySide = Callable[..., list[Any]]
-"""See `side_by_side`."""
+"""See `run_in_processes`."""
 
 
 def record_in_parts(
     source: str | Path,
     config: PipelineConfig,
     folder: Path,
-    given: Given,
+    prompts: PromptSet,
     *,
     length: str,
     workers: int = 2,
@@ -35,7 +35,7 @@ def record_in_parts(
     resume: bool = False,
     listener: Listener = lambda frame: None,
     map_jobs: SideBySide | None = None,
-) -> Ended:
+) -> SplitResult:
     """Track a long video in parts, side by side, and write one run folder; see the module.
 
     Parts that cannot be joined are finished each by itself, in folders within ``folder``. What there is only one of is
@@ -45,7 +45,7 @@ def record_in_parts(
         source: A video file, or a folder or pattern of images.
         config: The pipeline; of the solver ``online``, with its final refinement.
         folder: The run folder.
-        given: What the object is in the first frame.
+        prompts: What the object is in the first frame.
         length: Of a part, in seconds or frames, see `tracking3d.splitting.cutting.parse_length`.
         workers: Processes at a time.
         selection: ``START:STOP:STEP`` of the frames.
@@ -53,18 +53,18 @@ def record_in_parts(
         overwrite: Replace a run that is in the folder.
         resume: Go on with what is there.
         listener: Is told of every answer, the first ones and those of the refinement.
-        map_jobs: What takes the place of `side_by_side` with so many workers.
+        map_jobs: What takes the place of `run_in_processes` with so many workers.
 
     Raises:
         InputError: If the video cannot be split, or what is there is of something else.
         Tracking3dError: What was finished until then is kept, for ``resume``.
     """
     video = LongVideo(
-        str(source), config, folder, given, length, workers, selection, command, overwrite, resume
+        str(source), config, folder, prompts, length, workers, selection, command, overwrite, resume
     )
-    told, map_jobs = _once(listener), map_jobs or partial(side_by_side, workers=workers)
+    told, map_jobs = _once(listener), map_jobs or partial(run_in_processes, workers=workers)
     begun = begin(told, video)
-    if isinstance(begun, Ended):
+    if isinstance(begun, SplitResult):
         return begun
     steps = steps_of(begun)
     answers: list[Any] | None = None
@@ -72,7 +72,7 @@ def record_in_parts(
         try:
             wanted = next(steps) if answers is None else steps.send(answers)
         except StopIteration as stop:
-            ended: Ended = stop.value
+            ended: SplitResult = stop.value
             return ended
         answers = map_jobs(take_step, wanted, told=told)
 

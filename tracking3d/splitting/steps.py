@@ -7,11 +7,11 @@ from collections.abc import Callable, Generator
 from dataclasses import dataclass, replace
 from typing import Any
 
-from tracking3d.last_passes import Foreseen
+from tracking3d.last_passes import PrecomputedRefinement
 from tracking3d.splitting.beginning import Begun
 from tracking3d.splitting.ending import Again, Ending, Joined, Refused, Tracked, end, join
 from tracking3d.splitting.last_looks import Placing, Settling, Weighing, place, put_together, settle, weigh
-from tracking3d.splitting.long_video import Ended
+from tracking3d.splitting.long_video import SplitResult
 from tracking3d.splitting.part_runs import PartJob, Revisit, look_again, track_part
 
 
@@ -32,7 +32,7 @@ class Step:
     frames: int = 0
 
 
-Steps = Generator[list[Step], list[Any], Ended]
+Steps = Generator[list[Step], list[Any], SplitResult]
 """Gives steps that may be done side by side, and is sent what they returned, in their order."""
 
 
@@ -54,7 +54,7 @@ def steps_of(begun: Begun) -> Steps:
     if isinstance(found, Refused):
         whole = [replace(job, resume=True, first_pass_only=False) for job in jobs]
         yield [Step(track_part, job, f"end of part {number} of {of}") for number, job in enumerate(whole, 1)]
-        return Ended(tuple(job.folder for job in jobs), of, found.reason)
+        return SplitResult(tuple(job.folder for job in jobs), of, found.reason)
     assert isinstance(found, Joined)
     clock = time.monotonic()
     looks = found.looks
@@ -64,17 +64,19 @@ def steps_of(begun: Begun) -> Steps:
     ]
     seconds = {**found.seconds, "second_look": time.monotonic() - clock}
     yield from steps_to_the_end(replace(found, seconds=seconds))
-    return Ended((begun.video.folder,), of)
+    return SplitResult((begun.video.folder,), of)
 
 
 def steps_to_the_end(joined: Joined) -> Generator[list[Step], list[Any], None]:
     """What is left to be done when all frames of a joined run were looked at again."""
-    foreseen, seconds = yield from _last_looks(joined)
+    precomputed, seconds = yield from _last_looks(joined)
     joined = replace(joined, seconds={**joined.seconds, **seconds})
-    yield [Step(end, Ending(joined, foreseen), "its end")]
+    yield [Step(end, Ending(joined, precomputed), "its end")]
 
 
-def _last_looks(joined: Joined) -> Generator[list[Step], list[Any], tuple[Foreseen, dict[str, float]]]:
+def _last_looks(
+    joined: Joined,
+) -> Generator[list[Step], list[Any], tuple[PrecomputedRefinement, dict[str, float]]]:
     """What becomes of the frames, and the seconds of each step."""
     looks, of, clock = joined.looks, len(joined.looks), time.monotonic()
     refined = joined.seconds["refine"] + joined.seconds["second_look"]
@@ -83,19 +85,20 @@ def _last_looks(joined: Joined) -> Generator[list[Step], list[Any], tuple[Forese
     placed = yield [
         Step(place, Placing(job, look), f"poses {number} of {of}") for number, job in enumerate(looks, 1)
     ]
-    answers = {answer.index: answer for part in placed for answer in part}
+    estimates = {record.index: record for part in placed for record in part}
     seconds = {"settle": settled - clock, "poses": time.monotonic() - settled}
     if not joined.begun.config.object.evidence:
-        return Foreseen(look, answers, {}), seconds
+        return PrecomputedRefinement(look, estimates, {}), seconds
     clock = time.monotonic()
-    weighing = Weighing(looks[0], answers, look)
+    weighing = Weighing(looks[0], estimates, look)
     [masks] = yield [Step(put_together, weighing, "what its masks say together")]
     decided = yield [
         Step(weigh, replace(weighing, job=job, masks=masks), f"masks {number} of {of}")
         for number, job in enumerate(looks, 1)
     ]
     pictures = {index: mask for part in decided for index, mask in part.items()}
-    return Foreseen(look, answers, pictures), {**seconds, "masks": time.monotonic() - clock}
+    masks_took = time.monotonic() - clock
+    return PrecomputedRefinement(look, estimates, pictures), {**seconds, "masks": masks_took}
 
 
 def _frames(job: PartJob | Revisit) -> int:

@@ -19,11 +19,11 @@ from tracking3d.datasets.clip import write_clip
 from tracking3d.frames import Box
 from tracking3d.geometry.camera import DEFAULT_FIELD_OF_VIEW, Camera
 from tracking3d.results.files import write_mask, writing
-from tracking3d.synthesis.convex_drawing import draw
-from tracking3d.synthesis.convex_raycast import Ellipsoid, Polyhedron, Surface
+from tracking3d.synthesis.convex_drawing import draw_convex
+from tracking3d.synthesis.convex_raycast import ConvexSurface, Ellipsoid, Polyhedron
 from tracking3d.synthesis.procedural_texture import paint_background, paint_panel
 
-SURFACES: dict[str, Surface] = {
+SURFACES: dict[str, ConvexSurface] = {
     "box": Polyhedron.box((0.62, 0.48, 0.56)),
     "chamfered_box": Polyhedron.box((0.62, 0.48, 0.56), chamfer=0.25),
     "ellipsoid": Ellipsoid(np.array([0.95, 0.7, 0.6])),
@@ -80,7 +80,7 @@ class SyntheticClip:
     masks: NDArray[np.bool_]
     T_cam_obj: NDArray[np.float64]
     camera: Camera
-    surface: Surface
+    surface: ConvexSurface
 
     @property
     def K(self) -> NDArray[np.float64]:
@@ -112,7 +112,7 @@ def synthesize(spec: SyntheticSpec) -> SyntheticClip:
     images = np.empty((spec.frames, height, width, 3), np.uint8)
     masks = np.empty((spec.frames, height, width), bool)
     for n, pose in enumerate(poses):
-        image, masks[n] = draw(pose, camera, surface, panels, background, spec.supersample)
+        image, masks[n] = draw_convex(pose, camera, surface, panels, background, spec.supersample)
         noisy = image + spec.noise * rng.standard_normal(image.shape, dtype=np.float32)
         images[n] = np.clip(noisy.round(), 0, 255).astype(np.uint8)
     return SyntheticClip(images, masks, poses, camera, surface)

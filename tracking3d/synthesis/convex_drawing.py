@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.geometry.camera import Camera
-from tracking3d.synthesis.convex_raycast import Surface
+from tracking3d.synthesis.convex_raycast import ConvexSurface
 from tracking3d.synthesis.procedural_texture import FloatImage, sample_panels
 
 LIGHT = np.array([-0.45, -0.7, -0.55]) / np.linalg.norm([-0.45, -0.7, -0.55])
@@ -16,10 +16,10 @@ AMBIENT, DIFFUSE = 0.6, 0.5
 """Share of a colour that is seen in the shade, and what facing the light adds."""
 
 
-def draw(
+def draw_convex(
     pose: NDArray[np.float64],
     camera: Camera,
-    surface: Surface,
+    surface: ConvexSurface,
     panels: FloatImage,
     background: FloatImage,
     supersample: int,

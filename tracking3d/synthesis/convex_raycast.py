@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Hits:
+class ConvexHits:
     """Where N rays meet a surface.
 
     Attributes:
@@ -36,7 +36,7 @@ class Hits:
     uv: Array
 
 
-class Surface(Protocol):
+class ConvexSurface(Protocol):
     """A closed convex surface around the origin, covered by texture panels."""
 
     @property
@@ -49,7 +49,7 @@ class Surface(Protocol):
         """Radius of a sphere around the origin which encloses the surface."""
         ...
 
-    def cast(self, origin: Array, directions: Array) -> Hits:
+    def cast(self, origin: Array, directions: Array) -> ConvexHits:
         """First hits of rays from ``origin`` ``(3,)``, which is outside, along ``directions`` ``(N, 3)``."""
         ...
 
@@ -88,8 +88,8 @@ class Polyhedron:
         """Number of texture panels: one per plane."""
         return len(self.offsets)
 
-    def cast(self, origin: Array, directions: Array) -> Hits:
-        """See `Surface.cast`: a ray enters by the last plane facing ``origin``, if not out by another yet."""
+    def cast(self, origin: Array, directions: Array) -> ConvexHits:
+        """See `ConvexSurface.cast`: a ray enters by the last plane facing ``origin``, if not out by another yet."""
         slope = self.normals @ directions.T
         room = self.offsets - self.normals @ origin
         facing = np.flatnonzero(room < 0)
@@ -103,7 +103,7 @@ class Polyhedron:
         hit = distance < leave.min(axis=0)
         points = origin + np.where(hit, distance, 0.0)[:, None] * directions
         uv = np.einsum("nij,nj->ni", _tangents(self.normals)[panel], points) / (2 * self.radius) + 0.5
-        return Hits(hit, distance, points, self.normals[panel], panel, uv)
+        return ConvexHits(hit, distance, points, self.normals[panel], panel, uv)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,8 +123,8 @@ class Ellipsoid:
         """The longest half axis."""
         return float(np.max(self.radii))
 
-    def cast(self, origin: Array, directions: Array) -> Hits:
-        """See `Surface.cast`: the smaller root of a quadratic, where this is the unit sphere."""
+    def cast(self, origin: Array, directions: Array) -> ConvexHits:
+        """See `ConvexSurface.cast`: the smaller root of a quadratic, where this is the unit sphere."""
         o, d = origin / self.radii, directions / self.radii
         a, b, c = (d * d).sum(axis=1), d @ o, o @ o - 1
         discriminant = b * b - a * c
@@ -136,7 +136,7 @@ class Ellipsoid:
         main = np.take_along_axis(unit, axis[:, None], axis=1)
         others = np.array([[1, 2], [0, 2], [0, 1]])[axis]
         uv = np.take_along_axis(unit, others, axis=1) / (2 * main) + 0.5
-        return Hits(
+        return ConvexHits(
             hit,
             distance,
             unit * self.radii,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from tracking3d.synthesis.camera_effects import exposed, linear
 from tracking3d.synthesis.lighting import Lamp, lamp_at, shaded
 from tracking3d.synthesis.pixel_rays import pixels_around, ray_directions
-from tracking3d.synthesis.ray_casting import Hits, Surface
+from tracking3d.synthesis.ray_casting import MeshHits, RayMesh
 from tracking3d.synthesis.room_rendering import room_light
 from tracking3d.synthesis.scene import Scene
 from tracking3d.synthesis.texture_lookup import bilinear
@@ -50,7 +50,7 @@ class _Sight:
     depth: Array
     points: Array
     normals: Array
-    hits: Hits
+    hits: MeshHits
     T: Array
 
 
@@ -129,14 +129,14 @@ def _sample(
     return light, depth, front
 
 
-def _look(scene: Scene, surface: Surface, T: Array, offset: Array) -> _Sight:
+def _look(scene: Scene, surface: RayMesh, T: Array, offset: Array) -> _Sight:
     """Cast one ray a pixel at a solid of pose ``T`` ``(4, 4)``."""
     columns, rows = pixels_around(surface.vertices, T, scene.camera)
     directions = ray_directions(scene.camera, columns + offset[0], rows + offset[1])
     R, t = T[:3, :3], T[:3, 3]
     hits = surface.cast(np.tile(-R.T @ t, (len(directions), 1)), directions @ R)
     hit = (hits.face >= 0) & (hits.distance > 0)
-    hits = Hits(hits.face[hit], hits.distance[hit], hits.weights[hit])
+    hits = MeshHits(hits.face[hit], hits.distance[hit], hits.weights[hit])
     points = hits.distance[:, None] * directions[hit]
     normals = surface.normals(hits.face, hits.weights) @ R.T
     # Surfaces without inside and outside show their colour on both sides.
@@ -145,7 +145,7 @@ def _look(scene: Scene, surface: Surface, T: Array, offset: Array) -> _Sight:
     return _Sight((rows[hit], columns[hit]), hits.distance, points, normals, hits, T)
 
 
-def _shadowed(surface: Surface, T: Array, seen: _Sight, source: Array, lift: float) -> NDArray[np.bool_]:
+def _shadowed(surface: RayMesh, T: Array, seen: _Sight, source: Array, lift: float) -> NDArray[np.bool_]:
     """Whether a solid of pose ``T`` is between the points and a point of the lamp."""
     origins = seen.points + lift * seen.normals
     towards = source - origins
@@ -156,7 +156,7 @@ def _shadowed(surface: Surface, T: Array, seen: _Sight, source: Array, lift: flo
     return shadowed
 
 
-def _albedo(scene: Scene, hits: Hits) -> Array:
+def _albedo(scene: Scene, hits: MeshHits) -> Array:
     """Linear colours ``(N, 3)`` of points of the object."""
     corners = scene.surface.faces[hits.face]
     if scene.texture is None or scene.solid.uvs is None:

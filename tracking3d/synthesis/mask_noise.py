@@ -45,7 +45,7 @@ def noisy_boundaries(masks: Masks, pixels: float, seed: int) -> Masks:
     noisy = masks.copy()
     for n in range(1, len(masks)):
         shift = gaussian_filter(rng.standard_normal(masks.shape[1:]), _CORRELATION * pixels, mode="wrap")
-        noisy[n] = signed_distance(masks[n]) > pixels * shift / shift.std() if masks[n].any() else False
+        noisy[n] = boundary_distance(masks[n]) > pixels * shift / shift.std() if masks[n].any() else False
     return noisy
 
 
@@ -70,7 +70,7 @@ def with_hand(masks: Masks, seed: int) -> Masks:
     return biased
 
 
-def signed_distance(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+def boundary_distance(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Distance ``(H, W)`` in pixels of every pixel's centre to the boundary of a mask ``(H, W)``, positive inside."""
     inside, outside = (cv2.distanceTransform(part.astype(np.uint8), cv2.DIST_L2, 5) for part in (mask, ~mask))
     # Pixel centres next to the boundary are half a pixel away from it, not one.

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from tracking3d.geometry.camera import Camera
 from tracking3d.synthesis.motions import Path
 from tracking3d.synthesis.pixel_rays import pixels_around, ray_directions
-from tracking3d.synthesis.ray_casting import Surface
+from tracking3d.synthesis.ray_casting import RayMesh
 from tracking3d.synthesis.spec import SequenceSpec
 
 Array = NDArray[np.float64]
@@ -44,7 +44,7 @@ class Hand:
         reach: Distance of the fingertips from the object's centre at their closest, in object radii.
     """
 
-    surface: Surface
+    surface: RayMesh
     path: Path
     radius: float
     angle: float
@@ -72,7 +72,7 @@ class Hand:
         return _SKIN * (1 + 0.06 * waves[:, None])
 
 
-def make_hand(spec: SequenceSpec, path: Path, surface: Surface, radius: float, camera: Camera) -> Hand | None:
+def make_hand(spec: SequenceSpec, path: Path, surface: RayMesh, radius: float, camera: Camera) -> Hand | None:
     """The hand of a sequence, reaching as far over the object as its strength asks for; None at strength 0."""
     strength = spec.disturbances.occluder
     if strength == 0:
@@ -82,7 +82,7 @@ def make_hand(spec: SequenceSpec, path: Path, surface: Surface, radius: float, c
     start = path.T_cam_obj(np.zeros(1))[0, :3, 3]
     # Measured in the image, the hand's unit of length is about the object's radius.
     scale = _NEARNESS * (start[2] - radius) * radius / start[2]
-    solid = Surface.of(_hand_mesh().apply_scale(scale))
+    solid = RayMesh.of(_hand_mesh().apply_scale(scale))
     angle = rng.uniform(0, 2 * math.pi)
     cycles = max(1, round(last / 40))
 
@@ -100,7 +100,7 @@ def make_hand(spec: SequenceSpec, path: Path, surface: Surface, radius: float, c
     return hand(far)
 
 
-def _object_rays(surface: Surface, T_cam_obj: Array, camera: Camera) -> Array:
+def _object_rays(surface: RayMesh, T_cam_obj: Array, camera: Camera) -> Array:
     """Directions ``(N, 3)`` of a coarse grid of rays that meet the object."""
     columns, rows = pixels_around(surface.vertices, T_cam_obj, camera)
     step = max(1, round(math.sqrt(len(columns)) / _GRID))

@@ -89,7 +89,7 @@ def rectangle(x: float, y: float) -> Array:
     return np.array([(-x, -y), (x, -y), (x, y), (-x, y)])
 
 
-def refined(profile: Array, step: float = 0.04) -> Array:
+def subdivide_polyline(profile: Array, step: float = 0.04) -> Array:
     """The same polyline with points at most ``step`` apart."""
     pieces = []
     for start, end in pairwise(profile):

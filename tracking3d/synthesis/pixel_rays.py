@@ -17,7 +17,7 @@ def ray_directions(camera: Camera, x: Array, y: Array) -> Array:
     return np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones(len(x))], axis=1)
 
 
-def project(camera: Camera, points: Array) -> Array:
+def camera_to_pixels(camera: Camera, points: Array) -> Array:
     """Pixels ``(..., 2)`` of points ``(..., 3)`` in camera coordinates; NaN behind the camera."""
     z = np.where(points[..., 2:] > 0, points[..., 2:], np.nan)
     return points[..., :2] / z * (camera.fx, camera.fy) + (camera.cx, camera.cy)
@@ -31,7 +31,7 @@ def pixels_around(
     Every ``step``-th in both directions; all of the image where a part of the bounding box is behind the camera.
     """
     corners = np.array(list(product(*zip(vertices.min(0), vertices.max(0), strict=True))))
-    pixels = project(camera, corners @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3])
+    pixels = camera_to_pixels(camera, corners @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3])
     size = np.array([camera.width, camera.height])
     if np.isnan(pixels).any():
         low, high = np.zeros(2, np.int64), size

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.synthesis.pixel_rays import project
+from tracking3d.synthesis.pixel_rays import camera_to_pixels
 from tracking3d.synthesis.scene import Scene
 
 Array = NDArray[np.float64]
@@ -17,7 +17,7 @@ _SAME = 1e-3  # depth in object radii within which a ray's hit and a point are o
 
 
 @dataclass(frozen=True, eq=False)
-class PointTracks:
+class GroundTruthTracks:
     """N surface points in T frames.
 
     Attributes:
@@ -31,7 +31,7 @@ class PointTracks:
     object_points: Array
 
 
-def track_points(scene: Scene, count: int = 200) -> PointTracks:
+def sample_point_tracks(scene: Scene, count: int = 200) -> GroundTruthTracks:
     """Random points, evenly spread over what is seen of the object in at least one frame.
 
     Fewer than ``count`` only where hardly anything of the object is seen.
@@ -41,7 +41,7 @@ def track_points(scene: Scene, count: int = 200) -> PointTracks:
     tracks = [_in_frame(scene, n, T, points, faces) for n, T in enumerate(scene.T_cam_obj)]
     positions, visible = (np.stack(part) for part in zip(*tracks, strict=True))
     chosen = np.flatnonzero(visible.any(0))[:count]
-    return PointTracks(positions[:, chosen], visible[:, chosen], points[chosen])
+    return GroundTruthTracks(positions[:, chosen], visible[:, chosen], points[chosen])
 
 
 def _on_surface(scene: Scene, count: int, rng: np.random.Generator) -> tuple[Array, NDArray[np.int64]]:
@@ -60,7 +60,7 @@ def _in_frame(
 ) -> tuple[Array, NDArray[np.bool_]]:
     R, t = T[:3, :3], T[:3, 3]
     in_camera = points @ R.T + t
-    pixels = project(scene.camera, in_camera)
+    pixels = camera_to_pixels(scene.camera, in_camera)
     inside = ((pixels >= -0.5) & (pixels < (scene.camera.width - 0.5, scene.camera.height - 0.5))).all(1)
     origin = -R.T @ t
     ahead = np.flatnonzero(inside)  # NaN is not inside

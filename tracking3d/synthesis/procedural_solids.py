@@ -19,8 +19,8 @@ from tracking3d.synthesis.patches import (
     cube_sphere,
     prism,
     rectangle,
-    refined,
     revolved,
+    subdivide_polyline,
     tube,
 )
 from tracking3d.synthesis.procedural_texture import paint_bands, paint_panel, paint_plain
@@ -56,14 +56,14 @@ def bottle(rng: np.random.Generator) -> list[Patch]:
     """A surface of revolution with shoulders, neck and cap."""
     profile = [(0.0, -0.9), (0.33, -0.9), (0.38, -0.84), (0.38, 0.1), (0.36, 0.25), (0.28, 0.4), (0.17, 0.52)]
     profile += [(0.13, 0.62), (0.13, 0.72), (0.18, 0.73), (0.18, 0.93), (0.0, 0.94)]
-    return revolved(refined(np.array(profile)), sectors=2)
+    return revolved(subdivide_polyline(np.array(profile)), sectors=2)
 
 
 def vase(rng: np.random.Generator) -> list[Patch]:
     """A surface of revolution with a belly; its print of bands does not tell how far it has turned."""
     profile = [(0.0, -0.88), (0.3, -0.88), (0.36, -0.8), (0.5, -0.55), (0.58, -0.25), (0.56, 0.05)]
     profile += [(0.44, 0.32), (0.3, 0.5), (0.26, 0.66), (0.34, 0.85), (0.32, 0.9), (0.0, 0.9)]
-    return revolved(refined(np.array(profile)), sectors=2)
+    return revolved(subdivide_polyline(np.array(profile)), sectors=2)
 
 
 def blob(rng: np.random.Generator) -> list[Patch]:
@@ -92,7 +92,7 @@ def mug(rng: np.random.Generator) -> list[Patch]:
         (0.45, -0.5),
         (0.0, -0.52),
     ]
-    body = revolved(refined(np.array(wall)), sectors=2)
+    body = revolved(subdivide_polyline(np.array(wall)), sectors=2)
     angle = np.linspace(-0.58, 0.58, 40) * math.pi
     curve = np.stack([0.5 + 0.32 * np.cos(angle), 0.38 * np.sin(angle), np.zeros_like(angle)], 1)
     handle = tube(curve, 0.075, np.array([0.0, 0.0, 1.0]))

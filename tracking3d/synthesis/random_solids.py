@@ -16,8 +16,8 @@ from tracking3d.synthesis.patches import (
     cube_sphere,
     prism,
     rectangle,
-    refined,
     revolved,
+    subdivide_polyline,
     tube,
 )
 
@@ -120,7 +120,7 @@ def knob(rng: np.random.Generator) -> list[Patch]:
         girth = 0.5 * (1 + 0.25 * np.sin(waves * math.pi * height / half_height + phase))
         profile = np.column_stack([girth, height])
         ends = (0.0, -half_height), (0.0, half_height)
-        body = revolved(refined(np.vstack([ends[0], profile, ends[1]])), sectors=2)
+        body = revolved(subdivide_polyline(np.vstack([ends[0], profile, ends[1]])), sectors=2)
     size = rng.uniform(0.09, 0.15)
     if rng.random() < 0.5:  # at the side, else on top
         middle = 0.5 * float(rng.uniform(-1, 1)) * half_height
@@ -143,7 +143,7 @@ def bowl(rng: np.random.Generator) -> list[Patch]:
         [inner_foot + (inner_rim - inner_foot) * share**power, wall + (depth - wall) * share]
     )
     profile = np.vstack([(0.0, 0.0), outside, inside[::-1], (0.0, wall)])
-    return _fitted(revolved(refined(profile), sectors=2))
+    return _fitted(revolved(subdivide_polyline(profile), sectors=2))
 
 
 _UPRIGHT = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])

@@ -23,7 +23,7 @@ _CREASE = np.cos(np.radians(45.0))
 
 
 @dataclass(frozen=True, eq=False)
-class Hits:
+class MeshHits:
     """What N rays meet first.
 
     Attributes:
@@ -38,7 +38,7 @@ class Hits:
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class RayMesh:
     """A mesh that rays are cast at.
 
     Attributes:
@@ -56,7 +56,7 @@ class Surface:
     intersector: Any
 
     @classmethod
-    def of(cls, mesh: trimesh.Trimesh) -> Surface:
+    def of(cls, mesh: trimesh.Trimesh) -> RayMesh:
         """Prepare a mesh.
 
         Raises:
@@ -80,7 +80,7 @@ class Surface:
             RayMeshIntersector(mesh),
         )
 
-    def cast(self, origins: Array, directions: Array) -> Hits:
+    def cast(self, origins: Array, directions: Array) -> MeshHits:
         """First hits of rays from ``origins`` along ``directions``, both ``(N, 3)``; both sides of a face count."""
         face = np.full(len(origins), -1, np.int64)
         distance = np.full(len(origins), np.inf)
@@ -99,7 +99,7 @@ class Surface:
         # Single precision may give a triangle whose edge the exact ray just misses.
         inside = np.stack([1 - v - w, v, w], 1).clip(0)
         weights[hit] = inside / inside.sum(1, keepdims=True)
-        return Hits(face, distance, weights)
+        return MeshHits(face, distance, weights)
 
     def blocked(self, origins: Array, directions: Array) -> NDArray[np.bool_]:
         """Whether rays, both ``(N, 3)``, meet the mesh at all: ``(N,)``."""

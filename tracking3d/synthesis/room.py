@@ -21,7 +21,7 @@ from tracking3d.synthesis.motions import Path
 from tracking3d.synthesis.patches import Array, Patch, prism, rectangle
 from tracking3d.synthesis.procedural_texture import paint_background, paint_panel
 from tracking3d.synthesis.random_solids import assembly, organic
-from tracking3d.synthesis.ray_casting import Surface
+from tracking3d.synthesis.ray_casting import RayMesh
 from tracking3d.synthesis.solid import Solid
 from tracking3d.synthesis.spec import SequenceSpec
 from tracking3d.synthesis.texture_lookup import pyramid
@@ -49,14 +49,14 @@ class Room:
     T_obj_room: Array
     low: Array
     high: Array
-    furniture: Surface
+    furniture: RayMesh
     uvs: Array
     looks: NDArray[np.int64]
     density: Array
     textures: list[list[NDArray[np.float32]]]
 
 
-def make_room(spec: SequenceSpec, solid: Solid, path: Path) -> Room | None:
+def build_room(spec: SequenceSpec, solid: Solid, path: Path) -> Room | None:
     """The room of a sequence in which the camera walks round the object; None for other motions."""
     if spec.motion != "walk_round":
         return None
@@ -87,7 +87,7 @@ def make_room(spec: SequenceSpec, solid: Solid, path: Path) -> Room | None:
         T_obj_room,
         solid.radius * np.array([-half[0], floor, -half[1]]),
         solid.radius * np.array([half[0], table + rng.uniform(8.2, 9.5), half[1]]),
-        Surface.of(mesh),
+        RayMesh.of(mesh),
         uv,
         look_of_face,
         _density(mesh, uv, np.array([levels[0].shape[0] for levels in textures])[look_of_face]),

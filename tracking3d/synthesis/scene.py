@@ -19,8 +19,8 @@ from tracking3d.synthesis.mesh_files import load_solid
 from tracking3d.synthesis.motions import Path, make_path
 from tracking3d.synthesis.occluder import Hand, make_hand
 from tracking3d.synthesis.procedural_solids import PROCEDURAL, make_procedural_solid
-from tracking3d.synthesis.ray_casting import Surface
-from tracking3d.synthesis.room import Room, make_room
+from tracking3d.synthesis.ray_casting import RayMesh
+from tracking3d.synthesis.room import Room, build_room
 from tracking3d.synthesis.solid import Solid, faded
 from tracking3d.synthesis.spec import SequenceSpec
 
@@ -50,7 +50,7 @@ class Scene:
     camera: Camera
     told_camera: Camera
     solid: Solid
-    surface: Surface
+    surface: RayMesh
     path: Path
     background: NDArray[np.float32]
     hand: Hand | None
@@ -71,13 +71,13 @@ def make_scene(spec: SequenceSpec) -> Scene:
     """
     camera = Camera.from_fov(*spec.size, spec.fov, origin="synthetic")
     solid = make_solid(spec)
-    surface = Surface.of(solid.mesh())
+    surface = RayMesh.of(solid.mesh())
     path = make_path(spec, camera, solid.radius)
     hand = make_hand(spec, path, surface, solid.radius, camera)
     background = linear(make_background(spec))
     texture = _resolved_texture(solid, camera, path, spec.supersample)
     told = _told_camera(spec, camera)
-    room = make_room(spec, solid, path)
+    room = build_room(spec, solid, path)
     return Scene(spec, camera, told, solid, surface, path, background, hand, texture, room)
 
 

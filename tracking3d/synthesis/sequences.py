@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.synthesis.frame_rendering import RenderedFrame, render_frame
-from tracking3d.synthesis.point_tracks import PointTracks, track_points
+from tracking3d.synthesis.point_tracks import GroundTruthTracks, sample_point_tracks
 from tracking3d.synthesis.scene import Scene, make_scene
 from tracking3d.synthesis.spec import SequenceSpec
 
@@ -32,7 +32,7 @@ class RenderedSequence:
     masks: NDArray[np.bool_]
     visible_masks: NDArray[np.bool_]
     depth: NDArray[np.float32]
-    points: PointTracks
+    points: GroundTruthTracks
 
 
 def render_frames(scene: Scene) -> Iterator[RenderedFrame]:
@@ -55,5 +55,5 @@ def render_sequence(spec: SequenceSpec) -> RenderedSequence:
         np.stack([frame.mask for frame in frames]),
         np.stack([frame.visible_mask for frame in frames]),
         np.stack([frame.depth for frame in frames]),
-        track_points(scene),
+        sample_point_tracks(scene),
     )

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from tracking3d.config.explain import describe
+from tracking3d.config.explain import describe_validation_error
 from tracking3d.config.models import Section
 from tracking3d.errors import InputError
 
@@ -138,4 +138,4 @@ def check_spec(settings: Mapping[str, Any], origin: str) -> SequenceSpec:
     try:
         return SequenceSpec.model_validate(settings)
     except ValidationError as error:
-        raise InputError(f"{origin}: {describe(error, SequenceSpec)}") from error
+        raise InputError(f"{origin}: {describe_validation_error(error, SequenceSpec)}") from error

@@ -22,7 +22,7 @@ from tracking3d.results.files import write_atomic, write_image, write_mask, writ
 from tracking3d.results.layout import partial_path
 from tracking3d.synthesis.camera_effects import compressed
 from tracking3d.synthesis.frame_rendering import RenderedFrame, render_frame
-from tracking3d.synthesis.point_tracks import PointTracks, track_points
+from tracking3d.synthesis.point_tracks import GroundTruthTracks, sample_point_tracks
 from tracking3d.synthesis.scene import Scene, make_scene
 from tracking3d.synthesis.solid import Solid
 from tracking3d.synthesis.spec import SequenceSpec
@@ -82,7 +82,7 @@ def write_sequence(
         box = box or list(cv2.boundingRect(frame.visible_mask.astype(np.uint8)))
         _write_frame(partial, f"{n:06d}", frame, spec, scale)
         listener(n)
-    _write_points(partial, track_points(scene))
+    _write_points(partial, sample_point_tracks(scene))
     _write_mesh(partial, scene.solid)
     for name, document in _documents(scene, box, scale).items():
         write_atomic(partial / name, json.dumps(document, indent=1).encode() + b"\n")
@@ -118,7 +118,7 @@ def _write_frame(folder: Path, name: str, frame: RenderedFrame, spec: SequenceSp
     write_atomic(folder / "depth" / f"{name}.png", cv2.imencode(".png", counts)[1].tobytes())
 
 
-def _write_points(folder: Path, tracks: PointTracks) -> None:
+def _write_points(folder: Path, tracks: GroundTruthTracks) -> None:
     arrays = io.BytesIO()
     np.savez_compressed(
         arrays,

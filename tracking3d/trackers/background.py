@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from tracking3d.frames import Image
 from tracking3d.geometry.camera import Window
-from tracking3d.rendering.backend import compiled
 
 _RATE = 0.1  # at which a pixel that is known well follows its values
 _FAMILIAR = 3.0  # frames until a pixel's memory has full weight
@@ -145,13 +144,9 @@ def differences(
     """
     square = np.ones((3, 3), np.uint8)
     highest, lowest = cv2.dilate(mean, square), cv2.erode(mean, square)
-    if compiled():
-        from tracking3d.trackers.kernels import background
+    from tracking3d.trackers.kernels import background
 
-        return background.differences(present, highest, lowest, variance, _LEAST_NOISE**2)
-    values = present.astype(np.float32)
-    beyond = np.maximum(np.maximum(values - highest, lowest - values), 0)
-    return _mean_square(beyond) / (variance + _LEAST_NOISE**2)
+    return background.differences(present, highest, lowest, variance, _LEAST_NOISE**2)
 
 
 def learn(
@@ -170,31 +165,10 @@ def learn(
         proof: ``(h, w)`` see `BackgroundMemory.learn`.
         memory: Mean ``(h, w, 3)``, and variance, frames and what is proven ``(h, w)``.
     """
-    if compiled():
-        from tracking3d.trackers.kernels import background
+    from tracking3d.trackers.kernels import background
 
-        constants = _RATE, _NOISE**2, _LEAST_VARIANCE, _LASTING
-        background.learn(present, familiar, seen, proof, memory, constants)
-        return
-    mean, variance, frames, proven = memory
-    new = seen & (frames < 0.9)
-    familiar = familiar & seen & ~new
-    rate = familiar * np.maximum(1 / (frames + 1), np.float32(_RATE))
-    difference = present - mean
-    variance += rate * (_mean_square(difference) - variance)
-    np.maximum(variance, _LEAST_VARIANCE, out=variance, where=familiar)
-    variance[new] = _NOISE**2  # the first value tells nothing of the noise
-    mean += np.where(new, 1, rate)[..., None] * difference
-    frames += np.where(familiar | new, 1, -1) * seen
-    np.clip(frames, 0, _LASTING, out=frames)
-    proven[new] = 0
-    proven += seen * proof
-    np.clip(proven, 0, 1, out=proven)
-
-
-def _mean_square(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Over the channels; several times as fast as squares and means of arrays with three of them."""
-    return np.einsum("ijk,ijk->ij", values, values) / values.shape[2]
+    constants = _RATE, _NOISE**2, _LEAST_VARIANCE, _LASTING
+    background.learn(present, familiar, seen, proof, memory, constants)
 
 
 def _crop_to_frame(window: Window) -> NDArray[np.float64]:

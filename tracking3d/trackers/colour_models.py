@@ -7,8 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from tracking3d.rendering.backend import compiled
-
 _BINS = (16, 12, 12)  # L, a, b
 _LOG_LIMIT = 3.0
 _CELL_BITS = 5  # bits a channel of the cells whose colours share a palette entry
@@ -181,14 +179,6 @@ def local_shares(
         radius: Likewise.
         size: More than any label.
     """
-    if compiled():
-        from tracking3d.trackers.kernels import colour_models
+    from tracking3d.trackers.kernels import colour_models
 
-        return colour_models.local_shares(labels, last_labels, last_mask, radius, size)
-    side = (2 * radius + 1,) * 2
-    shares = np.zeros((2, *labels.shape), np.float32)
-    for entry in np.unique(labels):
-        here, where = last_labels == entry, labels == entry
-        for share, part in zip(shares, (last_mask, 1 - last_mask), strict=True):
-            share[where] = cv2.blur(here * part, side)[where]
-    return shares
+    return colour_models.local_shares(labels, last_labels, last_mask, radius, size)

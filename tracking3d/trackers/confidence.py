@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.trackers.outline import signed_distance
+from tracking3d.trackers.outline import inside_distance
 
 _BAND = 0.08  # width of the bands along the outline, relative to the square root of the area
 _LOST_SEPARATION = 0.1
@@ -65,7 +65,7 @@ def outline_margin(evidence: NDArray[np.float32], mask: NDArray[np.bool_]) -> fl
         evidence: ``(S, S)`` log-odds of the object.
         mask: ``(S, S)``.
     """
-    distance = signed_distance(mask)
+    distance = inside_distance(mask)
     band = np.abs(distance) <= max(_BAND * math.sqrt(np.count_nonzero(mask)), 1.0)
     inner, outer = band & mask, band & ~mask
     if not inner.any() or not outer.any():

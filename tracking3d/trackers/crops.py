@@ -39,7 +39,7 @@ def inside_frame(shape: tuple[int, ...], window: Window) -> NDArray[np.bool_]:
     return ((rows > 0) & (rows < shape[0]))[:, None] & ((columns > 0) & (columns < shape[1]))
 
 
-def paste(mask: NDArray[np.bool_], window: Window, shape: tuple[int, ...]) -> NDArray[np.float32]:
+def paste_mask(mask: NDArray[np.bool_], window: Window, shape: tuple[int, ...]) -> NDArray[np.float32]:
     """A full-frame mask ``(H, W)`` in [0, 1] from a window's ``(size, size)`` mask, smooth at its outline."""
     height, width = shape[:2]
     soft = cv2.GaussianBlur(mask.astype(np.float32), (3, 3), 0)

@@ -51,7 +51,7 @@ class Cues:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class FrameCrop:
     """A frame seen through a square window.
 
     Attributes:
@@ -79,7 +79,12 @@ class View:
 
 
 def colour_and_motion(
-    last: View, present: View, colours: GlobalColours, palette: Palette, motion: MaskMotion, cues: Cues
+    last: FrameCrop,
+    present: FrameCrop,
+    colours: GlobalColours,
+    palette: Palette,
+    motion: MaskMotion,
+    cues: Cues,
 ) -> NDArray[np.float32]:
     """``(S, S)`` log-odds of the object by how pixels look and move."""
     evidence = cues.global_colours * colours.log_ratio(present.colours) + cues.motion * motion.cue
@@ -109,7 +114,7 @@ def distance_beyond(box: Box, window: Window) -> NDArray[np.float32]:
 
 
 def decide(
-    present: View,
+    present: FrameCrop,
     evidence: NDArray[np.float32],
     last_mask: NDArray[np.float32],
     motion: MaskMotion,

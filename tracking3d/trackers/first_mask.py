@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from tracking3d.frames import Box, Image
 from tracking3d.geometry.camera import Window
 from tracking3d.trackers.colour_models import lab
-from tracking3d.trackers.crops import clip_box, cut, inside_frame, paste
+from tracking3d.trackers.crops import clip_box, cut, inside_frame, paste_mask
 
 _SIZE = 288
 _MARGIN = 0.35
@@ -38,7 +38,7 @@ def mask_in_box(image: Image, box: Box, iterations: int = 5) -> NDArray[np.float
     mask = _grab_cut(lab(cut(image, window)), candidate, iterations)
     if np.count_nonzero(mask) < _LEAST_SHARE * np.count_nonzero(candidate):
         mask = _ellipse(rows, columns)
-    return paste(mask, window, image.shape)
+    return paste_mask(mask, window, image.shape)
 
 
 def _grab_cut(colours: NDArray[np.uint8], candidate: NDArray[np.bool_], iterations: int) -> NDArray[np.bool_]:

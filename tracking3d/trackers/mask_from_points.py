@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import dijkstra
 from tracking3d.frames import Image
 from tracking3d.geometry.camera import Window
 from tracking3d.trackers.colour_models import lab
-from tracking3d.trackers.crops import box_of, cut, inside_frame, paste
+from tracking3d.trackers.crops import box_of, cut, inside_frame, paste_mask
 
 Points = NDArray[np.float32]
 """``(N, 3)``: x, y in pixels of the image, and 1 on the object or 0 beside it."""
@@ -65,7 +65,9 @@ def mask_from_points(image: Image, points: Points) -> NDArray[np.float32]:
     near = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _BAND + 1, 2 * _BAND + 1))
     on |= cv2.erode(likely.astype(np.uint8), near) > 0
     inner &= cv2.dilate((likely | on).astype(np.uint8), near) > 0
-    return paste(_grab_cut(lab(cut(image, window)), likely, on, beside & ~on, inner), window, image.shape)
+    return paste_mask(
+        _grab_cut(lab(cut(image, window)), likely, on, beside & ~on, inner), window, image.shape
+    )
 
 
 def _seeds(

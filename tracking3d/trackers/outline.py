@@ -16,7 +16,7 @@ _SHIFT_COST = 0.001  # of the mean support, for every second pixel: without evid
 _BACKGROUND_MOTION = -0.4  # pixels: a separate part that moves so much more like the background is none
 
 
-def signed_distance(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+def inside_distance(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
     """``(S, S)`` pixels to the outline: positive inside, negative outside."""
     inside = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 3)
     return inside - cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 3)
@@ -30,7 +30,7 @@ def prior(moved: list[tuple[float, NDArray[np.float32]]], area: int) -> NDArray[
         area: The object's area; distances are relative to its square root.
     """
     weights, masks = zip(*moved, strict=True)
-    distance = np.average([signed_distance(mask > 0.5) for mask in masks], axis=0, weights=weights)
+    distance = np.average([inside_distance(mask > 0.5) for mask in masks], axis=0, weights=weights)
     return np.clip(distance / (0.12 * math.sqrt(area)), -4.0, 4.0).astype(np.float32)
 
 
@@ -65,7 +65,7 @@ def touches_border(mask: NDArray[np.bool_], in_frame: NDArray[np.bool_]) -> bool
     return bool((mask & in_frame & ~within).any())
 
 
-def tidied(
+def remove_specks(
     mask: NDArray[np.bool_], moved: NDArray[np.bool_], motion: NDArray[np.float32] | None = None
 ) -> NDArray[np.bool_]:
     """Drop specks, parts that are not the object's, and pinholes.

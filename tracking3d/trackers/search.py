@@ -12,7 +12,7 @@ from tracking3d.frames import Image
 from tracking3d.geometry.camera import Window
 from tracking3d.trackers.colour_models import GlobalColours, lab
 from tracking3d.trackers.crops import cut, inside_frame
-from tracking3d.trackers.outline import both_sides, tidied
+from tracking3d.trackers.outline import both_sides, remove_specks
 
 _OVERVIEW = 160  # longer side in pixels of the image that is searched
 _UNCHANGED = 6.0  # log-odds, as many as colours can say, that what was there without the object is not it
@@ -60,7 +60,7 @@ def find_by_colours(
     support = np.tanh(evidence / 3).astype(np.float32)
     smooth = cv2.ximgproc.fastGlobalSmootherFilter(crop, support, 100.0, 12.0)
     found = (smooth > 0) & in_frame
-    mask = _largest(tidied(found, found))
+    mask = _largest(remove_specks(found, found))
     if not _LEAST_AREA * area <= np.count_nonzero(mask) / window.scale**2 <= _MOST_AREA * area:
         return None
     inside, around = both_sides(mask)

@@ -20,12 +20,12 @@ from tracking3d.geometry.camera import Window
 from tracking3d.trackers.background import BackgroundMemory
 from tracking3d.trackers.colour_models import GlobalColours, Palette
 from tracking3d.trackers.confidence import Judgement, outline_margin
-from tracking3d.trackers.crops import box_iou, box_of, clip_box, cut, outside, paste
-from tracking3d.trackers.cues import Cues, View, colour_and_motion, decide, distance_beyond
+from tracking3d.trackers.crops import box_iou, box_of, clip_box, cut, outside, paste_mask
+from tracking3d.trackers.cues import Cues, FrameCrop, colour_and_motion, decide, distance_beyond
 from tracking3d.trackers.first_mask import mask_in_box
 from tracking3d.trackers.mask_motion import follow_mask
 from tracking3d.trackers.opencv_build import why_no_contrib
-from tracking3d.trackers.outline import both_sides, signed_distance, tidied, touches_border
+from tracking3d.trackers.outline import both_sides, inside_distance, remove_specks, touches_border
 from tracking3d.trackers.search import find_by_colours
 
 SMOOTHER = "ximgproc.fastGlobalSmootherFilter"
@@ -74,7 +74,7 @@ class ColourSegmentation:
         self._velocity = (0, 0)
         self._doubtful_frames = 0
         self._usual_area = float(np.count_nonzero(self._mask > 0.5))
-        view = View.of(image, Window.around(box_of(self._mask) or box, _MARGIN, size))
+        view = FrameCrop.of(image, Window.around(box_of(self._mask) or box, _MARGIN, size))
         inside, around = both_sides(cut(self._mask, view.window))
         self._colours = GlobalColours(view.colours, inside, around)
         self._palette = Palette(view.colours)
@@ -100,7 +100,7 @@ class ColourSegmentation:
             self._velocity = (0, 0)
         self._image, self._mask, self._doubtful_frames = image, mask.astype(np.float32), 0
         if box is not None:
-            view = View.of(image, Window.around(box, _MARGIN, self._size))
+            view = FrameCrop.of(image, Window.around(box, _MARGIN, self._size))
             self._colours.update(view.colours, *both_sides(cut(self._mask, view.window)))
             self._background.forget(mask)
 
@@ -125,8 +125,8 @@ class ColourSegmentation:
     def _follow(self, image: Image, box: Box, witness: Box | None) -> _Answer:
         before = Window.around(box, _MARGIN, self._size)
         right, down = self._velocity
-        last = View.of(self._image, before)
-        present = View.of(image, Window(before.left + right, before.top + down, before.side, self._size))
+        last = FrameCrop.of(self._image, before)
+        present = FrameCrop.of(image, Window(before.left + right, before.top + down, before.side, self._size))
         last_mask = cut(self._mask, before)
         shift = (before.scale * right, before.scale * down)
         seen = present.in_frame
@@ -145,7 +145,7 @@ class ColourSegmentation:
             evidence += self._cues.background * self._background.change(image, present.window)
         if witness is not None:
             evidence -= self._cues.witness * distance_beyond(witness, present.window)
-        mask = tidied(decide(present, evidence, last_mask, motion, self._cues), moved, motion.cue)
+        mask = remove_specks(decide(present, evidence, last_mask, motion, self._cues), moved, motion.cue)
 
         at_border = touches_border(moved, present.in_frame)
         believed = bool(abs(np.count_nonzero(mask) / area - 1) <= _AREA_CHANGE)
@@ -159,9 +159,9 @@ class ColourSegmentation:
             self._usual_area = self._usual_area if at_border else frame_area
             _, around = _sides(mask, present)
             self._colours.update(present.colours, mask, around)
-            far = signed_distance(mask) < -_FAR * math.sqrt(max(int(np.count_nonzero(mask)), 1))
+            far = inside_distance(mask) < -_FAR * math.sqrt(max(int(np.count_nonzero(mask)), 1))
             self._learn_background(image, present, around, np.where(far, 1, -motion.cue / _PARTED))
-        full = paste(mask, present.window, image.shape)
+        full = paste_mask(mask, present.window, image.shape)
         agreement = None if witness is None else box_iou(box_of(full) or (0.0, 0.0, 0.0, 0.0), witness)
         separation, margin = self._separation(present, mask), outline_margin(evidence, mask)
         return full, Judgement(separation, margin, agreement, believed)
@@ -174,14 +174,14 @@ class ColourSegmentation:
         if found is None or found[2] < _FOUND_AGAIN * self._first_separation:
             return _out_of_sight(image)
         mask, window, separation = found
-        return paste(mask, window, image.shape), Judgement(separation, margin=separation)
+        return paste_mask(mask, window, image.shape), Judgement(separation, margin=separation)
 
     def _begin_anew(
         self, image: Image, witness: Box, mask: NDArray[np.float32], judgement: Judgement
     ) -> _Answer:
         """Segment from the witness's box; keep the old mask unless the new one looks more like the object."""
         fresh = mask_in_box(image, witness)
-        view = View.of(image, Window.around(witness, _MARGIN, self._size))
+        view = FrameCrop.of(image, Window.around(witness, _MARGIN, self._size))
         separation = self._separation(view, cut(fresh, view.window))
         in_sight = box_of(mask) is not None
         if separation <= (judgement.separation if in_sight else _FOUND_AGAIN * self._first_separation):
@@ -189,15 +189,17 @@ class ColourSegmentation:
         self._background.forget(fresh > 0.5)
         return fresh, Judgement(separation, 0.0, judgement.agreement)
 
-    def _learn_background(self, image: Image, view: View, around: NDArray[np.bool_], proof: NDArray) -> None:
+    def _learn_background(
+        self, image: Image, view: FrameCrop, around: NDArray[np.bool_], proof: NDArray
+    ) -> None:
         if self._cues.background:
             self._background.learn(image, view.window, around, proof.astype(np.float32))
 
-    def _separation(self, view: View, mask: NDArray) -> float:
+    def _separation(self, view: FrameCrop, mask: NDArray) -> float:
         return self._colours.separation(view.colours, *_sides(mask, view))
 
 
-def _sides(mask: NDArray, view: View) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _sides(mask: NDArray, view: FrameCrop) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """The two sides of a crop's mask; what lies beyond the frame is no background."""
     inside, around = both_sides(mask)
     return inside, around & view.in_frame

@@ -1,77 +1,82 @@
-"""Frames from the caller's own arrays."""
+"""Frames that the caller of the library has in memory."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sized
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sized
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
 
 import numpy as np
 
 from tracking3d.errors import InputError
-from tracking3d.frames import Frame, SkippedFrame
+from tracking3d.frames import Frame, Image, SkippedFrame
 from tracking3d.video.selection import EVERY_FRAME, within
 from tracking3d.video.source import Intrinsics, checked
 
 
 @dataclass(frozen=True, eq=False)
 class ArraySource:
-    """Any iterable of ``(H, W, 3)`` uint8 RGB arrays, taken one at a time.
+    """Any iterable of images, taken one at a time.
 
     See `tracking3d.video.source.FrameSource` for the other attributes.
 
     Attributes:
-        rate: Arrays per second, which times are counted by; None where nobody knows.
+        images: ``(H, W, 3)`` uint8 RGB arrays of one size; frames of another size are skipped.
+        selection: Which of them are taken.
+        rate: Images per second, which times are counted by; None if nobody knows.
+        convert: Makes such an array of an item, given its position. The items may then also be `Frame` and
+            `SkippedFrame`, and sizes are left to whoever takes the frames.
     """
 
-    arrays: Iterable[Any]
+    images: Iterable[Any]
     selection: range = EVERY_FRAME
     name: str = "the frame iterable"
     rate: float | None = None
     intrinsics: Intrinsics | None = None
     intrinsics_origin: str = ""
+    convert: Callable[[Any, int], Image] | None = None
 
     @property
     def fps(self) -> float | None:
-        """Selected arrays per second, where somebody has said."""
+        """Selected images per second, if known."""
         return None if self.rate is None else self.rate / self.selection.step
 
     @property
     def count(self) -> int | None:
-        """Number of selected frames where the iterable has a length."""
-        return len(within(self.selection, len(self.arrays))) if isinstance(self.arrays, Sized) else None
+        """Number of selected frames, if the iterable tells its length."""
+        length = len(self.images) if isinstance(self.images, Sized) else getattr(self.images, "count", None)
+        return len(within(self.selection, length)) if isinstance(length, int) else None
 
     @property
     def repeatable(self) -> bool:
         """Whether the iterable can be gone through again, as an iterator cannot."""
-        return not isinstance(self.arrays, Iterator)
+        return bool(getattr(self.images, "repeatable", not isinstance(self.images, Iterator)))
 
     def __iter__(self) -> Iterator[Frame | SkippedFrame]:
-        """Give the selected frames; an `InputError` ends it at the first item that is no RGB array."""
-        return checked(self._frames(), self.name)
+        """Give the selected frames; an `InputError` ends it at the first item that is no image."""
+        frames = self._frames()
+        return checked(frames, self.name) if self.convert is None else frames
 
-    def _frames(self) -> Iterator[Frame]:
+    def _frames(self) -> Iterator[Frame | SkippedFrame]:
         wanted = self.selection
-        for index, array in islice(enumerate(self.arrays), wanted.start, wanted.stop, wanted.step):
-            if not (
-                isinstance(array, np.ndarray)
-                and array.dtype == np.uint8
-                and array.ndim == 3
-                and array.shape[2] == 3
-                and array.size
-            ):
-                raise InputError(
-                    f"Frame {index} of {self.name} is {_describe(array)}; give (H, W, 3) uint8 RGB arrays."
-                )
-            # A copy, because callers like to decode every frame into one buffer.
+        for index, item in islice(enumerate(self.images), wanted.start, wanted.stop, wanted.step):
             seconds = None if self.rate is None else index / self.rate
-            yield Frame(index, array.copy(), seconds, f"frame {index}")
+            if self.convert is None:
+                yield Frame(index, _copied(item, index, self.name), seconds, f"frame {index}")
+            elif isinstance(item, SkippedFrame):
+                yield item
+            elif isinstance(item, Frame):
+                yield replace(item, image=self.convert(item.image, item.index))
+            else:
+                yield Frame(index, self.convert(item, index), seconds)
 
 
-def _describe(item: Any) -> str:
-    return (
-        f"a {item.shape} array of {item.dtype}"
-        if isinstance(item, np.ndarray)
-        else f"a {type(item).__name__}"
-    )
+def _copied(item: Any, index: int, name: str) -> Image:
+    """A copy of an array, because callers like to decode every frame into one buffer."""
+    is_array = isinstance(item, np.ndarray)
+    if not (is_array and item.dtype == np.uint8 and item.ndim == 3 and item.shape[2] == 3 and item.size):
+        what = f"a {item.shape} array of {item.dtype}" if is_array else f"a {type(item).__name__}"
+        raise InputError(f"Frame {index} of {name} is {what}; give (H, W, 3) uint8 RGB arrays.")
+    image: Image = item.copy()
+    return image

@@ -55,7 +55,7 @@ def read_image(path: Path) -> Image:
         raise InputError(f"{path} cannot be read as an image ({reason}).") from error
 
 
-def read_intrinsics(path: Path) -> tuple[Intrinsics, str] | None:
+def read_exif_intrinsics(path: Path) -> tuple[Intrinsics, str] | None:
     """The pinhole camera that an image's EXIF data tell of, and in words where it came from.
 
     The 35 mm equivalent focal length is the one with the same *diagonal* field of view on a 36 x 24 mm frame

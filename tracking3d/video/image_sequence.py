@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, SkippedFrame
-from tracking3d.video.image_file import SUFFIXES, read_image, read_intrinsics
+from tracking3d.video.image_file import SUFFIXES, read_exif_intrinsics, read_image
 from tracking3d.video.selection import EVERY_FRAME, natural_order, within
 from tracking3d.video.source import Intrinsics, checked
 
@@ -67,7 +67,7 @@ class ImageSequence:
                 f"{name} has no frame {selection.start}, since its {len(files)} images count from 0; "
                 "choose other frames."
             )
-        intrinsics, origin = read_intrinsics(files[wanted[0]]) or (None, "")
+        intrinsics, origin = read_exif_intrinsics(files[wanted[0]]) or (None, "")
         return cls(name, files, wanted, intrinsics, origin)
 
     @property

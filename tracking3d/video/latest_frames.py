@@ -14,7 +14,7 @@ from numbers import Real
 
 from tracking3d.errors import InputError
 from tracking3d.frames import Frame, SkippedFrame
-from tracking3d.video.source import FrameSource, Intrinsics, notes_of
+from tracking3d.video.source import FrameSource, Intrinsics, source_notes
 
 DROPPED = "dropped to keep up"
 """The reason of a frame that was overwritten before it was taken."""
@@ -77,7 +77,7 @@ class LatestFrames:
     @property
     def notes(self) -> tuple[str, ...]:
         """The source's."""
-        return notes_of(self.source)
+        return source_notes(self.source)
 
     @property
     def repeatable(self) -> bool:

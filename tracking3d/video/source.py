@@ -55,7 +55,7 @@ class FrameSource(Protocol):
         ...
 
 
-def notes_of(source: FrameSource) -> tuple[str, ...]:
+def source_notes(source: FrameSource) -> tuple[str, ...]:
     """What a source did to its pictures, in clauses; sources that do nothing need not say so."""
     return tuple(getattr(source, "notes", ()))
 

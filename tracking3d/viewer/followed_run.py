@@ -186,7 +186,7 @@ def _alike(reason: str, other: str) -> bool:
     return reason == other or _FIGURES.sub("", reason) == _FIGURES.sub("", other)
 
 
-def runs_in(folder: Path) -> list[FollowedRun]:
+def open_followed_runs(folder: Path) -> list[FollowedRun]:
     """The runs in a folder: its own, or those of the several objects of one video.
 
     Raises:

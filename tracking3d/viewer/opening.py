@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from tracking3d.errors import InputError, PluginError
 from tracking3d.video.any_frame import FrameImages, frame_images
 from tracking3d.video.opening import open_source
-from tracking3d.viewer.followed_run import FollowedRun, runs_in
+from tracking3d.viewer.followed_run import FollowedRun, open_followed_runs
 from tracking3d.viewer.run_images import OverlayPictures, images_of_run
 from tracking3d.web.access import Access
 
@@ -62,7 +62,7 @@ def open_viewer(
         images = frame_images(open_source(source))
     videos, corrections = [], list[RunCorrection]()
     for folder in folders:
-        runs = runs_in(folder)
+        runs = open_followed_runs(folder)
         if not runs:
             raise InputError(f"{folder} holds no run; give a folder that --out of `tracking3d run` was.")
         own = images or images_of_run(str(runs[0].description.get("source", "")), runs[0].folder)

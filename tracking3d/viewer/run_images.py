@@ -13,7 +13,7 @@ from tracking3d.results import layout
 from tracking3d.results.run_source import places_of
 from tracking3d.video.any_frame import MOST_KEPT, FrameImages, VideoPictures, frame_images
 from tracking3d.video.opening import open_source
-from tracking3d.video.source import FrameSource, Intrinsics, notes_of
+from tracking3d.video.source import FrameSource, Intrinsics, source_notes
 from tracking3d.video.video_file import VideoFile
 
 
@@ -53,7 +53,7 @@ class LatestImages:
     count = property(lambda self: self.source.count)
     fps = property(lambda self: self.source.fps)
     repeatable = property(lambda self: self.source.repeatable)
-    notes = property(lambda self: notes_of(self.source))
+    notes = property(lambda self: source_notes(self.source))
     intrinsics_origin = property(lambda self: self.source.intrinsics_origin)
 
     @property

@@ -31,7 +31,7 @@ def list_streaks(runs: Sequence[FollowedRun]) -> str:
     return f'<div style="font-size:12px;line-height:1.35;max-height:40vh;overflow-y:auto;margin:4px 12px">{told}</div>'
 
 
-def describe(run: FollowedRun, record: FrameRecord | None, colour: Colour | None = None) -> str:
+def describe_frame(run: FollowedRun, record: FrameRecord | None, colour: Colour | None = None) -> str:
     """One run's answer for a frame in a line of HTML, after the colour of its curve."""
     name = html.escape(run.name)
     if colour is not None:

@@ -30,7 +30,7 @@ from tracking3d.viewer.kept_landmarks import kept_landmarks
 from tracking3d.viewer.panel import SPEEDS, Panel
 from tracking3d.viewer.picture import axes_of, beside, draw_picture
 from tracking3d.viewer.scene import ObjectScene, set_up_space
-from tracking3d.viewer.told import about, describe, list_streaks
+from tracking3d.viewer.told import about, describe_frame, list_streaks
 from tracking3d.web.access import Access
 
 POLL = 0.5
@@ -229,7 +229,7 @@ class Viewer:
                 scene.go_to(index, picture[::2, ::2], panel.still.value)
                 scene.show(panel.mesh.value, panel.path.value, panel.here.value, panel.landmarks.value)
             told = "".join(
-                describe(run, run.frames.get(index), timeline.colour_of(number, len(self._runs)))
+                describe_frame(run, run.frames.get(index), timeline.colour_of(number, len(self._runs)))
                 for number, run in enumerate(self._runs)
             )
             self._offer_correction(index)

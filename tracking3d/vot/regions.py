@@ -55,10 +55,10 @@ def prompt_of(region: Any, frame: Frame, offset: tuple[int, int] = (0, 0)) -> Pr
             raise ValueError(f"an array of shape {mask.shape} and type {mask.dtype}")
     except (TypeError, ValueError) as error:
         raise InputError(f"The first region is no rectangle, polygon or mask ({error}).") from error
-    return make_prompt(frame, mask=placed(mask != 0, offset, frame.size))
+    return make_prompt(frame, mask=place_mask(mask != 0, offset, frame.size))
 
 
-def placed(mask: NDArray[np.bool_], offset: tuple[int, int], size: tuple[int, int]) -> NDArray[np.bool_]:
+def place_mask(mask: NDArray[np.bool_], offset: tuple[int, int], size: tuple[int, int]) -> NDArray[np.bool_]:
     """A mask ``(h, w)`` whose first pixel is at column and row ``offset``, in a frame of ``size`` (height, width)."""
     full = np.zeros(size, bool)
     left, top = offset

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import torch
+from kornia.geometry.transform import remap
 from torch import Tensor
 from torch.nn import functional
 
 
 def sample(features: Tensor, points: Tensor, stride: float) -> Tensor:
     """Unit descriptors ``(N, C)`` of one map ``(C, h, w)`` at points ``(N, 2)`` in pixels of the image."""
-    height, width = features.shape[-2:]
-    extent = points.new_tensor([width, height]) * stride
-    grid = (2 * points + 1) / extent - 1
-    values = functional.grid_sample(features[None], grid[None, None], mode="bilinear", align_corners=False)
+    columns, rows = ((points + 0.5) / stride - 0.5).T  # cells lie in the middle of their pixels
+    values = remap(features[None], columns[None, None], rows[None, None], align_corners=True)
     return functional.normalize(values[0, :, 0].T, dim=1)
 
 

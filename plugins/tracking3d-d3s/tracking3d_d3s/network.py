@@ -19,7 +19,7 @@ from tracking3d.errors import InputError, PluginError
 from tracking3d.frames import Box, Frame, Image, MaskEstimate, Prompt
 from tracking3d.geometry.camera import Window
 from tracking3d.networks.session import Network
-from tracking3d.trackers.crops import box_iou, box_of, clip_box, cut, inside_frame, paste
+from tracking3d.trackers.crops import box_iou, box_of, clip_box, cut, inside_frame, paste_mask
 from tracking3d.trackers.csrt import BoxTracker, CsrtTracker
 
 _INPUTS = {"train_imgs": 3, "test_imgs": 3, "train_masks": 1, "test_dist": 1}
@@ -92,7 +92,7 @@ class D3sNetwork:
             mask = mask if mask.any() else inside
             self._template = _Template(pixels, _plane(mask))
             score = float(probability[mask].mean())
-            answer = MaskEstimate(paste(mask, window, image.shape), score, reason)
+            answer = MaskEstimate(paste_mask(mask, window, image.shape), score, reason)
         self._filter = BoxTracker(CsrtTracker.Options(), image, box) if self._follow_filter else None
         return answer
 
@@ -108,7 +108,7 @@ class D3sNetwork:
         mask = _largest((probability > self._threshold) & inside_frame(frame.image.shape, window))
         if mask is None:
             return MaskEstimate(None, 0.0, "D3S finds no object")
-        answer = paste(mask, window, frame.image.shape)
+        answer = paste_mask(mask, window, frame.image.shape)
         box = box_of(answer)
         if box is None:
             return MaskEstimate(None, 0.0, "D3S finds less than a pixel")

@@ -8,14 +8,8 @@ import numpy as np
 import pytest
 from tracked_solids import degrees_between, disturbed, scene
 
-from tracking3d.bundle_adjustment import adjustment
-from tracking3d.bundle_adjustment.adjustment import Problem, Structure, Tracks, _damped, adjust
-from tracking3d.bundle_adjustment.reprojection import to_camera
-
-
-@pytest.fixture(autouse=True, params=[True, False], ids=["compiled", "numpy"])
-def implementation(request, monkeypatch):
-    monkeypatch.setattr(adjustment, "compiled", lambda: request.param)
+from tracking3d.bundle_adjustment.adjustment import AdjustmentProblem, Structure, Tracks, _damped, adjust
+from tracking3d.bundle_adjustment.reprojection import transform_to_camera
 
 
 def problem(given, fixed=1, free_focal=False, prior_weight=0.0):
@@ -23,12 +17,12 @@ def problem(given, fixed=1, free_focal=False, prior_weight=0.0):
     pixels = np.nan_to_num(given.tracks.pixels)
     prior = given.truth.points + 0.1
     weights = np.full(count, prior_weight)
-    return Problem(pixels, given.tracks.weights(), given.K, fixed, 2.0, free_focal, prior, weights)
+    return AdjustmentProblem(pixels, given.tracks.weights(), given.K, fixed, 2.0, free_focal, prior, weights)
 
 
 def size_free_errors(found: Structure, truth: Structure) -> np.ndarray:
     """Distances of points after the one scaling about frame 0's camera that no image shows."""
-    x, y = (to_camera(s.R[0], s.t[0], s.points) for s in (found, truth))
+    x, y = (transform_to_camera(s.R[0], s.t[0], s.points) for s in (found, truth))
     factor = np.median(y[:, 2]) / np.median(x[:, 2])
     return np.linalg.norm(factor * x - y, axis=1)
 

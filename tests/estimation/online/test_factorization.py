@@ -9,7 +9,7 @@ import pytest
 from tracked_solids import degrees_between, intrinsics, scene
 
 from tracking3d.bundle_adjustment.adjustment import Structure
-from tracking3d.bundle_adjustment.reprojection import project, to_camera
+from tracking3d.bundle_adjustment.reprojection import project_camera_points, transform_to_camera
 from tracking3d.estimation.online.factorization import (
     affine_motion,
     assumed_relief,
@@ -30,7 +30,7 @@ def far_away(frames: int, **settings):
 def solved(K, truth, pixels, depth) -> Structure:
     affine = affine_motion(pixels, K, 3.0, 0)
     assert affine is not None
-    z0 = float(np.mean(to_camera(truth.R[0], truth.t[0], truth.points)[:, 2]))
+    z0 = float(np.mean(transform_to_camera(truth.R[0], truth.t[0], truth.points)[:, 2]))
     return metric_structure(affine, depth(affine), truth.t[0], z0)
 
 
@@ -48,7 +48,9 @@ def test_three_views_without_perspective_give_the_motion_or_its_reversal(frames)
     assert np.corrcoef(right.points[:, 2], truth.points[:, 2])[0, 1] > 0.999
     # Both are seen at the same places.
     for way in ways:
-        away = np.linalg.norm(project(to_camera(way.R, way.t, way.points), K) - pixels, axis=-1)
+        away = np.linalg.norm(
+            project_camera_points(transform_to_camera(way.R, way.t, way.points), K) - pixels, axis=-1
+        )
         assert np.median(away) < 0.5
 
 
@@ -67,7 +69,9 @@ def test_two_views_leave_the_amount_of_relief_open():
     turns = []
     for c in (0.3, 0.6, 1.2):
         found = solved(K, truth, pixels, lambda affine, c=c: assumed_relief(affine, c))
-        away = np.linalg.norm(project(to_camera(found.R, found.t, found.points), K) - pixels, axis=-1)
+        away = np.linalg.norm(
+            project_camera_points(transform_to_camera(found.R, found.t, found.points), K) - pixels, axis=-1
+        )
         assert np.median(away) < 0.5
         turns.append(degrees_between(found.R[1], found.R[0])[0])
     assert turns[0] > 1.5 * turns[1] > 2 * turns[2]
@@ -79,7 +83,7 @@ def test_an_object_far_from_the_axis_is_no_harder():
     common = given.tracks.visible.all(0)
     truth = replace(given.truth, points=given.truth.points[common])
     aside = truth.t + np.array([0.3, 0.2, 0.0]) * truth.t[0, 2]
-    pixels = project(to_camera(truth.R, aside, truth.points), K)
+    pixels = project_camera_points(transform_to_camera(truth.R, aside, truth.points), K)
     errors = []
     for sign in (1, -1):
         moved_aside = replace(truth, t=aside)

@@ -21,7 +21,7 @@ from tracking3d.estimation.online.judgement import (
     looks_wrong,
     unusual,
 )
-from tracking3d.estimation.online.pose_refinement import PoseFit, PoseWeights
+from tracking3d.estimation.online.pose_refinement_types import PoseFit, PoseWeights
 
 MANY, FEW = ENOUGH_POINTS, ENOUGH_POINTS - 1
 USUAL = Usual(appearance=0.2, outline=0.3, overlap=0.9)

@@ -1,16 +1,16 @@
-"""The compiled kernels of points and poses against their NumPy twins."""
+"""The compiled kernels of points and poses against slow and obvious twins in NumPy."""
 
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from functools import partial
 
 import numpy as np
 import pytest
 from tracked_solids import disturbed, scene
+from twins import bundle_adjustment, pose_from_points
 
-from tracking3d.bundle_adjustment import adjustment
-from tracking3d.bundle_adjustment.adjustment import Problem, adjust
-from tracking3d.estimation.online import pose_from_points
+from tracking3d.bundle_adjustment.adjustment import AdjustmentProblem, System, adjust
 from tracking3d.estimation.online.pose_from_points import pose_of_tracks
 from tracking3d.rendering.kernels.threads import get_num_threads, set_num_threads
 
@@ -24,18 +24,17 @@ every_scene = pytest.mark.parametrize("settings", SCENES.values(), ids=SCENES)
 
 
 @pytest.fixture
-def both(monkeypatch):
-    """Call a function with the kernels and without."""
+def by_twins(monkeypatch):
+    """Call a function with the kernels of bundle adjustment replaced by their twins."""
 
-    def both(function):
-        answers = []
-        for chosen in (True, False):
-            monkeypatch.setattr(adjustment, "compiled", lambda chosen=chosen: chosen)
-            monkeypatch.setattr(pose_from_points, "compiled", lambda chosen=chosen: chosen)
-            answers.append(function())
-        return answers
+    def call(function):
+        with monkeypatch.context() as patch:
+            patch.setattr(AdjustmentProblem, "evaluated", bundle_adjustment.evaluated)
+            patch.setattr(AdjustmentProblem, "linearised", bundle_adjustment.linearised)
+            patch.setattr(System, "step", bundle_adjustment.step)
+            return function()
 
-    return both
+    return call
 
 
 def posed(given, fixed, free_focal):
@@ -47,34 +46,35 @@ def posed(given, fixed, free_focal):
     prior = given.truth.points + 0.1
     weights = random.uniform(0, 0.3, len(prior))
     pixels = np.nan_to_num(given.tracks.pixels)
-    return Problem(pixels, weight, given.K, fixed, 2.0, free_focal, prior, weights), replace(
+    return AdjustmentProblem(pixels, weight, given.K, fixed, 2.0, free_focal, prior, weights), replace(
         at, focal_factor=1.1
     )
 
 
 @every_scene
 @pytest.mark.parametrize(("fixed", "free_focal"), [(0, False), (1, False), (1, True), (2, True)])
-def test_cost_residuals_equations_and_step_of_a_bundle(both, settings, fixed, free_focal):
+def test_cost_residuals_equations_and_step_of_a_bundle(settings, fixed, free_focal):
     problem, at = posed(scene(**settings), fixed, free_focal)
-    mine, expected = both(lambda: problem.evaluated(at))
+    mine, expected = problem.evaluated(at), bundle_adjustment.evaluated(problem, at)
     assert mine.cost == pytest.approx(expected.cost, rel=1e-12)
     np.testing.assert_allclose(mine.residual, expected.residual, rtol=1e-9, atol=1e-9)
-    mine, expected = both(lambda: problem.linearised(at))
+    mine, expected = problem.linearised(at), bundle_adjustment.linearised(problem, at)
     for field in fields(mine):
         values = getattr(expected, field.name)
         np.testing.assert_allclose(
             getattr(mine, field.name), values, rtol=1e-9, atol=1e-9 * np.abs(values).max(), err_msg=field.name
         )
     for damping in (1e-3, 10.0):
-        mine, wanted = both(lambda damping=damping: expected.step(damping))
+        mine, wanted = expected.step(damping), bundle_adjustment.step(expected, damping)
         for part, values in zip(mine, wanted, strict=True):
             np.testing.assert_allclose(part, values, rtol=1e-6, atol=1e-6 * np.abs(values).max())
 
 
 @every_scene
-def test_an_adjustment_ends_in_the_same_place(both, settings):
+def test_an_adjustment_ends_in_the_same_place(by_twins, settings):
     given = scene(**settings)
-    mine, expected = both(lambda: adjust(given.tracks, given.K, disturbed(given.truth), iterations=40))
+    adjusted = partial(adjust, given.tracks, given.K, disturbed(given.truth), iterations=40)
+    mine, expected = adjusted(), by_twins(adjusted)
     assert mine.cost == pytest.approx(expected.cost, rel=1e-5)
     np.testing.assert_allclose(mine.R, expected.R, atol=2e-3)
 
@@ -94,7 +94,7 @@ def test_threads_change_no_digit_of_a_step():
         np.testing.assert_array_equal(steps[0][1], other[1])
 
 
-def test_equations_that_are_not_finite_give_no_step(both):
+def test_equations_that_are_not_finite_give_no_step():
     problem, at = posed(scene(), 1, False)
     system = problem.linearised(at)
     for broken in (
@@ -102,11 +102,11 @@ def test_equations_that_are_not_finite_give_no_step(both):
         replace(system, points_gradient=np.full_like(system.points_gradient, np.inf)),
     ):
         with np.errstate(invalid="ignore"):
-            assert both(lambda broken=broken: broken.step(1e-3)) == [None, None]
+            assert broken.step(1e-3) is None and bundle_adjustment.step(broken, 1e-3) is None
 
 
 @every_scene
-def test_the_pose_of_tracks(both, settings):
+def test_the_pose_of_tracks(settings):
     given = scene(**settings)
     points, pixels = given.truth.points.copy(), given.tracks.pixels[2].copy()
     points[0], pixels[1], points[2] = np.nan, np.inf, [0, 0, -90]
@@ -114,8 +114,9 @@ def test_the_pose_of_tracks(both, settings):
     weight[3], weight[4] = 0, np.nan
     start = given.truth.R[0].copy(), given.truth.t[0].copy()
     for iterations in (0, 1, 30):
-        mine, expected = both(
-            lambda n=iterations: pose_of_tracks(points, pixels, weight, given.K, *start, 2.0, n)
+        mine, expected = (
+            fit(points, pixels, weight, given.K, *start, 2.0, iterations)
+            for fit in (pose_of_tracks, pose_from_points.pose_of_tracks)
         )
         np.testing.assert_allclose(mine.R, expected.R, atol=1e-5)
         np.testing.assert_allclose(mine.t, expected.t, atol=1e-5)

@@ -8,21 +8,16 @@ import pytest
 import torch
 from tracked_solids import degrees_between, scene
 
-from tracking3d.bundle_adjustment.reprojection import moved
-from tracking3d.estimation.online import pose_from_points as module
-from tracking3d.estimation.online.pose_from_points import (
-    point_equations,
-    pose_from_points,
-    pose_of_tracks,
-)
+from tracking3d.bundle_adjustment.reprojection import apply_pose_steps
+from tracking3d.estimation.online.pose_from_points import pose_from_points, pose_of_tracks
 from tracking3d.rendering.normal_equations import NormalEquations
 
 THRESHOLD = 1.5
 
 
-@pytest.fixture(autouse=True, params=[True, False], ids=["compiled", "numpy"])
-def implementation(request, monkeypatch):
-    monkeypatch.setattr(module, "compiled", lambda: request.param)
+def point_equations(points, pixels, weight, K, R, t, scale):
+    """The equations at a pose."""
+    return pose_of_tracks(points, pixels, weight, K, R, t, scale, iterations=0).equations
 
 
 def seen(turn: float = 40.0, noise: float = 0.0, **settings):
@@ -122,7 +117,9 @@ def test_a_far_start_does_not_hurt():
 
 def test_refinement_reaches_the_exact_pose_from_ten_degrees_away():
     K, points, pixels, R, t = seen()
-    start = (part[0] for part in moved(R[None], t[None], np.array([[0.1, -0.1, 0.3, 0.1, -0.1, 0.1]])))
+    start = (
+        part[0] for part in apply_pose_steps(R[None], t[None], np.array([[0.1, -0.1, 0.3, 0.1, -0.1, 0.1]]))
+    )
     fit = pose_of_tracks(points, pixels, None, K, *start, scale=2.0, iterations=30)
     assert degrees_between(fit.R, R)[0] < 1e-5
     assert np.allclose(fit.t, t, atol=1e-6)
@@ -133,7 +130,7 @@ def test_refinement_is_never_worse_than_its_start():
     K, points, pixels, R, t = seen(noise=1.0)
     for degrees in (5.0, 60.0, 170.0):
         turned, shifted = (
-            part[0] for part in moved(R[None], t[None], np.radians([[0, 0, 0, 0, degrees, 0]]))
+            part[0] for part in apply_pose_steps(R[None], t[None], np.radians([[0, 0, 0, 0, degrees, 0]]))
         )
         before = point_equations(points, pixels, None, K, turned, shifted, 1.0)
         assert pose_of_tracks(points, pixels, None, K, turned, shifted, 1.0).equations.cost <= before.cost
@@ -143,7 +140,7 @@ def test_the_gradient_is_the_finite_difference_of_the_cost_and_the_matrix_its_sl
     K, points, pixels, R, t = seen()
 
     def at(step, target=pixels):
-        R_new, t_new = (part[0] for part in moved(R[None], t[None], np.asarray(step)[None]))
+        R_new, t_new = (part[0] for part in apply_pose_steps(R[None], t[None], np.asarray(step)[None]))
         return point_equations(points, target, None, K, R_new, t_new, 2.0)
 
     noisy = pixels + np.random.default_rng(0).normal(size=pixels.shape)
@@ -160,13 +157,13 @@ def test_the_equations_step_like_the_renderers():
     """Their numbers, handed to the renderer's equations, lead to the true pose."""
     K, points, pixels, R, t = seen()
     off = np.array([0.02, -0.03, 0.05, 0.02, -0.01, 0.03])
-    R_off, t_off = (part[0] for part in moved(R[None], t[None], off[None]))
+    R_off, t_off = (part[0] for part in apply_pose_steps(R[None], t[None], off[None]))
     for _ in range(4):
         own = point_equations(points, pixels, None, K, R_off, t_off, 5.0)
         theirs = NormalEquations(
             torch.tensor(own.matrix)[None], torch.tensor(own.gradient)[None], torch.tensor([own.cost])
         )
-        R_off, t_off = (part[0] for part in moved(R_off[None], t_off[None], theirs.step().numpy()))
+        R_off, t_off = (part[0] for part in apply_pose_steps(R_off[None], t_off[None], theirs.step().numpy()))
     assert degrees_between(R_off, R)[0] < 1e-4
 
 

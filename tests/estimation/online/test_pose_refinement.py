@@ -10,9 +10,10 @@ import torch
 from rendered_solids import SIZE, observed, pose_of, shape_of, surface_of
 from torch import Tensor
 
-from tracking3d.bundle_adjustment.reprojection import moved
+from tracking3d.bundle_adjustment.reprojection import apply_pose_steps
 from tracking3d.estimation.observation import Observation
-from tracking3d.estimation.online.pose_refinement import PoseWeights, _Evidence, refine_pose, refine_poses
+from tracking3d.estimation.online.pose_refinement import _Evidence, refine_pose, refine_poses
+from tracking3d.estimation.online.pose_refinement_types import PoseWeights
 from tracking3d.geometry.pose import Pose, from_matrix, rotation_angle
 from tracking3d.rendering import MatchedPoints, Surface
 
@@ -27,7 +28,7 @@ AXES = [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, -1.0, 0.5)]
 def moved_by(pose: Pose, step: Tensor) -> Pose:
     """The pose after a step (v, w)."""
     R, t = (part.double().numpy()[None] for part in (pose.R, pose.translation))
-    turned, shifted = moved(R, t, step.double().numpy()[None])
+    turned, shifted = apply_pose_steps(R, t, step.double().numpy()[None])
     return from_matrix(torch.from_numpy(turned[0]).to(step), torch.from_numpy(shifted[0]).to(step))
 
 

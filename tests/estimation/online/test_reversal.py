@@ -13,7 +13,7 @@ from solid_points import map_with_points
 from tracked_solids import scene
 from turned_solid import CAMERA, SIZE, degrees_apart
 
-from tracking3d.bundle_adjustment.reprojection import project, to_camera
+from tracking3d.bundle_adjustment.reprojection import project_camera_points, transform_to_camera
 from tracking3d.bundle_adjustment.reversal import reversal_of
 from tracking3d.config.solvers import OnlineConfig
 from tracking3d.estimation.online import reversal as online_reversal
@@ -43,8 +43,10 @@ def test_from_afar_both_ways_round_look_the_same(fov, pixels):
     points, T, K = of_scene(fov=fov)
     reversal = reversal_of(points, T[2])
     other = reversal.poses(T)
-    seen = project(to_camera(T[:, :3, :3], T[:, :3, 3], points), K)
-    seen_reversed = project(to_camera(other[:, :3, :3], other[:, :3, 3], reversal.points(points)), K)
+    seen = project_camera_points(transform_to_camera(T[:, :3, :3], T[:, :3, 3], points), K)
+    seen_reversed = project_camera_points(
+        transform_to_camera(other[:, :3, :3], other[:, :3, 3], reversal.points(points)), K
+    )
     assert np.abs(seen - seen_reversed).max() < pixels
     # Yet they turn the other way: the given view stays, the last one is far off.
     np.testing.assert_allclose(other[2], T[2], atol=1e-9)

@@ -27,7 +27,7 @@ from tracking3d.estimation.online.surface_fit import (
     FloatArray,
     Landmarks,
     Rows,
-    Views,
+    ShapeKeyframes,
     _covered_rows,
     _faces_before,
     _outline_rows,
@@ -41,15 +41,15 @@ BALL = shape_of((0.75, 0.75, 0.75))
 ELLIPSOID = shape_of(frequency=10)
 
 
-def views_of(masks: Tensor, poses: list[Pose], weight: Tensor | None = None) -> Views:
+def views_of(masks: Tensor, poses: list[Pose], weight: Tensor | None = None) -> ShapeKeyframes:
     batch = Pose.stack(poses)
     K = intrinsics(masks.shape[-1]).repeat(len(poses), 1, 1)
     weight = torch.ones(len(poses)) if weight is None else weight
-    return Views(batch.R, batch.translation, K, signed_distance(masks), weight)
+    return ShapeKeyframes(batch.R, batch.translation, K, signed_distance(masks), weight)
 
 
 def fitted(
-    views: Views, landmarks: Landmarks | None = None, weights: FitWeights = USUAL, rounds: int = 6
+    views: ShapeKeyframes, landmarks: Landmarks | None = None, weights: FitWeights = USUAL, rounds: int = 6
 ) -> Tensor:
     """The ball, fitted."""
     return fit_surface(
@@ -243,17 +243,17 @@ EXACT = shape_of(frequency=2)
 VERTICES = EXACT.rest.double()
 
 
-def exact_views(count: int) -> tuple[Views, list[Pose]]:
+def exact_views(count: int) -> tuple[ShapeKeyframes, list[Pose]]:
     """Views in float64 whose distance is random and rough."""
     poses = [pose_of(50 * n, (0.2, 1, 0.1)) for n in range(count)]
     batch = Pose.stack(poses)
     distance = torch.randn(count, SIZE, SIZE, generator=torch.Generator().manual_seed(0)).double()
     weight = torch.linspace(1.0, 0.3, count).double()
     K = intrinsics().double().repeat(count, 1, 1)
-    return Views(batch.R.double(), batch.translation.double(), K, distance, weight), poses
+    return ShapeKeyframes(batch.R.double(), batch.translation.double(), K, distance, weight), poses
 
 
-def in_camera(vertices: Tensor, views: Views) -> Tensor:
+def in_camera(vertices: Tensor, views: ShapeKeyframes) -> Tensor:
     return vertices @ views.R.mT + views.t[:, None]
 
 

@@ -11,7 +11,7 @@ from solid_points import map_with_points, pixels_of
 from turned_solid import CAMERA, degrees_apart, turned, turned_map
 
 from tracking3d.estimation.online.points import FollowedPoints
-from tracking3d.estimation.online.pose_refinement import PoseWeights
+from tracking3d.estimation.online.pose_refinement_types import PoseWeights
 from tracking3d.estimation.online.tracking import (
     agreeing,
     coast,

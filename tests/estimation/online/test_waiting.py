@@ -15,7 +15,7 @@ from tracking3d.estimation.online import waiting
 from tracking3d.estimation.online.answers import unsolved
 from tracking3d.estimation.online.belief import Belief
 from tracking3d.estimation.online.points import MOST_POINTS, FollowedPoints, follow
-from tracking3d.estimation.online.start import Start
+from tracking3d.estimation.online.start import InitialMap
 from tracking3d.estimation.online.waiting import solved_start, waiting_view
 from tracking3d.frames import Frame
 
@@ -32,12 +32,14 @@ def asked(monkeypatch):
     def solve_start(known, cameras, views, weights, prior):
         calls["points"].append(len(views))
         return (
-            [Start(known, 1.0, calls["bundle"], "points", cameras[0])] if calls["bundle"] is not None else []
+            [InitialMap(known, 1.0, calls["bundle"], "points", cameras[0])]
+            if calls["bundle"] is not None
+            else []
         )
 
     def by_turning(known, camera, views, weights):
         calls["turning"].append(len(views))
-        return [Start(known, 0.5, 0.0, "turning", camera)]
+        return [InitialMap(known, 0.5, 0.0, "turning", camera)]
 
     monkeypatch.setattr(waiting, "solve_start", solve_start)
     monkeypatch.setattr(waiting, "by_turning", by_turning)
@@ -243,7 +245,7 @@ def test_a_start_waits_while_another_that_turns_otherwise_costs_hardly_more(
 ):
     def solve_start(known, cameras, views, weights, prior):
         return [
-            Start(replace(known, keyframes=turned_views(views, sign)), price, 0.05, "points", cameras[0])
+            InitialMap(replace(known, keyframes=turned_views(views, sign)), price, 0.05, "points", cameras[0])
             for sign, price in ((1.0, 1.0), (degrees, cost))
         ]
 
@@ -281,7 +283,7 @@ def test_where_points_get_worse_the_start_of_before_is_taken_up_again(monkeypatc
         asked.append(len(views))
         bundle = 0.1 if len(views) < 6 else 0.4
         known = map_with_points(STEADY)
-        return [Start(known, 1.0, bundle, str(len(views)), cameras[0])] * 2
+        return [InitialMap(known, 1.0, bundle, str(len(views)), cameras[0])] * 2
 
     monkeypatch.setattr(waiting, "solve_start", solve_start)
     monkeypatch.setattr(waiting, "_same_axis", lambda one, other: False)
@@ -296,7 +298,9 @@ def test_where_points_get_worse_the_start_of_before_is_taken_up_again(monkeypatc
 
 def test_when_no_more_frames_come_the_better_start_is_taken(monkeypatch):
     known = map_with_points(STEADY)
-    monkeypatch.setattr(waiting, "solve_start", lambda *given: [Start(known, 1.0, 0.1, "points", CAMERA)] * 2)
+    monkeypatch.setattr(
+        waiting, "solve_start", lambda *given: [InitialMap(known, 1.0, 0.1, "points", CAMERA)] * 2
+    )
     monkeypatch.setattr(waiting, "_same_axis", lambda one, other: False)
     state, start = solved_start(belief_of(STEADY), CONFIG)
     assert start is None

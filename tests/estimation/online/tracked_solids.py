@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tracking3d.bundle_adjustment.adjustment import Structure, Tracks
-from tracking3d.bundle_adjustment.reprojection import project, to_camera
+from tracking3d.bundle_adjustment.reprojection import project_camera_points, transform_to_camera
 
 SIZE = (640, 480)
 RADIUS = 0.9
@@ -72,10 +72,10 @@ def scene(
     direction = np.array(axis) / np.linalg.norm(axis)
     R = Rotation.from_rotvec(np.radians(np.linspace(0, turn, frames))[:, None] * direction).as_matrix()
     t = np.array([0.05 * z0, 0.03 * z0, z0]) + np.linspace(0, 1, frames)[:, None] * [0.1, -0.05, 0.2]
-    x_cam = to_camera(R, t, points)
+    x_cam = transform_to_camera(R, t, points)
     facing = np.sum((normals @ R.transpose(0, 2, 1)) * x_cam, -1) < -0.1 * np.linalg.norm(x_cam, axis=-1)
     kept = np.flatnonzero(facing.sum(0) >= min(3, frames))[:count]
-    pixels, visible = project(x_cam[:, kept], K), facing[:, kept]
+    pixels, visible = project_camera_points(x_cam[:, kept], K), facing[:, kept]
     pixels = pixels + noise * random.normal(size=pixels.shape)
     wrong = random.random(len(kept)) < outliers
     slide = 2 * random.normal(size=(len(kept), 2)) * np.arange(frames)[:, None, None]

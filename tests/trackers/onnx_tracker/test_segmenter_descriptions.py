@@ -11,8 +11,8 @@ from tracking3d.networks.catalogue import known_networks
 from tracking3d.trackers.onnx.description import (
     PromptableNetwork,
     SaliencyNetwork,
-    builtin_descriptions,
-    load_description,
+    builtin_segmenter_descriptions,
+    load_segmenter_description,
 )
 
 
@@ -23,7 +23,7 @@ def written(folder: Path, text: str) -> Path:
 
 
 def test_the_kinds_that_come_along():
-    kinds = {name: type(load_description(name)) for name in builtin_descriptions()}
+    kinds = {name: type(load_segmenter_description(name)) for name in builtin_segmenter_descriptions()}
     assert kinds == {
         "u2netp": SaliencyNetwork,
         "isnet": SaliencyNetwork,
@@ -33,9 +33,9 @@ def test_the_kinds_that_come_along():
     }
 
 
-@pytest.mark.parametrize("name", builtin_descriptions())
+@pytest.mark.parametrize("name", builtin_segmenter_descriptions())
 def test_what_comes_along_names_its_origin_and_networks_that_are_known(name):
-    description = load_description(name)
+    description = load_segmenter_description(name)
     assert description.title and description.link.startswith("https://")
     if isinstance(description, SaliencyNetwork):
         named = {description.model}
@@ -45,9 +45,9 @@ def test_what_comes_along_names_its_origin_and_networks_that_are_known(name):
 
 
 def test_the_shortest_descriptions(tmp_path):
-    saliency = load_description(written(tmp_path, "kind: saliency\n"))
+    saliency = load_segmenter_description(written(tmp_path, "kind: saliency\n"))
     assert isinstance(saliency, SaliencyNetwork) and saliency.input.size is None
-    promptable = load_description(written(tmp_path, "kind: promptable\n"))
+    promptable = load_segmenter_description(written(tmp_path, "kind: promptable\n"))
     assert isinstance(promptable, PromptableNetwork) and promptable.input.size == 1024
 
 
@@ -72,13 +72,13 @@ def test_the_shortest_descriptions(tmp_path):
 )
 def test_a_faulty_description_is_one_sentence_with_its_file(tmp_path, text, told):
     with pytest.raises(InputError, match=told.replace(".", r"\.")) as error:
-        load_description(written(tmp_path, text))
+        load_segmenter_description(written(tmp_path, text))
     assert "mine.yaml" in str(error.value)
     assert len(str(error.value).splitlines()) == 1
 
 
 def test_an_unknown_name_is_told_with_the_nearest(tmp_path):
     with pytest.raises(InputError, match="did you mean 'mobile-sam'"):
-        load_description("mobilesam")
+        load_segmenter_description("mobilesam")
     with pytest.raises(InputError, match="There is no segmenter"):
-        load_description(tmp_path / "absent.yaml")
+        load_segmenter_description(tmp_path / "absent.yaml")

@@ -4,12 +4,62 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numba import boolean, float64, int64, void
 
 from tracking3d.bundle_adjustment.kernels.reprojection import pixel_motion, shared, to_camera
 from tracking3d.bundle_adjustment.reprojection import BEHIND, NEAREST, FloatArray
-from tracking3d.rendering.kernels.compilation import kernel
+from tracking3d.rendering.kernels.compilation import kernel, record
+
+
+class BundleArrays(NamedTuple):
+    """F frames and N points as kernels take them, float64 and contiguous.
+
+    Attributes:
+        pixels: ``(F, N, 2)`` and
+        weight: ``(F, N)`` of the observations.
+        K: ``(3, 3)``.
+        R: ``(F, 3, 3)`` and
+        t: ``(F, 3)`` of the poses.
+        points: ``(N, 3)``.
+    """
+
+    pixels: FloatArray
+    weight: FloatArray
+    K: FloatArray
+    R: FloatArray
+    t: FloatArray
+    points: FloatArray
+
+
+class BundleEquations(NamedTuple):
+    """Normal equations of C unknowns of the poses and N points; written to.
+
+    Attributes:
+        poses: ``(C, C)``.
+        points: ``(N, 3, 3)``.
+        coupling: ``(N, 3, C)``.
+        poses_gradient: ``(C,)``.
+        points_gradient: ``(N, 3)``.
+    """
+
+    poses: FloatArray
+    points: FloatArray
+    coupling: FloatArray
+    poses_gradient: FloatArray
+    points_gradient: FloatArray
+
+
+_BUNDLE = record(
+    BundleArrays,
+    float64[:, :, ::1], float64[:, ::1], float64[:, ::1], float64[:, :, ::1], float64[:, ::1], float64[:, ::1],
+)  # fmt: skip
+_EQUATIONS = record(
+    BundleEquations,
+    float64[:, ::1], float64[:, :, ::1], float64[:, :, ::1], float64[::1], float64[:, ::1],
+)  # fmt: skip
 
 
 def evaluated(
@@ -23,7 +73,7 @@ def evaluated(
 ) -> tuple[float, FloatArray]:
     """The sum of weighted losses, and ``(F, N)`` residuals; nan where nothing is seen."""
     residual = np.empty(weight.shape)
-    return float(_evaluate(*_packed(pixels, weight, K, R, t, points), float(scale), residual)), residual
+    return float(_evaluate(_packed(pixels, weight, K, R, t, points), float(scale), residual)), residual
 
 
 def linearised(
@@ -36,27 +86,28 @@ def linearised(
     scale: float,
     fixed: int,
     free_focal: bool,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+) -> BundleEquations:
     """Blocks of the normal equations as `tracking3d.bundle_adjustment.adjustment` has them, without the prior's."""
     many, size = len(points), 6 * (len(R) - fixed) + free_focal
-    poses, blocks, coupling = np.zeros((size, size)), np.zeros((many, 3, 3)), np.zeros((many, 3, size))
-    poses_gradient, points_gradient = np.zeros(size), np.zeros((many, 3))
-    _linearise(
-        *_packed(pixels, weight, K, R, t, points), float(scale), fixed, free_focal,
-        poses, blocks, coupling, poses_gradient, points_gradient,
-    )  # fmt: skip
-    return poses, blocks, coupling, poses_gradient, points_gradient
+    equations = BundleEquations(
+        np.zeros((size, size)),
+        np.zeros((many, 3, 3)),
+        np.zeros((many, 3, size)),
+        np.zeros(size),
+        np.zeros((many, 3)),
+    )
+    bundle = _packed(pixels, weight, K, R, t, points)
+    _linearise(bundle, float(scale), fixed, free_focal, equations)
+    return equations
 
 
-def _packed(*arrays: FloatArray) -> list[FloatArray]:
-    return [np.ascontiguousarray(array, np.float64) for array in arrays]
+def _packed(*arrays: FloatArray) -> BundleArrays:
+    return BundleArrays(*(np.ascontiguousarray(array, np.float64) for array in arrays))
 
 
-@kernel(
-    "float64(float64[:,:,::1], float64[:,::1], float64[:,::1], float64[:,:,::1], float64[:,::1],"
-    " float64[:,::1], float64, float64[:,::1])"
-)
-def _evaluate(pixels, weight, K, R, t, points, scale, residual):
+@kernel(float64(_BUNDLE, float64, float64[:, ::1]))
+def _evaluate(bundle, scale, residual):
+    pixels, weight, K, R, t, points = bundle
     total, x_cam, difference = 0.0, np.empty(3), np.empty(2)
     for f in range(len(R)):
         for n in range(len(points)):
@@ -83,14 +134,10 @@ def _difference(x_cam, K, pixel, difference):
     return difference[0] ** 2 + difference[1] ** 2
 
 
-@kernel(
-    "void(float64[:,:,::1], float64[:,::1], float64[:,::1], float64[:,:,::1], float64[:,::1],"
-    " float64[:,::1], float64, int64, boolean, float64[:,::1], float64[:,:,::1], float64[:,:,::1],"
-    " float64[::1], float64[:,::1])"
-)
-def _linearise(
-    pixels, weight, K, R, t, points, scale, fixed, free_focal, poses, blocks, coupling, poses_gradient, points_gradient
-):  # fmt: skip
+@kernel(void(_BUNDLE, float64, int64, boolean, _EQUATIONS))
+def _linearise(bundle, scale, fixed, free_focal, equations):
+    pixels, weight, K, R, t, points = bundle
+    poses, blocks, coupling, poses_gradient, points_gradient = equations
     x_cam, difference, focal = np.empty(3), np.empty(2), np.array((K[0, 0], K[1, 1]))
     by_point, by_pose, by_point_obj = np.empty((2, 3)), np.empty((2, 6)), np.empty((2, 3))
     last = len(poses) - 1

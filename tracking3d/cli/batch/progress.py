@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
-from tracking3d.batch.folder import Progress as HowFar
+from tracking3d.batch.folder import BatchProgress as HowFar
 from tracking3d.batch.running import Happening, Listener
 
 _MOST_WORKERS = 32
@@ -22,7 +22,7 @@ _EVERY = 10.0  # seconds between two events of progress
 
 
 @contextmanager
-def shown(quiet: bool, as_json: bool) -> Iterator[Listener]:
+def show_batch_progress(quiet: bool, as_json: bool) -> Iterator[Listener]:
     """Show how a batch goes on; yields what is to be told.
 
     Args:

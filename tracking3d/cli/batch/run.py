@@ -13,7 +13,7 @@ import typer
 from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quality, Quiet, configure, numbers
 
 if TYPE_CHECKING:
-    from tracking3d.batch.rows import Row
+    from tracking3d.batch.rows import VideoRow
     from tracking3d.batch.video_job import VideoJob
     from tracking3d.config.models import PipelineConfig
 
@@ -105,11 +105,11 @@ def run(
     from tracking3d.batch.places import absolute
     from tracking3d.batch.running import run_batch
     from tracking3d.benchmark.sequences import open_dataset
-    from tracking3d.cli.batch.progress import shown
+    from tracking3d.cli.batch.progress import show_batch_progress
     from tracking3d.engines.choosing import open_engine
     from tracking3d.engines.protocol import Needs
 
-    def of_row(row: Row) -> PipelineConfig:
+    def of_row(row: VideoRow) -> PipelineConfig:
         return _configured(row, config, preset, quality, overrides, threads)
 
     if quiet:
@@ -126,7 +126,7 @@ def run(
     gpus = any(video.config.runtime.device.startswith("cuda") for video in videos)
     needs = Needs(threads, memory or 0.0, 1.0 if gpus else 0.0)
     command = shlex.join(sys.argv)
-    with open_engine(address, workers, needs) as engine, shown(quiet, as_json) as listener:
+    with open_engine(address, workers, needs) as engine, show_batch_progress(quiet, as_json) as listener:
         try:
             progress = run_batch(
                 videos,
@@ -165,7 +165,7 @@ def _check_split(
 
 
 def _configured(
-    row: Row,
+    row: VideoRow,
     config: Path | None,
     preset: str | None,
     quality: str | None,

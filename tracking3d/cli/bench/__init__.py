@@ -4,19 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from tracking3d.cli.bench import (
-    batch,
-    cost,
-    live,
-    masks,
-    matching,
-    points,
-    render,
-    schedule,
-    soak,
-    split,
-    track,
-)
+from tracking3d.cli.bench import live, masks, matching, points, render, track
 
 app = typer.Typer(
     help="Measure how fast, and how good by themselves, the parts are on this machine.",
@@ -28,8 +16,3 @@ app.command(name="live")(live.live)
 app.command(name="masks")(masks.masks)
 app.command(name="matching")(matching.matching)
 app.command(name="points")(points.points)
-app.command(name="batch")(batch.batch)
-app.command(name="soak")(soak.soak)
-app.command(name="split")(split.split)
-app.command(name="schedule")(schedule.schedule)
-app.command(name="cost")(cost.cost)

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from tracking3d.cli.evaluate.options import Data, Out, Sequences
 from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quiet
+
+if TYPE_CHECKING:
+    from tracking3d.benchmark.mask_trackers import TrackerMeasurement
 
 
 class Start(StrEnum):
@@ -64,7 +67,7 @@ def masks(
     import cv2
 
     from tracking3d.benchmark.mask_table import format_masks, report
-    from tracking3d.benchmark.mask_trackers import Contestant, Measured, measure_trackers
+    from tracking3d.benchmark.mask_trackers import Contestant, measure_trackers
     from tracking3d.benchmark.mask_trackers import ablation as switched_off
     from tracking3d.benchmark.sequences import open_dataset
     from tracking3d.cli.evaluate.progress import making_progress
@@ -81,16 +84,10 @@ def masks(
     with making_progress(quiet or as_json) as made:
         dataset = open_dataset(name, data, out, 1, made).only(sequences or [])
 
-    def told(measured: Measured) -> None:
-        iou = measured.figures()["iou_mean"]
-        what = measured.error or f"IoU {iou:.3f}"
-        typer.echo(f"{measured.sequence} ({measured.tracker}): {what}", err=True)
-
     cv2.setNumThreads(threads)
     silent = quiet or as_json
-    results = measure_trackers(
-        contestants, dataset, start.value, frames, (lambda measured: None) if silent else told
-    )
+    heard = (lambda measured: None) if silent else _print_measured
+    results = measure_trackers(contestants, dataset, start.value, frames, heard)
     if as_json:
         typer.echo(json.dumps(report(results, dataset, start.value)))
     elif not quiet:
@@ -99,3 +96,9 @@ def masks(
         for one in failed if silent else ():
             typer.echo(f"{one.sequence} ({one.tracker}) failed: {one.error}", err=True)
         raise typer.Exit(1)
+
+
+def _print_measured(measured: TrackerMeasurement) -> None:
+    """Print on the standard error how a tracker did on a sequence."""
+    what = measured.error or f"IoU {measured.figures()['iou_mean']:.3f}"
+    typer.echo(f"{measured.sequence} ({measured.tracker}): {what}", err=True)

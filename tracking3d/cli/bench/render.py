@@ -66,11 +66,9 @@ def render(
         typer.echo(json.dumps(report))
         return
     from tracking3d.cli.tables import print_table
-    from tracking3d.speed.table import format_growth, format_left_out, format_problem, format_times
+    from tracking3d.speed.table import format_growth, format_problem, format_times
 
     print_table(format_times(report))
     typer.echo(format_problem(report))
-    for line in format_left_out(report):
-        typer.echo(line)
     if "growth" in report:
         print_table(format_growth(report["growth"]))

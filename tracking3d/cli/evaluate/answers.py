@@ -12,7 +12,7 @@ from tracking3d.cli.options import Debug
 from tracking3d.errors import InputError
 
 
-class Answers(StrEnum):
+class EstimateKind(StrEnum):
     """Which answers of a run are scored."""
 
     final = "final"
@@ -39,9 +39,9 @@ def score_answers(
         ),
     ] = None,
     answers: Annotated[
-        Answers,
+        EstimateKind,
         typer.Option(help="Of a run with a final refinement: score its final answers, or the causal ones."),
-    ] = Answers.final,
+    ] = EstimateKind.final,
     offset: Annotated[
         int,
         typer.Option(
@@ -65,7 +65,7 @@ def score_answers(
     from tracking3d.results.run_reader import RunReader
 
     known = read_truth(truth)
-    refined = answers is Answers.final
+    refined = answers is EstimateKind.final
     given, kind = open_answers(results, known, form, refined=refined, offset=offset, **_read_options(options))
     if form is None and not as_json:
         typer.echo(f"{results} is read as {kind}.", err=True)

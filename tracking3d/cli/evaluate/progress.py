@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from tracking3d.benchmark.pool import Listener, Outcome
+from tracking3d.benchmark.pool import JobOutcome, Listener
 
 
 @contextmanager
@@ -27,7 +27,7 @@ def jobs_progress(count: int | None, quiet: bool) -> Iterator[Listener]:
     bar = Progress(*columns, console=console, disable=quiet or not console.is_terminal, transient=True)
     task = bar.add_task("", total=count)
 
-    def listener(outcome: Outcome) -> None:
+    def listener(outcome: JobOutcome) -> None:
         bar.update(task, advance=1)
         if not quiet:
             bar.console.print(escape(_line(outcome)), highlight=False, soft_wrap=True)
@@ -36,7 +36,7 @@ def jobs_progress(count: int | None, quiet: bool) -> Iterator[Listener]:
         yield listener
 
 
-def _line(outcome: Outcome) -> str:
+def _line(outcome: JobOutcome) -> str:
     what = f"{outcome.job.sequence} ({outcome.job.variant.label})"
     if outcome.scores is None:
         return f"{what} failed: {outcome.error}"

@@ -14,10 +14,10 @@ from tracking3d.evidence import (
     Colours,
     along_edges,
     as_lab,
-    features,
     in_question,
     log_odds,
     pasted,
+    pixel_features,
     tidied,
 )
 from tracking3d.evidence.taking_in import taken_in, unlike_surroundings, vouched
@@ -71,7 +71,7 @@ def answer_mask(
         return WeighedMask(rendered, MaskSource.RENDERED)
     window, image = finer(observation)
     lab, own, drawn = as_lab(image), seen_through(initial, window), seen_through(rendered, window)
-    sources = features(lab, own, drawn, confidence, colours)
+    sources = pixel_features(lab, own, drawn, confidence, colours)
     odds, asked = log_odds(sources), in_question(sources)
     told = moving() if moving is not None and asked >= _IN_QUESTION else None
     if told is not None:

@@ -9,7 +9,7 @@ from tracking3d.estimation.estimate import Status
 from tracking3d.estimation.online.belief import View
 from tracking3d.estimation.online.judgement import BELIEVED, Support
 from tracking3d.estimation.online.points import FollowedPoints
-from tracking3d.estimation.online.pose_refinement import PoseFit
+from tracking3d.estimation.online.pose_refinement_types import PoseFit
 
 
 @dataclass(frozen=True, eq=False)

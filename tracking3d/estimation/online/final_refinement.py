@@ -8,7 +8,8 @@ from tracking3d.config.solvers import OnlineConfig
 from tracking3d.estimation.online.belief import ObjectMap
 from tracking3d.estimation.online.growing import refined
 from tracking3d.estimation.online.lens import lens_change, solve_lens
-from tracking3d.estimation.online.pose_refinement import PoseWeights, refine_pose
+from tracking3d.estimation.online.pose_refinement import refine_pose
+from tracking3d.estimation.online.pose_refinement_types import PoseWeights
 from tracking3d.estimation.online.tracking import evidence
 from tracking3d.geometry.camera import Camera
 

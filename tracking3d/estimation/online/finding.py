@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from tracking3d.config.models import PipelineConfig
 from tracking3d.config.solvers import OnlineConfig
 from tracking3d.estimation.correction import SIGHTED
-from tracking3d.estimation.framing import mask_box, projected_box
-from tracking3d.estimation.observation import Observation, observe
+from tracking3d.estimation.observation import Observation
 from tracking3d.estimation.online.attempt import Attempt
 from tracking3d.estimation.online.belief import Belief, View
 from tracking3d.estimation.online.judgement import judge, looks_wrong
 from tracking3d.estimation.online.mapping import mask_weight
 from tracking3d.estimation.online.motion import led_to
 from tracking3d.estimation.online.points import FollowedPoints
-from tracking3d.estimation.online.pose_refinement import PoseFit, PoseWeights
+from tracking3d.estimation.online.pose_refinement_types import PoseFit, PoseWeights
 from tracking3d.estimation.online.sighting import meets, sighted
 from tracking3d.estimation.online.tracking import (
     agreeing,
@@ -30,25 +27,14 @@ from tracking3d.estimation.online.tracking import (
     supported,
     worth_trying,
 )
-from tracking3d.features.protocol import FeatureEncoder
+from tracking3d.estimation.solver_base import SolverBase
 from tracking3d.frames import Frame
-from tracking3d.geometry.camera import Camera, Window
 from tracking3d.geometry.pose import Pose
 
 
 @dataclass(frozen=True)
-class PoseFinder:
-    """Finds an object that is known in a frame.
-
-    Attributes:
-        config: The pipeline's configuration.
-        camera: The camera of the full frame.
-        encoder: The feature encoder.
-    """
-
-    config: PipelineConfig
-    camera: Camera
-    encoder: FeatureEncoder
+class PoseFinder(SolverBase):
+    """Finds an object that is known in a frame."""
 
     @property
     def online(self) -> OnlineConfig:
@@ -61,11 +47,6 @@ class PoseFinder:
         """Weights of a pose's terms."""
         online = self.online
         return PoseWeights(appearance=online.appearance, outline=online.outline, points=online.points)
-
-    @property
-    def device(self) -> torch.device:
-        """Where tensors live."""
-        return torch.device(self.config.runtime.device)
 
     def _found(
         self, state: Belief, view: View, frame: Frame, image: NDArray[np.uint8], starts: dict[str, Pose]
@@ -131,11 +112,4 @@ class PoseFinder:
     def _observe(
         self, state: Belief, frame: Frame, mask: NDArray[np.bool_] | None, pose: Pose
     ) -> Observation:
-        box = mask_box(mask) if mask is not None else projected_box(state.known.vertices, state.camera, pose)
-        if box is None:
-            box = (0.0, 0.0, float(state.camera.width), float(state.camera.height))
-        window = Window.around(box, self.config.window.margin, self.config.window.size)
-        observation = observe(frame, mask, window, state.camera, self.encoder, self.device)
-        if state.space is None:
-            return observation
-        return replace(observation, features=state.space.project(observation.features))
+        return self.observe(frame, mask, pose, state.known.vertices, state.camera, state.space)

@@ -12,7 +12,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from tracking3d.bundle_adjustment.adjustment import Problem, Structure, System, Tracks, adjust
+from tracking3d.bundle_adjustment.adjustment import AdjustmentProblem, Structure, System, Tracks, adjust
 from tracking3d.bundle_adjustment.reprojection import FloatArray
 from tracking3d.estimation.online.pose_from_points import pose_of_tracks
 
@@ -122,7 +122,9 @@ def _fitted(
     points = _on_plane(rays, tilt, z0)
     assert points is not None
     free = np.zeros(len(points))
-    problem = Problem(tracks.pixels, tracks.weights(), K, 1, scale, False, np.zeros_like(points), free)
+    problem = AdjustmentProblem(
+        tracks.pixels, tracks.weights(), K, 1, scale, False, np.zeros_like(points), free
+    )
     best, damping = problem.evaluated(resected(tracks, K, points - t0, t0, scale)), 1e-3
     for _ in range(_ITERATIONS):
         step = -_plane_step(problem.linearised(best), best.points + t0, offset / z0, damping)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from tracking3d.estimation.assessment import Assessment
 from tracking3d.estimation.estimate import Status
-from tracking3d.estimation.online.pose_refinement import PoseFit, PoseWeights
+from tracking3d.estimation.online.pose_refinement_types import PoseFit, PoseWeights
 from tracking3d.estimation.online.stiffness import least_held
 
 ENOUGH_POINTS = 15
@@ -156,7 +156,7 @@ def likelihood(fit: PoseFit, support: Support) -> float:
     """How likely a frame like this is right: a logistic regression, see `weighed`.
 
     Right means within 10 degrees and above an IoU of 0.7. Fitted by ``training/confidence.py`` on the causal answers of
-    the suite ``fresh`` of seed 9101; docs/method.md has what it is worth on others.
+    the suite ``fresh`` of seed 9101; docs/method/confidence.md has what it is worth on others.
     """
     return 1 / (1 + math.exp(-_INTERCEPT - sum(_odds(fit, support).values())))
 

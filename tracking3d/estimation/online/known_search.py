@@ -16,7 +16,8 @@ from tracking3d.estimation.online.keypoints import Keypoints, detect, match
 from tracking3d.estimation.online.known_views import sides
 from tracking3d.estimation.online.mapping import nearest_views, project_points
 from tracking3d.estimation.online.points import FollowedPoints
-from tracking3d.estimation.online.pose_refinement import PoseFit, PoseWeights, refine_poses
+from tracking3d.estimation.online.pose_refinement import refine_poses
+from tracking3d.estimation.online.pose_refinement_types import PoseFit, PoseWeights
 from tracking3d.estimation.online.tracking import matched_poses, pose_of_points
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, from_matrix

@@ -49,7 +49,7 @@ _FINEST_TEXELS, _TEXELS_OF_A_FACE = 512, 4.0
 
 
 @dataclass(frozen=True, eq=False)
-class Drawing:
+class RenderedSide:
     """One side of an object, drawn.
 
     Attributes:
@@ -84,10 +84,10 @@ def known_map(
     camera = Camera.from_fov(_PICTURE, _PICTURE, _FIELD_OF_VIEW)
     distance = RADIUS / math.sin(_FILLED * math.radians(_FIELD_OF_VIEW) / 2)
     colours = _colours(known).to(device)
-    seen: list[tuple[View, Drawing]] = []
+    seen: list[tuple[View, RenderedSide]] = []
     for number, R in enumerate(sides(SIDES)):
         pose = pose_of(R, np.array([0.0, 0.0, distance]), shape.rest)
-        drawing = draw(shape, colours, pose, camera, renderer)
+        drawing = render_side(shape, colours, pose, camera, renderer)
         # Drawn sides come before the first frame.
         frame = Frame(number - SIDES, drawing.image)
         window = Window.around(mask_box(drawing.mask), config.window.margin, config.window.size)
@@ -127,7 +127,9 @@ def sides(count: int) -> list[NDArray[np.float64]]:
 
 
 @torch.no_grad()
-def draw(shape: Shape, colours: Tensor, pose: Pose, camera: Camera, renderer: str = "auto") -> Drawing:
+def render_side(
+    shape: Shape, colours: Tensor, pose: Pose, camera: Camera, renderer: str = "auto"
+) -> RenderedSide:
     """Draw an object before a background of its mean colour, which puts no edge of its own along the outline.
 
     Args:
@@ -162,7 +164,7 @@ def draw(shape: Shape, colours: Tensor, pose: Pose, camera: Camera, renderer: st
 
     # The centre of a pixel is where four finer ones meet; none of them may lie beside the object.
     corners_of = [points[row::_FINER, column::_FINER] for row in range(_FINER) for column in range(_FINER)]
-    return Drawing(
+    return RenderedSide(
         (255 * reduced(picture)).round().clip(0, 255).astype(np.uint8),
         reduced(covered.astype(np.float32)) > 0.5,
         reduced(seen) > 0.99,
@@ -170,7 +172,9 @@ def draw(shape: Shape, colours: Tensor, pose: Pose, camera: Camera, renderer: st
     )
 
 
-def _with_points(learnt: ObjectMap, camera: Camera, view: View, drawing: Drawing) -> tuple[ObjectMap, View]:
+def _with_points(
+    learnt: ObjectMap, camera: Camera, view: View, drawing: RenderedSide
+) -> tuple[ObjectMap, View]:
     """With landmarks at a drawn side's keypoints, exactly on the surface."""
     kernel = np.ones((2 * _WITHIN + 1, 2 * _WITHIN + 1), np.uint8)
     inside = cv2.erode((drawing.known & drawing.mask).astype(np.uint8), kernel) > 0
@@ -195,7 +199,7 @@ def _sampled(points: NDArray[np.float32], pixel: NDArray[np.float32]) -> NDArray
 
 
 def _colours(known: KnownObject) -> Tensor:
-    """``(4, T, T)`` see `draw`; no finer than pictures show them, with nothing mixed in that was never seen."""
+    """``(4, T, T)`` see `render_side`; no finer than pictures show them, with nothing mixed in that was never seen."""
     texture = known.model.texture.astype(np.float32) / 255
     seen = (known.model.texture_weight > 0).astype(np.float32)
     layers = np.concatenate([texture * seen[..., None], seen[..., None]], 2)
@@ -212,21 +216,21 @@ def _texels(size: int, faces: int) -> int:
     return max(size, min(round(_TEXELS_OF_A_FACE * math.sqrt(faces / 2)), _FINEST_TEXELS))
 
 
-def _space(seen: list[tuple[View, Drawing]], channels: int) -> FeatureSpace:
+def _space(seen: list[tuple[View, RenderedSide]], channels: int) -> FeatureSpace:
     """The main components of the object's features over all its sides."""
     features = torch.cat([view.observation.features for view, _ in seen], 2)
     mask = torch.cat([_believed(view, drawing) for view, drawing in seen], 1)
     return FeatureSpace.of(features, mask, channels)
 
 
-def _believed(view: View, drawing: Drawing) -> Tensor:
+def _believed(view: View, drawing: RenderedSide) -> Tensor:
     """``(S, S)`` the part of a drawn side's window in which the colours are known."""
     known = torch.from_numpy(drawing.known).to(view.observation.mask)
     return (crop(known[None], view.observation.window)[0] > 0.99).float() * view.observation.mask
 
 
 def _texture(
-    learnt: ObjectMap, seen: list[tuple[View, Drawing]], space: FeatureSpace | None, channels: int
+    learnt: ObjectMap, seen: list[tuple[View, RenderedSide]], space: FeatureSpace | None, channels: int
 ) -> BackProjection:
     """What all sides together show of the feature texture, counted as a few views."""
     size, rest = learnt.texels.size, learnt.vertices

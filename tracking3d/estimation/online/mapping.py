@@ -14,7 +14,7 @@ from tracking3d.bundle_adjustment.adjustment import Structure, Tracks, adjust
 from tracking3d.estimation.online.belief import ObjectMap, View
 from tracking3d.estimation.online.keypoints import Keypoints, match
 from tracking3d.estimation.online.points import FollowedPoints
-from tracking3d.estimation.online.surface_fit import FitWeights, Landmarks, Views, fit_surface
+from tracking3d.estimation.online.surface_fit import FitWeights, Landmarks, ShapeKeyframes, fit_surface
 from tracking3d.estimation.shape import flatten
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, from_matrix
@@ -300,7 +300,7 @@ def fit_shape(known: ObjectMap, positions: list[int], weights: FitWeights, round
     views = [known.keyframes[position] for position in positions]
     observations = [view.observation for view in views]
     poses = Pose.stack([view.pose for view in views])
-    seen = Views(
+    seen = ShapeKeyframes(
         poses.R,
         poses.translation,
         torch.stack([o.K for o in observations]),

@@ -8,86 +8,17 @@ Cauchy loss.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from tracking3d.bundle_adjustment.reprojection import (
-    BEHIND,
-    FloatArray,
-    finite_rows,
-    moved,
-    pixel_by_point,
-    pixel_by_pose,
-    project,
-    to_camera,
-)
-from tracking3d.rendering.backend import compiled
+from tracking3d.bundle_adjustment.reprojection import FloatArray, finite_rows
+from tracking3d.estimation.online.pnp_types import PnPFit, PoseHypothesis
 
 _FEWEST = 4
 _SAMPLES = 500
 _CONFIDENCE = 0.999
 _REFINEMENTS = 2
-FIRST_DAMPING, MOST_DAMPING = 1e-4, 1e9
-CONVERGED = 1e-6
-
-
-@dataclass(frozen=True, eq=False)
-class PoseHypothesis:
-    """One pose and who agrees with it.
-
-    Attributes:
-        R: ``(3, 3)`` and
-        t: ``(3,)`` of ``T_cam_obj``.
-        inliers: ``(N,)`` bool, which points are seen within the threshold.
-        residual: Root of the inliers' mean squared distance, in pixels.
-    """
-
-    R: FloatArray
-    t: FloatArray
-    inliers: NDArray[np.bool_]
-    residual: float
-
-    @property
-    def count(self) -> int:
-        """How many points agree."""
-        return int(np.count_nonzero(self.inliers))
-
-
-@dataclass(frozen=True, eq=False)
-class PointEquations:
-    """A quadratic model ``cost + gradient d + d matrix d / 2`` of the points' mean Cauchy loss in ``d = (v, w)``.
-
-    As `tracking3d.rendering.NormalEquations`, of one frame, with ``t`` as pivot.
-
-    Attributes:
-        matrix: ``(6, 6)``.
-        gradient: ``(6,)``.
-        cost: By weight; a point behind the camera costs a large constant.
-        residual: ``(N,)`` distance in pixels; nan for points without weight or behind the camera.
-    """
-
-    matrix: FloatArray
-    gradient: FloatArray
-    cost: float
-    residual: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class PoseFit:
-    """A pose refined from a start.
-
-    Attributes:
-        R: ``(3, 3)`` and
-        t: ``(3,)`` of ``T_cam_obj``.
-        equations: The model at this pose.
-    """
-
-    R: FloatArray
-    t: FloatArray
-    equations: PointEquations
 
 
 def pose_from_points(
@@ -133,7 +64,7 @@ def pose_of_tracks(
     t: FloatArray,
     scale: float,
     iterations: int = 10,
-) -> PoseFit:
+) -> PnPFit:
     """The pose of least robust reprojection error near a start; never worse than the start.
 
     Args:
@@ -146,53 +77,10 @@ def pose_of_tracks(
         scale: Residual in pixels at which the loss is ``log 2``.
         iterations: The most steps that are tried.
     """
-    if compiled():
-        from tracking3d.estimation.online.kernels import pose_from_points
+    from tracking3d.estimation.online.kernels import pose_from_points
 
-        share = _shares(points, pixels, weight)
-        return pose_from_points.pose_of_tracks(points, pixels, share, K, R, t, scale, iterations)
-    at = point_equations(points, pixels, weight, K, R, t, scale)
-    damping = FIRST_DAMPING
-    for _ in range(iterations):
-        diagonal = at.matrix.diagonal()
-        floor = 1e-9 * diagonal.max() + 1e-12
-        step = -np.linalg.solve(at.matrix + np.diag(damping * diagonal + floor), at.gradient)
-        R_new, t_new = (part[0] for part in moved(R[None], t[None], np.asarray(step[None], np.float64)))
-        new = point_equations(points, pixels, weight, K, R_new, t_new, scale)
-        if not new.cost < at.cost:
-            damping = min(10 * damping, MOST_DAMPING)
-            continue
-        settled = at.cost - new.cost < CONVERGED * at.cost
-        R, t, at, damping = R_new, t_new, new, damping / 10
-        if settled:
-            break
-    return PoseFit(R, t, at)
-
-
-def point_equations(
-    points: FloatArray,
-    pixels: FloatArray,
-    weight: FloatArray | None,
-    K: FloatArray,
-    R: FloatArray,
-    t: FloatArray,
-    scale: float,
-) -> PointEquations:
-    """The points' normal equations at a pose; all zero if there is no point. Arguments as of `pose_of_tracks`."""
     share = _shares(points, pixels, weight)
-    x_cam = to_camera(R, t, np.where(finite_rows(points)[:, None], points, 0.0))
-    difference = project(x_cam, K) - pixels
-    residual = np.where(share > 0, np.hypot(difference[:, 0], difference[:, 1]), np.nan)
-    used = np.isfinite(residual)
-    relative = np.where(used, residual / scale, BEHIND)
-    cost = float(np.sum(share * np.log1p(relative**2)))
-    difference = np.where(used[:, None], difference, 0.0)
-    # The Cauchy loss as weights of least squares: its derivative is 2 r / (scale^2 + r^2).
-    robust = np.where(used, 2 * share / (scale**2 + np.sum(difference**2, 1)), 0.0)
-    motion = pixel_by_pose(pixel_by_point(x_cam, K), x_cam - t)
-    rows = motion.reshape(-1, 6)
-    weighted = (robust[:, None, None] * motion).reshape(-1, 6)
-    return PointEquations(rows.T @ weighted, weighted.T @ difference.ravel(), cost, residual)
+    return pose_from_points.pose_of_tracks(points, pixels, share, K, R, t, scale, iterations)
 
 
 def _shares(points: FloatArray, pixels: FloatArray, weight: FloatArray | None) -> FloatArray:

@@ -8,74 +8,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from tracking3d.bundle_adjustment.reprojection import FloatArray, moved
+from tracking3d.bundle_adjustment.reprojection import FloatArray, apply_pose_steps
 from tracking3d.estimation.observation import Observation
+from tracking3d.estimation.online.pose_refinement_types import (
+    ENOUGH,
+    FIRST_DAMPING,
+    LEAST_DAMPING,
+    MOST_DAMPING,
+    NOTHING_SEEN,
+    EvaluatedPoses,
+    PoseFit,
+    PoseWeights,
+)
 from tracking3d.geometry.pose import Pose, from_matrix
-from tracking3d.rendering import MatchedPoints, NormalEquations, Scales, Surface, pose_terms
+from tracking3d.rendering import MatchedPoints, Scales, Surface, pose_terms
 from tracking3d.rendering.backend import use_numba
 
-FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-6, 1e3
-ENOUGH = 1e-4
-"""Share of the cost below which a gain ends the search."""
-NOTHING_SEEN = 1.0
-"""What a pose costs that shows nothing comparable, above one that shows unseen texture only."""
-
-
-@dataclass(frozen=True)
-class PoseWeights:
-    """What each kind of evidence counts, and where its robust loss turns over.
-
-    Attributes:
-        appearance: Of the mean over the covered pixels in the mask and the frame.
-        appearance_scale: Difference of features at which the loss is ``log 2``.
-        outline: Of the mean along the outline.
-        outline_scale: Pixels at full working resolution at which the loss is ``log 2``.
-        points: Of the mean over the matched points.
-        points_scale: Pixels at full working resolution at which the loss is ``log 2``.
-        unseen: What a covered pixel of unseen texture costs, in place of its loss.
-    """
-
-    appearance: float = 1.0
-    appearance_scale: float = 0.25
-    outline: float = 0.3
-    outline_scale: float = 2.0
-    points: float = 1.0
-    points_scale: float = 1.0
-    unseen: float = 0.5
-
-
-@dataclass(frozen=True, eq=False)
-class PoseFit:
-    """A pose and how well it explains the frame.
-
-    Attributes:
-        pose: Of the frame.
-        cost: What was minimized.
-        appearance: Mean Cauchy loss over the covered pixels in the mask and the frame, unseen ones charged.
-        outline: Mean Cauchy loss of the outline; 0 without a mask.
-        points: Mean Cauchy loss of the matched points; 0 without any.
-        overlap: IoU of what is covered with the mask, inside the frame; 1 without a mask.
-        unseen: Share of the comparable pixels whose texture was never seen, in [0, 1].
-        information: ``(6, 6)`` matrix of the normal equations, see `tracking3d.rendering.NormalEquations`.
-        iterations: Evaluations spent.
-    """
-
-    pose: Pose
-    cost: float
-    appearance: float
-    outline: float
-    points: float
-    overlap: float
-    unseen: float
-    information: Tensor
-    iterations: int
+_DEFAULT_WEIGHTS = PoseWeights()
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,57 +56,12 @@ class _Evidence:
         return _Evidence(self.observation.half, matched, weights)
 
 
-@dataclass(frozen=True, eq=False)
-class EvaluatedPoses:
-    """B poses with what they cost, see `PoseFit`: float64 arrays, each ``(B, ...)``.
-
-    Attributes:
-        spent: Evaluations that led to them, int64.
-        moved: Whether they are elsewhere than where they started, bool.
-    """
-
-    R: FloatArray
-    t: FloatArray
-    cost: FloatArray
-    appearance: FloatArray
-    outline: FloatArray
-    points: FloatArray
-    overlap: FloatArray
-    unseen: FloatArray
-    matrix: FloatArray
-    gradient: FloatArray
-    spent: NDArray[np.int64]
-    moved: NDArray[np.bool_]
-
-    def __getitem__(self, places: NDArray[Any]) -> EvaluatedPoses:
-        """Some of them."""
-        return EvaluatedPoses(*(values[places] for values in vars(self).values()))
-
-    def __setitem__(self, places: NDArray[Any], others: EvaluatedPoses) -> None:
-        """Put others in their place."""
-        for mine, theirs in zip(vars(self).values(), vars(others).values(), strict=True):
-            mine[places] = theirs
-
-    def steps(self, damping: FloatArray) -> FloatArray:
-        """``(B, 6)`` of Levenberg-Marquardt, see `tracking3d.rendering.NormalEquations.step`."""
-        parts = (torch.from_numpy(part) for part in (self.matrix, self.gradient, self.cost))
-        taken: FloatArray = NormalEquations(*parts).step(torch.from_numpy(damping)).numpy()
-        return taken
-
-    def fit(self, n: int, pose: Pose, iterations: int) -> PoseFit:
-        """One of them."""
-        costs = (self.cost, self.appearance, self.outline, self.points, self.overlap, self.unseen)
-        cost, appearance, outline, points, overlap, unseen = (float(values[n]) for values in costs)
-        information = torch.from_numpy(self.matrix[n]).to(pose.translation)
-        return PoseFit(pose, cost, appearance, outline, points, overlap, unseen, information, iterations)
-
-
 def refine_pose(
     surface: Surface,
     observation: Observation,
     start: Pose,
     matched: MatchedPoints | None = None,
-    weights: PoseWeights = PoseWeights(),
+    weights: PoseWeights = _DEFAULT_WEIGHTS,
     iterations: tuple[int, ...] = (4, 5),
 ) -> PoseFit:
     """Fit one pose; see `refine_poses`."""
@@ -164,7 +73,7 @@ def refine_poses(
     observation: Observation,
     starts: Sequence[Pose],
     matched: MatchedPoints | None = None,
-    weights: PoseWeights = PoseWeights(),
+    weights: PoseWeights = _DEFAULT_WEIGHTS,
     iterations: tuple[int, ...] = (4, 5),
 ) -> list[PoseFit]:
     """Fit one frame's pose from several starts, coarse to fine, each as if it were alone.
@@ -209,7 +118,9 @@ def _minimized(
     going, damping = np.arange(len(R)), np.full(len(R), FIRST_DAMPING)
     for _ in range(steps):
         present = best[going]
-        trial = _evaluated(surface, evidence, *moved(present.R, present.t, present.steps(damping[going])))
+        trial = _evaluated(
+            surface, evidence, *apply_pose_steps(present.R, present.t, present.steps(damping[going]))
+        )
         trial.moved[:] = True
         gain = present.cost - trial.cost
         better = gain > 0

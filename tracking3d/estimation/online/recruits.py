@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking3d.bundle_adjustment.adjustment import Structure, adjust
-from tracking3d.bundle_adjustment.reprojection import project, to_camera
+from tracking3d.bundle_adjustment.reprojection import project_camera_points, transform_to_camera
 from tracking3d.estimation.online.belief import ObjectMap, View
 from tracking3d.estimation.online.mapping import pose_arrays, tracks_of
 from tracking3d.estimation.online.points import FollowedPoints, new_corners
@@ -84,7 +84,9 @@ def recruit(known: ObjectMap, camera: Camera, positions: list[int]) -> ObjectMap
     )
     motion = np.nanmax(np.linalg.norm(tracks.pixels - pixel, axis=2), 0) / scale
     # A point that stays while the object would have carried it along is none of it.
-    carried = np.linalg.norm(project(to_camera(R, t, start.points), camera.K) - pixel, axis=2)
+    carried = np.linalg.norm(
+        project_camera_points(transform_to_camera(R, t, start.points), camera.K) - pixel, axis=2
+    )
     carried = np.nanmax(np.where(tracks.visible, carried, np.nan), 0) / scale
     stays = (carried > _MOVED) & (motion < _STAYS * carried)
     near = np.linalg.norm(found.points - known.vertices.mean(0).cpu().numpy(), axis=1) < 1.6 * known.radius

@@ -45,7 +45,7 @@ from tracking3d.estimation.online.moving import moving_beside, with_past
 from tracking3d.estimation.online.object_model import object_model
 from tracking3d.estimation.online.points import FollowedPoints, follow, grey
 from tracking3d.estimation.online.reversal import turned_round
-from tracking3d.estimation.online.start import Start
+from tracking3d.estimation.online.start import InitialMap
 from tracking3d.estimation.online.steering import trusting, turned_back
 from tracking3d.estimation.online.tracking import (
     agreeing,
@@ -209,7 +209,7 @@ class OnlineSolver(PoseFinder):
             return belief, replace(answer, reason=reason)
         return self._begun(belief, start)
 
-    def _begun(self, state: Belief, start: Start) -> tuple[Belief, FrameEstimate]:
+    def _begun(self, state: Belief, start: InitialMap) -> tuple[Belief, FrameEstimate]:
         """Answer all waiting frames anew."""
         assert state.waiting is not None
         everything = list(range(len(start.known.keyframes)))

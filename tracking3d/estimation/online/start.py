@@ -21,7 +21,8 @@ from tracking3d.estimation.online.mapping import (
     tracks_of,
 )
 from tracking3d.estimation.online.points import FollowedPoints
-from tracking3d.estimation.online.pose_refinement import PoseWeights, refine_pose
+from tracking3d.estimation.online.pose_refinement import refine_pose
+from tracking3d.estimation.online.pose_refinement_types import PoseWeights
 from tracking3d.estimation.online.shape_modes import Modes
 from tracking3d.estimation.online.structure import structure_hypotheses
 from tracking3d.estimation.online.surface_fit import FitWeights
@@ -46,7 +47,7 @@ _STAGES = ((99, 5, True), (5, 12, True), (3, 10, False))
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
+class InitialMap:
     """A solved start.
 
     Attributes:
@@ -70,7 +71,7 @@ def solve_start(
     views: list[View],
     weights: FitWeights,
     prior: float,
-) -> list[Start]:
+) -> list[InitialMap]:
     """Starts by rising cost; empty where the points cannot tell.
 
     Args:
@@ -106,7 +107,7 @@ def solve_start(
         ]
         cost = float(np.mean([fit.cost for fit in fits])) + structure.cost
         cost *= 1 + _UNUSUAL_LENS * abs(math.log2(camera.fy / cameras[0].fy))
-        starts.append(Start(hypothesis, cost, structure.cost, structure.origin, camera))
+        starts.append(InitialMap(hypothesis, cost, structure.cost, structure.origin, camera))
     starts.sort(key=lambda start: start.cost)
     return starts
 
@@ -129,7 +130,7 @@ def with_observations(known: ObjectMap, views: list[View], coarse: bool) -> Obje
     return replace(known, keyframes=tuple(keyframes))
 
 
-def by_turning(known: ObjectMap, camera: Camera, views: list[View], weights: FitWeights) -> list[Start]:
+def by_turning(known: ObjectMap, camera: Camera, views: list[View], weights: FitWeights) -> list[InitialMap]:
     """The best start that needs no points, from the first of the views.
 
     Shape and poses are fitted together from every hypothesis of `turning_hypotheses`; the better ones go on.
@@ -162,7 +163,7 @@ def by_turning(known: ObjectMap, camera: Camera, views: list[View], weights: Fit
         refine_pose(surface, view.observation, view.pose, None, PoseWeights(), iterations=(0,))
         for view in found.keyframes
     ]
-    return [Start(found, float(np.mean([fit.cost for fit in fits])), 0.0, name, camera)]
+    return [InitialMap(found, float(np.mean([fit.cost for fit in fits])), 0.0, name, camera)]
 
 
 def _spread(views: list[View], most: int) -> list[View]:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.estimation.online.pose_refinement import PoseFit
+from tracking3d.estimation.online.pose_refinement_types import PoseFit
 
 TURN = 10.0
 """Degrees of the turn whose cost is told."""

@@ -50,7 +50,7 @@ class FitWeights:
 
 
 @dataclass(frozen=True, eq=False)
-class Views:
+class ShapeKeyframes:
     """The keyframes as the shape is fitted to them.
 
     Attributes:
@@ -86,7 +86,7 @@ def fit_surface(
     faces: Tensor,
     face_uvs: Tensor,
     laplacian: Tensor,
-    views: Views,
+    views: ShapeKeyframes,
     landmarks: Landmarks | None = None,
     weights: FitWeights = FitWeights(),
     rounds: int = 3,
@@ -127,7 +127,9 @@ def fit_surface(
     return shape
 
 
-def _drawn(vertices: Tensor, faces: Tensor, face_uvs: Tensor, views: Views, renderer: str) -> Rendering:
+def _drawn(
+    vertices: Tensor, faces: Tensor, face_uvs: Tensor, views: ShapeKeyframes, renderer: str
+) -> Rendering:
     """The shape in every view, without a texture."""
     size = (int(views.distance.shape[1]), int(views.distance.shape[2]))
     nothing = vertices.new_zeros(1, 8, 8)
@@ -142,7 +144,7 @@ def _solved(matrix: sparse.spmatrix, target: FloatArray) -> FloatArray:
     return np.asarray(factors.solve(target))
 
 
-def _outline_rows(drawn: Rendering, views: Views, weights: FitWeights) -> Rows:
+def _outline_rows(drawn: Rendering, views: ShapeKeyframes, weights: FitWeights) -> Rows:
     """The outlines' signed distances from the masks'; every frame counts the same but for its weight."""
     contour = find_contour(drawn)
     residual, slope = contour_slopes(contour, views.distance)
@@ -156,7 +158,12 @@ def _outline_rows(drawn: Rendering, views: Views, weights: FitWeights) -> Rows:
 
 
 def _covered_rows(
-    drawn: Rendering, x_cam: Tensor, face: Tensor, views: Views, landmarks: Landmarks, weights: FitWeights
+    drawn: Rendering,
+    x_cam: Tensor,
+    face: Tensor,
+    views: ShapeKeyframes,
+    landmarks: Landmarks,
+    weights: FitWeights,
 ) -> Rows:
     """The landmarks' distances from the faces ``(N,)`` that are drawn where they are, along the faces' normals."""
     kept = torch.nonzero(face >= 0)[:, 0]
@@ -190,7 +197,7 @@ def _uncovered_rows(vertices: Tensor, points: Tensor, face: Tensor, weights: Fit
     return jacobian, _numpy(root[:, None] * difference).ravel()
 
 
-def _faces_before(drawn: Rendering, views: Views, landmarks: Landmarks) -> tuple[Tensor, Tensor]:
+def _faces_before(drawn: Rendering, views: ShapeKeyframes, landmarks: Landmarks) -> tuple[Tensor, Tensor]:
     """Landmarks in camera coordinates ``(N, 3)``, and the face ``(N,)`` that is drawn where each is; -1 for none."""
     view = landmarks.view
     x_cam = torch.einsum("nij,nj->ni", views.R[view], landmarks.points) + views.t[view]
@@ -213,7 +220,7 @@ def _landmark_roots(distance: Tensor, scale: float, count: int, weights: FitWeig
     return mean.sqrt() / weights.landmarks_scale
 
 
-def _pixel_by_point(x_cam: Tensor, views: Views, view: Tensor) -> Tensor:
+def _pixel_by_point(x_cam: Tensor, views: ShapeKeyframes, view: Tensor) -> Tensor:
     """``(N, 2, 3)`` derivative of pixels by points of the object, given in camera coordinates ``(N, 3)``."""
     x, y, z = x_cam.unbind(1)
     fx, fy = views.K[view, 0, 0] / z, views.K[view, 1, 1] / z

@@ -23,7 +23,8 @@ from tracking3d.estimation.online.mapping import (
 )
 from tracking3d.estimation.online.points import FollowedPoints
 from tracking3d.estimation.online.pose_from_points import pose_from_points
-from tracking3d.estimation.online.pose_refinement import PoseFit, PoseWeights, refine_pose, refine_poses
+from tracking3d.estimation.online.pose_refinement import refine_pose, refine_poses
+from tracking3d.estimation.online.pose_refinement_types import PoseFit, PoseWeights
 from tracking3d.geometry.camera import Camera
 from tracking3d.geometry.pose import Pose, extrapolate, from_matrix, rotation_about
 from tracking3d.rendering import MatchedPoints, Surface

@@ -18,7 +18,7 @@ from tracking3d.estimation.online.keypoints import detect, match
 from tracking3d.estimation.online.lens import lens_hypotheses
 from tracking3d.estimation.online.mapping import tracks_of
 from tracking3d.estimation.online.points import MOST_POINTS, FollowedPoints, new_corners
-from tracking3d.estimation.online.start import Start, by_turning, solve_start
+from tracking3d.estimation.online.start import InitialMap, by_turning, solve_start
 from tracking3d.estimation.online.structure import motion_enough
 from tracking3d.estimation.online.surface_fit import FitWeights
 from tracking3d.estimation.online.texture_strength import PLAIN, texture_strength
@@ -96,7 +96,9 @@ def waiting_view(
     return known, replace(view, points=points, keypoints=keypoints, keypoint_landmark=label)
 
 
-def solved_start(state: Belief, config: OnlineConfig, ended: bool = False) -> tuple[Belief, Start | None]:
+def solved_start(
+    state: Belief, config: OnlineConfig, ended: bool = False
+) -> tuple[Belief, InitialMap | None]:
     """The start, where the waiting frames can tell; else None, and when it is tried next.
 
     Args:
@@ -142,14 +144,14 @@ def solved_start(state: Belief, config: OnlineConfig, ended: bool = False) -> tu
     return state, starts[0] if starts else None
 
 
-def _starts_from_points(state: Belief, views: list[View], config: OnlineConfig) -> list[Start]:
+def _starts_from_points(state: Belief, views: list[View], config: OnlineConfig) -> list[InitialMap]:
     weights = FitWeights(smoothness=config.smoothness)
     return solve_start(state.known, lens_hypotheses(state.camera), views, weights, config.surface_prior)
 
 
 def _start_without_points(
     state: Belief, views: list[View], config: OnlineConfig
-) -> tuple[Belief, Start | None]:
+) -> tuple[Belief, InitialMap | None]:
     """The start from pixels and outlines alone; None where nothing shows that the object turns."""
     waiting = state.waiting or ()
     if not _changed(views):
@@ -158,7 +160,7 @@ def _start_without_points(
     return state, by_turning(state.known, state.camera, views, FitWeights(smoothness=config.smoothness))[0]
 
 
-def _undecided(starts: list[Start], motion: float, leaning: NDArray[np.float64] | None) -> bool:
+def _undecided(starts: list[InitialMap], motion: float, leaning: NDArray[np.float64] | None) -> bool:
     """Whether another start, whose object turns otherwise, costs hardly more than the best for so little motion.
 
     Only points that are followed well tell more when there is more motion.
@@ -179,7 +181,7 @@ def _undecided(starts: list[Start], motion: float, leaning: NDArray[np.float64] 
     return lead < (_LEAD_AGAIN if again else _LEAD)
 
 
-def _turn(start: Start) -> NDArray[np.float64]:
+def _turn(start: InitialMap) -> NDArray[np.float64]:
     """``(3,)`` rotation vector from the first view of a start to the last, in camera coordinates."""
     first, *_, last = start.known.keyframes
     return Rotation.from_matrix((last.pose.R @ first.pose.R.T).cpu().numpy()).as_rotvec()

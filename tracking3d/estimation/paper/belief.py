@@ -20,7 +20,7 @@ from tracking3d.rendering import BackProjection, TexelMap, back_project, project
 
 
 @dataclass(frozen=True, eq=False)
-class Keyframe:
+class PosedObservation:
     """A frame that stays in the optimization, with its pose as it stands."""
 
     observation: Observation
@@ -28,7 +28,7 @@ class Keyframe:
 
 
 @dataclass(frozen=True, eq=False)
-class Belief:
+class PaperState:
     """What the solver knows.
 
     Attributes:
@@ -53,11 +53,11 @@ class Belief:
     texels: TexelMap
     offsets: Tensor
     texture: Tensor
-    keyframes: tuple[Keyframe, ...]
+    keyframes: tuple[PosedObservation, ...]
     seen: BackProjection
     last: tuple[Pose, int]
     before: tuple[Pose, int] | None = None
-    waiting: tuple[tuple[Keyframe, FrameEstimate], ...] | None = None
+    waiting: tuple[tuple[PosedObservation, FrameEstimate], ...] | None = None
     started: bool = False
     space: FeatureSpace | None = None
     renderer: str = "auto"
@@ -73,11 +73,11 @@ class Belief:
         centred = self.vertices - self.vertices.mean(0)
         return 2 * float(centred.norm(dim=1).max())
 
-    def moved(self, pose: Pose, index: int) -> Belief:
+    def moved(self, pose: Pose, index: int) -> PaperState:
         """The same belief one frame later."""
         return replace(self, last=(pose, index), before=self.last if self.started else None, started=True)
 
-    def back_project(self, values: Tensor, keyframe: Keyframe) -> BackProjection:
+    def back_project(self, values: Tensor, keyframe: PosedObservation) -> BackProjection:
         """What a frame shows of the texture; ``values`` is ``(C, H, W)`` over the frame's window."""
         observation = keyframe.observation
         scale = values.shape[-1] / observation.window.size
@@ -108,7 +108,7 @@ class Belief:
         covered = rasterize(screen, depth, self.shape.faces, size, self.renderer).face_index[0] >= 0
         return np.asarray(covered.cpu().numpy(), dtype=np.bool_)
 
-    def parameters(self, frames: list[Keyframe]) -> Parameters:
+    def parameters(self, frames: list[PosedObservation]) -> Parameters:
         """Poses of the frames, with the shape and texture as they are."""
         poses = Pose.stack([frame.pose for frame in frames])
         return Parameters(poses.translation, poses.quaternion, self.offsets, self.texture)

@@ -11,13 +11,14 @@ from dataclasses import replace
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from tracking3d.config.solvers import PaperConfig
-from tracking3d.estimation.observation import Batch, halved
-from tracking3d.estimation.paper.belief import Belief, Keyframe
+from tracking3d.estimation.observation import ObservationBatch, halved
+from tracking3d.estimation.paper.belief import PaperState, PosedObservation
 from tracking3d.estimation.paper.optimize import Optimum, optimize
 from tracking3d.estimation.paper.problem import Parameters, Problem
-from tracking3d.geometry.pose import Pose, from_matrix, rotation_about
+from tracking3d.geometry.pose import Pose, from_matrix, rotation_exponential
 
 RATES = (3.0, 8.0)
 """Degrees a frame that the hypotheses turn."""
@@ -26,7 +27,9 @@ _SEMIFINALISTS = 6
 _FINALISTS = 2
 
 
-def joint_start(belief: Belief, frames: list[Keyframe], config: PaperConfig, tau: float) -> Optimum:
+def joint_start(
+    belief: PaperState, frames: list[PosedObservation], config: PaperConfig, tau: float
+) -> Optimum:
     """Solve shape, texture and all poses of ``frames``; the first pose is fixed.
 
     Args:
@@ -37,7 +40,7 @@ def joint_start(belief: Belief, frames: list[Keyframe], config: PaperConfig, tau
     """
     config = config.model_copy(update={"stop": "plateau", "patience": config.start_iterations})
     coarse, fine = (
-        Problem(belief.shape, Batch.of(observations), config, backend=belief.renderer)
+        Problem(belief.shape, ObservationBatch.of(observations), config, backend=belief.renderer)
         for observations in (
             [halved(frame.observation) for frame in frames],
             [frame.observation for frame in frames],
@@ -60,36 +63,33 @@ def joint_start(belief: Belief, frames: list[Keyframe], config: PaperConfig, tau
     return replace(optima[0], iterations=spent)
 
 
-def hypotheses(belief: Belief, frames: list[Keyframe]) -> list[Parameters]:
+def hypotheses(belief: PaperState, frames: list[PosedObservation]) -> list[Parameters]:
     """No rotation; the rotations found so far mirrored in depth; turning in eight directions at two rates.
 
     Translations are those found so far: they are seen directly.
     """
-    first = frames[0].pose
-    found = [frame.pose for frame in frames]
-    still = [Pose(pose.translation, first.quaternion) for pose in found]
-    variants = [still, [_mirrored(first, pose) for pose in found]]
+    first, found = frames[0].pose, Pose.stack([frame.pose for frame in frames])
+    elapsed = [frame.observation.index - frames[0].observation.index for frame in frames]
+    still = Pose(found.translation, first.quaternion.expand_as(found.quaternion))
+    variants = [still, _mirrored(first, found)]
     for direction in range(DIRECTIONS):
         angle = 2 * math.pi * direction / DIRECTIONS
         axis = first.translation.new_tensor([math.cos(angle), math.sin(angle), 0.0])
-        for rate in RATES:
-            variants.append([_turned(first, frame, axis, rate, frames[0]) for frame in frames])
+        variants += [_turned(first, found, axis, rate, elapsed) for rate in RATES]
     return [
-        belief.parameters(
-            [Keyframe(frame.observation, pose) for frame, pose in zip(frames, poses, strict=True)]
-        )
-        for poses in variants
+        Parameters(poses.translation, poses.quaternion, belief.offsets, belief.texture) for poses in variants
     ]
 
 
-def _turned(first: Pose, frame: Keyframe, axis: Tensor, rate: float, start: Keyframe) -> Pose:
-    degrees = rate * (frame.observation.index - start.observation.index)
-    degrees = max(min(degrees, 60.0), -60.0)
-    return from_matrix(rotation_about(axis, degrees) @ first.R, frame.pose.translation)
+def _turned(first: Pose, found: Pose, axis: Tensor, rate: float, elapsed: list[int]) -> Pose:
+    """The first rotation turned about ``axis`` by ``rate`` degrees in each of the elapsed frames, by 60 at most."""
+    angles = axis.new_tensor([math.radians(max(min(rate * frames, 60.0), -60.0)) for frames in elapsed])
+    turn = rotation_exponential(angles[:, None] * functional.normalize(axis, dim=0))
+    return from_matrix(turn @ first.R, found.translation)
 
 
-def _mirrored(first: Pose, pose: Pose) -> Pose:
-    """The rotation since the first frame with its tilt out of the image plane reversed (Necker)."""
-    delta = pose.R @ first.R.T
+def _mirrored(first: Pose, found: Pose) -> Pose:
+    """The rotations since the first frame with their tilt out of the image plane reversed (Necker)."""
+    delta = found.R @ first.R.T
     flip = torch.diag(delta.new_tensor([1.0, 1.0, -1.0]))
-    return from_matrix(flip @ delta @ flip @ first.R, pose.translation)
+    return from_matrix(flip @ delta @ flip @ first.R, found.translation)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking3d.estimation.paper.belief import Belief
+from tracking3d.estimation.paper.belief import PaperState
 from tracking3d.geometry.pose import Pose, extrapolate
 from tracking3d.rendering.visibility import NEAR
 
 
-def candidate_poses(belief: Belief, index: int, mask: NDArray[np.bool_] | None) -> list[Pose]:
+def candidate_poses(belief: PaperState, index: int, mask: NDArray[np.bool_] | None) -> list[Pose]:
     """The last pose, constant velocity, and their rotations moved to where the mask is.
 
     After a lost frame there is no velocity to go on with; the keyframes' poses are tried instead.
@@ -28,7 +28,7 @@ def candidate_poses(belief: Belief, index: int, mask: NDArray[np.bool_] | None) 
     return candidates
 
 
-def moved_to_mask(belief: Belief, pose: Pose, mask: NDArray[np.bool_]) -> Pose:
+def moved_to_mask(belief: PaperState, pose: Pose, mask: NDArray[np.bool_]) -> Pose:
     """Shift a pose so that its silhouette has the mask's centroid and area."""
     silhouette = belief.silhouette(pose)
     camera = belief.camera

@@ -9,7 +9,7 @@ from torch.nn import functional
 
 from tracking3d.config.solvers import PaperConfig, Weights
 from tracking3d.estimation import losses
-from tracking3d.estimation.observation import Batch
+from tracking3d.estimation.observation import ObservationBatch
 from tracking3d.estimation.shape import Shape
 from tracking3d.geometry.pose import Pose
 from tracking3d.rendering import Rendering, SoftBand, render, sample_texture, texture_losses
@@ -92,7 +92,7 @@ class Problem:
     """
 
     shape: Shape
-    batch: Batch
+    batch: ObservationBatch
     config: PaperConfig
     seen: Tensor | None = None
     previous: tuple[Pose, int] | None = None

@@ -14,47 +14,34 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tracking3d.config.models import PipelineConfig
 from tracking3d.config.solvers import PaperConfig
 from tracking3d.estimation.appearance import visible_texture
 from tracking3d.estimation.assessment import Assessment, assess
 from tracking3d.estimation.estimate import FrameEstimate, MaskSource, ObjectModel, Status
 from tracking3d.estimation.feature_space import TAU, FeatureSpace, feature_channels
-from tracking3d.estimation.framing import mask_box, projected_box
-from tracking3d.estimation.keyframes import Candidate, is_new_view, select_keyframes
-from tracking3d.estimation.observation import Batch, Observation, observe
-from tracking3d.estimation.paper.belief import Belief, Keyframe
+from tracking3d.estimation.keyframes import KeyframeCandidate, is_new_view, select_keyframes
+from tracking3d.estimation.observation import Observation, ObservationBatch
+from tracking3d.estimation.paper.belief import PaperState, PosedObservation
 from tracking3d.estimation.paper.joint_start import joint_start
 from tracking3d.estimation.paper.optimize import Optimum, optimize
 from tracking3d.estimation.paper.prediction import candidate_poses
 from tracking3d.estimation.paper.problem import Problem
 from tracking3d.estimation.shape import Shape
 from tracking3d.estimation.solver import STATE_CLASSES
+from tracking3d.estimation.solver_base import SolverBase
 from tracking3d.estimation.start import first_mask, first_translation, mask_ellipse, prototype_mesh
-from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Frame, MaskEstimate
-from tracking3d.geometry.camera import Camera, Window
 from tracking3d.geometry.pose import Pose
 from tracking3d.rendering import BackProjection, TexelMap
 from tracking3d.stages import in_stage
 
 
 @dataclass(frozen=True)
-class PaperSolver:
-    """See the module; implements `tracking3d.estimation.solver.Solver`.
+class PaperSolver(SolverBase):
+    """See the module; implements `tracking3d.estimation.solver.Solver`."""
 
-    Attributes:
-        config: The pipeline's configuration.
-        camera: The camera of the full frame.
-        encoder: The feature encoder.
-    """
-
-    config: PipelineConfig
-    camera: Camera
-    encoder: FeatureEncoder
-
-    state_classes: ClassVar[tuple[type, ...]] = (*STATE_CLASSES, Belief, Keyframe)
-    """What a `Belief` is made of, for keeping it."""
+    state_classes: ClassVar[tuple[type, ...]] = (*STATE_CLASSES, PaperState, PosedObservation)
+    """What a `PaperState` is made of, for keeping it."""
 
     @property
     def settings(self) -> PaperConfig:
@@ -72,12 +59,7 @@ class PaperSolver:
     def _channels(self) -> int:
         return feature_channels(self.encoder, self.config.object.texture_channels)
 
-    @property
-    def device(self) -> torch.device:
-        """Where tensors live."""
-        return torch.device(self.config.runtime.device)
-
-    def init(self, frame: Frame, mask: MaskEstimate) -> tuple[Belief, FrameEstimate]:
+    def init(self, frame: Frame, mask: MaskEstimate) -> tuple[PaperState, FrameEstimate]:
         """Fit prototype, shape and texture to the first frame.
 
         Raises:
@@ -94,7 +76,7 @@ class PaperSolver:
         if shape.flat:
             # Facing the camera: any plane fits a ball, and the one that fits an ellipsoid best is seen edge-on.
             offsets[:, 2] = -shape.rest[:, 2]
-        belief = Belief(
+        belief = PaperState(
             self.camera,
             shape,
             TexelMap.of(shape.face_uvs, size),
@@ -113,9 +95,9 @@ class PaperSolver:
             space = FeatureSpace.of(observation.features, observation.mask, self._channels)
             belief = replace(belief, space=space)
             observation = replace(observation, features=space.project(observation.features))
-        return self._solve(belief, frame, binary, Keyframe(observation, pose))
+        return self._solve(belief, frame, binary, PosedObservation(observation, pose))
 
-    def step(self, state: Belief, frame: Frame, mask: MaskEstimate) -> tuple[Belief, FrameEstimate]:
+    def step(self, state: PaperState, frame: Frame, mask: MaskEstimate) -> tuple[PaperState, FrameEstimate]:
         """Track one more frame."""
         binary = mask.binary
         if binary is not None and not binary.any():
@@ -125,9 +107,9 @@ class PaperSolver:
             candidates = candidate_poses(state, frame.index, binary)
         observation = self._observe(state, frame, binary, candidates[0])
         pose = self._best_candidate(state, observation, candidates)
-        return self._solve(state, frame, binary, Keyframe(observation, pose))
+        return self._solve(state, frame, binary, PosedObservation(observation, pose))
 
-    def result(self, state: Belief) -> ObjectModel:
+    def result(self, state: PaperState) -> ObjectModel:
         """The object with its visible texture back-projected from the keyframes (section 3.4)."""
         texture, weight = visible_texture(state.seen_with_keyframes())
         return ObjectModel(
@@ -140,18 +122,11 @@ class PaperSolver:
         )
 
     def _observe(
-        self, belief: Belief, frame: Frame, mask: NDArray[np.bool_] | None, pose: Pose
+        self, belief: PaperState, frame: Frame, mask: NDArray[np.bool_] | None, pose: Pose
     ) -> Observation:
-        box = mask_box(mask) if mask is not None else projected_box(belief.vertices, belief.camera, pose)
-        if box is None:
-            box = (0.0, 0.0, float(self.camera.width), float(self.camera.height))
-        window = Window.around(box, self.config.window.margin, self.config.window.size)
-        observation = observe(frame, mask, window, self.camera, self.encoder, self.device)
-        if belief.space is None:
-            return observation
-        return replace(observation, features=belief.space.project(observation.features))
+        return self.observe(frame, mask, pose, belief.vertices, belief.camera, belief.space)
 
-    def _best_candidate(self, belief: Belief, observation: Observation, candidates: list[Pose]) -> Pose:
+    def _best_candidate(self, belief: PaperState, observation: Observation, candidates: list[Pose]) -> Pose:
         """The pose with the least loss as it stands."""
         if len(candidates) == 1:
             return candidates[0]
@@ -159,11 +134,11 @@ class PaperSolver:
         totals = []
         for pose in candidates:
             with torch.no_grad():
-                losses = problem.losses(belief.parameters([Keyframe(observation, pose)]))
+                losses = problem.losses(belief.parameters([PosedObservation(observation, pose)]))
             totals.append(float(losses.total(self.settings.weights)))
         return candidates[int(np.argmin(np.nan_to_num(totals, nan=np.inf)))]
 
-    def _problem_of_pose(self, belief: Belief, observation: Observation) -> Problem:
+    def _problem_of_pose(self, belief: PaperState, observation: Observation) -> Problem:
         """One frame against the shape and texture known so far."""
         seen = previous = None
         if self.settings.unseen_charge is not None:
@@ -171,11 +146,13 @@ class PaperSolver:
         if belief.keyframes:
             keyframe = belief.keyframes[-1]
             previous = keyframe.pose, keyframe.observation.index
-        return Problem(belief.shape, Batch.of([observation]), self.settings, seen, previous, belief.renderer)
+        return Problem(
+            belief.shape, ObservationBatch.of([observation]), self.settings, seen, previous, belief.renderer
+        )
 
     def _solve(
-        self, belief: Belief, frame: Frame, mask: NDArray[np.bool_] | None, current: Keyframe
-    ) -> tuple[Belief, FrameEstimate]:
+        self, belief: PaperState, frame: Frame, mask: NDArray[np.bool_] | None, current: PosedObservation
+    ) -> tuple[PaperState, FrameEstimate]:
         """Optimize, judge, choose keyframes, answer."""
         first, iterations = not belief.started, 0
         optimum = None
@@ -183,7 +160,7 @@ class PaperSolver:
             optimum = self._refine_pose(belief, current)
             iterations = optimum.iterations
             if not optimum.reason:
-                current = Keyframe(current.observation, optimum.parameters.poses[0])
+                current = PosedObservation(current.observation, optimum.parameters.poses[0])
         frames = [current]
         if optimum is None or self._needs_joint(belief, current, optimum):
             with in_stage("map"):
@@ -233,7 +210,7 @@ class PaperSolver:
         reason = f"the rendered mask overlaps the initial one by an IoU of {iou:.2f} only, so that one is the answer"
         return initial, MaskSource.INITIAL, replace(judgement, status=Status.UNCERTAIN, reason=reason)
 
-    def _refine_pose(self, belief: Belief, current: Keyframe) -> Optimum:
+    def _refine_pose(self, belief: PaperState, current: PosedObservation) -> Optimum:
         """The new frame's pose alone, against what is known."""
         return optimize(
             self._problem_of_pose(belief, current.observation),
@@ -243,7 +220,7 @@ class PaperSolver:
             free="pose",
         )
 
-    def _needs_joint(self, belief: Belief, current: Keyframe, optimum: Optimum) -> bool:
+    def _needs_joint(self, belief: PaperState, current: PosedObservation, optimum: Optimum) -> bool:
         """Whether shape and texture have something to learn from this frame."""
         if self.settings.joint == "always" or belief.waiting is not None or not belief.keyframes:
             return True
@@ -252,7 +229,7 @@ class PaperSolver:
         latest = belief.keyframes[-1].pose
         return is_new_view(latest, current.pose, belief.object_size, self.settings.keyframes)
 
-    def _with_new_texture(self, belief: Belief, current: Keyframe) -> Belief:
+    def _with_new_texture(self, belief: PaperState, current: PosedObservation) -> PaperState:
         """Start texels that no keyframe has seen at what the new frame shows."""
         if self.settings.texture_start == "zero":
             return belief
@@ -260,7 +237,9 @@ class PaperSolver:
         new = (belief.seen_with_keyframes().weight <= 0) & (shown.weight > 0)
         return replace(belief, texture=torch.where(new, shown.mean(), belief.texture))
 
-    def _optimize(self, belief: Belief, current: Keyframe) -> tuple[list[Keyframe], Optimum]:
+    def _optimize(
+        self, belief: PaperState, current: PosedObservation
+    ) -> tuple[list[PosedObservation], Optimum]:
         """Everything over the keyframes and the new frame; over all first frames when the joint start is due."""
         config = self.settings
         waiting = belief.waiting or ()
@@ -270,7 +249,7 @@ class PaperSolver:
         frames = [*belief.keyframes, current]
         # The gauge: the oldest frame does not move, so that poses stored at different times compare.
         fixed = 1 if belief.keyframes or not belief.started else 0
-        batch = Batch.of([frame.observation for frame in frames])
+        batch = ObservationBatch.of([frame.observation for frame in frames])
         problem = Problem(belief.shape, batch, config, backend=belief.renderer)
         start = belief.parameters(frames)
         return frames, optimize(problem, start, iterations=config.iterations, tau=self.tau, fixed=fixed)
@@ -284,15 +263,15 @@ class PaperSolver:
             losses["features"] = float(optimum.losses.features.mean())
         return assess(losses["features"], silhouette, has_mask, self.tau, limit, optimum.reason)
 
-    def _updated(self, belief: Belief, frames: list[Keyframe], optimum: Optimum) -> Belief:
+    def _updated(self, belief: PaperState, frames: list[PosedObservation], optimum: Optimum) -> PaperState:
         """Take over what was found, and choose the keyframes anew."""
         parameters = optimum.parameters
-        moved = [Keyframe(frame.observation, parameters.poses[i]) for i, frame in enumerate(frames)]
+        moved = [PosedObservation(frame.observation, parameters.poses[i]) for i, frame in enumerate(frames)]
         found = replace(belief, offsets=parameters.offsets, texture=parameters.texture)
         silhouette = (optimum.losses.silhouette + optimum.losses.distance).tolist()
         appearance = optimum.losses.features.tolist()
         candidates = [
-            Candidate(keyframe.pose, silhouette[i], appearance[i]) for i, keyframe in enumerate(moved)
+            KeyframeCandidate(keyframe.pose, silhouette[i], appearance[i]) for i, keyframe in enumerate(moved)
         ]
         criteria = self.settings.keyframes
         kept = select_keyframes(candidates, found.object_size, self.tau, criteria)
@@ -304,14 +283,19 @@ class PaperSolver:
         return replace(found, keyframes=tuple(moved[i] for i in kept), seen=seen)
 
     def _with_waiting(
-        self, belief: Belief, known: Belief, frames: list[Keyframe], optimum: Optimum, answer: FrameEstimate
-    ) -> tuple[Belief, FrameEstimate]:
+        self,
+        belief: PaperState,
+        known: PaperState,
+        frames: list[PosedObservation],
+        optimum: Optimum,
+        answer: FrameEstimate,
+    ) -> tuple[PaperState, FrameEstimate]:
         """Keep the first frames until they are solved together, then answer them anew."""
         if belief.waiting is None:
             return known, answer
         count = len(belief.waiting) + 1
         if count < self.settings.start_frames:
-            waiting = (*belief.waiting, (Keyframe(frames[-1].observation, known.last[0]), answer))
+            waiting = (*belief.waiting, (PosedObservation(frames[-1].observation, known.last[0]), answer))
             if answer.status is Status.TRACKED and len(waiting) > 1:
                 reason = "the first frames are not yet solved together"
                 answer = replace(

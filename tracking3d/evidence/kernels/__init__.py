@@ -1,1 +1,1 @@
-"""Compiled inner loops of the evidence; each has a twin in NumPy or torch in the module it is named after."""
+"""Compiled inner loops of the evidence; each file belongs to the module of the same name one folder up."""

@@ -15,7 +15,7 @@ _HULLS = 2
 """As many as `tracking3d.evidence.consensus` has ranks; loops over so many known beforehand are a third faster."""
 
 
-def carried(
+def sample_grid_distances(
     distance: NDArray[np.float32],
     unknown: NDArray[np.bool_],
     to_pixels: NDArray[np.float64],
@@ -25,7 +25,7 @@ def carried(
     cells: int,
     mark: int,
 ) -> NDArray[np.int8] | None:
-    """``(C * C * C,)``: see `tracking3d.evidence.consensus.carried`; ``mark`` stands where nothing is known."""
+    """``(C * C * C,)``: see `tracking3d.evidence.consensus.sample_grid_distances`; ``mark`` is for unknown cells."""
     values = np.empty((cells, cells, cells), np.int8)
     in_front = _carried(
         np.ascontiguousarray(distance, np.float32),

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, ValidationError
 
-from tracking3d.config.explain import describe
+from tracking3d.config.explain import describe_validation_error
 from tracking3d.config.models import Section
 from tracking3d.errors import InputError
 from tracking3d.networks.descriptions import description_names, read_description
@@ -71,7 +71,7 @@ class EncoderDescription(Section):
         return (self.output,) if isinstance(self.output, str) else self.output or ()
 
 
-def load_description(name: str | Path) -> EncoderDescription:
+def load_encoder_description(name: str | Path) -> EncoderDescription:
     """Read a description.
 
     Args:
@@ -84,9 +84,9 @@ def load_description(name: str | Path) -> EncoderDescription:
     try:
         return EncoderDescription.model_validate(keys)
     except ValidationError as error:
-        raise InputError(f"{file}: {describe(error, EncoderDescription, 'key')}") from error
+        raise InputError(f"{file}: {describe_validation_error(error, EncoderDescription, 'key')}") from error
 
 
-def builtin_descriptions() -> list[str]:
+def builtin_encoder_descriptions() -> list[str]:
     """Names of the descriptions that come with the package."""
     return description_names(PACKAGE)

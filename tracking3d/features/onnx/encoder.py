@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from tracking3d.errors import InputError
-from tracking3d.features.onnx.description import EncoderDescription, NetworkInput, load_description
+from tracking3d.features.onnx.description import EncoderDescription, NetworkInput, load_encoder_description
 from tracking3d.networks.session import Network, TensorInfo
 from tracking3d.networks.store import find_network
 
@@ -72,7 +72,7 @@ class OnnxEncoder:
             InputError: If there is no such network or description, or they do not fit.
         """
         given = cls.Options.model_validate(options.model_dump())
-        description = None if given.description is None else load_description(given.description)
+        description = None if given.description is None else load_encoder_description(given.description)
         return cls(Network(find_network(given.model), given.threads), description)
 
     def encode(self, images: Tensor) -> Tensor:

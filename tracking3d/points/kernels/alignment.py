@@ -1,21 +1,70 @@
 """Patches aligned one after the other; `tracking3d.points.alignment` says what is computed."""
+# mypy: disable-error-code="no-untyped-def"
 
 from __future__ import annotations
 
 from math import sqrt
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+from numba import float32, float64, int64, void
 from numpy.typing import NDArray
 
-from tracking3d.rendering.kernels.compilation import OPTIONS, REORDER, kernel
+from tracking3d.rendering.kernels.compilation import OPTIONS, REORDER, kernel, record
 
 _STRIDE = 16
 """Pixels from one row of a patch to the next: whole vectors. It holds a window and a pixel on either side of it, so
 that a window has up to 14 pixels; what is beyond the window has no weight."""
 _NONE: Any = np.float32(0)
 _HALF, _ONE = np.float32(0.5), np.float32(1)
+
+
+class AlignedPlanes(NamedTuple):
+    """Template, how much of it is known, and the image that it is aligned with, all ``(h, w)``."""
+
+    template: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    image: NDArray[np.float32]
+
+
+class AlignmentSettings(NamedTuple):
+    """How patches are aligned.
+
+    Attributes:
+        window: ``(S, S)`` weights of a patch's pixels.
+        prior: Deviation in pixels of the shifts that are expected.
+        noise: Deviation of grey values that say the same.
+        least_cover: Share of the window in which the template has to be known.
+        steps: The most that are taken.
+    """
+
+    window: NDArray[np.float64]
+    prior: float
+    noise: float
+    least_cover: float
+    steps: int
+
+
+class AlignmentArrays(NamedTuple):
+    """What is found out of N points, written to.
+
+    Attributes:
+        shift: ``(N, 2)``.
+        covariance: ``(N, 3)`` as xx, xy, yy.
+        agreement: ``(N, 2)``: correlation, and contrast of the template.
+    """
+
+    shift: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    agreement: NDArray[np.float64]
+
+
+_PLANES = record(AlignedPlanes, float32[:, ::1], float32[:, ::1], float32[:, ::1])
+_SETTINGS = record(AlignmentSettings, float64[:, ::1], float64, float64, float64, int64)
+_FOUND = record(AlignmentArrays, float64[:, ::1], float64[:, ::1], float64[:, ::1])
+
+_inner = numba.njit(fastmath=REORDER, **OPTIONS)
 
 
 @numba.njit(inline="always", fastmath=REORDER, **OPTIONS)
@@ -57,29 +106,19 @@ def _patch(plane: NDArray[Any], x: float, y: float, half: int, values: NDArray[A
     return True
 
 
-@kernel(
-    "void(float32[:,::1], float32[:,::1], float32[:,::1], float64[:,::1], float64[:,::1], float64, float64, float64,"
-    " int64, float64[:,::1], float64[:,::1], float64[:,::1], int64, int64)",
-    fastmath=REORDER,
-)
+@kernel(void(_PLANES, float64[:, ::1], _SETTINGS, _FOUND, int64, int64), fastmath=REORDER)
 def align(
-    template: NDArray[Any],
-    weight: NDArray[Any],
-    image: NDArray[Any],
+    planes: AlignedPlanes,
     xy: NDArray[Any],
-    window: NDArray[Any],
-    prior: float,
-    noise: float,
-    least_cover: float,
-    steps: int,
-    shift: NDArray[Any],
-    covariance: NDArray[Any],
-    agreement: NDArray[Any],
+    settings: AlignmentSettings,
+    found: AlignmentArrays,
     first: int,
     last: int,
 ) -> None:
-    """Fill ``shift`` (N, 2), ``covariance`` (N, 3) as xx, xy, yy, and ``agreement`` (N, 2): correlation, and
-    contrast of the template; of the points from ``first`` to before ``last``."""
+    """Fill what is found out of the points ``xy`` ``(N, 2)`` from ``first`` to before ``last``."""
+    template, weight, image = planes
+    window, prior, noise, least_cover, steps = settings
+    shift, covariance, agreement = found
     side = window.shape[0]
     radius, count = side // 2, side * _STRIDE
     # Single precision: twice as many pixels fit into a vector, and grey values have eight bits.
@@ -100,93 +139,18 @@ def align(
         agreement[p, 0], agreement[p, 1] = -1.0, 0.0
         if not (-radius < px < width + radius and -radius < py < height + radius):
             continue
-        cover, mean = _NONE, _NONE
         if _patch(template, px, py, radius + 1, wider) and _patch(weight, px, py, radius, known):
-            # One array a loop: of more the compiler does not find out that they lie apart.
-            for k in range(count):
-                w[k] = share[k] * known[k]
-            for k in range(count):
-                T[k] = wider[k + _STRIDE + 1]
-            for k in range(count):
-                gx[k] = _HALF * (wider[k + _STRIDE + 2] - wider[k + _STRIDE])
-            for k in range(count):
-                gy[k] = _HALF * (wider[k + 2 * _STRIDE + 1] - wider[k + 1])
+            _cut_out(share, known, wider, w, T, gx, gy)
         else:
-            for i in range(side):
-                for j in range(side):
-                    k = i * _STRIDE + j
-                    x, y = px + j - radius, py + i - radius
-                    within = 1.0 <= x <= width - 2.0 and 1.0 <= y <= height - 2.0
-                    w[k] = window[i, j] * _between(weight, x, y) if within else 0.0
-                    T[k] = _between(template, x, y)
-                    gx[k] = 0.5 * (_between(template, x + 1, y) - _between(template, x - 1, y))
-                    gy[k] = 0.5 * (_between(template, x, y + 1) - _between(template, x, y - 1))
-        for k in range(count):
-            cover += w[k]
-            mean += w[k] * T[k]
-        if cover < least_cover * total:
+            _cut_out_at_border(template, weight, window, px, py, w, T, gx, gy)
+        cover, variance = _levelled(w, T, gx, gy, least_cover * total)
+        if cover == 0:
             continue
-        mean = mean / cover
-        variance, mean_x, mean_y = _NONE, _NONE, _NONE
-        part = _ONE / cover
-        for k in range(count):
-            w[k] *= part
-        for k in range(count):
-            T[k] -= mean
-        for k in range(count):
-            variance += w[k] * T[k] * T[k]
-            mean_x += w[k] * gx[k]
-            mean_y += w[k] * gy[k]
         agreement[p, 1] = sqrt(variance)
-        for k in range(count):
-            gx[k] -= mean_x
-        for k in range(count):
-            gy[k] -= mean_y
-        dx, dy = 0.0, 0.0
-        for _ in range(steps):
-            if not _patch(image, px + dx, py + dy, radius, here):
-                for i in range(side):
-                    for j in range(side):
-                        here[i * _STRIDE + j] = _between(image, px + j - radius + dx, py + i - radius + dy)
-            mean_here, together = _NONE, _NONE
-            for k in range(count):
-                mean_here += w[k] * here[k]
-                together += w[k] * here[k] * T[k]  # whatever the mean: that of T is 0
-            gain = np.float32(min(max(together / (variance + 1e-6), 0.4), 2.5))
-            sxx, sxy, syy, gradient_x, gradient_y, residual = _NONE, _NONE, _NONE, _NONE, _NONE, _NONE
-            for k in range(count):
-                r = here[k] - mean_here - gain * T[k]
-                robust = spread / (spread + r * r)
-                u = w[k] * robust * robust
-                ux, uy = u * gx[k], u * gy[k]
-                sxx += ux * gx[k]
-                sxy += ux * gy[k]
-                syy += uy * gy[k]
-                gradient_x += ux * r
-                gradient_y += uy * r
-                residual += w[k] * r * r
-            hxx, hxy, hyy = (
-                gain * gain * np.float64(sxx),
-                gain * gain * np.float64(sxy),
-                gain * gain * np.float64(syy),
-            )
-            bx, by = -gain * np.float64(gradient_x), -gain * np.float64(gradient_y)
-            hold = noise * noise / (cover * prior * prior) * 6
-            bx -= hold * dx
-            by -= hold * dy
-            det = (hxx + hold) * (hyy + hold) - hxy * hxy
-            sx = ((hyy + hold) * bx - hxy * by) / det
-            sy = ((hxx + hold) * by - hxy * bx) / det
-            length = sqrt(sx * sx + sy * sy)
-            if length > 1:
-                sx, sy = sx / length, sy / length
-            dx += sx
-            dy += sy
-            if length < 0.02:
-                break  # what was found out so near to the end is told of it
-        variance_here = _NONE
-        for k in range(count):
-            variance_here += w[k] * (here[k] - mean_here) * (here[k] - mean_here)
+        hold = noise * noise / (cover * prior * prior) * 6
+        dx, dy, together, hxx, hxy, hyy, residual, variance_here = _stepped(
+            image, px, py, steps, hold, spread, w, T, gx, gy, here, variance
+        )
         shift[p, 0], shift[p, 1] = dx, dy
         agreement[p, 0] = together / sqrt((variance + 4) * (variance_here + 4))
         error = max(noise * noise, residual) / cover * 6
@@ -195,3 +159,123 @@ def align(
         covariance[p, 0] = error * (hyy + hold) / det
         covariance[p, 1] = -error * hxy / det
         covariance[p, 2] = error * (hxx + hold) / det
+
+
+@_inner
+def _cut_out(share, known, wider, w, T, gx, gy):
+    """Fill weights ``w``, template ``T`` and its slopes from a patch that has a pixel more on every side."""
+    count = len(w) // _STRIDE * _STRIDE
+    # One array a loop: of more the compiler does not find out that they lie apart.
+    for k in range(count):
+        w[k] = share[k] * known[k]
+    for k in range(count):
+        T[k] = wider[k + _STRIDE + 1]
+    for k in range(count):
+        gx[k] = _HALF * (wider[k + _STRIDE + 2] - wider[k + _STRIDE])
+    for k in range(count):
+        gy[k] = _HALF * (wider[k + 2 * _STRIDE + 1] - wider[k + 1])
+
+
+@_inner
+def _cut_out_at_border(template, weight, window, px, py, w, T, gx, gy):
+    """The same pixel by pixel, around a place that is near the border of the planes."""
+    height, width = template.shape
+    side = window.shape[0]
+    radius = side // 2
+    for i in range(side):
+        for j in range(side):
+            k = i * _STRIDE + j
+            x, y = px + j - radius, py + i - radius
+            within = 1.0 <= x <= width - 2.0 and 1.0 <= y <= height - 2.0
+            w[k] = window[i, j] * _between(weight, x, y) if within else 0.0
+            T[k] = _between(template, x, y)
+            gx[k] = 0.5 * (_between(template, x + 1, y) - _between(template, x - 1, y))
+            gy[k] = 0.5 * (_between(template, x, y + 1) - _between(template, x, y - 1))
+
+
+@_inner
+def _levelled(w, T, gx, gy, least):
+    """Make the sum of the weights 1 and the means 0; what the sum was, and the template's variance.
+
+    Both are 0 if the sum was less than ``least``.
+    """
+    count = len(w) // _STRIDE * _STRIDE
+    cover, mean = _NONE, _NONE
+    for k in range(count):
+        cover += w[k]
+        mean += w[k] * T[k]
+    variance, mean_x, mean_y = _NONE, _NONE, _NONE
+    if cover < least:
+        return _NONE, variance
+    mean = mean / cover
+    part = _ONE / cover
+    for k in range(count):
+        w[k] *= part
+    for k in range(count):
+        T[k] -= mean
+    for k in range(count):
+        variance += w[k] * T[k] * T[k]
+        mean_x += w[k] * gx[k]
+        mean_y += w[k] * gy[k]
+    for k in range(count):
+        gx[k] -= mean_x
+    for k in range(count):
+        gy[k] -= mean_y
+    return cover, variance
+
+
+@_inner
+def _stepped(image, px, py, steps, hold, spread, w, T, gx, gy, here, variance):
+    """Step to where the patch lies in the image.
+
+    Returns:
+        The shift by x and y; at the last step the covariance of both patches, xx, xy and yy of the matrix and the
+        mean square that was left; and the variance of the image's patch.
+    """
+    side = len(w) // _STRIDE
+    radius, count = side // 2, side * _STRIDE
+    dx, dy = 0.0, 0.0
+    for _ in range(steps):
+        if not _patch(image, px + dx, py + dy, radius, here):
+            for i in range(side):
+                for j in range(side):
+                    here[i * _STRIDE + j] = _between(image, px + j - radius + dx, py + i - radius + dy)
+        mean_here, together = _NONE, _NONE
+        for k in range(count):
+            mean_here += w[k] * here[k]
+            together += w[k] * here[k] * T[k]  # whatever the mean: that of T is 0
+        gain = np.float32(min(max(together / (variance + 1e-6), 0.4), 2.5))
+        sxx, sxy, syy, gradient_x, gradient_y, residual = _NONE, _NONE, _NONE, _NONE, _NONE, _NONE
+        for k in range(count):
+            r = here[k] - mean_here - gain * T[k]
+            robust = spread / (spread + r * r)
+            u = w[k] * robust * robust
+            ux, uy = u * gx[k], u * gy[k]
+            sxx += ux * gx[k]
+            sxy += ux * gy[k]
+            syy += uy * gy[k]
+            gradient_x += ux * r
+            gradient_y += uy * r
+            residual += w[k] * r * r
+        hxx, hxy, hyy = (
+            gain * gain * np.float64(sxx),
+            gain * gain * np.float64(sxy),
+            gain * gain * np.float64(syy),
+        )
+        bx, by = -gain * np.float64(gradient_x), -gain * np.float64(gradient_y)
+        bx -= hold * dx
+        by -= hold * dy
+        det = (hxx + hold) * (hyy + hold) - hxy * hxy
+        sx = ((hyy + hold) * bx - hxy * by) / det
+        sy = ((hxx + hold) * by - hxy * bx) / det
+        length = sqrt(sx * sx + sy * sy)
+        if length > 1:
+            sx, sy = sx / length, sy / length
+        dx += sx
+        dy += sy
+        if length < 0.02:
+            break  # what was found out so near to the end is told of it
+    variance_here = _NONE
+    for k in range(count):
+        variance_here += w[k] * (here[k] - mean_here) * (here[k] - mean_here)
+    return dx, dy, together, hxx, hxy, hyy, residual, variance_here

@@ -4,13 +4,55 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
 import torch
+from numba import boolean, float32, int64
+from numpy.typing import NDArray
 from torch import Tensor
 
-from tracking3d.rendering.kernels.compilation import OPTIONS, array, kernel
+from tracking3d.rendering.kernels.compilation import OPTIONS, array, kernel, record
+
+
+class FrameArrays(NamedTuple):
+    """A frame: ``values`` ``(C, H, W)``, where they are ``valid``, the mesh's depth ``drawn`` there, and ``K``."""
+
+    values: NDArray[np.float32]
+    valid: NDArray[np.float32]
+    drawn: NDArray[np.float32]
+    K: NDArray[np.float32]
+
+
+class FaceArrays(NamedTuple):
+    """Faces in camera coordinates: corners ``(F, 3, 3)``, normals ``(F, 3)``, and which may be seen ``(F,)``."""
+
+    corners: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    facing: NDArray[np.bool_]
+
+
+class TexelArrays(NamedTuple):
+    """Texels of an atlas: flat indices ``(M,)``, faces ``(M,)`` and barycentric coordinates ``(3, M)``."""
+
+    texel: NDArray[np.int64]
+    face: NDArray[np.int64]
+    barycentric: NDArray[np.float32]
+
+
+class SeenArrays(NamedTuple):
+    """Memory for what is seen of texels: flat indices ``(M,)``, values ``(C, M)`` and weights ``(M,)``."""
+
+    texel: NDArray[np.int64]
+    values: NDArray[np.float32]
+    weight: NDArray[np.float32]
+
+
+_FRAME = record(FrameArrays, float32[:, :, ::1], float32[:, ::1], float32[:, ::1], float32[:, ::1])
+_FACES = record(FaceArrays, float32[:, :, ::1], float32[:, ::1], boolean[::1])
+_TEXELS = record(TexelArrays, int64[::1], int64[::1], float32[:, ::1])
+_SEEN = record(SeenArrays, int64[::1], float32[:, ::1], float32[::1])
 
 
 def seen_texels(
@@ -38,11 +80,17 @@ def seen_texels(
     """
     texel, face, barycentric = texels
     count, channels = len(texel), len(values)
-    seen = np.empty(count, np.int64), np.empty((channels, count), np.float32), np.empty(count, np.float32)
+    seen = SeenArrays(
+        np.empty(count, np.int64), np.empty((channels, count), np.float32), np.empty(count, np.float32)
+    )
     found = _seen_texels(
-        array(values), array(valid), array(drawn), array(corners), array(normals), array(facing),
-        array(texel), array(face), array(barycentric.T), array(K), grazing, tolerance, *seen,
-    )  # fmt: skip
+        FrameArrays(array(values), array(valid), array(drawn), array(K)),
+        FaceArrays(array(corners), array(normals), array(facing)),
+        TexelArrays(array(texel), array(face), array(barycentric.T)),
+        grazing,
+        tolerance,
+        seen,
+    )
     index, shown, weight = (torch.from_numpy(one) for one in seen)
     return index[:found], shown[:, :found], weight[:found]
 
@@ -60,15 +108,13 @@ def _sampled(plane, column, row, right, down):
     return total
 
 
-@kernel(
-    "int64(float32[:,:,::1], float32[:,::1], float32[:,::1], float32[:,:,::1], float32[:,::1], boolean[::1],"
-    " int64[::1], int64[::1], float32[:,::1], float32[:,::1], float32, float32,"
-    " int64[::1], float32[:,::1], float32[::1])"
-)
-def _seen_texels(
-    values, valid, drawn, corners, normals, facing,
-    texel, face_of, barycentric, K, grazing, tolerance, index, shown, weight,
-):  # fmt: skip
+@kernel(int64(_FRAME, _FACES, _TEXELS, float32, float32, _SEEN))
+def _seen_texels(frame, faces, texels, grazing, tolerance, seen):
+    """Fill ``seen``, and return how many texels are."""
+    values, valid, drawn, K = frame
+    corners, normals, facing = faces
+    texel, face_of, barycentric = texels
+    index, shown, weight = seen
     height, width = valid.shape
     found = 0
     for one in range(len(texel)):

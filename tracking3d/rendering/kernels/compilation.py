@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
-from numba.core import event
+from numba.core import event, types
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -33,12 +33,12 @@ class Kernel:
 
     Args:
         function: What to compile.
-        signature: Numba types of its arguments, such as ``void(float32[::1], int64)``.
+        signature: Numba types of its arguments, such as ``void(float32[::1], int64)``, in words or as Numba's own.
         fastmath: Freedoms of floating-point arithmetic; none by default.
     """
 
     def __init__(
-        self, function: Callable[..., Any], signature: str, fastmath: set[str] | None = None
+        self, function: Callable[..., Any], signature: Any, fastmath: set[str] | None = None
     ) -> None:
         self._function, self._signature = function, signature
         self._options = {**OPTIONS, "fastmath": fastmath or False}
@@ -100,9 +100,19 @@ class Kernel:
         return None
 
 
-def kernel(signature: str, fastmath: set[str] | None = None) -> Callable[[Callable[..., Any]], Kernel]:
+def kernel(signature: Any, fastmath: set[str] | None = None) -> Callable[[Callable[..., Any]], Kernel]:
     """Decorator that makes a `Kernel`."""
     return lambda function: Kernel(function, signature, fastmath)
+
+
+def record(fields: type[tuple[Any, ...]], *field_types: Any) -> Any:
+    """Numba's type of arguments that come together in a named tuple, for signatures.
+
+    Args:
+        fields: The named tuple.
+        *field_types: Numba types of its fields, in their order.
+    """
+    return types.BaseTuple.from_types(field_types, fields)
 
 
 def array(tensor: Tensor) -> NDArray[Any]:

@@ -7,16 +7,44 @@ its gradients are summed up before they are added to the vertices.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 import torch
+from numba import float32, int64, void
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from tracking3d.rendering.kernels.compilation import OPTIONS, REORDER, array, check_corners, kernel
+from tracking3d.rendering.kernels.compilation import OPTIONS, REORDER, array, check_corners, kernel, record
 from tracking3d.rendering.kernels.threads import share
+
+
+class AttributeArrays(NamedTuple):
+    """What is interpolated: the inputs of `Interpolate`, and where the rows of every view begin and end."""
+
+    screen: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    faces: NDArray[np.int64]
+    attributes: NDArray[np.float32]
+    face_index: NDArray[np.int64]
+    ends: NDArray[np.int64]
+
+
+class AttributeGradients(NamedTuple):
+    """Sums of gradients by the inputs, written to; those by attributes are empty if nobody wants them."""
+
+    screen: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    attributes: NDArray[np.float32]
+
+
+_ATTRIBUTES = record(
+    AttributeArrays,
+    float32[:, :, ::1], float32[:, ::1], int64[:, ::1], float32[:, :, :, ::1], int64[:, :, ::1], int64[::1],
+)  # fmt: skip
+_GRADIENTS = record(AttributeGradients, float32[:, :, ::1], float32[:, ::1], float32[:, :, :, ::1])
 
 
 class Interpolate(torch.autograd.Function):
@@ -35,8 +63,8 @@ class Interpolate(torch.autograd.Function):
         if _count(index, ends) >= len(faces):
             raise IndexError(f"face_index names face {int(index.max())}, but there are {len(faces)} faces")
         values = torch.empty(int(ends[-1]), attributes.shape[3], dtype=torch.float32)
-        arrays = array(screen), array(depth), array(faces), array(attributes), index, ends
-        share(_forward, len(index), 2, *arrays, values.numpy())
+        arrays = AttributeArrays(array(screen), array(depth), array(faces), array(attributes), index, ends)
+        share(_forward, len(index), 2, arrays, values.numpy())
         ctx.save_for_backward(screen, depth, faces, attributes, face_index, values)
         ctx.ends = ends
         return values
@@ -44,16 +72,17 @@ class Interpolate(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        *inputs, values = ctx.saved_tensors
-        screen, depth, _, attributes, _ = inputs
+        screen, depth, faces, attributes, face_index, values = ctx.saved_tensors
         grads = [torch.zeros(part.shape, dtype=torch.float32) for part in (screen, depth)]
         wanted = ctx.needs_input_grad[3]
         grad_attributes = torch.zeros(attributes.shape if wanted else (0, 0, 0, 0), dtype=torch.float32)
-        arrays = (*map(array, inputs), ctx.ends, array(values), array(grad))
+        arrays = AttributeArrays(
+            array(screen), array(depth), array(faces), array(attributes), array(face_index), ctx.ends
+        )
         # Views that share their attributes would add to the same places.
         views, least = len(screen), 10**9 if wanted and len(attributes) == 1 else 2
-        outputs = [part.numpy() for part in (*grads, grad_attributes)]
-        share(_backward, views, least, *arrays, *outputs)
+        outputs = AttributeGradients(*(part.numpy() for part in (*grads, grad_attributes)))
+        share(_backward, views, least, arrays, array(values), array(grad), outputs)
         return grads[0], grads[1], None, grad_attributes if wanted else None, None
 
 
@@ -105,12 +134,9 @@ def _mix(attributes, mesh, face, wa, wb, wc, values, row, channels):
         )
 
 
-@kernel(
-    "void(float32[:,:,::1], float32[:,::1], int64[:,::1], float32[:,:,:,::1], int64[:,:,::1], int64[::1],"
-    " float32[:,::1], int64, int64)",
-    fastmath=REORDER,
-)
-def _forward(screen, depth, faces, attributes, face_index, ends, values, first, last):
+@kernel(void(_ATTRIBUTES, float32[:, ::1], int64, int64), fastmath=REORDER)
+def _forward(arrays, values, first, last):
+    screen, depth, faces, attributes, face_index, ends = arrays
     height, width = face_index.shape[1:]
     channels = attributes.shape[3]
     for view in range(first, last):
@@ -151,14 +177,12 @@ def _differences(attributes, mesh, face, values, grad, row, channels):
 
 
 @kernel(
-    "void(float32[:,:,::1], float32[:,::1], int64[:,::1], float32[:,:,:,::1], int64[:,:,::1], int64[::1],"
-    " float32[:,::1], float32[:,::1], float32[:,:,::1], float32[:,::1], float32[:,:,:,::1], int64, int64)",
+    void(_ATTRIBUTES, float32[:, ::1], float32[:, ::1], _GRADIENTS, int64, int64),
     fastmath=REORDER,
 )
-def _backward(
-    screen, depth, faces, attributes, face_index, ends, values, grad,
-    grad_screen, grad_depth, grad_attributes, first, last,
-):  # fmt: skip
+def _backward(arrays, values, grad, gradients, first, last):
+    screen, depth, faces, attributes, face_index, ends = arrays
+    grad_screen, grad_depth, grad_attributes = gradients
     height, width = face_index.shape[1:]
     channels = attributes.shape[3]
     for view in range(first, last):

@@ -4,17 +4,43 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
 import torch
+from numba import float32, float64, int64, void
+from numpy.typing import NDArray
 from torch import Tensor
 
-from tracking3d.rendering.kernels.compilation import OPTIONS, REORDER, array, check_corners, kernel
+from tracking3d.rendering.kernels.compilation import OPTIONS, REORDER, array, check_corners, kernel, record
 from tracking3d.rendering.kernels.interpolation import slopes_of_face
 from tracking3d.rendering.kernels.texture_losses import bilinear_weights, taps_of, texels_at
 from tracking3d.rendering.kernels.threads import share
 from tracking3d.rendering.renderer import Rendering
+
+
+class RenderingArrays(NamedTuple):
+    """What was drawn, as `Rendering` has it; ``ends`` ``(B + 1,)`` are where the pixels of every view begin and end."""
+
+    screen: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    faces: NDArray[np.int64]
+    face_uvs: NDArray[np.float32]
+    face_index: NDArray[np.int64]
+    drawn: NDArray[np.float32]
+    texture: NDArray[np.float32]
+    pixels: NDArray[np.int64]
+    ends: NDArray[np.int64]
+    uv: NDArray[np.float32]
+    K: NDArray[np.float32]
+
+
+_RENDERING = record(
+    RenderingArrays,
+    float32[:, :, ::1], float32[:, ::1], int64[:, ::1], float32[:, :, ::1], int64[:, :, ::1], float32[:, :, ::1],
+    float32[:, :, ::1], int64[::1], int64[::1], float32[:, ::1], float32[:, :, ::1],
+)  # fmt: skip
 
 
 def accumulate(
@@ -31,10 +57,21 @@ def accumulate(
     texture = array(drawn.texture.permute(1, 2, 0))
     pixels, (batch, height, width) = array(drawn.pixels), drawn.face_index.shape
     ends = np.searchsorted(pixels, np.arange(batch + 1) * height * width)
-    geometry = drawn.screen, drawn.x_cam[..., 2], drawn.faces, drawn.face_uvs, drawn.face_index, drawn.depth
-    seen = drawn.uv, drawn.K, pivot, observed, weight
+    arrays = RenderingArrays(
+        array(drawn.screen),
+        array(drawn.x_cam[..., 2]),
+        array(drawn.faces),
+        array(drawn.face_uvs),
+        array(drawn.face_index),
+        array(drawn.depth),
+        texture,
+        pixels,
+        ends,
+        array(drawn.uv),
+        array(drawn.K),
+    )
     sums = np.zeros((batch, 7, 7))
-    share(_accumulate, batch, 2, *map(array, geometry), texture, pixels, ends, *map(array, seen), scale, sums)
+    share(_accumulate, batch, 2, arrays, *map(array, (pivot, observed, weight)), scale, sums)
     result = torch.from_numpy(sums).to(drawn.uv)
     return result[:, :6, :6], result[:, 6, :6], result[:, 6, 6]
 
@@ -84,16 +121,14 @@ def point_motion(ray_x, ray_y, z, fx, fy, pivot, motion):
 
 
 @kernel(
-    "void(float32[:,:,::1], float32[:,::1], int64[:,::1], float32[:,:,::1], int64[:,:,::1], float32[:,:,::1],"
-    " float32[:,:,::1], int64[::1], int64[::1], float32[:,::1], float32[:,:,::1], float32[:,::1],"
-    " float32[:,::1], float32[::1], float64, float64[:,:,::1], int64, int64)",
+    void(
+        _RENDERING, float32[:, ::1], float32[:, ::1], float32[::1], float64, float64[:, :, ::1], int64, int64
+    ),
     fastmath=REORDER,
 )
-def _accumulate(
-    screen, depth, faces, face_uvs, face_index, drawn, texture, pixels, ends, uv, K, pivot, observed, weight,
-    scale, sums, first, last,
-):  # fmt: skip
+def _accumulate(rendering, pivot, observed, weight, scale, sums, first, last):
     """Sums of each view: the matrix, and in the last row the gradient and the cost."""
+    screen, depth, faces, face_uvs, face_index, drawn, texture, pixels, ends, uv, K = rendering
     height, width, channels = texture.shape
     sharpness = np.float32(1 / scale**2)
     rows, columns = face_index.shape[1:]

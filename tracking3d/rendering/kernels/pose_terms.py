@@ -4,23 +4,31 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numba
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numba import float32, float64, int64, void
 from torch import Tensor
 
 from tracking3d.rendering.contour import MOST_ON_AN_EDGE, PROBE
-from tracking3d.rendering.kernels.compilation import OPTIONS, REORDER, array, check_corners, kernel
+from tracking3d.rendering.kernels.compilation import OPTIONS, REORDER, array, kernel
 from tracking3d.rendering.kernels.interpolation import barycentrics, slopes_of_face
 from tracking3d.rendering.kernels.normal_equations import of_channels, point_motion
+from tracking3d.rendering.kernels.pose_inputs import (
+    MATCHES,
+    SCALES,
+    SURFACE,
+    TARGET,
+    LossScales,
+    drawing_buffers,
+    packed,
+)
 from tracking3d.rendering.kernels.texture_losses import bilinear_weights, taps_of, texels_at
 from tracking3d.rendering.kernels.threads import share
 from tracking3d.rendering.kernels.visibility import draw_view
 from tracking3d.rendering.normal_equations import NormalEquations
-from tracking3d.rendering.pose_terms import MatchedPoints, PoseTarget, PoseTerms, Scales
+from tracking3d.rendering.pose_comparison import MatchedPoints, PoseTarget, PoseTerms, Scales
 from tracking3d.rendering.surface import Surface
 from tracking3d.rendering.visibility import NEAR
 
@@ -41,10 +49,8 @@ def pose_terms(
 ) -> PoseTerms:
     """See `tracking3d.rendering.pose_terms`; ``nearest`` is the least depth of matched points."""
     sums, counts = np.zeros((len(R), 3, 7, 7)), np.zeros((len(R), 4))
-    share(
-        _pose_terms, len(R), 2, *packed(surface, target, matched), array(R), array(t),
-        scales.appearance, scales.outline, scales.points, nearest, sums, counts,
-    )  # fmt: skip
+    losses = LossScales(float(scales.appearance), float(scales.outline), float(scales.points), float(nearest))
+    share(_pose_terms, len(R), 2, *packed(surface, target, matched), array(R), array(t), losses, sums, counts)
     models = (
         NormalEquations(term[:, :6, :6], term[:, 6, :6], term[:, 6, 6])
         for term in torch.from_numpy(sums).unbind(1)
@@ -57,85 +63,34 @@ def pose_terms(
     return PoseTerms(appearance, outline, by_points, of_pixels[:, COMPARABLE], of_pixels[:, KNOWN], overlap)
 
 
-def packed(surface: Surface, target: PoseTarget, matched: MatchedPoints | None) -> list[NDArray[Any]]:
-    """The arrays that `terms_of_pose` takes first; what a frame does not have is empty.
-
-    Raises:
-        IndexError: If faces name vertices that are not there.
-    """
-    check_corners(surface.faces, surface.vertices[None])
-    none = target.comparable.new_zeros(0, 0)
-    mesh = surface.vertices, surface.faces, surface.face_uvs, *surface.edges, surface.layers
-    frame = (
-        target.features.permute(1, 2, 0),
-        target.comparable,
-        target.inside,
-        none.bool() if target.mask is None else target.mask,
-        none if target.distance is None else target.distance,
-        target.K,
-    )
-    points = (none, none) if matched is None else (matched.points, matched.pixels)
-    return [array(part) for part in (*mesh, *frame, *points)]
-
-
-PACKED = (
-    "float32[:,::1], int64[:,::1], float32[:,:,::1], int64[:,::1], int64[::1], float32[:,:,::1],"
-    " float32[:,:,::1], float32[:,::1], boolean[:,::1], boolean[:,::1], float32[:,::1], float32[:,::1],"
-    " float32[:,::1], float32[:,::1]"
-)
-"""Numba's types of what `packed` returns."""
-
-
 @kernel(
-    f"void({PACKED}, float32[:,:,::1], float32[:,::1],"
-    " float64, float64, float64, float64, float64[:,:,:,::1], float64[:,::1], int64, int64)"
-)
-def _pose_terms(
-    vertices, faces, face_uvs, edges, shared, layers, features, comparable, inside, mask, distance, K,
-    points, pixels, R, t, appearance, outline, by_points, nearest, sums, counts, first, last,
-):  # fmt: skip
-    buffers = drawing_buffers(vertices, comparable)
-    for pose in range(first, last):
-        terms_of_pose(
-            vertices, faces, face_uvs, edges, shared, layers, features, comparable, inside, mask, distance, K,
-            points, pixels, R[pose], t[pose], appearance, outline, by_points, nearest, buffers, sums[pose],
-            counts[pose],
-        )  # fmt: skip
-
-
-@numba.njit(**OPTIONS)
-def drawing_buffers(vertices, comparable):
-    """What `terms_of_pose` writes on its way, to be used again: corners in the camera, on the screen; faces, depths."""
-    return (
-        np.empty_like(vertices),
-        np.empty((len(vertices), 2), np.float32),
-        np.empty(comparable.shape, np.int64),
-        np.empty(comparable.shape, np.float32),
+    void(
+        SURFACE, TARGET, MATCHES, float32[:, :, ::1], float32[:, ::1], SCALES, float64[:, :, :, ::1],
+        float64[:, ::1], int64, int64,
     )
+)  # fmt: skip
+def _pose_terms(surface, target, matches, R, t, scales, sums, counts, first, last):
+    buffers = drawing_buffers(surface.vertices, target.comparable)
+    for pose in range(first, last):
+        terms_of_pose(surface, target, matches, R[pose], t[pose], scales, buffers, sums[pose], counts[pose])
 
 
 @numba.njit(**OPTIONS)
-def terms_of_pose(
-    vertices, faces, face_uvs, edges, shared, layers, features, comparable, inside, mask, distance, K,
-    points, pixels, R, t, appearance, outline, by_points, nearest, buffers, sums, counts,
-):  # fmt: skip
+def terms_of_pose(surface, target, matches, R, t, scales, buffers, sums, counts):
     """Add one pose's terms to zeros: ``sums`` ``(3, 7, 7)`` and ``counts`` ``(4,)``, by the places above."""
     x_cam, screen, face_index, inverse_depth = buffers
-    _project(vertices, R, t, K, np.float32(NEAR), x_cam, screen)
+    _project(surface.vertices, R, t, target.K, np.float32(NEAR), x_cam, screen)
     depth = np.ascontiguousarray(x_cam[:, 2])
     face_index[:] = -1
     inverse_depth[:] = 0
-    draw_view(screen, depth, faces, np.float32(NEAR), face_index, inverse_depth)
-    _of_pixels(
-        screen, depth, faces, face_uvs, layers, face_index, inverse_depth, features, comparable, K, t, appearance,
-        sums[APPEARANCE], counts,
-    )  # fmt: skip
-    if mask.size:
-        _count_overlap(face_index, inside, mask, counts)
-    if distance.size:
-        _of_outline(screen, x_cam, faces, edges, shared, face_index, distance, K, t, outline, sums[OUTLINE])
-    if points.size:
-        _of_points(points, pixels, R, t, K, by_points, nearest, sums[POINTS])
+    draw_view(screen, depth, surface.faces, np.float32(NEAR), face_index, inverse_depth)
+    _of_pixels(surface, target, buffers, depth, t, scales.appearance, sums[APPEARANCE], counts)
+    if target.mask.size:
+        _count_overlap(face_index, target.inside, target.mask, counts)
+    if target.distance.size:
+        _of_outline(surface, target, buffers, t, scales.outline, sums[OUTLINE])
+    if matches.points.size:
+        _of_points(matches, R, t, target.K, scales.points, scales.nearest, sums[POINTS])
 
 
 @numba.njit(**OPTIONS)
@@ -160,11 +115,11 @@ def _count_overlap(face_index, inside, mask, counts):
 
 
 @numba.njit(fastmath=REORDER, **OPTIONS)
-def _of_pixels(
-    screen, depth, faces, face_uvs, layers, face_index, inverse_depth, features, comparable, K, pivot, scale, sums,
-    counts,
-):  # fmt: skip
+def _of_pixels(surface, target, buffers, depth, pivot, scale, sums, counts):
     """Mean loss of the features over the covered pixels; see `tracking3d.rendering.kernels.normal_equations`."""
+    faces, face_uvs, layers = surface.faces, surface.face_uvs, surface.layers
+    features, comparable, K = target.features, target.comparable, target.K
+    screen, face_index, inverse_depth = buffers.screen, buffers.face_index, buffers.inverse_depth
     height, width, channels = layers.shape[0], layers.shape[1], layers.shape[2] - 1
     rows, columns = face_index.shape
     one = np.float32(1)
@@ -248,8 +203,11 @@ def _add(sums, slope_x, slope_y, motion, weight, residual):
 
 
 @numba.njit(**OPTIONS)
-def _of_outline(screen, x_cam, faces, edges, shared, face_index, distance, K, pivot, scale, sums):
+def _of_outline(surface, target, buffers, pivot, scale, sums):
     """Mean loss of the contour's distances; see `tracking3d.rendering.contour`."""
+    faces, edges, shared = surface.faces, surface.edges, surface.faces_of_edge
+    distance, K = target.distance, target.K
+    screen, x_cam, face_index = buffers.screen, buffers.x_cam, buffers.face_index
     height, width = distance.shape
     near, one = np.float32(NEAR), np.float32(1)
     motion = np.zeros((2, 6), np.float32)
@@ -310,8 +268,9 @@ def _of_outline(screen, x_cam, faces, edges, shared, face_index, distance, K, pi
 
 
 @numba.njit(**OPTIONS)
-def _of_points(points, pixels, R, t, K, scale, nearest, sums):
+def _of_points(matches, R, t, K, scale, nearest, sums):
     """Mean loss of the distances between projected points and pixels."""
+    points, pixels = matches
     motion = np.zeros((2, 6), np.float32)
     for n in range(len(points)):
         px, py, pz = points[n]

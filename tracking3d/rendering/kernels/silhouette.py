@@ -8,18 +8,39 @@ of every pair of a face and a pixel is kept, as in the torch implementation.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 import torch
+from numba import float32, float64, int32, int64, void
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from tracking3d.rendering.kernels.compilation import OPTIONS, REORDER, array, check_corners, kernel
+from tracking3d.rendering.kernels.compilation import OPTIONS, REORDER, array, check_corners, kernel, record
 from tracking3d.rendering.kernels.threads import share
 
 _TINY = np.finfo(np.float32).tiny
+
+
+class PairArrays(NamedTuple):
+    """Pairs of a face and a pixel that it is near to.
+
+    Attributes:
+        counts: ``(B, 2)`` of boxes and of pairs in each view.
+        ends: ``(B + 1,)`` where the memory for the pairs of every view begins and ends.
+        places: ``(M, 3)`` the pixel, and the nearest edge's two corners.
+        slopes: ``(M, 3)`` t, the nearest place on the edge, and ``factor r``.
+    """
+
+    counts: NDArray[np.int64]
+    ends: NDArray[np.int64]
+    places: NDArray[np.int32]
+    slopes: NDArray[np.float32]
+
+
+_PAIRS = record(PairArrays, int64[:, ::1], int64[::1], int32[:, ::1], float32[:, ::1])
 
 
 class SoftSilhouette(torch.autograd.Function):
@@ -52,10 +73,10 @@ class SoftSilhouette(torch.autograd.Function):
         ends = np.concatenate([np.zeros(1, np.int64), counts[:, 1].cumsum()])
         places = np.empty((int(ends[-1]), 3), np.int32)
         slopes = np.empty((int(ends[-1]), 3), np.float32)
+        pairs = PairArrays(counts, ends, places, slopes)
         band = sigma, knum, epsilon
-        outputs = rest.numpy(), silhouette.numpy(), places, slopes
-        share(_pairs, views, 2, corners, array(faces), boxes, counts, ends, *band, *outputs)
-        ctx.shape, ctx.pairs = screen.shape, (counts, ends, places, slopes, rest.numpy())
+        share(_pairs, views, 2, corners, array(faces), boxes, *band, rest.numpy(), silhouette.numpy(), pairs)
+        ctx.shape, ctx.pairs = screen.shape, (pairs, rest.numpy())
         return silhouette
 
     @staticmethod
@@ -145,17 +166,18 @@ def _nearest(px, py, ax, ay, ex, ey, inverse_length2):
 
 
 @kernel(
-    "void(float32[:,:,::1], int64[:,::1], int32[:,:,::1], int64[:,::1], int64[::1], float64, int64,"
-    " float64, float32[:,:,::1], float32[:,:,::1], int32[:,::1], float32[:,::1], int64, int64)",
+    void(
+        float32[:, :, ::1], int64[:, ::1], int32[:, :, ::1], float64, int64, float64, float32[:, :, ::1],
+        float32[:, :, ::1], _PAIRS, int64, int64,
+    ),
     fastmath=REORDER,
-)
-def _pairs(
-    screen, faces, boxes, counts, ends, sigma, knum, epsilon, rest, silhouette, places, slopes, first, last
-):
-    """``1 - S``; and for each pair its pixel, the nearest edge's two corners, t, and ``factor r``.
+)  # fmt: skip
+def _pairs(screen, faces, boxes, sigma, knum, epsilon, rest, silhouette, pairs, first, last):
+    """``1 - S`` and the silhouette, and of each pair what the backward pass needs.
 
     The factor is such that ``factor r (1 - S) dL/dS`` is the gradient by the nearest point of the edge.
     """
+    counts, ends, places, slopes = pairs
     height, width = rest.shape[1:]
     sharpness, small = np.float32(sigma), np.float32(epsilon)
     one, two = np.float32(1), np.float32(2)
@@ -203,11 +225,9 @@ def _pairs(
             drawn[pixel] = one - product[pixel]
 
 
-@kernel(
-    "void(float32[:,:,::1], int64[:,::1], int64[::1], int32[:,::1], float32[:,::1], float32[:,:,::1],"
-    " float32[:,:,::1], int64, int64)"
-)
-def _backward(grad, counts, ends, places, slopes, rest, grad_screen, first, last):
+@kernel(void(float32[:, :, ::1], _PAIRS, float32[:, :, ::1], float32[:, :, ::1], int64, int64))
+def _backward(grad, pairs, rest, grad_screen, first, last):
+    counts, ends, places, slopes = pairs
     height, width = grad.shape[1:]
     scale_x, scale_y = np.float32(2) / np.float32(width), np.float32(2) / np.float32(height)
     for view in range(first, last):

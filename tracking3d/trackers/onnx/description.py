@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, ValidationError
 
-from tracking3d.config.explain import describe
+from tracking3d.config.explain import describe_validation_error
 from tracking3d.config.models import Section
 from tracking3d.errors import InputError
 from tracking3d.networks.descriptions import description_names, read_description
@@ -115,7 +115,7 @@ class PromptableNetwork(Section):
 Description = SaliencyNetwork | PromptableNetwork
 
 
-def load_description(segmenter: str | Path) -> Description:
+def load_segmenter_description(segmenter: str | Path) -> Description:
     """Read a description.
 
     Args:
@@ -132,9 +132,9 @@ def load_description(segmenter: str | Path) -> Description:
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        raise InputError(f"{file}: {describe(error, model, 'key')}") from error
+        raise InputError(f"{file}: {describe_validation_error(error, model, 'key')}") from error
 
 
-def builtin_descriptions() -> list[str]:
+def builtin_segmenter_descriptions() -> list[str]:
     """Names of the descriptions that come with the package."""
     return description_names(PACKAGE)

@@ -13,7 +13,7 @@ from tracking3d.trackers.onnx.description import ImageInput
 
 
 @dataclass(frozen=True)
-class Fit:
+class Letterbox:
     """How an image lies in a network's input.
 
     Attributes:
@@ -49,23 +49,23 @@ def _interval(centre: float, length: float, limit: int) -> slice:
     return slice(start, max(min(round(centre + length / 2), limit), min(start + 2, limit)))
 
 
-def fit_image(size: tuple[int, int], description: ImageInput) -> Fit:
+def fit_image(size: tuple[int, int], description: ImageInput) -> Letterbox:
     """Where an image of ``size`` ``(H, W)`` goes in the input that ``description`` asks for."""
     match description.size:
         case None:
-            return Fit(size, size, size)
+            return Letterbox(size, size, size)
         case int(side):
             target = (side, side)
         case target:
             pass
     if description.fit == "stretch":
-        return Fit(size, target, target)
+        return Letterbox(size, target, target)
     scale = min(target[0] / size[0], target[1] / size[1])
     content = max(round(size[0] * scale), 1), max(round(size[1] * scale), 1)
-    return Fit(size, content, target)
+    return Letterbox(size, content, target)
 
 
-def network_input(image: Image, fit: Fit, description: ImageInput) -> NDArray[np.float32]:
+def network_input(image: Image, fit: Letterbox, description: ImageInput) -> NDArray[np.float32]:
     """The float32 array that the network takes for ``image`` ``(H, W, 3)``; axes as described."""
     height, width = fit.content
     shrinks = height * width < image.shape[0] * image.shape[1]
@@ -84,7 +84,7 @@ def network_input(image: Image, fit: Fit, description: ImageInput) -> NDArray[np
     return np.ascontiguousarray(canvas[None] if "n" in description.layout else canvas)
 
 
-def on_image(values: NDArray, fit: Fit, padded: bool) -> NDArray[np.float32]:
+def on_image(values: NDArray, fit: Letterbox, padded: bool) -> NDArray[np.float32]:
     """Values of a network's output grid ``(h, w)`` at the pixels of the image, ``(H, W)``.
 
     Args:

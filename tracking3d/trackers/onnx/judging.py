@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tracking3d.frames import Box, Image
 from tracking3d.geometry.camera import Window
 from tracking3d.trackers.colour_models import GlobalColours, lab
-from tracking3d.trackers.confidence import Judgement, outline_margin, signed_distance
+from tracking3d.trackers.confidence import Judgement, inside_distance, outline_margin
 from tracking3d.trackers.crops import box_iou, box_of, cut, inside_frame
 from tracking3d.trackers.onnx.images import enlarged
 from tracking3d.trackers.onnx.proposals import Proposal
@@ -169,5 +169,5 @@ def _sides(mask: NDArray[np.float32], window: Window) -> tuple[NDArray[np.bool_]
     in_frame = inside_frame(mask.shape, window)
     if not inside.any():
         return inside, in_frame
-    beyond = signed_distance(inside) < -_BAND * math.sqrt(np.count_nonzero(inside))
+    beyond = inside_distance(inside) < -_BAND * math.sqrt(np.count_nonzero(inside))
     return inside, beyond & in_frame

@@ -11,7 +11,7 @@ from tracking3d.errors import InputError
 from tracking3d.networks.store import find_network
 from tracking3d.trackers.csrt import CsrtTracker
 from tracking3d.trackers.onnx.boxes import BoxProposer, CsrtBoxes, nano_boxes, vit_boxes
-from tracking3d.trackers.onnx.description import SaliencyNetwork, load_description
+from tracking3d.trackers.onnx.description import SaliencyNetwork, load_segmenter_description
 from tracking3d.trackers.onnx.promptable import PromptableSegmenter
 from tracking3d.trackers.onnx.proposals import Segmenter
 from tracking3d.trackers.onnx.saliency import SaliencySegmenter
@@ -52,7 +52,7 @@ def build_segmenter(options: OnnxOptions) -> Segmenter:
     Raises:
         InputError: If a description or a file is missing or cannot be used.
     """
-    description = load_description(options.segmenter)
+    description = load_segmenter_description(options.segmenter)
 
     def file(option: str, given: str | None, default: str | None) -> Path:
         return _file(option, given or default, f"the segmenter '{options.segmenter}'")

@@ -13,7 +13,7 @@ from tracking3d.frames import Box, Image
 from tracking3d.networks.session import Network
 from tracking3d.trackers.crops import box_of
 from tracking3d.trackers.onnx.description import Decoder, PromptableNetwork
-from tracking3d.trackers.onnx.images import Fit, fit_image, network_input, on_image, sigmoid
+from tracking3d.trackers.onnx.images import Letterbox, fit_image, network_input, on_image, sigmoid
 from tracking3d.trackers.onnx.judging import background_points
 from tracking3d.trackers.onnx.proposals import Proposal, sharpness
 from tracking3d.trackers.onnx.saliency import known
@@ -98,7 +98,7 @@ class Look:
         output: str,
         names: Decoder,
         embeddings: dict[str, NDArray],
-        fit: Fit,
+        fit: Letterbox,
     ) -> None:
         self._network, self._output, self._names = network, output, names
         self._embeddings, self._fit = embeddings, fit

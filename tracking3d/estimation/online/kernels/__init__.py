@@ -1,4 +1,4 @@
 """Numba kernels of what points say of poses and shape: float64, and no sum depends on the processor.
 
-Each file is the fast twin of the module of the same name one folder up, which is its specification.
+Each file belongs to the module of the same name one folder up, which says what is computed.
 """

@@ -16,12 +16,12 @@ from tracking3d.bundle_adjustment.kernels.reprojection import (
     turned_by,
 )
 from tracking3d.bundle_adjustment.reprojection import BEHIND, NEAREST, FloatArray
-from tracking3d.estimation.online.pose_from_points import (
+from tracking3d.estimation.online.pnp_types import (
     CONVERGED,
     FIRST_DAMPING,
     MOST_DAMPING,
+    PnPFit,
     PointEquations,
-    PoseFit,
 )
 from tracking3d.rendering.kernels.compilation import kernel
 
@@ -35,12 +35,12 @@ def pose_of_tracks(
     t: FloatArray,
     scale: float,
     iterations: int,
-) -> PoseFit:
+) -> PnPFit:
     """See `tracking3d.estimation.online.pose_from_points`; ``share`` sums to 1 and is 0 for rows without use."""
     given = (np.ascontiguousarray(part, np.float64) for part in (points, pixels, share, K))
     start = (np.array(part, np.float64, order="C") for part in (R, t))  # written to
     R, t, *equations = _pose_of_tracks(*given, *start, float(scale), iterations)
-    return PoseFit(R, t, PointEquations(*equations))
+    return PnPFit(R, t, PointEquations(*equations))
 
 
 @kernel(

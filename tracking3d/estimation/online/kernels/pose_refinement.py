@@ -4,8 +4,11 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numba import boolean, float64, int64, void
+from numpy.typing import NDArray
 
 from tracking3d.bundle_adjustment.kernels.reprojection import (
     factorised,
@@ -14,7 +17,7 @@ from tracking3d.bundle_adjustment.kernels.reprojection import (
     turned_by,
 )
 from tracking3d.bundle_adjustment.reprojection import FloatArray
-from tracking3d.estimation.online.pose_refinement import (
+from tracking3d.estimation.online.pose_refinement_types import (
     ENOUGH,
     FIRST_DAMPING,
     LEAST_DAMPING,
@@ -24,7 +27,16 @@ from tracking3d.estimation.online.pose_refinement import (
     PoseWeights,
 )
 from tracking3d.rendering import MatchedPoints, PoseTarget, Surface
-from tracking3d.rendering.kernels.compilation import kernel
+from tracking3d.rendering.kernels.compilation import kernel, record
+from tracking3d.rendering.kernels.pose_inputs import (
+    MATCHES,
+    SCALES,
+    SURFACE,
+    TARGET,
+    LossScales,
+    drawing_buffers,
+    packed,
+)
 from tracking3d.rendering.kernels.pose_terms import (
     APPEARANCE,
     BOTH,
@@ -32,16 +44,42 @@ from tracking3d.rendering.kernels.pose_terms import (
     EITHER,
     KNOWN,
     OUTLINE,
-    PACKED,
     POINTS,
-    drawing_buffers,
-    packed,
     terms_of_pose,
 )
 from tracking3d.rendering.kernels.threads import share
-from tracking3d.rendering.pose_terms import NEAREST_POINT, check_comparison
+from tracking3d.rendering.pose_comparison import NEAREST_POINT, check_comparison
 
 _COST, _APPEARANCE, _OUTLINE, _POINTS, _OVERLAP, _UNSEEN = range(6)
+
+
+class PoseArrays(NamedTuple):
+    """B poses while they are minimized; written to.
+
+    Attributes:
+        R: ``(B, 3, 3)`` and
+        t: ``(B, 3)``, where they are.
+        numbers: ``(B, 6)`` by the places above: what they cost and why.
+        matrix: ``(B, 6, 6)`` and
+        gradient: ``(B, 6)`` of the quadratic model there.
+        spent: ``(B,)`` evaluations.
+        moved: ``(B,)`` whether a step was taken.
+    """
+
+    R: FloatArray
+    t: FloatArray
+    numbers: FloatArray
+    matrix: FloatArray
+    gradient: FloatArray
+    spent: NDArray[np.int64]
+    moved: NDArray[np.bool_]
+
+
+_POSES = record(
+    PoseArrays,
+    float64[:, :, ::1], float64[:, ::1], float64[:, ::1], float64[:, :, ::1], float64[:, ::1], int64[::1],
+    boolean[::1],
+)  # fmt: skip
 
 
 def minimized(
@@ -59,11 +97,13 @@ def minimized(
     count = len(R)
     numbers, matrix, gradient = np.empty((count, 6)), np.empty((count, 6, 6)), np.empty((count, 6))
     spent, moved = np.empty(count, np.int64), np.empty(count, np.bool_)
+    scales = LossScales(
+        *map(float, (weights.appearance_scale, weights.outline_scale, weights.points_scale, NEAREST_POINT))
+    )
     share(
-        _minimized, count, 2, *packed(surface, target, matched),
-        np.array([weights.appearance_scale, weights.outline_scale, weights.points_scale]),
-        np.array([weights.appearance, weights.outline, weights.points, weights.unseen]),
-        NEAREST_POINT, steps, R, t, numbers, matrix, gradient, spent, moved,
+        _minimized, count, 2, *packed(surface, target, matched), scales,
+        np.array([weights.appearance, weights.outline, weights.points, weights.unseen]), steps,
+        PoseArrays(R, t, numbers, matrix, gradient, spent, moved),
     )  # fmt: skip
     cost, appearance, outline, points, overlap, unseen = np.ascontiguousarray(numbers.T)
     return EvaluatedPoses(
@@ -71,15 +111,10 @@ def minimized(
     )
 
 
-@kernel(
-    f"void({PACKED}, float64[::1], float64[::1], float64, int64, float64[:,:,::1], float64[:,::1],"
-    " float64[:,::1], float64[:,:,::1], float64[:,::1], int64[::1], boolean[::1], int64, int64)"
-)
-def _minimized(
-    vertices, faces, face_uvs, edges, edge_faces, layers, features, comparable, inside, mask, distance, K,
-    points, pixels, scales, weights, nearest, steps, R, t, numbers, matrix, gradient, spent, moved, first, last,
-):  # fmt: skip
-    buffers = drawing_buffers(vertices, comparable)
+@kernel(void(SURFACE, TARGET, MATCHES, SCALES, float64[::1], int64, _POSES, int64, int64))
+def _minimized(surface, target, matches, scales, weights, steps, poses, first, last):
+    R, t, numbers, matrix, gradient, spent, moved = poses
+    buffers = drawing_buffers(surface.vertices, target.comparable)
     R32, t32 = np.empty((3, 3), np.float32), np.empty(3, np.float32)
     sums, counts = np.empty((3, 7, 7)), np.empty(4)
     R_new, t_new, step, system = np.empty((3, 3)), np.empty(3), np.empty(6), np.empty((6, 6))
@@ -97,12 +132,8 @@ def _minimized(
             R32[:], t32[:] = R_new, t_new
             sums[:] = 0
             counts[:] = 0
-            terms_of_pose(
-                vertices, faces, face_uvs, edges, edge_faces, layers, features, comparable, inside, mask,
-                distance, K, points, pixels, R32, t32, scales[0], scales[1], scales[2], nearest, buffers, sums,
-                counts,
-            )  # fmt: skip
-            _weigh(sums, counts, mask.size > 0, weights, new_numbers, new_matrix, new_gradient)
+            terms_of_pose(surface, target, matches, R32, t32, scales, buffers, sums, counts)
+            _weigh(sums, counts, target.mask.size > 0, weights, new_numbers, new_matrix, new_gradient)
             cost = numbers[pose, _COST]
             gain = math.inf if evaluation == 0 else cost - new_numbers[_COST]
             if gain > 0:

@@ -1,0 +1,41 @@
+"""The robust visual hull in torch, all points of a view at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from tracking3d.reconstruction.grid import FloatArray
+from tracking3d.reconstruction.shape_views import ShapeView
+
+
+def robust_hull(
+    points: FloatArray, views: Sequence[ShapeView], far: float, share: float, least: int
+) -> tuple[FloatArray, FloatArray]:
+    """See `tracking3d.reconstruction.hull.robust_hull`."""
+    P = np.stack([view.P for view in views])
+    focal = np.array([view.K[0, 0] for view in views])
+    inside = np.stack([view.depth_inside for view in views])
+    within = np.stack([view.within for view in views])
+    side = inside.shape[1]
+    values = torch.full((len(P), len(points)), torch.inf, dtype=torch.float64)
+    at = torch.from_numpy(np.asarray(points, np.float64))
+    for v, projection in enumerate(torch.from_numpy(P)):
+        x, y, depth = (at @ projection[:, :3].T + projection[:, 3]).unbind(1)
+        x, y = x / depth, y / depth
+        left, right, top, bottom = (float(edge) for edge in within[v])
+        known = (depth > 1e-6) & (x >= left) & (x <= right) & (y >= top) & (y <= bottom)
+        window = known & (x >= 0) & (x < side - 1) & (y >= 0) & (y < side - 1)
+        grid = torch.stack([x, y], 1)[window] * (2 / (side - 1)) - 1
+        sampled = torch.nn.functional.grid_sample(
+            torch.from_numpy(inside[v]).double()[None, None], grid[None, None], align_corners=True
+        ).flatten()
+        values[v, known] = -far
+        values[v, window] = (sampled * depth[window] / focal[v]).clamp(-far, far)
+    ordered = values.sort(0).values
+    seen = values.isfinite().sum(0)
+    rank = torch.minimum((share * seen).long() + least, seen - 1).clamp_min(0)
+    hull = ordered.gather(0, rank[None])[0].clamp_max(far)
+    return hull.float().numpy(), seen.float().numpy()

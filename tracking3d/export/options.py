@@ -1,0 +1,39 @@
+"""What may be asked of an export."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Answers = Literal["final", "causal"]
+Of = Literal["object", "camera"]
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """What may be asked of an export; a format that has no use for an option refuses it.
+
+    Attributes:
+        answers: ``final`` takes the answers of the final refinement where there are any, ``causal`` those before it.
+        object_size: Metres of the longest side of the smallest box around the object; None leaves the run's unit.
+        fps: Frames per second; None takes what the run knows.
+        source: The video, where it is no longer where the run found it.
+        of: ``object`` for poses ``T_cam_obj``, ``camera`` for those of a camera about the still object, ``T_obj_cam``.
+        cut_out: Pictures as PNG that are transparent around the object, instead of whole ones with masks beside.
+        images: Whether pictures are written where a format has room for them.
+        undistorted: Masks and pictures as a camera without the distortion of the lens sees them, instead of as they
+            were taken.
+        frame: The frame that ``xy`` is in; None takes the first one with a pose.
+        xy: Pixels on the object whose surface points are followed; empty for a grid over the object.
+    """
+
+    answers: Answers = "final"
+    object_size: float | None = None
+    fps: float | None = None
+    source: str | None = None
+    of: Of = "object"
+    cut_out: bool = False
+    images: bool = True
+    undistorted: bool = False
+    frame: int | None = None
+    xy: tuple[tuple[float, float], ...] = ()

@@ -1,0 +1,184 @@
+"""The second passes of one object: it is estimated again in every frame, and adjusted by all frames together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from functools import partial
+from typing import Any
+
+import cv2
+import numpy as np
+
+from tracking3d.checkpoint.progress import check_picture
+from tracking3d.checkpoint.run_state import RunState
+from tracking3d.estimation.estimate import FrameEstimate, ObjectModel, Status
+from tracking3d.evidence.scene import Mask
+from tracking3d.frames import Frame, MaskEstimate
+from tracking3d.last_passes import Decision, LastPasses, PrecomputedRefinement, estimate_again
+from tracking3d.open_tracking import TrackedObject
+from tracking3d.reconstruction import BELIEVED, TextureView, kept_views, texture_view
+from tracking3d.reconstruction.second_look import SecondLook
+from tracking3d.rendering.backend import shared_among
+from tracking3d.results.files import decoded_mask
+from tracking3d.results.records import FrameRecord
+from tracking3d.results.refinement_writer import RefinementWriter
+from tracking3d.results.run_writer import RunWriter
+from tracking3d.side_by_side import WorkBehind
+from tracking3d.stages import measured
+
+
+class FinalRefinement:
+    """Takes one object's frames through the second passes; everything is solved with the final model already.
+
+    Args:
+        tracked: The object; its session is refined, see `Session.refine`.
+        writer: Of the run.
+        estimates: Writes the refined estimates.
+        state: How far the run is.
+        work: Writes in another thread while the next frame is solved.
+        initial: Score and reason of every frame's initial mask, by index.
+        precomputed: What the last steps come to, if other processes have taken them.
+    """
+
+    def __init__(
+        self,
+        tracked: TrackedObject,
+        writer: RunWriter,
+        estimates: RefinementWriter,
+        state: RunState,
+        work: WorkBehind,
+        initial: Mapping[int, tuple[float, str]],
+        precomputed: PrecomputedRefinement | None = None,
+    ) -> None:
+        self._session, self._writer, self._estimates = tracked.session, writer, estimates
+        self._state, self._work, self._initial = state, work, initial
+        self._views: tuple[TextureView, ...] = ()
+        self._precomputed = precomputed
+        wanted, camera = self._session.config.object, self._session.camera
+        if precomputed is not None:
+            look = precomputed.look
+        else:
+            causal = sorted(estimates.causal)
+            look = SecondLook(self._session.result(), camera, causal, wanted.landmark_views)
+        self._last = LastPasses(estimates, look, fixed=tracked.corrections)
+
+    def take_again(self, frame: Frame) -> FrameRecord | None:
+        """Estimate the object in a frame again; None if the frame has no causal estimate."""
+        estimates, state = self._estimates, self._state
+        if frame.index not in estimates.causal:
+            return None
+        if state.kept:
+            check_picture(state.kept, frame)
+            if frame.index <= state.before.last_refined:
+                record = estimates.estimate(frame.index)
+                return self._work.do(partial(self._collect, record, frame, estimates.mask(record)))
+        mask = estimates.initial_mask(frame.index)
+        score, reason = self._initial.get(frame.index, (1.0, ""))
+        initial = MaskEstimate(None if mask is None else mask.astype(np.float32), score, reason)
+        estimate = estimate_again(self._session, frame, estimates.causal[frame.index], initial)
+        kept = self._session.kept() if state.checkpoint else {}
+        return self._work.do(partial(self._keep, estimate, frame, mask, kept))
+
+    def _keep(
+        self, estimate: FrameEstimate | None, frame: Frame, initial: Mask | None, session: dict[str, Any]
+    ) -> FrameRecord:
+        estimates = self._estimates
+        record = estimates.write(estimate, frame, initial)
+        self._state.save(
+            session,
+            last_refined=frame.index,
+            refined_lines=estimates.lines,
+            seconds=self._writer.seconds,
+            refinement_seconds=estimates.seconds,
+        )
+        return self._collect(record, frame, estimate.mask if estimate else estimates.mask(record))
+
+    def _collect(self, record: FrameRecord, frame: Frame, mask: Mask) -> FrameRecord:
+        """Keep what the final poses, surface and texture can be taken from; the record as it is."""
+        most = self._session.config.object.texture_views
+        if self._precomputed is None:
+            self._last.collect(frame, mask)
+        if most and record.status is Status.TRACKED and record.confidence >= BELIEVED:
+            camera = record.through(self._session.camera)
+            image, seen = camera.undistorted(frame.image), camera.mask_to_pinhole(mask)
+            view = texture_view(frame.index, image, seen, camera, record.T_cam_obj)
+            self._views = self._views if view is None else kept_views(self._views, view, most)
+        return record
+
+    def adjust_all(self) -> None:
+        """All frames were taken again: adjust poses, surface and lens together."""
+        if self._precomputed is not None:
+            self._put(self._precomputed)
+        else:
+            with shared_among(cv2.getNumThreads()), measured("map") as watch:
+                self._last.adjust_all()
+            self._estimates.together += watch.times
+            if self._session.config.object.evidence:
+                self._last.begin_masks()
+        self._writer.refine_camera(self._last.look.camera)
+
+    def _put(self, precomputed: PrecomputedRefinement) -> None:
+        """Take over poses and masks; frames are then only drawn."""
+        for record in precomputed.estimates.values():
+            self._estimates.put(record)
+        for index, png in precomputed.masks.items():
+            if (mask := decoded_mask(png)) is not None:
+                self._estimates.put_mask(index, mask)
+
+    @property
+    def decides_masks(self) -> bool:
+        """Whether the frames are to come once for `collect_mask` before they are drawn."""
+        return self._last.masks is not None
+
+    def collect_mask(self, frame: Frame) -> None:
+        """Adjust the pose of a frame, and keep what it says of the object's masks."""
+        if self._last.masks is not None and frame.index in self._estimates.causal:
+            self._estimates.put(self._last.adjusted(frame))
+            self._last.collect_mask(frame)
+
+    def settle_masks(self) -> None:
+        """Put together what the masks of all frames have in common, if masks are decided."""
+        if self._last.masks is not None:
+            with measured("map") as watch:
+                self._last.settle_masks()
+            self._estimates.together += watch.times
+
+    def draw(self, frame: Frame) -> None:
+        """Draw the final estimate of a frame; if masks are decided, of those frames whose turn has come."""
+        if frame.index not in self._estimates.causal:
+            return
+        if self._last.masks is not None:
+            with measured("map") as watch:
+                decided = list(self._last.decide(frame))
+            self._draw_decided(decided)
+            self._estimates.together += watch.times
+            return
+        if self._precomputed is None:
+            self._estimates.put(self._last.adjusted(frame))
+        self._draw(frame, self._estimates.mask(self._estimates.estimate(frame.index)))
+
+    def draw_rest(self) -> None:
+        """Draw the frames that are left when there are no more to come."""
+        if self._last.masks is not None:
+            with measured("map") as watch:
+                decided = list(self._last.rest())
+            self._draw_decided(decided)
+            self._estimates.together += watch.times
+
+    def final_model(self) -> tuple[ObjectModel, tuple[TextureView, ...]]:
+        """The model with the adjusted surface, and the views of its texture with adjusted poses."""
+        model, look = self._session.result(), self._last.look
+        views = tuple(look.seen_by(view, self._estimates.estimate(view.index)) for view in self._views)
+        return look.moved(model), views
+
+    def _draw_decided(self, decisions: Iterable[Decision]) -> None:
+        for frame, decided in decisions:
+            if decided is None:
+                self._draw(frame, self._estimates.mask(self._estimates.estimate(frame.index)))
+            else:
+                self._estimates.put_mask(frame.index, decided.mask, decided.probability)
+                self._draw(frame, decided.mask)
+
+    def _draw(self, frame: Frame, mask: Mask) -> None:
+        initial = self._estimates.initial_mask(frame.index)
+        self._work.do(partial(self._estimates.draw, frame, mask, initial))

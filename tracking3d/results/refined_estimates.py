@@ -1,0 +1,133 @@
+"""The estimates of a run in its final refinement: refined ones are kept aside until all are there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking3d.estimation.estimate import FrameEstimate, MaskSource
+from tracking3d.frames import Frame
+from tracking3d.results import layout
+from tracking3d.results.files import decoded_mask, mask_file, read_mask, write_mask
+from tracking3d.results.probabilities import write_probability
+from tracking3d.results.records import FrameRecord, mask_iou_or_none
+from tracking3d.results.run_reader import RunReader, read_records
+from tracking3d.stages import measured
+
+
+class RefinedEstimates:
+    """The refined estimate of each frame, or the causal one if there is none; any process can read them.
+
+    Args:
+        folder: The run folder.
+        causal: The causal estimate of every frame.
+        size: ``(height, width)`` of the frames.
+
+    Attributes:
+        causal: The causal estimates by frame index.
+    """
+
+    def __init__(self, folder: Path, causal: Iterable[FrameRecord], size: tuple[int, int]) -> None:
+        self._folder, self._aside, self._size = folder, folder / layout.REFINING, size
+        self.causal = {record.index: record for record in causal}
+        self._records = {record.index: record for record in read_records(self._aside / layout.FRAMES)}
+        self._decided: dict[int, bytes] = {}  # masks as PNG
+
+    @classmethod
+    def of_folder(cls, folder: Path, size: tuple[int, int]) -> RefinedEstimates:
+        """The estimates of a run that is stopped; ``size`` is that of its frames."""
+        return RefinedEstimates(folder, RunReader(folder, refined=False).frames, size)
+
+    @property
+    def writes_probabilities(self) -> bool:
+        """Whether the run keeps the probabilities of masks."""
+        return (self._folder / layout.PROBABILITIES).is_dir()
+
+    def estimate(self, index: int) -> FrameRecord:
+        """The estimate of frame ``index`` as it is now."""
+        return self._records.get(index) or self.causal[index]
+
+    def all(self) -> list[FrameRecord]:
+        """The estimate of every frame as it is now, in the order of the causal ones."""
+        return [self.estimate(index) for index in self.causal]
+
+    def mask(self, record: FrameRecord) -> NDArray[np.bool_]:
+        """The mask ``(H, W)`` of an estimate; empty if it cannot be read."""
+        if record.refined and (decided := self._decided.get(record.index)) is not None:
+            mask = decoded_mask(decided)
+        else:
+            mask = read_mask(layout.mask_path(self._aside if record.refined else self._folder, record.index))
+        return np.zeros(self._size, bool) if mask is None else mask
+
+    def initial_mask(self, index: int) -> NDArray[np.bool_] | None:
+        """What the mask tracker gave for frame ``index``, ``(H, W)`` bool, or None."""
+        return read_mask(layout.initial_mask_path(self._folder, index))
+
+    def put(self, record: FrameRecord) -> None:
+        """Replace a refined estimate, see `put_right`; causal ones stand.
+
+        It is not kept for a run that is stopped here and resumed later: that computes it again.
+        """
+        if record.index in self._records:
+            self._records[record.index] = record
+
+    def put_mask(
+        self, index: int, mask: NDArray[np.bool_], probability: NDArray[np.float32] | None = None
+    ) -> None:
+        """Give a refined estimate another mask, as `put` does; causal ones stand.
+
+        Args:
+            index: Of the frame.
+            mask: ``(H, W)``.
+            probability: ``(H, W)`` of the object; None if it is written already.
+
+        Raises:
+            OutputError: If the probability cannot be written.
+        """
+        if (record := self._records.get(index)) is None:
+            return
+        self._records[index] = replace(
+            record,
+            area=int(np.count_nonzero(mask)),
+            iou_initial=mask_iou_or_none(mask, self.initial_mask(index)),
+            mask_source=MaskSource.WEIGHED,
+        )
+        self._decided[index] = mask_file(mask)
+        if probability is not None and self.writes_probabilities:
+            write_probability(self._aside, index, probability)
+
+
+def write_refined(
+    into: Path,
+    estimate: FrameEstimate,
+    frame: Frame,
+    causal: FrameRecord,
+    initial: NDArray[np.bool_] | None,
+    probabilities: bool,
+) -> FrameRecord:
+    """Write the mask of a refined estimate; its record is to be written by the caller.
+
+    Args:
+        into: A folder with ``masks/``.
+        estimate: The estimate.
+        frame: The frame.
+        causal: The frame's causal estimate.
+        initial: ``(H, W)`` what the mask tracker gave.
+        probabilities: Whether the probabilities of the mask are written, too.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
+    estimate = replace(
+        estimate, refined=True, initial_mask=initial, keyframe=estimate.keyframe or causal.keyframe
+    )
+    with measured("write") as watch:
+        record = FrameRecord.of(estimate, frame.name, initial, revision=True)
+        write_mask(layout.mask_path(into, frame.index), estimate.mask)
+        if probabilities:
+            write_probability(into, frame.index, estimate.probability)
+    return record.and_wrote(watch.times.write)
