@@ -25,7 +25,7 @@ from tracking3d.synthesis.camera_effects import compressed, linear
 from tracking3d.synthesis.frame_rendering import render_frame
 from tracking3d.synthesis.lighting import lamp_at
 from tracking3d.synthesis.motions import Path as Motion
-from tracking3d.synthesis.ray_casting import Surface
+from tracking3d.synthesis.ray_casting import RayMesh
 from tracking3d.synthesis.room import Room
 from tracking3d.synthesis.room_rendering import room_light
 from tracking3d.synthesis.scene import Scene, make_scene
@@ -111,7 +111,7 @@ def build_room(scene: Scene, T_cam_room: Array) -> Room:
     textures = [pyramid(linear(one)) for one in pictures]
     density = np.where(looks == 6, 1024, 64) / (7 * r)
     low, high = r * np.array([-8, -4.2, -5.5]), r * np.array([8, 3.8, 8])
-    return Room(T_obj_room, low, high, Surface.of(furniture), uvs, looks, density, textures)
+    return Room(T_obj_room, low, high, RayMesh.of(furniture), uvs, looks, density, textures)
 
 
 def render_surroundings(scene: Scene, T_cam_room: Array) -> NDArray[np.float32]:
