@@ -21,7 +21,8 @@ from PIL import Image, ImageDraw
 from scipy.spatial.transform import Rotation
 
 from tracking3d.datasets.clip import write_clip
-from tracking3d.synthesis.camera_effects import compress, linear
+from tracking3d.synthesis.camera_effects import compress as encode_jpeg
+from tracking3d.synthesis.camera_effects import linear
 from tracking3d.synthesis.frame_rendering import render_frame
 from tracking3d.synthesis.lighting import lamp_at
 from tracking3d.synthesis.motions import Path as Motion
@@ -159,7 +160,9 @@ def build_scene(mesh: Path, frames: int, size: tuple[int, int]) -> Scene:
 
 def compress(image: NDArray[np.uint8], strength: float) -> NDArray[np.uint8]:
     """The image after JPEG compression."""
-    return np.asarray(cv2.imdecode(np.frombuffer(compress(image, strength), np.uint8), cv2.IMREAD_COLOR_RGB))
+    return np.asarray(
+        cv2.imdecode(np.frombuffer(encode_jpeg(image, strength), np.uint8), cv2.IMREAD_COLOR_RGB)
+    )
 
 
 def main() -> None:
