@@ -69,7 +69,7 @@ def script(monkeypatch) -> Script:
             T[2, 3] = 3
             return FrameEstimate(frame.index, frame.time, T, mask, mask, Status.TRACKED, "", 1.0, seconds=0.1)
 
-        def kept(self):
+        def state_dict(self):
             return {}
 
         def resume(self, first, kept, failures):

@@ -417,7 +417,7 @@ def test_symmetries_may_stand_in_the_description(read, data):
     ("text", "reason"),
     [
         ("", "the key 'name' is missing"),
-        ("- a", "holds a list"),
+        ("- a", "has a list at its top level"),
         ("name: [", "not valid YAML"),
         ("{name: a, title: b, mask: {}}", "there is no key 'mask'; did you mean 'masks'"),
         ("{name: a, title: b, masks: {file: x}}", "there is no key 'masks.file'; did you mean 'masks.files'"),

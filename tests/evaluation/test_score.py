@@ -97,7 +97,7 @@ def write_run(tmp_path):
         run.mkdir()
         document = {
             "format": "tracking3d-run",
-            "format_version": 1,
+            "format_version": 2,
             "state": "finished",
             "config": {},
             "camera": asdict(CAMERA),

@@ -126,7 +126,7 @@ class Stuck:
 def test_a_capture_that_does_not_go_back_is_not_taken_for_one_that_does():
     source = CapturedFrames(Stuck(), start=0, count=3, fps=None)
     next(iter(source))
-    with pytest.raises(InputError, match=r"^the VideoCapture shows another picture when it is taken back"):
+    with pytest.raises(InputError, match=r"^the VideoCapture cannot be rewound to frame 0"):
         next(iter(source))
 
 
@@ -134,5 +134,5 @@ def test_a_capture_at_its_end_has_no_frame(video):
     capture = cv2.VideoCapture(video)
     while capture.read()[0]:
         pass
-    with pytest.raises(InputError, match=r"^the VideoCapture has no frame left"):
+    with pytest.raises(InputError, match=r"^the VideoCapture has no readable frame left"):
         list(open_frames(capture))

@@ -82,12 +82,12 @@ def test_an_empty_set_is_one_object_that_the_mask_tracker_knows():
 @pytest.mark.parametrize(
     ("prompts", "message"),
     [
-        (PromptSet(), "either a box or a mask"),
-        (PromptSet.of_one(BOX, mask_of(BOX)), "either a box or a mask"),
+        (PromptSet(), "one of a box, a mask or points"),
+        (PromptSet.of_one(BOX, mask_of(BOX)), "one of a box, a mask or points"),
         (PromptSet.of_one(box=(1, 1, 0, 5)), r"^box=1,1,0,5 has no size"),
-        (PromptSet(as_lists=True), "boxes or masks"),
+        (PromptSet(as_lists=True), "boxes, masks or points"),
         (PromptSet(boxes=[BOX, (1, 1, 0, 5)], as_lists=True), r"^boxes\[1\]=1,1,0,5 has no size"),
-        (PromptSet(boxes="1,2,3,4", as_lists=True), "give a list with one for each object"),
+        (PromptSet(boxes="1,2,3,4", as_lists=True), "give a list with one item per object"),
     ],
 )
 def test_what_cannot_be_a_prompt_is_refused_before_the_first_frame(prompts, message):

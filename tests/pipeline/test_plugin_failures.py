@@ -261,7 +261,7 @@ def test_the_run_folder_records_every_failure_and_the_summary_counts_them(clip, 
 def test_with_stop_the_finished_frames_are_kept(clip, source, tmp_path, settings):
     with pytest.raises(PluginError, match=r"failed at 002\.png") as caught:
         record(source, settings("stop", tracker=bad("raises", 2)), tmp_path / "run", mask=clip.masks[0])
-    assert "What was finished until then is kept" in caught.value.__notes__[0]
+    assert "The frames finished until then are in" in caught.value.__notes__[0]
     reader = RunReader(tmp_path / "run")
     assert (reader.state, [frame.index for frame in reader.frames]) == ("failed", [0, 1])
     assert "no pixels" in reader.description["error"]

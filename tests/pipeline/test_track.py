@@ -92,7 +92,7 @@ def test_frames_keep_their_index_and_time(clip, quick):
 def test_frames_that_could_not_be_read_are_passed_over(clip, quick):
     images = list(clip.images)
     frames = [SkippedFrame(0, "damaged"), images[0], images[1], SkippedFrame(3, "damaged"), images[3]]
-    with pytest.raises(InputError, match=r"The first frame.*cannot be read \(damaged\).*skip_damaged"):
+    with pytest.raises(InputError, match=r"The first frame.*cannot be decoded \(damaged\).*skip_damaged"):
         next(track(frames, mask=clip.masks[0], config=quick))
     estimates = list(track(frames, mask=clip.masks[0], config=quick, skip_damaged=True))
     assert [estimate.index for estimate in estimates] == [1, 2, 4]
@@ -200,12 +200,12 @@ def test_all_frames_must_have_one_size(clip, quick):
 
 
 def test_neither_box_nor_mask_is_refused_where_the_tracker_needs_one(clip, quick):
-    with pytest.raises(InputError, match="box or a mask"):
+    with pytest.raises(InputError, match="one of a box, a mask or points"):
         next(track(clip.images, config=quick))
 
 
 def test_both_box_and_mask_are_refused(clip, quick):
-    with pytest.raises(InputError, match="either a box or a mask"):
+    with pytest.raises(InputError, match="one of a box, a mask or points"):
         next(track(clip.images, box=clip.box, mask=clip.masks[0], config=quick))
 
 

@@ -196,7 +196,7 @@ def test_record_names_its_own_arguments_where_a_folder_is_taken(config, tmp_path
         ({"prompt": BOX}, r"^prompt= is a tuple; make one .*make_prompt"),
         ({"prompt": Prompt((1, 2))}, r"^prompt\.box=\(1, 2\) is not four numbers"),
         ({"prompt": Prompt(BOX, "mask.png")}, r"^prompt\.mask='mask.png' is text"),
-        ({"prompt": None}, r"either a box or a mask"),
+        ({"prompt": None}, r"one of a box, a mask or points"),
         ({"intrinsics": (1, 2)}, r"^intrinsics=\(1, 2\) must be fx, fy, cx, cy"),
         ({"intrinsics": (0, 50, 32, 24)}, r"^intrinsics=.* positive fx and fy"),
         ({"intrinsics": (math.nan, 50, 32, 24)}, r"^intrinsics=.* must be fx"),
@@ -229,7 +229,7 @@ def test_a_selection_and_a_rate_of_the_wrong_type_are_refused():
         open_source([IMAGE], slice(0, 2))
     with pytest.raises(InputError, match=r"^frames='x' is not START:STOP:STEP"):
         open_source([IMAGE], "x")
-    with pytest.raises(InputError, match=r"played at '15' frames a second; give a positive rate"):
+    with pytest.raises(InputError, match=r"played at '15' frames per second; give a positive rate"):
         LatestFrames(open_source([IMAGE]), rate="15")
 
 

@@ -168,7 +168,7 @@ def test_the_command_makes_a_fresh_suite(call, tmp_path, monkeypatch, meshes):
         ("evaluate suite fresh --seed 9000 --meshes .", "holds no mesh file"),
         ("evaluate suite standard --seed 9000", "--seed applies to the suite fresh only, not to standard"),
         ("evaluate suite smoke --meshes .", "--meshes applies to the suite fresh only"),
-        ("evaluate spread fresh", "say --seed N, or name it fresh-N"),
+        ("evaluate spread fresh", "give --seed N, or the name fresh-N"),
     ],
 )
 def test_what_the_commands_cannot_use_is_one_sentence(call, words, message):

@@ -62,7 +62,7 @@ def benchmark(tmp_path):
         config = {"solver": {"name": "online" if number < 3 else "paper"}}
         (run / "run.json").write_text(
             json.dumps(
-                {"format": "tracking3d-run", "format_version": 1, "state": "finished"}
+                {"format": "tracking3d-run", "format_version": 2, "state": "finished"}
                 | {"config": config, "camera": asdict(CAMERA)}
             )
         )

@@ -202,7 +202,7 @@ def test_boxes_that_ostrack_has_written_lead_the_segmentation(tmp_path):
         frame, truth = disc_at(50 + 4 * n, n)
         assert iou(made.step(frame), truth) > 0.85
     beyond = made.step(disc_at(82, 8)[0])
-    assert beyond.reason == "OSTrack gave no region for this frame"
+    assert beyond.reason == "OSTrack has no region for this frame"
     assert beyond.score <= 0.5
 
 
