@@ -72,7 +72,7 @@ def script(monkeypatch) -> Script:
         def state_dict(self):
             return {}
 
-        def resume(self, first, kept, failures):
+        def load_state_dict(self, first, kept, failures):
             self.camera = Camera.from_fov(first.size[1], first.size[0])
 
         def failure_at(self, index):

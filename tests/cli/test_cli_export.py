@@ -27,7 +27,7 @@ def test_the_formats_are_listed(call):
 
 def test_an_export_says_where_it_is(call, finished):
     result = call("export", finished, "--to", "tum", "--out", "poses.txt")
-    said = "Wrote poses.txt: 5 frames, lengths in the run's own unit.\n"
+    said = "Wrote poses.txt: 5 frames, lengths in the arbitrary unit of the run.\n"
     assert (result.exit_code, result.stdout, result.stderr) == (0, said, "")
     metric = call("export", finished, "--to", "tum", "--out", "metric.txt", "--object-size", "0.2")
     assert metric.stdout == "Wrote metric.txt: 5 frames.\n"
@@ -61,7 +61,7 @@ def test_what_cannot_be_used_is_refused(call, refused, finished):
     assert "absent is not a run folder" in refused("export", "absent", "--to", "tum")
     assert "does not use --cut-out" in refused("export", finished, "--to", "tum", "--cut-out")
     assert "--object-size is -1" in refused("export", finished, "--to", "tum", "--object-size", "-1")
-    assert "--of is object or camera" in refused("export", finished, "--to", "tum", "--of", "hand")
+    assert "--of must be object or camera" in refused("export", finished, "--to", "tum", "--of", "hand")
     assert "--xy 'a' is not 2 numbers" in refused("export", finished, "--to", "tapvid", "--xy", "a")
     assert call("export", finished, "--to", "tum").exit_code == 0
     assert "pass --overwrite" in refused("export", finished, "--to", "tum")

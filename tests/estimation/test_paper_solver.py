@@ -231,7 +231,7 @@ def test_the_object_is_a_closed_textured_mesh(preset):
 
 def test_the_visible_texture_is_that_of_the_video():
     sharp = {"frequency": 8, "texture_size": 100}
-    solver = quick_solver("rerendering", window={"size": 64}, object=sharp)
+    solver = quick_solver("rerendering", crop={"size": 64}, object=sharp)
     estimates, state = run(solver, range(4))
     model = solver.result(state)
     camera = short_clip().camera

@@ -87,7 +87,7 @@ def test_a_session_goes_on_where_another_was_stopped(clip, tmp_path, few_sides):
         corrections.append(estimate.mask if stopped.corrected else None)
     assert corrections[0] is not None  # where the tracker was told at last where the object is
     resumed = Session(settings, None)
-    resumed.resume(frames[0], stopped.state_dict(), {})
+    resumed.load_state_dict(frames[0], stopped.state_dict(), {})
     assert resumed.replays
     for frame, correction in zip(frames[:2], corrections, strict=True):
         resumed.replay(frame, frame.index == 0, correction)

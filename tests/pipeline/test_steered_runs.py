@@ -355,7 +355,7 @@ def test_a_finished_run_is_computed_again_where_a_frame_is_corrected(clip, image
     created = RunReader(tmp_path / "run").description["created"]
     run(clip, images, tmp_path / "run", CAUSAL, mask=wrong, corrections=given, resume=True)
     assert RunReader(tmp_path / "run").description["created"] == created
-    with pytest.raises(InputError, match="it was corrected in frame 4, which is not asked for now"):
+    with pytest.raises(InputError, match="it was corrected in frame 4, which is not requested now"):
         run(clip, images, tmp_path / "run", CAUSAL, mask=wrong, resume=True)
 
 

@@ -116,7 +116,7 @@ def test_answers_are_taken_one_by_one_and_all_together_where_that_was_said(clip,
 def test_answers_that_were_not_kept_are_not_made_up(clip, config):
     tracking = track(clip.images, mask=clip.masks[0], config=config)
     next(tracking)
-    with pytest.raises(InputError, match=r"not kept; ask for result\(\) first, or give refine="):
+    with pytest.raises(InputError, match=r"not saved; call result\(\) first, or give refine="):
         tracking.result()
 
 

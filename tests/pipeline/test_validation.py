@@ -196,7 +196,7 @@ def test_record_names_its_own_arguments_where_a_folder_is_taken(config, tmp_path
         ({"prompt": BOX}, r"^prompt= is a tuple; make one .*make_prompt"),
         ({"prompt": Prompt((1, 2))}, r"^prompt\.box=\(1, 2\) is not four numbers"),
         ({"prompt": Prompt(BOX, "mask.png")}, r"^prompt\.mask='mask.png' is text"),
-        ({"prompt": None}, r"one of a box, a mask or points"),
+        ({"prompt": None}, r"either a box or a mask"),
         ({"intrinsics": (1, 2)}, r"^intrinsics=\(1, 2\) must be fx, fy, cx, cy"),
         ({"intrinsics": (0, 50, 32, 24)}, r"^intrinsics=.* positive fx and fy"),
         ({"intrinsics": (math.nan, 50, 32, 24)}, r"^intrinsics=.* must be fx"),

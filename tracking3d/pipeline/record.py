@@ -250,7 +250,7 @@ def begin_recording(
     if checkpoint is not None and kept is not None:
         checkpoint.clear_strangers()
         failures = {index: frame.failure for index, frame in kept.taken.items() if frame.failure}
-        session.resume(opened.first, kept.session, failures)
+        session.load_state_dict(opened.first, kept.session, failures)
         writer.use_camera(session.camera)
     elif not temporary and source.repeatable:
         checkpoint = Checkpoint(folder, session.state_classes, runtime.device, runtime.rollback_points)

@@ -159,7 +159,7 @@ class Session:
         return (Camera, Lens, MaskEstimate, FrameOrder, RandomState, StageTimes, *own)
 
     def state_dict(self) -> dict[str, Any]:
-        """The state that another session needs to continue after the latest frame, see `resume`; it is immutable."""
+        """The immutable state that another session continues from, see `load_state_dict`."""
         return {
             "solver": self._state,
             "camera": self._camera,
@@ -172,7 +172,7 @@ class Session:
             "tracker": self._tracker.state(),
         }
 
-    def resume(self, first: Frame, kept: Mapping[str, Any], failures: Mapping[int, str]) -> None:
+    def load_state_dict(self, first: Frame, kept: Mapping[str, Any], failures: Mapping[int, str]) -> None:
         """Restore a saved session (`state_dict`), instead of starting on a first frame.
 
         If `replays`, pass the frames up to the one after which it was saved to `replay` before the next
@@ -198,7 +198,7 @@ class Session:
 
     @property
     def replays(self) -> bool:
-        """Whether the mask tracker has to see the frames again after `resume`."""
+        """Whether the mask tracker has to see the frames again after `load_state_dict`."""
         return not self._tracker.can_resume and not self._refined
 
     def replay(

@@ -116,7 +116,7 @@ def join(tell: Tell, tracked: Tracked) -> Again | Refused | MergedSubmaps:
     }
     writer = _begin_writing(begun, opened, whole)
     owned = _owned_ranges(begun)
-    session.resume(opened.first, whole.session, {})
+    session.load_state_dict(opened.first, whole.session, {})
     write_causal_mesh(video.folder, session)
     session.refine()
     write_merged_run(writer, session, whole.runs, owned, sum(seconds.values()) + time.monotonic() - clock)

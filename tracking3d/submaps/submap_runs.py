@@ -143,7 +143,7 @@ def resume_submap(job: Revisit) -> tuple[SavedState, Session]:
         first, session = opened.first, opened.objects[0].session
     kept = Checkpoint(job.folder, session.state_classes, job.config.runtime.device).read()
     failures = {index: frame.failure for index, frame in kept.taken.items() if frame.failure}
-    session.resume(first, kept.session, failures)
+    session.load_state_dict(first, kept.session, failures)
     return kept, session
 
 
