@@ -29,4 +29,4 @@ def test_the_smoke_suite_is_made_tracked_and_scored(tmp_path, monkeypatch, seque
     assert all(scores["points_average_jaccard"] is not None for scores in kept["sequences"].values())
 
     again = CliRunner().invoke(app, arguments)
-    assert again.exit_code == 0 and again.stderr.count("done before") == sequences
+    assert again.exit_code == 0 and again.stderr.count("from an earlier run") == sequences
