@@ -56,7 +56,7 @@ class SkippedFrame:
 
 @dataclass(frozen=True, eq=False)
 class Prompt:
-    """The object in one frame: the first, or one in which it is told anew.
+    """The object in one frame: the first, or one in which it is given again.
 
     Attributes:
         box: ``(x, y, width, height)`` in pixels. Always present; the mask's bounding box where a mask was given.

@@ -310,10 +310,10 @@ def test_a_tracker_that_is_on_the_object_keeps_what_it_has_learnt(clip):
     mask = clip.masks[1]
     estimate = tracker.step(Frame(1, clip.images[1]), make_prompt(Frame(1, clip.images[1]), mask=mask))
     assert (estimate.binary == mask).all()
-    assert not tracker.anew
+    assert not tracker.restarted
     elsewhere = make_prompt(Frame(2, clip.images[2]), mask=wrong_place(clip))
     tracker.step(Frame(2, clip.images[2]), elsewhere)
-    assert tracker.anew
+    assert tracker.restarted
     assert iou(tracker.step(Frame(3, clip.images[3])).binary, wrong_place(clip)) > 0.5
 
 

@@ -43,7 +43,7 @@ class PromptedTracker:
         self._tracker = self._new()
         self._first: Frame | None = None
         self._backwards = False
-        self.anew = False
+        self.restarted = False
         """Whether it was started more than once, or not on the first frame's prompt."""
         self.waits = prompt is None and choice.name != "precomputed"
         """Whether the object has not been prompted yet."""
@@ -96,7 +96,7 @@ class PromptedTracker:
         if mask is not None and self.can_correct and common is not None and common >= STRAYED:
             self._tracker.correct(frame, mask)
         else:
-            self._tracker, self.anew = other, True
+            self._tracker, self.restarted = other, True
         return estimate
 
     @property
@@ -119,7 +119,7 @@ class PromptedTracker:
     @property
     def can_resume(self) -> bool:
         """Whether its memory can be saved; not if it was started twice, as one first frame does not describe that."""
-        return self._tracker.can_resume and not (self.anew or self.waits)
+        return self._tracker.can_resume and not (self.restarted or self.waits)
 
     def state(self) -> Any:
         """Its memory; None if it cannot be saved.
@@ -146,11 +146,11 @@ class PromptedTracker:
 
     def _start_on(self, frame: Frame, prompt: Prompt) -> MaskEstimate:
         self._prompt, self._first = prompt, frame
-        self.waits, self.anew = False, True
+        self.waits, self.restarted = False, True
         return self._tracker.init(frame, prompt)
 
     def _restart(self) -> None:
-        self._tracker, self.anew = self._new(), True
+        self._tracker, self.restarted = self._new(), True
 
     def _new(self) -> GuardedTracker:
         return GuardedTracker(build_plugin(TRACKERS, self._choice), plugin_label(TRACKERS, self._choice.name))

@@ -197,7 +197,7 @@ class TrackingResult:
 
         Raises:
             InputError: If there is no such frame or model, the object is lost in it, ``xy`` are no points, or points
-                beside the object are asked for although the frames can be read once only.
+                on the background are requested although the frames can be read once only.
         """
         if not self._source.repeatable:
             if beside_object:

@@ -165,7 +165,7 @@ class Session:
             "camera": self._camera,
             "initial_mask": self.initial_mask,
             "last_pose": self._last_pose,
-            "steering": (self._first_pose, self._presented, self._latest, self._tracker.anew),
+            "steering": (self._first_pose, self._presented, self._latest, self._tracker.restarted),
             "refined": self._refined,
             "refining": self.refining,
             "random": self._settings.random,
@@ -190,7 +190,7 @@ class Session:
         self._state, self._camera = kept["solver"], kept["camera"]
         self.initial_mask, self._last_pose = kept["initial_mask"], kept["last_pose"]
         self._refined, self._failures = kept["refined"], dict(failures)
-        self._first_pose, self._presented, self._latest, self._tracker.anew = kept["steering"]
+        self._first_pose, self._presented, self._latest, self._tracker.restarted = kept["steering"]
         self.refining, self._settings.random = kept["refining"], kept["random"]
         if self._tracker.can_resume and not self._refined:
             with self._settings.in_force():

@@ -46,7 +46,7 @@ class GlobalAdjustment:
         most: How many of them are kept.
 
     Attributes:
-        camera: The same, through another lens if nobody gave it and `settle` found it.
+        camera: The same, with another focal length if none was given and `settle` estimated it.
         vertices: ``(V, 3)`` of the object; others after `settle`.
         vertices_of_landmarks: The same as landmarks alone have it, which know nothing of what masks are wrong by.
         faces: ``(F, 3)``.

@@ -89,12 +89,12 @@ def merge_submaps(session: Session, config: PipelineConfig, plan: Plan, folder: 
         for run, own, similarity in zip(runs, best.states, best.similarities, strict=True)
     ]
     first, last = runs[0].kept.session, max(record.index for run in runs for record in run.records)
-    first_pose, presented, _, anew = first["steering"]
+    first_pose, presented, _, restarted = first["steering"]
     state = {
         **first,
         "solver": updated,
         "camera": updated.camera,
-        "steering": (first_pose, FrameOrder(presented.first), last, anew),
+        "steering": (first_pose, FrameOrder(presented.first), last, restarted),
     }
     return MergedMap(
         settled,

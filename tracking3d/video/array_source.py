@@ -24,7 +24,7 @@ class ArraySource:
     Attributes:
         images: ``(H, W, 3)`` uint8 RGB arrays of one size; frames of another size are skipped.
         selection: Which of them are taken.
-        rate: Images per second, which times are counted by; None if nobody knows.
+        rate: Images per second, which times are counted by; None if unknown.
         convert: Makes such an array of an item, given its position. The items may then also be `Frame` and
             `SkippedFrame`, and sizes are left to whoever takes the frames.
     """

@@ -70,16 +70,16 @@ class ColourJudge:
         window = _window(box_of(mask) or (0.0, 0.0, float(mask.shape[1]), float(mask.shape[0])))
         self._colours = GlobalColours(lab(crop_window(image, window)), *_sides(mask, window))
 
-    def verdict(self, image: Image, proposal: Proposal, witness: Box | None) -> Verdict:
+    def verdict(self, image: Image, proposal: Proposal, tracked_box: Box | None) -> Verdict:
         """Sharpen a proposal by the colours and judge it.
 
         Args:
             image: ``(H, W, 3)`` RGB.
             proposal: What a network proposes.
-            witness: ``(x, y, w, h)``, a box tracker's opinion, or None if it has none.
+            tracked_box: ``(x, y, w, h)``, a box tracker's opinion, or None if it has none.
         """
         mask = self._sharpen(image, proposal.mask)
-        return Verdict(replace(proposal, mask=mask), self._judge(image, mask, witness))
+        return Verdict(replace(proposal, mask=mask), self._judge(image, mask, tracked_box))
 
     def learn(self, image: Image, mask: NDArray[np.float32]) -> None:
         """Let the colours follow a mask that is trusted."""
@@ -94,7 +94,7 @@ class ColourJudge:
         self.learn(image, mask)
         return self
 
-    def _judge(self, image: Image, mask: NDArray[np.float32], witness: Box | None) -> Judgement:
+    def _judge(self, image: Image, mask: NDArray[np.float32], tracked_box: Box | None) -> Judgement:
         box = box_of(mask)
         if box is None:
             return Judgement(0.0, 0.0, 0.0, believed=False)
@@ -102,7 +102,7 @@ class ColourJudge:
         colours = lab(crop_window(image, window))
         separation = self._colours.separation(colours, *_sides(mask, window))
         margin = outline_margin(self._colours.log_ratio(colours), crop_window(mask, window) > 0.5)
-        return Judgement(separation, margin, None if witness is None else box_iou(box, witness))
+        return Judgement(separation, margin, None if tracked_box is None else box_iou(box, tracked_box))
 
     def _sharpen(self, image: Image, mask: NDArray[np.float32]) -> NDArray[np.float32]:
         """The network's probabilities combined with the colours; nothing is added where the network found nothing."""

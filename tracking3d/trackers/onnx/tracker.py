@@ -127,16 +127,16 @@ class OnnxTracker:
             return given
         return MaskEstimate(best.proposal.mask, best.score)
 
-    def _segment(self, image: Image, witness: Box | None, carried: MaskEstimate) -> MaskEstimate:
+    def _segment(self, image: Image, tracked_box: Box | None, carried: MaskEstimate) -> MaskEstimate:
         """The network's mask, or the propagated one if the network has no usable mask."""
         assert self._carried is not None
-        box = witness if witness is not None else self._place(carried)
-        best = self._best(self._judge, image, box, carried.mask, witness)
-        if witness is not None and carried.mask is not None and _unusable(best):
+        box = tracked_box if tracked_box is not None else self._place(carried)
+        best = self._best(self._judge, image, box, carried.mask, tracked_box)
+        if tracked_box is not None and carried.mask is not None and _unusable(best):
             # One of the box tracker and the carried mask is wrong: colours tell whether it is the former.
             other = self._best(self._judge, image, self._place(carried), carried.mask, None)
             if not _unusable(other) and not other.judgement.doubt:
-                best, witness = other, None
+                best, tracked_box = other, None
         if reason := _unusable(best):
             if carried.mask is None:
                 return MaskEstimate(None, 0.0, reason)
@@ -147,16 +147,16 @@ class OnnxTracker:
         if best.score >= _CONFIDENT:
             self._judge.learn(image, mask)
         if self._options.anchor:
-            self._anchor(image, best, witness)
-        if witness is None:
+            self._anchor(image, best, tracked_box)
+        if tracked_box is None:
             return MaskEstimate(mask, best.score / 2, "the box tracker has lost the object")
         return MaskEstimate(mask, best.score, best.judgement.doubt)
 
-    def _anchor(self, image: Image, best: Verdict, witness: Box | None) -> None:
+    def _anchor(self, image: Image, best: Verdict, tracked_box: Box | None) -> None:
         """Re-initialize the box tracker if confident masks show that it has left the object, or if it is lost."""
-        strayed = witness is None or box_iou(self._last_box, witness) < _STRAYED
+        strayed = tracked_box is None or box_iou(self._last_box, tracked_box) < _STRAYED
         self._strayed = self._strayed + 1 if strayed and best.score_without_box >= _CONFIDENT else 0
-        if self._strayed >= (1 if witness is None else _PATIENCE):
+        if self._strayed >= (1 if tracked_box is None else _PATIENCE):
             self._boxes.start(image, self._last_box)
             self._strayed = 0
 
@@ -166,10 +166,10 @@ class OnnxTracker:
         image: Image,
         box: Box,
         last: NDArray[np.float32] | None,
-        witness: Box | None,
+        tracked_box: Box | None,
     ) -> Verdict:
         proposals = self._segmenter.propose(image, box, last)
-        verdicts = [judge.verdict(image, proposal, witness) for proposal in proposals]
+        verdicts = [judge.verdict(image, proposal, tracked_box) for proposal in proposals]
         return max(verdicts, key=lambda verdict: verdict.preference)
 
     def _place(self, carried: MaskEstimate) -> Box:
