@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from torch.nn import functional
 from tracking3d.features.protocol import FeatureEncoder
 from tracking3d.frames import Box, Frame
 from tracking3d.geometry.camera import Camera, Window
+from tracking3d.geometry.pixel_distance import pixel_distance
 from tracking3d.geometry.pose import Pose
 from tracking3d.rendering import PoseTarget, channels_last, signed_distance
 
@@ -182,18 +182,14 @@ def _resample(image: Tensor, size: int) -> Tensor:
 
 
 def mask_distance(mask: Tensor) -> Tensor:
-    """Distance of every pixel of ``(S, S)`` to the mask, in NDC (half the window's side is 1).
+    """Distance of every pixel of ``(S, S)`` to the mask, in NDC (half the window's side is 1); 0 for an empty mask.
 
-    OpenCV's exact transform: the target is constant, so nothing is differentiated through it, and kornia's
-    differentiable one is an approximation. The last bit of OpenCV's roots depends on where the image lies in memory;
-    the squares are whole numbers, so they are taken once more.
+    The target is constant, so nothing is differentiated through it.
     """
-    outside = (mask < 0.5).cpu().numpy().astype(np.uint8)
-    if outside.all():
+    inside = (mask >= 0.5).cpu().numpy()
+    if not inside.any():
         return torch.zeros_like(mask)
-    pixels = cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    exact = np.sqrt(np.rint(np.square(pixels)))
-    return torch.from_numpy(exact).to(mask) * (2.0 / mask.shape[-1])
+    return torch.from_numpy(pixel_distance(inside)).to(mask) * (2.0 / mask.shape[-1])
 
 
 def projected_box(vertices: Tensor, camera: Camera, pose: Pose) -> Box | None:

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-import cv2
 import numpy as np
 import torch
 import trimesh
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csr_matrix, diags, identity
 from scipy.sparse.linalg import spsolve
 
+from tracking3d.geometry.pixel_distance import pixel_distance
 from tracking3d.points.view import SurfaceView
 from tracking3d.rendering import find_contour, render
 from tracking3d.rendering.contour import contour_slopes
@@ -76,9 +76,7 @@ def outline_of(view: SurfaceView) -> Outline:
 
 def depth_inside(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Signed distance ``(h, w)`` to a mask's outline, which runs half-way between pixels inside and outside."""
-    inward = cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    outward = cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return np.where(inside, inward - 0.5, 0.5 - outward).astype(np.float32)
+    return np.where(inside, pixel_distance(~inside) - 0.5, 0.5 - pixel_distance(inside)).astype(np.float32)
 
 
 def fit_to_outlines(
