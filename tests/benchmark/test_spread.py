@@ -8,28 +8,32 @@ import platform
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tracking3d.benchmark import spread
+from tracking3d.benchmark import spread, spread_variants, suite
+from tracking3d.benchmark.input_change import InputChange
 from tracking3d.benchmark.job import Job
 from tracking3d.benchmark.noisy_frames import NoisyFrames
+from tracking3d.benchmark.pool import JobOutcome
 from tracking3d.benchmark.processors import KERNELS, Kernels, detect_kernels
 from tracking3d.benchmark.results import ResultSet
 from tracking3d.benchmark.sequences import Dataset
 from tracking3d.benchmark.spread import (
-    AS_IT_IS,
+    UNCHANGED,
     describe_flips,
     flips,
     format_spreads,
-    plan,
     run_spread,
     spreads,
     to_markdown,
     write_spreads,
 )
+from tracking3d.benchmark.spread_variants import computation_variants, input_variants
+from tracking3d.benchmark.suite import run_suite
 from tracking3d.benchmark.variant import Variant
 from tracking3d.config.loading import load_config
 from tracking3d.errors import InputError
@@ -65,29 +69,29 @@ def kernels(monkeypatch):
         level = environment.get("ATEN_CPU_CAPABILITY", "avx2").upper()
         return None if core == "SkylakeX" else Kernels({"Zen": "Haswell"}.get(core, core), level)
 
-    monkeypatch.setattr(spread, "detect_kernels", pretended)
+    monkeypatch.setattr(spread_variants, "detect_kernels", pretended)
 
 
 @pytest.mark.usefixtures("kernels")
 def test_what_is_one_computation_is_run_once_and_what_cannot_be_run_is_named():
-    variants, left_out = plan(BASE)
+    variants, left_out = computation_variants(BASE)
     by_label = {one.label: one for one in variants}
     noisy = [f"one grey level of noise, seed {seed}" for seed in (1, 2)]
     assert list(by_label) == [
-        AS_IT_IS, "OpenBLAS Nehalem", "ATen default", "ATen avx512", "renderer torch", *noisy
+        UNCHANGED, "OpenBLAS Nehalem", "ATen default", "ATen avx512", "renderer torch", *noisy
     ]  # fmt: skip
     assert by_label["OpenBLAS Nehalem"].environment == {"OPENBLAS_CORETYPE": "Nehalem"}
     assert by_label["renderer torch"].config.runtime.renderer == "torch"
-    assert [by_label[label].grey_noise for label in noisy] == [1, 2]
+    assert [by_label[label].input.grey_noise for label in noisy] == [1, 2]
     assert {one.masks for one in variants} == {"truth"}
     assert left_out["OpenBLAS SkylakeX"] == "this processor cannot run them"
-    assert left_out["OpenBLAS Zen"] == f"they are those of '{AS_IT_IS}' (Haswell, AVX2)"
+    assert left_out["OpenBLAS Zen"] == f"they are those of '{UNCHANGED}' (Haswell, AVX2)"
     assert set(left_out) == {"OpenBLAS Haswell", "OpenBLAS Zen", "OpenBLAS SkylakeX", "ATen avx2"}
 
 
 @pytest.mark.usefixtures("kernels")
 def test_the_renderer_that_is_chosen_anyway_is_no_variant():
-    variants, _ = plan(BASE.with_changes("torch", runtime__renderer="torch"))
+    variants, _ = computation_variants(BASE.with_changes("torch", runtime__renderer="torch"))
     assert [one.label for one in variants if "renderer" in one.label] == ["renderer numba"]
 
 
@@ -101,7 +105,7 @@ def test_patterns_choose_variants_and_what_is_compared_with_stays(monkeypatch, t
 
     monkeypatch.setattr(spread, "run_suite", run_suite)
     results, _ = run_spread(BASE, dataset, tmp_path, ["*Nehalem", "renderer*"])
-    assert [one.label for one in results] == [AS_IT_IS, "OpenBLAS Nehalem", "renderer torch"]
+    assert [one.label for one in results] == [UNCHANGED, "OpenBLAS Nehalem", "renderer torch"]
     results, left_out = run_spread(BASE, dataset, tmp_path)
     assert len(results) == 6 and left_out["ATen avx512"] == "every run failed: It crashed."
     with pytest.raises(InputError, match="no variant 'Zen' here; choose from: as it is; OpenBLAS Nehalem"):
@@ -116,8 +120,9 @@ def test_every_variant_has_runs_of_its_own(clips, tmp_path):
         run_key(),
         run_key(environment={"OPENBLAS_CORETYPE": "Haswell"}),
         run_key(environment={"OPENBLAS_CORETYPE": "Nehalem"}),
-        run_key(grey_noise=1),
-        run_key(grey_noise=2),
+        run_key(input=InputChange(grey_noise=1)),
+        run_key(input=InputChange(grey_noise=2)),
+        run_key(input=InputChange(first_frame=1)),
     ]
     assert len(set(keys)) == len(keys)
     assert run_key() == run_key(label="another")
@@ -133,6 +138,34 @@ def test_a_process_tells_which_kernels_it_takes():
         pytest.skip("NumPy has no OpenBLAS for x86 here")
     # Every x86 processor of today runs these.
     assert detect_kernels(KERNELS["OpenBLAS Nehalem"]) == Kernels("Nehalem", usual.aten)
+
+
+def test_changes_of_the_input_are_ten_and_the_first_variant_has_none():
+    variants = input_variants(BASE)
+    assert variants[0].label == UNCHANGED and variants[0].disturbance == ()
+    assert len({one.model_dump_json(exclude={"label"}) for one in variants}) == len(variants) == 11
+
+
+def test_only_what_means_something_for_a_sequence_is_run(clips, monkeypatch, tmp_path):
+    """The clip `narrow` has a lens that is given anyway, and true masks that have no box to be moved."""
+    ran = []
+
+    def run_jobs(jobs, *rest):
+        ran.extend(job.variant.label for job in jobs)
+        return [JobOutcome(job, {"iou_mean": 1.0}, "") for job in jobs]
+
+    monkeypatch.setattr(suite, "run_jobs", run_jobs)
+    dataset = Dataset("real", None, "clip", clips, ("narrow",))
+    results = run_suite(input_variants(BASE), dataset, tmp_path)
+    assert len(results) == 11 and not any(one.errors for one in results)
+    without = {one.label for one in results if not one.scores}
+    assert without == {"lens given", "box moved by 2 pixels", "box grown by 4 %", *_too_short(clips)}
+    assert ran == [one.label for one in results if one.scores]
+
+
+def _too_short(clips):
+    count = len(list((clips / "narrow/frames").iterdir()))
+    return {f"first frame +{n}" for n in (1, 2, 3) if n + 1 >= count}
 
 
 def test_noise_is_one_grey_level_its_own_in_every_frame_and_the_same_each_time():
@@ -170,6 +203,22 @@ def test_what_one_variant_did_not_finish_is_compared_under_none():
     assert flips(failed) == {}
     with pytest.raises(InputError, match="no sequence that all variants finished"):
         spreads([RESULTS[0], result("none", box=None, mug=None, card=None)])
+
+
+def test_a_sequence_counts_under_the_variants_that_mean_something_for_it():
+    some = [*RESULTS[:2], result("lens given", box=(9.0, 0.5, 0.0))]
+    found = {(one.sequence, one.measure): one for one in spreads(some)}
+    assert found["box", "rotation_error_mean_deg"].worst == ("lens given", 9.0)
+    assert set(found["mug", "rotation_error_mean_deg"].values) == {"as it is", "other"}
+    assert found["", "rotation_error_mean_deg"].values == {"as it is": 1.0, "other": 2.0, "lens given": 9.0}
+    assert flips(some) == {"mug": ["other"], "card": ["other"]}
+
+
+def test_causal_estimates_are_compared_too():
+    causal = {"box": {"iou_mean": 0.6}}
+    pair = [replace(one, causal=causal) for one in RESULTS[:2]]
+    [found] = [one for one in spreads(pair) if (one.sequence, one.measure) == ("box", "causal iou_mean")]
+    assert found.mean == 0.6
 
 
 def test_a_sequence_flips_if_it_is_lost_under_some_variants_only():

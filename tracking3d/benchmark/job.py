@@ -62,7 +62,12 @@ class Job:
 
     @cached_property
     def truth(self) -> Truth:
-        """What is known about the sequence."""
+        """What is known about the sequence, with the changes that the variant makes to its input."""
+        return self.variant.input.apply(self.unchanged_truth)
+
+    @cached_property
+    def unchanged_truth(self) -> Truth:
+        """What is known about the sequence as the dataset has it."""
         return read_sequence(load_layout(self.layout), self.root, self.sequence)
 
     @cached_property
@@ -183,8 +188,8 @@ def _track(job: Job, run: Path) -> None:
 def _record(job: Job, run: Path, listener: Listener) -> None:
     truth, config = job.truth, job.config
     source: FrameSource = ImageSequence(job.sequence, truth.frames, range(len(truth.frames)))
-    if job.variant.grey_noise is not None:
-        source = NoisyFrames(source, job.variant.grey_noise)
+    if job.variant.input.grey_noise is not None:
+        source = NoisyFrames(source, job.variant.input.grey_noise)
     if job.variant.masks == "tracker":
         if truth.box is None:
             raise InputError(f"{job.sequence} has no box in its first frame; a mask tracker cannot start.")

@@ -1,4 +1,4 @@
-"""How much estimates for the same video differ: on other processors, by another renderer, with next to no noise.
+"""How much estimates for the same video differ: on other processors, with next to no noise, from another first box.
 
 What rounding or one grey level changes is not known better than that: a spread is the least that any figure of the
 same sequences is uncertain by.
@@ -17,24 +17,26 @@ from rich.markup import escape
 from rich.table import Table
 
 from tracking3d.benchmark.pool import Listener
-from tracking3d.benchmark.processors import KERNELS, detect_kernels
 from tracking3d.benchmark.results import ResultSet, figure
 from tracking3d.benchmark.sequences import Dataset
+from tracking3d.benchmark.spread_variants import UNCHANGED, Vary, computation_variants, input_variants
 from tracking3d.benchmark.suite import run_suite
 from tracking3d.benchmark.variant import Variant
 from tracking3d.errors import InputError
 from tracking3d.results.files import write_atomic, writing
 
-AS_IT_IS = "as it is"
-RENDERERS = ("torch", "numba")
-NOISE_SEEDS = (1, 2)
+CAUSAL = "causal "
+"""Before a measure of the causal estimates; the others are of the final ones."""
 
 MEASURES = {
+    "causal iou_mean": ("IoU, causal", True),
     "iou_mean": ("IoU", True),
     "boundary_f_mean": ("boundary F", True),
+    "causal rotation_error_mean_deg": ("rotation error, mean °, causal", False),
     "rotation_error_mean_deg": ("rotation error, mean °", False),
     "rotation_error_median_deg": ("rotation error, median °", False),
     "share_under_5_deg": ("rotation under 5°", True),
+    "share_tracked": ("share called tracked", True),
     "share_lost": ("share called lost", False),
 }
 """Measures that are printed: what tables call them, and whether more is better."""
@@ -75,37 +77,12 @@ class Spread:
         return label, self.values[label]
 
 
-def plan(base: Variant) -> tuple[list[Variant], dict[str, str]]:
-    """The variants of ``base`` that this processor can run, and why the others are left out, by label.
-
-    Those whose kernels are the ones that the processor takes anyway are left out too: they are one computation.
-    """
-    variants, left_out = [base.with_changes(AS_IT_IS)], {}
-    seen = {detect_kernels({}): AS_IT_IS}
-    for label, environment in KERNELS.items():
-        kernels = detect_kernels(environment)
-        if kernels is None:
-            left_out[label] = "this processor cannot run them"
-        elif kernels in seen:
-            left_out[label] = f"they are those of '{seen[kernels]}' ({kernels.openblas}, {kernels.aten})"
-        else:
-            seen[kernels] = label
-            variants.append(base.with_changes(label).model_copy(update={"environment": environment}))
-    usual = base.config.runtime.renderer
-    for renderer in RENDERERS:
-        if renderer != ("numba" if usual == "auto" else usual):
-            variants.append(base.with_changes(f"renderer {renderer}", runtime__renderer=renderer))
-    for seed in NOISE_SEEDS:
-        label = f"one grey level of noise, seed {seed}"
-        variants.append(base.with_changes(label).model_copy(update={"grey_noise": seed}))
-    return variants, left_out
-
-
 def run_spread(
     base: Variant,
     dataset: Dataset,
     out: Path,
     patterns: Sequence[str] = (),
+    vary: Vary = Vary.COMPUTATION,
     processes: int = 1,
     listener: Listener = lambda outcome: None,
 ) -> tuple[list[ResultSet], dict[str, str]]:
@@ -118,20 +95,23 @@ def run_spread(
         dataset: What to run on.
         out: Folder of the benchmark.
         patterns: Only variants that match any of them, beside the one as it is; all if there is none.
+        vary: What differs between the variants.
         processes: Jobs at a time.
         listener: Called for every job.
 
     Raises:
         InputError: If a pattern matches nothing, or the source of masks of ``base`` does not exist.
     """
-    variants, left_out = plan(base)
+    variants, left_out = (
+        computation_variants(base) if vary is Vary.COMPUTATION else (input_variants(base), {})
+    )
     for pattern in patterns:
         if not any(fnmatch(one.label, pattern) for one in variants):
             raise InputError(
                 f"There is no variant '{pattern}' here; choose from: {'; '.join(one.label for one in variants)}."
             )
     if patterns:
-        wanted = (AS_IT_IS, *patterns)
+        wanted = (UNCHANGED, *patterns)
         variants = [one for one in variants if any(fnmatch(one.label, pattern) for pattern in wanted)]
     results = run_suite(variants, dataset, out, processes, listener)
     # Some kernels end a process only when it comes to an operation that this processor has not.
@@ -142,33 +122,48 @@ def run_spread(
 
 
 def spreads(results: Sequence[ResultSet]) -> list[Spread]:
-    """Every measure of every sequence that all variants finished, each measure's mean over them last.
+    """Every measure of every sequence, then its mean over the sequences that all variants ran.
+
+    A sequence counts under the variants that ran it, at least two, unless one of them failed.
 
     Raises:
         InputError: If there is no such sequence.
     """
     found = []
     for measure in MEASURES:
-        by_variant = {one.label: one.values(measure) for one in results}
-        common = [name for name in results[0].scores if all(name in values for values in by_variant.values())]
-        for name in common:
-            found.append(Spread(name, measure, {label: one[name] for label, one in by_variant.items()}))
+        by_sequence = {name: _by_variant(results, name, measure) for name in results[0].scores}
+        found += [Spread(name, measure, values) for name, values in by_sequence.items() if values]
+        common = [values for values in by_sequence.values() if len(values) == len(results)]
         if common:
-            means = {
-                label: float(np.mean([one[name] for name in common])) for label, one in by_variant.items()
-            }
+            means = {one.label: float(np.mean([values[one.label] for values in common])) for one in results}
             found.append(Spread("", measure, means))
     if not found:
         raise InputError("There is no sequence that all variants finished; see what they failed of above.")
     return found
 
 
+def _by_variant(results: Sequence[ResultSet], name: str, measure: str) -> dict[str, float]:
+    """A measure of a sequence by the variants that ran it; empty if one of them failed or there is only one."""
+    ran = [one for one in results if name in one.scores]
+    values = {one.label: value for one in ran if (value := _value(one, name, measure)) is not None}
+    return values if 2 <= len(values) == len(ran) else {}
+
+
+def _value(result: ResultSet, name: str, measure: str) -> float | None:
+    scores = result.causal if measure.startswith(CAUSAL) else result.scores
+    value = (scores.get(name) or {}).get(measure.removeprefix(CAUSAL))
+    return None if value is None else float(value)
+
+
 def flips(results: Sequence[ResultSet]) -> dict[str, list[str]]:
     """Sequences that are lost under some variants and tracked under others, with the labels of the former."""
-    lost = {one.label: {name for name in one.scores if _is_lost(one.scores[name] or {})} for one in results}
-    everywhere = [name for name in results[0].scores if all(one.scores.get(name) for one in results)]
-    found = {name: [label for label, names in lost.items() if name in names] for name in everywhere}
-    return {name: labels for name, labels in found.items() if 0 < len(labels) < len(results)}
+    found = {}
+    for name in results[0].scores:
+        ran = {one.label: scores for one in results if (scores := one.scores.get(name, {})) != {}}
+        if all(ran.values()):  # none failed
+            lost = [label for label, scores in ran.items() if _is_lost(scores or {})]
+            found[name] = lost if len(lost) < len(ran) else []
+    return {name: labels for name, labels in found.items() if labels}
 
 
 def _is_lost(scores: Mapping[str, float | None]) -> bool:
@@ -187,6 +182,8 @@ def format_spreads(results: Sequence[ResultSet], title: str) -> list[Table]:
         by_sequence.add_row(*map(escape, row), style="bold" if row[1] == "mean" else None)
     by_variant = Table(title="Means over the sequences, by variant", title_justify="left")
     header, rows = _means(found)
+    if not rows:
+        return [by_sequence]
     for name in header:
         by_variant.add_column(name, justify="left" if name == "variant" else "right")
     for row in rows:
@@ -199,6 +196,8 @@ def to_markdown(results: Sequence[ResultSet], title: str) -> str:
     found = spreads(results)
     parts = [title]
     for header, rows in (_rows(found), _means(found)):
+        if not rows:
+            continue
         lines = [header, ["---"] * len(header), *rows]
         parts.append("\n".join(f"| {' | '.join(line)} |" for line in lines))
     parts.append(describe_flips(results))
@@ -251,7 +250,7 @@ def _rows(found: Sequence[Spread]) -> tuple[list[str], list[list[str]]]:
 
 def _means(found: Sequence[Spread]) -> tuple[list[str], list[list[str]]]:
     of_suite = [one for one in found if not one.sequence]
-    labels = of_suite[0].values
+    labels = of_suite[0].values if of_suite else {}
     rows = [[label, *(_fine(one.values[label], one.measure) for one in of_suite)] for label in labels]
     return ["variant", *(MEASURES[one.measure][0] for one in of_suite)], rows
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, field_validator
 
+from tracking3d.benchmark.input_change import InputChange
 from tracking3d.config.models import PipelineConfig
 from tracking3d.errors import InputError
 
@@ -22,7 +23,7 @@ class Variant(BaseModel):
         masks: ``tracker``, ``truth``, ``initial``, ``degraded:IOU``, ``noise:PIXELS``, ``hand``, or a folder that
             holds a folder of masks for every sequence.
         environment: Environment variables of the process that runs it, such as which matrix kernels it uses.
-        grey_noise: Seed of one grey level of noise on the frames; None for none.
+        input: Changes of the sequence's input.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -31,7 +32,7 @@ class Variant(BaseModel):
     config: PipelineConfig
     masks: str = "tracker"
     environment: dict[str, str] = {}
-    grey_noise: int | None = None
+    input: InputChange = InputChange()
 
     @field_validator("masks")
     @classmethod
@@ -43,7 +44,8 @@ class Variant(BaseModel):
     @property
     def disturbance(self) -> tuple[Any, ...]:
         """What else a run depends on besides configuration and masks; empty if nothing."""
-        return (self.environment, self.grey_noise) if self.environment or self.grey_noise is not None else ()
+        changed = self.environment or self.input != InputChange()
+        return (self.environment, self.input.model_dump()) if changed else ()
 
     def with_changes(self, label: str, *, masks: str | None = None, **settings: Any) -> Variant:
         """A variant with other masks and settings: ``solver__weights__motion=0`` sets that key."""

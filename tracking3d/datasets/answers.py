@@ -46,6 +46,7 @@ class Answers:
         mesh: Reads the estimated shape in object coordinates.
         points: Follows points.
         corrected_points: Follows points with the help of the images too.
+        tracked: Frames that the method called tracked, if it says so.
     """
 
     origin: Path
@@ -66,6 +67,7 @@ class Answers:
     mesh: Callable[[], trimesh.Trimesh] | None = None
     points: PointTracker | None = None
     corrected_points: PointTracker | None = None
+    tracked: frozenset[int] | None = None
 
     def matched(self, frames: int) -> str:
         """Which frames are scored, in words.

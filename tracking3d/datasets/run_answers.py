@@ -74,6 +74,7 @@ def answers_of_run(folder: Path, truth: Truth, *, refined: bool = True, offset: 
         corrected_points=replace(points, images=_frames(truth, offset))
         if has_mesh and has_landmarks(run)
         else None,
+        tracked=frozenset(index for index, one in records.items() if one.status is Status.TRACKED),
     )
 
 

@@ -46,6 +46,7 @@ class Scores(MaskScores, PoseScores, PointTrackScores, ModelScores, ConfidenceSc
             stage of a frame, see `tracking3d.runtime.stage_times.StageTimes`; None if it was not recorded.
         peak_memory_mb: Most memory held, in 10^6 bytes; None if it was not recorded.
         memory_growth_mb: How much more was held at most in the second half of the frames than in the first.
+        share_tracked: Share of `frames` that it called tracked; None if it does not say so.
     """
 
     frames: int
@@ -62,6 +63,7 @@ class Scores(MaskScores, PoseScores, PointTrackScores, ModelScores, ConfidenceSc
     seconds_solve: float | None = None
     seconds_map: float | None = None
     seconds_write: float | None = None
+    share_tracked: float | None = None
 
 
 def score(answers: Answers, truth: Truth) -> Scores:
@@ -93,6 +95,7 @@ def score(answers: Answers, truth: Truth) -> Scores:
         peak_memory_mb=answers.peak_memory_mb,
         memory_growth_mb=answers.memory_growth_mb,
         **_stages(answers),
+        share_tracked=None if answers.tracked is None else len(answers.tracked) / len(answers.asked),
     )
 
 

@@ -9,6 +9,7 @@ import typer
 
 from tracking3d.cli.evaluate.options import Data, Jobs, Masks, Out, Sequences, name_of_settings
 from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quiet, configure
+from tracking3d.errors import InputError
 
 
 def spread(
@@ -24,6 +25,14 @@ def spread(
             help="Run only variants whose name matches, besides the unchanged one; may be repeated.",
         ),
     ] = None,
+    vary: Annotated[
+        str,
+        typer.Option(
+            metavar="computation|input",
+            help="What differs: the processor's kernels and the renderer, or the first box, the first frame and the "
+            "given lens.",
+        ),
+    ] = "computation",
     config: ConfigFile = None,
     preset: Preset = None,
     overrides: Overrides = None,
@@ -32,30 +41,35 @@ def spread(
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Measure how much estimates vary with the processor's kernels, the renderer, and tiny noise on the images.
+    """Measure how much estimates vary with the processor and tiny noise, or with small changes of the input.
 
     Prints mean, spread and worst case of every measure, and which sequences some variants track and others lose. Writes
-    DIR/tables/spread-NAME-MASKS.md and .json; runs are kept in DIR/runs and are not repeated.
+    DIR/tables/spread-NAME-MASKS.md and .json, or spread-NAME-MASKS-input with --vary input; runs are kept in DIR/runs
+    and are not repeated.
     """
     from tracking3d.benchmark.sequences import open_dataset
     from tracking3d.benchmark.spread import describe_flips, format_spreads, run_spread, write_spreads
+    from tracking3d.benchmark.spread_variants import Vary
     from tracking3d.benchmark.table import file_name
     from tracking3d.benchmark.variant import Variant, check_masks
     from tracking3d.cli.evaluate.progress import jobs_progress, making_progress
     from tracking3d.cli.tables import print_table
 
+    if vary not in list(Vary):
+        raise InputError(f"--vary {vary} is unknown; give {' or '.join(Vary)}.")
     check_masks(masks)
     settings = configure(config, preset, overrides)
     base = Variant(label=name_of_settings(config, preset, overrides, "tracker"), config=settings, masks=masks)
     with making_progress(quiet) as made:
         dataset = open_dataset(name, data, out, jobs, made).only(sequences or [])
     with jobs_progress(None, quiet) as listener:
-        results, left_out = run_spread(base, dataset, out, patterns or [], jobs, listener)
+        results, left_out = run_spread(base, dataset, out, patterns or [], Vary(vary), jobs, listener)
     failed = {f"{sequence} ({one.label})": why for one in results for sequence, why in one.errors.items()}
     for what, why in failed.items():
         typer.echo(f"{what} failed: {why}", err=True)
     title = f"{dataset.name} ({len(dataset.sequences)} sequences): {base.label}, masks {masks}"
-    file = out / "tables" / f"spread-{dataset.name}-{file_name(Path(masks).name)}"
+    suffix = "" if vary == Vary.COMPUTATION else f"-{vary}"
+    file = out / "tables" / f"spread-{dataset.name}-{file_name(Path(masks).name)}{suffix}"
     files = write_spreads(results, left_out, title, file)
     if not quiet:
         for one in format_spreads(results, title):
