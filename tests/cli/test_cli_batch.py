@@ -49,6 +49,26 @@ def table(shots, tmp_path):
     return file
 
 
+def test_a_row_has_its_own_quality_and_final_mesh(call, shots, tmp_path, script, opened, monkeypatch):
+    monkeypatch.setattr("tracking3d.pipeline.record.make_final_shape", lambda *_: "")
+    table = tmp_path / "jobs.csv"
+    table.write_text(f'video,box,quality,model\nshots/cup,"{BOX}",best,none\nshots/plate,"{BOX}",,\n')
+    result = call("batch", table, "--out", "out", "--no-report", "--model", "fine")
+    assert result.exit_code == 0, result.output
+    made = {
+        config.crop.size: (config.object.shape, config.object.texture_views) for config, _ in script.built
+    }
+    assert made == {192: ("fast", 0), 128: ("fine", 24)}
+
+
+def test_a_row_with_a_final_mesh_for_its_quality_fails_alone(call, shots, tmp_path, script, opened):
+    table = tmp_path / "jobs.csv"
+    table.write_text(f'video,box,quality\nshots/cup,"{BOX}",fine\nshots/plate,"{BOX}",\n')
+    result = call("batch", table, "--out", "out", "--no-report", "--retries", 0)
+    assert result.exit_code == 1 and len(script.built) == 1
+    assert "fine is a value of model" in result.output
+
+
 def test_a_table_is_tracked_with_the_settings_of_its_rows(call, table, script, opened):
     result = call("batch", table, "--out", "out", "--no-report", "--set", "crop.size=64", "--threads", 2)
     assert result.exit_code == 0, result.output

@@ -77,7 +77,7 @@ def commands(command, path: str = "tracking3d"):
 
 
 SHARED = {
-    **dict.fromkeys(("--config", "--preset", "--quality", "--set"), panels.SETTINGS),
+    **dict.fromkeys(("--config", "--preset", "--quality", "--model", "--set"), panels.SETTINGS),
     **dict.fromkeys(("--fov", "--intrinsics"), panels.CAMERA),
     "--out": panels.OUTPUT,
     "--frames": panels.VIDEO,

@@ -50,7 +50,12 @@ def test_every_option_is_documented(path, command):
     page = (ROOT / "docs/command-line.md").read_text(encoding="utf-8")
     section = re.search(rf"^## {path[0]}\b.*?(?=^## |\Z)", page, re.M | re.S)
     assert section, f"docs/command-line.md has no section on {path[0]}"
-    options = {name for parameter in command.params for name in parameter.opts if name.startswith("--")}
+    options = {
+        name
+        for parameter in command.params
+        for name in parameter.opts
+        if name.startswith("--") and not getattr(parameter, "hidden", False)
+    }
     missing = {
         name
         for name in options - {"--debug", "--help"}

@@ -173,7 +173,8 @@ def refused(*arguments: object) -> str:
 @pytest.mark.parametrize(
     ("more", "sentence"),
     [
-        (("--model", "fine"), "is fixed"),
+        (("--model", "fine"), "are fixed"),
+        (("--model", "fast"), "are fixed"),
         (("--split", "4f"), "leave out --split, or --object"),
         (("--box", "1,2,30,40", "--box", "50,60,30,40"), "2 objects are given"),
         (("--flat",), "flat or not"),
@@ -196,7 +197,7 @@ def test_the_library_says_what_it_cannot_take(clip):
     frames = list(clip.images)
     with pytest.raises(InputError, match=r"object= is the number 3|object= is"):
         track(frames, object=3)
-    with pytest.raises(InputError, match="is held"):
+    with pytest.raises(InputError, match="are fixed"):
         track(frames, object="nowhere", model="fine")
     known = config(object={"model": "nowhere"})
     with pytest.raises(InputError, match="2 objects are given"):

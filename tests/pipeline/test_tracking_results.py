@@ -169,7 +169,7 @@ def test_a_fine_model_needs_packages_and_says_which(clip, config, monkeypatch):
             r"^model='fast' takes the texture .* without the final refinement",
         ),
         ({"frames": iter(()), "refine": True}, r"^refine=True: the iterable of frames comes once only"),
-        ({"frames": iter(()), "model": "fast"}, r"^model='fast' takes .* the iterable of frames cannot"),
+        ({"frames": iter(()), "model": "fast"}, r"^model='fast' takes .* the iterable of frames does not"),
         (
             {"frames": iter(()), "model": "fine"},
             r"^model='fine' makes .* the iterable of frames comes once only",

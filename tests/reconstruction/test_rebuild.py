@@ -102,7 +102,7 @@ def test_the_command_says_what_it_did(tmp_path):
 
 def test_a_shape_that_cannot_be_told_leaves_the_mesh_and_its_texture(tmp_path):
     run = written(tmp_path)
-    result = CliRunner().invoke(app, ["model", str(run), "--quality", "fine"])
+    result = CliRunner().invoke(app, ["model", str(run), "--model", "fine"])
     assert result.exit_code == 0, result.output
     assert "The mesh keeps its shape: only" in result.output
     assert len(load_model(run).texture) > 16 and not (run / "online").exists()
@@ -123,6 +123,24 @@ def test_a_new_shape_takes_the_place_of_the_old_one_which_is_kept(tmp_path, monk
     np.testing.assert_array_equal(load_model(run / "online").vertices, before.vertices)
     retexture_run(run)  # the fast model again
     np.testing.assert_array_equal(load_model(run).vertices, before.vertices)
+
+
+def test_without_a_texture_from_the_video_the_online_mesh_comes_back_as_it_was(tmp_path, monkeypatch):
+    run = written(tmp_path)
+    files = {
+        path: path.read_bytes() for path in (run / "mesh.obj", run / "features.npz", run / "texture.png")
+    }
+    result = CliRunner().invoke(app, ["model", str(run), "--model", "none"])
+    assert result.exit_code == 0 and "stays as it is" in result.output
+    assert {path: path.read_bytes() for path in files} == files
+    made = ReconstructedShape(ball().vertices * 0.97, ball().faces, "it is better", None, None)
+    monkeypatch.setattr(rebuild, "reconstruct_shape", lambda vertices, faces, views, left_out: made)
+    before = load_model(run)
+    rebuild_shape(run)
+    result = CliRunner().invoke(app, ["model", str(run), "--model", "none"])
+    assert result.exit_code == 0 and "the online mesh again" in result.output.replace("\n", " ")
+    np.testing.assert_array_equal(load_model(run).vertices, before.vertices)
+    np.testing.assert_array_equal(load_model(run).texture, before.texture)
 
 
 def test_a_missing_package_is_named(tmp_path, monkeypatch):

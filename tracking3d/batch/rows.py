@@ -68,6 +68,7 @@ class VideoRow(Section):
     features: str | None = None
     preset: str | None = None
     quality: str | None = None
+    model: str | None = None
     split: Annotated[str | None, BeforeValidator(_word)] = None
     settings: Annotated[tuple[str, ...], BeforeValidator(_settings)] = ()
 

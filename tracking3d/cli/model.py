@@ -2,45 +2,52 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from tracking3d.cli.options import Debug, Run, Video
+from tracking3d.cli.options.choices import model_option
 from tracking3d.errors import InputError
 
 Largest = Annotated[int, typer.Option(min=64, max=8192, help="Maximum side of the texture image, in texels.")]
 
 
-class ModelQuality(StrEnum):
-    """What is rebuilt: the texture, or the shape too."""
+def _refuse_quality(value: str | None) -> None:
+    """Answer the former option ``--quality fast|fine``."""
+    from tracking3d.config.choices import check_quality
 
-    FAST = "fast"
-    FINE = "fine"
+    if value is not None:
+        check_quality(value)
+        raise InputError(
+            f"--quality {value} sets everything of a run, and this run exists already; choose its mesh by "
+            "--model none, fast or fine."
+        )
 
 
 def model(
     run: Run,
-    quality: Annotated[
-        ModelQuality,
-        typer.Option(
-            help="fast re-textures the online mesh, fine also reconstructs the shape from all frames."
-        ),
-    ] = ModelQuality.FAST,
+    model: Annotated[str, model_option()] = "fast",
+    quality: Annotated[str | None, typer.Option(hidden=True, callback=_refuse_quality)] = None,
     source: Video = None,
     views: Annotated[int, typer.Option(min=1, max=500, help="Frames that the texture is taken from.")] = 24,
     largest: Largest = 2048,
     debug: Debug = False,
 ) -> None:
-    """Re-texture the mesh of a run from its video, and with --quality fine reconstruct its shape too.
+    """Re-texture the mesh of a run from its video, and with --model fine reconstruct its shape too.
 
-    `tracking3d run` does this at its end; its option --model chooses how.
+    `tracking3d run` does this at its end, with the same option --model.
     """
-    from tracking3d.reconstruction.rebuild import rebuild_shape, retexture_run
+    from tracking3d.reconstruction.rebuild import rebuild_shape, restore_online_mesh, retexture_run
 
-    if quality is ModelQuality.FINE:
+    if model == "none":
+        restored = restore_online_mesh(run)
+        typer.echo(
+            f"{run}: {'the online mesh again' if restored else 'has the online mesh already; it stays as it is'}"
+        )
+        return
+    if model == "fine":
         shaped = rebuild_shape(run, source, views, largest)
         made, taken = shaped.model, shaped.views
         typer.echo(f"{run}: {len(made.faces)} faces; {shaped.sentence}" if shaped.new else shaped.sentence)
@@ -50,17 +57,17 @@ def model(
     typer.echo(f"{run}: texture of {size} x {size} texels from {taken} frames")
 
 
-def check_fine(source: str) -> None:
-    """Make sure, before anything is tracked, that the shape can be reconstructed at the end.
+def check_model_source(model: str | None, source: str) -> None:
+    """Make sure, before anything is tracked, that the final mesh can be made at the end.
 
     Raises:
-        InputError: The source is a camera, whose frames cannot be read twice.
-        PluginError: A package is missing.
+        InputError: The source is a camera, whose frames cannot be read twice, or a package is missing.
     """
     from tracking3d.reconstruction.rebuild import check_packages
 
-    if source.isdigit() and not Path(source).exists():
+    if model in ("fast", "fine") and source.isdigit() and not Path(source).exists():
         raise InputError(
-            "--model fine reads the video a second time, which a camera does not allow; leave it out."
+            f"--model {model} reads the video a second time, which a camera does not allow; leave it out."
         )
-    check_packages()
+    if model == "fine":
+        check_packages()

@@ -48,7 +48,7 @@ def parse_given_masks(file: Path) -> list[Path]:
     return [Path(f"{image}@{number}") for number in numbers]
 
 
-def check_known(settings: PipelineConfig, objects: int, fine: bool, split: bool) -> None:
+def check_known(settings: PipelineConfig, objects: int, split: bool) -> None:
     """Make sure that the other options go with ``--object``.
 
     Raises:
@@ -59,10 +59,6 @@ def check_known(settings: PipelineConfig, objects: int, fine: bool, split: bool)
     from tracking3d.pipeline.validation import check_single_known_object as check_one
 
     check_one(settings, objects)
-    if fine:
-        raise InputError(
-            "The shape of a known object is fixed; leave out --model fine, or leave out --object to rebuild the shape."
-        )
     if split:
         raise InputError(
             "--split merges parts that each reconstruct the object; leave out --split, or --object."

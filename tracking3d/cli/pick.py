@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tracking3d.cli.options import ConfigFile, Debug, Overrides, Preset, Quiet, configure
+from tracking3d.cli.model import check_model_source
+from tracking3d.cli.options import Debug, Quiet, SettingsOptions, grouped
 from tracking3d.cli.options.output import Browser, Host, Overwrite, RunFolder
 from tracking3d.cli.options.panels import OUTPUT
 from tracking3d.cli.options.tracking import Tracker
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from tracking3d.prompts.prompt import PromptSet
 
 
+@grouped
 def pick(
     source: Annotated[
         str, typer.Argument(metavar="VIDEO", help="Video file, image folder or quoted image pattern.")
@@ -30,9 +32,8 @@ def pick(
     out: RunFolder = None,
     overwrite: Overwrite = False,
     frames: Frames = None,
-    config: ConfigFile = None,
-    preset: Preset = None,
-    overrides: Overrides = None,
+    *,
+    settings: SettingsOptions,
     host: Host = None,
     port: Annotated[
         int,
@@ -63,12 +64,13 @@ def pick(
 
     if view:
         check_viser("--view")
-    settings = configure(config, preset, overrides, tracker={"name": tracker})
+    check_model_source(settings.model, source)
+    config = settings.configure(tracker={"name": tracker})
     folder = out or default_folder(source)
-    picked = picked_in_browser(source, frames, settings, folder, host, port, browser, overwrite)
+    picked = picked_in_browser(source, frames, config, folder, host, port, browser, overwrite)
     prompts = prompts_of(picked)
     options = RecordOptions(shlex.join(sys.argv), frames, overwrite)
-    track(RunRequest(source, settings, folder, prompts, options), RunDisplay(quiet, view=view, host=host))
+    track(RunRequest(source, config, folder, prompts, options), RunDisplay(quiet, view=view, host=host))
 
 
 def prompts_of(picked: Picked) -> PromptSet:

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from tracking3d.cli.model import check_fine
+from tracking3d.cli.model import check_model_source
 from tracking3d.cli.objects import check_known, parse_given_box, parse_given_masks
 from tracking3d.cli.options import Debug, Quiet, SettingsOptions, grouped
 from tracking3d.cli.options.camera import CameraOptions
-from tracking3d.cli.options.output import ModelChoice, OutputOptions
+from tracking3d.cli.options.output import OutputOptions
 from tracking3d.cli.options.performance import PerformanceOptions
 from tracking3d.cli.options.prompt import PromptOptions
 from tracking3d.cli.options.tracking import TrackingOptions
@@ -52,13 +52,12 @@ def run(
     prompt = prompt.completed_from(settings.config)
     output.check()
     performance.check()
-    if output.model is ModelChoice.FINE:
-        check_fine(source)
-    config = _configure(prompt, camera, tracking, settings, output, performance)
+    check_model_source(settings.model, source)
+    config = _configure(prompt, camera, tracking, settings, performance)
     prompts = _parse_prompts(prompt, video.frames)
     corrections = _parse_corrections(prompt, len(prompts))
     folder = output.out or default_folder(source)
-    check_known(config, len(prompts), output.model is ModelChoice.FINE, performance.split is not None)
+    check_known(config, len(prompts), performance.split is not None)
     if not prompts and needs_prompt(config):
         if not a_person_is_there() or quiet or output.resume or source.isdigit():
             raise InputError(
@@ -80,11 +79,9 @@ def _configure(
     camera: CameraOptions,
     tracking: TrackingOptions,
     settings: SettingsOptions,
-    output: OutputOptions,
     performance: PerformanceOptions,
 ) -> PipelineConfig:
     """The configuration that the options make together."""
-    model = output.model
     return settings.configure(
         tracker=tracking.tracker_settings(prompt.masks),
         features=tracking.features,
@@ -93,8 +90,6 @@ def _configure(
             "model": prompt.known,
             "flat": tracking.flat or None,
             "prototype": tracking.prototype,
-            "texture_views": 0 if model is ModelChoice.NONE else None,
-            "shape": None if model is None else "fine" if model is ModelChoice.FINE else "fast",
         },
         crop={"size": performance.size},
         solver={"final_refine": tracking.final_refine},

@@ -13,6 +13,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from tracking3d.config.choices import QUALITIES, check_quality
 from tracking3d.config.explain import describe_validation_error, format_value, hint
 from tracking3d.config.models import PipelineConfig, PluginChoice
 from tracking3d.config.prompt_section import PromptSection
@@ -101,17 +102,13 @@ def layers_in_words(
 
 def list_presets() -> list[str]:
     """The names of the presets that come with the package."""
-    return _names("presets")
+    files = (resources.files("tracking3d.config") / "presets").iterdir()
+    return sorted(Path(item.name).stem for item in files if item.name.endswith(".yaml"))
 
 
 def list_qualities() -> list[str]:
     """The names of the qualities, fastest first."""
-    return sorted(_names("qualities"), key=["draft", "good", "best"].index)
-
-
-def _names(folder: str) -> list[str]:
-    files = (resources.files("tracking3d.config") / folder).iterdir()
-    return sorted(Path(item.name).stem for item in files if item.name.endswith(".yaml"))
+    return list(QUALITIES)
 
 
 def ready_files() -> dict[str, Path]:
@@ -181,6 +178,7 @@ def _files(file: Path | None, preset: str | None, quality: str | None) -> list[L
     chosen = DEFAULT_PRESET if named["preset"] is None else named["preset"]
     layers = [_named_layer("preset", "presets", list_presets(), chosen)]
     if named["quality"] is not None:
+        check_quality(named["quality"], None if quality is not None else file)
         layers.append(_named_layer("quality", "qualities", list_qualities(), named["quality"]))
     return [*layers, (str(file), from_file)] if file is not None else layers
 

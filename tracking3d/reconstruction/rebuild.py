@@ -131,6 +131,24 @@ def rebuild_shape(
     return ShapedRun(model, len(views), True, made.sentence)
 
 
+def restore_online_mesh(folder: Path) -> bool:
+    """Make the mesh of the online map that of the run again, with the texture that it had then.
+
+    Returns:
+        Whether a reconstructed shape was replaced; otherwise the mesh is that of the online map, and stays as it is.
+
+    Raises:
+        InputError: If the run has no mesh.
+        OutputError: If the mesh cannot be written.
+    """
+    run = RunReader(folder)
+    model = _online_model(run)
+    if not (run.mesh_folder / layout.ONLINE / layout.FEATURES).is_file():
+        return False
+    export_mesh(run.mesh_folder, model)
+    return True
+
+
 def score_run(folder: Path, source: str | None = None, largest: int = 2048) -> HeldOutScores:
     """How well the mesh of a run predicts frames that it was not made from.
 

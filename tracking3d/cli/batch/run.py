@@ -217,6 +217,7 @@ def _build_config(row: VideoRow, settings: SettingsOptions, threads: int) -> Pip
         row.preset or settings.preset,
         [*(settings.overrides or ()), *row.settings],
         row.quality or settings.quality,
+        row.model or settings.model,
         tracker=tracker,
         features=row.features,
         camera={"fov": row.fov, "intrinsics": camera},

@@ -49,7 +49,7 @@ def score_models(
 ) -> None:
     """Score the meshes of runs: by rendering held-out frames, and against the true shape.
 
-    Every eighth reliable frame is held out of the texture, as `tracking3d model --quality fine` holds it out of the
+    Every eighth reliable frame is held out of the texture, as `tracking3d model --model fine` holds it out of the
     shape; only its pose is fitted. Nothing is written.
     """
     import json

@@ -1,9 +1,8 @@
-"""Options for the run folder, the final mesh, the report and the viewer."""
+"""Options for the run folder, the report and the viewer."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -11,15 +10,6 @@ import typer
 
 from tracking3d.cli.options.panels import OUTPUT
 from tracking3d.errors import InputError
-
-
-class ModelChoice(StrEnum):
-    """How the final mesh is made."""
-
-    NONE = "none"
-    FAST = "fast"
-    FINE = "fine"
-
 
 RunFolder = Annotated[
     Path | None,
@@ -30,15 +20,6 @@ Overwrite = Annotated[
 ]
 Resume = Annotated[
     bool, typer.Option("--resume", help="Continue the stopped run in that folder.", rich_help_panel=OUTPUT)
-]
-Model = Annotated[
-    ModelChoice | None,
-    typer.Option(
-        help="Final mesh: none keeps the online texture, fast re-textures from the video, fine also reconstructs "
-        "the shape.",
-        show_default="fast",
-        rich_help_panel=OUTPUT,
-    ),
 ]
 Report = Annotated[
     bool,
@@ -78,7 +59,6 @@ class OutputOptions:
     out: RunFolder = None
     overwrite: Overwrite = False
     resume: Resume = False
-    model: Model = None
     report: Report = True
     view: View = False
     host: Host = None

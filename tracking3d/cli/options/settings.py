@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from tracking3d.cli.options.choices import Model, Quality
 from tracking3d.cli.options.panels import SETTINGS
 
 if TYPE_CHECKING:
@@ -30,14 +31,6 @@ Preset = Annotated[
         rich_help_panel=SETTINGS,
     ),
 ]
-Quality = Annotated[
-    str | None,
-    typer.Option(
-        metavar="draft|good|best",
-        help="Trade speed for quality: chooses tracker, resolution, refinement and final mesh together.",
-        rich_help_panel=SETTINGS,
-    ),
-]
 Overrides = Annotated[
     list[str] | None,
     typer.Option(
@@ -56,11 +49,12 @@ class SettingsOptions:
     config: ConfigFile = None
     preset: Preset = None
     quality: Quality = None
+    model: Model = None
     overrides: Overrides = None
 
     def configure(self, **direct: Any) -> PipelineConfig:
         """The configuration; see `configure`."""
-        return configure(self.config, self.preset, self.overrides, self.quality, **direct)
+        return configure(self.config, self.preset, self.overrides, self.quality, self.model, **direct)
 
 
 def configure(
@@ -68,6 +62,7 @@ def configure(
     preset: str | None,
     overrides: list[str] | None,
     quality: str | None = None,
+    model: str | None = None,
     **direct: Any,
 ) -> PipelineConfig:
     """Load the configuration, and check the options of its plug-ins too.
@@ -77,16 +72,20 @@ def configure(
         preset: Name of a preset.
         overrides: ``SECTION.KEY=VALUE`` items.
         quality: Name of a quality.
+        model: The final mesh, see `tracking3d.config.choices`.
         **direct: Sections of settings that other options give; those that are None change nothing.
 
     Raises:
         InputError: A setting is unknown or invalid.
     """
+    from tracking3d.config.choices import check_model, set_model
     from tracking3d.config.loading import load_config
     from tracking3d.pipeline.tracker_selection import check_tracker_options
     from tracking3d.plugins import FEATURES, check_options
 
     config = load_config(file, preset, overrides or (), quality=quality, **_without_none(direct))
+    if model is not None:
+        config = set_model(config, check_model(model))
     check_tracker_options(config)
     check_options(FEATURES, config.features)
     return config
