@@ -37,7 +37,7 @@ def test_an_export_says_where_it_is(call, finished):
     told = json.loads(call("export", finished, "--to", "kitti", "--out", "kitti", "--json").stdout)
     assert told == {"path": "kitti", "unit": "arbitrary", "frames": 5, "without": []}
     assert call("export", finished, "--to", "csv", "--quiet").stdout == ""
-    assert (finished / "export" / "csv.csv").is_file()
+    assert (finished / "export" / "run.csv").is_file()
 
 
 def test_a_run_that_has_not_ended_is_exported_as_far_as_it_is(call, finished):
@@ -46,6 +46,18 @@ def test_a_run_that_has_not_ended_is_exported_as_far_as_it_is(call, finished):
     result = call("export", finished, "--to", "vot", "--out", "masks.txt")
     assert result.exit_code == 0
     assert "is interrupted; frames estimated so far: 5" in result.stderr
+
+
+def test_all_objects_of_a_run_are_exported_each_into_its_folder(call, refused, clip, script):
+    assert call("run", clip, *BOX, "--box", "5,5,9,9", "--out", "both").exit_code == 0
+    result = call("export", "both", "--to", "stl")
+    files = [Path(f"both/object_{number}/export/both_object_{number}.stl") for number in (0, 1)]
+    assert result.exit_code == 0, result.output
+    assert [file.is_file() for file in files] == [True, True]
+    assert [line.split(":")[0] for line in result.stdout.splitlines()] == [f"Wrote {file}" for file in files]
+    told = call("export", "both", "--to", "stl", "--json", "--overwrite").stdout.splitlines()
+    assert [json.loads(line)["path"] for line in told] == [str(file) for file in files]
+    assert "both holds 2 objects" in refused("export", "both", "--to", "stl", "--out", "a.stl")
 
 
 def test_pixels_are_followed(call, finished):

@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 
 from tracking3d.errors import InputError, OutputError
+from tracking3d.export.exported_run import ExportedRun
 from tracking3d.export.exporting import export_run
 from tracking3d.export.formats import FORMATS
 from tracking3d.export.options import ExportOptions
+from tracking3d.results.run_reader import RunReader
 
 
 def names(folder: Path) -> list[str]:
@@ -22,7 +24,7 @@ def names(folder: Path) -> list[str]:
 
 
 def test_without_a_place_it_goes_into_the_run(run):
-    assert export_run(run, "tum").path == run / "export" / "tum.txt"
+    assert export_run(run, "tum").path == run / "export" / "run_tum.txt"
     done = export_run(run, "kitti", overwrite=True)
     assert (done.path, done.frames, done.without, done.unit) == (
         run / "export" / "kitti",
@@ -32,6 +34,36 @@ def test_without_a_place_it_goes_into_the_run(run):
     )
     assert export_run(run, "bop").path.name == "tracking3d_run-test.csv"
     assert export_run(run, "davis").without == (4,)  # a lost frame has a mask
+
+
+def one_file(to: str) -> bool:
+    return bool(FORMATS[to].suffix)
+
+
+def test_files_are_named_after_the_run_and_no_two_formats_share_a_name(run):
+    exported = ExportedRun(RunReader(run), ExportOptions())
+    names = {to: one.default_name(exported) for to, one in FORMATS.items()}
+    assert len(set(names.values())) == len(names)
+    assert names["usdz"] == "run.usdz" and names["glb"] == "run.glb" and names["csv"] == "run.csv"
+    assert names["animated-glb"] == "run_animated.glb" and names["points-csv"] == "run_points.csv"
+    assert all(name.startswith("run") for to, name in names.items() if one_file(to) and to != "bop")
+    assert all(name == to for to, name in names.items() if not one_file(to))
+
+
+@pytest.mark.parametrize("name", ["box_in_hand", "my run (2)", "v1.2", "käse"])
+def test_the_name_of_the_run_folder_is_kept_as_it_is(run, tmp_path, name):
+    renamed = Path(shutil.copytree(run, tmp_path / name))
+    assert export_run(renamed, "stl").path == renamed / "export" / f"{name}.stl"
+
+
+def test_files_of_several_objects_can_lie_in_one_folder(run, tmp_path):
+    both = tmp_path / "both"
+    for number in (0, 1):
+        shutil.copytree(run, both / f"object_{number}")
+    made = [export_run(both / f"object_{number}", "stl").path.name for number in (0, 1)]
+    assert made == ["both_object_0.stl", "both_object_1.stl"]
+    shutil.rmtree(both / "object_1")  # a run that somebody has called so
+    assert export_run(both / "object_0", "ply").path.name == "object_0.ply"
 
 
 def test_a_folder_says_what_it_is(run, tmp_path):

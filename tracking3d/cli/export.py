@@ -14,6 +14,7 @@ from tracking3d.errors import InputError
 
 if TYPE_CHECKING:
     from tracking3d.export.exporter import ExportOptions
+    from tracking3d.export.exporting import Export
 
 _CONTENT = "Content"
 
@@ -96,7 +97,10 @@ class SourceOptions:
 def export(
     content: ContentOptions,
     video: SourceOptions,
-    run: Annotated[Path | None, typer.Argument(metavar="RUN", help="Run folder.")] = None,
+    run: Annotated[
+        Path | None,
+        typer.Argument(metavar="RUN", help="Run folder, or the folder that holds those of several objects."),
+    ] = None,
     to: Annotated[
         str | None,
         typer.Option(metavar="FORMAT", help="Format; --list shows all.", rich_help_panel=OUTPUT),
@@ -105,7 +109,7 @@ def export(
         Path | None,
         typer.Option(
             metavar="PATH",
-            help="File or folder to write; default a new one in RUN/export.",
+            help="File or folder to write; default RUN/export and the name of the run.",
             rich_help_panel=OUTPUT,
         ),
     ] = None,
@@ -127,8 +131,19 @@ def export(
     if run is None or to is None:
         raise InputError("export needs RUN and --to FORMAT; --list shows the formats.")
     from tracking3d.export.exporting import export_run
+    from tracking3d.results.layout import runs_in
 
-    done = export_run(run, to, out, options=_exporter_options(content, video), overwrite=overwrite)
+    runs = runs_in(run)
+    if out is not None and len(runs) > 1:
+        raise InputError(
+            f"{run} holds {len(runs)} objects, and --out is the place of one; give {runs[0]}, or no --out."
+        )
+    options = _exporter_options(content, video)
+    for one in runs:
+        _print_export(export_run(one, to, out, options=options, overwrite=overwrite), as_json, quiet)
+
+
+def _print_export(done: Export, as_json: bool, quiet: bool) -> None:
     if done.not_finished:
         typer.echo(done.not_finished, err=True)
     if as_json:

@@ -17,6 +17,7 @@ from tracking3d.estimation.estimate import ObjectModel, Status
 from tracking3d.export.options import ExportOptions
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
+from tracking3d.results.layout import runs_in
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
@@ -83,6 +84,13 @@ class ExportedRun:
     def name(self) -> str:
         """The run folder's name, of letters, digits and hyphens alone."""
         return re.sub("[^A-Za-z0-9]+", "-", self.reader.folder.resolve().name).strip("-") or "run"
+
+    @property
+    def title(self) -> str:
+        """The run folder's name; of one of several objects with the name of the folder that holds them."""
+        folder = self.reader.folder.resolve()
+        several = folder in runs_in(folder.parent) and len(runs_in(folder.parent)) > 1
+        return f"{folder.parent.name}_{folder.name}" if several else folder.name or "run"
 
     @property
     def camera(self) -> Camera:

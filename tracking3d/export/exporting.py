@@ -105,9 +105,7 @@ def export_run(
     exporter.check_available()
     reader = RunReader(Path(run), refined=options.answers == "final")
     exported = ExportedRun(reader, options)
-    compact = exported.name.replace("-", "")
-    name = exporter.file_name.format(run=compact) or f"{exporter.name}{exporter.suffix}"
-    path = reader.folder / FOLDER / name if out is None else Path(out).resolve()
+    path = reader.folder / FOLDER / exporter.default_name(exported) if out is None else Path(out).resolve()
     _check_place(path, exporter, overwrite)
     if path in (file.resolve() for file in run_files(reader.folder)):
         raise OutputError(f"{path} is a file of the run itself; choose another {_OUT}.")

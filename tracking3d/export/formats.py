@@ -32,7 +32,15 @@ _POINTS = frozenset({"frame", "xy"})
 _MASKS = frozenset({"undistorted"})
 
 _ALL = (
-    Exporter("tum", "poses", "trajectory in the TUM format", write_tum, ".txt", options=_TIMED | {"of"}),
+    Exporter(
+        "tum",
+        "poses",
+        "trajectory in the TUM format",
+        write_tum,
+        ".txt",
+        "{run}_tum",
+        options=_TIMED | {"of"},
+    ),
     Exporter("kitti", "poses", "poses, calibration and times of KITTI", write_kitti, options=_TIMED | {"of"}),
     Exporter("csv", "poses", "table of poses", write_csv, ".csv", options=_TIMED),
     Exporter(
@@ -51,7 +59,7 @@ _ALL = (
         "results of the BOP Challenge",
         write_bop_poses,
         ".csv",
-        "tracking3d_{run}-test.csv",
+        "tracking3d_{letters}-test",
         options=_LENGTHS,
     ),
     Exporter(
@@ -78,8 +86,10 @@ _ALL = (
     Exporter(
         "youtube-vos", "masks", "indexed PNG and meta.json of YouTube-VOS", write_youtube_vos, options=_MASKS
     ),
-    Exporter("coco", "masks", "COCO's JSON, run-length encoded", write_coco, ".json", options=_MASKS),
-    Exporter("vot", "masks", "regions of the VOT toolkit", write_vot, ".txt", options=_MASKS),
+    Exporter(
+        "coco", "masks", "COCO's JSON, run-length encoded", write_coco, ".json", "{run}_coco", options=_MASKS
+    ),
+    Exporter("vot", "masks", "regions of the VOT toolkit", write_vot, ".txt", "{run}_vot", options=_MASKS),
     Exporter("cut-outs", "masks", "the object as PNG with alpha", write_cut_outs, options=_PICTURES | _MASKS),
     Exporter(
         "vp9",
@@ -111,8 +121,24 @@ _ALL = (
         write_probabilities_16,
         options=_MASKS,
     ),
-    Exporter("tapvid", "points", "point tracks as TAP-Vid's arrays", write_tapvid, ".npz", options=_POINTS),
-    Exporter("points-csv", "points", "point tracks as a table", write_points_csv, ".csv", options=_POINTS),
+    Exporter(
+        "tapvid",
+        "points",
+        "point tracks as TAP-Vid's arrays",
+        write_tapvid,
+        ".npz",
+        "{run}_tapvid",
+        options=_POINTS,
+    ),
+    Exporter(
+        "points-csv",
+        "points",
+        "point tracks as a table",
+        write_points_csv,
+        ".csv",
+        "{run}_points",
+        options=_POINTS,
+    ),
     Exporter("glb", "model", "textured mesh, y up", write_glb, ".glb", options=_LENGTHS),
     Exporter("ply", "model", "mesh with colours, object coordinates", write_ply, ".ply", options=_LENGTHS),
     Exporter("stl", "model", "mesh without colours, object coordinates", write_stl, ".stl", options=_LENGTHS),
@@ -122,6 +148,7 @@ _ALL = (
         "animated object in front of the camera",
         write_animated_glb,
         ".glb",
+        "{run}_animated",
         options=_TIMED,
     ),
     Exporter(
