@@ -1,6 +1,6 @@
 """Makes the picture of shapes from eight sides: that of the online map, the one made anew, and that with its texture.
 
-$ tracking3d model RUN --quality fine
+$ tracking3d model RUN --model fine
 $ python docs/images/shape_anew.py RUN picture.jpg
 $ python docs/images/shape_anew.py RUN picture.jpg --truth CLIP    # the true shape above them
 """

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from contextlib import contextmanager
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tracking3d.engines.in_this_process import InThisProcess
 from tracking3d.engines.protocol import Needs
+from tracking3d.video import VideoWriter
 
 BOX = "20,10,20,20"
 
@@ -47,6 +51,44 @@ def table(shots, tmp_path):
         f'video,box,settings,fov\nshots/cup,"{BOX}",runtime.seed=5,\nshots/plate,"{BOX}; 5,5,9,9",,40\n'
     )
     return file
+
+
+def test_the_line_of_the_readme_works_with_what_the_readme_says(call, clip, tmp_path, script, opened):
+    readme = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+    (command,) = re.findall(r"`tracking3d (batch clips/ --out runs)`", readme)
+    file, line, video = re.search(r"`(clips/\S+\.box)` with the line `(\S+)` for `(\S+)`", readme).groups()
+    (tmp_path / "clips").mkdir()
+    with VideoWriter(tmp_path / video, 10, (480, 640)) as writer:
+        for _ in range(3):
+            writer.write(np.zeros((480, 640, 3), np.uint8))
+    (tmp_path / file).write_text(line + "\n")
+    result = call(*command.split(), "--no-report")
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / "runs" / Path(video).stem / "run.json").is_file()
+    assert [prompt.box for _, prompt in script.built] == [tuple(map(int, line.split(",")))]
+
+
+def test_a_folder_of_videos_without_any_box_is_refused_at_once(refused, shots, opened):
+    (shots / "cup.box").unlink()
+    for name in ("one", "two"):
+        (shots / f"{name}.mp4").touch()
+    line = refused("batch", shots, "--out", "out")
+    assert f"None of the 2 videos of {shots} has a box" in line and f"{shots / 'one.box'}" in line
+    assert opened == [] and not Path("out").exists()
+    (shots / "two.mp4").unlink()
+    assert "The only video" in refused("batch", shots, "--out", "out")
+
+
+def test_videos_without_a_box_are_named_before_the_others_are_tracked(call, shots, script, opened):
+    for number in range(7):
+        (shots / f"bare_{number}.mp4").touch()
+    result = call("batch", shots, "--out", "out", "--no-report", "--retries", 0)
+    assert result.exit_code == 1
+    first = result.stderr.splitlines()[0]
+    assert first.startswith(
+        "7 of 8 videos have no box and will fail (bare_0, bare_1, bare_2, bare_3, bare_4 and 2 more)"
+    )
+    assert len(script.built) == 1
 
 
 def test_a_row_has_its_own_quality_and_final_mesh(call, shots, tmp_path, script, opened, monkeypatch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import posixpath
 import shlex
 import sys
 from collections.abc import Sequence
@@ -22,6 +23,9 @@ if TYPE_CHECKING:
     from tracking3d.config.models import PipelineConfig
     from tracking3d.engines.protocol import Needs
 
+
+_MOST_NAMES = 5
+"""Videos without a prompt that are named."""
 
 Jobs = Annotated[
     str,
@@ -154,6 +158,7 @@ def run(
         videos = dataset_jobs(open_dataset(jobs, data, data, 1).only(sequences or []), config)
     else:
         videos = list_jobs(jobs, lambda row: _build_config(row, settings, engine.threads), split or "")
+        _check_prompts(jobs, videos, quiet)
     needs = _needs(videos, engine)
     with (
         open_engine(engine.address, engine.workers, needs) as workers,
@@ -175,6 +180,35 @@ def run(
             raise
     if progress.failed:
         raise typer.Exit(1)
+
+
+def _check_prompts(jobs: str, videos: Sequence[VideoJob], quiet: bool) -> None:
+    """Say before anything is tracked which videos have no prompt.
+
+    Raises:
+        InputError: None of them has one.
+    """
+    from tracking3d.batch.listing import NO_PROMPT
+    from tracking3d.errors import InputError
+
+    missing = [video for video in videos if video.fault == NO_PROMPT]
+    if not missing:
+        return
+    example = posixpath.splitext(missing[0].video)[0] + ".box"
+    what_to_do = (
+        f"write X,Y,WIDTH,HEIGHT of the object in the first frame into a file next to each video, such as {example}, "
+        "or add a column box to a table."
+    )
+    if len(missing) == len(videos):
+        number = "The only video" if len(videos) == 1 else f"None of the {len(videos)} videos"
+        raise InputError(f"{number} of {jobs} has {'no' if len(videos) == 1 else 'a'} box; {what_to_do}")
+    if not quiet:
+        names = ", ".join(video.name for video in missing[:_MOST_NAMES])
+        more = f" and {len(missing) - _MOST_NAMES} more" if len(missing) > _MOST_NAMES else ""
+        typer.echo(
+            f"{len(missing)} of {len(videos)} videos have no box and will fail ({names}{more}); {what_to_do}",
+            err=True,
+        )
 
 
 def _needs(videos: Sequence[VideoJob], engine: EngineOptions) -> Needs:
