@@ -85,9 +85,8 @@ def test_videos_without_a_box_are_named_before_the_others_are_tracked(call, shot
     result = call("batch", shots, "--out", "out", "--no-report", "--retries", 0)
     assert result.exit_code == 1
     first = result.stderr.splitlines()[0]
-    assert first.startswith(
-        "7 of 8 videos have no box and will fail (bare_0, bare_1, bare_2, bare_3, bare_4 and 2 more)"
-    )
+    assert first.startswith("7 of 8 videos have no box and will fail (bare_0, bare_1, bare_2, bare_3, bare_4")
+    assert "bare_4 and 2 more)" in first
     assert len(script.built) == 1
 
 
