@@ -13,8 +13,8 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from tracking3d.export.exported_run import longest_side
 from tracking3d.results.run_reader import RunReader
+from tracking3d.results.run_unit import longest_side
 
 UPRIGHT = np.diag([1.0, -1.0, -1.0])
 VALIDATE = """
@@ -49,6 +49,28 @@ def test_glb_stands_upright_in_metres(export, run):
     scale = 0.25 / longest_side(np.asarray(own.vertices))
     np.testing.assert_allclose(mesh.bounds, np.sort(own.bounds @ UPRIGHT * scale, axis=0), atol=1e-6)
     assert {"tracking3d_object", "tracking3d_y_up"} <= set(scene.graph.nodes)
+
+
+@pytest.mark.parametrize("to", ["glb", "animated-glb"])
+def test_a_glb_says_whether_its_unit_is_the_metre(export, run, to):
+    extras = [asset_of(export(run, to, f"{s}.glb", object_size=s))["extras"] for s in (None, 0.25)]
+    assert extras[0]["unit"] == "unknown" and "not in metres" in extras[0]["note"]
+    assert extras[1] == {"unit": "metre"}
+
+
+def test_a_usdz_says_whether_its_unit_is_the_metre(export, run):
+    pxr = pytest.importorskip("pxr.Usd")
+    layers = [
+        pxr.Stage.Open(str(export(run, "usdz", f"{s}.usdz", object_size=s))).GetRootLayer()
+        for s in (None, 0.25)
+    ]
+    assert [layer.customLayerData["tracking3d:unit"] for layer in layers] == ["unknown", "metre"]
+    assert "not in metres" in layers[0].comment and layers[1].comment == "Lengths are in metres."
+
+
+def asset_of(file: Path) -> dict:
+    data = file.read_bytes()
+    return json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])["asset"]
 
 
 @pytest.mark.parametrize("to", ["ply", "stl"])

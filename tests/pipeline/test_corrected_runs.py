@@ -25,7 +25,9 @@ from tracking3d.pipeline.session import SOLVERS, Session
 from tracking3d.prompts.corrections import Correction
 from tracking3d.results import layout
 from tracking3d.results.files import write_image
+from tracking3d.results.mesh_export import load_model
 from tracking3d.results.run_reader import RunReader
+from tracking3d.results.run_unit import visible_side
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.video import open_source
 
@@ -108,6 +110,21 @@ def box_of(clip, frame: int):
 
 def contents(folder: Path) -> dict[Path, bytes]:
     return {path: (folder / path).read_bytes() for path in files_of(folder)}
+
+
+def test_a_corrected_run_in_metres_is_in_metres_again(clip, images, tmp_path):
+    prompt = {"mask": clip.masks[0]}
+    record(open_source(str(images)), settings("object.size=0.22"), tmp_path / "run", **prompt)
+    record(open_source(str(images)), settings(), tmp_path / "whole", **prompt, corrections=told(clip))
+    correct_run(tmp_path / "run", told(clip))
+    for refined in (True, False):
+        run, whole = (RunReader(tmp_path / name, refined) for name in ("run", "whole"))
+        assert (run.unit, whole.unit) == ("metre", "arbitrary")
+        mesh = load_model(run.mesh_folder)
+        assert visible_side(mesh) == pytest.approx(0.22)
+        scale = 0.22 / visible_side(load_model(whole.mesh_folder))
+        for mine, expected in zip(run.frames, whole.frames, strict=True):
+            np.testing.assert_allclose(mine.T_cam_obj[:3, 3], expected.T_cam_obj[:3, 3] * scale, atol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,7 @@ from tracking3d.reconstruction.shape import ReconstructedShape
 from tracking3d.rendering.kernels import threads as kernels
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.run_reader import RunReader
+from tracking3d.results.run_unit import visible_side
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.video import open_source
 
@@ -124,6 +125,23 @@ def test_the_model_is_what_was_asked_for(clip, config):
     plain = track(clip.images, mask=clip.masks[0], config=config, model="none").result()
     assert plain.refined
     assert plain.run.config["object"]["texture_views"] == 0
+
+
+def test_a_result_with_a_size_is_in_metres(clip, config, result):
+    metric = track(clip.images, mask=clip.masks[0], config=config, object_size=0.22).result()
+    assert metric.run.unit == "metre" and visible_side(metric.model) == pytest.approx(0.22)
+    for one, other in ((metric, result), (metric.causal, result.causal)):
+        scale = visible_side(one.model) / visible_side(other.model)
+        np.testing.assert_allclose(one.poses[:, :3, 3], other.poses[:, :3, 3] * scale, rtol=1e-9)
+        np.testing.assert_array_equal(one.poses[:, :3, :3], other.poses[:, :3, :3])
+
+
+def test_a_size_that_is_none_is_refused_at_once(clip, config):
+    for size in ("0.2", True, -1, float("nan")):
+        with pytest.raises(InputError, match=r"^object_size= is .* give a number of metres above 0"):
+            track(clip.images, mask=clip.masks[0], config=config, object_size=size)
+    with pytest.raises(InputError, match="has its own unit"):
+        track(clip.images, config=config, object="thing", object_size=0.2)
 
 
 def test_a_fine_model_has_a_new_shape_where_that_explains_the_frames_better(clip, config, monkeypatch):

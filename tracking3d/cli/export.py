@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tracking3d.cli.options import AsJson, Debug, Quiet, Video, grouped, numbers
+from tracking3d.cli.options.object_size import ObjectSize
 from tracking3d.cli.options.panels import OUTPUT, VIDEO
 from tracking3d.errors import InputError
 
@@ -32,14 +33,7 @@ class ContentOptions:
             rich_help_panel=_CONTENT,
         ),
     ] = "final"
-    object_size: Annotated[
-        float | None,
-        typer.Option(
-            metavar="METRES",
-            help="Longest side of the object; lengths are exported in metres then.",
-            rich_help_panel=_CONTENT,
-        ),
-    ] = None
+    object_size: ObjectSize = None
     of: Annotated[
         str,
         typer.Option(

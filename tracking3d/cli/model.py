@@ -9,6 +9,7 @@ import typer
 
 from tracking3d.cli.options import Debug, Run, Video
 from tracking3d.cli.options.choices import model_option
+from tracking3d.cli.options.object_size import ObjectSize
 from tracking3d.errors import InputError
 
 Largest = Annotated[int, typer.Option(min=64, max=8192, help="Maximum side of the texture image, in texels.")]
@@ -30,6 +31,7 @@ def model(
     run: Run,
     model: Annotated[str, model_option()] = "fast",
     quality: Annotated[str | None, typer.Option(hidden=True, callback=_refuse_quality)] = None,
+    object_size: ObjectSize = None,
     source: Video = None,
     views: Annotated[int, typer.Option(min=1, max=500, help="Frames that the texture is taken from.")] = 24,
     largest: Largest = 2048,
@@ -39,6 +41,15 @@ def model(
 
     `tracking3d run` does this at its end, with the same option --model.
     """
+    _make_mesh(run, model, source, views, largest)
+    if object_size is not None:
+        from tracking3d.results.run_unit import scale_run
+
+        scale_run(run, object_size)
+        typer.echo(f"{run}: all lengths are in metres")
+
+
+def _make_mesh(run: Path, model: str, source: str | None, views: int, largest: int) -> None:
     from tracking3d.reconstruction.rebuild import rebuild_shape, restore_online_mesh, retexture_run
 
     if model == "none":

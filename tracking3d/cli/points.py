@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from tracking3d.cli.options import Debug, Quiet, Run, Video, grouped, numbers
+from tracking3d.cli.options.object_size import ObjectSize
 from tracking3d.cli.options.panels import OUTPUT
 from tracking3d.errors import InputError, OutputError
 
@@ -70,6 +71,7 @@ class QueryOptions:
         ),
     ] = False
     source: Video = None
+    object_size: ObjectSize = None
 
     def pixels(self) -> list[tuple[float, ...]]:
         """The pixels of ``--xy``.
@@ -126,6 +128,7 @@ def points(
                 f"{file} cannot be written: the folder {file.parent} does not exist; make it first."
             )
     reader = RunReader(run, refined=not query.causal)
+    scale = _scale(reader, query.object_size)
     if query.grid is not None:
         pixels += grid_on_object(reader, query.frame, query.grid)
     tracks = track_points(reader, query.frame, pixels)  # before the video is read: it may refuse the query
@@ -136,7 +139,19 @@ def points(
     tracks, remarks = _followed(reader, query, pixels, tracks, images, quiet)
     for remark in remarks:
         typer.echo(remark, err=True)
+    if scale is not None:
+        tracks = replace(tracks, points=tracks.points * scale)
     _write(tracks, images, as_json, csv, video)
+
+
+def _scale(reader: RunReader, object_size: float | None) -> float | None:
+    """Metres per unit of the run, if the length of the object is given."""
+    if object_size is None:
+        return None
+    from tracking3d.results.mesh_export import load_model
+    from tracking3d.results.run_unit import metres_per_unit
+
+    return metres_per_unit(load_model(reader.mesh_folder), object_size)
 
 
 def _followed(

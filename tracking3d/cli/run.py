@@ -53,7 +53,9 @@ def run(
     output.check()
     performance.check()
     check_model_source(settings.model, source)
-    config = _configure(prompt, camera, tracking, settings, performance)
+    if prompt.known is not None and output.object_size is not None:
+        raise InputError("A known object has its own unit; leave out --object-size, or --object.")
+    config = _configure(prompt, camera, tracking, settings, output, performance)
     prompts = _parse_prompts(prompt, video.frames)
     corrections = _parse_corrections(prompt, len(prompts))
     folder = output.out or default_folder(source)
@@ -79,6 +81,7 @@ def _configure(
     camera: CameraOptions,
     tracking: TrackingOptions,
     settings: SettingsOptions,
+    output: OutputOptions,
     performance: PerformanceOptions,
 ) -> PipelineConfig:
     """The configuration that the options make together."""
@@ -90,6 +93,7 @@ def _configure(
             "model": prompt.known,
             "flat": tracking.flat or None,
             "prototype": tracking.prototype,
+            "size": output.object_size,
         },
         crop={"size": performance.size},
         solver={"final_refine": tracking.final_refine},

@@ -150,9 +150,25 @@ class ObjectConfig(Section):
             "the final refinement, and keeps the result if it explains held-out frames better (extra model)."
         ),
     )
+    size: float | None = Field(
+        None,
+        gt=0,
+        le=1e6,
+        description=(
+            "Metres of the object's longest side: of the longest side of the smallest box around what the video has "
+            "shown. All lengths of the finished run are then in metres; null leaves the run's arbitrary unit. A known "
+            "object has its own unit."
+        ),
+    )
     flat: bool = Field(
         False, description="Planar object: project all vertices onto one plane after each iteration."
     )
+
+    @model_validator(mode="after")
+    def _has_one_unit(self) -> ObjectConfig:
+        if self.model is not None and self.size is not None:
+            raise ValueError("a known object has its own unit; leave out size, or model")
+        return self
 
     @model_validator(mode="before")
     @classmethod

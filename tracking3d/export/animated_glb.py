@@ -61,7 +61,7 @@ def write_animated_glb(run: ExportedRun, path: Path) -> None:
             }
         ]
 
-    path.write_bytes(glb_file(run.model, finish=animate, buffer_postprocessor=append))
+    path.write_bytes(glb_file(run.model, finish=animate, unit=run.unit, buffer_postprocessor=append))
 
 
 def _add_accessors(tree: dict[str, Any], tracks: dict[str, NDArray[np.float32]]) -> dict[str, int]:

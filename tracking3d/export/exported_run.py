@@ -8,29 +8,23 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from tracking3d.datasets.clip import is_rigid
-from tracking3d.errors import InputError, argument
+from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import ObjectModel, Status
 from tracking3d.export.options import ExportOptions
 from tracking3d.frames import Frame
 from tracking3d.geometry.camera import Camera
-from tracking3d.results.layout import runs_in
+from tracking3d.results.layout import METRE, runs_in
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
+from tracking3d.results.run_unit import metres_per_unit, scale_model, scale_pose
 from tracking3d.video.selection import parse_selection
 
 FRAMES_PER_SECOND = 30.0
 """Assumed by formats that require a frame rate if it is unknown."""
-
-ARBITRARY = "arbitrary"
-"""Name of the unit of a run whose object was not measured."""
-
-_HARDLY_SEEN = 0.1
-"""Minimum share of seen faces for which the object's length can be computed from them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +118,9 @@ class ExportedRun:
             InputError: If there is no such frame.
         """
         posed = [
-            PosedFrame(n, self.seconds(n), self._scale(one.T_cam_obj), self.reader.camera_of(one), one)
+            PosedFrame(
+                n, self.seconds(n), scale_pose(one.T_cam_obj, self.scale), self.reader.camera_of(one), one
+            )
             for n, one in self.records.items()
             if one.status is not Status.LOST and is_rigid(one.T_cam_obj)
         ]
@@ -172,12 +168,12 @@ class ExportedRun:
         """
         if self.options.object_size is None:
             return 1.0
-        return self.options.object_size / visible_side(load_model(self.reader.mesh_folder))
+        return metres_per_unit(load_model(self.reader.mesh_folder), self.options.object_size)
 
     @property
     def unit(self) -> str:
         """The unit of lengths, in words."""
-        return "metre" if self.options.object_size is not None else ARBITRARY
+        return METRE if self.options.object_size is not None else self.reader.unit
 
     @cached_property
     def model(self) -> ObjectModel:
@@ -186,8 +182,7 @@ class ExportedRun:
         Raises:
             InputError: If the run has none.
         """
-        model = load_model(self.reader.mesh_folder)
-        return replace(model, vertices=model.vertices * self.scale)
+        return scale_model(load_model(self.reader.mesh_folder), self.scale)
 
     def mask(self, index: int) -> NDArray[np.bool_]:
         """``(H, W)``: the estimated mask of a frame of `span`; empty if the frame was skipped."""
@@ -230,41 +225,3 @@ class ExportedRun:
         from tracking3d.export.pictures import read_selected_images
 
         return read_selected_images(self.reader, self.options.source, self.records)
-
-    def _scale(self, T_cam_obj: NDArray[np.float64]) -> NDArray[np.float64]:
-        scaled = T_cam_obj.copy()
-        scaled[:3, 3] *= self.scale
-        return scaled
-
-
-def visible_side(model: ObjectModel) -> float:
-    """The longest side of what the video has shown of an object; what it has not is a guess, and often too deep.
-
-    For an object that was hardly seen it is that of the whole mesh.
-
-    Raises:
-        InputError: If that has no extent.
-    """
-    height, width = model.texture_weight.shape
-    columns = (model.face_uvs[..., 0] * width).astype(int) % width
-    rows = (model.face_uvs[..., 1] * height).astype(int).clip(0, height - 1)
-    seen = (model.texture_weight[rows, columns] > 0).all(axis=1)
-    hardly = seen.mean() < _HARDLY_SEEN
-    return longest_side(model.vertices if hardly else model.vertices[np.unique(model.faces[seen])])
-
-
-def longest_side(vertices: NDArray[np.float64]) -> float:
-    """The longest side of the smallest box, turned as it likes, around ``(V, 3)``: what a ruler would give.
-
-    Raises:
-        InputError: If the vertices have no extent.
-    """
-    try:
-        longest = float(max(trimesh.bounds.oriented_bounds(vertices)[1]))
-    except Exception:  # a flat or otherwise degenerate hull
-        longest = float(np.ptp(vertices, axis=0).max())
-    if not 0 < longest < np.inf:
-        raise InputError(
-            f"The mesh of the run has no size; leave out {argument('object_size=', '--object-size')}."
-        )
-    return longest

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tracking3d.errors import InputError, OutputError, argument
-from tracking3d.export.exported_run import ARBITRARY, ExportedRun
+from tracking3d.export.exported_run import ExportedRun
 from tracking3d.export.exporter import Exporter
 from tracking3d.export.formats import FORMATS
 from tracking3d.export.options import ExportOptions
 from tracking3d.results.files import writing
-from tracking3d.results.layout import OVERWRITE, partial_path, run_files
+from tracking3d.results.layout import ARBITRARY, OVERWRITE, partial_path, run_files
 from tracking3d.results.run_reader import RunReader
 
 FOLDER = "export"

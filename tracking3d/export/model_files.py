@@ -19,7 +19,7 @@ from tracking3d.results.mesh_export import glb_file
 
 def write_glb(run: ExportedRun, path: Path) -> None:
     """Write the textured mesh, y up, below the nodes ``tracking3d_y_up`` and ``tracking3d_object``."""
-    path.write_bytes(glb_file(run.model))
+    path.write_bytes(glb_file(run.model, unit=run.unit))
 
 
 def write_ply(run: ExportedRun, path: Path) -> None:

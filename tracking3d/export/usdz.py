@@ -18,6 +18,7 @@ from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.export.axes import HALF_TURN, continuous, quaternion
 from tracking3d.export.exported_run import ExportedRun
 from tracking3d.geometry.camera import Camera
+from tracking3d.results.mesh_export import unit_note
 
 _APERTURE = 36.0
 """Millimetres of the film's width; only its ratio to the focal length means anything."""
@@ -37,6 +38,9 @@ def write_usdz(run: ExportedRun, path: Path) -> None:
     stage = Usd.Stage.CreateNew(str(parts / "scene.usdc"))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    note = unit_note(run.unit)
+    stage.SetMetadata("customLayerData", {f"tracking3d:{key}": text for key, text in note.items()})
+    stage.SetMetadata("comment", note.get("note", "Lengths are in metres."))
     stage.SetTimeCodesPerSecond(run.fps)
     stage.SetFramesPerSecond(run.fps)
     stage.SetStartTimeCode(run.span[0])

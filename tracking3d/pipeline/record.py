@@ -32,6 +32,7 @@ from tracking3d.results.description import RunHeader
 from tracking3d.results.given_masks import keep_given_masks
 from tracking3d.results.layout import object_folders
 from tracking3d.results.run_reader import RunReader
+from tracking3d.results.run_unit import apply_object_size
 from tracking3d.results.run_writer import RunWriter, WrittenSoFar
 from tracking3d.video.source import FrameSource, source_notes
 
@@ -193,6 +194,8 @@ def record_tracking(
     for into, recording in zip(folders, recordings, strict=True):
         if recording is not None and not options.first_pass_only:
             make_final_shape(into, opened.config, opened.source)
+        if not options.first_pass_only:
+            apply_object_size(into, opened.config.object)
     return [RunReader(into) for into in folders]
 
 

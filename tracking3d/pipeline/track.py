@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from tracking3d.config.camera import choose_camera
 from tracking3d.config.models import PipelineConfig
+from tracking3d.config.object_size import set_object_size
 from tracking3d.estimation.estimate import FrameEstimate
 from tracking3d.frames import Box
 from tracking3d.pipeline.components import SOLVERS
@@ -47,6 +48,7 @@ def track(
     refine: bool | None = None,
     model: ModelChoice | None = None,
     object: str | Path | None = None,
+    object_size: float | None = None,
 ) -> Tracking:
     """Track an object through frames; estimates come as the frames do, memory is bounded by the keyframes.
 
@@ -74,6 +76,8 @@ def track(
             it if it explains them better; None leaves that to the configuration.
         object: The folder of an earlier run, or a mesh file: the object is that one. It is then found without a box,
             or with one, estimates are in its coordinates and unit, and its shape and colours are held.
+        object_size: Metres of the object's longest side; all lengths of the `Tracking.result` are then in metres.
+            Estimates on the way are in a unit of their own, since the shape is not known before the end.
 
     Returns:
         An iterator of one estimate a frame, whose `Tracking.result` is all of it.
@@ -83,10 +87,11 @@ def track(
             the box or mask.
     """
     source, config = open_frames(frames), set_known_object(validate_config(config), object)
-    config = config_of_result(config, source, refine, model)
+    config = config_of_result(set_object_size(config, object_size), source, refine, model)
     prompts = PromptSet.of_one(box, mask, points, start_frame)
     request = request_tracking(source, config, prompts, corrections, skip_damaged)
-    return Tracking(request, refine is not None or model is not None, validate_queries(follow))
+    kept = any(option is not None for option in (refine, model, object_size))
+    return Tracking(request, kept, validate_queries(follow))
 
 
 def track_objects(

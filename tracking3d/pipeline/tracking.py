@@ -23,6 +23,7 @@ from tracking3d.pipeline.point_queries import PointFollowing
 from tracking3d.pipeline.record import RecordOptions, begin_recording
 from tracking3d.pipeline.result import TemporaryRun, TrackingResult
 from tracking3d.reconstruction.final_shape import make_final_shape
+from tracking3d.results.run_unit import apply_object_size
 
 _T = TypeVar("_T")
 
@@ -180,6 +181,7 @@ def track_frames(
             run_refinement(opened.source, ActiveRecordings([recording]))
     if run is not None:
         run.about_shape = make_final_shape(run.folder, opened.config, opened.source)
+        apply_object_size(run.folder, opened.config.object)
 
 
 class _ObjectsInStep:

@@ -74,7 +74,7 @@ def retexture_run(
     if not views:
         raise no_reliable_frame_error(run)
     model = bake_texture(model, views, largest)
-    export_mesh(run.mesh_folder, model)
+    export_mesh(run.mesh_folder, model, run.unit)
     return model, len(views)
 
 
@@ -120,14 +120,14 @@ def rebuild_shape(
     made = reconstruct_shape(online.vertices, online.faces, shapes, judges)
     if made.vertices is None or made.faces is None:
         model = bake_texture(online, views, largest)
-        export_mesh(run.mesh_folder, model)
+        export_mesh(run.mesh_folder, model, run.unit)
         return ShapedRun(model, len(views), False, made.sentence)
     model = bake_texture(replace_shape(online, made.vertices, made.faces, shapes), views, largest)
     kept = run.mesh_folder / layout.ONLINE
     if not (kept / layout.FEATURES).is_file():
         kept.mkdir(exist_ok=True)
-        export_mesh(kept, online)
-    export_mesh(run.mesh_folder, model)
+        export_mesh(kept, online, run.unit)
+    export_mesh(run.mesh_folder, model, run.unit)
     return ShapedRun(model, len(views), True, made.sentence)
 
 
@@ -145,7 +145,7 @@ def restore_online_mesh(folder: Path) -> bool:
     model = _online_model(run)
     if not (run.mesh_folder / layout.ONLINE / layout.FEATURES).is_file():
         return False
-    export_mesh(run.mesh_folder, model)
+    export_mesh(run.mesh_folder, model, run.unit)
     return True
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from tracking3d.estimation.estimate import MaskSource, Status
 from tracking3d.geometry.camera import Camera
-from tracking3d.results.layout import CONVENTIONS, FORMAT, FORMAT_VERSION
+from tracking3d.results.layout import ARBITRARY, CONVENTIONS, FORMAT, FORMAT_VERSION
 from tracking3d.results.process import this_process
 from tracking3d.results.records import FrameRecord
 from tracking3d.runtime.memory import resident_memory
@@ -80,6 +80,7 @@ def description_at_start(header: RunHeader) -> dict[str, Any]:
         "renderer": header.renderer,
         "versions": versions(),
         "conventions": CONVENTIONS,
+        "unit": {"name": ARBITRARY},
         "refinement": None,
         "skipped": [],
     }

@@ -59,6 +59,9 @@ GLB = "mesh.glb"
 FEATURES = "features.npz"
 LANDMARKS = "landmarks.npz"
 
+ARBITRARY, METRE = "arbitrary", "metre"
+"""Units of length of a run: its own, and that of a run whose object was measured."""
+
 OUT = argument("folder", "--out")
 OVERWRITE = argument("overwrite=True", "--overwrite")
 """Names in messages of the arguments of `tracking3d.pipeline.record.record` and of ``tracking3d run``."""
@@ -67,7 +70,7 @@ CONVENTIONS = {
     "axes": "OpenCV camera axes: x right, y down, z forward.",
     "pixels": "Pixel (0, 0) is the centre of the top-left pixel; K belongs to the full frame.",
     "T_cam_obj": "Object to camera: x_cam = R x_obj + t, a row-major 4 x 4 matrix.",
-    "scale": "The unit of length is arbitrary unless the user gave one; only ratios are meaningful.",
+    "scale": "The unit of length is arbitrary, and only ratios are meaningful, unless unit.name is metre.",
     "mesh": (
         "mesh.obj is in object coordinates; a node in mesh.glb rotates them by 180 degrees about x, so that "
         "y is up."

@@ -27,7 +27,7 @@ from tracking3d.errors import InputError
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.geometry.gltf_axes import OBJECT_NODE, UPRIGHT_NODE, UPRIGHT_ROTATION
 from tracking3d.results.files import image_file, write_atomic
-from tracking3d.results.layout import FEATURES, GLB, MTL, OBJ, OUT, TEXTURE
+from tracking3d.results.layout import ARBITRARY, FEATURES, GLB, MTL, OBJ, OUT, TEXTURE
 
 _FARTHEST = 1e12  # of a vertex; float32 can square it
 _REPEAT, _CLAMP, _LINEAR, _MIPMAP = 10497, 33071, 9729, 9987  # glTF's constants
@@ -35,16 +35,21 @@ _VERTICES, _INDICES = 34962, 34963  # so are these, for what a buffer holds
 _ROUNDING = 2.0**-20  # of texture coordinates; far less than a texel
 
 
-def export_mesh(folder: Path, model: ObjectModel) -> None:
+def export_mesh(folder: Path, model: ObjectModel, unit: str = ARBITRARY) -> None:
     """Write the mesh files of a run.
+
+    Args:
+        folder: The run folder, or one within.
+        model: The object.
+        unit: Its unit of length, ``arbitrary`` or ``metre``.
 
     Raises:
         OutputError: If one cannot be written.
     """
     texture = _Texture(model)
-    for name, data in obj_files(model, "object coordinates, OpenCV axes, arbitrary unit", texture).items():
+    for name, data in obj_files(model, f"object coordinates, OpenCV axes, unit: {unit}", texture).items():
         write_atomic(folder / name, data)
-    write_atomic(folder / GLB, glb_file(model, texture=texture))
+    write_atomic(folder / GLB, glb_file(model, texture=texture, unit=unit))
     exact = io.BytesIO()
     seen: dict[str, Any] = {} if model.seen is None else {"seen": model.seen}
     np.savez_compressed(
@@ -106,6 +111,7 @@ def glb_file(
     model: ObjectModel,
     finish: Callable[[dict[str, Any]], None] | None = None,
     texture: _Texture | None = None,
+    unit: str = ARBITRARY,
     **more: Any,
 ) -> bytes:
     """The model as GLB, turned upright.
@@ -114,6 +120,7 @@ def glb_file(
         model: The object.
         finish: Changes the glTF tree once this module is done with it; see trimesh's ``tree_postprocessor``.
         texture: Its texture, if it is encoded already.
+        unit: Unit of length of the model, ``arbitrary`` or ``metre``; it is noted in ``asset.extras``.
         more: Further arguments of trimesh's ``export_glb``.
     """
     pbr = trimesh.visual.material.PBRMaterial(
@@ -125,6 +132,7 @@ def glb_file(
 
     def finish_all(tree: dict[str, Any]) -> None:
         _finish_gltf(tree)
+        tree["asset"]["extras"] = unit_note(unit)
         if finish is not None:
             finish(tree)
 
@@ -132,6 +140,18 @@ def glb_file(
         split_mesh(model, pbr), include_normals=True, tree_postprocessor=finish_all, **more
     )
     return data
+
+
+def unit_note(unit: str) -> dict[str, str]:
+    """What a format whose unit is the metre says of lengths in ``unit``.
+
+    Args:
+        unit: ``arbitrary`` or ``metre``.
+    """
+    if unit != ARBITRARY:
+        return {"unit": unit}
+    note = "The size of the object is unknown: lengths are in an arbitrary unit, not in metres."
+    return {"unit": "unknown", "note": note}
 
 
 def split_mesh(model: ObjectModel, material: trimesh.visual.material.Material) -> trimesh.Trimesh:

@@ -151,7 +151,9 @@ def open_scene(
     if (kept := _read_scene(file, key, scene)) is not None:
         return RunScene(run, kept, pictures)
     scene = fit_outlines(refine_scene(scene, rounds, after_round))
-    _write(file, key, scene)
+    nowhere = np.full((4, 4), np.nan)
+    T = np.stack([nowhere if view is None else view.T_cam_obj for view in scene.views])
+    _write(file, key, scene.vertices, T)
     return RunScene(run, scene, pictures)
 
 
@@ -189,6 +191,19 @@ def has_landmarks(run: RunReader) -> bool:
     return key == _key(run, _surface(run)[0], ROUNDS)
 
 
+def read_landmarks(run: RunReader) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Surface ``(V, 3)`` and poses ``(T, 4, 4)`` of the landmarks that are saved for a run as it is, or None."""
+    if not has_landmarks(run):
+        return None
+    with np.load(run.mesh_folder / layout.LANDMARKS, allow_pickle=False) as kept:
+        return kept["vertices"], kept["T_cam_obj"]
+
+
+def write_landmarks(run: RunReader, vertices: NDArray[np.float64], T_cam_obj: NDArray[np.float64]) -> None:
+    """Save a surface ``(V, 3)`` and poses ``(T, 4, 4)`` as the landmarks of a run as it is now."""
+    _write(run.mesh_folder / layout.LANDMARKS, _key(run, _surface(run)[0], ROUNDS), vertices, T_cam_obj)
+
+
 def _surface(run: RunReader) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Vertices ``(V, 3)`` and faces ``(F, 3)`` of the mesh of a run."""
     mesh = run.mesh()
@@ -217,11 +232,9 @@ def _read_scene(file: Path, key: str, scene: LandmarkScene) -> LandmarkScene | N
     return scene.redrawn(vertices, dict(enumerate(T)))
 
 
-def _write(file: Path, key: str, scene: LandmarkScene) -> None:
-    nowhere = np.full((4, 4), np.nan)
-    T = np.stack([nowhere if view is None else view.T_cam_obj for view in scene.views])
+def _write(file: Path, key: str, vertices: NDArray[np.float64], T_cam_obj: NDArray[np.float64]) -> None:
     data = io.BytesIO()
-    np.savez_compressed(data, key=np.array(key), vertices=scene.vertices, T_cam_obj=T)
+    np.savez_compressed(data, key=np.array(key), vertices=vertices, T_cam_obj=T_cam_obj)
     try:
         write_atomic(file, data.getvalue())
     except OutputError:

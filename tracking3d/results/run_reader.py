@@ -40,6 +40,8 @@ _KINDS: dict[str, Any] = {
     "timings": dict,
     "skipped": list,
     "notes": list,
+    "unit": dict | None,
+    "scaling": dict | None,
 }
 
 _RUN = argument("the folder that `record` wrote", "the --out folder of a `tracking3d run`")
@@ -102,6 +104,12 @@ class RunReader:
                 f"{self.folder / layout.FRAMES} is damaged: frame {record.index} names no camera ({fault}); restore it."
             )
         return camera
+
+    @property
+    def unit(self) -> str:
+        """The unit of lengths: ``arbitrary``, or ``metre`` if the object's size was given."""
+        name = (self.description.get("unit") or {}).get("name")
+        return layout.METRE if name == layout.METRE else layout.ARBITRARY
 
     @property
     def refinement_stages(self) -> StageTimes | None:

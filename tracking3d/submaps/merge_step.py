@@ -22,6 +22,7 @@ from tracking3d.reconstruction.final_shape import make_final_shape
 from tracking3d.results.description import RunHeader
 from tracking3d.results.run_notes import note_in_run
 from tracking3d.results.run_reader import RunReader
+from tracking3d.results.run_unit import apply_object_size
 from tracking3d.results.run_writer import RunWriter
 from tracking3d.submaps.alignment import DisagreementError
 from tracking3d.submaps.job import Tell
@@ -161,6 +162,7 @@ def end(tell: Tell, ending: Ending) -> None:
             run_passes(opened.source, opened.frames, [recording], tell)
     if recording is not None:
         make_final_shape(video.folder, config, opened.source)
+    apply_object_size(video.folder, config.object)
     remove_parts(video.folder)
 
 

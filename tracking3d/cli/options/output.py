@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from tracking3d.cli.options.object_size import ObjectSize
 from tracking3d.cli.options.panels import OUTPUT
 from tracking3d.errors import InputError
 
@@ -59,6 +60,7 @@ class OutputOptions:
     out: RunFolder = None
     overwrite: Overwrite = False
     resume: Resume = False
+    object_size: ObjectSize = None
     report: Report = True
     view: View = False
     host: Host = None

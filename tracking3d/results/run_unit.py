@@ -1,0 +1,232 @@
+"""The unit of a run: arbitrary, or metres if the length of the object's longest side is given.
+
+A run is estimated in a unit of its own. Once it is finished, all lengths in its folder are scaled together. In
+``frames.jsonl`` scaled lines follow the lines in the run's own unit, which stay: checkpoints for corrections refer to
+them by their place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from tracking3d.config.models import ObjectConfig
+from tracking3d.config.object_size import check_object_size
+from tracking3d.errors import InputError, argument
+from tracking3d.estimation.estimate import ObjectModel
+from tracking3d.results import layout
+from tracking3d.results.files import write_atomic
+from tracking3d.results.layout import METRE
+from tracking3d.results.mesh_export import export_mesh, load_model
+from tracking3d.results.point_tracking import read_landmarks, write_landmarks
+from tracking3d.results.records import FrameRecord, latest
+from tracking3d.results.run_notes import note_in_run
+from tracking3d.results.run_reader import RunReader, read_records
+
+_HARDLY_SEEN = 0.1
+"""Minimum share of seen faces for which the object's length can be computed from them."""
+_SIZE = argument("object_size=", "--object-size")
+
+
+@dataclass(frozen=True)
+class Scales:
+    """What ``run.json`` says of the unit of a run in metres.
+
+    Attributes:
+        object_size: Metres of the object's longest side.
+        scale: Metres per unit that the run was estimated in, of the final estimates and mesh.
+        causal_scale: The same of the causal ones, whose mesh is another one.
+        own_lines: Bytes of ``frames.jsonl`` in the run's own unit.
+    """
+
+    object_size: float
+    scale: float
+    causal_scale: float
+    own_lines: int
+
+
+def metres_per_unit(model: ObjectModel, object_size: float) -> float:
+    """The scale that gives the object's longest visible side a length.
+
+    Args:
+        model: The mesh.
+        object_size: Metres of that side.
+
+    Raises:
+        InputError: The mesh has no extent, or the length is none.
+    """
+    check_object_size(object_size)
+    return object_size / visible_side(model)
+
+
+def scale_pose(T_cam_obj: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
+    """A pose ``(4, 4)`` in another unit."""
+    scaled = T_cam_obj.copy()
+    scaled[:3, 3] *= scale
+    return scaled
+
+
+def scale_model(model: ObjectModel, scale: float) -> ObjectModel:
+    """A mesh in another unit."""
+    return model if scale == 1 else replace(model, vertices=model.vertices * scale)
+
+
+def apply_object_size(folder: Path, config: ObjectConfig) -> None:
+    """Put a finished run into metres if its configuration asks for it, and if that was not done before.
+
+    A run of a known object is in metres if the run that the object is from is.
+
+    Args:
+        folder: The run folder.
+        config: Settings of the object.
+
+    Raises:
+        InputError: The run has no mesh to measure.
+        OutputError: A file cannot be written.
+    """
+    run = RunReader(folder)
+    done = run.unit == METRE and not run.description.get("scaling")
+    if run.state != "finished" or done:
+        return
+    if config.size is not None:
+        scale_run(folder, config.size)
+    elif (
+        config.model is not None
+        and Path(config.model).is_dir()
+        and RunReader(Path(config.model)).unit == METRE
+    ):
+        size = _scales(RunReader(Path(config.model))).object_size
+        _scale_by(folder, replace(_scales(run), object_size=size), {run.mesh_folder: 1.0})
+
+
+def scale_run(folder: Path, object_size: float) -> None:
+    """Put all lengths of a finished run into metres: poses, meshes and landmarks.
+
+    If that is interrupted, call it again.
+
+    Args:
+        folder: The run folder.
+        object_size: Metres of the object's longest side: of that of the smallest box around what the video has shown.
+
+    Raises:
+        InputError: The run is not finished, or has no mesh to measure.
+        OutputError: A file cannot be written.
+    """
+    run = RunReader(folder)
+    if run.state != "finished":
+        raise InputError(f"{run.not_finished} Its unit cannot be changed before it is finished; resume it.")
+    if run.description.get("scaling"):  # which was interrupted
+        _scale_files(folder, run.description["scaling"])
+    run, causal = RunReader(folder), RunReader(folder, refined=False)
+    before = _scales(run)
+    factor = metres_per_unit(load_model(run.mesh_folder), object_size)
+    causal_factor = metres_per_unit(load_model(causal.mesh_folder), object_size)
+    now = Scales(object_size, before.scale * factor, before.causal_scale * causal_factor, before.own_lines)
+    factors = {
+        run.mesh_folder / layout.ONLINE: factor,
+        causal.mesh_folder: causal_factor,
+        run.mesh_folder: factor,
+    }
+    _scale_by(folder, now, factors)
+
+
+def _scale_by(folder: Path, now: Scales, factors: Mapping[Path, float]) -> None:
+    """Note what the scaling comes to, so that it can be completed if it is interrupted, and scale."""
+    extents = {
+        place.relative_to(folder).as_posix(): by * _extent(load_model(place))
+        for place, by in factors.items()
+        if (place / layout.FEATURES).is_file()
+    }
+    scaling = {"to": asdict(now), "extents": extents}
+    note_in_run(folder, {"scaling": scaling})
+    _scale_files(folder, scaling)
+
+
+def _scale_files(folder: Path, scaling: Mapping[str, Any]) -> None:
+    """Write every file in the new unit; what was written before an interruption stays as it is."""
+    now = Scales(**scaling["to"])
+    landmarks = {
+        refined: found
+        for refined in (True, False)
+        if (found := read_landmarks(RunReader(folder, refined))) is not None
+    }
+    before = {refined: _extent(load_model(RunReader(folder, refined).mesh_folder)) for refined in landmarks}
+    _write_lines(folder, now)
+    for place, extent in scaling["extents"].items():
+        model = load_model(folder / place)
+        export_mesh(folder / place, scale_model(model, extent / _extent(model)), METRE)
+    for refined, (vertices, T_cam_obj) in landmarks.items():
+        run = RunReader(folder, refined)
+        by = _extent(load_model(run.mesh_folder)) / before[refined]
+        poses = np.stack([scale_pose(T, by) for T in T_cam_obj])
+        write_landmarks(run, vertices * by, poses)
+    note_in_run(folder, {"unit": {"name": METRE, **asdict(now)}, "scaling": {}})
+
+
+def _write_lines(folder: Path, now: Scales) -> None:
+    file = folder / layout.FRAMES
+    own = list(read_records(file, now.own_lines))
+    lines = b"".join(record.to_json().encode() + b"\n" for record in _scaled(own, now))
+    write_atomic(file, file.read_bytes()[: now.own_lines] + lines)
+
+
+def _scaled(own: list[FrameRecord], now: Scales) -> Iterator[FrameRecord]:
+    """The estimates that count, in metres: the causal ones, then those of the final refinement."""
+    for record in latest(own, refined=False):
+        yield replace(record, T_cam_obj=scale_pose(record.T_cam_obj, now.causal_scale))
+    for record in latest(own):
+        if record.refined:
+            yield replace(record, T_cam_obj=scale_pose(record.T_cam_obj, now.scale))
+
+
+def _scales(run: RunReader) -> Scales:
+    unit = dict(run.description.get("unit") or {})
+    if unit.pop("name", None) != METRE:
+        return Scales(0.0, 1.0, 1.0, (run.folder / layout.FRAMES).stat().st_size)
+    try:
+        return Scales(**unit)
+    except TypeError as error:
+        raise InputError(
+            f"{run.folder / layout.RUN} is damaged: unit is {unit!r:.40}; restore it."
+        ) from error
+
+
+def _extent(model: ObjectModel) -> float:
+    return float(np.ptp(model.vertices, axis=0).max())
+
+
+def visible_side(model: ObjectModel) -> float:
+    """The longest side of what the video has shown of an object; what it has not is a guess, and often too deep.
+
+    For an object that was hardly seen it is that of the whole mesh.
+
+    Raises:
+        InputError: If that has no extent.
+    """
+    height, width = model.texture_weight.shape
+    columns = (model.face_uvs[..., 0] * width).astype(int) % width
+    rows = (model.face_uvs[..., 1] * height).astype(int).clip(0, height - 1)
+    seen = (model.texture_weight[rows, columns] > 0).all(axis=1)
+    hardly = seen.mean() < _HARDLY_SEEN
+    return longest_side(model.vertices if hardly else model.vertices[np.unique(model.faces[seen])])
+
+
+def longest_side(vertices: NDArray[np.float64]) -> float:
+    """The longest side of the smallest box, turned as it likes, around ``(V, 3)``: what a ruler would give.
+
+    Raises:
+        InputError: If the vertices have no extent.
+    """
+    try:
+        longest = float(max(trimesh.bounds.oriented_bounds(vertices)[1]))
+    except Exception:  # a flat or otherwise degenerate hull
+        longest = float(np.ptp(vertices, axis=0).max())
+    if not 0 < longest < np.inf:
+        raise InputError(f"The mesh of the run has no size; leave out {_SIZE}.")
+    return longest
