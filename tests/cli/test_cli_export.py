@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from tracking3d.export.exporting import Export
 from tracking3d.export.formats import FORMATS
 
 BOX = ("--box", "20,10,20,20")
@@ -58,6 +59,26 @@ def test_all_objects_of_a_run_are_exported_each_into_its_folder(call, refused, c
     told = call("export", "both", "--to", "stl", "--json", "--overwrite").stdout.splitlines()
     assert [json.loads(line)["path"] for line in told] == [str(file) for file in files]
     assert "both holds 2 objects" in refused("export", "both", "--to", "stl", "--out", "a.stl")
+
+
+def test_the_start_of_a_video_is_a_number_or_a_date(call, refused, finished, monkeypatch):
+    asked = []
+
+    def export_run(*_, options, **__):
+        asked.append(options.start_time)
+        return Export(Path("bag"), None, 0, ())
+
+    monkeypatch.setattr("tracking3d.export.exporting.export_run", export_run)
+    command = ("export", finished, "--to", "ros-bag", "--start-time")
+    for text in ("100.5", "1970-01-01T00:01:40.5Z", "1970-01-01T00:01:40.5", "1970-01-01T01:01:40.5+01:00"):
+        assert call(*command, text).exit_code == 0
+    assert asked == [100.5] * 4
+    assert "--start-time 'noon' is no time" in refused(*command, "noon")
+
+
+@pytest.mark.parametrize("text", ["0", "-5", "nan", "1e10"])
+def test_stamps_that_ros_cannot_hold_are_refused(refused, finished, text):
+    assert "the end of ROS's clock" in refused("export", finished, "--to", "mcap", "--start-time", text)
 
 
 def test_pixels_are_followed(call, finished):

@@ -207,6 +207,8 @@ def test_extras_are_declared():
         ("tum", {"cut_out": True}, "does not use cut_out="),
         ("vot", {"object_size": 1.0}, "does not use object_size="),
         ("tum", {"fps": 0.0}, "fps= is 0"),
+        ("tum", {"start_time": 5.0}, "does not use start_time="),
+        ("csv", {"compressed_images": True}, "does not use compressed_images="),
         ("tum", {"object_size": float("nan")}, "object_size= is nan"),
         ("tum", {"of": "hand"}, "Poses cannot be of 'hand'"),
         ("tum", {"answers": "best"}, "Estimates cannot be 'best'"),

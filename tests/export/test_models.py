@@ -60,10 +60,8 @@ def test_a_glb_says_whether_its_unit_is_the_metre(export, run, to):
 
 def test_a_usdz_says_whether_its_unit_is_the_metre(export, run):
     pxr = pytest.importorskip("pxr.Usd")
-    layers = [
-        pxr.Stage.Open(str(export(run, "usdz", f"{s}.usdz", object_size=s))).GetRootLayer()
-        for s in (None, 0.25)
-    ]
+    stages = [pxr.Stage.Open(str(export(run, "usdz", f"{s}.usdz", object_size=s))) for s in (None, 0.25)]
+    layers = [stage.GetRootLayer() for stage in stages]  # which live as long as their stages
     assert [layer.customLayerData["tracking3d:unit"] for layer in layers] == ["unknown", "metre"]
     assert "not in metres" in layers[0].comment and layers[1].comment == "Lengths are in metres."
 

@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import shutil
 import subprocess
 import sys
+from datetime import UTC, datetime
 from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
 
+import av
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image as Pillow
 from scipy.spatial.transform import Rotation
 
+from tracking3d.export.exported_run import ExportedRun
+from tracking3d.export.options import ExportOptions
+from tracking3d.export.ros_bag import START, start_time
 from tracking3d.results.correspondences import project_object_points
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.run_reader import RunReader
@@ -177,7 +186,7 @@ def test_rosbags_reads_poses_and_cameras(export, shifted_run, silhouettes):
     with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
         for connection, stamp, raw in bag.messages():
             message = bag.deserialize(raw, connection.msgtype)
-            index = round(stamp * 25 / 1e9)
+            index = round((stamp - 1e9) * 25 / 1e9)  # a video that does not say when it was recorded
             if connection.topic == "/tf":
                 (one,) = message.transforms
                 assert one.child_frame_id == "tracking3d_object"
@@ -194,6 +203,78 @@ def test_rosbags_reads_poses_and_cameras(export, shifted_run, silhouettes):
         )
         silhouettes(shifted_run).agree(index, lenses[index].k.reshape(3, 3), T, mesh.vertices, mesh.faces)
         assert transforms[index].translation.z == place.z
+
+
+def recorded(folder: Path) -> dict[str, list[tuple[int, Any]]]:
+    """The messages of a bag with their stamps, by topic."""
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    found: dict[str, list[tuple[int, Any]]] = {}
+    with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
+        for connection, stamp, raw in bag.messages():
+            found.setdefault(connection.topic, []).append((stamp, bag.deserialize(raw, connection.msgtype)))
+    return found
+
+
+def test_stamps_begin_at_a_positive_time_that_may_be_chosen(export, run):
+    pytest.importorskip("rosbags")
+    for name, options, start in [
+        ("plain", {}, 1.0),
+        ("chosen", {"start_time": 1_700_000_000.25}, 1_700_000_000.25),
+    ]:
+        stamped = recorded(export(run, "ros-bag", name, **options))["/tracking3d/pose"]
+        first, message = stamped[0]
+        assert first == round(start * 1e9)
+        assert message.header.stamp.sec + message.header.stamp.nanosec / 1e9 == pytest.approx(start)
+        assert stamped[1][0] - first == pytest.approx(4e7, abs=1)  # 25 frames a second
+
+
+def test_stamps_begin_when_the_video_was_recorded(run, tmp_path):
+    container = av.open(str(tmp_path / "clip.mp4"), "w")
+    container.metadata["creation_time"] = "2026-11-25T12:00:00Z"
+    stream = container.add_stream("libx264", rate=10)
+    stream.width, stream.height = 64, 48
+    for packet in [*stream.encode(av.VideoFrame(64, 48, "yuv420p")), *stream.encode()]:
+        container.mux(packet)
+    container.close()
+    moment = datetime(2026, 11, 25, 12, tzinfo=UTC).timestamp()
+    reader = RunReader(run)
+    assert start_time(ExportedRun(reader, ExportOptions(source=str(tmp_path / "clip.mp4")))) == moment
+    assert start_time(ExportedRun(reader, ExportOptions(source=str(tmp_path / "absent.mp4")))) == START
+    assert start_time(ExportedRun(reader, ExportOptions(start_time=5.0))) == 5.0
+
+
+def test_images_are_included_if_asked_for(export, run):
+    pytest.importorskip("rosbags")
+    assert "/tracking3d/image/compressed" not in recorded(export(run, "ros-bag", "without"))
+    messages = recorded(export(run, "ros-bag", "with", compressed_images=True))
+    images = messages["/tracking3d/image/compressed"]
+    assert [stamp for stamp, _ in images] == [stamp for stamp, _ in messages["/tracking3d/camera_info"]]
+    _, one = images[0]
+    assert one.format == "jpeg" and one.header.frame_id == "tracking3d_camera_optical"
+    seen = np.asarray(Pillow.open(io.BytesIO(one.data.tobytes())).convert("RGB"), float)
+    given = np.asarray(Pillow.open(RunReader(run).description["source"] + "/000.png"), float)
+    assert np.corrcoef(seen.ravel(), given.ravel())[0, 1] > 0.6  # of noise, which JPEG blurs
+
+
+def test_mcap_holds_the_messages_of_the_bag_and_their_definitions(export, run):
+    pytest.importorskip("rosbags")
+    reader = pytest.importorskip("mcap.reader")
+    decoder = pytest.importorskip("mcap_ros2.decoder")
+    bag = recorded(export(run, "ros-bag", "bag", compressed_images=True))
+    file = export(run, "mcap", "run.mcap", compressed_images=True)
+    assert file.is_file()
+    found: dict[str, list[int]] = {}
+    with file.open("rb") as stream:
+        for _, channel, message, decoded in reader.make_reader(
+            stream, decoder_factories=[decoder.DecoderFactory()]
+        ).iter_decoded_messages():
+            found.setdefault(channel.topic, []).append(message.log_time)
+            if channel.topic == "/tracking3d/pose":
+                index = found[channel.topic].index(message.log_time)
+                assert decoded.pose.position.z == bag[channel.topic][index][1].pose.position.z
+    assert found == {topic: [stamp for stamp, _ in messages] for topic, messages in bag.items()}
 
 
 READ_RECORDING = """

@@ -62,6 +62,12 @@ class ContentOptions:
             rich_help_panel=_CONTENT,
         ),
     ] = False
+    compressed_images: Annotated[
+        bool,
+        typer.Option(
+            "--compressed-images", help="Include the frames of the video as JPEG.", rich_help_panel=_CONTENT
+        ),
+    ] = False
     xy: Annotated[
         list[str] | None,
         typer.Option(
@@ -84,6 +90,14 @@ class SourceOptions:
     fps: Annotated[
         float | None,
         typer.Option(metavar="NUMBER", help="Frame rate of the video.", rich_help_panel=VIDEO),
+    ] = None
+    start_time: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SECONDS|DATE",
+            help="Start of the video, in seconds from 1970 or as ISO 8601; default the time at which it was recorded.",
+            rich_help_panel=VIDEO,
+        ),
     ] = None
 
 
@@ -158,6 +172,8 @@ def _exporter_options(content: ContentOptions, video: SourceOptions) -> ExportOp
         object_size=content.object_size,
         fps=video.fps,
         source=video.source,
+        start_time=None if video.start_time is None else _seconds(video.start_time),
+        compressed_images=content.compressed_images,
         of=content.of,  # type: ignore[arg-type]
         cut_out=content.cut_out,
         images=content.images,
@@ -165,6 +181,22 @@ def _exporter_options(content: ContentOptions, video: SourceOptions) -> ExportOp
         frame=content.frame,
         xy=pixels,  # type: ignore[arg-type]
     )
+
+
+def _seconds(text: str) -> float:
+    """Seconds from 1970, given as such or as a date."""
+    from tracking3d.video.recording_time import seconds_since_1970
+
+    try:
+        return float(text)
+    except ValueError:
+        pass
+    try:
+        return seconds_since_1970(text)
+    except ValueError as error:
+        raise InputError(
+            f"--start-time '{text}' is no time; write seconds from 1970, or a date such as 2026-11-25T12:00:00Z."
+        ) from error
 
 
 def _print_formats(as_json: bool) -> None:

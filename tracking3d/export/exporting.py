@@ -23,6 +23,8 @@ FOLDER = "export"
 LABEL = "export.json"
 """Name of a file in every exported folder that describes the export and allows replacing it."""
 _FORMAT = "tracking3d-export"
+_END_OF_TIME = 2.0**31
+"""Seconds from 1970 that a stamp of ROS can hold."""
 _OUT = argument("out=", "--out")
 _TO = argument("to=", "--to")
 _NAMED = {
@@ -33,6 +35,8 @@ _NAMED = {
     "cut_out": argument("cut_out=", "--cut-out"),
     "undistorted": argument("undistorted=", "--undistorted"),
     "images": argument("images=", "--no-images"),
+    "start_time": argument("start_time=", "--start-time"),
+    "compressed_images": argument("compressed_images=", "--compressed-images"),
     "frame": argument("frame=", "--frame"),
     "xy": argument("xy=", "--xy"),
 }
@@ -126,6 +130,11 @@ def _check(options: ExportOptions) -> None:
         value = getattr(options, name)
         if value is not None and not 0 < value < float("inf"):
             raise InputError(f"{_NAMED[name]} is {value:g}; give a number above 0.")
+    if options.start_time is not None and not 0 < options.start_time < _END_OF_TIME:
+        raise InputError(
+            f"{_NAMED['start_time']} is {options.start_time:g}; give seconds from 1970 above 0 and before 2038, "
+            "the end of ROS's clock."
+        )
     if options.answers not in ("final", "causal"):
         raise InputError(f"Estimates cannot be '{options.answers}'; choose final or causal.")
     if options.of not in ("object", "camera"):

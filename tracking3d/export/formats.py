@@ -19,7 +19,7 @@ from tracking3d.export.point_tracks import write_points_csv, write_tapvid
 from tracking3d.export.pose_table import write_csv, write_parquet
 from tracking3d.export.probability_pictures import write_probabilities, write_probabilities_16
 from tracking3d.export.rerun_recording import write_rerun
-from tracking3d.export.ros_bag import write_ros_bag
+from tracking3d.export.ros_bag import write_mcap, write_ros_bag
 from tracking3d.export.tum import write_tum
 from tracking3d.export.usdz import write_usdz
 from tracking3d.export.vot_masks import write_vot
@@ -27,6 +27,7 @@ from tracking3d.export.vot_masks import write_vot
 _LENGTHS = frozenset({"object_size"})
 _TIMED = _LENGTHS | {"fps"}
 _PICTURES = frozenset({"source"})
+_RECORDING = _TIMED | _PICTURES | {"start_time", "compressed_images"}
 _TRAINING = _LENGTHS | _PICTURES | {"cut_out", "images"}
 _POINTS = frozenset({"frame", "xy"})
 _MASKS = frozenset({"undistorted"})
@@ -65,9 +66,19 @@ _ALL = (
     Exporter(
         "ros-bag",
         "poses",
-        "ROS 2 bag: poses, camera, TF",
+        "ROS 2 bag: poses, camera, TF, images",
         write_ros_bag,
-        options=_TIMED,
+        options=_RECORDING,
+        modules=("rosbags",),
+        extra="ros",
+    ),
+    Exporter(
+        "mcap",
+        "poses",
+        "the same as one MCAP file",
+        write_mcap,
+        ".mcap",
+        options=_RECORDING,
         modules=("rosbags",),
         extra="ros",
     ),
