@@ -24,10 +24,10 @@ class ExportOptions:
         undistorted: Masks and pictures as a camera without the distortion of the lens sees them, instead of as they
             were taken.
         frame: The frame that ``xy`` is in; None takes the first one with a pose.
+        xy: Pixels on the object whose surface points are followed; empty for a grid over the object.
         start_time: Seconds from 1970 to the start of the video, for stamps of clocks; None takes the time at which the
             video was recorded, if it says, else one second.
         compressed_images: Whether the frames are written as JPEG into a recording that can do without.
-        xy: Pixels on the object whose surface points are followed; empty for a grid over the object.
     """
 
     answers: Answers = "final"
@@ -38,7 +38,7 @@ class ExportOptions:
     cut_out: bool = False
     images: bool = True
     undistorted: bool = False
-    start_time: float | None = None
-    compressed_images: bool = False
     frame: int | None = None
     xy: tuple[tuple[float, float], ...] = ()
+    start_time: float | None = None
+    compressed_images: bool = False
