@@ -31,7 +31,8 @@ class Exporter:
         write: Writes a run to a path that does not exist yet: a file if there is a ``suffix``, else a folder.
         suffix: Suffix of the file; empty if a folder is written.
         file_name: Name of the file without its suffix in the folder of exports: ``{run}`` stands for the name of the
-            run, ``{letters}`` for the letters and digits of the run folder's name; empty for the name of the run. A folder has the format's name.
+            run, ``{letters}`` for the letters and digits of that name; the name of the run if this is empty. A
+            folder has the format's name.
         options: Names of those `ExportOptions` that it has a use for, besides `ANYWHERE`.
         modules: What has to be importable, besides what tracking3d always needs.
         extra: What brings them: the name of an extra of this package.
@@ -51,7 +52,9 @@ class Exporter:
         """The name of the file or folder in the folder of exports of a run."""
         if not self.suffix:
             return self.name
-        return (self.file_name or "{run}").format(run=run.title, letters=run.name.replace("-", "")) + self.suffix
+        return (self.file_name or "{run}").format(
+            run=run.title, letters=run.name.replace("-", "")
+        ) + self.suffix
 
     @property
     def is_available(self) -> bool:
