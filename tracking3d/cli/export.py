@@ -126,9 +126,13 @@ def export(
         return
     if run is None or to is None:
         raise InputError("export needs RUN and --to FORMAT; --list shows the formats.")
+    from tracking3d.cli.progress import load_with_progress, show_progress
+
+    load_with_progress("tracking3d.export.exporting", quiet)
     from tracking3d.export.exporting import export_run
 
-    done = export_run(run, to, out, options=_exporter_options(content, video), overwrite=overwrite)
+    with show_progress(quiet):
+        done = export_run(run, to, out, options=_exporter_options(content, video), overwrite=overwrite)
     if done.not_finished:
         typer.echo(done.not_finished, err=True)
     if as_json:

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from tracking3d.cli.options import Debug, Run, Video
+from tracking3d.cli.options import Debug, Quiet, Run, Video
 from tracking3d.errors import InputError
 
 Largest = Annotated[int, typer.Option(min=64, max=8192, help="Maximum side of the texture image, in texels.")]
@@ -32,20 +32,33 @@ def model(
     source: Video = None,
     views: Annotated[int, typer.Option(min=1, max=500, help="Frames that the texture is taken from.")] = 24,
     largest: Largest = 2048,
+    quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
     """Re-texture the mesh of a run from its video, and with --quality fine reconstruct its shape too.
 
     `tracking3d run` does this at its end; its option --model chooses how.
     """
-    from tracking3d.reconstruction.rebuild import rebuild_shape, retexture_run
+    from tracking3d.cli.plans import plan_shape, plan_texture
+    from tracking3d.cli.progress import load_with_progress, show_progress
 
+    load_with_progress("tracking3d.reconstruction.rebuild", quiet)
+    from tracking3d.reconstruction.rebuild import rebuild_shape, retexture_run
+    from tracking3d.results.run_reader import RunReader
+
+    frames, outcome = len(RunReader(run).frames), ""
     if quality is ModelQuality.FINE:
-        shaped = rebuild_shape(run, source, views, largest)
+        with show_progress(quiet, plan_shape(frames)):
+            shaped = rebuild_shape(run, source, views, largest)
         made, taken = shaped.model, shaped.views
-        typer.echo(f"{run}: {len(made.faces)} faces; {shaped.sentence}" if shaped.new else shaped.sentence)
+        outcome = f"{run}: {len(made.faces)} faces; {shaped.sentence}" if shaped.new else shaped.sentence
     else:
-        made, taken = retexture_run(run, source, views, largest)
+        with show_progress(quiet, plan_texture(frames)):
+            made, taken = retexture_run(run, source, views, largest)
+    if quiet:
+        return
+    if outcome:
+        typer.echo(outcome)
     size = len(made.texture)
     typer.echo(f"{run}: texture of {size} x {size} texels from {taken} frames")
 

@@ -20,6 +20,7 @@ from tracking3d.geometry.camera import Camera
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
+from tracking3d.runtime.progress import report_each
 from tracking3d.video.selection import parse_selection
 
 FRAMES_PER_SECOND = 30.0
@@ -221,7 +222,8 @@ class ExportedRun:
     def _read_pictures(self) -> Iterator[Frame]:
         from tracking3d.export.pictures import read_selected_images
 
-        return read_selected_images(self.reader, self.options.source, self.records)
+        images = read_selected_images(self.reader, self.options.source, self.records)
+        return report_each("exporting frames", images, len(self.records))
 
     def _scale(self, T_cam_obj: NDArray[np.float64]) -> NDArray[np.float64]:
         scaled = T_cam_obj.copy()

@@ -13,7 +13,7 @@ what they did.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sized
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -72,7 +72,7 @@ def report_each(name: str, items: Iterable[T], total: int | None = None) -> Iter
         items: What the loop goes through.
         total: How many there are, if ``items`` has no length.
     """
-    if total is None and hasattr(items, "__len__"):
+    if total is None and isinstance(items, Sized):
         total = len(items)
     report_progress(name, 0, total)
     for done, item in enumerate(items, start=1):
