@@ -21,7 +21,7 @@ import numba
 import pytest
 
 import tracking3d
-from tracking3d.rendering.kernels.compilation import Kernel, _announce, kernel
+from tracking3d.rendering.kernels.compilation import Kernel, _announced, kernel
 
 RENDER = """
 import json, logging
@@ -120,7 +120,7 @@ def twice(value):
 
 def small_kernel(file: Path) -> Kernel:
     """The kernel as a process that has just started finds it."""
-    _announce.cache_clear()
+    _announced.clear()
     spec = importlib.util.spec_from_file_location("small_kernel", file)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -251,6 +251,31 @@ def test_four_processes_that_start_at_once_agree(before, processes, cache):
     assert all(processes.end(process).answer == EXPECTED for process in started)
     if before != "damaged code":
         assert processes.run() == Said(EXPECTED, "")
+
+
+TOGETHER = """
+import sys, time
+from pathlib import Path
+import only_kernel
+Path(sys.argv[1]).touch()
+while not all(Path(other).exists() for other in sys.argv[1:]):
+    time.sleep(0.001)
+assert only_kernel.twice(1.5) == 3
+"""
+
+
+def test_of_two_processes_that_need_a_kernel_at_once_one_compiles_it(tmp_path, monkeypatch):
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *sys.path]))
+    (tmp_path / "only_kernel.py").write_text(SMALL)
+    ready = [str(tmp_path / "ready_a"), str(tmp_path / "ready_b")]
+    started = [
+        subprocess.Popen([sys.executable, "-c", TOGETHER, *order], stderr=subprocess.PIPE, text=True)
+        for order in (ready, ready[::-1])
+    ]
+    logs = [process.communicate(timeout=120)[1] for process in started]
+    assert [process.returncode for process in started] == [0, 0], logs
+    assert sum(log.count("Compiling kernels") for log in logs) == 1
 
 
 @pytest.mark.slow

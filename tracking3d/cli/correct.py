@@ -37,7 +37,7 @@ def correct(
     from tracking3d.cli.report import report_at_end
     from tracking3d.cli.summary import print_summary
 
-    load_with_progress("tracking3d.pipeline.correct", quiet)
+    load_with_progress("tracking3d.pipeline.correct", quiet, kernels=True)
     from tracking3d.pipeline.correct import correct_run, object_folders_of
     from tracking3d.prompts.corrections import parse_correction
     from tracking3d.results.layout import CORRECTING, RUN, has_state

@@ -34,7 +34,7 @@ def demo(
     from tracking3d.cli.summary import print_summary
     from tracking3d.cli.tables import print_figures
 
-    load_with_progress("tracking3d.pipeline.record", quiet)
+    load_with_progress("tracking3d.pipeline.record", quiet, kernels=True)
     from tracking3d.datasets.clip import read_truth
     from tracking3d.evaluation.score import score_run
     from tracking3d.pipeline.open_tracking import request_tracking

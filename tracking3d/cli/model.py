@@ -42,7 +42,7 @@ def model(
     from tracking3d.cli.plans import plan_shape, plan_texture
     from tracking3d.cli.progress import load_with_progress, show_progress
 
-    load_with_progress("tracking3d.reconstruction.rebuild", quiet)
+    load_with_progress("tracking3d.reconstruction.rebuild", quiet, kernels=True)
     from tracking3d.reconstruction.rebuild import rebuild_shape, retexture_run
     from tracking3d.results.run_reader import RunReader
 

@@ -59,7 +59,7 @@ def pick(
     """
     from tracking3d.cli.progress import load_with_progress
 
-    load_with_progress("tracking3d.pipeline.record", quiet)
+    load_with_progress("tracking3d.pipeline.record", quiet, kernels=True)
     from tracking3d.cli.tracking import RunDisplay, RunRequest, default_folder, track
     from tracking3d.pipeline.record import RecordOptions
     from tracking3d.viewer.opening import check_viser

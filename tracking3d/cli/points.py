@@ -125,7 +125,7 @@ def points(
     from tracking3d.cli.plans import plan_points
     from tracking3d.cli.progress import load_with_progress, show_progress
 
-    load_with_progress("tracking3d.results.point_tracking", quiet)
+    load_with_progress("tracking3d.results.point_tracking", quiet, kernels=True)
     from tracking3d.results.correspondences import grid_on_object, track_points
     from tracking3d.results.run_reader import RunReader
 

@@ -158,15 +158,18 @@ def show_progress(quiet: bool, plan: Sequence[PlannedStage] = ()) -> Iterator[Pr
         yield display
 
 
-def load_with_progress(module: str, quiet: bool) -> None:
+def load_with_progress(module: str, quiet: bool, kernels: bool = False) -> None:
     """Import a module that takes seconds to load, so that imports of it afterwards take no time.
 
     Args:
         module: Its full name.
         quiet: Show nothing meanwhile.
+        kernels: Whether compiled kernels will be needed: those that are missing are compiled in the background.
     """
     with show_progress(quiet):
         import_module(module)
+        if kernels:
+            import_module("tracking3d.speed.kernels_ahead").compile_in_background(quiet)
 
 
 def _describe(frame: FrameRecord | SkippedFrame) -> str:

@@ -30,7 +30,7 @@ def report(
     from tracking3d.cli.plans import plan_report
     from tracking3d.cli.progress import load_with_progress, show_progress
 
-    load_with_progress("tracking3d.report.several", quiet)
+    load_with_progress("tracking3d.report.several", quiet, kernels=True)
     from tracking3d.report.several import write_reports
     from tracking3d.results.layout import runs_in
     from tracking3d.results.run_reader import RunReader

@@ -50,7 +50,7 @@ def run(
 
     output.check()
     performance.check()
-    load_with_progress("tracking3d.pipeline.record", quiet)
+    load_with_progress("tracking3d.pipeline.record", quiet, kernels=True)
     from tracking3d.pipeline.record import RecordOptions
     from tracking3d.pipeline.validation import needs_prompt
 

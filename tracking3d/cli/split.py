@@ -30,10 +30,8 @@ def track_in_parts(request: RunRequest, length: str, workers: int | None, displa
         InputError: Options do not go together.
     """
     from tracking3d.cli.plans import plan_run
-    from tracking3d.cli.progress import load_with_progress, show_progress
+    from tracking3d.cli.progress import show_progress
     from tracking3d.cli.report import report_at_end
-
-    load_with_progress("tracking3d.submaps.split_run", display.quiet)
     from tracking3d.submaps.split_run import record_in_parts
     from tracking3d.video import open_source
 

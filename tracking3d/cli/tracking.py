@@ -65,11 +65,9 @@ class RunDisplay:
 def track(request: RunRequest, display: RunDisplay) -> None:
     """Track, show the progress, and print a summary."""
     from tracking3d.cli.plans import plan_run
-    from tracking3d.cli.progress import load_with_progress, show_progress
+    from tracking3d.cli.progress import show_progress
     from tracking3d.cli.report import report_at_end
     from tracking3d.cli.view import watch
-
-    load_with_progress("tracking3d.pipeline.record", display.quiet)
     from tracking3d.pipeline.open_tracking import request_tracking
     from tracking3d.pipeline.record import record_tracking
     from tracking3d.results.layout import object_folders
