@@ -64,6 +64,11 @@ def _ended(folder: Path, function: Callable[..., None], *arguments: Any) -> Ende
     return Ended(process.exitcode, out.read_text(), err.read_text())
 
 
+def forked_in_terminal(terminal: str, *arguments: object) -> BaseProcess:
+    """The command line in a process of its own, not yet started, whose terminal is the device ``terminal``."""
+    return forked(_program_in_terminal, terminal, list(map(str, arguments)))
+
+
 def _call(function: Callable[..., None], arguments: tuple[Any, ...]) -> None:
     import cv2
     import torch
@@ -93,6 +98,15 @@ def _program(arguments: list[str], environment: dict[str, str]) -> None:
     sys.path[:0] = environment.get("PYTHONPATH", "").split(os.pathsep)
     sys.argv = ["tracking3d", *arguments]
     main()
+
+
+def _program_in_terminal(terminal: str, arguments: list[str]) -> None:
+    device = os.open(terminal, os.O_RDWR | os.O_NOCTTY)
+    for number in range(3):
+        os.dup2(device, number)
+    sys.stdin = open(0, closefd=False)  # noqa: SIM115
+    sys.stdout, sys.stderr = (open(number, "w", closefd=False) for number in (1, 2))  # noqa: SIM115
+    _program(arguments, {"TERM": "xterm-256color", "COLUMNS": "120", "LINES": "40"})
 
 
 def _script(script: str, arguments: list[str]) -> None:

@@ -24,8 +24,8 @@ from tracking3d.evaluation.score import Scores
 from tracking3d.results.run_reader import RunReader
 
 EXACT = {
-    "tracking3d": """Frame FrameEstimate ObjectModel PipelineConfig Prompt Session Status __version__ export_run
-        load_config track track_objects Tracking TrackingResult""",
+    "tracking3d": """Frame FrameEstimate ObjectModel PipelineConfig Prompt Session StageProgress Status __version__
+        export_run listen_to_progress load_config track track_objects Tracking TrackingResult""",
     "tracking3d.modules": """LaplacianLoss MeshRenderer OutlineLoss Silhouette SilhouetteLoss TextureLoss
         TexturedMesh RenderedViews camera_from_pinhole pinhole_of_camera pose_from_se3 quaternion_from_kornia
         quaternion_of_pose se3_from_matrix se3_of_pose""",

@@ -198,7 +198,7 @@ def test_segmentation_does_without_solvers_and_runs():
 def test_points_are_followed_by_surface_and_images_alone():
     for path in (PACKAGE / "points").rglob("*.py"):
         rooms = {name.split(".")[1] for name in imported_modules(path)}
-        assert rooms <= {"bundle_adjustment", "errors", "geometry", "points", "rendering"}, path
+        assert rooms <= {"bundle_adjustment", "errors", "geometry", "points", "rendering", "runtime"}, path
 
 
 def test_the_solvers_are_tenants_that_never_import_each_other():

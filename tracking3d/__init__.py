@@ -17,11 +17,13 @@ __all__ = [
     "PipelineConfig",
     "Prompt",
     "Session",
+    "StageProgress",
     "Status",
     "Tracking",
     "TrackingResult",
     "__version__",
     "export_run",
+    "listen_to_progress",
     "load_config",
     "track",
     "track_objects",
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
     from tracking3d.pipeline.result import TrackingResult
     from tracking3d.pipeline.track import Session, track, track_objects
     from tracking3d.pipeline.tracking import Tracking
+    from tracking3d.runtime.progress import StageProgress, listen_to_progress
 
 _HOME = {
     "Frame": "tracking3d.frames",
@@ -44,10 +47,12 @@ _HOME = {
     "PipelineConfig": "tracking3d.config.models",
     "Prompt": "tracking3d.frames",
     "Session": "tracking3d.pipeline.track",
+    "StageProgress": "tracking3d.runtime.progress",
     "Status": "tracking3d.estimation.estimate",
     "Tracking": "tracking3d.pipeline.tracking",
     "TrackingResult": "tracking3d.pipeline.result",
     "export_run": "tracking3d.export.exporting",
+    "listen_to_progress": "tracking3d.runtime.progress",
     "load_config": "tracking3d.config.loading",
     "track": "tracking3d.pipeline.track",
     "track_objects": "tracking3d.pipeline.track",

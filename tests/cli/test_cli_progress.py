@@ -1,35 +1,136 @@
-"""What a run shows where nobody watches a terminal: a line in the log every now and then."""
+"""What a command shows of its progress where nobody watches a terminal, and what it says of the remaining time."""
 
 from __future__ import annotations
 
+import time
+
+import pytest
+
 from tracking3d.cli import progress as module
-from tracking3d.cli.progress import progress
+from tracking3d.cli.plans import plan_run
+from tracking3d.cli.progress import show_progress
+from tracking3d.cli.remaining_time import PlannedStage, RemainingTime, estimate_in_words
+from tracking3d.config.loading import load_config
 from tracking3d.frames import SkippedFrame
+from tracking3d.runtime.progress import StageProgress, report_progress
 
 
-def told(monkeypatch, capsys, quiet: bool) -> list[str]:
-    """The lines printed of forty frames, three seconds each."""
-    clock = iter(range(0, 1000, 3))
-    now = [0.0]
-    monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
-    with progress(40, quiet) as listener:
-        for index in range(40):
-            now[0] = float(next(clock))
-            listener(SkippedFrame(index, "torn"))
-    return capsys.readouterr().err.splitlines()
+def wait_for_line(capsys, at_most: float = 20.0) -> str:
+    """What is printed next on the standard error, by whatever thread."""
+    end = time.monotonic() + at_most
+    while time.monotonic() < end:
+        if text := capsys.readouterr().err:
+            return text.splitlines()[0]
+        time.sleep(0.01)
+    raise AssertionError(f"nothing was printed in {at_most} s")
 
 
-def test_a_log_gets_a_line_every_now_and_then(monkeypatch, capsys):
-    lines = told(monkeypatch, capsys, quiet=False)
-    assert 5 < len(lines) < 15
-    assert lines[0] == "5 of 40: frame 4 skipped"
+def test_a_log_names_the_stage_its_count_and_the_latest_frame(monkeypatch, capsys):
+    monkeypatch.setattr(module, "_EVERY", 0.05)
+    with show_progress(quiet=False) as display:
+        display.show_frame(SkippedFrame(4, "torn"))
+        report_progress("tracking", 5, 40)
+        display.show_frame(SkippedFrame(4, "torn"))
+        while not (line := wait_for_line(capsys)).startswith("tracking"):
+            pass
+    assert line.startswith("tracking 5/40, frame 4 skipped, ")
+
+
+def test_a_log_goes_on_within_a_step_that_takes_long(monkeypatch, capsys):
+    monkeypatch.setattr(module, "_EVERY", 0.05)
+    with show_progress(quiet=False):
+        report_progress("report")
+        for _ in range(3):  # nothing is reported meanwhile
+            assert wait_for_line(capsys).startswith(("report, ", "starting, "))
 
 
 def test_quiet_is_quiet(monkeypatch, capsys):
-    assert told(monkeypatch, capsys, quiet=True) == []
-
-
-def test_a_short_run_prints_nothing(capsys):
-    with progress(None, False) as listener:
-        listener(SkippedFrame(0, "torn"))
+    monkeypatch.setattr(module, "_EVERY", 0.01)
+    with show_progress(quiet=True) as display:
+        report_progress("tracking", 5, 40)
+        display.show_frame(SkippedFrame(4, "torn"))
+        time.sleep(0.1)
     assert capsys.readouterr().err == ""
+
+
+def test_a_short_command_prints_nothing_in_a_log(capsys):
+    with show_progress(quiet=False):
+        report_progress("tracking", 5, 40)
+    assert capsys.readouterr().err == ""
+
+
+def after(
+    plan: list[PlannedStage], reports: list[tuple[float, str, int, int | None]], now: float
+) -> float | None:
+    """The remaining time that is estimated ``now``, after some reports at their times."""
+    remaining = RemainingTime(plan)
+    for at, *progress in reports:
+        remaining.take(StageProgress(*progress), at)
+    return remaining.seconds(now)
+
+
+PLAN = [PlannedStage("tracking", 40.0), PlannedStage("refining poses", 20.0), PlannedStage("report", 10.0)]
+
+
+def test_the_rest_of_the_plan_is_part_of_the_estimate():
+    halfway = [(0.4 * done, "tracking", done, 100) for done in range(51)]
+    assert after(PLAN, halfway, 20.0) == pytest.approx(50, rel=0.01)
+
+
+def test_later_stages_are_as_slow_as_earlier_ones_were():
+    slowly = [(4.0 * done, "tracking", done, 100) for done in range(101)]
+    left = after(PLAN, [*slowly, (400.0, "refining poses", 0, 4)], 400.0)
+    assert left == pytest.approx(300, rel=0.1)
+
+
+def test_the_estimate_is_never_zero_while_there_is_work():
+    finished = [(0.4 * done, "tracking", done, 100) for done in range(101)]
+    in_report = [*finished, (40.0, "refining poses", 4, 4), (60.0, "report", 0, None)]
+    for late in (60.0, 71.0, 500.0):
+        assert after(PLAN, in_report, late) >= 1
+    assert after(PLAN, [(0.0, "report", 1, 2), (5.0, "report", 2, 2)], 5.0) >= 1
+    assert estimate_in_words(0.2) == "about 5 s left"
+
+
+def test_a_step_that_takes_longer_than_those_before_adds_to_the_estimate():
+    steady = [(float(done), "tracking", done, 10) for done in range(6)]
+    assert after([], steady, 5.0) == pytest.approx(5)
+    assert after([], steady, 45.0) > 5
+
+
+def test_a_stage_that_is_not_planned_is_judged_by_its_own_pace():
+    assert after([], [(0.0, "drawing", 0, None)], 3.0) is None
+    assert after([], [(0.0, "drawing", 0, 10), (2.0, "drawing", 1, 10)], 2.0) == pytest.approx(18)
+
+
+def test_a_stage_that_comes_for_every_object_is_followed_by_the_later_ones_each_time():
+    first = [(0.0, "tracking", 1, 1), (40.0, "refining poses", 0, 4), (50.0, "report", 0, None)]
+    assert after(PLAN, [*first, (51.0, "refining poses", 0, 4)], 51.0) > 10
+
+
+def test_before_the_first_report_nothing_is_known():
+    assert after(PLAN, [], 3.0) is None
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [
+        (1.0, "about 5 s left"),
+        (61.0, "about 1 min 05 s left"),
+        (130.0, "about 2 min 30 s left"),
+        (3700.0, "about 1 h 02 min left"),
+    ],
+)
+def test_an_estimate_in_words_is_no_more_exact_than_it_is(seconds, words):
+    assert estimate_in_words(seconds) == words
+
+
+def test_the_plan_of_a_run_has_the_stages_that_its_settings_ask_for():
+    config = load_config().model_dump()
+    names = [stage.name for stage in plan_run(config, 10)]
+    assert (names[0], names[-1]) == ("tracking", "turntable")
+    assert "refining masks" in names and "matching depths" not in names
+    config["solver"]["final_refine"], config["object"]["shape"] = False, "fine"
+    names = [stage.name for stage in plan_run(config, 10, report=False)]
+    assert "refining masks" not in names and "matching depths" in names and "turntable" not in names
+    assert plan_run(config, None) == []

@@ -25,7 +25,7 @@ def parts(monkeypatch):
         return answer
 
     monkeypatch.setattr("tracking3d.submaps.split_run.record_in_parts", record_in_parts)
-    monkeypatch.setattr("tracking3d.cli.progress.print_summary", lambda folder: print(f"summary of {folder}"))
+    monkeypatch.setattr("tracking3d.cli.summary.print_summary", lambda folder: print(f"summary of {folder}"))
     return asked, answers
 
 

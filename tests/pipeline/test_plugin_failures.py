@@ -270,7 +270,7 @@ def test_with_stop_the_finished_frames_are_kept(clip, source, tmp_path, settings
 def test_the_summary_on_the_screen_says_how_many_frames_failed_and_why(
     clip, source, tmp_path, capsys, settings
 ):
-    from tracking3d.cli.progress import print_summary
+    from tracking3d.cli.summary import print_summary
 
     record(source, settings(tracker=bad("raises", 1, 2)), tmp_path / "run", mask=clip.masks[0])
     print_summary(tmp_path / "run")

@@ -14,14 +14,16 @@ import site
 import subprocess
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 import numba
 import pytest
+from forked import Ended, forked_script
 
 import tracking3d
-from tracking3d.rendering.kernels.compilation import Kernel, _announce, kernel
+from tracking3d.rendering.kernels.compilation import Kernel, _announced, kernel
 
 RENDER = """
 import json, logging
@@ -120,7 +122,7 @@ def twice(value):
 
 def small_kernel(file: Path) -> Kernel:
     """The kernel as a process that has just started finds it."""
-    _announce.cache_clear()
+    _announced.clear()
     spec = importlib.util.spec_from_file_location("small_kernel", file)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -251,6 +253,35 @@ def test_four_processes_that_start_at_once_agree(before, processes, cache):
     assert all(processes.end(process).answer == EXPECTED for process in started)
     if before != "damaged code":
         assert processes.run() == Said(EXPECTED, "")
+
+
+TOGETHER = """
+import sys, time
+import numba
+from pathlib import Path
+numba.config.CACHE_DIR = ""
+sys.path.insert(0, sys.argv[1])
+import only_kernel
+Path(sys.argv[2]).touch()
+while not all(Path(other).exists() for other in sys.argv[2:]):
+    time.sleep(0.001)
+assert only_kernel.twice(1.5) == 3
+"""
+
+
+def test_of_two_processes_that_need_a_kernel_at_once_one_compiles_it(tmp_path):
+    (tmp_path / "only_kernel.py").write_text(SMALL)
+    ready = [tmp_path / "ready_a", tmp_path / "ready_b"]
+
+    def need_kernel(order: list[Path]) -> Ended:
+        folder = order[0].with_suffix(".outputs")
+        folder.mkdir()
+        return forked_script(folder, TOGETHER, tmp_path, *order)
+
+    with ThreadPoolExecutor(2) as both:
+        ended = list(both.map(need_kernel, [ready, ready[::-1]]))
+    assert [one.returncode for one in ended] == [0, 0], ended
+    assert sum(one.stderr.count("Compiling kernels") for one in ended) == 1
 
 
 @pytest.mark.slow

@@ -16,6 +16,7 @@ from tracking3d.results.point_tracking import open_scene
 from tracking3d.results.point_trails import draw_trails, write_trails
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_source import open_run_source
+from tracking3d.runtime.progress import StageProgress, listen_to_progress
 from tracking3d.video import open_source
 
 SHAKEN = 1.5  # degrees
@@ -93,16 +94,18 @@ def test_landmarks_are_kept_and_belong_to_their_run(shaken, scene):
     folder, clip, _ = shaken
     file = folder / layout.LANDMARKS
     assert file in layout.run_files(folder)
-    told = []
-    again = open_scene(folder, source(clip), after_round=told.append)
-    assert told == []
+    heard = []
+    with listen_to_progress(heard.append):
+        again = open_scene(folder, source(clip))
+    assert {progress.name for progress in heard} == {"reading frames"}
     assert np.allclose(again.scene.vertices, scene.scene.vertices)
     for one, other in zip(again.scene.views, scene.scene.views, strict=True):
         assert np.allclose(one.T_cam_obj, other.T_cam_obj)
         assert np.allclose(one.inverse_depth, other.inverse_depth)
     file.write_bytes(b"damaged")
-    open_scene(folder, source(clip), rounds=1, after_round=told.append)
-    assert told == [1]
+    with listen_to_progress(heard.append):
+        open_scene(folder, source(clip), rounds=1)
+    assert StageProgress("refining poses", 1, 1) in heard
     untouched = open_scene(folder, source(clip), rounds=0)
     assert np.allclose(untouched.scene.views[1].T_cam_obj, RunReader(folder).frames[1].T_cam_obj)
 

@@ -8,7 +8,7 @@ import json
 import numpy as np
 import pytest
 
-from tracking3d.cli.progress import print_summary
+from tracking3d.cli.summary import print_summary
 from tracking3d.estimation.estimate import MaskSource, lost_estimate
 from tracking3d.frames import Frame, MaskEstimate
 from tracking3d.results.contact_sheet import CROPS, TILE

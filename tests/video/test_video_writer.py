@@ -159,3 +159,30 @@ def test_encoders_print_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str
     with VideoWriter(tmp_path / "out.mp4", 10.0, (96, 128)) as video:
         video.write(noise(0))
     assert capfd.readouterr() == ("", "")
+
+
+def test_a_video_can_be_watched_while_it_is_written(tmp_path: Path) -> None:
+    with VideoWriter(tmp_path / "out.mp4", 10.0, (96, 128)) as video:
+        for index in range(6):
+            video.write(noise(index))
+            if index:  # a frame is there as soon as it is known how long it is shown: when the next one comes
+                assert len(list(open_source(tmp_path / "out.mp4"))) == index
+
+
+def test_a_finished_video_has_an_index_of_all_frames(tmp_path: Path) -> None:
+    with VideoWriter(tmp_path / "out.mp4", 10.0, (96, 128)) as video:
+        for index in range(40):
+            video.write(noise(index))
+        assert b"moof" in (tmp_path / "out.mp4").read_bytes()
+    assert b"moof" not in (tmp_path / "out.mp4").read_bytes()
+    with av.open(str(tmp_path / "out.mp4")) as container:
+        [stream] = container.streams.video
+        assert (stream.frames, container.duration) == (40, 4_000_000)
+    assert [path.name for path in tmp_path.iterdir()] == ["out.mp4"]
+
+
+def test_a_video_whose_index_cannot_be_written_plays_as_it_is(tmp_path: Path) -> None:
+    with VideoWriter(tmp_path / "out.mp4", 10.0, (96, 128)) as video:
+        video.write(noise(0))
+        (tmp_path / ".out.mp4.part").mkdir()
+    assert len(list(open_source(tmp_path / "out.mp4"))) == 1

@@ -32,6 +32,7 @@ from tracking3d.report.several import write_reports
 from tracking3d.results import layout
 from tracking3d.results.files import write_atomic, writing
 from tracking3d.results.records import FrameRecord
+from tracking3d.runtime.progress import ProgressListener, StageProgress, listen_to_progress
 from tracking3d.video import open_source
 from tracking3d.video.image_sequence import ImageSequence
 from tracking3d.video.source import FrameSource
@@ -80,7 +81,8 @@ def track_video(
     A video that was begun before is resumed from its last finished frame, however it was stopped.
 
     Args:
-        tell: Called with a mapping: ``frames``, the number of estimates, and ``of`` how many, if known.
+        tell: Called with a mapping: ``frames``, the number of estimates, and ``of`` how many, if known; or ``stage``,
+            the name of the stage that begins.
         job: The video.
         out: The folder of the batch.
         command: The command line, for the record.
@@ -90,7 +92,7 @@ def track_video(
     Raises:
         Tracking3dError: If it cannot be tracked; finished frames are kept for the next attempt.
     """
-    with local_work_folder(job, out, networks) as work:
+    with local_work_folder(job, out, networks) as work, listen_to_progress(telling_stages(tell)):
         attempts = count_attempt(work)
         run = work / RUN
         _track(tell, fetch_inputs(job, work / "source"), run, command)
@@ -174,6 +176,19 @@ def counting(tell: Tell, of: int | None, **about: Any) -> Callable[[FrameRecord 
             tell({"frames": done, "of": of, "process": process, **about})
 
     tell({"frames": 0, "of": of, "process": process, **about})
+    return listener
+
+
+def telling_stages(tell: Tell) -> ProgressListener:
+    """A listener that reports the name of each stage when it begins."""
+    present = ""
+
+    def listener(progress: StageProgress) -> None:
+        nonlocal present
+        if progress.name != present:
+            present = progress.name
+            tell({"stage": present})
+
     return listener
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tracking3d.cli.options import AsJson, Debug
+from tracking3d.cli.options import AsJson, Debug, Quiet
 from tracking3d.cli.options.panels import OUTPUT
 
 if TYPE_CHECKING:
@@ -34,22 +34,26 @@ def compare(
         ),
     ] = None,
     as_json: AsJson = False,
+    quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
     """Print what differs between runs on the same video: settings, masks, poses, statuses and time."""
     import json
 
+    from tracking3d.cli.progress import load_with_progress, show_progress
+
+    load_with_progress("tracking3d.report.comparison", quiet)
+    from tracking3d.report.comparison import write_comparison
     from tracking3d.report.differences import compare_runs
 
-    comparison = compare_runs(runs, against)
-    if out is not None:
-        from tracking3d.report.comparison import write_comparison
-
-        write_comparison(comparison, out)
+    with show_progress(quiet):
+        comparison = compare_runs(runs, against)
+        if out is not None:
+            write_comparison(comparison, out)
     if as_json:
         typer.echo(json.dumps(comparison.as_json()))
         return
-    for note in comparison.notes:
+    for note in () if quiet else comparison.notes:
         typer.echo(note, err=True)
     _print(comparison)
     if out is not None:

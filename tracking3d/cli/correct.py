@@ -32,8 +32,12 @@ def correct(
     """
     import logging
 
-    from tracking3d.cli.progress import print_summary, progress
-    from tracking3d.cli.report import report_progress
+    from tracking3d.cli.plans import plan_run
+    from tracking3d.cli.progress import load_with_progress, show_progress
+    from tracking3d.cli.report import report_at_end
+    from tracking3d.cli.summary import print_summary
+
+    load_with_progress("tracking3d.pipeline.correct", quiet, kernels=True)
     from tracking3d.pipeline.correct import correct_run, object_folders_of
     from tracking3d.prompts.corrections import parse_correction
     from tracking3d.results.layout import CORRECTING, RUN, has_state
@@ -43,10 +47,12 @@ def correct(
         logging.getLogger("tracking3d").setLevel(logging.ERROR)
     by_folder = object_folders_of(run, [parse_correction(text) for text in corrections])
     for folder, theirs in by_folder.items():
-        count = len(RunReader(folder).frames)
+        earlier = RunReader(folder)
+        plan = plan_run(earlier.config, len(earlier.frames), report=report)
         with ExitStack() as ends:
-            reporting = ends.enter_context(report_progress([folder] if report else []))
-            listener = reporting(ends.enter_context(progress(count, quiet, 1)))
+            shown = ends.enter_context(show_progress(quiet, plan))
+            reporting = ends.enter_context(report_at_end([folder] if report else []))
+            listener = reporting(shown.show_frame)
             try:
                 correct_run(folder, theirs, source=source, listener=listener)
             except BaseException as error:

@@ -28,9 +28,13 @@ def demo(
     """
     import json
 
-    from tracking3d.cli.progress import print_summary, progress
-    from tracking3d.cli.report import report_progress
+    from tracking3d.cli.plans import plan_run
+    from tracking3d.cli.progress import load_with_progress, show_progress
+    from tracking3d.cli.report import report_at_end
+    from tracking3d.cli.summary import print_summary
     from tracking3d.cli.tables import print_figures
+
+    load_with_progress("tracking3d.pipeline.record", quiet, kernels=True)
     from tracking3d.datasets.clip import read_truth
     from tracking3d.evaluation.score import score_run
     from tracking3d.pipeline.open_tracking import request_tracking
@@ -42,15 +46,15 @@ def demo(
     from tracking3d.video import open_source
 
     settings = configure(None, None, None, tracker="csrt", features="rgb", runtime={"seed": seed})
-    clip, folder = make_demo_clip(out / "clip", seed=seed), out / "run"
-    source = open_source(clip / "frames")
-    box = read_truth(clip).box
-    options = RecordOptions(f"tracking3d demo --seed {seed}", overwrite=True)
-    request = request_tracking(source, settings, PromptSet.of_one(box))
-    with report_progress([folder]) as reporting, progress(source.count, quiet) as listener:
-        record_tracking(request, folder, options, reporting(listener))
-
-    scores = score_run(folder, clip)
+    with show_progress(quiet) as display:
+        clip, folder = make_demo_clip(out / "clip", seed=seed), out / "run"
+        source = open_source(clip / "frames")
+        display.expect(plan_run(settings.model_dump(), source.count))
+        options = RecordOptions(f"tracking3d demo --seed {seed}", overwrite=True)
+        request = request_tracking(source, settings, PromptSet.of_one(read_truth(clip).box))
+        with report_at_end([folder]) as reporting:
+            record_tracking(request, folder, options, reporting(display.show_frame))
+        scores = score_run(folder, clip)
     summary = {
         "iou_initial": scores.iou_initial_mean,
         "iou": scores.iou_mean,

@@ -138,6 +138,9 @@ def export(
         return
     if run is None or to is None:
         raise InputError("export needs RUN and --to FORMAT; --list shows the formats.")
+    from tracking3d.cli.progress import load_with_progress, show_progress
+
+    load_with_progress("tracking3d.export.exporting", quiet)
     from tracking3d.export.exporting import export_run
     from tracking3d.results.layout import runs_in
 
@@ -148,7 +151,9 @@ def export(
         )
     options = _exporter_options(content, video)
     for one in runs:
-        _print_export(export_run(one, to, out, options=options, overwrite=overwrite), as_json, quiet)
+        with show_progress(quiet):
+            done = export_run(one, to, out, options=options, overwrite=overwrite)
+        _print_export(done, as_json, quiet)
 
 
 def _print_export(done: Export, as_json: bool, quiet: bool) -> None:

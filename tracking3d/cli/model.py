@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tracking3d.cli.options import Debug, Run, Video
+from tracking3d.cli.options import Debug, Quiet, Run, Video
 from tracking3d.cli.options.choices import model_option
 from tracking3d.cli.options.object_size import ObjectSize
 from tracking3d.errors import InputError
@@ -35,37 +35,51 @@ def model(
     source: Video = None,
     views: Annotated[int, typer.Option(min=1, max=500, help="Frames that the texture is taken from.")] = 24,
     largest: Largest = 2048,
+    quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
     """Re-texture the mesh of a run from its video, and with --model fine reconstruct its shape too.
 
     `tracking3d run` does this at its end, with the same option --model.
     """
-    _make_mesh(run, model, source, views, largest)
+    from tracking3d.cli.progress import load_with_progress
+
+    load_with_progress("tracking3d.reconstruction.rebuild", quiet, kernels=True)
+    outcome = _make_mesh(run, model, source, views, largest, quiet)
     if object_size is not None:
         from tracking3d.results.run_unit import scale_run
 
         scale_run(run, object_size)
-        typer.echo(f"{run}: all lengths are in metres")
+        outcome.append(f"{run}: all lengths are in metres")
+    if not quiet:
+        typer.echo("\n".join(outcome))
 
 
-def _make_mesh(run: Path, model: str, source: str | None, views: int, largest: int) -> None:
+def _make_mesh(run: Path, model: str, source: str | None, views: int, largest: int, quiet: bool) -> list[str]:
+    """Make the mesh of a run, and return what to print about it."""
+    from tracking3d.cli.plans import plan_shape, plan_texture
+    from tracking3d.cli.progress import show_progress
     from tracking3d.reconstruction.rebuild import rebuild_shape, restore_online_mesh, retexture_run
+    from tracking3d.results.run_reader import RunReader
 
     if model == "none":
         restored = restore_online_mesh(run)
-        typer.echo(
+        return [
             f"{run}: {'the online mesh again' if restored else 'has the online mesh already; it stays as it is'}"
-        )
-        return
+        ]
+    frames, outcome = len(RunReader(run).frames), []
     if model == "fine":
-        shaped = rebuild_shape(run, source, views, largest)
+        with show_progress(quiet, plan_shape(frames)):
+            shaped = rebuild_shape(run, source, views, largest)
         made, taken = shaped.model, shaped.views
-        typer.echo(f"{run}: {len(made.faces)} faces; {shaped.sentence}" if shaped.new else shaped.sentence)
+        outcome.append(
+            f"{run}: {len(made.faces)} faces; {shaped.sentence}" if shaped.new else shaped.sentence
+        )
     else:
-        made, taken = retexture_run(run, source, views, largest)
+        with show_progress(quiet, plan_texture(frames)):
+            made, taken = retexture_run(run, source, views, largest)
     size = len(made.texture)
-    typer.echo(f"{run}: texture of {size} x {size} texels from {taken} frames")
+    return [*outcome, f"{run}: texture of {size} x {size} texels from {taken} frames"]
 
 
 def check_model_source(model: str | None, source: str) -> None:

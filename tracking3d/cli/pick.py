@@ -58,6 +58,9 @@ def pick(
 
     The page shows at once the mask that the tracker makes from it. It also offers the command and a YAML file to copy.
     """
+    from tracking3d.cli.progress import load_with_progress
+
+    load_with_progress("tracking3d.pipeline.record", quiet, kernels=True)
     from tracking3d.cli.tracking import RunDisplay, RunRequest, default_folder, track
     from tracking3d.pipeline.record import RecordOptions
     from tracking3d.viewer.opening import check_viser

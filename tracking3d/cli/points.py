@@ -118,15 +118,19 @@ def points(
     the mesh does not cover are tracked in the images. A pixel outside the frame is an error, and so is one off the
     object without --any.
     """
-    from tracking3d.results.correspondences import grid_on_object, track_points
-    from tracking3d.results.run_reader import RunReader
-
     pixels = query.pixels()
     for file in (csv, video):
         if file is not None and not file.absolute().parent.is_dir():
             raise OutputError(
                 f"{file} cannot be written: the folder {file.parent} does not exist; make it first."
             )
+    from tracking3d.cli.plans import plan_points
+    from tracking3d.cli.progress import load_with_progress, show_progress
+
+    load_with_progress("tracking3d.results.point_tracking", quiet, kernels=True)
+    from tracking3d.results.correspondences import grid_on_object, track_points
+    from tracking3d.results.run_reader import RunReader
+
     reader = RunReader(run, refined=not query.causal)
     scale = _scale(reader, query.object_size)
     if query.grid is not None:
@@ -136,12 +140,16 @@ def points(
     if not query.by_mesh or video is not None:
         needed = query.any_pixel or query.source is not None or video is not None
         images = _images(reader, query.source, needed)
-    tracks, remarks = _followed(reader, query, pixels, tracks, images, quiet)
+    with show_progress(quiet, plan_points(len(reader.frames))):
+        tracks, remarks = _followed(reader, query, pixels, tracks, images, quiet)
     for remark in remarks:
         typer.echo(remark, err=True)
     if scale is not None:
         tracks = replace(tracks, points=tracks.points * scale)
-    _write(tracks, images, as_json, csv, video)
+    with show_progress(quiet):
+        _write_files(tracks, images, csv, video)
+    if as_json or (csv is None and video is None):
+        _print(tracks, as_json)
 
 
 def _scale(reader: RunReader, object_size: float | None) -> float | None:
@@ -173,25 +181,16 @@ def _followed(
     otherwise = "" if query.by_mesh else ", or --any to follow them in the images alone"
     remarks = [reader.not_finished, check_asked(tracks, reader.camera, covered, otherwise)]
     if images is not None and by_images:
-        report = _silent if quiet else _print_round
-        tracks = open_scene(reader, images, after_round=report).track(query.frame, pixels, query.any_pixel)
+        tracks = open_scene(reader, images).track(query.frame, pixels, query.any_pixel)
         if not quiet:
             remarks.append(_by_images(tracks))
     return tracks, [remark for remark in remarks if remark]
 
 
-def _silent(done: int) -> None:
-    pass
-
-
-def _print_round(done: int) -> None:
-    typer.echo(f"Adjusting landmarks, round {done}", err=True)
-
-
-def _write(
-    tracks: PointTracks, images: FrameSource | None, as_json: bool, csv: Path | None, video: Path | None
+def _write_files(
+    tracks: PointTracks, images: FrameSource | None, csv: Path | None, video: Path | None
 ) -> None:
-    from tracking3d.results.point_files import points_to_csv, points_to_json
+    from tracking3d.results.point_files import points_to_csv
     from tracking3d.results.point_trails import write_trails
 
     if csv is not None:
@@ -201,9 +200,14 @@ def _write(
             raise OutputError(f"{csv} cannot be written: {error.strerror}.") from error
     if video is not None and images is not None:
         write_trails(video, images, tracks, images.fps or _RATE)
+
+
+def _print(tracks: PointTracks, as_json: bool) -> None:
+    from tracking3d.results.point_files import points_to_csv, points_to_json
+
     if as_json:
         typer.echo(points_to_json(tracks))
-    elif csv is None and video is None:
+    else:
         typer.echo(points_to_csv(tracks), nl=False)
 
 

@@ -1,155 +1,183 @@
-"""Progress of a run, and its closing table."""
+"""Progress of a command on the standard error: its stage, how far that is, and the remaining time.
+
+On a terminal it is a line that moves as long as the command works, also within a step that takes long; in a log it is
+a line every ten seconds. Importing this module does not load torch, so that the line is there before.
+"""
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
+from importlib import import_module
+from typing import TYPE_CHECKING
 
-from rich.console import Console
-from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
+from rich.console import Console, RenderableType
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
+from rich.table import Column
 
-from tracking3d.cli.tables import format_value, print_table
-from tracking3d.frames import SkippedFrame
-from tracking3d.pipeline.record import Listener
-from tracking3d.results import layout
-from tracking3d.results.description import own_masks, time_per_frame
-from tracking3d.results.records import FrameRecord
-from tracking3d.results.run_reader import RunReader
-from tracking3d.runtime.stage_times import STAGES
+from tracking3d.cli.remaining_time import PlannedStage, RemainingTime, duration_in_words, estimate_in_words
+from tracking3d.runtime.progress import StageProgress, listen_to_progress
 
-_EVERY = 10.0  # seconds between lines of a log
-_COLOURS = {"tracked": "green", "uncertain": "yellow", "lost": "red", "skipped": "red"}
+if TYPE_CHECKING:
+    from tracking3d.frames import SkippedFrame
+    from tracking3d.results.records import FrameRecord
+
+_EVERY = 10.0
+"""Seconds between lines of a log."""
+_STARTING = "starting"
+_COLOURS = {"tracked": "green", "uncertain": "yellow", "lost": "red"}
+
+
+class ProgressDisplay:
+    """What is shown of a command's progress; the base shows nothing."""
+
+    def __init__(self) -> None:
+        self._remaining = RemainingTime()
+        self._began = time.monotonic()
+        self._progress = StageProgress(_STARTING)
+        self._detail = ""
+
+    def expect(self, plan: Sequence[PlannedStage]) -> None:
+        """Estimate the remaining time by these stages from here on."""
+        self._remaining = RemainingTime(plan)
+
+    def take(self, progress: StageProgress) -> None:
+        """Show a stage and how far it is."""
+        if progress.name != self._progress.name:
+            self._detail = ""
+        self._progress = progress
+        self._remaining.take(progress, time.monotonic())
+
+    def show_frame(self, frame: FrameRecord | SkippedFrame) -> None:
+        """Show what came of a frame: a listener for `tracking3d.pipeline.record`."""
+        self._detail = _describe(frame)
+
+    @property
+    def _stage(self) -> str:
+        """The stage with its count."""
+        now = self._progress
+        if now.total:
+            return f"{now.name} {now.done}/{now.total}"
+        return f"{now.name} {now.done}" if now.done else now.name
+
+    def _time(self, now: float) -> str:
+        """The remaining time, or the time that has gone by as long as the other is unknown."""
+        left = self._remaining.seconds(now)
+        return duration_in_words(now - self._began) if left is None else estimate_in_words(left)
+
+
+class _Bar(Progress):
+    """Asks for the present state whenever it is drawn, so that the time goes on within a step."""
+
+    before_drawing: Callable[[], None] = staticmethod(lambda: None)
+
+    def get_renderables(self) -> Iterable[RenderableType]:
+        """What is drawn."""
+        self.before_drawing()
+        yield from super().get_renderables()
+
+
+class _Line(ProgressDisplay):
+    """A line on a terminal, drawn by a thread of its own ten times a second."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__()
+        self._bar = _Bar(
+            SpinnerColumn(),
+            TextColumn("{task.description}", table_column=Column(no_wrap=True)),
+            BarColumn(bar_width=16),
+            TextColumn("{task.fields[time]}", table_column=Column(no_wrap=True)),
+            TextColumn("{task.fields[detail]}", table_column=Column(no_wrap=True, overflow="ellipsis")),
+            console=console,
+            transient=True,
+        )
+        self._bar.before_drawing = self._refresh
+        self._task = self._bar.add_task(_STARTING, total=None, time="", detail="")
+
+    def __enter__(self) -> None:
+        self._bar.start()
+
+    def __exit__(self, *error: object) -> None:
+        self._bar.stop()
+
+    def _refresh(self) -> None:
+        now = time.monotonic()
+        left = self._remaining.seconds(now)
+        share = None if left is None else (now - self._began) / (now - self._began + left)
+        self._bar.update(
+            self._task,
+            description=self._stage,
+            total=None if share is None else 1.0,
+            completed=share or 0.0,
+            time=self._time(now),
+            detail=self._detail,
+        )
+
+
+class _Log(ProgressDisplay):
+    """A line every ten seconds, printed by a thread of its own."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__()
+        self._console, self._over = console, threading.Event()
+        self._thread = threading.Thread(target=self._print_regularly, daemon=True, name="tracking3d-progress")
+
+    def __enter__(self) -> None:
+        self._thread.start()
+
+    def __exit__(self, *error: object) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def _print_regularly(self) -> None:
+        while not self._over.wait(_EVERY):
+            parts = filter(None, (self._stage, self._detail, self._time(time.monotonic())))
+            self._console.print(", ".join(parts), highlight=False, soft_wrap=True)
 
 
 @contextmanager
-def progress(count: int | None, quiet: bool, objects: int = 1) -> Iterator[Listener]:
-    """Show a progress bar on the standard error: frame, status, IoU with the initial mask, speed, time left.
-
-    The final refinement gets a second bar. If the standard error is a log instead of a terminal, a line is printed
-    every ten seconds.
+def show_progress(quiet: bool, plan: Sequence[PlannedStage] = ()) -> Iterator[ProgressDisplay]:
+    """Show on the standard error which stage the command is in, as long as the block runs.
 
     Args:
-        count: Number of frames, if known.
         quiet: Show nothing.
-        objects: Number of objects; the bar counts the frames of each.
+        plan: The stages that will come, if they are known by now; see `ProgressDisplay.expect`.
 
     Yields:
-        The listener to call with every frame.
+        The display.
     """
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield _silent if quiet else _log_progress(console, count and count * objects)
+    if quiet:
+        yield ProgressDisplay()
         return
-    bar = Progress(
-        BarColumn(bar_width=24),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[frame]}"),
-        TimeRemainingColumn(compact=True),
-        console=console,
-        disable=quiet,
-        transient=True,
-    )
-    tasks = [bar.add_task("", total=count and count * objects, frame="first frame")]
-
-    def listener(frame: FrameRecord | SkippedFrame) -> None:
-        again = isinstance(frame, FrameRecord) and frame.refined
-        if again and len(tasks) == 1:
-            bar.update(tasks[0], visible=False)
-            tasks.append(bar.add_task("", total=bar.tasks[0].completed, frame="final refinement"))
-        bar.update(tasks[-1], advance=1, frame=_line(frame))
-
-    with bar:
-        yield listener
+    console = Console(stderr=True)
+    display = _Line(console) if console.is_terminal else _Log(console)
+    display.expect(plan)
+    with display, listen_to_progress(display.take):
+        yield display
 
 
-def _silent(frame: FrameRecord | SkippedFrame) -> None:
-    pass
+def load_with_progress(module: str, quiet: bool, kernels: bool = False) -> None:
+    """Import a module that takes seconds to load, so that imports of it afterwards take no time.
+
+    Args:
+        module: Its full name.
+        quiet: Show nothing meanwhile.
+        kernels: Whether compiled kernels will be needed: those that are missing are compiled in the background.
+    """
+    with show_progress(quiet):
+        import_module(module)
+        if kernels:
+            import_module("tracking3d.speed.kernels_ahead").compile_in_background(quiet)
 
 
-def _log_progress(console: Console, count: int | None) -> Listener:
-    """Print the progress once every `_EVERY` seconds."""
-    last, done = time.monotonic(), {False: 0, True: 0}
+def _describe(frame: FrameRecord | SkippedFrame) -> str:
+    """Frame, status, IoU with the initial mask, and time, in the markup of rich."""
+    from tracking3d.cli.tables import format_value
+    from tracking3d.frames import SkippedFrame
 
-    def listener(frame: FrameRecord | SkippedFrame) -> None:
-        nonlocal last
-        again = isinstance(frame, FrameRecord) and frame.refined
-        done[again] += 1
-        if time.monotonic() - last >= _EVERY:
-            last = time.monotonic()
-            total = done[False] if again else count
-            console.print(
-                f"{done[again]}{f' of {total}' if total else ''}: {_line(frame)}",
-                highlight=False,
-                soft_wrap=True,
-            )
-
-    return listener
-
-
-def print_summary(folder: Path) -> None:
-    """Print the closing table of the run in ``folder``."""
-    reader = RunReader(folder)
-    run = reader.description
-    counts, (whole, stages) = run["counts"], time_per_frame(run)
-    table = Table(
-        title=f"{escape(str(folder))} ({reader.state_in_words})", show_header=False, title_justify="left"
-    )
-    if choice := run.get("tracker_choice"):
-        table.add_row("mask tracker", escape(str(choice)))
-    table.add_row("frames", str(counts["frames"]))
-    for status in ("tracked", "uncertain", "lost", "skipped"):
-        if counts[status] or status == "tracked":
-            table.add_row(f"  {status}", f"[{_COLOURS[status]}]{counts[status]}[/]")
-    if counts["failed"]:
-        table.add_row("  with a plug-in failure", f"[red]{counts['failed']}[/]")
-        for failure in run["failures"]:
-            table.add_row(f"    in {failure['frames']} of them", escape(failure["reason"]))
-    if refinement := run.get("refinement"):
-        took = f"{refinement['frames']} frames in {format_value(refinement['seconds'])} s"
-        table.add_row("final refinement", took if refinement["frames"] else escape(refinement["reason"]))
-    own = own_masks(run)
-    if own is not None:
-        rest = "" if own == counts["frames"] else "; the others keep the initial mask"
-        table.add_row("frames with an estimated mask", f"{own} of {counts['frames']}{rest if own else ''}")
-    if own is None or own:
-        table.add_row(
-            "mean IoU with the initial masks"
-            if own is None
-            else "  mean IoU of these with the initial masks",
-            format_value(run["iou_initial_mean"] if own is None else run["iou_initial_mean_own"]),
-        )
-    table.add_row("seconds per frame", format_value(whole))
-    for stage in STAGES if stages else ():
-        table.add_row(f"  {stage}", format_value(getattr(stages, stage)))
-    if shape := run.get("shape"):
-        table.add_row("shape", escape(str(shape)))
-    for note in run["notes"]:
-        table.add_row("note", f"[yellow]{escape(note)}[/]")
-    for what, names in _OUTPUTS.items():
-        if files := [escape(str(folder / name)) for name in names if (folder / name).exists()]:
-            table.add_row(what, "\n".join(files))
-    print_table(table)
-
-
-_OUTPUTS = {
-    "poses": (layout.FRAMES,),
-    "masks": (layout.MASKS,),
-    "mesh": (layout.OBJ, layout.GLB),
-    "video": (layout.OVERLAY,),
-    "contact sheet": (layout.CONTACT_SHEET,),
-    "report": (layout.REPORT,),
-}
-
-
-def _line(frame: FrameRecord | SkippedFrame) -> str:
     if isinstance(frame, SkippedFrame):
-        return f"[{_COLOURS['skipped']}]frame {frame.index} skipped[/]"
-    phase = "final refinement, " if frame.refined else ""
-    return (
-        f"{phase}frame {frame.index} [{_COLOURS[frame.status]}]{frame.status}[/] "
-        f"IoU {format_value(frame.iou_initial)} {frame.seconds:.2f} s"
-    )
+        return f"[red]frame {frame.index} skipped[/]"
+    colour, iou = _COLOURS[frame.status], format_value(frame.iou_initial)
+    return f"frame {frame.index} [{colour}]{frame.status}[/] IoU {iou} {frame.seconds:.2f} s"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from tracking3d.cli.options import Debug, RunOrParent
+from tracking3d.cli.options import Debug, Quiet, RunOrParent
 from tracking3d.errors import Tracking3dError
 
 if TYPE_CHECKING:
@@ -20,21 +20,32 @@ if TYPE_CHECKING:
 
 def report(
     run: RunOrParent,
+    quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
     """Write RUN/report.html, a single file that any browser shows, and RUN/turntable.mp4.
 
     If there are several objects, each gets its own report, and RUN/index.html links to them.
     """
+    from tracking3d.cli.plans import plan_report
+    from tracking3d.cli.progress import load_with_progress, show_progress
+
+    load_with_progress("tracking3d.report.several", quiet, kernels=True)
     from tracking3d.report.several import write_reports
     from tracking3d.results.layout import runs_in
+    from tracking3d.results.run_reader import RunReader
 
-    for path in write_reports(runs_in(run)):
-        typer.echo(path)
+    folders = runs_in(run)
+    with show_progress(quiet) as display:
+        display.expect(plan_report(sum(len(RunReader(folder).frames) for folder in folders)))
+        written = write_reports(folders)
+    if not quiet:
+        for path in written:
+            typer.echo(path)
 
 
 @contextmanager
-def report_progress(folders: Sequence[Path]) -> Iterator[Callable[[Listener], Listener]]:
+def report_at_end(folders: Sequence[Path]) -> Iterator[Callable[[Listener], Listener]]:
     """Write the reports of runs when the block ends, however it ends, if at least one frame was tracked.
 
     If a report cannot be written, that is printed; it does not change how the run ended.

@@ -46,12 +46,15 @@ def run(
     Give the object with --box, --mask, --points, --masks or --object. Each box, mask or --points is an object with a
     run folder of its own.
     """
+    from tracking3d.cli.progress import load_with_progress
+
+    output.check()
+    performance.check()
+    load_with_progress("tracking3d.pipeline.record", quiet, kernels=True)
     from tracking3d.pipeline.record import RecordOptions
     from tracking3d.pipeline.validation import needs_prompt
 
     prompt = prompt.completed_from(settings.config)
-    output.check()
-    performance.check()
     check_model_source(settings.model, source)
     if prompt.known is not None and output.object_size is not None:
         raise InputError("A known object has its own unit; leave out --object-size, or --object.")

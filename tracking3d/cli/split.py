@@ -29,8 +29,9 @@ def track_in_parts(request: RunRequest, length: str, workers: int | None, displa
     Raises:
         InputError: Options do not go together.
     """
-    from tracking3d.cli.progress import progress
-    from tracking3d.cli.report import report_progress
+    from tracking3d.cli.plans import plan_run
+    from tracking3d.cli.progress import show_progress
+    from tracking3d.cli.report import report_at_end
     from tracking3d.submaps.split_run import record_in_parts
     from tracking3d.video import open_source
 
@@ -40,9 +41,11 @@ def track_in_parts(request: RunRequest, length: str, workers: int | None, displa
     folder, options = request.folder, request.options
     with ExitStack() as ends:
         ends.enter_context(_resumable(folder))
-        reporting = ends.enter_context(report_progress([folder] if display.report else []))
         count = open_source(request.source, options.selection).count
-        listener = reporting(ends.enter_context(progress(count, display.quiet)))
+        plan = plan_run(request.config.model_dump(), count, report=display.report)
+        shown = ends.enter_context(show_progress(display.quiet, plan))
+        reporting = ends.enter_context(report_at_end([folder] if display.report else []))
+        listener = reporting(shown.show_frame)
         ended = record_in_parts(
             request.source,
             request.config,
@@ -62,7 +65,7 @@ def track_in_parts(request: RunRequest, length: str, workers: int | None, displa
 
 def _print_summaries(ended: SplitResult) -> None:
     """Print the closing table, or those of all parts and why they could not be merged."""
-    from tracking3d.cli.progress import print_summary
+    from tracking3d.cli.summary import print_summary
 
     for one in ended.folders:
         print_summary(one)

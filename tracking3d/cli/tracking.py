@@ -64,8 +64,9 @@ class RunDisplay:
 
 def track(request: RunRequest, display: RunDisplay) -> None:
     """Track, show the progress, and print a summary."""
-    from tracking3d.cli.progress import progress
-    from tracking3d.cli.report import report_progress
+    from tracking3d.cli.plans import plan_run
+    from tracking3d.cli.progress import show_progress
+    from tracking3d.cli.report import report_at_end
     from tracking3d.cli.view import watch
     from tracking3d.pipeline.open_tracking import request_tracking
     from tracking3d.pipeline.record import record_tracking
@@ -82,8 +83,10 @@ def track(request: RunRequest, display: RunDisplay) -> None:
     finished = {one: _time_written(one) for one in folders if options.resume and is_finished(one)}
     with ExitStack() as ends:
         ends.enter_context(resumable(folders))
-        reporting = ends.enter_context(report_progress(folders if display.report else []))
-        listener = reporting(ends.enter_context(progress(source.count, display.quiet, objects)))
+        plan = plan_run(request.config.model_dump(), source.count, objects, display.report)
+        shown = ends.enter_context(show_progress(display.quiet, plan))
+        reporting = ends.enter_context(report_at_end(folders if display.report else []))
+        listener = reporting(shown.show_frame)
         if display.view:
             source, listener = ends.enter_context(
                 watch(source, folder, listener, display.host, display.quiet)
@@ -103,7 +106,7 @@ def _print_summaries(folders: Sequence[Path], finished: Mapping[Path, int]) -> N
         folders: The run folders.
         finished: When the runs that had been finished before were written.
     """
-    from tracking3d.cli.progress import print_summary
+    from tracking3d.cli.summary import print_summary
 
     for folder in folders:
         if folder in finished and finished[folder] == _time_written(folder):

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tracking3d.cli.options import Debug, Video
+from tracking3d.cli.options import Debug, Quiet, Video
 from tracking3d.cli.options.output import Browser, Host
 from tracking3d.cli.options.panels import OUTPUT
+from tracking3d.runtime.progress import report_progress
 
 if TYPE_CHECKING:
     from tracking3d.frames import SkippedFrame
@@ -41,17 +42,23 @@ def view(
         ),
     ] = 8080,
     browser: Browser = True,
+    quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
     """Show runs in the browser: model, camera path, video, masks, and uncertain frames. Ctrl-C stops the server.
 
     The page follows a run that is still running. Several runs are shown side by side.
     """
+    from tracking3d.cli.progress import load_with_progress, show_progress
+
+    load_with_progress("tracking3d.viewer.opening", quiet)
     from tracking3d.viewer.opening import check_viser, open_viewer
     from tracking3d.web.access import Access
 
     check_viser("`tracking3d view`")
-    viewer = open_viewer(runs, Access.on(host), port, source)
+    with show_progress(quiet):
+        report_progress("opening the viewer")
+        viewer = open_viewer(runs, Access.on(host), port, source)
     try:
         show_address(viewer.address, browser and host is None)
         wait_for_the_end()
@@ -102,6 +109,7 @@ def watch(
     try:
         yield passed_on, listening
         if opened:
+            report_progress("showing the run until Ctrl-C")
             if not quiet:
                 typer.echo("The viewer stays open; Ctrl-C stops it.", err=True)
             wait_for_the_end()

@@ -21,6 +21,7 @@ from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_unit import metres_per_unit, scale_model, scale_pose
+from tracking3d.runtime.progress import report_each
 from tracking3d.video.selection import parse_selection
 
 FRAMES_PER_SECOND = 30.0
@@ -224,4 +225,5 @@ class ExportedRun:
     def _read_pictures(self) -> Iterator[Frame]:
         from tracking3d.export.pictures import read_selected_images
 
-        return read_selected_images(self.reader, self.options.source, self.records)
+        images = read_selected_images(self.reader, self.options.source, self.records)
+        return report_each("exporting frames", images, len(self.records))

@@ -17,6 +17,7 @@ from tracking3d.export.options import ExportOptions
 from tracking3d.results.files import writing
 from tracking3d.results.layout import ARBITRARY, OVERWRITE, partial_path, run_files
 from tracking3d.results.run_reader import RunReader
+from tracking3d.runtime.progress import report_progress
 
 FOLDER = "export"
 """Default folder of exports, in the run folder."""
@@ -115,6 +116,7 @@ def export_run(
         raise OutputError(f"{path} is a file of the run itself; choose another {_OUT}.")
     answered = _frames_with_estimates(exporter, exported)
     without = tuple(index for index in exported.span if index not in answered)
+    report_progress(f"writing {exporter.name}")
     with _replace_when_done(path) as place:
         exporter.write(exported, place)
         if place.is_dir():

@@ -27,6 +27,7 @@ from tracking3d.pipeline.frame_reading import read_again, read_with_next, with_s
 from tracking3d.pipeline.recorder import ObjectRecorder
 from tracking3d.rendering.backend import share_threads
 from tracking3d.results.records import FrameRecord
+from tracking3d.runtime.progress import report_each
 from tracking3d.video.source import FrameSource
 
 Listener = Callable[[FrameRecord | SkippedFrame], None]
@@ -112,7 +113,8 @@ def run_passes(
             threads.enter_context(recording.writing_beside())
         try:
             waits = any(one.needs_first_pass for one in active)
-            for frame, coming in read_with_next(source, frames) if waits else ():
+            arriving = report_each("tracking", read_with_next(source, frames), source.count)
+            for frame, coming in arriving if waits else ():
                 shared = with_share(frame, len(recordings)) if isinstance(frame, Frame) else frame
                 for recording in active:
                     with active.guard(recording):
@@ -143,7 +145,8 @@ def run_refinement(source: FrameSource, active: ActiveRecordings) -> None:
         for recording in active:
             with active.guard(recording):
                 recording.begin_refinement(source)
-        for frame in read_again(source) if any(one.needs_second_pass for one in active) else ():
+        again = _read_again("refining frames", source)
+        for frame in again if any(one.needs_second_pass for one in active) else ():
             for recording in active:
                 with active.guard(recording):
                     active.tell(recording.take_again(with_share(frame, objects)))
@@ -159,18 +162,25 @@ def _run_last_passes(source: FrameSource, active: ActiveRecordings) -> None:
     for recording, refinement in active.refining():
         with active.guard(recording):
             refinement.adjust_all()
-    for frame in read_again(source) if any(each.decides_masks for _, each in active.refining()) else ():
+    decides_masks = any(each.decides_masks for _, each in active.refining())
+    for frame in _read_again("collecting masks", source) if decides_masks else ():
         for recording, refinement in active.refining():
             with active.guard(recording):
                 refinement.collect_mask(frame)
     for recording, refinement in active.refining():
         with active.guard(recording):
             refinement.settle_masks()
-    for frame in read_again(source) if any(active.refining()) else ():
+    last = _read_again("refining masks" if decides_masks else "drawing", source)
+    for frame in last if any(active.refining()) else ():
         for recording, refinement in active.refining():
             with active.guard(recording):
                 refinement.draw(frame)
     _finish_writing(active)
+
+
+def _read_again(stage: str, source: FrameSource) -> Iterator[Frame]:
+    """The frames once more, each a step of a stage."""
+    return report_each(stage, read_again(source), source.count)
 
 
 def _finish_writing(active: ActiveRecordings) -> None:

@@ -24,6 +24,7 @@ from tracking3d.results.records import FrameRecord
 from tracking3d.results.refinement_writer import RefinementWriter
 from tracking3d.results.run_writer import RunWriter
 from tracking3d.runtime.concurrency import BackgroundWriter
+from tracking3d.runtime.progress import report_progress
 from tracking3d.video.source import FrameSource
 
 _log = logging.getLogger(__name__)
@@ -222,6 +223,7 @@ class ObjectRecorder:
                 else f"the solver {self._session.config.solver.name} gives causal estimates only"
             )
             return None
+        report_progress("refining the map")
         self._causal_model = self._session.result()
         estimates = self._writer.begin_refinement(self._causal_model)
         self._session.refine()
@@ -254,6 +256,7 @@ class ObjectRecorder:
             model = bake_texture(*self.refinement.final_model(), largest)
             self._writer.end_refinement()
             self._causal_model = None
+        report_progress("writing the model")
         self._writer.finish(model, "finished")
         if self._state.checkpoint:
             self._state.checkpoint.finish()

@@ -25,6 +25,7 @@ from tracking3d.points.pictures import (
     placement_variance,
 )
 from tracking3d.points.view import Array
+from tracking3d.runtime.progress import report_each
 
 _WINDOW = (17, 17)
 _LEVELS = 4  # halvings of the picture
@@ -212,7 +213,7 @@ def follow_in_images(pictures: Sequence[Picture | None], start: int, xy: Array) 
         return tracks
     follower = ImageFollower(start, first, xy)
     _write(tracks, start, follower.first())
-    for row in (*range(start + 1, whole), *range(start - 1, -1, -1)):
+    for row in report_each("following points", (*range(start + 1, whole), *range(start - 1, -1, -1))):
         if (picture := pictures[row]) is not None:
             _write(tracks, row, follower.step(row, picture))
     return tracks

@@ -7,7 +7,7 @@ points are followed better: it is done several times.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -24,6 +24,7 @@ from tracking3d.points.surface import move_surface
 from tracking3d.points.track_chaining import follow_chain
 from tracking3d.points.view import Array, SurfaceView, redraw_surface
 from tracking3d.points.warping import Warps
+from tracking3d.runtime.progress import report_progress
 
 ROUNDS = 6
 START_VIEWS = 8
@@ -112,7 +113,6 @@ class LandmarkScene:
 def refine_scene(
     scene: LandmarkScene,
     rounds: int = ROUNDS,
-    after_round: Callable[[int], None] = lambda done: None,
     free_focal: bool = False,
 ) -> LandmarkScene:
     """Put surface and poses right, as far as the images say how, until the poses hardly turn any more.
@@ -123,18 +123,18 @@ def refine_scene(
     Args:
         scene: As a run left it.
         rounds: How many times at most.
-        after_round: Is told how many are done.
         free_focal: Whether to estimate the focal length too, because it is not given.
     """
     done, last = 0, rounds
     while done < last:
+        report_progress("refining poses", done, last)
         done += 1
         before, scene = scene, _refine_once(scene, free_focal)
-        after_round(done)
         if scene.reversal is not before.reversal:
             last = done + rounds  # all of it is new
         elif _rotation_between(before, scene) < _SETTLED:
             break
+    report_progress("refining poses", done, done)
     return scene
 
 
@@ -149,6 +149,7 @@ def fit_outlines(scene: LandmarkScene) -> LandmarkScene:
     """
     if not any(support.agreeing for support in scene.support.values()):
         return scene
+    report_progress("fitting outlines")
     return _fit_surface(_refine_once(replace(_fit_surface(scene), may_reverse=False), free_focal=False))
 
 

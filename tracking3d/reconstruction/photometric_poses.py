@@ -26,6 +26,7 @@ from tracking3d.rendering import (
     back_project,
     pose_terms,
 )
+from tracking3d.runtime.progress import report_each
 
 COLOUR, OUTLINE = 0.1, 2.0
 """Difference of colours in [0, 1], and pixels, from which on a disagreement counts less."""
@@ -71,7 +72,9 @@ def refine_views(surface: Surface, views: Sequence[ShapeView]) -> list[ShapeView
         surface: From `coloured_surface`.
         views: The frames.
     """
-    return [replace(view, T_cam_obj=_fit_pose(surface, view)) for view in views]
+    return [
+        replace(view, T_cam_obj=_fit_pose(surface, view)) for view in report_each("testing the shape", views)
+    ]
 
 
 def _fit_pose(surface: Surface, view: ShapeView) -> NDArray[np.float64]:

@@ -23,6 +23,7 @@ from tracking3d.reconstruction.shape_views import ShapeView
 from tracking3d.rendering.interpolation import interpolate
 from tracking3d.rendering.renderer import project
 from tracking3d.rendering.visibility import rasterize
+from tracking3d.runtime.progress import report_each
 
 NEIGHBOURS, AGREEING = 6, 3
 """Views that a patch is looked for in, and those of them that count."""
@@ -98,7 +99,7 @@ def depth_maps(
     stride = _stride(references)
     maps = [
         _depth_map(view, neighbours, grey, guide, reach, steps, stride)
-        for view in references
+        for view in report_each("matching depths", references)
         if len(neighbours := _neighbours(view, views)) >= 2
     ]
     return [_check_consistency(one, maps, reach / steps, stride) for one in maps]

@@ -23,6 +23,7 @@ from tracking3d.results import layout
 from tracking3d.results.mesh_export import export_mesh, load_model
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
+from tracking3d.runtime.progress import report_progress
 from tracking3d.video.source import FrameSource
 
 _TEXTURE_VIEWS = 24
@@ -74,6 +75,7 @@ def retexture_run(
     if not views:
         raise no_reliable_frame_error(run)
     model = bake_texture(model, views, largest)
+    report_progress("writing the model")
     export_mesh(run.mesh_folder, model, run.unit)
     return model, len(views)
 
@@ -120,13 +122,16 @@ def rebuild_shape(
     made = reconstruct_shape(online.vertices, online.faces, shapes, judges)
     if made.vertices is None or made.faces is None:
         model = bake_texture(online, views, largest)
+        report_progress("writing the model")
         export_mesh(run.mesh_folder, model, run.unit)
         return ShapedRun(model, len(views), False, made.sentence)
+    report_progress("unwrapping the surface")
     model = bake_texture(replace_shape(online, made.vertices, made.faces, shapes), views, largest)
     kept = run.mesh_folder / layout.ONLINE
     if not (kept / layout.FEATURES).is_file():
         kept.mkdir(exist_ok=True)
         export_mesh(kept, online, run.unit)
+    report_progress("writing the model")
     export_mesh(run.mesh_folder, model, run.unit)
     return ShapedRun(model, len(views), True, made.sentence)
 

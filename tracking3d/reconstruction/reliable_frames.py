@@ -12,6 +12,7 @@ from tracking3d.frames import Frame, pixels
 from tracking3d.reconstruction.views import BELIEVED
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
+from tracking3d.runtime.progress import report_each
 from tracking3d.video.opening import open_source
 from tracking3d.video.source import FrameSource
 
@@ -34,7 +35,7 @@ def reliable_frames(run: RunReader, source: str | FrameSource | None) -> Iterato
     name = video.name
     records = {record.index: record for record in run.frames}
     prompt = run.description.get("prompt") or {}
-    for frame in video:
+    for frame in report_each("reading frames", video, video.count):
         record = records.get(frame.index)
         if not isinstance(frame, Frame) or record is None:
             continue

@@ -31,6 +31,7 @@ from tracking3d.reconstruction.plane_sweep import Guide, depth_maps
 from tracking3d.reconstruction.shape_views import ShapeView, spread_by_rotation
 from tracking3d.reconstruction.tsdf_fusion import depth_evidence, fuse_depth
 from tracking3d.reconstruction.visual_hull import carve_hull
+from tracking3d.runtime.progress import report_progress
 
 FEWEST = 8
 """Frames that a shape is made from."""
@@ -88,12 +89,15 @@ def reconstruct_shape(
         return _keep_mesh(f"only {len(used)} frames differ enough to tell a shape, and {FEWEST} are needed")
     if (turn := _turn(used)) < LEAST_TURN:
         return _keep_mesh(f"the object turns by {turn:.0f} degrees only, and {LEAST_TURN:.0f} are needed")
+    report_progress("carving the hull")
     start = trimesh.Trimesh(vertices, faces, process=False)
     grid, inside = _volume(start, used)
+    report_progress("extracting the surface")
     mesh = _check_shape(grid, inside)
     if mesh is None:
         return _keep_mesh("what is seen contradicts itself: the new surface is full of holes")
     new_faces = np.asarray(mesh.faces, np.int64)
+    report_progress("fitting outlines")
     new_vertices = fit_to_outlines(
         np.asarray(mesh.vertices), new_faces, spread_by_rotation(used, _REFERENCES_APART, _REFERENCES)
     )

@@ -21,6 +21,7 @@ from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.reconstruction.views import TextureView
 from tracking3d.rendering import TexelMap, seen_texels
 from tracking3d.rendering.backend import give_threads, threads_kept
+from tracking3d.runtime.progress import report_each, report_progress
 
 _SMALLEST = 64
 _STEEPNESS = 3
@@ -54,12 +55,13 @@ def bake_texture(model: ObjectModel, views: Sequence[TextureView], largest: int 
 
 
 def _paint_texture(model: ObjectModel, views: Sequence[TextureView], size: int) -> ObjectModel:
+    report_progress("texture", 0, len(views))
     gains, coarse = _level_exposure(model, views, max(size // _COARSE, 64))
     expected = cv2.resize(coarse, (size, size), interpolation=cv2.INTER_LINEAR).reshape(-1, 3)
     texels = TexelMap.of(torch.from_numpy(model.face_uvs).float(), size)
     total, weight = np.zeros((size * size, 3), np.float32), np.zeros(size * size, np.float32)
     sharpest = max(view.sharpness for view in views) or 1.0
-    for view, gain in zip(views, gains, strict=True):
+    for view, gain in report_each("texture", list(zip(views, gains, strict=True))):
         add_view(total, weight, _seen(model, texels, view), gain, expected, view.sharpness / sharpest)
     if not weight.any():
         return model

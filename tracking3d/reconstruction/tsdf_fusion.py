@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from tracking3d.reconstruction.grid import FloatArray
 from tracking3d.reconstruction.plane_sweep import DepthMap
+from tracking3d.runtime.progress import report_each
 
 FREE = 0.25
 """Weight of a depth in the free space before it: a wrong depth would otherwise carve a tunnel."""
@@ -44,7 +45,7 @@ def depth_evidence(
         ``(N,)`` weighted sum of signed distances, and ``(N,)`` of weights.
     """
     total, weight = np.zeros(len(points), np.float32), np.zeros(len(points), np.float32)
-    for one in maps:
+    for one in report_each("fusing depths", maps):
         P = one.view.P.astype(np.float32)
         x, y, z = P[:, :3] @ points.T + P[:, 3:]
         ahead = z > 1e-6

@@ -21,6 +21,7 @@ from tracking3d.report.settings import flat
 from tracking3d.results.files import read_mask
 from tracking3d.results.records import jsonable, mask_iou_or_none
 from tracking3d.results.run_reader import RunReader
+from tracking3d.runtime.progress import report_each
 from tracking3d.runtime.stage_times import STAGES
 
 MOST_FRAMES = 6
@@ -208,7 +209,9 @@ def _difference(name: str, first: RunReader, other: RunReader) -> Difference:
     return Difference(
         name=name,
         indices=np.array(shared, dtype=np.int64),
-        iou=np.array([_iou(first, other, index) for index in shared], dtype=np.float64),
+        iou=np.array(
+            [_iou(first, other, index) for index in report_each("comparing masks", shared)], dtype=np.float64
+        ),
         rotation=rotation,
         translation=translation,
         scale=scale,

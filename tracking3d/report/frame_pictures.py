@@ -19,6 +19,7 @@ from tracking3d.frames import Frame, Image
 from tracking3d.results import layout
 from tracking3d.results.overlay import OverlaySize
 from tracking3d.results.run_reader import RunReader
+from tracking3d.runtime.progress import report_each
 from tracking3d.video import open_source
 
 BUDGET = 6_500_000
@@ -69,7 +70,8 @@ def frame_pictures(run: RunReader, budget: int = BUDGET) -> FramePictures:
     widest = min(WIDEST, size.width)
     width = int(min(max(math.sqrt(room / _BYTES_A_PIXEL / ratio), NARROWEST), widest))
     positions = range(0, count, step)
-    jpegs = [_encode(image[: size.picture], width) for image in overlay_frames(run, positions)]
+    overlays = report_each("report", overlay_frames(run, positions), len(positions))
+    jpegs = [_encode(image[: size.picture], width) for image in overlays]
     while (total := sum(map(len, jpegs))) > budget and width > NARROWEST // 2:
         width = int(width * min(math.sqrt(budget / total), 0.9))
         jpegs = [_encode(_decode(jpeg), width) for jpeg in jpegs]

@@ -29,6 +29,7 @@ from tracking3d.results.mesh_view import render_view, side_shown
 from tracking3d.results.notes import unseen_share
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
+from tracking3d.runtime.progress import report_progress
 
 _MOST_LISTED = 30
 """Stretches of uncertain and lost frames that are named; the plots show all."""
@@ -51,6 +52,7 @@ def write_report(folder: Path) -> Path:
         InputError: If it is no run folder, or damaged.
         OutputError: If the report cannot be written; the run is left as it is.
     """
+    report_progress("report")
     run = RunReader(folder)
     try:
         model, no_model = _model_of(run)

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.results.layout import partial_path
 from tracking3d.results.mesh_view import render_view
+from tracking3d.runtime.progress import report_each
 from tracking3d.video.writer import VideoWriter
 
 VIEWS = 48
@@ -34,7 +35,7 @@ def write_turntable(path: Path, model: ObjectModel, rotation: NDArray[np.float64
     partial = partial_path(path)
     try:
         with VideoWriter(partial, FPS, (SIDE, SIDE)) as video:
-            for yaw in np.arange(VIEWS) * 360.0 / VIEWS:
+            for yaw in report_each("turntable", np.arange(VIEWS) * 360.0 / VIEWS):
                 turned = Rotation.from_euler("yx", [yaw, PITCH], degrees=True).as_matrix() @ rotation
                 video.write(render_view(model, turned, SIDE))
         partial.replace(path)

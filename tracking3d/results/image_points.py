@@ -18,6 +18,7 @@ from tracking3d.points.surface_association import meetings, merge_image_points
 from tracking3d.points.uncertainty import FEATURES
 from tracking3d.results.correspondences import PointKind, PointTracks
 from tracking3d.results.run_reader import RunReader
+from tracking3d.runtime.progress import report_each
 from tracking3d.video import FrameSource
 
 Array = NDArray[np.float64]
@@ -53,7 +54,7 @@ def read_run_images(run: RunReader, source: FrameSource) -> list[Picture | None]
     indices = {one.index for one in run.frames}
     pictures = {
         frame.index: open_picture(frame.image, run.mask(frame.index))
-        for frame in source
+        for frame in report_each("reading frames", source, source.count)
         if isinstance(frame, Frame) and frame.index in indices
     }
     return [pictures.get(one.index) for one in run.frames]

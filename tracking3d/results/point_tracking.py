@@ -38,6 +38,7 @@ from tracking3d.results.image_points import follow_beside_mesh, read_run_images,
 from tracking3d.results.records import FrameRecord
 from tracking3d.results.run_reader import RunReader
 from tracking3d.results.run_source import open_run_source
+from tracking3d.runtime.progress import report_each, report_progress
 from tracking3d.video import FrameSource
 
 _DAMAGED = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
@@ -80,6 +81,7 @@ class RunScene:
         inside = in_frame(self.run.camera, query)
         camera = self.run.camera_of(asked)
         seen = camera.to_pinhole(query)
+        report_progress("following points")
         found = follow_points(self.scene, start, np.where(inside[:, None], seen, np.nan))
         on_object = np.asarray(np.isfinite(found.points).all(1))
         face, barycentric = np.full(len(query), -1), np.full((len(query), 3), np.nan)
@@ -114,7 +116,6 @@ def open_scene(
     run: RunReader | Path,
     source: FrameSource | None = None,
     rounds: int = ROUNDS,
-    after_round: Callable[[int], None] = lambda done: None,
 ) -> RunScene:
     """Read the frames of a run and put its surface and poses right by them.
 
@@ -125,7 +126,6 @@ def open_scene(
         run: A run with a mesh.
         source: Its frames; those that the run names if left out.
         rounds: See `refine_scene`; 0 leaves surface and poses as the run has them, and nothing is saved.
-        after_round: See `refine_scene`.
 
     Raises:
         InputError: If the run has no mesh, or its frames cannot be read or are of another size.
@@ -135,7 +135,7 @@ def open_scene(
     images: dict[int, SurfaceView | None] = {}
     records = {one.index: one for one in run.frames}
     source = source if source is not None else open_run_source(run)
-    for frame in source:
+    for frame in report_each("reading frames", source, source.count):
         if isinstance(frame, Frame) and (record := records.get(frame.index)) is not None:
             images[frame.index] = _view(run, record, frame.image, vertices, faces)
     if not images:
@@ -150,7 +150,7 @@ def open_scene(
     key = _key(run, vertices, rounds)
     if (kept := _read_scene(file, key, scene)) is not None:
         return RunScene(run, kept, pictures)
-    scene = fit_outlines(refine_scene(scene, rounds, after_round))
+    scene = fit_outlines(refine_scene(scene, rounds))
     nowhere = np.full((4, 4), np.nan)
     T = np.stack([nowhere if view is None else view.T_cam_obj for view in scene.views])
     _write(file, key, scene.vertices, T)

@@ -12,6 +12,7 @@ import numpy as np
 from tracking3d.frames import Frame, Image, SkippedFrame
 from tracking3d.results.correspondences import PointTracks
 from tracking3d.results.drawing import Colour
+from tracking3d.runtime.progress import report_each
 from tracking3d.video import VideoWriter
 
 TRAIL = 6
@@ -56,7 +57,7 @@ def write_trails(path: Path, frames: Iterable[Frame | SkippedFrame], tracks: Poi
     rows = {int(index): row for row, index in enumerate(tracks.frames)}
     writer: VideoWriter | None = None
     try:
-        for frame in frames:
+        for frame in report_each("drawing", frames, len(rows)):
             if isinstance(frame, Frame) and frame.index in rows:
                 drawn = draw_trails(frame.image, tracks, rows[frame.index])
                 writer = writer or VideoWriter(path, fps, (drawn.shape[0], drawn.shape[1]))

@@ -12,7 +12,7 @@ from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 
@@ -38,10 +38,13 @@ from tracking3d.results.probabilities import write_probability
 from tracking3d.results.records import FrameRecord, jsonable, latest
 from tracking3d.results.refinement_writer import RefinementWriter, clear_refinement
 from tracking3d.results.run_reader import RunReader, read_records
+from tracking3d.runtime.regular_work import RegularWork
 
 FinalState = Literal["finished", "interrupted", "failed"]
 SKIPS_EVERY = 1.0
 """Seconds between two writes of ``run.json`` for skipped frames; the last ones are written at the end."""
+SHEET_EVERY, SHEET_SHARE = 5.0, 0.01
+"""Seconds between two writes of the contact sheet while the run goes on, and the most of the time that they take."""
 RESERVE = 2048  # bytes that ``run.json`` has to spare for saying, on a full disk, how the run ended
 _STAYS = {"created", "refinement", "split", "tracker_choice"}  # of a run that is continued
 DEFAULT_FPS = 10.0
@@ -76,6 +79,7 @@ class RunWriter:
         self._camera, self._fps = header.camera, header.fps or DEFAULT_FPS
         self._started, self._drawing, self._over = time.monotonic(), 0.0, False
         self._pictures = Pictures(self.folder / layout.OVERLAY, self._camera, self._fps)
+        self._sheet = RegularWork(partial(self._write_contact_sheet, None), SHEET_EVERY, SHEET_SHARE)
         self._refinement: RefinementWriter | None = None
         self._probabilities = bool(header.config.get("runtime", {}).get("probabilities"))
         self._description = description.description_at_start(header)
@@ -147,6 +151,7 @@ class RunWriter:
         drawn = time.perf_counter()
         self._pictures.add(frame, estimate, record)
         self._drawing = time.perf_counter() - drawn
+        self._sheet.do_if_due()
         return record
 
     def skip(self, skipped: SkippedFrame) -> None:
@@ -314,11 +319,20 @@ class RunWriter:
 
     def _finish(self, model: ObjectModel | None) -> None:
         records = list(read_records(self.folder / layout.FRAMES))
-        figures = description.summary(
-            latest(records), len(self._description["skipped"]), self.seconds, latest(records, refined=False)
-        )
+        figures = self._summarize(records)
         self._description |= figures | {"notes": notes_of_run(self._description, model, latest(records))}
+        self._write_contact_sheet(model)
+
+    def _write_contact_sheet(self, model: ObjectModel | None) -> None:
+        """Write the contact sheet of the frames so far; None leaves the model out."""
+        records = list(read_records(self.folder / layout.FRAMES))
         replaced = {record.index for record in latest(records) if record.revision and not record.refined}
-        sheet = self._pictures.contact_sheet(model, self._description, replaced)
+        figures = self._summarize(records)
+        sheet = self._pictures.contact_sheet(model, figures | self._description, replaced)
         if sheet is not None:
             write_image(self.folder / layout.CONTACT_SHEET, sheet)
+
+    def _summarize(self, records: list[FrameRecord]) -> dict[str, Any]:
+        """Counts and times of the run so far."""
+        skipped = len(self._description["skipped"])
+        return description.summary(latest(records), skipped, self.seconds, latest(records, refined=False))

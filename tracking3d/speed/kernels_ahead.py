@@ -1,7 +1,7 @@
 """Compiling every kernel before it is needed: ``python -m tracking3d.speed.kernels_ahead``.
 
-Otherwise each is compiled when it is called for the first time, by every process that comes to it meanwhile. An image
-for many machines, or a test run with several workers, does it once.
+Otherwise each is compiled when it is called for the first time. An image for many machines, or a test run with several
+workers, does it once; the command line does it in the background when it is first started.
 """
 
 from __future__ import annotations
@@ -9,17 +9,27 @@ from __future__ import annotations
 import importlib
 import multiprocessing
 import os
-import pkgutil
+import subprocess
+import sys
+from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
 
-from tracking3d.rendering.kernels.compilation import Kernel
+from filelock import FileLock, Timeout
+
+from tracking3d.rendering.kernels.compilation import Kernel, announce_compilation
+
+_FIRST = "tracking3d.estimation.online.optimization.kernels.pose_refinement"
+"""Takes as long as ten others, and is needed soon."""
+_MOST_PROCESSES = 8
+_LOCK = "all_kernels.lock"
 
 
 def kernel_modules() -> list[str]:
     """Full names of the modules that hold kernels: those in rooms' folders ``kernels``."""
-    found = pkgutil.walk_packages([str(Path(__file__).parents[1])], "tracking3d.")
-    return sorted(one.name for one in found if ".kernels." in one.name)
+    package = Path(__file__).parents[1]
+    found = (path.relative_to(package).with_suffix("").parts for path in package.rglob("kernels/[!_]*.py"))
+    return sorted(".".join(["tracking3d", *parts]) for parts in found)
 
 
 def compile_module(name: str) -> int:
@@ -41,11 +51,70 @@ def find_kernels(module: ModuleType) -> list[Kernel]:
     ]
 
 
-def main() -> None:
-    """Compile all, side by side."""
-    with multiprocessing.get_context("spawn").Pool(min(os.cpu_count() or 1, 8)) as pool:
-        count = sum(pool.imap_unordered(compile_module, kernel_modules()))
-    print(f"{count} kernels are compiled.")
+def compile_in_background(quiet: bool = False) -> bool:
+    """Let a process of its own compile the kernels that are not kept on disk; it goes on when this one ends.
+
+    That is said once; of a process that is at it already, and of kernels that this process compiles from here on since
+    it needs them sooner, nothing more is said.
+
+    Args:
+        quiet: Say nothing at all.
+
+    Returns:
+        Whether a process was started; not if all are kept, they cannot be kept, or another process is at it.
+    """
+    kernels = [one for name in kernel_modules() for one in find_kernels(importlib.import_module(name))]
+    missing = next((one for one in kernels if not one.is_kept), None)
+    lock = None if missing is None else _lock_of(missing)
+    if lock is None:
+        return False
+    try:
+        lock.acquire(timeout=0)
+        lock.release()  # the process that is started takes it
+    except (Timeout, OSError, NotImplementedError):
+        announce_compilation("", quiet=True)
+        return False
+    announce_compilation("this is done once, in the background", quiet)
+    process = subprocess.Popen(
+        [sys.executable, "-c", f"from {__name__} import main; main(in_background=True)"],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        start_new_session=True,
+    )
+    process.returncode = 0  # nobody waits for it
+    return True
+
+
+def main(in_background: bool = False) -> None:
+    """Compile all, several at a time.
+
+    Args:
+        in_background: Leave a processor to whoever started this, and do nothing if another process is at it.
+    """
+    modules = sorted(kernel_modules(), key=lambda name: name != _FIRST)
+    if in_background:
+        lock = _lock_of(find_kernels(importlib.import_module(_FIRST))[0])
+        with suppress(AttributeError, OSError):
+            os.nice(10)
+        with suppress(Timeout, OSError, NotImplementedError):
+            if lock is not None:
+                with lock.acquire(timeout=0):
+                    _compile_all(modules, max((os.cpu_count() or 1) - 1, 1))
+        return
+    print(f"{_compile_all(modules, os.cpu_count() or 1)} kernels are compiled.")
+
+
+def _compile_all(modules: list[str], processes: int) -> int:
+    with multiprocessing.get_context("spawn").Pool(min(processes, _MOST_PROCESSES)) as pool:
+        return sum(pool.imap_unordered(compile_module, modules))
+
+
+def _lock_of(kernel: Kernel) -> FileLock | None:
+    """The lock of the process that compiles all kernels of this installation; None if they cannot be kept."""
+    folder = kernel.folder
+    return None if folder is None else FileLock(folder / _LOCK)
 
 
 if __name__ == "__main__":

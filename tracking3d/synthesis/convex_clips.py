@@ -19,6 +19,7 @@ from tracking3d.datasets.clip import write_clip
 from tracking3d.frames import Box
 from tracking3d.geometry.camera import DEFAULT_FIELD_OF_VIEW, Camera
 from tracking3d.results.files import write_mask, writing
+from tracking3d.runtime.progress import report_each
 from tracking3d.synthesis.convex_drawing import draw_convex
 from tracking3d.synthesis.convex_raycast import ConvexSurface, Ellipsoid, Polyhedron
 from tracking3d.synthesis.procedural_texture import paint_background, paint_panel
@@ -111,7 +112,7 @@ def synthesize(spec: SyntheticSpec) -> SyntheticClip:
     poses = _poses(spec, camera, surface.radius)
     images = np.empty((spec.frames, height, width, 3), np.uint8)
     masks = np.empty((spec.frames, height, width), bool)
-    for n, pose in enumerate(poses):
+    for n, pose in enumerate(report_each("drawing the clip", poses)):
         image, masks[n] = draw_convex(pose, camera, surface, panels, background, spec.supersample)
         noisy = image + spec.noise * rng.standard_normal(image.shape, dtype=np.float32)
         images[n] = np.clip(noisy.round(), 0, 255).astype(np.uint8)

@@ -25,14 +25,18 @@ ENCODERS = ("libx264", "libopenh264", "h264_videotoolbox", "h264_mf", "mpeg4")
 _OPTIONS = {"libx264": {"crf": "20", "preset": "veryfast", "tune": "zerolatency"}, "mpeg4": {"qscale": "3"}}
 
 _FRAGMENTED = {"movflags": "+frag_every_frame+empty_moov+default_base_moof", "flush_packets": "1"}
-"""Every frame is its own fragment, so that a killed process loses only the last one."""
+"""Every frame is its own fragment, so that the file plays while it grows, and a killed process loses only the last one.
+"""
+_SEEKABLE = {"movflags": "+faststart"}
+"""One index of all frames before the first, as players and browsers want it that jump to any of them."""
 
 
 class VideoWriter:
     """Writes RGB frames of one size to an MP4 file, one at a time.
 
     Use it in a ``with`` statement: however that ends, by an exception or Ctrl-C too, the file is finished and
-    plays with the frames written so far. Without a frame there is no file. Odd sizes are padded by one row or
+    plays with the frames written so far. Without a frame there is no file. While it grows it can be watched already;
+    at the end it gets an index of all frames, so that players can jump to each. Odd sizes are padded by one row or
     column, which H.264's halved colour planes need.
     """
 
@@ -125,6 +129,8 @@ class VideoWriter:
                         self._file.close()
         if not self._frames and self.path.is_file():
             self.path.unlink()
+        elif not self._failed:
+            _add_index(self.path)
 
     def __enter__(self) -> Self:
         return self
@@ -149,3 +155,25 @@ class VideoWriter:
                     self._file.close()
             reason = getattr(error, "strerror", None) or error
             raise OutputError(f"{self.path} cannot be written: {reason}.") from error
+
+
+def _add_index(path: Path) -> None:
+    """Copy a video of fragments into one with an index, without encoding it again; if that fails, it stays as it is."""
+    partial = path.with_name(f".{path.name}.part")
+    try:
+        with (
+            av.open(str(path)) as fragments,
+            av.open(str(partial), "w", format="mp4", options=_SEEKABLE) as whole,
+        ):
+            [stream] = fragments.streams.video
+            copy = whole.add_stream_from_template(stream)
+            for packet in fragments.demux(stream):
+                if packet.dts is not None:  # the last one only says that there are no more
+                    packet.stream = copy
+                    whole.mux(packet)
+        partial.replace(path)
+    except (FFmpegError, OSError):  # a full disk: the fragments play too
+        pass
+    finally:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)

@@ -11,10 +11,11 @@ from dataclasses import asdict
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TaskID, TextColumn
+from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
 
 from tracking3d.batch.folder import BatchProgress as HowFar
 from tracking3d.batch.running import Happening, Listener
+from tracking3d.cli.remaining_time import duration_in_words
 
 _MOST_WORKERS = 32
 """Most lines of workers on the terminal."""
@@ -34,9 +35,11 @@ def show_batch_progress(quiet: bool, as_json: bool) -> Iterator[Listener]:
         return
     console = Console(stderr=True)
     bars = Progress(
+        SpinnerColumn(),
         TextColumn("{task.description}"),
         BarColumn(bar_width=24),
         TextColumn("{task.fields[said]}"),
+        TimeElapsedColumn(),
         console=console,
         disable=quiet or not console.is_terminal,
         transient=True,
@@ -55,7 +58,7 @@ def show_batch_progress(quiet: bool, as_json: bool) -> Iterator[Listener]:
                 lines[worker],
                 total=about.get("of"),
                 complete=about.get("frames", 0),
-                said=escape(", ".join(str(about[key]) for key in ("video", "step") if key in about)),
+                said=escape(", ".join(str(about[key]) for key in ("video", "step", "stage") if key in about)),
                 visible=True,
             )
         for worker, line in lines.items():
@@ -77,7 +80,7 @@ def in_words(progress: HowFar) -> str:
     if progress.failed:
         parts.append(f"{progress.failed} failed")
     if progress.seconds_to_go is not None:
-        parts.append(f"{_duration(progress.seconds_to_go)} left")
+        parts.append(f"{duration_in_words(progress.seconds_to_go)} left")
     return ", ".join(parts)
 
 
@@ -98,18 +101,6 @@ def _line(happening: Happening) -> str:
         before = f", {happening.progress.before} of them earlier" if happening.progress.before else ""
         return in_words(happening.progress) + before
     return ""
-
-
-def _duration(seconds: float) -> str:
-    minutes, seconds = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return (
-        f"{hours} h {minutes:02d} min"
-        if hours
-        else f"{minutes} min {seconds:02d} s"
-        if minutes
-        else f"{seconds} s"
-    )
 
 
 def _events() -> Listener:

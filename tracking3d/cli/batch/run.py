@@ -141,6 +141,9 @@ def run(
     To continue a stopped batch, repeat the command. DIR/results.csv (and .parquet), DIR/failures.csv and DIR/index.html
     grow as videos finish. The exit code is 1 if a video failed.
     """
+    from tracking3d.cli.progress import load_with_progress
+
+    load_with_progress("tracking3d.batch.running", quiet or as_json, kernels=True)
     from tracking3d.batch.listing import dataset_jobs, list_jobs
     from tracking3d.batch.running import run_batch
     from tracking3d.batch.storage import absolute

@@ -1,7 +1,7 @@
 """Compiling kernels once and keeping them on disk.
 
-Numba's cache replaces files atomically and every kernel has one signature, so that several processes that start
-at once do the same work at worst. If no folder can be written, each process compiles for itself.
+Numba's cache replaces files atomically, and every kernel has one signature. Of several processes that need a kernel
+at once, one compiles it and the others wait for its file. If no folder can be written, each compiles for itself.
 """
 
 from __future__ import annotations
@@ -10,11 +10,12 @@ import contextlib
 import functools
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numba
+from filelock import FileLock
 from numba.core import event, types
 from numpy.typing import NDArray
 from torch import Tensor
@@ -26,6 +27,7 @@ REORDER = {"reassoc", "contract", "arcp", "nsz"}
 
 _log = logging.getLogger("tracking3d.rendering")
 _compiling = threading.RLock()
+_announced = threading.Event()
 
 
 class Kernel:
@@ -58,17 +60,23 @@ class Kernel:
 
     def load(self) -> bool:
         """Load it now if it is kept on disk, and say whether it is there; else it is compiled when it is called."""
-        if self._compiled is None and self._is_kept():
+        if self._compiled is None and self.is_kept:
             self.compile()
         return self._compiled is not None
 
-    def _is_kept(self) -> bool:
+    @property
+    def folder(self) -> Path | None:
+        """Where it is kept; None if no folder can be written."""
         try:
-            folder = numba.njit(cache=True, **self._options)(self._function).stats.cache_path
-            _drop_stale(folder, self._function)
+            return Path(numba.njit(cache=True, **self._options)(self._function).stats.cache_path)
         except (RuntimeError, OSError):
-            return False
-        return any(Path(folder).glob(f"*.{self._function.__name__}-*.nbi"))
+            return None
+
+    @property
+    def is_kept(self) -> bool:
+        """Whether it is kept on disk."""
+        folder = self.folder
+        return folder is not None and _is_kept(folder, self._function)
 
     def _compile(self) -> Callable[..., Any]:
         dispatcher = self._with_cache()
@@ -86,11 +94,13 @@ class Kernel:
             dispatcher = numba.njit(cache=True, **self._options)(self._function)
         except RuntimeError:
             return None
-        folder = dispatcher.stats.cache_path
+        folder = Path(dispatcher.stats.cache_path)
         for _ in range(2):
             try:
-                _drop_stale(folder, self._function)
-                with event.install_listener("numba:compile", _Announcer(folder)):
+                with (
+                    _alone(folder, self._function),
+                    event.install_listener("numba:compile", _Announcer(folder)),
+                ):
                     dispatcher.compile(self._signature)
                 return dispatcher
             except Exception:  # what a damaged file raises can be anything
@@ -134,17 +144,39 @@ def check_corners(faces: Tensor, screen: Tensor) -> None:
         )
 
 
-def _drop_stale(folder: str, function: Callable[..., Any]) -> None:
+def _is_kept(folder: Path, function: Callable[..., Any]) -> bool:
+    """Whether a compiled kernel is there that is not older than its source."""
+    try:
+        _drop_stale(folder, function)
+    except OSError:
+        return False
+    return any(folder.glob(f"*.{function.__name__}-*.nbi"))
+
+
+@contextlib.contextmanager
+def _alone(folder: Path, function: Callable[..., Any]) -> Iterator[None]:
+    """No other process compiles the kernel meanwhile; where files cannot be locked, another may do the same work."""
+    if _is_kept(folder, function):
+        yield
+        return
+    lock = FileLock(folder / f"{function.__module__}.{function.__name__}.lock")
+    with contextlib.ExitStack() as held:
+        with contextlib.suppress(OSError, NotImplementedError):
+            held.enter_context(lock)
+        yield
+
+
+def _drop_stale(folder: Path, function: Callable[..., Any]) -> None:
     """Forget a compiled kernel that is older than any kernel's source: Numba looks at its own file only."""
     rooms = {Path(__file__).parent, Path(function.__code__.co_filename).parent}
     newest = max(source.stat().st_mtime for room in rooms for source in room.glob("*.py"))
-    if any(index.stat().st_mtime < newest for index in Path(folder).glob(f"*.{function.__name__}-*.nbi")):
+    if any(index.stat().st_mtime < newest for index in folder.glob(f"*.{function.__name__}-*.nbi")):
         _forget(folder, function.__name__)
 
 
-def _forget(folder: str, name: str) -> None:
+def _forget(folder: Path, name: str) -> None:
     """Remove what says where a compiled kernel is kept."""
-    for index in Path(folder).glob(f"*.{name}-*.nbi"):
+    for index in folder.glob(f"*.{name}-*.nbi"):
         with contextlib.suppress(OSError):
             index.unlink()
 
@@ -152,17 +184,24 @@ def _forget(folder: str, name: str) -> None:
 class _Announcer(event.Listener):
     """Tells the user of the first compilation in this process."""
 
-    def __init__(self, folder: str | None) -> None:
+    def __init__(self, folder: Path | None) -> None:
         self._folder = folder
 
     def on_start(self, event: event.Event) -> None:
-        _announce(self._folder is not None)
+        kept = "the result is kept" if self._folder else "no folder can be written to keep the result in"
+        announce_compilation(kept)
 
     def on_end(self, event: event.Event) -> None:
         pass
 
 
-@functools.cache
-def _announce(is_kept: bool) -> None:
-    kept = "the result is kept" if is_kept else "no folder can be written to keep the result in"
-    _log.warning("Compiling kernels for this processor takes some seconds; %s.", kept)
+def announce_compilation(outcome: str, quiet: bool = False) -> None:
+    """Say that kernels are compiled, once in a process.
+
+    Args:
+        outcome: What becomes of them, in words.
+        quiet: Say nothing, now and later.
+    """
+    if not _announced.is_set() and not quiet:
+        _log.warning("Compiling kernels for this processor takes some seconds; %s.", outcome)
+    _announced.set()
