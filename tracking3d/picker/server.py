@@ -13,6 +13,9 @@ from importlib.resources import files
 from typing import Any
 from urllib.parse import urlsplit
 
+import numpy as np
+from numpy.typing import NDArray
+
 from tracking3d.errors import InputError, Tracking3dError
 from tracking3d.picker.drawing import parse_object, read_drawing
 from tracking3d.picker.session import Picked, PickingSession
@@ -89,14 +92,17 @@ class Picker:
         """
         if path == "/mask":
             drawn = parse_object(body)
-            mask = self.session.mask(drawn)
-            return {"veil": self.session.veil(mask, drawn.colour), "area": int(mask.sum())}, _nothing
+            return self.show(self.session.mask(drawn), drawn.colour)
         if path not in ("/save", "/start"):
             return None
         picked = self.session.picked(read_drawing(body))
         command, settings = self.save(picked)
         then = partial(self.start, picked) if path == "/start" else _nothing
         return {"command": command, "settings": settings}, then
+
+    def show(self, mask: NDArray[np.bool_], colour: str) -> tuple[Any, Callable[[], None]]:
+        """The response that shows a mask ``(H, W)``; see `order`."""
+        return {"veil": self.session.veil(mask, colour), "area": int(mask.sum())}, _nothing
 
     def start(self, picked: Picked) -> None:
         """The run is to start with that."""

@@ -73,8 +73,12 @@ class PickingSession:
             1
         ].tobytes()
 
-    def mask(self, drawn: DrawnObject) -> NDArray[np.bool_]:
+    def mask(self, drawn: DrawnObject, present: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
         """The mask ``(H, W)`` that the tracker makes of what was drawn.
+
+        Args:
+            drawn: Box, points and paint.
+            present: ``(H, W)`` the mask that paint alone changes, see `drawn_mask`.
 
         Raises:
             InputError: If nothing can be made of it.
@@ -82,7 +86,7 @@ class PickingSession:
         """
         frame = self._frame(drawn.frame)
         with self._busy:  # a tracker takes all that the machine has
-            given = drawn_mask(frame.image, drawn)
+            given = drawn_mask(frame.image, drawn, present)
             if given is None and drawn.box is None:
                 raise InputError("No object is marked yet.")
             prompt = make_prompt(frame, drawn.box if given is None else None, given)

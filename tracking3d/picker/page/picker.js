@@ -9,6 +9,7 @@ const HINTS = {
   paint: "Paint over the object.",
   erase: "Erase what is not the object.",
 };
+const PRESENT = "This is the mask of the run. Paint and Erase change it; a box or points replace it.";
 const byId = (id) => document.getElementById(id);
 const canvas = byId("canvas");
 const context = canvas.getContext("2d");
@@ -22,6 +23,8 @@ let current = 0;
 let pressed = null; // what is being drawn: {kind, ...}
 let zoom = 1;
 let asked = 0; // number of the last question for a mask
+let present = null; // the mask that the run has of this frame, if a run is corrected
+let running = false; // whether the run is being corrected
 
 const one = () => objects[current];
 const isEmpty = (object) => !object.box && !object.points.length && !object.strokes.length;
@@ -80,6 +83,7 @@ function draw() {
   context.clearRect(0, 0, canvas.width, canvas.height);
   if (picture) context.drawImage(picture, 0, 0, canvas.width, canvas.height);
   const unit = session.width / canvas.clientWidth; // frame pixels of a pixel of the screen
+  if (present && !(one().frame === frame && one().veil)) context.drawImage(present, 0, 0);
   objects.forEach((object, number) => {
     if (object.frame !== frame) return;
     context.globalAlpha = number === current ? 1 : 0.6;
@@ -213,7 +217,7 @@ async function showMask() {
   if (isEmpty(object)) {
     object.veil = null;
     object.told = "";
-    say("");
+    say(present ? PRESENT : "");
     list();
     return draw();
   }
@@ -338,6 +342,10 @@ function goTo(index) {
   image.src = `frame/${near}.jpg`;
   frame = near;
   byId("frame").value = byId("number").value = near;
+  if (session.correcting) {
+    if (isEmpty(one())) say("");
+    showPresent();
+  }
   list();
   draw();
 }
@@ -399,6 +407,25 @@ function offerCorrection() {
   follow();
 }
 
+// Paint and erase start from the mask that the run has.
+async function showPresent() {
+  const asks = frame;
+  let image = null;
+  present = null;
+  try {
+    const { veil } = await ask("mask", plain({ ...newObject(), colour: COLOURS[0] }));
+    image = new Image();
+    image.src = veil;
+    await image.decode();
+  } catch {
+    image = null; // the run has no mask of this frame
+  }
+  if (asks !== frame) return;
+  present = image;
+  if (isEmpty(one()) && !byId("status").textContent) say(present ? PRESENT : "The run has no mask of this frame.");
+  draw();
+}
+
 async function follow() {
   let told;
   try {
@@ -408,6 +435,12 @@ async function follow() {
   }
   byId("start").disabled = told.running || isEmpty(one());
   if (told.sentence) say(told.sentence, told.failed);
+  if (running && !told.running && !told.failed) {
+    objects = [newObject()]; // the drawing is in the run now
+    showPresent();
+    list();
+  }
+  running = told.running;
   byId("progress").hidden = !told.running;
   if (told.share === null) byId("progress").removeAttribute("value");
   else byId("progress").value = told.share;
