@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from tracking3d.errors import InputError, Tracking3dError
 from tracking3d.picker.drawing import parse_object, read_drawing
 from tracking3d.picker.session import Picked, PickingSession
+from tracking3d.picker.settings import parse_settings, setting_choices, settings_in_words
 from tracking3d.web.access import SAFE_HEADERS, Access
 
 LARGEST_BODY = 2 * 2**20
@@ -93,6 +94,9 @@ class Picker:
         if path == "/mask":
             drawn = parse_object(body)
             return self.show(self.session.mask(drawn), drawn.colour)
+        if path == "/settings":
+            self.session.choose(parse_settings(body))
+            return {"tracker": self.session.config.tracker.name, **_describe_settings(self.session)}, _nothing
         if path not in ("/save", "/start"):
             return None
         picked = self.session.picked(read_drawing(body))
@@ -180,7 +184,7 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             done = self.server.picker.order(self.path, body)
         except Tracking3dError as error:
-            return self._refuse(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
+            return self._refuse(HTTPStatus.UNPROCESSABLE_ENTITY, error.at_the_command_line)
         if done is None:
             return self._refuse(HTTPStatus.NOT_FOUND, "This page does not exist.")
         told, then = done
@@ -266,4 +270,13 @@ def _describe(session: PickingSession) -> dict[str, Any]:
         "width": session.width,
         "height": session.height,
         "tracker": session.config.tracker.name,
+        "choices": setting_choices(session.config) if session.menu else None,
+        **_describe_settings(session),
     }
+
+
+def _describe_settings(session: PickingSession) -> dict[str, Any]:
+    """What is chosen, and what the settings come to that are not."""
+    if session.menu is None:
+        return {}
+    return {"chosen": session.menu.chosen.model_dump(), "usual": settings_in_words(session.config)}

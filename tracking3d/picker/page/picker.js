@@ -322,7 +322,7 @@ for (const button of document.querySelectorAll("#tools button")) {
 
 const KEYS = { b: "box", o: "on", i: "beside", p: "paint", e: "erase" };
 document.addEventListener("keydown", (event) => {
-  if (event.target.matches("input[type=text], input[type=number]")) return;
+  if (event.target.matches("input[type=text], input[type=number], select")) return;
   if ((event.ctrlKey || event.metaKey) && event.key === "z") return undo();
   if (event.ctrlKey || event.metaKey || event.altKey) return;
   if (KEYS[event.key]) take(KEYS[event.key]);
@@ -353,10 +353,55 @@ function goTo(index) {
 byId("frame").addEventListener("input", (event) => goTo(Number(event.target.value)));
 byId("number").addEventListener("change", (event) => goTo(Number(event.target.value) || session.first));
 
+// ---- settings of the run ----
+
+const UNCHOSEN = { quality: "not given", fov: "degrees, upright", intrinsics: "fx, fy, cx, cy" };
+let settled = Promise.resolve(); // the last change of settings has arrived
+
+function offerSettings() {
+  byId("settings").hidden = false;
+  for (const control of document.querySelectorAll("[data-setting]")) {
+    const words = session.choices[control.dataset.setting];
+    if (words) control.replaceChildren(new Option("", ""), ...words.map((word) => new Option(word, word)));
+    control.addEventListener("change", () => { settled = settled.then(changeSettings); });
+  }
+  showSettings();
+}
+
+// Settings that were not chosen are those of the quality, the preset or the configuration file.
+function showSettings() {
+  for (const control of document.querySelectorAll("[data-setting]")) {
+    const name = control.dataset.setting, value = session.chosen[name];
+    control.value = Array.isArray(value) ? value.join(", ") : value ?? "";
+    const unchosen = control.options?.[0];
+    if (unchosen) unchosen.textContent = session.usual[name] && !value ? `default (${session.usual[name]})` : UNCHOSEN[name] ?? "default";
+  }
+  byId("source").textContent = `${session.source}, ${session.width} x ${session.height}, tracker ${session.tracker}`;
+}
+
+async function changeSettings() {
+  const chosen = {};
+  for (const control of document.querySelectorAll("[data-setting]")) {
+    const name = control.dataset.setting, text = control.value.trim();
+    chosen[name] = text === "" ? null : name === "fov" ? Number(text)
+      : name === "intrinsics" ? text.split(/[\s,]+/).map(Number) : text;
+  }
+  try {
+    Object.assign(session, await ask("settings", chosen));
+    say("");
+  } catch (error) {
+    showSettings();
+    return say(`${error.message} The settings are as before.`, true);
+  }
+  showSettings();
+  if (!isEmpty(one())) await showMask();
+}
+
 // ---- how it ends ----
 
 async function end(path) {
   say("One moment …");
+  await settled;
   try {
     const told = await ask(path, { objects: objects.filter((object) => !isEmpty(object)).map(plain) });
     say("");
@@ -390,7 +435,7 @@ byId("start").addEventListener("click", async () => {
   if (session.correcting) return correct();
   const told = await end("start");
   if (!told) return;
-  for (const control of document.querySelectorAll("button, input")) control.disabled = true;
+  for (const control of document.querySelectorAll("button, input, select")) control.disabled = true;
   canvas.style.pointerEvents = "none";
   byId("told").hidden = false;
   byId("told").textContent = told.command;
@@ -472,6 +517,7 @@ async function open() {
   goTo(Number(/^#frame=(\d{1,9})$/.exec(location.hash)?.[1] ?? frame));
   window.addEventListener("resize", resize);
   if (session.correcting) offerCorrection();
+  else if (session.choices) offerSettings();
 }
 
 open();
