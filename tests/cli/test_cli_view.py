@@ -127,7 +127,7 @@ def terminal(monkeypatch):
 def test_run_without_an_object_picks_where_a_person_is_there(call, clip, script, terminal, monkeypatch):
     asked = []
 
-    def picked(source, frames, settings, folder, overwrite=False):
+    def picked(source, frames, settings, folder, overwrite=False, menu=None):
         asked.append((source, frames, settings.tracker.name, folder))
         return Picked(2, (CUP,), boxes=[(20.0, 10.0, 20.0, 20.0)])
 
@@ -204,3 +204,53 @@ def test_the_viewer_starts_without_torch():
     code = "import sys, tracking3d.viewer.opening; print({'torch', 'kornia', 'numba'} & set(sys.modules))"
     answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert answer.stdout == "set()\n", "loading it takes longer than all else until the page is there"
+
+
+@pytest.mark.parametrize("command", ["pick", "run"])
+def test_the_options_of_the_command_line_are_chosen_on_the_page_and_can_be_changed(
+    call, clip, script, terminal, monkeypatch, command
+):
+    def picked(source, frames, settings, folder, *more, overwrite=False, menu=None):
+        menu = more[-1] if more else menu
+        first, intrinsics = menu.chosen, (300.0, 300.0, 31.5, 23.5)
+        assert (first.tracker, first.quality, first.fov) == ("csrt", "best", 30)
+        assert menu.configure(first) == settings and settings.crop.size == 192
+        chosen = first.model_copy(update={"model": "none", "fov": None, "intrinsics": intrinsics})
+        return Picked(0, (CUP,), boxes=[(20.0, 10.0, 20.0, 20.0)], config=menu.configure(chosen))
+
+    monkeypatch.setattr(pick_module, "picked_in_browser", picked)
+    options = ["--tracker", "csrt", "--quality", "best", "--fov", "30", "--out", "run"]
+    assert call(command, clip, *options).exit_code == 0
+    config = RunReader(Path("run")).config
+    assert config["camera"]["intrinsics"] == [300.0, 300.0, 31.5, 23.5] and config["camera"]["fov"] is None
+    assert config["object"]["texture_views"] == 0 and config["crop"]["size"] == 192
+
+
+def test_a_camera_file_of_the_command_line_stays_unless_the_page_names_another_lens(clip, tmp_path):
+    from tracking3d.cli.options import SettingsOptions
+    from tracking3d.cli.options.camera import CameraOptions
+    from tracking3d.cli.options.tracking import TrackingOptions
+
+    file = tmp_path / "cameras.txt"
+    file.write_text("1 PINHOLE 64 48 60 60 31.5 23.5\n")
+    camera = CameraOptions(intrinsics=str(file))
+    menu = pick_module.settings_menu(
+        str(clip), None, TrackingOptions(), camera, SettingsOptions(), pick_module._configure
+    )
+    config = menu.configure(menu.chosen.model_copy(update={"quality": "draft"}))
+    assert config.camera.file is not None and str(config.camera.file) == str(file)
+    config = menu.configure(menu.chosen.model_copy(update={"fov": 20.0}))
+    assert config.camera.file is None and config.camera.fov == 20
+
+
+def test_the_page_of_the_tracker_auto_shows_the_masks_of_the_one_that_it_stands_for(clip):
+    from tracking3d.cli.options import SettingsOptions
+    from tracking3d.cli.options.camera import CameraOptions
+    from tracking3d.cli.options.tracking import TrackingOptions
+
+    tracking = TrackingOptions(tracker="auto")
+    menu = pick_module.settings_menu(
+        str(clip), None, tracking, CameraOptions(), SettingsOptions(), pick_module._configure
+    )
+    assert menu.chosen.tracker == "auto"
+    assert menu.configure(menu.chosen).tracker.name in ("csrt", "onnx", "flow")

@@ -12,12 +12,14 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # recorded_runs, r
 
 from recorded_runs import write_frames
 
+from tracking3d.cli.options import configure as configured
 from tracking3d.config.loading import load_config
 from tracking3d.frames import MaskEstimate
 from tracking3d.picker import session as session_module
 from tracking3d.picker.outcome import command_of, save_outcome, settings_as_yaml
 from tracking3d.picker.server import Picker
 from tracking3d.picker.session import PickingSession
+from tracking3d.picker.settings import ChosenSettings, SettingsMenu
 from tracking3d.video import open_source
 from tracking3d.video.any_frame import frame_images
 from tracking3d.web.access import Access
@@ -50,3 +52,25 @@ def picker(session, tmp_path):
     picker = Picker(session, save, Access(), 0)
     yield picker
     picker.close()
+
+
+@pytest.fixture
+def menu() -> SettingsMenu:
+    """The settings of a page whose command line said ``--quality draft``."""
+
+    def configure(chosen: ChosenSettings):
+        given = {
+            "tracker": {"name": chosen.tracker},
+            "features": chosen.features,
+            "camera": {"fov": chosen.fov},
+        }
+        return configured(None, None, None, chosen.quality, chosen.model, **given)
+
+    return SettingsMenu(ChosenSettings(quality="draft"), configure)
+
+
+@pytest.fixture
+def picker_with_settings(session, picker, menu) -> Picker:
+    """A picker whose page offers settings."""
+    session.config, session.menu = menu.configure(menu.chosen), menu
+    return picker

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import base64
+
+import cv2
+import numpy as np
 import pytest
+from browser import open_page
 from raw_requests import raw_request, request, status
 from test_picker_server import BOX, POINTS, body, post, whole
 
@@ -10,10 +15,77 @@ from tracking3d.errors import InputError
 from tracking3d.picker.correction import CorrectionPage, CorrectionProgress
 from tracking3d.web.access import Access
 
+NOTHING = {**BOX, "box": None}
+PAINT = {"path": [[80, 10]], "radius": 4, "on": True}
+ERASE = {"path": [[50, 0], [50, 63]], "radius": 3, "on": False}
+
+
+def mask_of_run(index: int) -> np.ndarray | None:
+    """The left half of the object is missing; frame 2 has no mask."""
+    mask = np.zeros((64, 96), bool)
+    mask[20:44, 48:66] = True
+    return None if index == 2 else mask
+
 
 @pytest.fixture
 def begun() -> list:
     return []
+
+
+def colours_of(page, drawn) -> np.ndarray:
+    """``(H, W)`` which pixels the page colours for a drawing."""
+    veil = body(post(page, "/mask", drawn))["veil"]
+    layer = np.frombuffer(base64.b64decode(veil.partition(",")[2]), np.uint8)
+    return cv2.imdecode(layer, cv2.IMREAD_UNCHANGED)[..., 3] > 0
+
+
+def test_before_anything_is_drawn_the_mask_of_the_run_is_shown(page):
+    assert np.array_equal(colours_of(page, {**NOTHING, "frame": 3}), mask_of_run(3))
+    assert status(post(page, "/mask", {**NOTHING, "frame": 2})) == 422
+
+
+def test_paint_and_erase_start_from_the_mask_of_the_run(page, begun):
+    drawn = {**NOTHING, "frame": 3, "strokes": [PAINT, ERASE]}
+    assert status(post(page, "/correct", drawn)) == 200
+    mask, before = begun[0].mask, mask_of_run(3)
+    assert mask[10, 80] and not mask[:, 50].any()
+    assert np.array_equal(mask[:, 55:70], before[:, 55:70])
+    assert np.array_equal(mask, colours_of(page, drawn))
+
+
+@pytest.mark.parametrize("anew", [BOX, POINTS], ids=["box", "points"])
+def test_a_box_or_points_replace_the_mask_of_the_run(page, begun, anew):
+    assert status(post(page, "/correct", {**anew, "frame": 3, "strokes": [PAINT]})) == 200
+    assert begun[0].mask[22:42, 33:46].mean() > 0.9
+
+
+def test_of_a_frame_without_a_mask_paint_is_all_there_is(page, begun):
+    assert status(post(page, "/correct", {**NOTHING, "frame": 2, "strokes": [PAINT]})) == 200
+    assert 40 < begun[0].mask.sum() < 80
+
+
+def test_a_drawing_of_nothing_corrects_nothing(page, begun):
+    answer = post(page, "/correct", {**NOTHING, "frame": 3})
+    assert status(answer) == 422 and b"Nothing is drawn yet" in answer
+    wiped = {"path": [[0, 32], [95, 32]], "radius": 60, "on": False}
+    assert status(post(page, "/correct", {**NOTHING, "frame": 3, "strokes": [wiped]})) == 422
+    assert begun == []
+
+
+def test_a_person_sees_the_mask_of_the_run_and_erases_from_it(page, begun):
+    with open_page(f"{page.address}#frame=3") as opened:
+        opened.wait_for_selector("#status:has-text('This is the mask of the run')")
+        opened.wait_for_selector("#start:disabled")
+        opened.keyboard.press("e")
+        area = opened.locator("#canvas").bounding_box()
+        for press, y in ((opened.mouse.down, 0.25), (opened.mouse.up, 0.75)):
+            opened.mouse.move(area["x"] + area["width"] * 50 / 96, area["y"] + area["height"] * y)
+            press()
+        opened.wait_for_selector("#status:has-text('The run continues from this mask')")
+        opened.click("#start")
+        opened.wait_for_selector("#status:has-text('so far')")
+    before = mask_of_run(3)
+    assert 0 < begun[0].mask.sum() < before.sum() and not (begun[0].mask & ~before).any()
 
 
 @pytest.fixture
@@ -23,9 +95,10 @@ def page(session, begun):
             raise InputError("A correction is in progress; wait for it to finish.")
         begun.append(drawn)
 
-    page = CorrectionPage(
-        session, "cup", begin, lambda: CorrectionProgress(bool(begun), "so far", share=0.5), Access(), 0
-    )
+    def progress():
+        return CorrectionProgress(bool(begun), "so far" if begun else "", share=0.5)
+
+    page = CorrectionPage(session, "cup", mask_of_run, begin, progress, Access(), 0)
     yield page
     page.close()
 
@@ -45,7 +118,7 @@ def test_it_says_whom_it_corrects_and_how_far_that_is(page, begun):
     assert (told["correcting"], told["first"], told["last"]) == ("cup", 0, 5)
     assert body(whole(page, request("GET", "/progress.json"))) == {
         "running": False,
-        "sentence": "so far",
+        "sentence": "",
         "failed": False,
         "share": 0.5,
     }

@@ -134,6 +134,45 @@ def test_noise_is_no_proof_of_another_lens():
     assert found.focal_factor == pytest.approx(1, abs=0.05)
 
 
+def deviation_of_lens(degrees: float, distance: float, seed: int = 5) -> tuple[float, float]:
+    """Error and standard deviation of the logarithm of a focal length that was taken for a fifth too short."""
+    T, random = poses(), np.random.default_rng(seed)
+    turns = np.deg2rad(np.linspace(0, degrees, 9))[:, None] * np.array([0.0, 1.0, 0.0])
+    T[:, :3, :3], T[:, 2, 3] = Rotation.from_rotvec(turns).as_matrix(), distance
+    measured = projected(POINTS, T) + random.normal(0, 0.1, (9, 40, 2))
+    T[:, 2, 3] /= 1.2
+    lens, deviation = INTRINSICS / [1.2, 1.2, 1, 1], np.full((9, 40), 0.1)
+    given = bundle(POINTS, lens, T, measured, deviation, 0.1)
+    found = bundle(POINTS, lens, T, measured, deviation, 0.1, begun=given)
+    assert given.focal_deviation is None and found.focal_deviation is not None
+    return np.log(found.focal_factor / 1.2), found.focal_deviation
+
+
+def test_a_lens_is_certain_after_a_large_turn_seen_from_near_and_uncertain_after_a_small_one_from_afar():
+    _, near = deviation_of_lens(60, 4)
+    _, far = deviation_of_lens(5, 12)
+    assert near < 0.03
+    assert far > 0.15
+
+
+def test_the_error_of_a_lens_is_what_its_deviation_leads_to_expect():
+    for degrees, distance in [(60, 4), (30, 4), (60, 12), (5, 12)]:
+        of_one = [deviation_of_lens(degrees, distance, seed) for seed in range(3)]
+        assert max(abs(error) / deviation for error, deviation in of_one) < 2
+
+
+def test_a_lens_has_the_same_deviation_whether_it_stays_or_was_changed():
+    measured, lens, T = seen_through(0.6, noise=0.1)
+    deviation = np.full((9, 40), 0.1)
+    given = bundle(POINTS, lens, T, measured, deviation, 0.1)
+    changed = bundle(POINTS, lens, T, measured, deviation, 0.1, begun=given)
+    again = lens * [changed.focal_factor, changed.focal_factor, 1, 1]
+    settled = bundle(POINTS, again, changed.T_cam_obj, measured, deviation, 0.1)
+    kept = bundle(POINTS, again, changed.T_cam_obj, measured, deviation, 0.1, begun=settled)
+    assert kept.focal_factor == pytest.approx(1, abs=0.02)
+    assert kept.focal_deviation == pytest.approx(changed.focal_deviation, rel=0.2)
+
+
 @pytest.mark.parametrize("wrong", [False, True])
 def test_the_way_round_that_explains_the_measurements_is_found(wrong):
     T, measured = poses(), projected(POINTS, poses()) + RNG.normal(0, 0.1, (9, 40, 2))

@@ -108,6 +108,8 @@ def test_a_lens_that_was_assumed_is_put_right_with_them_and_one_that_was_given_s
     assert look.camera.fx == pytest.approx(CAMERA.fx, rel=0.08)
     assert look.camera.fy == pytest.approx(look.camera.fx)
     assert look.camera.assumed and look.camera.known
+    assert given.camera.focal_deviation is None
+    assert abs(np.log(look.camera.fx / CAMERA.fx)) < 2 * look.camera.focal_deviation < 0.3
     assert look.camera.origin == f"solved field of view of {look.camera.fov:.1f} degrees"
     assert rotation_errors(found).mean() < 0.5
 

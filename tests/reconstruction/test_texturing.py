@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import base64
+from collections.abc import Iterable
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -12,8 +15,10 @@ from rendered_views import FINE, ball, pattern, view
 
 from tracking3d.estimation.estimate import ObjectModel
 from tracking3d.reconstruction import bake_texture, texturing
+from tracking3d.reconstruction.meshing import unwrap
 from tracking3d.reconstruction.texturing import fill_holes, texture_size
-from tracking3d.rendering import sample_texture
+from tracking3d.rendering import TexelMap, sample_texture
+from tracking3d.report.model_data import model_data
 
 YAWS = (-40, -20, 0, 20, 40)
 
@@ -46,6 +51,43 @@ def test_what_no_view_shows_is_marked_and_continues_what_is_seen():
     assert 0.2 < known.mean() < 0.5
     low, high = model.texture[known].min(0), model.texture[known].max(0)
     assert (model.texture >= low).all() and (model.texture <= high).all()
+
+
+def unwrapped(yaws: Iterable[float]) -> ObjectModel:
+    """The ball with an atlas of charts, seen from these sides."""
+    pytest.importorskip("xatlas", reason="xatlas is absent: pip install 'tracking3d[model]'")
+    model = ball()
+    model = replace(model, face_uvs=unwrap(model.vertices, model.faces))
+    return bake_texture(model, [view(n, yaw) for n, yaw in enumerate(yaws)])
+
+
+def around(texels: np.ndarray) -> np.ndarray:
+    """Those texels and their neighbours, diagonal ones too."""
+    return cv2.dilate(texels.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+
+
+def test_what_was_seen_goes_on_beyond_the_edge_of_a_chart_as_colours_do():
+    model = unwrapped(YAWS)
+    size = len(model.texture)
+    charts = np.zeros(size * size, bool)
+    charts[TexelMap.of(torch.from_numpy(model.face_uvs).float(), size).texel.numpy()] = True
+    charts, seen = charts.reshape(size, size), model.texture_weight > 0
+    beside_seen, beside_unseen = around(charts & seen), around(charts & ~seen)
+    only_seen, only_unseen = ~charts & beside_seen & ~beside_unseen, ~charts & beside_unseen & ~beside_seen
+    assert only_seen.sum() > size and only_unseen.any()
+    assert seen[only_seen].all() and not seen[only_unseen].any()
+
+
+def test_the_picture_for_the_model_viewer_has_no_pale_line_along_charts():
+    """There the viewer interpolates between texels on the surface and texels off it."""
+    model = unwrapped(range(0, 360, 30))
+    belt = (np.abs(model.vertices[model.faces][..., 1]) < 0.6).all(1)
+    address = model_data(model)["texture"]
+    encoded = np.frombuffer(base64.b64decode(address.partition(",")[2]), np.uint8)
+    picture = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
+    known = torch.from_numpy(picture[len(picture) // 2 :, :, :1].transpose(2, 0, 1) / 255).float()
+    corners = torch.from_numpy(model.face_uvs[belt].reshape(-1, 2)).float()
+    assert (sample_texture(known, corners) > 0.65).all()  # from which on the shader shows the colour alone
 
 
 def test_shape_and_features_stay():

@@ -125,6 +125,8 @@ def test_frames_that_are_no_text_of_ours_are_named(run, content):
         ("cx", 1e300),
         ("cy", "left"),
         ("origin", 7),
+        ("focal_deviation", "small"),
+        ("focal_deviation", -0.1),
         ("assumed", "no"),
         ("zoom", 3),
     ],

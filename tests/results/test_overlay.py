@@ -133,6 +133,51 @@ def test_the_status_bar_shows_status_by_colour_and_survives_any_reason(turning_s
     assert (bar[:, -3:] == drawing.PAPER).all()  # nothing runs out of the picture
 
 
+REASON = "the rendered mask overlaps the initial one by an IoU of 0.45 only, so that one is the answer"
+
+
+@pytest.fixture
+def texts(monkeypatch):
+    """The texts that are drawn, with the column at which each ends."""
+    drawn, draw_text = [], drawing.draw_text
+
+    def recorded(image, text, *where):
+        drawn.append((text, end := draw_text(image, text, *where)))
+        return end
+
+    monkeypatch.setattr(drawing, "draw_text", recorded)
+    return drawn
+
+
+@pytest.mark.parametrize("width", [96, 320, 500, 640, 1920])
+@pytest.mark.parametrize("reason", [REASON, "csrt: " + 4 * REASON, "no pose", ""])
+def test_a_reason_is_shown_in_whole_words_in_frames_of_any_width(make_turning_sphere, texts, width, reason):
+    clip = make_turning_sphere(1, width, width // 2)
+    overlay_of(clip, 0, status=Status.UNCERTAIN, reason=reason)
+    after_figures = [text for text, _ in texts][[text for text, _ in texts].index("estimate") + 1 :]
+    shown = " ".join(after_figures)
+    if len(reason) <= len(REASON):
+        assert shown == reason
+    else:
+        assert shown.endswith("...") and reason.startswith(shown.removesuffix("...") + " ")
+        assert len(shown) > 80
+    assert max(end for _, end in texts) <= OverlaySize.of(clip.camera).width
+
+
+def test_text_is_shortened_between_words():
+    words = ["points", "agree,", "pixels", "do", "not"]
+    beginnings = [" ".join(words[:count]) + "..." for count in range(1, len(words))]
+    for width in range(60, 400):
+        short = drawing.shorten(" ".join(words), 10, width)
+        assert drawing.text_width(short, 10) <= width
+        assert short in [*beginnings, " ".join(words)] or "points".startswith(short.removesuffix("..."))
+
+
+def test_of_a_single_long_word_the_beginning_is_kept():
+    assert drawing.shorten("/a/very/long/path" * 20, 10, 200).startswith("/a/very/long/")
+    assert drawing.wrap("/a/very/long/path" * 20 + " is missing", 10, 200, 2)[1] == "is missing"
+
+
 def test_thumbnails_are_few_and_spread_over_a_clip_of_any_length(turning_sphere):
     picture = np.zeros((240, 320, 3), dtype=np.uint8)
     small = dataclasses.replace(turning_sphere.estimates[0], mask=np.zeros((4, 4), dtype=bool))

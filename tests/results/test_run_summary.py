@@ -94,14 +94,22 @@ def test_an_assumed_lens_is_noted(summary, turning_sphere):
     assert sheet.shape[0] % TILE == 16 + 2 * 23
 
 
-def test_a_lens_that_was_solved_is_told():
-    camera = {"assumed": True, "origin": "solved field of view of 52.1 degrees"}
-    [note] = describe_camera_and_model(camera, None)
-    assert (
-        note
-        == "no focal length was given: solved field of view of 52.1 degrees; the final refinement estimated it"
-    )
-    assert describe_camera_and_model(camera | {"assumed": False}, None) == []
+SOLVED = {"assumed": True, "origin": "solved field of view of 17.8 degrees"}
+
+
+def test_an_estimated_lens_is_a_doubt_if_its_uncertainty_says_so():
+    assert describe_camera_and_model(SOLVED | {"focal_deviation": 0.21}, None) == [
+        "no focal length was given: solved field of view of 17.8 degrees, uncertain by 21 % of the focal length; "
+        "give --fov or --intrinsics if depth matters"
+    ]
+    assert describe_camera_and_model(SOLVED | {"focal_deviation": 0.01}, None) == []
+
+
+@pytest.mark.parametrize("unknown", [{}, {"focal_deviation": None}], ids=["earlier version", "not estimated"])
+def test_a_lens_of_which_nothing_says_how_certain_it_is_is_a_doubt(unknown):
+    [note] = describe_camera_and_model(SOLVED | unknown, None)
+    assert note.startswith("no focal length was given: solved field of view of 17.8 degrees; give --fov")
+    assert describe_camera_and_model(SOLVED | unknown | {"assumed": False}, None) == []
 
 
 def test_a_surface_that_was_mostly_never_seen_is_noted(turning_sphere):

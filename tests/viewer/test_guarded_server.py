@@ -182,7 +182,7 @@ def test_a_crowd_is_turned_away_and_when_it_has_gone_the_page_is_served(server, 
 def test_a_viser_that_cannot_be_guarded_is_not_used(monkeypatch):
     original = websockets.asyncio.server.serve
     monkeypatch.setattr(guarded_server._Guard, "serve", property(lambda self: original), raising=False)
-    with pytest.raises(PluginError, match="cannot be guarded"):
+    with pytest.raises(PluginError, match="cannot be protected from other web pages"):
         start_server(Access(), 0)
     assert websockets.asyncio.server.serve is original
 

@@ -66,6 +66,8 @@ class Structure:
         residual: ``(F, N)`` distance in pixels between track and projection; nan if unseen.
         iterations: Steps that were tried.
         origin: In a word, where it comes from.
+        focal_curvature: Second derivative of the sum of losses by the logarithm of the focal factor, with poses and
+            points free to follow; 0 if the focal length was not solved for.
     """
 
     R: FloatArray
@@ -76,6 +78,7 @@ class Structure:
     residual: FloatArray = field(default_factory=_nothing)
     iterations: int = 0
     origin: str = ""
+    focal_curvature: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +97,18 @@ class System:
         from tracking3d.bundle_adjustment.kernels import elimination
 
         return elimination.step(poses, points, self.coupling, self.poses_gradient, self.points_gradient)
+
+    def last_curvature(self) -> float:
+        """Curvature along the last unknown of the poses, with all others eliminated; 0 if it is not known."""
+        poses, points = _damp(self.poses, _LEAST_DAMPING), _damp(self.points, _LEAST_DAMPING)
+        try:
+            coupling = np.linalg.solve(np.linalg.cholesky(points), self.coupling).reshape(-1, len(poses))
+            reduced = poses - coupling.T @ coupling
+            others = np.linalg.solve(reduced[:-1, :-1], reduced[:-1, -1])
+        except np.linalg.LinAlgError:
+            return 0.0
+        curvature = float(reduced[-1, -1] - reduced[-1, :-1] @ others)
+        return max(curvature, 0.0) if math.isfinite(curvature) else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,7 +236,8 @@ def adjust(
     if fixed == 1 and not problem.prior_weight.any():
         best = problem.evaluate(_with_depth_of(begun, best, problem.weight.max(0, initial=0.0) > 0))
     points = np.where(known[:, None], best.points, np.nan)
-    return replace(best, points=points, iterations=tried)
+    curvature = problem.linearize(best).last_curvature() if free_focal else 0.0
+    return replace(best, points=points, iterations=tried, focal_curvature=curvature)
 
 
 def _with_depth_of(reference: Structure, structure: Structure, used: NDArray[np.bool_]) -> Structure:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import shlex
 import sys
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,15 +13,17 @@ import typer
 
 from tracking3d.cli.model import check_model_source
 from tracking3d.cli.options import Debug, Quiet, SettingsOptions, grouped
+from tracking3d.cli.options.camera import CameraOptions
 from tracking3d.cli.options.output import Browser, Host, Overwrite, RunFolder
 from tracking3d.cli.options.panels import OUTPUT
-from tracking3d.cli.options.tracking import Tracker
+from tracking3d.cli.options.tracking import Features, Tracker, TrackingOptions
 from tracking3d.cli.options.video import Frames
 from tracking3d.cli.view import show_address
 
 if TYPE_CHECKING:
     from tracking3d.config.models import PipelineConfig
     from tracking3d.picker.session import Picked
+    from tracking3d.picker.settings import ChosenSettings, SettingsMenu
     from tracking3d.prompts.prompt import PromptSet
 
 
@@ -29,11 +33,13 @@ def pick(
         str, typer.Argument(metavar="VIDEO", help="Video file, image folder or quoted image pattern.")
     ],
     tracker: Tracker = None,
+    features: Features = None,
     out: RunFolder = None,
     overwrite: Overwrite = False,
     frames: Frames = None,
     *,
     settings: SettingsOptions,
+    camera: CameraOptions,
     host: Host = None,
     port: Annotated[
         int,
@@ -56,7 +62,8 @@ def pick(
 ) -> None:
     """Mark the object in the browser with a box, points or a brush on any frame, then start the run from the page.
 
-    The page shows at once the mask that the tracker makes from it. It also offers the command and a YAML file to copy.
+    The page shows at once the mask that the tracker makes from it. Tracker, quality, final mesh, features and lens can
+    be changed there. It also offers the command and a YAML file to copy.
     """
     from tracking3d.cli.progress import load_with_progress
 
@@ -67,13 +74,83 @@ def pick(
 
     if view:
         check_viser("--view")
-    check_model_source(settings.model, source)
-    config = settings.configure(tracker={"name": tracker})
+    tracking = TrackingOptions(tracker, features)
+    menu = settings_menu(source, frames, tracking, camera, settings, _configure)
+    config = menu.configure(menu.chosen)
     folder = out or default_folder(source)
-    picked = picked_in_browser(source, frames, config, folder, host, port, browser, overwrite)
+    picked = picked_in_browser(source, frames, config, folder, host, port, browser, overwrite, menu)
     prompts = prompts_of(picked)
     options = RecordOptions(shlex.join(sys.argv), frames, overwrite)
-    track(RunRequest(source, config, folder, prompts, options), RunDisplay(quiet, view=view, host=host))
+    request = RunRequest(source, picked.config or config, folder, prompts, options)
+    track(request, RunDisplay(quiet, view=view, host=host))
+
+
+def _configure(tracking: TrackingOptions, camera: CameraOptions, settings: SettingsOptions) -> PipelineConfig:
+    """The configuration that the options make together."""
+    return settings.configure(
+        tracker={"name": tracking.tracker}, features=tracking.features, camera=camera.settings()
+    )
+
+
+Configure = Callable[[TrackingOptions, CameraOptions, SettingsOptions], "PipelineConfig"]
+"""Makes the configuration of a run from the options that the page can change."""
+
+
+def settings_menu(
+    source: str,
+    frames: str | None,
+    tracking: TrackingOptions,
+    camera: CameraOptions,
+    settings: SettingsOptions,
+    configure: Configure,
+) -> SettingsMenu:
+    """The settings that the page offers, those of the command line at first.
+
+    Args:
+        source: The video.
+        frames: ``START:STOP:STEP``.
+        tracking: Options of the command line, of which the page changes tracker and features.
+        camera: The same; field of view and intrinsics.
+        settings: The same; quality and final mesh.
+        configure: Makes the configuration from such options.
+    """
+    from tracking3d.picker.settings import ChosenSettings, SettingsMenu
+
+    lens = camera.settings()
+    at_first = ChosenSettings(
+        tracker=tracking.tracker,
+        quality=settings.quality,
+        model=settings.model,
+        features=tracking.features,
+        fov=lens["fov"],
+        intrinsics=lens.get("intrinsics"),
+    )
+
+    def configure_run(chosen: ChosenSettings) -> PipelineConfig:
+        check_model_source(chosen.model, source)
+        as_given = (chosen.fov, chosen.intrinsics) == (at_first.fov, at_first.intrinsics)
+        text = chosen.intrinsics and ",".join(map(repr, chosen.intrinsics))
+        config = configure(
+            replace(tracking, tracker=chosen.tracker, features=chosen.features),
+            camera if as_given else replace(camera, fov=chosen.fov, intrinsics=text),
+            replace(settings, quality=chosen.quality, model=chosen.model),
+        )
+        return _with_named_tracker(config, source, frames)
+
+    return SettingsMenu(at_first, configure_run)
+
+
+def _with_named_tracker(config: PipelineConfig, source: str, frames: str | None) -> PipelineConfig:
+    """The configuration with a tracker in place of ``auto``, since the page shows its masks."""
+    from tracking3d.frames import Frame
+    from tracking3d.pipeline.tracker_selection import choose_tracker
+    from tracking3d.video import open_source
+
+    if config.tracker.name != "auto":
+        return config
+    opened = open_source(source, frames)
+    first = next((frame for frame in opened if isinstance(frame, Frame)), None)
+    return config if first is None else choose_tracker(config, opened.count, False, first, None)[0]
 
 
 def prompts_of(picked: Picked) -> PromptSet:
@@ -93,6 +170,7 @@ def picked_in_browser(
     port: int = 8090,
     browser: bool = True,
     overwrite: bool = False,
+    menu: SettingsMenu | None = None,
 ) -> Picked:
     """Serve the page until the user starts the run.
 
@@ -105,6 +183,7 @@ def picked_in_browser(
         port: The port, or the next free one above it.
         browser: Open the page, if the program was started from a terminal.
         overwrite: Whether an earlier run in the folder may be replaced.
+        menu: The settings that the page offers; None if ``settings`` are fixed.
 
     Raises:
         InputError: The source cannot be paused, so that no frame can be picked.
@@ -126,11 +205,13 @@ def picked_in_browser(
     if not opened.repeatable:
         raise InputError(f"{opened.name} cannot be paused to draw in; give the object with --box.")
     images = frame_images(opened)
-    session = PickingSession(source, images, within(selection, images.count or opened.count or 1), settings)
+    indices = within(selection, images.count or opened.count or 1)
+    session = PickingSession(source, images, indices, settings, menu)
 
     def save(picked: Picked) -> tuple[str, str]:
-        save_outcome(picked, settings, folder, source)
-        return command_of(picked, folder, source, frames), settings_as_yaml(settings)
+        chosen = picked.config or settings
+        save_outcome(picked, chosen, folder, source)
+        return command_of(picked, folder, source, frames), settings_as_yaml(chosen)
 
     picker = Picker(session, save, Access.on(host), port)
     try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,12 +19,14 @@ from tracking3d.cli.options.performance import PerformanceOptions
 from tracking3d.cli.options.prompt import PromptOptions
 from tracking3d.cli.options.tracking import TrackingOptions
 from tracking3d.cli.options.video import Source, VideoOptions
+from tracking3d.cli.pick import settings_menu
 from tracking3d.cli.split import track_in_parts
 from tracking3d.cli.tracking import RunDisplay, RunRequest, a_person_is_there, default_folder, track
 from tracking3d.errors import InputError
 
 if TYPE_CHECKING:
     from tracking3d.config.models import PipelineConfig
+    from tracking3d.picker.settings import SettingsMenu
     from tracking3d.prompts.corrections import Correction
     from tracking3d.prompts.prompt import PromptSet
 
@@ -69,7 +72,9 @@ def run(
                 "Give the object in the first frame with --box X,Y,W,H, --mask FILE, --points 'X,Y+ X,Y-' or "
                 "--masks DIR, or draw it with `tracking3d pick`."
             )
-        prompts = _ask_in_browser(source, config, folder, video.frames, output.overwrite)
+        configure = partial(_configure_in_browser, prompt, output, performance)
+        menu = settings_menu(source, video.frames, tracking, camera, settings, configure)
+        prompts, config = _ask_in_browser(source, folder, video.frames, output.overwrite, menu)
     options = RecordOptions(_command(), video.frames, output.overwrite, output.resume)
     request = RunRequest(source, config, folder, prompts, options, corrections, video.skip_damaged, video.fps)
     display = RunDisplay(quiet, output.report, output.view, output.host)
@@ -108,6 +113,18 @@ def _configure(
     )
 
 
+def _configure_in_browser(
+    prompt: PromptOptions,
+    output: OutputOptions,
+    performance: PerformanceOptions,
+    tracking: TrackingOptions,
+    camera: CameraOptions,
+    settings: SettingsOptions,
+) -> PipelineConfig:
+    """See `settings_menu`."""
+    return _configure(prompt, camera, tracking, settings, output, performance)
+
+
 def _parse_prompts(prompt: PromptOptions, frames: str | None) -> PromptSet:
     """The objects that the options give."""
     from tracking3d.prompts.points import parse_points
@@ -139,10 +156,12 @@ def _command() -> str:
 
 
 def _ask_in_browser(
-    source: str, config: PipelineConfig, folder: Path, frames: str | None, overwrite: bool
-) -> PromptSet:
-    """The objects that a person marks in the browser."""
+    source: str, folder: Path, frames: str | None, overwrite: bool, menu: SettingsMenu
+) -> tuple[PromptSet, PipelineConfig]:
+    """The objects that a person marks in the browser, and the settings that they choose there."""
     from tracking3d.cli.pick import picked_in_browser, prompts_of
 
     typer.echo("Mark the object in the browser; Ctrl-C cancels.", err=True)
-    return prompts_of(picked_in_browser(source, frames, config, folder, overwrite=overwrite))
+    config = menu.configure(menu.chosen)
+    picked = picked_in_browser(source, frames, config, folder, overwrite=overwrite, menu=menu)
+    return prompts_of(picked), picked.config or config

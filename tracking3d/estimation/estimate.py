@@ -121,7 +121,8 @@ class ObjectModel:
         face_uvs: ``(F, 3, 2)`` float64, one per face corner, so that the seam of the atlas is exact. u runs to
             the right, v *down* the texture image; u may pass 1 at the seam and wraps.
         texture: ``(T, T, 3)`` uint8 RGB, back-projected from the video.
-        texture_weight: ``(T, T)`` float32, how much each texel was seen; 0 = never.
+        texture_weight: ``(T, T)`` float32, how much each texel was seen; 0 = never. Texels off the surface, around
+            charts, continue it.
         features: ``(T, T, C)`` float32 feature texture the poses were estimated with.
         seen: ``(V,)`` bool, whether a frame shows a vertex; None if nobody asked, as of the online map's mesh.
     """

@@ -32,6 +32,7 @@ class Camera:
         origin: Where the intrinsics came from, in words; recorded in the run.
         assumed: Whether nobody gave the focal length.
         lens: How the pictures that were taken differ from what this camera sees; None if they do not.
+        focal_deviation: Relative standard deviation of the focal length, if it was estimated with one.
     """
 
     fx: float
@@ -43,6 +44,7 @@ class Camera:
     origin: str = "given"
     assumed: bool = False
     lens: Lens | None = None
+    focal_deviation: float | None = None
 
     @classmethod
     def from_fov(
@@ -73,7 +75,7 @@ class Camera:
 
     def zoom(self, factor: float, origin: str) -> Camera:
         """With ``factor`` times the focal lengths; ``origin`` says in words where that came from."""
-        return replace(self, fx=factor * self.fx, fy=factor * self.fy, origin=origin)
+        return replace(self, fx=factor * self.fx, fy=factor * self.fy, origin=origin, focal_deviation=None)
 
     def to_picture(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
         """This camera's pixels ``(N, 2)`` as those of the pictures that were taken; NaN where the lens sees none."""

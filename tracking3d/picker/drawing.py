@@ -74,6 +74,11 @@ class DrawnObject(_Drawn):
         return name.strip()
 
     @property
+    def is_empty(self) -> bool:
+        """Whether nothing was drawn."""
+        return self.box is None and not self.points and not self.strokes
+
+    @property
     def only_a_box(self) -> bool:
         """Whether a box says it all."""
         return self.box is not None and not self.points and not self.strokes

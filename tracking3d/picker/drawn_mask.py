@@ -17,7 +17,9 @@ _SEED = 0.012  # radius around a point that is certain, as a share of the longer
 _LEAST_CONTRAST = 2.0
 
 
-def drawn_mask(image: Image, drawn: DrawnObject) -> NDArray[np.bool_] | None:
+def drawn_mask(
+    image: Image, drawn: DrawnObject, present: NDArray[np.bool_] | None = None
+) -> NDArray[np.bool_] | None:
     """The mask ``(H, W)`` of what was drawn; None if nothing was, or only a box, which a tracker takes as it is.
 
     Points alone make the mask that they make as a prompt (`mask_from_points`); in a box they decide by colour (GrabCut,
@@ -26,6 +28,7 @@ def drawn_mask(image: Image, drawn: DrawnObject) -> NDArray[np.bool_] | None:
     Args:
         image: ``(H, W, 3)`` uint8 RGB.
         drawn: Box, points and strokes in pixels of the image.
+        present: ``(H, W)`` the mask that paint alone changes; a box or points replace it. None starts from nothing.
     """
     if drawn.only_a_box:
         return None
@@ -36,6 +39,8 @@ def drawn_mask(image: Image, drawn: DrawnObject) -> NDArray[np.bool_] | None:
         mask = _of_points(image, drawn)
     elif drawn.box is not None:
         mask = (mask_in_box(image, drawn.box) >= 0.5).astype(np.uint8)
+    elif present is not None:
+        mask = present.astype(np.uint8)
     for stroke in drawn.strokes:
         path = np.array(stroke.path).round().astype(np.int32)
         radius, value = max(round(stroke.radius), 1), int(stroke.on)

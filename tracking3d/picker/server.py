@@ -13,9 +13,13 @@ from importlib.resources import files
 from typing import Any
 from urllib.parse import urlsplit
 
+import numpy as np
+from numpy.typing import NDArray
+
 from tracking3d.errors import InputError, Tracking3dError
 from tracking3d.picker.drawing import parse_object, read_drawing
 from tracking3d.picker.session import Picked, PickingSession
+from tracking3d.picker.settings import parse_settings, setting_choices, settings_in_words
 from tracking3d.web.access import SAFE_HEADERS, Access
 
 LARGEST_BODY = 2 * 2**20
@@ -89,14 +93,20 @@ class Picker:
         """
         if path == "/mask":
             drawn = parse_object(body)
-            mask = self.session.mask(drawn)
-            return {"veil": self.session.veil(mask, drawn.colour), "area": int(mask.sum())}, _nothing
+            return self.show(self.session.mask(drawn), drawn.colour)
+        if path == "/settings":
+            self.session.choose(parse_settings(body))
+            return {"tracker": self.session.config.tracker.name, **_describe_settings(self.session)}, _nothing
         if path not in ("/save", "/start"):
             return None
         picked = self.session.picked(read_drawing(body))
         command, settings = self.save(picked)
         then = partial(self.start, picked) if path == "/start" else _nothing
         return {"command": command, "settings": settings}, then
+
+    def show(self, mask: NDArray[np.bool_], colour: str) -> tuple[Any, Callable[[], None]]:
+        """The response that shows a mask ``(H, W)``; see `order`."""
+        return {"veil": self.session.veil(mask, colour), "area": int(mask.sum())}, _nothing
 
     def start(self, picked: Picked) -> None:
         """The run is to start with that."""
@@ -174,7 +184,7 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             done = self.server.picker.order(self.path, body)
         except Tracking3dError as error:
-            return self._refuse(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
+            return self._refuse(HTTPStatus.UNPROCESSABLE_ENTITY, error.at_the_command_line)
         if done is None:
             return self._refuse(HTTPStatus.NOT_FOUND, "This page does not exist.")
         told, then = done
@@ -260,4 +270,13 @@ def _describe(session: PickingSession) -> dict[str, Any]:
         "width": session.width,
         "height": session.height,
         "tracker": session.config.tracker.name,
+        "choices": setting_choices(session.config) if session.menu else None,
+        **_describe_settings(session),
     }
+
+
+def _describe_settings(session: PickingSession) -> dict[str, Any]:
+    """What is chosen, and what the settings come to that are not."""
+    if session.menu is None:
+        return {}
+    return {"chosen": session.menu.chosen.model_dump(), "usual": settings_in_words(session.config)}

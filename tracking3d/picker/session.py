@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import threading
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -15,6 +15,7 @@ from tracking3d.errors import InputError
 from tracking3d.frames import Box, Frame
 from tracking3d.picker.drawing import Drawing, DrawnObject
 from tracking3d.picker.drawn_mask import drawn_mask
+from tracking3d.picker.settings import ChosenSettings, SettingsMenu
 from tracking3d.plugins import TRACKERS, build_plugin
 from tracking3d.prompts.prompt import make_prompt
 from tracking3d.trackers.protocol import MaskTracker
@@ -32,12 +33,14 @@ class Picked:
         objects: What was drawn.
         boxes: One ``(x, y, width, height)`` for each object, if boxes are enough, else none.
         masks: One ``(H, W)`` bool for each object, if they are not, else none.
+        config: The settings that were chosen on the page; None if it offers none.
     """
 
     frame: int
     objects: tuple[DrawnObject, ...]
     boxes: list[Box] = field(default_factory=list)
     masks: list[NDArray[np.bool_]] = field(default_factory=list)
+    config: PipelineConfig | None = None
 
 
 class PickingSession:
@@ -48,13 +51,21 @@ class PickingSession:
         images: Its frames.
         frames: Indices of the frames that can be picked in.
         config: With the tracker that makes the masks.
+        menu: The settings that can be chosen; None if they are fixed.
 
     Raises:
         InputError: If the first frame cannot be read.
     """
 
-    def __init__(self, source: str, images: FrameImages, frames: range, config: PipelineConfig) -> None:
-        self.source, self.frames, self.config = source, frames, config
+    def __init__(
+        self,
+        source: str,
+        images: FrameImages,
+        frames: range,
+        config: PipelineConfig,
+        menu: SettingsMenu | None = None,
+    ) -> None:
+        self.source, self.frames, self.config, self.menu = source, frames, config, menu
         self._images = images
         self._busy = threading.Lock()
         first = images.image(frames.start)
@@ -73,8 +84,24 @@ class PickingSession:
             1
         ].tobytes()
 
-    def mask(self, drawn: DrawnObject) -> NDArray[np.bool_]:
+    def choose(self, chosen: ChosenSettings) -> None:
+        """Continue with other settings; the present ones stay if these cannot be used.
+
+        Raises:
+            Tracking3dError: If they cannot be.
+        """
+        if self.menu is None:
+            raise InputError("The settings of this run are fixed.")
+        config = self.menu.configure(chosen)
+        with self._busy:
+            self.config, self.menu = config, replace(self.menu, chosen=chosen)
+
+    def mask(self, drawn: DrawnObject, present: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
         """The mask ``(H, W)`` that the tracker makes of what was drawn.
+
+        Args:
+            drawn: Box, points and paint.
+            present: ``(H, W)`` the mask that paint alone changes, see `drawn_mask`.
 
         Raises:
             InputError: If nothing can be made of it.
@@ -82,7 +109,7 @@ class PickingSession:
         """
         frame = self._frame(drawn.frame)
         with self._busy:  # a tracker takes all that the machine has
-            given = drawn_mask(frame.image, drawn)
+            given = drawn_mask(frame.image, drawn, present)
             if given is None and drawn.box is None:
                 raise InputError("No object is marked yet.")
             prompt = make_prompt(frame, drawn.box if given is None else None, given)
@@ -113,11 +140,13 @@ class PickingSession:
             raise InputError(f"The objects are drawn on frames {drawn_on}; draw all of them on one frame.")
         if len(drawing.objects) > 1 and self.config.tracker.name == "precomputed":
             raise InputError("The tracker precomputed has masks of one object; pick one object.")
-        frame = self._frame(frames[0])
+        frame, chosen = self._frame(frames[0]), self.config if self.menu else None
         if all(one.only_a_box for one in drawing.objects):
             boxes = [one.box for one in drawing.objects if one.box is not None]
-            return Picked(frame.index, drawing.objects, [make_prompt(frame, box).box for box in boxes])
-        return Picked(frame.index, drawing.objects, masks=[self.mask(one) for one in drawing.objects])
+            given = [make_prompt(frame, box).box for box in boxes]
+            return Picked(frame.index, drawing.objects, given, config=chosen)
+        masks = [self.mask(one) for one in drawing.objects]
+        return Picked(frame.index, drawing.objects, masks=masks, config=chosen)
 
     def _frame(self, index: int) -> Frame:
         image = self._images.image(index) if index in self.frames else None

@@ -70,6 +70,7 @@ class LandmarkScene:
         vertices: ``(V, 3)`` in object coordinates.
         faces: ``(F, 3)``.
         focal_factor: By which the views' focal lengths are those that they were opened with.
+        focal_deviation: Standard deviation of the logarithm of the focal length; None before it is estimated.
         support: What landmarks say of each view's pose; empty before they were looked for.
         may_reverse: Whether depth may be the other way round than the run has it; no longer once that is clear.
         reversal: What was done to surface and poses, where landmarks said that it was.
@@ -79,6 +80,7 @@ class LandmarkScene:
     vertices: Array
     faces: NDArray[np.int64]
     focal_factor: float = 1.0
+    focal_deviation: float | None = None
     support: Mapping[int, LandmarkSupport] = field(default_factory=dict)
     may_reverse: bool = False
     reversal: Reversal | None = None
@@ -218,7 +220,8 @@ def _refine_once(scene: LandmarkScene, free_focal: bool) -> LandmarkScene:
     counts = zip(there, followed, found.agreeing.sum(1).tolist(), strict=True)
     support = {at: LandmarkSupport(count, agreeing) for at, count, agreeing in counts}
     redrawn = scene.redrawn(vertices, dict(zip(there, found.T_cam_obj, strict=True)), found.focal_factor)
-    return replace(redrawn, support=support)
+    deviation = scene.focal_deviation if found.focal_deviation is None else found.focal_deviation
+    return replace(redrawn, support=support, focal_deviation=deviation)
 
 
 @dataclass(frozen=True, eq=False)

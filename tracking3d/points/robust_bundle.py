@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -47,6 +47,7 @@ class BundleResult:
         focal_factor: By which all focal lengths are to be multiplied.
         cost: Mean robust loss of the measurements, by weight.
         agreeing: ``(T, N)`` bool, the measurements that the points and poses explain.
+        focal_deviation: Standard deviation of the logarithm of the focal length; None if it was not estimated.
     """
 
     points: Array
@@ -55,6 +56,7 @@ class BundleResult:
     focal_factor: float
     cost: float
     agreeing: NDArray[np.bool_]
+    focal_deviation: float | None = None
 
 
 def intersect(
@@ -139,17 +141,23 @@ def bundle(
     )
     if begun is None:
         found = solved(Structure(T_cam_obj[:, :3, :3].copy(), T_cam_obj[:, :3, 3].copy(), points.copy()))
+        deviation_of_lens = None
     else:
         T = begun.T_cam_obj
         found = solved(Structure(T[:, :3, :3], T[:, :3, 3], begun.points), free_focal=True)
-        gain = _OUTLIER**2 * (begun.cost - found.cost) * tracks.weights().sum() / known.any(1).sum()
+        tracked = known.any(1).sum()
+        gain = _OUTLIER**2 * (begun.cost - found.cost) * tracks.weights().sum() / tracked
+        # The loss is half of minus twice the logarithm of the likelihood, in units of squared outliers.
+        information = 0.5 * _OUTLIER**2 * found.focal_curvature / tracked
+        deviation_of_lens = 1 / math.sqrt(information + _LENS**-2)
         if not gain > (math.log(found.focal_factor) / _LENS) ** 2:
-            return begun
+            return replace(begun, focal_deviation=deviation_of_lens)
     T = T_cam_obj.copy()
     T[:, :3, :3], T[:, :3, 3] = found.R, found.t
     far = np.where(known, found.residual, 0.0) / (_OUTLIER * np.where(known, spread, 1.0))
     weight = np.where(known, 1 / (1 + far**2) ** 2 / spread**2, 0.0)
-    return BundleResult(found.points, T, weight, found.focal_factor, found.cost, known & (far < 1))
+    agreeing = known & (far < 1)
+    return BundleResult(found.points, T, weight, found.focal_factor, found.cost, agreeing, deviation_of_lens)
 
 
 @dataclass(frozen=True, eq=False)

@@ -95,6 +95,8 @@ class GlobalAdjustment:
         self.vertices = self._scene.vertices
         if scene.focal_factor != 1:
             self.camera = self.camera.with_solved_focal(scene.focal_factor)
+        if scene.focal_deviation is not None:
+            self.camera = replace(self.camera, focal_deviation=scene.focal_deviation)
 
     def pose(
         self, record: FrameRecord, image: Image, mask: NDArray[np.bool_]

@@ -45,7 +45,8 @@ def bake_texture(model: ObjectModel, views: Sequence[TextureView], largest: int 
 
     Returns:
         The same surface. `ObjectModel.texture_weight` is 0 where no view shows it; there the texture continues its
-        surroundings.
+        surroundings. Texels that are not on the surface continue it in both, so that neither a colour nor a 0 of theirs
+        gets into what is interpolated at the edge of a chart.
     """
     if not views:
         return model
@@ -71,7 +72,7 @@ def _paint_texture(model: ObjectModel, views: Sequence[TextureView], size: int) 
     return replace(
         model,
         texture=np.clip(np.round(255 * texture), 0, 255).astype(np.uint8),
-        texture_weight=weight.reshape(size, size),
+        texture_weight=continue_charts(weight.reshape(size, size), texels.texel.numpy()),
     )
 
 
@@ -123,6 +124,23 @@ def fill_holes(texture: FloatArray, known: NDArray[np.bool_]) -> FloatArray:
     x, y = np.meshgrid(columns, rows)
     beyond = cv2.remap(wrapped, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.where(known[..., None], texture, beyond).astype(np.float32)
+
+
+def continue_charts(values: FloatArray, texel: NDArray[np.int64]) -> FloatArray:
+    """``(T, T)`` where texels off the surface have the value of the nearest one on it.
+
+    Args:
+        values: ``(T, T)``.
+        texel: ``(N,)`` flat indices of the texels on the surface, at least one.
+    """
+    beyond = np.ones(values.shape, np.uint8)
+    beyond.ravel()[texel] = 0
+    _, labels = cv2.distanceTransformWithLabels(
+        beyond, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    value_of_label = np.zeros(labels.max() + 1, np.float32)
+    value_of_label[labels.ravel()[texel]] = values.ravel()[texel]
+    return np.asarray(value_of_label[labels])
 
 
 def _level_exposure(

@@ -45,12 +45,45 @@ def text_width(text: str, height: int) -> int:
 
 
 def shorten(text: str, height: int, width: int) -> str:
-    """As much of ``text`` as fits in ``width`` pixels; empty if that is next to nothing."""
+    """As many words of ``text`` as fit in ``width`` pixels, with "..." for the rest; empty if not even a word does.
+
+    Of a single word too long, such as a path, its beginning is kept.
+    """
     if text_width(text, height) <= width:
         return text
-    while text and text_width(text + "...", height) > width:
-        text = text[:-1]
-    return text.rstrip() + "..." if len(text) > 3 else ""
+    words = text.split()
+    kept = next(
+        (
+            short
+            for count in range(len(words) - 1, 0, -1)
+            if _fits(short := " ".join(words[:count]), height, width)
+        ),
+        "",
+    )
+    if kept:
+        return kept + "..."
+    letters = words[0] if words else ""
+    while letters and not _fits(letters, height, width):
+        letters = letters[:-1]
+    return letters + "..." if len(letters) > 3 else ""
+
+
+def wrap(text: str, height: int, width: int, most: int) -> list[str]:
+    """``text`` in lines of at most ``width`` pixels, at most ``most`` of them; the last is shortened if need be."""
+    words = text.split()
+    lines: list[str] = []
+    while words and len(lines) < most - 1:
+        count = 1
+        while count < len(words) and text_width(" ".join(words[: count + 1]), height) <= width:
+            count += 1
+        lines.append(shorten(" ".join(words[:count]), height, width))
+        words = words[count:]
+    return [*lines, shorten(" ".join(words), height, width)] if words else lines
+
+
+def _fits(text: str, height: int, width: int) -> bool:
+    """Whether ``text`` and the sign that some is left out fit."""
+    return text_width(text + "...", height) <= width
 
 
 def fit(image: Image, size: int) -> Image:

@@ -1,8 +1,8 @@
 """The overlay: one frame with its estimates drawn in.
 
 The picture has the outline of the initial mask (thin, orange) and of the estimate (thicker, cyan), the object's
-axes (x red, y green, z blue) and below it a status bar. Axes are drawn if the pose is trusted: in frames that
-are tracked, and if they begin on the object.
+axes (x red, y green, z blue) and below it a status bar, with the reason in lines of its own. Axes are drawn if the
+pose is trusted: in frames that are tracked, and if they begin on the object.
 """
 
 from __future__ import annotations
@@ -21,6 +21,9 @@ from tracking3d.results import drawing
 from tracking3d.results.records import FrameRecord
 
 NARROWEST, WIDEST = 320, 1920
+_WIDE = 640  # pixels in which a reason fits in one line
+_LEADING = 0.75  # height of a further line of text, compared with the first
+_REASON: drawing.Colour = (170, 170, 175)
 _AXIS_COLOURS: tuple[drawing.Colour, ...] = ((255, 60, 60), (60, 220, 60), (80, 120, 255))
 
 
@@ -33,20 +36,24 @@ class OverlaySize:
         width: Width of picture and bar, even.
         picture: Height of the picture.
         bar: Height of the status bar below it; the sum is even.
+        line: Height of one line of text in the bar: the first has the figures, those below it the reason.
     """
 
     scale: float
     width: int
     picture: int
     bar: int
+    line: int
 
     @classmethod
     def of(cls, camera: Camera) -> OverlaySize:
         """The frame's own size, unless its text could not be read or the video would be needlessly large."""
         scale = min(max(1.0, NARROWEST / camera.width), WIDEST / camera.width)
         width, picture = 2 * round(camera.width * scale / 2), max(round(camera.height * scale), 1)
-        bar = max(22, round(width / 30))
-        return cls(scale, width, picture, bar + (picture + bar) % 2)
+        line = max(22, round(width / 30))
+        # A reason of a hundred letters needs two lines in a narrow picture.
+        bar = line + round(_LEADING * line) * (1 if width >= _WIDE else 2)
+        return cls(scale, width, picture, bar + (picture + bar) % 2, line)
 
     @property
     def height(self) -> int:
@@ -113,7 +120,7 @@ def draw_overlay(
         drawing.draw_outline(picture, _scale(estimate.initial_mask, shape), drawing.INITIAL, thin)
     if axes is not None and estimate.status is Status.TRACKED:
         _draw_axes(picture, estimate, camera, axes, size.scale, thin + 1)
-    _draw_bar(canvas[size.picture :], record)
+    _draw_bar(canvas[size.picture :], record, size.line)
     return canvas
 
 
@@ -158,10 +165,10 @@ def _is_on(mask: NDArray[np.bool_], pixel: NDArray[np.float64]) -> bool:
     return any(cv2.pointPolygonTest(outline, place, False) >= 0 for outline in outlines)
 
 
-def _draw_bar(bar: Image, record: FrameRecord) -> None:
+def _draw_bar(bar: Image, record: FrameRecord, line: int) -> None:
     height, width = bar.shape[:2]
-    letters = round(height * 0.42)
-    gap, base = letters, round((height + letters) / 2)
+    letters = round(line * 0.42)
+    gap, base = letters, round((line + letters) / 2)
     left = drawing.draw_text(bar, f"#{record.index}", gap // 2, base, letters, drawing.INK)
     left = drawing.draw_text(
         bar, record.status.value, left + gap, base, letters, drawing.STATUS[record.status]
@@ -177,7 +184,7 @@ def _draw_bar(bar: Image, record: FrameRecord) -> None:
     if legend > left + gap:
         after = drawing.draw_text(bar, "initial ", legend, base, letters, drawing.INITIAL)
         drawing.draw_text(bar, "estimate", after, base, letters, drawing.REFINED)
-    reason = drawing.shorten(
-        record.reason, letters, (legend if legend > left + gap else width) - left - 2 * gap
-    )
-    drawing.draw_text(bar, reason, left + gap, base, letters, (170, 170, 175))
+    step = round(_LEADING * line)
+    for text in drawing.wrap(record.reason, letters, width - gap, (height - line) // step):
+        base += step
+        drawing.draw_text(bar, text, gap // 2, base, letters, _REASON)

@@ -272,6 +272,9 @@ def _camera_fault(camera: Camera) -> str:
         number = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _FARTHEST
         if not number or (name in ("fx", "fy") and not value > 0):
             return f"{name} is {value!r:.40}"
+    deviation = camera.focal_deviation
+    if deviation is not None and not (isinstance(deviation, int | float) and 0 <= deviation < _FARTHEST):
+        return f"focal_deviation is {deviation!r:.40}"
     described = isinstance(camera.origin, str) and isinstance(camera.assumed, bool)
     return "" if described else f"origin is {camera.origin!r:.40}, assumed {camera.assumed!r:.40}"
 

@@ -11,6 +11,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from subprocess import DEVNULL, Popen, TimeoutExpired
 from typing import IO
@@ -99,6 +100,7 @@ class RunCorrection:
             self._page = CorrectionPage(
                 session,
                 self.run.name,
+                partial(self.run.mask, kind="refined"),
                 self.begin,
                 self.progress,
                 self._access,

@@ -17,13 +17,16 @@ from tracking3d.frames import Image
 from tracking3d.geometry.camera import Camera
 from tracking3d.results import drawing, layout
 from tracking3d.results.records import FrameRecord
+from tracking3d.viewer.first_look import fainten, frustum_size, object_box, radius_of
 from tracking3d.viewer.followed_run import FollowedRun
+from tracking3d.viewer.picture import axes_of
 
 MOST_FRUSTA = 48
 """Frusta along a path; of more frames so many are shown, spread over them."""
 LARGEST_MESH = 2**28
 """Bytes of a mesh file that are sent to the browser."""
-_FRUSTUM = 0.06  # of the distance between camera and object
+_CURRENT = 2.5  # size of the current frame's frustum, in those of keyframes
+_GAMMA = 2.2
 _EVEN_LIGHT, _LIGHT_FROM_ABOVE = 2.4, 0.6
 _LANDMARK = (255, 230, 120)
 _HALF_TURN_ABOUT_X = (0.0, 1.0, 0.0, 0.0)  # from glTF's axes, in which mesh.glb is, to the object's
@@ -46,6 +49,7 @@ class ObjectScene:
         distance: From the object to the camera, in the median.
         place: ``(3,)`` where the object stands.
         path: ``(N, 3)`` the camera's places, in object coordinates.
+        box: ``(2, 3)`` two opposite corners of the object, in object coordinates.
 
     Args:
         server: Shows it.
@@ -68,18 +72,23 @@ class ObjectScene:
         self.place = np.zeros(3)
         self.distance = 4.0
         self.path = np.array([[0.0, 0.0, -4.0]])
+        self.box = object_box(None, None, self.distance)
 
     @property
-    def reach(self) -> float:
-        """How far below or above the object the path reaches."""
-        return float(np.abs(self.path[:, 1]).max())
+    def frustum(self) -> float:
+        """Size of a keyframe's frustum."""
+        return frustum_size(radius_of(self.box), self.distance)
 
     def draw_again(self) -> None:
         """Show what is new in the run."""
         self._draw_mesh()
         records = [record for record in self._run.frames.values() if np.isfinite(record.T_cam_obj).all()]
+        T_obj_cam = [np.linalg.inv(record.T_cam_obj).astype(np.float64) for record in records]
         if records:
-            self._draw_path(records)
+            self.path = np.stack(T_obj_cam)[:, :3, 3]
+            self.distance = float(np.median(np.linalg.norm(self.path, axis=1)))
+        self.box = object_box(self._run.model, axes_of(self._run), self.distance)
+        self._draw_path(records, T_obj_cam)
 
     def go_to(self, index: int, image: Image | None, camera_stands_still: bool) -> None:
         """Put the camera where it was in a frame.
@@ -103,11 +112,11 @@ class ObjectScene:
                 f"{self._root.name}/here",
                 fov=math.radians(camera.fov),
                 aspect=camera.width / camera.height,
-                scale=3 * _FRUSTUM * self.distance,
+                scale=_CURRENT * self.frustum,
                 thickness=2.0,
                 thickness_units="screen",
             )
-        self._here.scale = 3 * _FRUSTUM * self.distance
+        self._here.scale = _CURRENT * self.frustum
         self._here.color = drawing.STATUS[record.status]
         self._here.image = None if image is None else _as_seen(camera, image)
         self._here.wxyz, self._here.position = _wxyz(T_obj_cam), T_obj_cam[:3, 3]
@@ -148,18 +157,17 @@ class ObjectScene:
             f"{self._root.name}/mesh", data, wxyz=_HALF_TURN_ABOUT_X, cast_shadow=False, receive_shadow=False
         )
 
-    def _draw_path(self, records: list[FrameRecord]) -> None:
-        T_obj_cam: NDArray[np.float64] = np.linalg.inv(np.stack([record.T_cam_obj for record in records]))
-        places = T_obj_cam[:, :3, 3]
-        self.distance = float(np.median(np.linalg.norm(places, axis=1)))
-        self.path = places
-        colours = np.array([drawing.STATUS[record.status] for record in records], np.uint8)
+    def _draw_path(self, records: list[FrameRecord], T_obj_cam: list[NDArray[np.float64]]) -> None:
+        shown = np.array([fainten(drawing.STATUS[record.status]) for record in records]).reshape(-1, 3)
+        colours = (
+            (255 * (shown / 255) ** _GAMMA).round().astype(np.uint8)
+        )  # viser takes those of lines as linear
         if len(records) > 1:
             self._server.scene.add_line_segments(
                 f"{self._way.name}/line",
-                np.stack([places[:-1], places[1:]], axis=1).astype(np.float32),
+                np.stack([self.path[:-1], self.path[1:]], axis=1).astype(np.float32),
                 np.stack([colours[:-1], colours[1:]], axis=1),
-                thickness=2.0,
+                thickness=1.0,
                 thickness_units="screen",
             )
         for slot, number in enumerate(_spread_frames(records)):
@@ -174,10 +182,10 @@ class ObjectScene:
             f"{self._way.name}/frustum_{slot:03d}",
             fov=math.radians(camera.fov),
             aspect=camera.width / camera.height,
-            scale=_FRUSTUM * self.distance * (1.0 if record.keyframe else 0.6),
-            thickness=2.0 if record.keyframe else 1.0,
+            scale=self.frustum * (1.0 if record.keyframe else 0.6),
+            thickness=1.0,
             thickness_units="screen",
-            color=drawing.KEYFRAME if record.keyframe else drawing.STATUS[record.status],
+            color=fainten(drawing.KEYFRAME if record.keyframe else drawing.STATUS[record.status]),
             wxyz=_wxyz(T_obj_cam),
             position=T_obj_cam[:3, 3],
         )

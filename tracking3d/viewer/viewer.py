@@ -26,6 +26,7 @@ from tracking3d.viewer.browser_camera import look_from_aside, look_through
 from tracking3d.viewer.checkpoint_landmarks import landmarks_of_checkpoint
 from tracking3d.viewer.correcting import Corrections
 from tracking3d.viewer.descriptions import about, describe_frame, list_streaks
+from tracking3d.viewer.first_look import radius_of, stack_objects
 from tracking3d.viewer.followed_run import FollowedRun
 from tracking3d.viewer.guarded_server import start_server
 from tracking3d.viewer.panel import SPEEDS, Panel
@@ -296,13 +297,12 @@ class Viewer:
             self.go_to(first)
 
     def _draw_scene(self) -> None:
-        place = above = 0.0
         any_landmarks = False
-        for scene, run in zip(self._scenes, self._runs, strict=True):
+        for scene in self._scenes:
             scene.draw_again()
-            if scene is not self._scenes[0]:
-                place += max(1.6 * scene.distance, 1.1 * (above + scene.reach))
-            scene.place, above = np.array([0.0, place, 0.0]), scene.reach
+        places = stack_objects([radius_of(scene.box) for scene in self._scenes])
+        for scene, run, place in zip(self._scenes, self._runs, places, strict=True):
+            scene.place = np.array([0.0, place, 0.0])
             # From the state of a run that goes on: the final refinement may scale and turn the object.
             points = None if run.refined else landmarks_of_checkpoint(run.folder)
             scene.draw_landmarks(points)

@@ -9,6 +9,7 @@ const HINTS = {
   paint: "Paint over the object.",
   erase: "Erase what is not the object.",
 };
+const PRESENT = "This is the mask of the run. Paint and Erase change it; a box or points replace it.";
 const byId = (id) => document.getElementById(id);
 const canvas = byId("canvas");
 const context = canvas.getContext("2d");
@@ -22,6 +23,8 @@ let current = 0;
 let pressed = null; // what is being drawn: {kind, ...}
 let zoom = 1;
 let asked = 0; // number of the last question for a mask
+let present = null; // the mask that the run has of this frame, if a run is corrected
+let running = false; // whether the run is being corrected
 
 const one = () => objects[current];
 const isEmpty = (object) => !object.box && !object.points.length && !object.strokes.length;
@@ -80,6 +83,7 @@ function draw() {
   context.clearRect(0, 0, canvas.width, canvas.height);
   if (picture) context.drawImage(picture, 0, 0, canvas.width, canvas.height);
   const unit = session.width / canvas.clientWidth; // frame pixels of a pixel of the screen
+  if (present && !(one().frame === frame && one().veil)) context.drawImage(present, 0, 0);
   objects.forEach((object, number) => {
     if (object.frame !== frame) return;
     context.globalAlpha = number === current ? 1 : 0.6;
@@ -213,7 +217,7 @@ async function showMask() {
   if (isEmpty(object)) {
     object.veil = null;
     object.told = "";
-    say("");
+    say(present ? PRESENT : "");
     list();
     return draw();
   }
@@ -318,7 +322,7 @@ for (const button of document.querySelectorAll("#tools button")) {
 
 const KEYS = { b: "box", o: "on", i: "beside", p: "paint", e: "erase" };
 document.addEventListener("keydown", (event) => {
-  if (event.target.matches("input[type=text], input[type=number]")) return;
+  if (event.target.matches("input[type=text], input[type=number], select")) return;
   if ((event.ctrlKey || event.metaKey) && event.key === "z") return undo();
   if (event.ctrlKey || event.metaKey || event.altKey) return;
   if (KEYS[event.key]) take(KEYS[event.key]);
@@ -338,6 +342,10 @@ function goTo(index) {
   image.src = `frame/${near}.jpg`;
   frame = near;
   byId("frame").value = byId("number").value = near;
+  if (session.correcting) {
+    if (isEmpty(one())) say("");
+    showPresent();
+  }
   list();
   draw();
 }
@@ -345,10 +353,55 @@ function goTo(index) {
 byId("frame").addEventListener("input", (event) => goTo(Number(event.target.value)));
 byId("number").addEventListener("change", (event) => goTo(Number(event.target.value) || session.first));
 
+// ---- settings of the run ----
+
+const UNCHOSEN = { quality: "not given", fov: "degrees, upright", intrinsics: "fx, fy, cx, cy" };
+let settled = Promise.resolve(); // the last change of settings has arrived
+
+function offerSettings() {
+  byId("settings").hidden = false;
+  for (const control of document.querySelectorAll("[data-setting]")) {
+    const words = session.choices[control.dataset.setting];
+    if (words) control.replaceChildren(new Option("", ""), ...words.map((word) => new Option(word, word)));
+    control.addEventListener("change", () => { settled = settled.then(changeSettings); });
+  }
+  showSettings();
+}
+
+// Settings that were not chosen are those of the quality, the preset or the configuration file.
+function showSettings() {
+  for (const control of document.querySelectorAll("[data-setting]")) {
+    const name = control.dataset.setting, value = session.chosen[name];
+    control.value = Array.isArray(value) ? value.join(", ") : value ?? "";
+    const unchosen = control.options?.[0];
+    if (unchosen) unchosen.textContent = session.usual[name] && !value ? `default (${session.usual[name]})` : UNCHOSEN[name] ?? "default";
+  }
+  byId("source").textContent = `${session.source}, ${session.width} x ${session.height}, tracker ${session.tracker}`;
+}
+
+async function changeSettings() {
+  const chosen = {};
+  for (const control of document.querySelectorAll("[data-setting]")) {
+    const name = control.dataset.setting, text = control.value.trim();
+    chosen[name] = text === "" ? null : name === "fov" ? Number(text)
+      : name === "intrinsics" ? text.split(/[\s,]+/).map(Number) : text;
+  }
+  try {
+    Object.assign(session, await ask("settings", chosen));
+    say("");
+  } catch (error) {
+    showSettings();
+    return say(`${error.message} The settings are as before.`, true);
+  }
+  showSettings();
+  if (!isEmpty(one())) await showMask();
+}
+
 // ---- how it ends ----
 
 async function end(path) {
   say("One moment …");
+  await settled;
   try {
     const told = await ask(path, { objects: objects.filter((object) => !isEmpty(object)).map(plain) });
     say("");
@@ -382,7 +435,7 @@ byId("start").addEventListener("click", async () => {
   if (session.correcting) return correct();
   const told = await end("start");
   if (!told) return;
-  for (const control of document.querySelectorAll("button, input")) control.disabled = true;
+  for (const control of document.querySelectorAll("button, input, select")) control.disabled = true;
   canvas.style.pointerEvents = "none";
   byId("told").hidden = false;
   byId("told").textContent = told.command;
@@ -399,6 +452,25 @@ function offerCorrection() {
   follow();
 }
 
+// Paint and erase start from the mask that the run has.
+async function showPresent() {
+  const asks = frame;
+  let image = null;
+  present = null;
+  try {
+    const { veil } = await ask("mask", plain({ ...newObject(), colour: COLOURS[0] }));
+    image = new Image();
+    image.src = veil;
+    await image.decode();
+  } catch {
+    image = null; // the run has no mask of this frame
+  }
+  if (asks !== frame) return;
+  present = image;
+  if (isEmpty(one()) && !byId("status").textContent) say(present ? PRESENT : "The run has no mask of this frame.");
+  draw();
+}
+
 async function follow() {
   let told;
   try {
@@ -408,6 +480,12 @@ async function follow() {
   }
   byId("start").disabled = told.running || isEmpty(one());
   if (told.sentence) say(told.sentence, told.failed);
+  if (running && !told.running && !told.failed) {
+    objects = [newObject()]; // the drawing is in the run now
+    showPresent();
+    list();
+  }
+  running = told.running;
   byId("progress").hidden = !told.running;
   if (told.share === null) byId("progress").removeAttribute("value");
   else byId("progress").value = told.share;
@@ -439,6 +517,7 @@ async function open() {
   goTo(Number(/^#frame=(\d{1,9})$/.exec(location.hash)?.[1] ?? frame));
   window.addEventListener("resize", resize);
   if (session.correcting) offerCorrection();
+  else if (session.choices) offerSettings();
 }
 
 open();
