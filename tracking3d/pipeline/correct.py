@@ -16,7 +16,7 @@ from tracking3d.errors import InputError
 from tracking3d.frames import SkippedFrame
 from tracking3d.pipeline.open_tracking import request_tracking
 from tracking3d.pipeline.record import RecordOptions, record_tracking
-from tracking3d.prompts.corrections import Correction, validate_corrections
+from tracking3d.prompts.corrections import Correction, missing_frame_error, validate_corrections
 from tracking3d.prompts.prompt import PromptSet
 from tracking3d.results.given_masks import read_given_mask
 from tracking3d.results.layout import runs_in
@@ -61,6 +61,7 @@ def correct_run(
             "run the video again, with the correction."
         ) from error
     [new] = validate_corrections(corrections)
+    _check_frames(run, new.values())
     together = {one.frame: one for one in _earlier(folder, given)} | new
     request = request_tracking(
         open_run_source(run, source),
@@ -81,15 +82,33 @@ def object_folders_of(folder: Path, corrections: Iterable[Correction]) -> dict[P
         corrections: `Correction.object` counts these.
 
     Raises:
-        InputError: If there is no such object.
+        InputError: If there is no such object, or a correction does not say which of several objects it is for.
     """
     folders = runs_in(folder)
-    by_object = validate_corrections(corrections, len(folders))
+    by_object = validate_corrections(corrections, len(folders), [one.name for one in folders])
     return {
         one: [replace(correction, object=0) for correction in theirs.values()]
         for one, theirs in zip(folders, by_object, strict=True)
         if theirs
     }
+
+
+def _check_frames(run: RunReader, corrections: Iterable[Correction]) -> None:
+    """Make sure that a run has estimates for the corrected frames; one that was stopped may have them later.
+
+    Raises:
+        InputError: It does not.
+    """
+    estimated = [record.index for record in run.frames]
+    skipped = {one["index"]: one["reason"] for one in run.description.get("skipped") or ()}
+    for one in corrections:
+        if one.frame in skipped:
+            raise InputError(
+                f"{one.name} frame {one.frame} of the run {run.folder} has no estimate, because it could not be used "
+                f"({skipped[one.frame]}); correct another frame."
+            )
+        if run.state == "finished" and one.frame not in estimated:
+            raise missing_frame_error(one, estimated)
 
 
 def _prompt(folder: Path, given: dict[str, Any]) -> dict[str, Any]:

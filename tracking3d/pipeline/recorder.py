@@ -17,7 +17,7 @@ from tracking3d.pipeline.final_refinement import FinalRefinement
 from tracking3d.pipeline.open_tracking import TrackedObject
 from tracking3d.pipeline.refinement_steps import PrecomputedRefinement
 from tracking3d.pipeline.session import Session
-from tracking3d.prompts.corrections import prompts_in
+from tracking3d.prompts.corrections import UnmetCorrections, prompts_in
 from tracking3d.reconstruction import bake_texture
 from tracking3d.results.mesh_export import load_model
 from tracking3d.results.records import FrameRecord
@@ -57,7 +57,7 @@ class ObjectRecorder:
         self._writer, self._state = writer, state
         self._redraw, self._temporary = redraw, temporary
         self._work = BackgroundWriter()  # all that touches writer and state while frames come
-        self._unmet = set(tracked.corrections)
+        self._unmet = UnmetCorrections(tracked.corrections)
         self._answered = state.kept is not None
         self._warned = False
         self._initial: dict[int, tuple[float, str]] = {}
@@ -98,8 +98,7 @@ class ObjectRecorder:
         Returns:
             The frame for the listener: this one, or the one before while `writing_beside`.
         """
-        if isinstance(frame, Frame):
-            self._unmet.discard(frame.index)
+        self._unmet.see(frame)
         if self._state.kept and self._state.has(frame.index):
             return self._replay_saved(self._state.kept, frame)
         if isinstance(frame, SkippedFrame):
@@ -184,10 +183,7 @@ class ObjectRecorder:
 
     def begin_refinement(self, source: FrameSource) -> None:
         """All frames were taken: refine everything, or record why not though it was asked for."""
-        for index in sorted(self._unmet):
-            _log.warning(
-                "Frame %d, which was to be corrected, is not among the frames that could be read.", index
-            )
+        self._unmet.warn()
         estimates = self._open_refinement(source)
         if estimates is not None:
             estimates.together = self._session.refining
