@@ -235,6 +235,7 @@ def begin_recording(
     if earlier == "finished":
         finish_state(folder)
         return None
+    corrected = folder if earlier == "outdated" else None
     if earlier == "outdated":
         folder, earlier = stage_correction(folder, header.config, options.selection, given, writers)
     checkpoint: Checkpoint | None = None
@@ -255,7 +256,7 @@ def begin_recording(
     elif not temporary and source.repeatable:
         checkpoint = Checkpoint(folder, session.state_classes, runtime.device, runtime.rollback_points)
     state = RunState(checkpoint, kept)
-    return ObjectRecorder(one, writer, state, opened.start_frame is not None, temporary)
+    return ObjectRecorder(one, writer, state, opened.start_frame is not None, temporary, corrected)
 
 
 def _header(

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from tracking3d.checkpoint.progress import JournalEntry, SavedState, check_picture, checksum
@@ -13,6 +14,7 @@ from tracking3d.checkpoint.run_state import RunState
 from tracking3d.errors import OutputError
 from tracking3d.estimation.estimate import FrameEstimate, ObjectModel
 from tracking3d.frames import Frame, SkippedFrame
+from tracking3d.pipeline.earlier_refinement import EarlierRefinement, find_earlier_refinement
 from tracking3d.pipeline.final_refinement import FinalRefinement
 from tracking3d.pipeline.open_tracking import TrackedObject
 from tracking3d.pipeline.refinement_steps import PrecomputedRefinement
@@ -38,6 +40,7 @@ class ObjectRecorder:
         state: How far the run is; the session was given the state of the stopped run, if there is one.
         redraw: Whether frames come in another order than that of time, and are drawn once more in that order.
         temporary: Whether the run folder is removed in the end, so that errors do not name it.
+        corrected: The folder of the run before it was corrected, if a correction is computed.
 
     Attributes:
         latest: The estimate for the frame that was taken last.
@@ -52,8 +55,11 @@ class ObjectRecorder:
         state: RunState,
         redraw: bool = False,
         temporary: bool = False,
+        corrected: Path | None = None,
     ) -> None:
         self._tracked, self._session = tracked, tracked.session
+        self._corrected = corrected
+        self._earlier: EarlierRefinement | None = None
         self._writer, self._state = writer, state
         self._redraw, self._temporary = redraw, temporary
         self._work = BackgroundWriter()  # all that touches writer and state while frames come
@@ -196,6 +202,7 @@ class ObjectRecorder:
                 self._work,
                 self._initial,
                 self.precomputed,
+                self._earlier,
             )
         elif self._redraw:
             self._writer.begin_drawing_again()
@@ -220,6 +227,8 @@ class ObjectRecorder:
             return None
         self._causal_model = self._session.result()
         estimates = self._writer.begin_refinement(self._causal_model)
+        if self._continue_earlier(estimates):
+            return estimates
         self._session.refine()
         self._state.save(
             self._session.state_dict(),
@@ -228,6 +237,21 @@ class ObjectRecorder:
             refinement_seconds=estimates.seconds,
         )
         return estimates
+
+    def _continue_earlier(self, estimates: RefinementWriter) -> bool:
+        """If this corrects a run, and most of its refined estimates stand, start from these; whether it was done."""
+        if self._corrected is None:
+            return False
+        earlier = find_earlier_refinement(self._corrected, self._writer.folder, estimates.causal)
+        if earlier is None or not self._session.continue_refinement(earlier.start):
+            _log.info("The correction changes most of the run: the final refinement takes all frames again.")
+            return False
+        self._earlier = earlier
+        _log.info(
+            "The final refinement takes %d frames again; the others keep their estimates.",
+            len(earlier.changed),
+        )
+        return True
 
     @property
     def needs_second_pass(self) -> bool:

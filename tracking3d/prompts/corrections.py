@@ -130,7 +130,8 @@ def validate_corrections(
         number = correction.object
         if number is None and objects > 1:
             choice = ", ".join(
-                argument(f"object={place}", f"{correction.frame}@{place}") + (f" ({names[place]})" if names else "")
+                argument(f"object={place}", f"{correction.frame}@{place}")
+                + (f" ({names[place]})" if names else "")
                 for place in range(objects)
             )
             raise InputError(
