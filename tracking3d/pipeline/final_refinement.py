@@ -153,7 +153,8 @@ class FinalRefinement:
     def collect_mask(self, frame: Frame) -> None:
         """Adjust the pose of a frame, and collect its evidence for the object's masks."""
         if self._last.masks is not None and frame.index in self._estimates.causal:
-            self._estimates.put(self._last.adjust(frame))
+            if self._earlier is None or frame.index not in self._earlier.kept:
+                self._estimates.put(self._last.adjust(frame))
             self._last.collect_mask(frame)
 
     def settle_masks(self) -> None:

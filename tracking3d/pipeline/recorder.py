@@ -106,7 +106,7 @@ class ObjectRecorder:
         """
         self._unmet.see(frame)
         if self._state.kept and self._state.has(frame.index):
-            return self._replay_saved(self._state.kept, frame)
+            return self._replay_saved(self._state.kept, frame, coming)
         if isinstance(frame, SkippedFrame):
             return self._work.do(partial(self._skip, frame))
         if not isinstance(coming, Frame) or self._state.has(coming.index):
@@ -152,7 +152,7 @@ class ObjectRecorder:
         return record
 
     def _replay_saved(
-        self, kept: SavedState, frame: Frame | SkippedFrame
+        self, kept: SavedState, frame: Frame | SkippedFrame, coming: Frame | SkippedFrame | None
     ) -> FrameRecord | SkippedFrame | None:
         """Draw a frame that has its estimate, and show it to a mask tracker that cannot be resumed otherwise."""
         if isinstance(frame, SkippedFrame) and frame.index not in kept.taken:
@@ -162,7 +162,12 @@ class ObjectRecorder:
         check_picture(kept, frame)
         assert isinstance(frame, Frame)
         if self._session.replays:
+            self._session.coming = coming if isinstance(coming, Frame) else None
             self._replay(kept, frame)
+        if self._corrected is not None and self._refines:
+            return self._writer.kept_record(
+                frame.index
+            )  # drawn once it is refined; nobody looks at the copy before
         return self._writer.draw_again(frame)
 
     def _replay(self, kept: SavedState, frame: Frame) -> None:

@@ -220,6 +220,8 @@ class Session(SessionRefinement):
         try:
             with self._replaying.in_force():
                 estimate = self._tracker.start(frame) if first else self._tracker.step(frame, prompt)
+                if not first:
+                    self._tracker.announce(self.coming)
                 if correction is not None:
                     self._tracker.correct(frame, correction)
         except PluginFailure as error:
