@@ -34,7 +34,12 @@ def correct(
 
     from tracking3d.cli.progress import print_summary, progress
     from tracking3d.cli.report import report_progress
-    from tracking3d.pipeline.correct import correct_run, object_folders_of
+    from tracking3d.pipeline.correct import (
+        check_corrections,
+        correct_run,
+        object_folders_of,
+        replaced_by_correction,
+    )
     from tracking3d.prompts.corrections import parse_correction
     from tracking3d.results.layout import CORRECTING, RUN, has_state
     from tracking3d.results.run_reader import RunReader
@@ -42,6 +47,10 @@ def correct(
     if quiet:
         logging.getLogger("tracking3d").setLevel(logging.ERROR)
     by_folder = object_folders_of(run, [parse_correction(text) for text in corrections])
+    for folder, theirs in by_folder.items():
+        check_corrections(folder, theirs)
+        for sentence in replaced_by_correction(folder, report) if not quiet else ():
+            typer.echo(sentence, err=True)
     for folder, theirs in by_folder.items():
         count = len(RunReader(folder).frames)
         with ExitStack() as ends:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -54,11 +55,7 @@ class EarlierRefinement:
     def leading(self) -> frozenset[int]:
         """The frames that stand and are each followed by one that has changed."""
         order = sorted((*self.kept, *self.changed))
-        return frozenset(
-            one
-            for one, after in zip(order, order[1:], strict=False)
-            if one in self.kept and after not in self.kept
-        )
+        return frozenset(one for one, after in pairwise(order) if one in self.kept and after not in self.kept)
 
     def _around(self, reach: int) -> frozenset[int]:
         order = sorted((*self.kept, *self.changed))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -75,16 +76,14 @@ class FinalRefinement:
         self._last = RefinementSteps(estimates, look, fixed=tracked.corrections, earlier=earlier)
 
     def take_again(self, frame: Frame) -> FrameRecord | None:
-        """Estimate the object in a frame again; None if the frame has no causal estimate, or its refined one stands."""
+        """Estimate the object in a frame again, unless its estimate stands; None if it has no causal estimate."""
         estimates, state, earlier = self._estimates, self._state, self._earlier
         if frame.index not in estimates.causal:
             return None
         if earlier is not None and (record := earlier.kept.get(frame.index)) is not None:
-            estimates.keep(record, earlier.folder)
             if frame.index in earlier.leading:
                 self._session.keep_frame(frame, record.T_cam_obj)
-            self._collect(record, frame, estimates.mask(record))
-            return None
+            return self._work.do(partial(self._keep, record, frame, earlier.folder))
         if state.kept:
             check_picture(state.kept, frame)
             if frame.index <= state.before.last_refined:
@@ -112,6 +111,10 @@ class FinalRefinement:
                 refinement_seconds=estimates.seconds,
             )
         return self._collect(record, frame, estimate.mask if estimate else estimates.mask(record))
+
+    def _keep(self, record: FrameRecord, frame: Frame, folder: Path) -> FrameRecord:
+        self._estimates.keep(record, folder)
+        return self._collect(record, frame, self._estimates.mask(record))
 
     def _collect(self, record: FrameRecord, frame: Frame, mask: Mask) -> FrameRecord:
         """Keep what the final poses, surface and texture can be taken from; the record as it is."""

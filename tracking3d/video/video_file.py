@@ -50,7 +50,7 @@ class VideoFile:
 
     @property
     def indices(self) -> range | None:
-        """Indices of the selected frames, if the header states how many frames there are, or else the selection does."""
+        """Indices of the selected frames, if the header states how many frames there are or the selection ends."""
         if self.counted and self.count is not None:
             return self.selection[: self.count]
         return None if self.selection.stop == EVERY_FRAME.stop else self.selection

@@ -45,8 +45,8 @@ from tracking3d.estimation.online.atlas.reinitialization import (
     is_reliable,
     masks_overlap,
 )
-from tracking3d.estimation.online.features.klt import FollowedPoints, follow, grey
 from tracking3d.estimation.online.continued_refinement import ContinuedRefinement
+from tracking3d.estimation.online.features.klt import FollowedPoints, follow, grey
 from tracking3d.estimation.online.initialization.initial_map import InitialMap
 from tracking3d.estimation.online.initialization.initializer import add_pending_frame, try_initialize
 from tracking3d.estimation.online.mapping.depth_reversal import fix_depth_reversal

@@ -91,7 +91,7 @@ def project_landmarks(object_map: ObjectMap, camera: Camera, pose: Pose) -> Foll
 def _fit_new_keyframes(
     object_map: ObjectMap, camera: Camera, refined: Mapping[int, NDArray[np.float64]], config: OnlineConfig
 ) -> ObjectMap:
-    """The map with poses and landmarks of keyframes that have no refined pose, and the surface, fitted to the others."""
+    """The map with the keyframes that have no refined pose, and the surface, fitted to the other keyframes."""
     views = object_map.keyframes
     new = [place for place, view in enumerate(views) if view.index not in refined]
     if not new or object_map.pointless:
