@@ -1,7 +1,8 @@
-"""Corrections of frames and objects that do not exist are refused with those that do, and nothing is lost at the end."""
+"""Corrections of frames and objects that do not exist are refused, and the sentence names those that do."""
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 
 import cv2
@@ -17,10 +18,10 @@ from tracking3d.pipeline.record import record, record_objects
 from tracking3d.pipeline.session import SOLVERS
 from tracking3d.prompts.corrections import Correction, parse_correction, validate_corrections
 from tracking3d.results.files import write_image
-from tracking3d.results.run_reader import RunReader
 from tracking3d.synthesis.convex_clips import SyntheticClip, SyntheticSpec, synthesize
 from tracking3d.video import open_source
 from tracking3d.video.source import known_indices
+from tracking3d.video.writer import VideoWriter
 
 BOX = (20.0, 16.0, 40.0, 32.0)
 FAR = Correction(99, box=BOX)
@@ -65,7 +66,7 @@ def test_the_library_refuses_a_frame_beyond_the_end_and_says_how_many_there_are(
 
 def test_frames_with_indices_of_their_own_are_corrected_by_these(clip):
     frames = [Frame(10 * number, image) for number, image in enumerate(clip.images, 1)]
-    with pytest.raises(InputError, match="frame 2 is not among .*: these are 3 frames, from 10 to 30"):
+    with pytest.raises(InputError, match=r"frame 2 is not among .*: these are 3 frames, from 10 to 30"):
         next(track(frames, mask=clip.masks[0], corrections=[Correction(2, box=BOX)], config=settings()))
     given = [Correction(30, box=BOX)]
     assert len(list(track(frames, mask=clip.masks[0], corrections=given, config=settings()))) == 3
@@ -93,9 +94,12 @@ def test_a_video_knows_its_frames_if_its_header_counts_them(clip, tmp_path):
     assert known_indices(open_source(str(with_count))) == range(3)
     assert known_indices(open_source(str(with_count), "1:9")) == range(1, 3)
     assert known_indices(open_source(iter(clip.images))) is None
-    raw = tmp_path / "clip.mjpeg"  # frames one after the other, without a header
-    raw.write_bytes(b"".join(cv2.imencode(".jpg", image)[1].tobytes() for image in clip.images))
-    assert known_indices(open_source(str(raw))) is None
+    uncounted = tmp_path / "growing.mp4"  # in fragments, so that the header is written before the frames
+    with closing(VideoWriter(uncounted, 25, clip.images[0].shape[:2])) as growing:
+        for image in clip.images:
+            growing.write(image)
+    assert known_indices(open_source(str(uncounted))) is None
+    assert known_indices(open_source(str(uncounted), "0:2")) == range(2)
 
 
 def test_a_run_names_its_frames_and_the_reason_of_those_that_it_skipped(clip, images, tmp_path):
